@@ -1,0 +1,1 @@
+"""Whole-body planning for mobile manipulators on virtual kinematic chains."""

@@ -1,0 +1,110 @@
+"""Minimal coordinates z of a Pinocchio model: one number per degree of freedom.
+
+Pinocchio stores a planar joint as (x, y, cos θ, sin θ) and a continuous joint as (cos θ, sin θ). Users and the
+optimiser work with (x, y, θ) and θ; this module maps one to the other, for numbers and for CasADi symbols.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from vkc_pin.errors import InputError
+
+__all__ = ["Coordinates"]
+
+_UNBOUNDED = ("JointModelRUBX", "JointModelRUBY", "JointModelRUBZ", "JointModelRevoluteUnboundedUnaligned")
+
+
+class Coordinates:
+    """The minimal coordinates of `model`.
+
+    Attributes:
+        names: One name per coordinate: the joint's, and for a planar joint `<joint>_x`, `<joint>_y`, `<joint>_yaw`.
+        joints: For each coordinate, the index of the joint it belongs to.
+        size: Their number n (equal to `model.nv`).
+        lower, upper: Position limits, shape (n,), [m] or [rad]; infinite for continuous joints and the planar yaw.
+        velocity: Velocity limits, shape (n,), [m/s] or [rad/s].
+
+    Raises:
+        InputError: The model has a joint that has no such coordinates (spherical, free-flyer, composite).
+    """
+
+    def __init__(self, model: pin.Model) -> None:
+        names: list[str] = []
+        joints: list[int] = []
+        plain: list[tuple[int, int]] = []  # q[i] = z[j]
+        angles: list[tuple[int, int]] = []  # q[i] = cos z[j], q[i + 1] = sin z[j]
+        lower, upper = [], []
+        for index in range(1, model.njoints):
+            joint, name, i = model.joints[index], model.names[index], model.joints[index].idx_q
+            kind = joint.shortname()
+            if kind == "JointModelPlanar":
+                plain += [(i, len(names)), (i + 1, len(names) + 1)]
+                angles.append((i + 2, len(names) + 2))
+                names += [f"{name}_x", f"{name}_y", f"{name}_yaw"]
+                lower += [*model.lowerPositionLimit[i : i + 2], -np.inf]
+                upper += [*model.upperPositionLimit[i : i + 2], np.inf]
+            elif kind in _UNBOUNDED:
+                angles.append((i, len(names)))
+                names.append(name)
+                lower.append(-np.inf)
+                upper.append(np.inf)
+            elif joint.nq == 1 and joint.nv == 1:
+                plain.append((i, len(names)))
+                names.append(name)
+                lower.append(model.lowerPositionLimit[i])
+                upper.append(model.upperPositionLimit[i])
+            else:
+                raise InputError("this joint type is not supported", field=name, expected="a planar joint or one of 1 degree of freedom", got=kind)
+            joints += [index] * (len(names) - len(joints))
+        self.names: tuple[str, ...] = tuple(names)
+        self.joints: tuple[int, ...] = tuple(joints)
+        self.size = len(names)
+        self.lower: NDArray[np.float64] = np.array(lower, float)
+        self.upper: NDArray[np.float64] = np.array(upper, float)
+        self.velocity: NDArray[np.float64] = np.array(model.velocityLimit, float)
+        self.nq = int(model.nq)
+        self._plain_q = np.array([i for i, _ in plain], int)
+        self._plain_z = np.array([j for _, j in plain], int)
+        self._angle_q = np.array([i for i, _ in angles], int)
+        self._angle_z = np.array([j for _, j in angles], int)
+
+    def q(self, z: ArrayLike) -> NDArray[np.float64]:
+        """Return Pinocchio's configuration(s), shape (..., nq), of minimal coordinates `z`, shape (..., n)."""
+        z = np.asarray(z, float)
+        if z.shape[-1:] != (self.size,):
+            raise InputError("wrong number of coordinates", field="z", expected=f"(..., {self.size})", got=z.shape)
+        q = np.empty((*z.shape[:-1], self.nq))
+        q[..., self._plain_q] = z[..., self._plain_z]
+        q[..., self._angle_q] = np.cos(z[..., self._angle_z])
+        q[..., self._angle_q + 1] = np.sin(z[..., self._angle_z])
+        return q
+
+    def z(self, q: ArrayLike) -> NDArray[np.float64]:
+        """Return the minimal coordinates, shape (..., n), of `q`, shape (..., nq); angles in (-π, π]."""
+        q = np.asarray(q, float)
+        if q.shape[-1:] != (self.nq,):
+            raise InputError("wrong size of configuration", field="q", expected=f"(..., {self.nq})", got=q.shape)
+        z = np.empty((*q.shape[:-1], self.size))
+        z[..., self._plain_z] = q[..., self._plain_q]
+        z[..., self._angle_z] = np.arctan2(q[..., self._angle_q + 1], q[..., self._angle_q])
+        return z
+
+    def q_symbolic(self, z: Any) -> Any:
+        """Return Pinocchio's configuration of the CasADi column `z` (SX or MX), shape (nq, 1)."""
+        import casadi
+
+        entries: list[Any] = [None] * self.nq
+        for i, j in zip(self._plain_q, self._plain_z, strict=True):
+            entries[i] = z[int(j)]
+        for i, j in zip(self._angle_q, self._angle_z, strict=True):
+            entries[i], entries[i + 1] = casadi.cos(z[int(j)]), casadi.sin(z[int(j)])
+        return casadi.vertcat(*entries)
+
+    def index(self, name: str) -> int:
+        """Return the position of coordinate `name` in z; raises `KeyError`-free `ValueError` if there is none."""
+        return self.names.index(name)

@@ -1,0 +1,296 @@
+"""Articulated objects: reading them, and re-rooting them at any link."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vkc_pin.articulation import DEFAULT_ACCELERATION, DEFAULT_VELOCITY, ArticulatedObject, invert, load_object
+from vkc_pin.errors import InputError, UnknownNameError
+
+KINDS = ("revolute", "continuous", "prismatic", "fixed")
+AXES = ("1 0 0", "0 1 0", "0 0 1", "-1 0 0", "0 0 -1", "0.6 0 0.8", "1 -2 3")
+SHAPES = ('<box size="0.1 0.2 0.3"/>', '<sphere radius="0.1"/>', '<cylinder radius="0.1" length="0.4"/>')
+
+
+def joint(name: str, kind: str, parent: str, child: str, axis: str) -> str:
+    limit = '<limit lower="-1" upper="1" velocity="1" effort="1"/>'
+    return f'''<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/><axis xyz="{axis}"/>{limit}</joint>
+'''
+
+
+@st.composite
+def trees(draw: st.DrawFn) -> tuple[str, int]:
+    """Random URDF trees of 1 to 8 links, and the index of one of the links."""
+    number = draw(st.integers(1, 8))
+    length = st.floats(-1.0, 1.0).map(lambda x: round(x, 4))
+    parts = []
+    for i in range(number):
+        origin = (
+            f'<origin xyz="{draw(length)} {draw(length)} {draw(length)}" rpy="{draw(length)} {draw(length)} {draw(length)}"/>'
+        )
+        shape = f"{origin}<geometry>{draw(st.sampled_from(SHAPES))}</geometry>"
+        inertia = '<mass value="1.5"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>'
+        bodies = f"<inertial>{origin}{inertia}</inertial><collision>{shape}</collision><visual>{shape}</visual>"
+        parts.append(f'<link name="l{i}">{bodies}</link>')
+    for i in range(1, number):
+        origin = (
+            f'<origin xyz="{draw(length)} {draw(length)} {draw(length)}" rpy="{draw(length)} {draw(length)} {draw(length)}"/>'
+        )
+        parent, kind, axis = draw(st.integers(0, i - 1)), draw(st.sampled_from(KINDS)), draw(st.sampled_from(AXES))
+        limit = f'<limit lower="-2" upper="{1 + i}" velocity="{i}" effort="{10 * i}"/>'
+        parts.append(
+            f'<joint name="j{i}" type="{kind}"><parent link="l{parent}"/><child link="l{i}"/>{origin}<axis xyz="{axis}"/>{limit}</joint>'
+        )
+    return f'<robot name="t">{"".join(parts)}</robot>', draw(st.integers(0, number - 1))
+
+
+def load_text(urdf: str, yaml: str) -> ArticulatedObject:
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "thing.urdf").write_text(urdf)
+        (Path(folder) / "thing.yaml").write_text(yaml)
+        return load_object(Path(folder) / "thing.yaml")
+
+
+def placements(model: pin.Model, geometry: pin.GeometryModel, q: np.ndarray) -> tuple[dict[str, pin.SE3], dict[str, pin.SE3]]:
+    """Placements in the universe frame of all body frames and of all shapes, by name."""
+    data, shapes = model.createData(), geometry.createData()
+    pin.framesForwardKinematics(model, data, q)
+    pin.updateGeometryPlacements(model, data, geometry, shapes)
+    bodies = {frame.name: data.oMf[i].copy() for i, frame in enumerate(model.frames) if frame.type == pin.FrameType.BODY}
+    return bodies, {shape.name: shapes.oMg[i].copy() for i, shape in enumerate(geometry.geometryObjects)}
+
+
+@settings(max_examples=120, deadline=None)
+@given(trees(), st.integers(0, 2**32 - 1))
+def test_every_frame_and_shape_of_the_inverted_tree_is_where_it_was(tree: tuple[str, int], seed: int) -> None:
+    urdf, root = tree
+    thing = load_text(urdf, "urdf: thing.urdf\nattachments: [{name: a, link: l0}]")
+    link, z = f"l{root}", np.random.default_rng(seed).uniform(-3.0, 3.0, thing.coordinates.size)
+    inverted = invert(thing, link, z)
+    moving = inverted.coordinates.names
+    assert set(moving) <= set(thing.coordinates.names)
+    q = inverted.coordinates.q(np.array([z[thing.coordinates.index(name)] for name in moving]))
+    for old_geometry, new_geometry in ((thing.collision, inverted.collision), (thing.visual, inverted.visual)):
+        bodies, shapes = placements(thing.model, old_geometry, thing.coordinates.q(z))
+        new_bodies, new_shapes = placements(inverted.model, new_geometry, q)
+        assert new_bodies.keys() == bodies.keys()
+        assert new_shapes.keys() == shapes.keys()
+        to_root = bodies[link].inverse()
+        for old, new in ((bodies, new_bodies), (shapes, new_shapes)):
+            for name in old:
+                np.testing.assert_allclose(new[name].homogeneous, (to_root * old[name]).homogeneous, atol=1e-12, rtol=0.0)
+    for name in moving:
+        old, new = thing.coordinates.index(name), inverted.coordinates.index(name)
+        for attribute in ("lower", "upper", "velocity"):
+            assert getattr(inverted.coordinates, attribute)[new] == getattr(thing.coordinates, attribute)[old]
+    assert sum(i.mass for i in inverted.model.inertias) == pytest.approx(sum(i.mass for i in thing.model.inertias))
+    for shape in inverted.collision.geometryObjects:
+        frame = inverted.model.frames[shape.parentFrame]
+        assert frame.parentJoint == shape.parentJoint
+        assert shape.name.startswith(frame.name)
+
+
+def test_only_the_path_to_the_base_moves_and_side_branches_keep_their_state() -> None:
+    links = "".join(f'<link name="{name}"/>' for name in ("base", "arm", "hand", "side", "back"))
+    joints = (
+        joint("shoulder", "revolute", "base", "arm", "0 0 1")
+        + joint("wrist", "prismatic", "arm", "hand", "1 0 0")
+        + joint("flap", "revolute", "arm", "side", "0 1 0")
+        + joint("lid", "revolute", "base", "back", "1 0 0")
+    )
+    urdf = f'<robot name="t">{links}{joints}</robot>'
+    thing = load_text(urdf, "urdf: thing.urdf\nattachments: [{name: a, link: hand}]")
+    state = dict(zip(thing.coordinates.names, [0.0] * 4, strict=True)) | {"flap": 0.4, "lid": -0.3}
+    inverted = invert(thing, "hand", np.array([state[name] for name in thing.coordinates.names]))
+    assert inverted.coordinates.names == ("wrist", "shoulder")
+    bodies, _ = placements(inverted.model, inverted.collision, inverted.coordinates.q([0.7, 0.2]))
+    np.testing.assert_allclose(bodies["arm"].actInv(bodies["side"]).rotation, pin.utils.rotate("y", 0.4), atol=1e-12)
+    np.testing.assert_allclose(bodies["base"].actInv(bodies["back"]).rotation, pin.utils.rotate("x", -0.3), atol=1e-12)
+    np.testing.assert_allclose(bodies["arm"].translation, [-0.7, 0.0, 0.0], atol=1e-12)
+    assert invert(thing, "base", [0.0] * 4).model.nq == 0
+
+
+def test_inverting_aligned_joints_leaves_exact_zeros_and_ones() -> None:
+    inverted = invert(load_object("door"), "lever", [0.0, 0.0])
+    for placement in inverted.model.jointPlacements:
+        assert set(np.abs(placement.rotation).ravel()) <= {0.0, 1.0}
+    assert [joint.shortname() for joint in inverted.model.joints][1:] == ["JointModelRZ", "JointModelRZ"]
+
+
+def test_invert_refuses_unknown_links_and_wrong_states() -> None:
+    door = load_object("door")
+    with pytest.raises(UnknownNameError) as caught:
+        invert(door, "levr", [0.0, 0.0])
+    assert caught.value.nearest == "lever"
+    with pytest.raises(InputError, match="number of coordinates"):
+        invert(door, "lever", [0.0])
+
+
+def test_door() -> None:
+    door = load_object("door")
+    assert door.coordinates.names == ("hinge", "knob")
+    assert door.base_link == "frame"
+    assert not door.free
+    np.testing.assert_array_equal(door.lower, [-1.57, 0.0])
+    np.testing.assert_array_equal(door.upper, [1.57, 0.8])
+    np.testing.assert_array_equal(door.velocity, [1.0, 2.0])
+    np.testing.assert_array_equal(door.acceleration, [1.0, 4.0])
+    (latch,) = door.latches
+    assert (latch.joint, latch.held_at, latch.released_by, latch.threshold, latch.engaged_within) == (
+        "hinge",
+        0.0,
+        "knob",
+        0.5,
+        0.05,
+    )
+    assert list(door.attachments) == ["handle", "handle_free"]
+    assert door.attachment() is door.attachment("handle")
+    free = door.attachment("handle_free")
+    assert (free.joint, free.lower, free.upper) == ("revolute", -0.6, 0.6)
+    np.testing.assert_array_equal(free.axis, [0.0, 1.0, 0.0])
+    with pytest.raises(UnknownNameError) as caught:
+        door.attachment("handel")
+    assert caught.value.nearest == "handle"
+
+
+def test_the_door_moves_as_its_description_says() -> None:
+    door = load_object("door")
+    closed, pushed = (door.link_placement("lever", [hinge, 0.0]).translation for hinge in (0.0, 1.0))
+    assert pushed[0] > closed[0] + 0.5, "hinge > 0 pushes the panel away from the handle's side, towards +x"
+    level, turned = (door.link_placement("lever", [0.0, knob]) * door.attachment().placement for knob in (0.0, 0.5))
+    assert turned.translation[2] < level.translation[2] - 0.02, "knob > 0 turns the lever's end down"
+    np.testing.assert_allclose(level.rotation[:, 2], [1.0, 0.0, 0.0], atol=1e-12)  # the tool approaches along +x
+    np.testing.assert_allclose(level.rotation[:, 0], [0.0, 0.0, 1.0], atol=1e-12)  # and closes across the bar
+    assert 0.95 <= level.translation[2] <= 1.0
+    assert -0.125 - 0.02 <= level.translation[0] <= -0.07 - 0.02, "the bar stands in front of the panel's face at -0.02"
+
+
+def test_parts_of_the_door_keep_apart_over_the_whole_range() -> None:
+    door = load_object("door")
+    shapes = door.collision
+    link = [door.model.frames[shape.parentFrame].name for shape in shapes.geometryObjects]
+    nearest = np.inf
+    for hinge in np.linspace(-1.57, 1.57, 158):
+        for knob in (0.0, 0.4, 0.8):
+            _, where = placements(door.model, shapes, door.coordinates.q([hinge, knob]))
+            transforms = [coal.Transform3s(where[s.name].rotation, where[s.name].translation) for s in shapes.geometryObjects]
+            for i, a in enumerate(shapes.geometryObjects):
+                for j, b in enumerate(shapes.geometryObjects):
+                    if link[i] == "frame" and link[j] != "frame":
+                        distance = coal.distance(
+                            a.geometry, transforms[i], b.geometry, transforms[j], coal.DistanceRequest(), coal.DistanceResult()
+                        )
+                        nearest = min(nearest, distance)
+    assert nearest > 0.02
+
+
+BASE = """urdf: thing.urdf
+joints:
+  hinge: {acceleration: 3}
+attachments:
+  - name: grip
+    link: panel
+latches:
+  - {joint: hinge, released_by: knob, threshold: 0.5, engaged_within: 0.05}
+"""
+URDF = (
+    '<robot name="t"><link name="frame"/><link name="panel"/><link name="lever"/>'
+    + joint("hinge", "revolute", "frame", "panel", "0 0 1")
+    + '<joint name="knob" type="continuous"><parent link="panel"/><child link="lever"/><axis xyz="1 0 0"/></joint></robot>'
+)
+
+
+def test_limits_that_are_not_stated_have_documented_defaults() -> None:
+    thing = load_text(URDF, BASE)
+    np.testing.assert_array_equal(thing.velocity, [1.0, DEFAULT_VELOCITY])
+    np.testing.assert_array_equal(thing.acceleration, [3.0, DEFAULT_ACCELERATION])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "field", "nearest"),
+    [
+        ("acceleration", "aceleration", 3, "joints.hinge.aceleration", "acceleration"),
+        ("  hinge:", "  hingge:", 3, "joints.hingge", "hinge"),
+        ("link: panel", "link: panell", 6, "attachments[0].link", "panel"),
+        ("joint: hinge", "joint: hinges", 8, "latches[0].joint", "hinge"),
+        ("released_by: knob", "released_by: knot", 8, "latches[0].released_by", "knob"),
+        ("link: panel", "link: panel\n    joint: revolut", 7, "attachments[0].joint", "revolute"),
+        ("latches:", "latch:", 7, "latch", "latches"),
+    ],
+)
+def test_unknown_names_in_a_description(old: str, new: str, line: int, field: str, nearest: str) -> None:
+    with pytest.raises(UnknownNameError) as caught:
+        load_text(URDF, BASE.replace(old, new))
+    assert (caught.value.line, caught.value.field, caught.value.nearest) == (line, field, nearest)
+    assert Path(str(caught.value.file)).name == "thing.yaml"
+    assert f"did you mean '{nearest}'" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "field"),
+    [
+        ("acceleration: 3", "acceleration: -3", 3, "joints.hinge.acceleration"),
+        ("acceleration: 3", "acceleration: .nan", 3, "joints.hinge.acceleration"),
+        ("acceleration: 3", "acceleration: yes", 3, "joints.hinge.acceleration"),
+        ("link: panel", "position: [0, 0, 0]", 5, "attachments[0].link"),
+        ("link: panel", "link: panel\n    joint: revolute", 5, "attachments[0]"),
+        ("link: panel", "link: panel\n    joint: revolute\n    axis: [0, 0, 0]", 8, "attachments[0].axis"),
+        ("link: panel", "link: panel\n    joint: revolute\n    axis: [0, 0, 1]\n    limits: [0.1, 1]", 5, "attachments[0]"),
+        ("link: panel", "link: panel\n    approach: [1, 0, 0]", 5, "attachments[0]"),
+        ("link: panel", "link: panel\n    approach: [1, 0, 0]\n    closing: [1, 0, 1]", 5, "attachments[0]"),
+        ("link: panel", "link: panel\n  - name: grip\n    link: panel", 7, "attachments[1].name"),
+        ("joint: hinge,", "joint: hinge, held_at: 2,", 8, "latches[0].held_at"),
+        ("released_by: knob", "released_by: hinge", 8, "latches[0].released_by"),
+        ("engaged_within: 0.05", "engaged_within: 0", 8, "latches[0].engaged_within"),
+        ("latches:", "urdf: thing.urdf\nlatches:", 7, "urdf"),
+        ("link: panel", "link: [panel", 7, None),
+    ],
+)
+def test_wrong_values_in_a_description(old: str, new: str, line: int, field: str | None) -> None:
+    with pytest.raises(InputError) as caught:
+        load_text(URDF, BASE.replace(old, new))
+    assert (caught.value.line, caught.value.field) == (line, field), str(caught.value)
+    assert Path(str(caught.value.file)).name == "thing.yaml"
+
+
+@pytest.mark.parametrize(
+    ("urdf", "message"),
+    [
+        (URDF.replace("</robot>", ""), "not valid XML"),
+        (URDF.replace("robot", "model"), "expected an element <robot>"),
+        (URDF.replace('type="continuous"', 'type="floating"'), "knob: this joint type is not supported"),
+        (URDF.replace('<axis xyz="1 0 0"/>', '<axis xyz="1 0 0"/><mimic joint="hinge"/>'), "knob: joints that mimic"),
+        (URDF.replace('velocity="1"', 'velocity="0"'), "hinge.limit.velocity"),
+        (URDF.replace('child link="lever"', 'child link="lver"'), "not a valid URDF"),
+        (
+            URDF.replace('<link name="panel"/>', f'<link name="panel"><visual><geometry>{SHAPES[0]}</geometry></visual></link>'),
+            "nothing in this URDF can collide",
+        ),
+    ],
+)
+def test_wrong_urdfs_are_refused(urdf: str, message: str) -> None:
+    with pytest.raises(InputError) as caught:
+        load_text(urdf, BASE)
+    assert message in str(caught.value)
+    assert Path(str(caught.value.file)).name == "thing.urdf"
+
+
+def test_unknown_objects_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UnknownNameError) as caught:
+        load_object("dor")
+    assert caught.value.nearest == "door"
+    with pytest.raises(InputError) as missing:
+        load_object(tmp_path / "none.yaml")
+    assert missing.value.file == tmp_path / "none.yaml"
+    (tmp_path / "thing.yaml").write_text("urdf: none.urdf\nattachments: [{name: a, link: b}]")
+    with pytest.raises(InputError) as lost:
+        load_object(tmp_path / "thing.yaml")
+    assert lost.value.file == tmp_path / "none.urdf"

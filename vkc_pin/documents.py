@@ -1,0 +1,214 @@
+"""YAML description files: read safely, checked against a schema, with errors that name file, line and field."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import pydantic
+import yaml
+
+from vkc_pin.errors import InputError, UnknownNameError
+
+__all__ = ["Document", "check", "field_name", "read_yaml"]
+
+Key = str | int
+T = TypeVar("T", bound=pydantic.BaseModel)
+
+_EXPECTED = {
+    "bool_parsing": "true or false",
+    "bool_type": "true or false",
+    "dict_type": "fields (name: value)",
+    "finite_number": "a finite number",
+    "float_parsing": "a number",
+    "float_type": "a number",
+    "list_type": "a list",
+    "model_attributes_type": "fields (name: value)",
+    "model_type": "fields (name: value)",
+    "string_type": "text",
+    "tuple_type": "a list",
+}
+
+
+def field_name(path: tuple[Key, ...]) -> str:
+    """Return a field's path as users write it: ("obstacles", 3, "size") is `obstacles[3].size`."""
+    text = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in path)
+    return text.removeprefix(".")
+
+
+@dataclass(frozen=True)
+class Document:
+    """Plain data with the place where each of its fields stands.
+
+    Attributes:
+        data: What was read: dictionaries, lists, text, numbers.
+        file: The file it came from, or None for data that was handed over.
+        lines: Field path → line, counted from 1; empty for data that was handed over.
+    """
+
+    data: Any
+    file: Path | None = None
+    lines: dict[tuple[Key, ...], int] = field(default_factory=dict)
+
+    def line(self, path: tuple[Key, ...]) -> int | None:
+        """Return the line of the field at `path`, or of the closest field around it."""
+        while path and path not in self.lines:
+            path = path[:-1]
+        return self.lines.get(path)
+
+    def value(self, path: tuple[Key, ...]) -> Any:
+        """Return the data at `path`, or None if there is none."""
+        value = self.data
+        for key in path:
+            try:
+                value = value[key]
+            except (KeyError, IndexError, TypeError):
+                return None
+        return value
+
+    def error(self, path: tuple[Key, ...], problem: str, *, expected: object = None, got: object = None) -> InputError:
+        """Return (not raise) the error that says that the field at `path` is wrong."""
+        return InputError(problem, file=self.file, line=self.line(path), field=field_name(path), expected=expected, got=got)
+
+    def unknown(self, path: tuple[Key, ...], kind: str, name: object, choices: Iterator[str] | Any) -> UnknownNameError:
+        """Return (not raise) the error that says that the field at `path` names something that does not exist."""
+        return UnknownNameError(kind, str(name), choices, file=self.file, line=self.line(path), field=field_name(path))
+
+    @contextmanager
+    def at(self, path: tuple[Key, ...]) -> Iterator[None]:
+        """Give errors raised inside the place `path`, unless they name a file of their own."""
+        try:
+            yield
+        except UnknownNameError as error:
+            if error.file is not None:
+                raise
+            kind = re.match(r"there is no (.*?) '", error.problem)
+            raise self.unknown(path, kind[1] if kind else "name", error.name, error.choices) from error
+        except InputError as error:
+            if error.file is not None:
+                raise
+            where = f"{error.field}: " if error.field else ""
+            raise self.error(path, where + error.problem, expected=error.expected, got=error.got) from error
+
+
+def read_yaml(file: str | Path) -> Document:
+    """Read a YAML file, with the line of every field.
+
+    Raises:
+        InputError: The file does not exist, is no valid YAML, or holds a key twice.
+    """
+    path = Path(file)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(
+            "cannot read the file", file=path, expected="an existing YAML file", got=getattr(error, "strerror", None) or error
+        ) from error
+    loader = yaml.SafeLoader(text)
+    lines: dict[tuple[Key, ...], int] = {}
+    try:
+        node = loader.get_single_node()
+        if node is not None:
+            _locate(node, (), lines, path, set())
+        data = None if node is None else loader.construct_document(node)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        problem = "; ".join(part for part in (error.context, error.problem) if part)
+        raise InputError(f"not valid YAML: {problem}", file=path, line=mark.line + 1 if mark else None) from error
+    except InputError:
+        raise
+    except (yaml.YAMLError, RecursionError, ValueError, TypeError) as error:
+        raise InputError(f"not valid YAML: {error}", file=path) from error
+    finally:
+        loader.dispose()
+    return Document(data, path, lines)
+
+
+def check(document: Document, schema: type[T]) -> T:
+    """Return `document` as `schema`.
+
+    Raises:
+        InputError: It does not fit; the error is about the first wrong field in the file.
+        UnknownNameError: The same, where a name resembles one that would fit.
+    """
+    try:
+        return schema.model_validate(document.data)
+    except pydantic.ValidationError as problem:
+        errors = problem.errors(include_url=False)
+    located = [(_path(document.data, error), error) for error in errors]
+    path, first = min(located, key=lambda item: document.line(item[0]) or 0)
+    raise _translate(document, path, first)
+
+
+def _locate(node: yaml.Node, path: tuple[Key, ...], lines: dict[tuple[Key, ...], int], file: Path, above: set[int]) -> None:
+    """Write the lines of `node` and of everything below it into `lines`; `above` holds the nodes it stands in."""
+    lines.setdefault(path, node.start_mark.line + 1)
+    if id(node) in above:
+        raise InputError("an alias contains itself", file=file, line=node.start_mark.line + 1, field=field_name(path))
+    above = above | {id(node)}
+    if isinstance(node, yaml.MappingNode):
+        seen: dict[str, int] = {}
+        for key, value in node.value:
+            name, line = key.value if isinstance(key, yaml.ScalarNode) else str(key.value), key.start_mark.line + 1
+            if name in seen:
+                raise InputError(
+                    "this field stands here twice",
+                    file=file,
+                    line=line,
+                    field=field_name((*path, name)),
+                    got=f"lines {seen[name]} and {line}",
+                )
+            seen[name] = line
+            lines[(*path, name)] = line
+            _locate(value, (*path, name), lines, file, above)
+    elif isinstance(node, yaml.SequenceNode):
+        for index, item in enumerate(node.value):
+            _locate(item, (*path, index), lines, file, above)
+
+
+def _path(data: Any, error: Any) -> tuple[Key, ...]:
+    """Return the path of an error in the data: pydantic's, without the tags of unions, which are no fields."""
+    path: list[Key] = []
+    location = error["loc"]
+    for position, key in enumerate(location):
+        inside = isinstance(data, dict) and key in data
+        inside = inside or (isinstance(data, list | tuple) and isinstance(key, int) and key < len(data))
+        if inside:
+            path.append(key)
+            data = data[key]
+        elif position == len(location) - 1 and error["type"] == "missing":
+            path.append(key)
+    if error["type"] == "unknown_field":
+        path.append(error["ctx"]["name"])
+    elif error["type"] in ("union_tag_invalid", "union_tag_not_found"):
+        path.append(error["ctx"]["discriminator"].strip("'"))
+    return tuple(path)
+
+
+def _translate(document: Document, path: tuple[Key, ...], error: Any) -> InputError:
+    """Return the exception that says what pydantic's `error` at `path` means."""
+    kind, context, got = error["type"], error.get("ctx", {}), error["input"]
+    if kind == "unknown_field":
+        return document.unknown(path, "field", context["name"], context["choices"])
+    if kind in ("too_short", "too_long") or (kind == "missing" and isinstance(path[-1], int)):
+        values = document.value(path[:-1] if kind == "missing" else path)
+        return document.error(
+            path, "wrong number of values", expected=error["ctx"]["max_length"] if kind == "too_long" else "more", got=values
+        )
+    if kind in ("missing", "union_tag_not_found"):
+        tag = kind == "union_tag_not_found"
+        return document.error(path, "missing", expected="the object's kind" if tag else "a value", got="nothing")
+    if kind in ("union_tag_invalid", "literal_error"):
+        choices = re.findall(r"'([^']*)'", context["expected_tags" if kind == "union_tag_invalid" else "expected"])
+        return document.unknown(path, str(path[-1]), context.get("tag", got), choices)
+    if kind == "vkc":
+        return document.error(path, context["problem"], expected=context["expected"], got=repr(got))
+    if kind in ("greater_than", "greater_than_equal", "less_than", "less_than_equal"):
+        sign = {"greater_than": ">", "greater_than_equal": ">=", "less_than": "<", "less_than_equal": "<="}[kind]
+        return document.error(path, "out of range", expected=f"a number {sign} {next(iter(context.values())):g}", got=repr(got))
+    expected = _EXPECTED.get(kind, error["msg"])
+    return document.error(path, "wrong value", expected=expected, got=repr(got))

@@ -1,0 +1,132 @@
+"""What a description file of an articulated object may contain, and the value types shared with scenes."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic_core import PydanticCustomError
+
+__all__ = [
+    "AttachmentSchema",
+    "JointSchema",
+    "LatchSchema",
+    "Name",
+    "Number",
+    "ObjectSchema",
+    "Positive",
+    "Schema",
+    "Vector3",
+    "fail",
+]
+
+
+def fail(problem: str, expected: str) -> PydanticCustomError:
+    """Return (not raise) the error of a validator: what is wrong and what would be right."""
+    return PydanticCustomError("vkc", "{problem}", {"problem": problem, "expected": expected})
+
+
+def _number(value: Any) -> Any:
+    if isinstance(value, bool):  # YAML turns yes, no, on, off into booleans, and pydantic those into 1 and 0
+        raise fail("wrong value", "a number")
+    return value
+
+
+def _name(value: str) -> str:
+    if not value or value != value.strip() or "." in value or "/" in value:
+        raise fail("not a name", "text without '.', '/' or spaces around it")
+    return value
+
+
+def _direction(value: tuple[float, float, float]) -> tuple[float, float, float]:
+    if np.linalg.norm(value) < 1e-6:
+        raise fail("a direction cannot be zero", "a vector of some length")
+    return value
+
+
+def _some(value: tuple[Any, ...]) -> tuple[Any, ...]:
+    if not value:
+        raise fail("nothing in the list", "at least one")
+    return value
+
+
+Number = Annotated[float, BeforeValidator(_number), Field(allow_inf_nan=False)]
+Positive = Annotated[Number, Field(gt=0.0)]
+Vector3 = tuple[Number, Number, Number]
+Direction = Annotated[Vector3, AfterValidator(_direction)]
+Name = Annotated[str, AfterValidator(_name)]
+
+
+class Schema(BaseModel):
+    """Base of all schemas: immutable, and an unknown field is an error that knows the valid ones."""
+
+    model_config = ConfigDict(frozen=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known_fields(cls, data: Any) -> Any:
+        if isinstance(data, dict):
+            for key in data:
+                if key not in cls.model_fields:
+                    raise PydanticCustomError(
+                        "unknown_field", "unknown field", {"name": str(key), "choices": list(cls.model_fields)}
+                    )
+        return data
+
+
+class JointSchema(Schema):
+    """What a URDF cannot say about a joint: [m/s] and [m/s²], or [rad/s] and [rad/s²]."""
+
+    velocity: Positive | None = None
+    acceleration: Positive | None = None
+
+
+class AttachmentSchema(Schema):
+    """Where and how a tool takes hold of a link; see `vkc_pin.articulation.Attachment`."""
+
+    name: Name
+    link: str
+    position: Vector3 = (0.0, 0.0, 0.0)
+    rpy: Vector3 | None = None
+    approach: Direction | None = None
+    closing: Direction | None = None
+    joint: Literal["fixed", "revolute", "prismatic", "spherical"] = "fixed"
+    axis: Direction | None = None
+    limits: tuple[Number, Number] | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> AttachmentSchema:
+        if (self.approach is None) != (self.closing is None) or (self.rpy is not None and self.approach is not None):
+            raise fail("the tool's direction is not clear", "either rpy, or approach and closing")
+        if self.approach is not None and self.closing is not None and abs(np.dot(self.approach, self.closing)) > 1e-9:
+            raise fail("approach and closing are not perpendicular", "two perpendicular directions")
+        if (self.joint in ("revolute", "prismatic")) != (self.axis is not None):
+            raise fail("axis and joint do not fit", "an axis with joint revolute or prismatic, and only there")
+        if self.joint in ("revolute", "prismatic") and self.limits is None:
+            raise fail("limits missing", "limits [lower, upper] of the grasp's joint")
+        if self.joint == "fixed" and self.limits is not None:
+            raise fail("a fixed grasp has no limits", "no limits, or another joint")
+        if self.limits is not None and not self.limits[0] <= 0.0 <= self.limits[1]:
+            raise fail("the limits do not contain 0", "limits [lower <= 0, upper >= 0]")
+        return self
+
+
+class LatchSchema(Schema):
+    """A joint held until another one is moved; see `vkc_pin.articulation.Latch`."""
+
+    joint: str
+    held_at: Number = 0.0
+    released_by: str
+    threshold: Number
+    engaged_within: Positive
+
+
+class ObjectSchema(Schema):
+    """A description file of an articulated object."""
+
+    urdf: str
+    free: bool = False
+    joints: dict[str, JointSchema] = {}
+    attachments: Annotated[tuple[AttachmentSchema, ...], AfterValidator(_some)]
+    latches: tuple[LatchSchema, ...] = ()

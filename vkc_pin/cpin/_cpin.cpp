@@ -1,0 +1,173 @@
+// Pinocchio's algorithms on casadi::SX.
+//
+// Everything crosses the border to Python as text: a numeric pinocchio::Model comes in as Pinocchio serialises it, a
+// casadi::Function goes out as CasADi serialises it. So this module shares no C++ object with the Python bindings of
+// either library, and need not be built with their compilers.
+
+#include <cmath>
+#include <sstream>
+#include <string>
+#include <vector>
+
+#include <pinocchio/autodiff/casadi.hpp>
+
+#include <pinocchio/algorithm/center-of-mass.hpp>
+#include <pinocchio/algorithm/frames.hpp>
+#include <pinocchio/algorithm/jacobian.hpp>
+#include <pinocchio/algorithm/kinematics.hpp>
+#include <pinocchio/algorithm/rnea.hpp>
+#include <pinocchio/config.hpp>
+#include <pinocchio/multibody.hpp>
+#include <pinocchio/serialization.hpp>
+
+#include <casadi/casadi.hpp>
+#include <casadi/config.h>
+
+#include <nanobind/nanobind.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
+
+namespace nb = nanobind;
+
+namespace {
+
+using casadi::Function;
+using casadi::SX;
+using Model = pinocchio::ModelTpl<SX>;
+using Data = pinocchio::DataTpl<SX>;
+using SE3 = pinocchio::SE3Tpl<SX>;
+using Vector = Eigen::Matrix<SX, Eigen::Dynamic, 1>;
+
+// Quarter turns reach us as cos(π/2) = 6e-17. Made exact they vanish from the expressions: far fewer instructions for
+// a change below the rounding of the numeric algorithms.
+void snap(pinocchio::SE3 & placement)
+{
+  constexpr double epsilon = 4e-16;
+  auto & rotation = placement.rotation();
+  for (Eigen::Index i = 0; i < rotation.size(); ++i)
+  {
+    const double nearest = std::round(rotation.data()[i]);
+    if (std::abs(rotation.data()[i] - nearest) <= epsilon)
+      rotation.data()[i] = nearest;
+  }
+}
+
+Model load(const std::string & text)
+{
+  pinocchio::Model model;
+  model.loadFromString(text);
+  for (auto & placement : model.jointPlacements)
+    snap(placement);
+  for (auto & frame : model.frames)
+    snap(frame.placement);
+  return model.cast<SX>();
+}
+
+Vector to_eigen(const SX & column)
+{
+  Vector vector(column.size1());
+  for (casadi_int i = 0; i < column.size1(); ++i)
+    vector[i] = column(i);
+  return vector;
+}
+
+template<typename Matrix>
+SX to_casadi(const Eigen::MatrixBase<Matrix> & matrix)
+{
+  SX result(matrix.rows(), matrix.cols());  // entries that are never set stay structurally zero
+  for (Eigen::Index j = 0; j < matrix.cols(); ++j)
+    for (Eigen::Index i = 0; i < matrix.rows(); ++i)
+    {
+      const SX & entry = matrix(i, j);
+      if (!entry.is_zero())
+        result(i, j) = entry;
+    }
+  return result;
+}
+
+SX column(const SE3 & placement)
+{
+  return SX::vertcat({SX::vec(to_casadi(placement.rotation())), to_casadi(placement.translation())});
+}
+
+std::string pack(
+  const std::string & name,
+  const std::vector<SX> & in,
+  const SX & out,
+  const std::vector<std::string> & names_in,
+  const std::string & name_out)
+{
+  return Function(name, in, {cse(out)}, names_in, {name_out}).serialize();
+}
+
+std::string joint_placements(const std::string & text)
+{
+  const Model model = load(text);
+  Data data(model);
+  const SX q = SX::sym("q", model.nq);
+  pinocchio::forwardKinematics(model, data, to_eigen(q));
+  std::vector<SX> columns{SX(12, 0)};
+  for (std::size_t i = 1; i < data.oMi.size(); ++i)
+    columns.push_back(column(data.oMi[i]));
+  return pack("joint_placements", {q}, SX::horzcat(columns), {"q"}, "M");
+}
+
+std::string frame_placements(const std::string & text, const std::vector<std::size_t> & frames)
+{
+  const Model model = load(text);
+  Data data(model);
+  const SX q = SX::sym("q", model.nq);
+  pinocchio::forwardKinematics(model, data, to_eigen(q));
+  std::vector<SX> columns{SX(12, 0)};
+  for (const std::size_t i : frames)
+  {
+    const auto & frame = model.frames.at(i);
+    columns.push_back(column(data.oMi[frame.parentJoint] * frame.placement));
+  }
+  return pack("frame_placements", {q}, SX::horzcat(columns), {"q"}, "M");
+}
+
+std::string frame_jacobian(const std::string & text, std::size_t frame, int reference)
+{
+  const Model model = load(text);
+  Data data(model);
+  const SX q = SX::sym("q", model.nq);
+  pinocchio::computeJointJacobians(model, data, to_eigen(q));
+  Data::Matrix6x jacobian = Data::Matrix6x::Zero(6, model.nv);
+  pinocchio::getFrameJacobian(
+    model, data, model.frames.at(frame).parentJoint, model.frames.at(frame).placement,
+    static_cast<pinocchio::ReferenceFrame>(reference), jacobian);
+  return pack("frame_jacobian", {q}, to_casadi(jacobian), {"q"}, "J");
+}
+
+std::string rnea(const std::string & text)
+{
+  const Model model = load(text);
+  Data data(model);
+  const SX q = SX::sym("q", model.nq), v = SX::sym("v", model.nv), a = SX::sym("a", model.nv);
+  pinocchio::rnea(model, data, to_eigen(q), to_eigen(v), to_eigen(a));
+  return pack("rnea", {q, v, a}, to_casadi(data.tau), {"q", "v", "a"}, "tau");
+}
+
+std::string center_of_mass(const std::string & text)
+{
+  const Model model = load(text);
+  Data data(model);
+  const SX q = SX::sym("q", model.nq);
+  pinocchio::centerOfMass(model, data, to_eigen(q), false);
+  return pack("center_of_mass", {q}, to_casadi(data.com[0]), {"q"}, "com");
+}
+
+} // namespace
+
+NB_MODULE(_cpin, module)
+{
+  module.doc() = "Pinocchio's algorithms on casadi::SX; models and functions cross as text.";
+  module.attr("PINOCCHIO_VERSION") = PINOCCHIO_VERSION;
+  module.attr("CASADI_VERSION") = CASADI_VERSION_STRING;
+  module.def("joint_placements", &joint_placements);
+  module.def("frame_placements", &frame_placements);
+  module.def("frame_jacobian", &frame_jacobian);
+  module.def("rnea", &rnea);
+  module.def("center_of_mass", &center_of_mass);
+}

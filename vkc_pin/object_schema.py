@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -127,6 +128,6 @@ class ObjectSchema(Schema):
 
     urdf: str
     free: bool = False
-    joints: dict[str, JointSchema] = {}
+    joints: Mapping[str, JointSchema] = Field(default_factory=dict)
     attachments: Annotated[tuple[AttachmentSchema, ...], AfterValidator(_some)]
     latches: tuple[LatchSchema, ...] = ()

@@ -1,0 +1,130 @@
+"""Where things stand: articulated objects placed in the world, and distances between groups of shapes."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import coal
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from vkc_pin.articulation import ArticulatedObject, tidy
+from vkc_pin.errors import InputError, UnknownNameError
+
+__all__ = ["LIMIT_SLACK", "PlacedObject", "clearance", "copy_shape", "placed_shapes", "standing_geometry", "within_limits"]
+
+LIMIT_SLACK = 1e-6
+"""Joint values up to this far outside their limits, [rad] or [m], count as rounding and are moved to the limit."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedObject:
+    """An articulated object that stands in the world (or is held).
+
+    Attributes:
+        name: Its name in the scene.
+        object: What it is.
+        placement: Its base link in the world frame.
+        state: Its joint values, shape (n,), [rad] or [m], in the order of `object.coordinates.names`.
+    """
+
+    name: str
+    object: ArticulatedObject
+    placement: pin.SE3
+    state: NDArray[np.float64]
+
+    def with_state(self, values: Mapping[str, float]) -> PlacedObject:
+        """Return the object with joints at `values`, by joint name, [rad] or [m]; the other joints stay.
+
+        Raises:
+            UnknownNameError: It has no such joint.
+            InputError: A value is not finite or outside the joint's limits.
+        """
+        state, coordinates = self.state.copy(), self.object.coordinates
+        for joint, value in values.items():
+            if joint not in coordinates.names:
+                raise UnknownNameError(f"joint of {self.name}", joint, coordinates.names, field=f"{self.name}.{joint}")
+            index = coordinates.index(joint)
+            state[index] = within_limits(value, self.object.lower[index], self.object.upper[index], f"{self.name}.{joint}")
+        return dataclasses.replace(self, state=state)
+
+    def link_placement(self, link: str) -> pin.SE3:
+        """Return the placement of `link` in the world frame. Raises `UnknownNameError` if there is none."""
+        return self.placement * self.object.link_placement(link, self.state)
+
+
+def within_limits(value: float, lower: float, upper: float, field: str | None) -> float:
+    """Return `value`, moved to the limit if it is outside by rounding only. Raises `InputError` if it is further out."""
+    if not np.isfinite(value):
+        raise InputError("not a finite number", field=field, expected="a finite number", got=value)
+    if not lower - LIMIT_SLACK <= value <= upper + LIMIT_SLACK:
+        raise InputError("outside the joint's limits", field=field, expected=f"{lower:g} to {upper:g}", got=f"{value:g}")
+    return float(min(max(value, lower), upper))
+
+
+def standing_geometry(placed: PlacedObject, *, visual: bool = False) -> list[pin.GeometryObject]:
+    """Return copies of an object's shapes where they stand: parent joint 0, placements in the world frame.
+
+    Args:
+        placed: The object.
+        visual: Return what to draw instead of what collides.
+
+    Returns:
+        The shapes in the object's own order, with their names in the object (`<link>_<number>`).
+    """
+    model, geometry = placed.object.model, placed.object.visual if visual else placed.object.collision
+    data = model.createData()
+    pin.forwardKinematics(model, data, placed.object.coordinates.q(placed.state))
+    return [
+        copy_shape(shape, shape.name, placed.placement * data.oMi[shape.parentJoint] * shape.placement)
+        for shape in geometry.geometryObjects
+    ]
+
+
+def copy_shape(shape: pin.GeometryObject, name: str, placement: pin.SE3) -> pin.GeometryObject:
+    """Return a copy of `shape` that stands still at `placement` in the world frame."""
+    copy = pin.GeometryObject(shape)
+    copy.name, copy.parentJoint, copy.parentFrame, copy.placement = name, 0, 0, tidy(placement)
+    return copy
+
+
+def placed_shapes(shapes: Iterable[pin.GeometryObject]) -> list[tuple[coal.CollisionGeometry, pin.SE3]]:
+    """Return (shape, placement) for shapes that stand in the world, for `clearance`."""
+    return [(shape.geometry, shape.placement) for shape in shapes]
+
+
+def clearance(
+    first: Iterable[tuple[coal.CollisionGeometry, pin.SE3]],
+    second: Iterable[tuple[coal.CollisionGeometry, pin.SE3]],
+    *,
+    reach: float = np.inf,
+) -> float:
+    """Return the smallest signed distance [m] between two groups of shapes with their placements in the world frame.
+
+    Args:
+        first: One group; a negative distance is a penetration depth.
+        second: The other group.
+        reach: Distances above this do not matter [m]: the result is then some number ≥ `reach`.
+    """
+    nearest, request = reach, coal.DistanceRequest()
+    around = [(shape, placement, *_ball(shape, placement)) for shape, placement in second]
+    for shape, placement in first:
+        centre, radius = _ball(shape, placement)
+        transform = coal.Transform3s(placement.rotation, placement.translation)
+        for other, other_placement, other_centre, other_radius in around:
+            if np.linalg.norm(centre - other_centre) - radius - other_radius >= nearest:
+                continue
+            other_transform = coal.Transform3s(other_placement.rotation, other_placement.translation)
+            distance = coal.distance(shape, transform, other, other_transform, request, coal.DistanceResult())
+            nearest = min(nearest, distance)
+    return float(nearest)
+
+
+def _ball(shape: coal.CollisionGeometry, placement: pin.SE3) -> tuple[NDArray[np.float64], float]:
+    """Return a ball around a shape: its centre in the world frame, shape (3,), and its radius [m]."""
+    if shape.aabb_radius < 0.0:
+        shape.computeLocalAABB()
+    return placement.act(np.array(shape.aabb_center)), float(shape.aabb_radius)

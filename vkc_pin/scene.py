@@ -1,0 +1,227 @@
+"""Scenes: a robot, where it starts, and the obstacles and articulated objects around it."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.geometry import PlacedObject, clearance, placed_shapes, standing_geometry, within_limits
+from vkc_pin.resources import find
+
+if TYPE_CHECKING:
+    from vkc_pin.robot import Robot
+
+__all__ = ["FLOOR", "START_CLEARANCE", "PlacedObject", "Scene", "StartRegion", "load_scene", "standing_geometry"]
+
+FLOOR = "floor"
+"""Name of the floor among a scene's obstacles."""
+START_CLEARANCE = 0.03
+"""Random starts keep the robot at least this far from everything but the floor [m]."""
+_TRIES = 2000
+
+
+@dataclass(frozen=True)
+class StartRegion:
+    """Where random starts are drawn from: intervals of the base's x and y [m] and heading [rad] (None: any)."""
+
+    x: tuple[float, float]
+    y: tuple[float, float]
+    yaw: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A robot and the world around it; immutable, the `with_` methods return changed copies.
+
+    Attributes:
+        name: Its name.
+        file: The file it came from, if any.
+        folder: The folder that relative paths in `document` start from.
+        robot: The robot.
+        start: Where it starts: base x, y [m], yaw [rad], then the arm joints [rad], shape (n,).
+        objects: Name → articulated object. One that is free and held stands where the robot's hand holds it.
+        obstacles: What does not move, as convex shapes: parent joint 0, placement in the world frame, colour set. An
+            obstacle of one shape has its name, one of several shapes `<name>_<number>`. The floor is among them.
+        obstacle_labels: For each of these shapes, the name of its obstacle (`FLOOR` for the floor).
+        obstacle_names: The obstacles' names in the order of the file, without the floor.
+        obstacle_visual: What to draw of the obstacles, without the floor.
+        floor: Whether there is a floor at z = 0.
+        arena: The floor that belongs to the scene: (x_min, x_max, y_min, y_max) [m].
+        start_region: Where `sample_start` draws from, if the scene says so.
+        held: Object → attachment of what the robot holds at the start.
+        document: The scene as plain data, from which `from_document` builds it again.
+    """
+
+    name: str
+    file: Path | None
+    folder: Path
+    robot: Robot
+    start: NDArray[np.float64]
+    objects: Mapping[str, PlacedObject]
+    obstacles: pin.GeometryModel
+    obstacle_labels: tuple[str, ...]
+    obstacle_names: tuple[str, ...]
+    obstacle_visual: pin.GeometryModel
+    floor: bool
+    arena: tuple[float, float, float, float]
+    start_region: StartRegion | None
+    held: Mapping[str, str]
+    document: dict[str, Any]
+
+    @staticmethod
+    def from_document(document: Mapping[str, Any], folder: str | Path = ".") -> Scene:
+        """Build a scene from plain data (see `Scene.document` and the scene files).
+
+        Args:
+            document: Dictionaries, lists, text and numbers.
+            folder: The folder that relative paths in it start from.
+
+        Raises:
+            InputError: It does not fit; `UnknownNameError` where a name does not exist.
+        """
+        from vkc_pin.documents import Document
+        from vkc_pin.scene_file import build_scene
+
+        return build_scene(Document(copy.deepcopy(dict(document))), Path(folder))
+
+    def with_start(self, base: ArrayLike | None = None, arm: ArrayLike | None = None) -> Scene:
+        """Return the scene with another start.
+
+        Args:
+            base: x, y [m] and yaw [rad] in the world frame, shape (3,); None keeps it.
+            arm: Arm joints [rad], shape (n - 3,); None keeps them.
+
+        Raises:
+            InputError: Wrong size, a value that is not finite, or a joint outside its limits.
+        """
+        start, names = self.start.copy(), self.robot.coordinates.names
+        for field, values, part in (("base", base, slice(0, 3)), ("arm", arm, slice(3, None))):
+            if values is None:
+                continue
+            given = np.asarray(values, float)
+            if given.shape != start[part].shape:
+                raise InputError("wrong number of values", field=field, expected=start[part].shape, got=given.shape)
+            lower, upper = self.robot.lower[part], self.robot.upper[part]
+            start[part] = [
+                within_limits(value, low, high, f"{field}.{name}")
+                for value, low, high, name in zip(given, lower, upper, names[part], strict=True)
+            ]
+        document = copy.deepcopy(self.document)
+        document["start"]["base"] = start[:3].tolist()
+        if arm is not None:
+            document["start"]["arm"] = start[3:].tolist()
+        changed = dataclasses.replace(self, start=start, document=document)
+        return changed.with_held_objects_in_the_hand()
+
+    def with_state(self, name: str, values: Mapping[str, float]) -> Scene:
+        """Return the scene with joints of object `name` at `values`, by joint name, [rad] or [m].
+
+        Raises:
+            UnknownNameError: There is no such object, or it has no such joint.
+            InputError: A value is not finite or outside the joint's limits.
+        """
+        if name not in self.objects:
+            raise UnknownNameError("object", name, self.objects)
+        placed = self.objects[name].with_state(values)
+        document = copy.deepcopy(self.document)
+        (entry,) = (item for item in document["objects"] if item["name"] == name)
+        state = zip(placed.object.coordinates.names, placed.state.tolist(), strict=True)
+        entry["state"] = dict(state)
+        changed = dataclasses.replace(self, objects=MappingProxyType({**self.objects, name: placed}), document=document)
+        return changed.with_held_objects_in_the_hand()
+
+    def with_held_objects_in_the_hand(self) -> Scene:
+        """Return the scene with every free object that is held placed where the robot holds it at the start."""
+        objects = dict(self.objects)
+        for name, attachment in self.held.items():
+            placed = objects[name]
+            if placed.object.free:
+                grasp = placed.object.attachment(attachment)
+                in_object = placed.object.link_placement(grasp.link, placed.state) * grasp.placement
+                objects[name] = dataclasses.replace(placed, placement=self.tool_placement() * in_object.inverse())
+        return dataclasses.replace(self, objects=MappingProxyType(objects))
+
+    def tool_placement(self) -> pin.SE3:
+        """Return the placement of the robot's tool frame in the world frame at the start."""
+        model = self.robot.model
+        data = model.createData()
+        pin.framesForwardKinematics(model, data, self.robot.coordinates.q(self.start))
+        return data.oMf[model.getFrameId(self.robot.tool_frame)].copy()
+
+    def start_clearance(self, *, reach: float = np.inf) -> float:
+        """Return the smallest distance [m] at the start between the robot, with what it carries, and the world.
+
+        The floor does not count, nor do the robot's distances to itself and to what it holds.
+
+        Args:
+            reach: Distances above this do not matter [m]: the result is then some number ≥ `reach`.
+        """
+        model, geometry = self.robot.model, self.robot.collision
+        data, shapes = model.createData(), geometry.createData()
+        pin.updateGeometryPlacements(model, data, geometry, shapes, self.robot.coordinates.q(self.start))
+        moving = [(shape.geometry, where) for shape, where in zip(geometry.geometryObjects, shapes.oMg, strict=True)]
+        standing = [
+            shape for shape, label in zip(self.obstacles.geometryObjects, self.obstacle_labels, strict=True) if label != FLOOR
+        ]
+        for name, placed in self.objects.items():
+            if name not in self.held:
+                standing += standing_geometry(placed)
+            elif placed.object.free:
+                moving += placed_shapes(standing_geometry(placed))
+        return clearance(moving, placed_shapes(standing), reach=reach)
+
+    def sample_start(self, rng: np.random.Generator) -> Scene:
+        """Return the scene with the base at a random place of its start region, clear of everything.
+
+        The base's x, y and heading are uniform in the region; places where `start_clearance` is below
+        `START_CLEARANCE` are drawn again.
+
+        Args:
+            rng: Where the random numbers come from; the same state gives the same start.
+
+        Raises:
+            InputError: The scene has no start region, the robot holds something that stands fixed in the world, or no
+                free place was found.
+        """
+        region = self.start_region
+        if region is None:
+            raise InputError("the scene has no start region", file=self.file, field="start_region", expected="x and y intervals")
+        for name in self.held:
+            if not self.objects[name].object.free:
+                raise InputError(
+                    "the robot cannot start elsewhere while it holds this", file=self.file, field=f"start.held.{name}"
+                )
+        low, high = region.yaw or (-np.pi, np.pi)
+        for _ in range(_TRIES):
+            base = rng.uniform([region.x[0], region.y[0], low], [region.x[1], region.y[1], high])
+            scene = self.with_start(base=base)
+            if scene.start_clearance(reach=START_CLEARANCE) >= START_CLEARANCE:
+                return scene
+        problem = f"no free place for the robot in {_TRIES} tries"
+        raise InputError(problem, file=self.file, field="start_region", expected=f"a clearance of {START_CLEARANCE} m somewhere")
+
+
+def load_scene(name_or_path: str | Path) -> Scene:
+    """Load a scene: by the name of a file in `scenes`, or by the path of a scene file (.yaml).
+
+    Raises:
+        UnknownNameError: There is no such scene, or it names something that does not exist.
+        InputError: Something in the file is wrong; the error says what, in which file, line and field.
+    """
+    from vkc_pin.documents import read_yaml
+    from vkc_pin.scene_file import build_scene
+
+    text = str(name_or_path)
+    by_path = isinstance(name_or_path, Path) or text.endswith((".yaml", ".yml")) or "/" in text
+    file = Path(name_or_path) if by_path else find("scenes", "*.yaml", text, what="scene")
+    return build_scene(read_yaml(file), file.parent)

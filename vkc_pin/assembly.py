@@ -1,0 +1,86 @@
+"""Grafts one kinematic tree onto another, joint by joint.
+
+Pinocchio's own `appendModel` aborts on equal names and has placed sub-models of fixed joints wrongly
+(stack-of-tasks/pinocchio #2328, #2293, #2805); this adds every joint, inertia, frame and geometry explicitly and
+leaves collision pairs to the caller.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import pinocchio as pin
+
+__all__ = ["clean", "graft", "graft_geometry"]
+
+
+def clean(placement: pin.SE3, tolerance: float = 1e-12) -> pin.SE3:
+    """Return `placement` with entries within `tolerance` of 0 and ±1 rounded: keeps symbolic kinematics sparse."""
+    rotation, translation = np.array(placement.rotation), np.array(placement.translation)
+    for array in (rotation, translation):
+        array[np.abs(array) < tolerance] = 0.0
+    for sign in (-1.0, 1.0):
+        rotation[np.abs(rotation - sign) < tolerance] = sign
+    return pin.SE3(rotation, translation)
+
+
+def graft(model: pin.Model, tree: pin.Model, *, parent: int, placement: pin.SE3, prefix: str = "") -> list[int]:
+    """Add every joint, inertia and frame of `tree` to `model`, its universe at `placement` in joint `parent`.
+
+    Args:
+        model: Changed in place.
+        tree: The tree to add; not changed.
+        parent: The joint of `model` that carries it (0 is the world).
+        placement: Of the tree's universe frame in the frame of `parent`.
+        prefix: Put before every joint and frame name.
+
+    Returns:
+        For each joint of `tree` its index in `model`; for the universe, `parent`.
+    """
+    joints = [parent]
+    for index in range(1, tree.njoints):
+        joint, above = tree.joints[index], tree.parents[index]
+        local = tree.jointPlacements[index] if above else placement * tree.jointPlacements[index]
+        iq, iv = slice(joint.idx_q, joint.idx_q + joint.nq), slice(joint.idx_v, joint.idx_v + joint.nv)
+        added = model.addJoint(
+            joints[above],
+            joint,
+            clean(local),
+            prefix + tree.names[index],
+            tree.effortLimit[iv],
+            tree.velocityLimit[iv],
+            tree.lowerPositionLimit[iq],
+            tree.upperPositionLimit[iq],
+        )
+        model.appendBodyToJoint(added, tree.inertias[index], pin.SE3.Identity())
+        joints.append(added)
+    for frame in tree.frames[1:]:
+        local = frame.placement if frame.parentJoint else placement * frame.placement
+        model.addFrame(pin.Frame(prefix + frame.name, joints[frame.parentJoint], 0, clean(local), frame.type))
+    return joints
+
+
+def graft_geometry(
+    geometry: pin.GeometryModel,
+    objects: Iterable[pin.GeometryObject],
+    *,
+    joints: list[int],
+    placement: pin.SE3,
+    prefix: str = "",
+) -> list[int]:
+    """Add copies of `objects` to `geometry`, their parent joints mapped by `joints` (see `graft`).
+
+    Returns:
+        The indices of the copies in `geometry`.
+    """
+    added = []
+    for original in objects:
+        local = original.placement if original.parentJoint else placement * original.placement
+        twin = pin.GeometryObject(prefix + original.name, joints[original.parentJoint], local, original.geometry)
+        twin.meshColor, twin.meshPath = np.array(original.meshColor), original.meshPath
+        twin.meshScale, twin.overrideMaterial = np.array(original.meshScale), original.overrideMaterial
+        added.append(geometry.addGeometryObject(twin))
+    return added
+
+

@@ -1,0 +1,152 @@
+"""The virtual kinematic chain: virtual base, robot, and the objects it handles, inverted, in one Pinocchio model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from vkc_pin.articulation import Attachment, invert
+from vkc_pin.assembly import clean, graft, graft_geometry
+from vkc_pin.coordinates import Coordinates
+from vkc_pin.robot import Robot
+from vkc_pin.scene import PlacedObject, Scene
+
+__all__ = ["Closure", "VirtualKinematicChain", "consolidate"]
+
+VIRTUAL_VELOCITY = 1.0  # [rad/s] or [m/s], of the hand in a grasp that leaves it a freedom
+VIRTUAL_ACCELERATION = 2.0
+_ROTATIONS = {"_x": np.array([1.0, 0.0, 0.0]), "_y": np.array([0.0, 1.0, 0.0]), "_z": np.array([0.0, 0.0, 1.0])}
+
+
+@dataclass(frozen=True)
+class Closure:
+    """h_chain of eq. 2: where the base link of a held object must stay.
+
+    Attributes:
+        joint: The joint of the chain that carries the object's base link.
+        local: Placement of the base link in that joint's frame.
+        target: Placement of the base link in the world.
+    """
+
+    joint: int
+    local: pin.SE3
+    target: pin.SE3
+
+
+@dataclass(frozen=True)
+class VirtualKinematicChain:
+    """C^V: one model of everything that moves together.
+
+    Attributes:
+        robot: The robot at its root.
+        model: `pinocchio.Model`; joint 1 is the planar virtual base, then the arm, then per grasp the virtual joint
+            of the attachment and the object's joints from the attachable link to its base, inverted.
+        coordinates: Minimal coordinates z of `model`.
+        names: Their names, shape (n,); objects' as `<object>.<joint>`, virtual joints' as `<object>.<attachment>`.
+        lower, upper, velocity, acceleration: Limits, shape (n,), SI units.
+        collision: Collision geometry of the robot (first, in the robot's order) and of the objects' moving links.
+        held_geometries: Object → indices of its geometry in `collision`.
+        closures: Object → its closure.
+        virtual: Object → names of the coordinates of its attachment's virtual joint.
+    """
+
+    robot: Robot
+    model: pin.Model
+    coordinates: Coordinates
+    names: tuple[str, ...]
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    acceleration: NDArray[np.float64]
+    collision: pin.GeometryModel
+    held_geometries: Mapping[str, tuple[int, ...]]
+    closures: Mapping[str, Closure]
+    virtual: Mapping[str, tuple[str, ...]]
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates n."""
+        return len(self.names)
+
+    def index(self, name: str) -> int:
+        """Return the position of coordinate `name` in z."""
+        return self.names.index(name)
+
+
+def _virtual_joints(attachment: Attachment, name: str) -> list[tuple[str, pin.JointModel, float, float]]:
+    """Return the joints of J(v)⁻¹, tool to object: each joint's axis is negated, and their order reversed."""
+    lower, upper = float(attachment.lower), float(attachment.upper)
+    axis = np.asarray(attachment.axis, float)
+    if attachment.joint == "revolute":
+        return [(name, pin.JointModelRevoluteUnaligned(-axis), lower, upper)]
+    if attachment.joint == "prismatic":
+        return [(name, pin.JointModelPrismaticUnaligned(-axis), lower, upper)]
+    if attachment.joint == "spherical":
+        return [(name + suffix, pin.JointModelRevoluteUnaligned(-unit), lower, upper) for suffix, unit in reversed(_ROTATIONS.items())]
+    return []
+
+
+def consolidate(scene: Scene, grasps: Mapping[str, str]) -> VirtualKinematicChain:
+    """Merge the scene's robot with the objects it grasps into one model (section III of the paper).
+
+    Args:
+        scene: Robot, objects and where they stand.
+        grasps: Object → attachment. Several objects become branches of one tree, all at the tool; only those held at
+            a waypoint are closed there.
+
+    Returns:
+        The chain. Branches beside the path from grasp to base are fixed at their present state.
+    """
+    robot = scene.robot
+    model, collision = pin.Model(robot.model), pin.GeometryModel()
+    graft_geometry(collision, robot.collision.geometryObjects, joints=list(range(model.njoints)), placement=pin.SE3.Identity())
+    tool = model.frames[model.getFrameId(robot.tool_frame)]
+    names = list(robot.coordinates.names)
+    limits = [list(robot.lower), list(robot.upper), list(robot.velocity), list(robot.acceleration)]
+    held_geometries, closures, virtual = {}, {}, {}
+    for name, attachment_name in grasps.items():
+        placed = scene.objects[name]
+        attachment = placed.object.attachments[attachment_name]
+        parent, placement = tool.parentJoint, tool.placement
+        added = []
+        for joint_name, joint, lower, upper in _virtual_joints(attachment, f"{name}.{attachment_name}"):
+            effort, speed = np.array([np.inf]), np.array([VIRTUAL_VELOCITY])
+            parent = model.addJoint(parent, joint, clean(placement), joint_name, effort, speed, np.array([lower]), np.array([upper]))
+            placement = pin.SE3.Identity()
+            added.append(joint_name)
+            for row, value in zip(limits, (lower, upper, VIRTUAL_VELOCITY, VIRTUAL_ACCELERATION), strict=True):
+                row.append(value)
+        virtual[name] = tuple(added)
+        tree = invert(placed.object, attachment.link, placed.state)
+        placement = clean(placement * attachment.placement.inverse())
+        joints = graft(model, tree.model, parent=parent, placement=placement, prefix=f"{name}.")
+        names += added
+        for joint_name in tree.model.names[1:]:
+            names.append(f"{name}.{joint_name}")
+            index = placed.object.coordinates.names.index(joint_name)
+            own = (placed.object.lower, placed.object.upper, placed.object.velocity, placed.object.acceleration)
+            for row, values in zip(limits, own, strict=True):
+                row.append(float(values[index]))
+        # What does not move with the object's joints (a door's frame) stands in the world, closed or not.
+        moving = [
+            geometry
+            for geometry, original in zip(tree.collision.geometryObjects, placed.object.collision.geometryObjects, strict=True)
+            if original.parentJoint != 0
+        ]
+        held_geometries[name] = tuple(graft_geometry(collision, moving, joints=joints, placement=placement, prefix=f"{name}."))
+        base = model.frames[model.getFrameId(f"{name}.{placed.object.base_link}")]
+        closures[name] = Closure(base.parentJoint, pin.SE3(base.placement), _base_target(placed))
+    coordinates = Coordinates(model)
+    lower, upper, velocity, acceleration = (np.array(row, float) for row in limits)
+    return VirtualKinematicChain(
+        robot, model, coordinates, tuple(names), lower, upper, velocity, acceleration, collision, held_geometries, closures, virtual
+    )
+
+
+def _base_target(placed: PlacedObject) -> pin.SE3:
+    base = placed.object.model.frames[placed.object.model.getFrameId(placed.object.base_link)]
+    return placed.placement * base.placement

@@ -1,0 +1,214 @@
+"""Turns steps into phases: what is held when, which joints move, and what must hold at the end (f_task of eq. 3)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import pinocchio as pin
+
+from vkc_pin.articulation import Attachment
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.options import Options
+from vkc_pin.scene import PlacedObject, Scene
+from vkc_pin.steps import Actuate, GoTo, Grasp, Reach, Step
+
+__all__ = ["FrameGoal", "Phase", "Task", "compile_task"]
+
+LATCH_MARGIN = 0.02  # [rad] or [m] past the threshold at which a latch lets go
+
+
+@dataclass(frozen=True)
+class FrameGoal:
+    """A frame of the robot at a placement in the world."""
+
+    frame: str
+    placement: pin.SE3
+
+
+@dataclass(frozen=True)
+class Phase:
+    """A stretch of the motion in which the same things are held.
+
+    Attributes:
+        name: What happens in it.
+        segments: Steps of time; the phase has `segments + 1` waypoints, the first shared with the phase before.
+        held: Object → attachment.
+        ranges: Object coordinate → (lower, upper) for every waypoint after the first; all others stand still.
+        values: Object coordinate → value at the last waypoint.
+        frames: Frame goals at the last waypoint.
+        base: (x, y, yaw or None) at the last waypoint, in the world.
+        grasps: Objects (→ attachment) that are grasped at the last waypoint.
+        before: Object coordinate → value at the first waypoint, for all objects that this task grasps.
+    """
+
+    name: str
+    segments: int
+    held: Mapping[str, str] = field(default_factory=dict)
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    values: Mapping[str, float] = field(default_factory=dict)
+    frames: tuple[FrameGoal, ...] = ()
+    base: tuple[float, float, float | None] | None = None
+    grasps: Mapping[str, str] = field(default_factory=dict)
+    before: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Task:
+    """What the steps ask for, in phases.
+
+    Attributes:
+        steps: The user's steps.
+        phases: In order; at least one.
+        grasps: Object → attachment, for every object that is held at any time.
+        state: Object coordinate (`<object>.<joint>`) → value at the start, for the objects in `grasps`.
+    """
+
+    steps: tuple[Step, ...]
+    phases: tuple[Phase, ...]
+    grasps: Mapping[str, str]
+    state: Mapping[str, float]
+
+    @property
+    def segments(self) -> int:
+        """Steps of time of the whole task; it has one waypoint more."""
+        return sum(phase.segments for phase in self.phases)
+
+
+def _placed(scene: Scene, name: str, field_name: str) -> PlacedObject:
+    if name not in scene.objects:
+        raise UnknownNameError("object", name, scene.objects, field=field_name)
+    return scene.objects[name]
+
+
+def _attachment(placed: PlacedObject, name: str | None, field_name: str) -> Attachment:
+    attachments = placed.object.attachments
+    if name is None:
+        if not attachments:
+            raise InputError(f"object '{placed.name}' has no attachment, so it cannot be grasped", field=field_name)
+        return next(iter(attachments.values()))
+    if name not in attachments:
+        raise UnknownNameError(f"attachment of '{placed.name}'", name, attachments, field=field_name)
+    return attachments[name]
+
+
+def path_joints(placed: PlacedObject, attachment: Attachment) -> list[str]:
+    """Return the names of the object's joints between its base and the attachment's link, base first."""
+    model = placed.object.model
+    joint = model.frames[model.getFrameId(attachment.link)].parentJoint
+    names: list[str] = []
+    while joint:
+        names.insert(0, str(model.names[joint]))
+        joint = model.parents[joint]
+    return names
+
+
+class _Compiler:
+    def __init__(self, scene: Scene, options: Options) -> None:
+        self.scene, self.options = scene, options
+        self.phases: list[Phase] = []
+        self.held: dict[str, str] = dict(scene.held)
+        self.grasps: dict[str, str] = dict(scene.held)
+        self.initial: dict[str, float] = {}
+        self.state: dict[str, float] = {}
+        for name in self.grasps:
+            self._enter(name)
+
+    def _enter(self, name: str) -> None:
+        """Make an object's joints coordinates of the task, with the values they have at its start."""
+        placed = self.scene.objects[name]
+        for joint, value in zip(placed.object.coordinates.names, placed.state, strict=True):
+            self.initial.setdefault(f"{name}.{joint}", float(value))
+            self.state.setdefault(f"{name}.{joint}", float(value))
+
+    def _append(self, name: str, segments: int, **details: Any) -> None:
+        self.phases.append(Phase(name, segments, held=dict(self.held), before=dict(self.state), **details))
+        self.state.update(details.get("values", {}))
+
+    def grasp(self, name: str, attachment_name: str | None, where: str) -> str:
+        """Add the phase that takes hold of an object, unless it is held; return the attachment."""
+        placed = _placed(self.scene, name, where)
+        if name in self.held and attachment_name in (None, self.held[name]):
+            return self.held[name]
+        attachment = _attachment(placed, attachment_name, where)
+        if self.grasps.get(name, attachment.name) != attachment.name:
+            raise InputError(
+                f"object '{name}' is grasped by two different attachments in one plan",
+                field=where,
+                expected=self.grasps[name],
+                got=attachment.name,
+            )
+        self.grasps[name] = attachment.name
+        self._enter(name)
+        self.held = {}  # one hand: whatever it held before is let go
+        self._append(f"reach {name}.{attachment.name}", self.options.reach_waypoints, grasps={name: attachment.name})
+        self.held = {name: attachment.name}
+        return attachment.name
+
+    def actuate(self, step: Actuate, where: str) -> None:
+        placed = _placed(self.scene, step.object, f"{where}.object")
+        names = placed.object.coordinates.names
+        for joint in step.joints:
+            if joint not in names:
+                raise UnknownNameError(f"joint of '{step.object}'", joint, names, field=f"{where}.joints")
+        attachment = placed.object.attachments[self.grasp(step.object, step.attachment, f"{where}.object")]
+        path = path_joints(placed, attachment)
+        for joint in step.joints:
+            if joint not in path:
+                raise InputError(
+                    f"joint '{joint}' does not move when '{step.object}' is held at '{attachment.name}'",
+                    field=f"{where}.joints",
+                    expected=f"one of {', '.join(path)}",
+                )
+        values = {f"{step.object}.{joint}": value for joint, value in step.joints.items()}
+        ranges = {coordinate: self._limits(placed, coordinate) for coordinate in values}
+        for latch in placed.object.latches:
+            held, release = f"{step.object}.{latch.joint}", f"{step.object}.{latch.released_by}"
+            if held not in values or abs(self.state[held] - latch.held_at) > latch.engaged_within or release in ranges:
+                continue
+            lower, upper = self._limits(placed, release)
+            turned = min(latch.threshold + LATCH_MARGIN, upper)
+            if self.state[release] < turned:
+                self._append(f"turn {release}", self.options.turn_waypoints, ranges={release: (lower, upper)}, values={release: turned})
+            ranges[release] = (turned, upper)
+            values[release] = turned
+        self._append(f"move {', '.join(values)}", self.options.move_waypoints, ranges=ranges, values=values)
+
+    def _limits(self, placed: PlacedObject, coordinate: str) -> tuple[float, float]:
+        index = placed.object.coordinates.names.index(coordinate.split(".", 1)[1])
+        return float(placed.object.lower[index]), float(placed.object.upper[index])
+
+    def add(self, step: Step, where: str) -> None:
+        if isinstance(step, Grasp):
+            self.grasp(step.object, step.attachment, where)
+        elif isinstance(step, Actuate):
+            self.actuate(step, where)
+        elif isinstance(step, Reach):
+            frame = step.frame or self.scene.robot.tool_frame
+            frames = [f.name for f in self.scene.robot.model.frames]
+            if frame not in frames:
+                raise UnknownNameError("frame of the robot", frame, frames, field=f"{where}.frame")
+            self.held = {}  # an articulated object cannot come along
+            self._append(f"reach with {frame}", self.options.reach_waypoints, frames=(FrameGoal(frame, step.pose),))
+        elif isinstance(step, GoTo):
+            self.held = {}
+            self._append("go to", self.options.reach_waypoints, base=(step.x, step.y, step.yaw))
+        else:
+            raise InputError("not a step", field=where, expected="Reach, Grasp, Actuate or GoTo", got=repr(step))
+
+
+def compile_task(scene: Scene, steps: Sequence[Step], options: Options) -> Task:
+    """Return the phases that bring about `steps`, beginning at the scene's start.
+
+    Raises:
+        InputError: No steps, an unknown object, joint, attachment or frame, or a joint that cannot be moved that way.
+    """
+    if not steps:
+        raise InputError("there is nothing to do", field="steps", expected="at least one step", got="an empty list")
+    compiler = _Compiler(scene, options)
+    for index, step in enumerate(steps):
+        compiler.add(step, f"steps[{index}]")
+    if not compiler.phases:
+        raise InputError("there is nothing to do", field="steps", expected="a step that changes something", got="only what holds already")
+    return Task(tuple(steps), tuple(compiler.phases), compiler.grasps, compiler.initial)

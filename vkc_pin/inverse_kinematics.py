@@ -1,0 +1,102 @@
+"""Inverse kinematics of the whole chain for many seeds at once: damped Gauss-Newton on mapped CasADi functions."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from vkc_pin import cpin
+from vkc_pin.coordinates import Coordinates
+from vkc_pin.transcription import pose_residual, target_vector
+
+__all__ = ["PoseSolver"]
+
+
+class PoseSolver:
+    """Brings one frame of a model to placements, for a batch of configurations.
+
+    Attributes:
+        size: Number of coordinates n.
+    """
+
+    def __init__(self, model: pin.Model, joint: int, local: pin.SE3) -> None:
+        coordinates = Coordinates(model)
+        self.size = coordinates.size
+        z, target = ca.SX.sym("z", self.size), ca.SX.sym("W", 12)
+        column = cpin.joint_placements(model)(coordinates.q_symbolic(z))[:, joint - 1]
+        rotation = ca.reshape(column[:9], 3, 3)
+        residual = pose_residual(rotation @ local.rotation, rotation @ local.translation + column[9:], target)
+        jacobian = ca.densify(ca.jacobian(residual, z))
+        self._function = ca.Function("pose", [z, target], [ca.densify(residual), jacobian], {"cse": True})
+        self._mapped = lru_cache(maxsize=8)(self._function.map)
+
+    @staticmethod
+    @lru_cache(maxsize=64)
+    def _cached(key: str, joint: int, local: bytes) -> PoseSolver:
+        model = pin.Model()
+        model.loadFromString(key)
+        return PoseSolver(model, joint, pin.SE3(np.frombuffer(local).reshape(4, 4)))
+
+    @classmethod
+    def of(cls, model: pin.Model, joint: int, local: pin.SE3) -> PoseSolver:
+        """Return the solver for this frame, built once per model."""
+        return cls._cached(model.saveToString(), joint, local.homogeneous.tobytes())
+
+    def evaluate(self, z: NDArray[np.float64], target: pin.SE3) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return residuals, shape (B, 6) ([m], [rad]), and their Jacobians, shape (B, 6, n), at `z`, shape (B, n)."""
+        batch = len(z)
+        residual, jacobian = self._mapped(batch)(z.T, np.repeat(target_vector(target)[:, None], batch, axis=1))
+        stacked = np.asarray(jacobian).reshape(6, batch, self.size).transpose(1, 0, 2)
+        return np.asarray(residual).T, stacked
+
+    def solve(
+        self,
+        z: NDArray[np.float64],
+        target: pin.SE3,
+        *,
+        lower: NDArray[np.float64],
+        upper: NDArray[np.float64],
+        weights: NDArray[np.float64],
+        iterations: int = 25,
+        tolerance: float = 1e-6,
+        max_step: float = 0.5,
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Return configurations that satisfy the pose within limits, near the given ones, and which of them do.
+
+        Args:
+            z: Seeds, shape (B, n).
+            target: Placement of the frame in the world.
+            lower, upper: Limits, shape (n,) or (B, n); equal ones keep a coordinate fixed.
+            weights: What moving a coordinate costs, shape (n,).
+            iterations: At most so many steps.
+            tolerance: Largest residual of a solution, [m] and [rad].
+            max_step: Longest step in one coordinate.
+
+        Returns:
+            Configurations, shape (B, n), and a mask, shape (B,).
+        """
+        z = np.clip(z, lower, upper)
+        movable = np.broadcast_to(upper - lower > 1e-9, z.shape)
+        residual, jacobian = self.evaluate(z, target)
+        for _ in range(iterations):
+            if np.abs(residual).max() < tolerance:
+                break
+            # A coordinate at its limit that the step would push further is taken out, once.
+            free = movable.copy()
+            for _ in range(2):
+                scaled = jacobian * (free / weights)[:, None, :]
+                damping = 1e-8 + 1e-3 * np.minimum(1.0, np.sum(residual**2, axis=1))
+                system = scaled @ jacobian.transpose(0, 2, 1) + damping[:, None, None] * np.eye(6)
+                step = -np.einsum("bij,bi->bj", scaled, np.linalg.solve(system, residual[..., None])[..., 0])
+                step *= np.minimum(1.0, max_step / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12))
+                blocked = free & ((z + step < lower - 1e-12) | (z + step > upper + 1e-12))
+                if not blocked.any():
+                    break
+                free &= ~blocked
+            z = np.clip(z + step, lower, upper)
+            residual, jacobian = self.evaluate(z, target)
+        return z, np.abs(residual).max(axis=1) < tolerance

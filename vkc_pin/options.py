@@ -1,0 +1,74 @@
+"""Everything about a plan that can be chosen, with its unit and default."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from vkc_pin.errors import InputError
+
+__all__ = ["Options"]
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to plan. Every field is checked when the object is made.
+
+    Attributes:
+        dt: Time between two waypoints [s].
+        grasp_time: How long the robot stands still at a grasp, for the gripper to close [s].
+        reach_waypoints: Segments of a phase in which nothing is held.
+        turn_waypoints: Segments of a phase in which a latch is released.
+        move_waypoints: Segments of a phase in which a held object is moved.
+        dist_safe: Clearance to keep at the waypoints [m].
+        grasp_clearance: Clearance of the gripper's touch links to the link that is grasped, before the grasp [m].
+        velocity_weight_base: W_vel of eq. 1 for the base coordinates.
+        velocity_weight_arm: W_vel for the arm joints.
+        velocity_weight_object: W_vel for the object's and the virtual joints.
+        acceleration_weight: W_acc of eq. 1, as a multiple of W_vel [s²].
+        contact_slots: Witness planes a waypoint can hold.
+        contact_reach: Pairs closer than this get a witness plane [m].
+        closure_position: Largest drift of a held object's base that `validation` accepts [m].
+        closure_angle: The same for its orientation [rad].
+        goal_position: ξ_goal, distance [m].
+        goal_angle: ξ_goal, angle [rad].
+        max_outer: Rounds of the witness-plane loop.
+        max_iterations: Ipopt iterations in one round.
+        penalty: First weight of the exact ℓ1 penalty on clearance slack; it is adapted.
+        refine_rounds: How often planes are added where a segment collides between waypoints.
+        max_restarts: How many different seeds are tried.
+    """
+
+    dt: float = 0.25
+    grasp_time: float = 1.0
+    reach_waypoints: int = 40
+    turn_waypoints: int = 6
+    move_waypoints: int = 30
+    dist_safe: float = 0.02
+    grasp_clearance: float = 0.005
+    velocity_weight_base: float = 5.0
+    velocity_weight_arm: float = 1.0
+    velocity_weight_object: float = 0.5
+    acceleration_weight: float = 0.3
+    contact_slots: int = 6
+    contact_reach: float = 0.25
+    closure_position: float = 1e-3
+    closure_angle: float = 1e-3
+    goal_position: float = 1e-3
+    goal_angle: float = 1e-3
+    max_outer: int = 14
+    max_iterations: int = 200
+    penalty: float = 20.0
+    refine_rounds: int = 6
+    max_restarts: int = 4
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            field = f"Options.{item.name}"
+            if item.type == "int":
+                if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+                    raise InputError("out of range", field=field, expected="a whole number of at least 1", got=repr(value))
+            elif isinstance(value, bool) or not isinstance(value, (int, float, np.floating)) or not 0 < value < np.inf:
+                raise InputError("out of range", field=field, expected="a positive finite number", got=repr(value))

@@ -1,0 +1,179 @@
+"""Plan: what planning returns, with its report, and how it is saved, loaded, shown and exported."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import tempfile
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vkc_pin.errors import InputError
+from vkc_pin.options import Options
+from vkc_pin.scene import Scene
+from vkc_pin.steps import Step, step_from_dict, step_to_dict
+from vkc_pin.trajectory import Trajectory
+from vkc_pin.validation import Report
+
+if TYPE_CHECKING:
+    import meshcat
+
+__all__ = ["Plan", "write_atomically"]
+
+FORMAT = 1
+
+
+def write_atomically(path: str | Path, data: bytes) -> Path:
+    """Write `data` to `path` whole or not at all, making its folder if need be; return the path."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(data)
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+    return path
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A motion and everything there is to say about it.
+
+    Attributes:
+        scene: The scene it was planned in.
+        steps: What was asked for.
+        options: How it was planned.
+        trajectory: The motion; if planning failed, the best there was.
+        validation: What the independent check says of it.
+        status: "success", or why not: "infeasible", "not converged", "time limit", "interrupted", "rejected".
+        metrics: planning_time [s], build_time [s], base_effort [m], base_effort_l1 [m], arm_effort [rad], clearance [m],
+            closure_error [m], duration [s], iterations, rounds, and the split time_coal, time_casadi, time_ipopt,
+            time_initialization, time_validation [s].
+        seed: Of the random numbers.
+        initialization: Which seed trajectory it came from.
+        history: One row per round of the solver.
+    """
+
+    scene: Scene
+    steps: tuple[Step, ...]
+    options: Options
+    trajectory: Trajectory
+    validation: Report
+    status: str
+    metrics: Mapping[str, float]
+    seed: int = 0
+    initialization: str = ""
+    history: Sequence[Mapping[str, float]] = field(default_factory=tuple)
+
+    @property
+    def success(self) -> bool:
+        """Whether the independent validation found nothing wrong with a motion that does what was asked for."""
+        return self.validation.ok and self.status == "success"
+
+    def report(self) -> str:
+        """Return what came out, for people: success or every violated constraint, efforts, clearance, times."""
+        m = self.metrics
+        lines = [
+            f"{'success' if self.success else 'FAILED'}: {self.status} — {self.scene.name}: "
+            + ", ".join(p.name for p in self.trajectory.phases),
+            f"  motion      {m['duration']:.1f} s, {len(self.trajectory.times)} waypoints",
+            f"  effort      base {m['base_effort']:.2f} m (|dx|+|dy| {m['base_effort_l1']:.2f} m), arm {m['arm_effort']:.2f} rad",
+            f"  clearance   {1e3 * m['clearance']:.1f} mm at the closest, closure within {1e3 * m['closure_error']:.3f} mm",
+            f"  planning    {m['planning_time']:.3f} s after {m['build_time']:.2f} s of symbolic build: "
+            f"seeds {m['time_initialization']:.3f}, coal {m['time_coal']:.3f}, CasADi {m['time_casadi']:.3f}, "
+            f"Ipopt {m['time_ipopt']:.3f}, validation {m['time_validation']:.3f}; "
+            f"{int(m['rounds'])} rounds, {int(m['iterations'])} Ipopt iterations, seed {self.initialization}",
+            *(f"  {line}" for line in self.validation.lines()),
+        ]
+        return "\n".join(lines)
+
+    def __repr__(self) -> str:
+        m = self.metrics
+        return f"<Plan {self.status}: base {m['base_effort']:.2f} m, arm {m['arm_effort']:.2f} rad, {m['planning_time']:.2f} s>"
+
+    def show(self, **options: Any) -> Any:
+        """Show the motion with meshcat: inline in a notebook, otherwise in the browser; see `visualization.show`."""
+        from vkc_pin import visualization
+
+        return visualization.show(self, **options)
+
+    def animate(self, viewer: meshcat.Visualizer | None = None) -> Any:
+        """Put the motion into a meshcat viewer with play, pause and a time slider; return the viewer."""
+        from vkc_pin import visualization
+
+        return visualization.animate(self, viewer)
+
+    def to_html(self, path: str | Path) -> Path:
+        """Write one self-contained page with the animation; return its path."""
+        from vkc_pin import visualization
+
+        return visualization.to_html(self, path)
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Draw joints, velocities, clearance and a top view; see `plotting.plot`."""
+        from vkc_pin import plotting
+
+        return plotting.plot(self, path)
+
+    def save(self, path: str | Path) -> Path:
+        """Save it, with its scene, steps, options and report, as an .npz file without pickles; return the path."""
+        about = {
+            "format": FORMAT,
+            "scene": self.scene.document,
+            "folder": str(self.scene.folder),
+            "steps": [step_to_dict(step) for step in self.steps],
+            "options": asdict(self.options),
+            "trajectory": {k: v for k, v in self.trajectory.to_dict().items() if k not in ("times", "positions")},
+            "validation": self.validation.to_dict(),
+            "status": self.status,
+            "metrics": dict(self.metrics),
+            "seed": self.seed,
+            "initialization": self.initialization,
+            "history": [dict(row) for row in self.history],
+        }
+        buffer = io.BytesIO()
+        np.savez_compressed(
+            buffer, about=np.array(json.dumps(about)), times=self.trajectory.times, positions=self.trajectory.positions
+        )
+        return write_atomically(path, buffer.getvalue())
+
+    @classmethod
+    def load(cls, path: str | Path) -> Plan:
+        """Return the plan that `save` wrote to `path`.
+
+        Raises:
+            InputError: The file is missing, or no plan, or of a newer format.
+        """
+        path = Path(path)
+        if not path.is_file():
+            raise InputError("no such file", file=path, expected="a saved plan (.npz)")
+        try:
+            with np.load(path, allow_pickle=False) as archive:
+                about = json.loads(str(archive["about"]))
+                trajectory = {**about["trajectory"], "times": archive["times"], "positions": archive["positions"]}
+        except (ValueError, KeyError, OSError, zipfile.BadZipFile) as error:
+            raise InputError("not a saved plan", file=path, expected="a file written by Plan.save", got=str(error)) from error
+        if about.get("format") != FORMAT:
+            raise InputError("unknown format", file=path, field="format", expected=FORMAT, got=about.get("format"))
+        return cls(
+            scene=Scene.from_document(about["scene"], about["folder"]),
+            steps=tuple(step_from_dict(step) for step in about["steps"]),
+            options=Options(**about["options"]),
+            trajectory=Trajectory.from_dict(trajectory),
+            validation=Report.from_dict(about["validation"]),
+            status=about["status"],
+            metrics=about["metrics"],
+            seed=about["seed"],
+            initialization=about["initialization"],
+            history=tuple(about["history"]),
+        )

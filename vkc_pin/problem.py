@@ -1,0 +1,199 @@
+"""TrajectoryProblem: one task in one scene as a nonlinear program (eqs. 1 to 7), over one or many phases."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from vkc_pin.chain import VirtualKinematicChain, consolidate
+from vkc_pin.contact import ContactModel, Contacts
+from vkc_pin.goal import Task, compile_task
+from vkc_pin.options import Options
+from vkc_pin.scene import Scene
+from vkc_pin.steps import Step
+from vkc_pin.transcription import PoseRow, Structure, Transcription, target_vector
+
+__all__ = ["ConstraintRow", "TrajectoryProblem", "build"]
+
+_KEPT = 8  # programs kept for reuse; each holds some tens of MB
+_transcriptions: OrderedDict[tuple[Any, ...], Transcription] = OrderedDict()
+
+
+@dataclass(frozen=True)
+class ConstraintRow:
+    """How far one named constraint is from holding at one waypoint.
+
+    Attributes:
+        name: "closure door", "goal tool", "velocity base_x", ...
+        waypoint: Counted from 0, the start.
+        violation: Amount in `unit`, 0 where it holds.
+        unit: "m", "rad", "m/s", ...
+    """
+
+    name: str
+    waypoint: int
+    violation: float
+    unit: str
+
+
+def transcribe(structure: Structure) -> tuple[Transcription, float]:
+    """Return the program of `structure`, and the seconds it took to build (0 if it was there already)."""
+    key = structure.key
+    if key in _transcriptions:
+        _transcriptions.move_to_end(key)
+        return _transcriptions[key], 0.0
+    transcription = _transcriptions[key] = Transcription(structure)
+    while len(_transcriptions) > _KEPT:
+        _transcriptions.popitem(last=False)
+    return transcription, transcription.build_time
+
+
+class TrajectoryProblem:
+    """A task in a scene, ready to be solved.
+
+    Attributes:
+        scene, task, options: What it was made of.
+        chain: The virtual kinematic chain, n coordinates.
+        contacts: What can collide with what.
+        transcription: The symbolic program, shared between problems of one structure.
+        build_time: Seconds spent on building symbols for this problem.
+        start: z_0, shape (n,).
+        lower, upper: Bounds of z_1..z_N, shape (N, n): joint limits (eq. 4), what stands still, joint goals.
+        targets: Placements of the pose rows (eqs. 2 and 3), one per `transcription.structure.poses`.
+        pose_names: Their names.
+        velocity, acceleration: Bounds per waypoint step (eq. 5), shape (n,): limits times dt and dt².
+    """
+
+    def __init__(self, scene: Scene, task: Task, options: Options) -> None:
+        self.scene, self.task, self.options = scene, task, options
+        self.chain: VirtualKinematicChain = consolidate(scene, task.grasps)
+        self.contacts = ContactModel(scene, self.chain, task, options)
+        self.ends = np.cumsum([phase.segments for phase in task.phases])
+        poses, self.targets, self.pose_names = self._poses()
+        self.transcription, self.build_time = transcribe(self._structure(poses))
+        self.start = self._start()
+        self.lower, self.upper = self._bounds()
+        self.velocity, self.acceleration = self.chain.velocity * options.dt, self.chain.acceleration * options.dt**2
+
+    @property
+    def segments(self) -> int:
+        """N, the number of waypoints after the start."""
+        return int(self.ends[-1])
+
+    def _poses(self) -> tuple[list[PoseRow], list[pin.SE3], list[str]]:
+        rows, targets, names = [], [], []
+        starts = np.concatenate([[0], self.ends[:-1]])
+        for name, closure in self.chain.closures.items():
+            waypoints: list[int] = []
+            for phase, first, last in zip(self.task.phases, starts, self.ends, strict=True):
+                if name in phase.held:
+                    waypoints += range(first + 1, last + 1)
+                elif name in phase.grasps:
+                    waypoints.append(last)
+            rows.append(PoseRow(closure.joint, closure.local, tuple(int(t) for t in waypoints)))
+            targets.append(closure.target)
+            names.append(f"closure {name}")
+        model = self.chain.model
+        for phase, last in zip(self.task.phases, self.ends, strict=True):
+            for goal in phase.frames:
+                frame = model.frames[model.getFrameId(goal.frame)]
+                rows.append(PoseRow(frame.parentJoint, pin.SE3(frame.placement), (int(last),)))
+                targets.append(goal.placement)
+                names.append(f"goal {goal.frame}")
+        return rows, targets, names
+
+    def _structure(self, poses: Sequence[PoseRow]) -> Structure:
+        o, robot = self.options, self.chain.robot.coordinates.size
+        weights = np.full(self.chain.size, o.velocity_weight_object)
+        weights[:robot], weights[:3] = o.velocity_weight_arm, o.velocity_weight_base
+        acceleration = weights * o.acceleration_weight / o.dt**2
+        rests = [int(end) for end, phase in zip(self.ends, self.task.phases, strict=True) if phase.grasps and end < self.ends[-1]]
+        differential = self.chain.robot.base == "differential"
+        return Structure(
+            self.chain.model, self.segments, tuple(poses), o.contact_slots, weights, acceleration, tuple(rests), differential
+        )
+
+    def _start(self) -> NDArray[np.float64]:
+        start = np.zeros(self.chain.size)
+        start[: len(self.scene.start)] = self.scene.start
+        for name, value in self.task.state.items():
+            start[self.chain.index(name)] = value
+        return start
+
+    def _bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        lower, upper = np.tile(self.chain.lower, (self.segments, 1)), np.tile(self.chain.upper, (self.segments, 1))
+        x_min, x_max, y_min, y_max = self.scene.arena
+        lower[:, :2], upper[:, :2] = np.maximum(lower[:, :2], (x_min, y_min)), np.minimum(upper[:, :2], (x_max, y_max))
+        begin = 0
+        for phase, end in zip(self.task.phases, self.ends, strict=True):
+            inside = slice(begin, end)  # row t belongs to waypoint t + 1
+            for name, value in phase.before.items():
+                column = self.chain.index(name)
+                low, high = phase.ranges.get(name, (value, value))
+                lower[inside, column], upper[inside, column] = low, high
+            for name, value in phase.values.items():
+                column = self.chain.index(name)
+                lower[end - 1, column] = upper[end - 1, column] = np.clip(value, self.chain.lower[column], self.chain.upper[column])
+            if phase.base is not None:
+                for column, value in enumerate(phase.base):
+                    if value is not None:
+                        if column == 2:  # the nearest of the equal headings
+                            value = self.start[2] + (value - self.start[2] + np.pi) % (2 * np.pi) - np.pi
+                        lower[end - 1, column] = upper[end - 1, column] = value
+            begin = end
+        return lower, upper
+
+    def waypoints(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return `z`, shape (N, n), with the start before it, shape (N + 1, n)."""
+        return np.vstack([self.start, z])
+
+    def clip(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return `z` with every coordinate within its bounds."""
+        return np.clip(z, self.lower, self.upper)
+
+    def evaluate_contacts(self, z: NDArray[np.float64], *, reach: float) -> Contacts:
+        """Return the pairs closer than `reach` [m] at z_1..z_N, shape (N, n)."""
+        return self.contacts.evaluate(z, np.arange(1, self.segments + 1), reach=reach)
+
+    def rates(self, z: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the steps δz, shape (N, n), and their differences δδz, shape (N + 1 + rests, n); see `Transcription`."""
+        t = self.transcription
+        first = t.first @ z + np.outer(t.start_first, self.start)
+        return first, t.second @ z + np.outer(t.start_second, self.start)
+
+    def rate_violation(self, z: NDArray[np.float64]) -> float:
+        """Return the largest excess over a velocity or acceleration bound, relative to that bound."""
+        first, second = self.rates(z)
+        return float(max(np.max(np.abs(first) / self.velocity), np.max(np.abs(second) / self.acceleration)) - 1.0)
+
+    def target_matrix(self) -> NDArray[np.float64]:
+        """Return the pose targets as parameters, shape (poses, 12)."""
+        return np.array([target_vector(t) for t in self.targets]).reshape(-1, 12)
+
+    def __repr__(self) -> str:
+        t = self.transcription
+        return (
+            f"<TrajectoryProblem {' → '.join(p.name for p in self.task.phases)}: {self.segments} steps of {self.options.dt} s, "
+            f"{t.size} variables, {t.rows} rows, {sum(len(p.pairs) for p in self.contacts.phases)} collision pairs>"
+        )
+
+
+def build(scene: Scene, steps: Sequence[Step], *, options: Options | None = None) -> TrajectoryProblem:
+    """Return the nonlinear program of `steps` in `scene`, to look at before solving.
+
+    Args:
+        scene: Robot, objects and obstacles.
+        steps: What should change in the world.
+        options: How to plan.
+
+    Raises:
+        InputError: The steps name something that is not there, or ask for what cannot be done.
+    """
+    options = options or Options()
+    return TrajectoryProblem(scene, compile_task(scene, steps, options), options)

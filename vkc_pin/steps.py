@@ -1,0 +1,153 @@
+"""What a user asks for: steps, each a change in the world."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike
+
+from vkc_pin.errors import InputError, UnknownNameError
+
+__all__ = ["Actuate", "GoTo", "Grasp", "Reach", "Step", "as_placement", "step_from_dict", "step_to_dict"]
+
+
+def as_placement(pose: Any, *, name: str = "pose") -> pin.SE3:
+    """Return `pose` as a `pinocchio.SE3`.
+
+    Args:
+        pose: An SE3, a 4 × 4 homogeneous matrix, or (x, y, z, roll, pitch, yaw) in [m] and [rad].
+        name: The argument's name, for the message.
+
+    Raises:
+        InputError: It is none of these, not finite, or its rotation is no rotation.
+    """
+    if isinstance(pose, pin.SE3):
+        return pin.SE3(pose)
+    expected = "a pinocchio.SE3, a 4 x 4 matrix or (x, y, z, roll, pitch, yaw)"
+    try:
+        array = np.asarray(pose, float)
+    except (TypeError, ValueError):
+        raise InputError("not a pose", field=name, expected=expected, got=repr(pose)) from None
+    if not np.all(np.isfinite(array)):
+        raise InputError("not finite", field=name, expected=expected, got=array.tolist())
+    if array.shape == (6,):
+        return pin.SE3(pin.rpy.rpyToMatrix(*array[3:]), array[:3])
+    if array.shape == (4, 4):
+        rotation = array[:3, :3]
+        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-6 or np.linalg.det(rotation) < 0:
+            raise InputError("its upper left 3 x 3 block is not a rotation", field=name, got=rotation.tolist())
+        return pin.SE3(rotation, array[:3, 3])
+    raise InputError("not a pose", field=name, expected=expected, got=f"an array of shape {array.shape}")
+
+
+@dataclass(frozen=True)
+class Reach:
+    """Bring a frame of the robot to a pose.
+
+    Attributes:
+        pose: Where, expressed in the world frame; see `as_placement` for what is taken.
+        frame: Which frame of the robot; None is its tool frame.
+    """
+
+    pose: Any
+    frame: str | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "pose", as_placement(self.pose, name="Reach.pose"))
+
+
+@dataclass(frozen=True)
+class Grasp:
+    """Take hold of an object.
+
+    Attributes:
+        object: Its name in the scene.
+        attachment: Where to grasp it; None is the object's first attachment.
+    """
+
+    object: str
+    attachment: str | None = None
+
+
+@dataclass(frozen=True)
+class Actuate:
+    """Bring joints of an object to values; grasping it and releasing its latches is implied.
+
+    Attributes:
+        object: The object's name in the scene.
+        joints: Joint name → value at the end, [rad] or [m].
+        attachment: Where to grasp it if it is not held yet; None is the object's first attachment.
+    """
+
+    object: str
+    joints: Mapping[str, float] = field(default_factory=dict)
+    attachment: str | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.joints, Mapping) or not self.joints:
+            raise InputError("nothing to actuate", field="Actuate.joints", expected="a mapping such as {'hinge': 1.2}", got=repr(self.joints))
+        joints = {}
+        for name, value in self.joints.items():
+            try:
+                joints[str(name)] = float(value)
+            except (TypeError, ValueError):
+                raise InputError("not a number", field=f"Actuate.joints[{name!r}]", got=repr(value)) from None
+            if not np.isfinite(joints[str(name)]):
+                raise InputError("not finite", field=f"Actuate.joints[{name!r}]", got=value)
+        object.__setattr__(self, "joints", joints)
+
+
+@dataclass(frozen=True)
+class GoTo:
+    """Bring the base to a place on the floor, and let go of what it holds first.
+
+    Attributes:
+        x, y: Position of the base frame in the world, [m].
+        yaw: Heading [rad]; None leaves it open.
+    """
+
+    x: float
+    y: float
+    yaw: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("x", "y", "yaw"):
+            value = getattr(self, name)
+            if value is None and name == "yaw":
+                continue
+            try:
+                value = float(value)
+            except (TypeError, ValueError):
+                raise InputError("not a number", field=f"GoTo.{name}", got=repr(value)) from None
+            if not np.isfinite(value):
+                raise InputError("not finite", field=f"GoTo.{name}", got=value)
+            object.__setattr__(self, name, value)
+
+
+Step = Reach | Grasp | Actuate | GoTo
+_KINDS = {kind.__name__: kind for kind in (Reach, Grasp, Actuate, GoTo)}
+
+
+def step_to_dict(step: Step) -> dict[str, Any]:
+    """Return `step` as plain data, e.g. for a saved plan."""
+    data = {"step": type(step).__name__, **vars(step)}
+    if isinstance(step, Reach):
+        data["pose"] = step.pose.homogeneous.tolist()
+    return data
+
+
+def step_from_dict(data: Mapping[str, Any]) -> Step:
+    """Return the step that `step_to_dict` made `data` of.
+
+    Raises:
+        UnknownNameError: There is no such step.
+    """
+    fields: dict[str, ArrayLike] = dict(data)
+    kind = str(fields.pop("step", ""))
+    if kind not in _KINDS:
+        raise UnknownNameError("step", kind, _KINDS)
+    return _KINDS[kind](**fields)  # type: ignore[no-any-return, arg-type]

@@ -1,0 +1,129 @@
+"""Trajectory: waypoints of robot and objects over time, linear in the coordinates between them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vkc_pin.errors import InputError, UnknownNameError
+
+__all__ = ["PhaseSpan", "Trajectory"]
+
+
+@dataclass(frozen=True)
+class PhaseSpan:
+    """A stretch of a trajectory in which the same things are held.
+
+    Attributes:
+        name: What happens in it, e.g. "reach door.handle".
+        first, last: Its waypoints; `last` is the next phase's `first`.
+        held: Object → attachment, for all that is held in it.
+    """
+
+    name: str
+    first: int
+    last: int
+    held: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Waypoints over time.
+
+    Attributes:
+        names: The coordinates' names, n of them: base x, y, yaw, arm joints, then `<object>.<joint>`.
+        times: Of the waypoints, shape (T,), increasing [s].
+        positions: Shape (T, n), [m] and [rad]; angles are not wrapped, so that they interpolate.
+        phases: Which stretch of it does what.
+        robot_size: How many of the coordinates are the robot's (3 for the base, then the arm).
+    """
+
+    names: tuple[str, ...]
+    times: NDArray[np.float64]
+    positions: NDArray[np.float64]
+    phases: tuple[PhaseSpan, ...]
+    robot_size: int
+
+    def __post_init__(self) -> None:
+        times, positions = np.array(self.times, float), np.array(self.positions, float)
+        if times.ndim != 1 or len(times) < 2 or not np.all(np.diff(times) > 0):
+            raise InputError("times do not increase", field="Trajectory.times", expected="at least 2 increasing numbers")
+        if positions.shape != (len(times), len(self.names)):
+            raise InputError("wrong shape", field="Trajectory.positions", expected=(len(times), len(self.names)), got=positions.shape)
+        times.setflags(write=False)
+        positions.setflags(write=False)
+        object.__setattr__(self, "times", times)
+        object.__setattr__(self, "positions", positions)
+
+    def at(self, time: ArrayLike) -> NDArray[np.float64]:
+        """Return the positions, shape (..., n), at `time` [s], shape (...,); outside the motion, its first or last."""
+        time = np.asarray(time, float)
+        columns = [np.interp(time, self.times, column) for column in self.positions.T]
+        return np.stack(columns, axis=-1)
+
+    def column(self, name: str) -> NDArray[np.float64]:
+        """Return one coordinate over the waypoints, shape (T,).
+
+        Raises:
+            UnknownNameError: There is no such coordinate.
+        """
+        if name not in self.names:
+            raise UnknownNameError("coordinate", name, self.names)
+        return np.array(self.positions[:, self.names.index(name)])
+
+    def velocities(self) -> NDArray[np.float64]:
+        """Return the velocity of every segment, shape (T − 1, n), [m/s] and [rad/s]."""
+        steps = np.diff(self.positions, axis=0) / np.diff(self.times)[:, None]
+        return np.asarray(steps)
+
+    def accelerations(self) -> NDArray[np.float64]:
+        """Return the acceleration at every waypoint, shape (T, n), [m/s²] and [rad/s²].
+
+        It is the velocity step there over the shorter of the two segments' durations; the motion starts and ends at rest.
+        """
+        durations = np.diff(self.times)
+        velocity = np.vstack([np.zeros(len(self.names)), self.velocities(), np.zeros(len(self.names))])
+        spans = np.concatenate([durations[:1], np.minimum(durations[1:], durations[:-1]), durations[-1:]])
+        return np.asarray(np.diff(velocity, axis=0) / spans[:, None])
+
+    def base_effort(self) -> float:
+        """Return the distance the base travels over the floor, Σ √(δx² + δy²) [m]."""
+        return float(np.linalg.norm(np.diff(self.positions[:, :2], axis=0), axis=1).sum())
+
+    def base_effort_l1(self) -> float:
+        """Return Σ |δx| + |δy| [m], which the method's authors log."""
+        return float(np.abs(np.diff(self.positions[:, :2], axis=0)).sum())
+
+    def arm_effort(self) -> float:
+        """Return the sum of the arm joints' absolute displacements, Σ |δq_arm| [rad]."""
+        return float(np.abs(np.diff(self.positions[:, 3 : self.robot_size], axis=0)).sum())
+
+    def phase_at(self, time: float) -> PhaseSpan:
+        """Return the phase at `time` [s]; at a boundary the later one."""
+        index = int(np.searchsorted(self.times, time, side="right")) - 1
+        return next((p for p in reversed(self.phases) if p.first <= index), self.phases[0])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data of it, e.g. for JSON."""
+        return {
+            "names": list(self.names),
+            "times": self.times.tolist(),
+            "positions": self.positions.tolist(),
+            "robot_size": self.robot_size,
+            "phases": [{**vars(p), "held": dict(p.held)} for p in self.phases],
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Trajectory:
+        """Return the trajectory that `to_dict` made `data` of."""
+        return cls(
+            tuple(data["names"]),
+            np.array(data["times"], float),
+            np.array(data["positions"], float),
+            tuple(PhaseSpan(p["name"], int(p["first"]), int(p["last"]), dict(p["held"])) for p in data["phases"]),
+            int(data["robot_size"]),
+        )

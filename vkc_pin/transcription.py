@@ -1,0 +1,322 @@
+"""The symbolic nonlinear program of a trajectory, built once per structure and kept.
+
+Variables are the waypoints after the start, each with one clearance slack: x = (z_1, s_1, ..., z_N, s_N). Everything
+that differs between two tasks of one structure is a parameter or a bound: start, placements to reach, witness planes,
+penalty. Rows belong to one waypoint each and derive from one small SX function per kind of waypoint, mapped over the
+waypoints; its exact Hessian is that of λᵀ·C·vec(M(z)) plus the pose rows, whatever the number of witness planes.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from vkc_pin import cpin
+from vkc_pin.coordinates import Coordinates
+
+__all__ = ["PoseRow", "Structure", "Transcription"]
+
+POSE_ROWS = 6
+
+
+@dataclass(frozen=True)
+class PoseRow:
+    """A frame that must be at a parametric placement at some waypoints.
+
+    Attributes:
+        joint: Joint of the model that carries it.
+        local: Its placement in the joint's frame.
+        waypoints: At which waypoints, counted from 1.
+    """
+
+    joint: int
+    local: pin.SE3
+    waypoints: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What a symbolic program depends on.
+
+    Attributes:
+        model: The chain.
+        segments: N, the number of waypoints after the start.
+        poses: Frames that must be somewhere.
+        slots: K, witness planes per waypoint.
+        weights_velocity, weights_acceleration: Of eq. 1, per coordinate, on the squared differences; shape (n,).
+        rests: Waypoints inside the motion at which it comes to rest, as it does at start and end.
+        differential: Whether the base must not slip sideways.
+    """
+
+    model: pin.Model
+    segments: int
+    poses: tuple[PoseRow, ...]
+    slots: int
+    weights_velocity: NDArray[np.float64]
+    weights_acceleration: NDArray[np.float64]
+    rests: tuple[int, ...] = ()
+    differential: bool = False
+
+    @property
+    def key(self) -> tuple[Any, ...]:
+        """Equal for structures that share one program."""
+        poses = tuple((p.joint, p.local.homogeneous.round(12).tobytes(), p.waypoints) for p in self.poses)
+        weights = (self.weights_velocity.tobytes(), self.weights_acceleration.tobytes())
+        return (self.model.saveToString(), self.segments, poses, self.slots, *weights, self.rests, self.differential)
+
+
+def pose_residual(rotation: Any, translation: Any, target: Any) -> Any:
+    """Return (p − p*, 2 sin(θ/2)·a), shape (6, 1), of a placement to `target` = (R* by columns, p*), shape (12, 1).
+
+    θ and a are angle and axis of R*ᵀR. Unlike ½ vee(E − Eᵀ), which vanishes at θ = π too, this grows up to π.
+    """
+    error = ca.reshape(target[:9], 3, 3).T @ rotation
+    vee = ca.vertcat(error[2, 1] - error[1, 2], error[0, 2] - error[2, 0], error[1, 0] - error[0, 1])
+    trace = error[0, 0] + error[1, 1] + error[2, 2]
+    return ca.vertcat(translation - target[9:], vee / ca.sqrt(1.0 + trace + 1e-9))
+
+
+def target_vector(placement: pin.SE3) -> NDArray[np.float64]:
+    """Return `placement` as the 12 numbers `pose_residual` takes."""
+    return np.concatenate([placement.rotation.T.ravel(), placement.translation])
+
+
+class _Kind:
+    """The SX functions of one kind of waypoint: which poses it must satisfy."""
+
+    def __init__(self, structure: Structure, poses: Sequence[int]) -> None:
+        model, coordinates = structure.model, Coordinates(structure.model)
+        n, slots, joints = coordinates.size, structure.slots, model.njoints - 1
+        z, s = ca.SX.sym("z", n), ca.SX.sym("s")
+        planes, offsets = ca.SX.sym("C", slots, 12 * joints), ca.SX.sym("R", slots)
+        targets = ca.SX.sym("W", 12, max(len(poses), 1))
+        placements = cpin.joint_placements(model)(coordinates.q_symbolic(z))
+        stacked = ca.vec(placements)
+        residuals = []
+        for k, pose in enumerate(poses):
+            row = structure.poses[pose]
+            column = placements[:, row.joint - 1]
+            rotation = ca.reshape(column[:9], 3, 3)
+            body = rotation @ row.local.rotation, rotation @ row.local.translation + column[9:]
+            residuals.append(pose_residual(*body, targets[:, k]))
+        pose_rows = ca.vertcat(*residuals) if residuals else ca.SX(0, 1)
+        self.rows = slots + POSE_ROWS * len(poses)
+        rows = ca.vertcat(planes @ stacked - offsets + s, pose_rows)
+        multipliers = ca.SX.sym("lam", self.rows)
+        # C·∂vec(M) is cheaper than differentiating every plane.
+        sweep = ca.jacobian(stacked, z)
+        slot_jacobian = ca.horzcat(planes @ sweep, ca.SX.ones(slots, 1))
+        pose_jacobian = ca.horzcat(ca.jacobian(pose_rows, z), ca.SX(pose_rows.numel(), 1))
+        jacobian = ca.vertcat(slot_jacobian, pose_jacobian)
+        w = ca.SX.sym("w", 12 * joints)
+        lagrangian = ca.dot(w, stacked) + ca.dot(multipliers[slots:], pose_rows)
+        hessian = ca.triu(ca.hessian(lagrangian, z)[0])
+        inner = ca.Function("inner", [z, targets, w, multipliers], [hessian])
+        hessian = inner(z, targets, planes.T @ multipliers[:slots], multipliers)
+        inputs = [z, s, ca.vec(planes), offsets, ca.vec(targets)]
+        options = {"cse": True}
+        self.value = ca.Function("g", inputs, [rows], options)
+        self.jacobian = ca.Function("rows_jacobian", inputs, [ca.vertcat(*jacobian.nonzeros())], options)
+        self.jacobian_pattern = jacobian.sparsity().get_triplet()
+        self.hessian = ca.Function("lagrangian_hessian", [*inputs, multipliers], [ca.vertcat(*hessian.nonzeros())], options)
+        self.hessian_pattern = hessian.sparsity().get_triplet()
+
+
+class Transcription:
+    """The program of one `Structure`: symbols, functions and Ipopt solvers, reused between tasks.
+
+    Attributes:
+        structure: What it was built of.
+        n, segments, slots: Sizes n, N and K.
+        size: Number of variables N·(n + 1).
+        rows: Number of constraint rows without the rate rows.
+        slot_rows: Rows of the witness planes, shape (N, K).
+        pose_rows: For each pose, waypoint → its rows, shape (6,).
+        base_rows: Rows that keep a differential base from slipping, shape (N,); empty for others.
+        rate_matrix, rate_start: Velocities and accelerations per step are rate_matrix·x + rate_start·z_0.
+        build_time: Seconds spent on building so far.
+    """
+
+    def __init__(self, structure: Structure) -> None:
+        started = time.perf_counter()
+        self.structure = structure
+        self.coordinates = Coordinates(structure.model)
+        self.n, self.segments, self.slots = self.coordinates.size, structure.segments, structure.slots
+        self.size = self.segments * (self.n + 1)
+        self._symbols()
+        self._objective()
+        self._constraints()
+        self._rates()
+        self._solvers: dict[tuple[bool, tuple[tuple[str, Any], ...]], ca.Function] = {}
+        self.build_time = time.perf_counter() - started
+
+    def _symbols(self) -> None:
+        n, N, K, joints = self.n, self.segments, self.slots, self.structure.model.njoints - 1
+        self.x = ca.MX.sym("x", self.size)
+        blocks = ca.reshape(self.x, n + 1, N)
+        self.z, self.s = blocks[:n, :], blocks[n, :]
+        self.start = ca.MX.sym("z0", n)
+        self.planes = ca.MX.sym("C", K * 12 * joints, N)
+        self.offsets = ca.MX.sym("R", K, N)
+        self.targets = ca.MX.sym("W", 12, max(len(self.structure.poses), 1))
+        self.penalty = ca.MX.sym("rho")
+        self.parameters = ca.veccat(self.start, self.planes, self.offsets, self.targets, self.penalty)
+
+    def parameter_vector(
+        self,
+        start: NDArray[np.float64],
+        planes: NDArray[np.float64],
+        offsets: NDArray[np.float64],
+        targets: NDArray[np.float64],
+        penalty: float,
+    ) -> NDArray[np.float64]:
+        """Return the parameters: start (n,), planes (N, K, 12·joints), offsets (N, K), targets (poses, 12), penalty."""
+        planes = planes.transpose(0, 2, 1).ravel()  # the K × 12J matrix of a waypoint, column by column
+        padded = targets.ravel() if len(targets) else np.zeros(12)
+        return np.concatenate([start, planes, offsets.ravel(), padded, [penalty]])
+
+    def _objective(self) -> None:
+        """f of eq. 1 as ½ xᵀHx + gᵀx + c."""
+        n, N = self.n, self.segments
+        first = np.eye(N) - np.eye(N, k=-1)  # δz_t = z_t − z_{t−1}
+        start_first = np.zeros(N)
+        start_first[0] = -1.0
+        # The velocity steps between segments, and from and to rest where the motion starts, pauses and ends.
+        stops = [0, *self.structure.rests, N]
+        runs = [np.diff(np.eye(N)[begin:end], axis=0, prepend=0.0, append=0.0) for begin, end in itertools.pairwise(stops)]
+        steps = np.vstack(runs)
+        second, start_second = steps @ first, steps @ start_first
+        self.first, self.second, self.start_first, self.start_second = first, second, start_first, start_second
+        hessian, linear = np.zeros((N, n + 1, N, n + 1)), np.zeros((N, n + 1, n))
+        for i, (v, a) in enumerate(zip(self.structure.weights_velocity, self.structure.weights_acceleration, strict=True)):
+            hessian[:, i, :, i] = 2 * (v * first.T @ first + a * second.T @ second)
+            linear[:, i, i] = 2 * (v * first.T @ start_first + a * second.T @ start_second)
+        self.objective_hessian = ca.sparsify(ca.DM(hessian.reshape(self.size, self.size)))
+        linear_matrix = ca.sparsify(ca.DM(linear.reshape(self.size, n)))
+        slack = np.zeros((N, n + 1))
+        slack[:, n] = 1.0
+        gradient = linear_matrix @ self.start + self.penalty * ca.DM(slack.ravel())
+        constant = ca.dot(self.start, self._start_weight() * self.start)
+        product = ca.mtimes(self.objective_hessian, self.x)
+        self.f = 0.5 * ca.dot(self.x, product) + ca.dot(gradient, self.x) + constant
+        self.gradient = product + gradient
+
+    def _start_weight(self) -> ca.DM:
+        v, a = self.structure.weights_velocity, self.structure.weights_acceleration
+        return ca.DM(v * (self.start_first @ self.start_first) + a * (self.start_second @ self.start_second))
+
+    def _constraints(self) -> None:
+        n, N, K = self.n, self.segments, self.slots
+        poses_at: list[tuple[int, ...]] = [() for _ in range(N)]
+        for index, pose in enumerate(self.structure.poses):
+            for waypoint in pose.waypoints:
+                poses_at[waypoint - 1] += (index,)
+        kinds = sorted(set(poses_at))
+        count = [K + POSE_ROWS * len(poses) for poses in poses_at]
+        first_row = np.concatenate([[0], np.cumsum(count)])
+        self.rows = int(first_row[-1])
+        self.slot_rows = first_row[:-1, None] + np.arange(K)
+        self.pose_rows: list[dict[int, NDArray[np.int_]]] = [{} for _ in self.structure.poses]
+        values, jacobians, hessians = [], [], []
+        value_rows, jacobian_at, hessian_at = [], [], []
+        self.multipliers = ca.MX.sym("lam_g", self.rows)
+        for poses in kinds:
+            at = [t for t in range(N) if poses_at[t] == poses]
+            kind = _Kind(self.structure, poses)
+            targets = ca.repmat(ca.vec(self.targets[:, list(poses)] if poses else self.targets[:, 0]), 1, len(at))
+            inputs = [self.z[:, at], self.s[:, at], self.planes[:, at], self.offsets[:, at], targets]
+            rows = first_row[at][:, None] + np.arange(kind.rows)
+            multipliers = ca.reshape(self.multipliers[rows.ravel().tolist()], kind.rows, len(at))
+            values.append(ca.vec(kind.value.map(len(at))(*inputs)))
+            jacobians.append(ca.vec(kind.jacobian.map(len(at))(*inputs)))
+            hessians.append(ca.vec(kind.hessian.map(len(at))(*inputs, multipliers)))
+            value_rows.append(rows.ravel())
+            offset = np.array(at)[:, None] * (n + 1)
+            row, column = (np.array(part) for part in kind.jacobian_pattern)
+            jacobian_at.append(np.stack([(first_row[at][:, None] + row).ravel(), (offset + column).ravel()]))
+            row, column = (np.array(part) for part in kind.hessian_pattern)
+            hessian_at.append(np.stack([(offset + row).ravel(), (offset + column).ravel()]))
+            for order, pose in enumerate(poses):
+                for t in at:
+                    self.pose_rows[pose][t + 1] = first_row[t] + K + POSE_ROWS * order + np.arange(POSE_ROWS)
+        order = np.argsort(np.concatenate(value_rows))
+        self.g = ca.vertcat(*values)[order.tolist()]
+        self.jacobian = _assemble(jacobians, jacobian_at, self.rows, self.size)
+        self.hessian = _assemble(hessians, hessian_at, self.size, self.size)
+        self.base_rows = np.zeros(0, int)
+        if self.structure.differential:
+            self._differential()
+
+    def _differential(self) -> None:
+        """Append −sin θ̄·δx + cos θ̄·δy at every segment's mid-heading: the base rolls, it does not slip."""
+        z = ca.horzcat(self.start, self.z)
+        heading, step = (z[2, 1:] + z[2, :-1]) / 2, z[:2, 1:] - z[:2, :-1]
+        slip = (-ca.sin(heading) * step[0, :] + ca.cos(heading) * step[1, :]).T
+        extra = ca.MX.sym("lam_slip", self.segments)
+        self.base_rows = self.rows + np.arange(self.segments)
+        self.g = ca.vertcat(self.g, slip)
+        self.jacobian = ca.vertcat(self.jacobian, ca.jacobian(slip, self.x))
+        curvature = ca.triu(ca.hessian(ca.dot(extra, slip), self.x)[0])
+        self.hessian = self.hessian + curvature
+        self.rows += self.segments
+        both = ca.MX.sym("lam_g", self.rows)
+        split = [both[: -self.segments], both[-self.segments :]]
+        (self.hessian,) = ca.substitute([self.hessian], [self.multipliers, extra], split)
+        self.multipliers = both
+
+    def _rates(self) -> None:
+        n, N = self.n, self.segments
+        select = np.eye(n + 1)[:n]  # leaves the slack out
+        matrix = np.vstack([np.kron(self.first, select), np.kron(self.second, select)])
+        identity = np.eye(n)
+        start = np.vstack([np.kron(self.start_first[:, None], identity), np.kron(self.start_second[:, None], identity)])
+        self.rate_matrix, self.rate_start = ca.sparsify(ca.DM(matrix)), ca.sparsify(ca.DM(start))
+
+    def solver(self, *, rates: bool, options: dict[str, Any]) -> ca.Function:
+        """Return Ipopt on this program; with `rates`, velocity and acceleration rows follow the others."""
+        key = (rates, tuple(sorted(options.items())))
+        if key not in self._solvers:
+            started = time.perf_counter()
+            self._solvers[key] = self._make_solver(rates, options)
+            self.build_time += time.perf_counter() - started
+        return self._solvers[key]
+
+    def _make_solver(self, rates: bool, options: dict[str, Any]) -> ca.Function:
+        g, jacobian, multipliers = self.g, self.jacobian, self.multipliers
+        if rates:
+            g = ca.vertcat(g, self.rate_matrix @ self.x + self.rate_start @ self.start)
+            jacobian = ca.vertcat(jacobian, self.rate_matrix)
+            multipliers = ca.MX.sym("lam", g.numel())
+        weight = ca.MX.sym("lam_f")
+        hessian = weight * ca.triu(self.objective_hessian) + self.hessian
+        if rates:
+            (hessian,) = ca.substitute([hessian], [self.multipliers], [multipliers[: self.rows]])
+        inputs = [self.x, self.parameters]
+        functions = {
+            "grad_f": ca.Function("nlp_grad_f", inputs, [self.f, self.gradient], ["x", "p"], ["f", "grad_f_x"]),
+            "jac_g": ca.Function("nlp_jac_g", inputs, [g, jacobian], ["x", "p"], ["g", "jac_g_x"]),
+            "hess_lag": ca.Function(
+                "nlp_hess_l", [*inputs, weight, multipliers], [hessian], ["x", "p", "lam_f", "lam_g"], ["triu_hess_gamma_x_x"]
+            ),
+        }
+        quiet = {"print_time": False, "record_time": True, "calc_lam_p": False, "no_nlp_grad": True}
+        program = {"x": self.x, "p": self.parameters, "f": self.f, "g": g}
+        return ca.nlpsol("trajectory", "ipopt", program, {**quiet, **functions, **options})
+
+
+def _assemble(parts: list[ca.MX], at: list[NDArray[np.int_]], rows: int, columns: int) -> ca.MX:
+    """Return the sparse matrix whose nonzeros are `parts`, one after another, at (row, column) `at`."""
+    where = np.concatenate(at, axis=1)
+    order = np.lexsort((where[0], where[1]))
+    row, column = where[0][order], where[1][order]
+    pointers = np.concatenate([[0], np.cumsum(np.bincount(column, minlength=columns))])
+    pattern = ca.Sparsity(rows, columns, pointers.tolist(), row.tolist())
+    return ca.MX(pattern, ca.vertcat(*parts)[order.tolist()])

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import tempfile
 from pathlib import Path
 
-import coal
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from vkc_pin.articulation import DEFAULT_ACCELERATION, DEFAULT_VELOCITY, ArticulatedObject, invert, load_object
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.geometry import PlacedObject, clearance, placed_shapes, standing_geometry
 
 KINDS = ("revolute", "continuous", "prismatic", "fixed")
 AXES = ("1 0 0", "0 1 0", "0 0 1", "-1 0 0", "0 0 -1", "0.6 0 0.8", "1 -2 3")
@@ -22,8 +23,8 @@ SHAPES = ('<box size="0.1 0.2 0.3"/>', '<sphere radius="0.1"/>', '<cylinder radi
 
 def joint(name: str, kind: str, parent: str, child: str, axis: str) -> str:
     limit = '<limit lower="-1" upper="1" velocity="1" effort="1"/>'
-    return f'''<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/><axis xyz="{axis}"/>{limit}</joint>
-'''
+    links = f'<parent link="{parent}"/><child link="{child}"/>'
+    return f'<joint name="{name}" type="{kind}">{links}<axis xyz="{axis}"/>{limit}</joint>'
 
 
 @st.composite
@@ -46,9 +47,8 @@ def trees(draw: st.DrawFn) -> tuple[str, int]:
         )
         parent, kind, axis = draw(st.integers(0, i - 1)), draw(st.sampled_from(KINDS)), draw(st.sampled_from(AXES))
         limit = f'<limit lower="-2" upper="{1 + i}" velocity="{i}" effort="{10 * i}"/>'
-        parts.append(
-            f'<joint name="j{i}" type="{kind}"><parent link="l{parent}"/><child link="l{i}"/>{origin}<axis xyz="{axis}"/>{limit}</joint>'
-        )
+        links = f'<parent link="l{parent}"/><child link="l{i}"/>'
+        parts.append(f'<joint name="j{i}" type="{kind}">{links}{origin}<axis xyz="{axis}"/>{limit}</joint>')
     return f'<robot name="t">{"".join(parts)}</robot>', draw(st.integers(0, number - 1))
 
 
@@ -173,23 +173,28 @@ def test_the_door_moves_as_its_description_says() -> None:
     assert -0.125 - 0.02 <= level.translation[0] <= -0.07 - 0.02, "the bar stands in front of the panel's face at -0.02"
 
 
-def test_parts_of_the_door_keep_apart_over_the_whole_range() -> None:
-    door = load_object("door")
-    shapes = door.collision
-    link = [door.model.frames[shape.parentFrame].name for shape in shapes.geometryObjects]
+def test_drawer() -> None:
+    drawer = load_object("drawer")
+    assert drawer.coordinates.names == ("slide",)
+    assert (drawer.lower[0], drawer.upper[0], drawer.velocity[0], drawer.acceleration[0]) == (0.0, 0.4, 0.5, 1.0)
+    assert drawer.latches == ()
+    assert list(drawer.attachments) == ["handle", "handle_free"]
+    moved = drawer.link_placement("tray", [0.4]).translation - drawer.link_placement("tray", [0.0]).translation
+    np.testing.assert_allclose(moved, [-0.4, 0.0, 0.0], atol=1e-12)  # out of the cabinet, towards whoever pulls
+
+
+@pytest.mark.parametrize(("name", "steps"), [("door", (158, 3)), ("drawer", (41,))])
+def test_moving_parts_keep_away_from_the_base_over_the_whole_range(name: str, steps: tuple[int, ...]) -> None:
+    thing = load_object(name)
+    still = [s for s in thing.collision.geometryObjects if s.parentJoint == 0]
+    assert len(still) >= 3
+    grids = [np.linspace(*limits, n) for *limits, n in zip(thing.lower, thing.upper, steps, strict=True)]
     nearest = np.inf
-    for hinge in np.linspace(-1.57, 1.57, 158):
-        for knob in (0.0, 0.4, 0.8):
-            _, where = placements(door.model, shapes, door.coordinates.q([hinge, knob]))
-            transforms = [coal.Transform3s(where[s.name].rotation, where[s.name].translation) for s in shapes.geometryObjects]
-            for i, a in enumerate(shapes.geometryObjects):
-                for j, b in enumerate(shapes.geometryObjects):
-                    if link[i] == "frame" and link[j] != "frame":
-                        distance = coal.distance(
-                            a.geometry, transforms[i], b.geometry, transforms[j], coal.DistanceRequest(), coal.DistanceResult()
-                        )
-                        nearest = min(nearest, distance)
-    assert nearest > 0.02
+    for state in itertools.product(*grids):
+        placed = standing_geometry(PlacedObject(name, thing, pin.SE3.Identity(), np.array(state)))
+        moving = [s for s, original in zip(placed, thing.collision.geometryObjects, strict=True) if original.parentJoint != 0]
+        nearest = min(nearest, clearance(placed_shapes(moving), placed_shapes(still)))
+    assert 0.02 < nearest < 0.05
 
 
 BASE = """urdf: thing.urdf

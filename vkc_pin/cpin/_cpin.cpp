@@ -4,8 +4,6 @@
 // casadi::Function goes out as CasADi serialises it. So this module shares no C++ object with the Python bindings of
 // either library, and need not be built with their compilers.
 
-#include <cmath>
-#include <sstream>
 #include <string>
 #include <vector>
 
@@ -38,28 +36,10 @@ using Data = pinocchio::DataTpl<SX>;
 using SE3 = pinocchio::SE3Tpl<SX>;
 using Vector = Eigen::Matrix<SX, Eigen::Dynamic, 1>;
 
-// Quarter turns reach us as cos(π/2) = 6e-17. Made exact they vanish from the expressions: far fewer instructions for
-// a change below the rounding of the numeric algorithms.
-void snap(pinocchio::SE3 & placement)
-{
-  constexpr double epsilon = 4e-16;
-  auto & rotation = placement.rotation();
-  for (Eigen::Index i = 0; i < rotation.size(); ++i)
-  {
-    const double nearest = std::round(rotation.data()[i]);
-    if (std::abs(rotation.data()[i] - nearest) <= epsilon)
-      rotation.data()[i] = nearest;
-  }
-}
-
 Model load(const std::string & text)
 {
   pinocchio::Model model;
   model.loadFromString(text);
-  for (auto & placement : model.jointPlacements)
-    snap(placement);
-  for (auto & frame : model.frames)
-    snap(frame.placement);
   return model.cast<SX>();
 }
 

@@ -169,7 +169,7 @@ def _exact(model: pin.Model) -> pin.Model:
     """Return a copy of `model` whose quarter turns are exact.
 
     They come as cos(π/2) = 6e-17, and a number that is neither 0 nor ±1 stays in every expression it enters: without
-    this a UR5e takes a third more instructions. The change is below the rounding of the numeric algorithms.
+    this a UR5e on a planar base takes a tenth more. The change is below the rounding of the numeric algorithms.
     """
     import numpy as np
 

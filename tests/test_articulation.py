@@ -6,6 +6,7 @@ import itertools
 import tempfile
 from pathlib import Path
 
+import coal
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -286,6 +287,24 @@ def test_wrong_urdfs_are_refused(urdf: str, message: str) -> None:
         load_text(urdf, BASE)
     assert message in str(caught.value)
     assert Path(str(caught.value.file)).name == "thing.urdf"
+
+
+@pytest.mark.parametrize("filename", ["wedge.obj", "package://things/wedge.obj"])
+def test_collision_meshes_become_their_convex_hulls(tmp_path: Path, filename: str) -> None:
+    folder = tmp_path / "things"
+    folder.mkdir()
+    (folder / "wedge.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n")
+    mesh = f'<geometry><mesh filename="{filename}" scale="2 2 1"/></geometry>'
+    (folder / "t.urdf").write_text(
+        f'<robot name="t"><link name="l"><visual>{mesh}</visual><collision>{mesh}</collision></link></robot>'
+    )
+    (folder / "t.yaml").write_text("urdf: t.urdf\nattachments: [{name: a, link: l}]\n")
+    (shape,) = load_object(folder / "t.yaml").collision.geometryObjects
+    assert isinstance(shape.geometry, coal.ConvexBase)
+    assert shape.geometry.computeVolume() == pytest.approx(4.0 / 6.0)
+    (folder / "wedge.obj").write_text("nothing")
+    with pytest.raises(InputError):
+        load_object(folder / "t.yaml")
 
 
 def test_unknown_objects_are_refused(tmp_path: Path) -> None:

@@ -194,11 +194,6 @@ def _translate(document: Document, path: tuple[Key, ...], error: Any) -> InputEr
     kind, context, got = error["type"], error.get("ctx", {}), error["input"]
     if kind == "unknown_field":
         return document.unknown(path, "field", context["name"], context["choices"])
-    if kind in ("too_short", "too_long") or (kind == "missing" and isinstance(path[-1], int)):
-        values = document.value(path[:-1] if kind == "missing" else path)
-        return document.error(
-            path, "wrong number of values", expected=error["ctx"]["max_length"] if kind == "too_long" else "more", got=values
-        )
     if kind in ("missing", "union_tag_not_found"):
         tag = kind == "union_tag_not_found"
         return document.error(path, "missing", expected="the object's kind" if tag else "a value", got="nothing")

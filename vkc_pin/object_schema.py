@@ -19,6 +19,7 @@ __all__ = [
     "Positive",
     "Schema",
     "Vector3",
+    "count",
     "fail",
 ]
 
@@ -52,9 +53,22 @@ def _some(value: tuple[Any, ...]) -> tuple[Any, ...]:
     return value
 
 
+def count(number: int) -> BeforeValidator:
+    """Return the validator that wants a list of `number` values: pydantic alone would not say how many it expected."""
+
+    def counted(value: Any) -> Any:
+        if not isinstance(value, list | tuple):
+            raise fail("wrong value", f"a list of {number} values")
+        if len(value) != number:
+            raise fail("wrong number of values", f"{number} values")
+        return value
+
+    return BeforeValidator(counted)
+
+
 Number = Annotated[float, BeforeValidator(_number), Field(allow_inf_nan=False)]
 Positive = Annotated[Number, Field(gt=0.0)]
-Vector3 = tuple[Number, Number, Number]
+Vector3 = Annotated[tuple[Number, Number, Number], count(3)]
 Direction = Annotated[Vector3, AfterValidator(_direction)]
 Name = Annotated[str, AfterValidator(_name)]
 
@@ -94,7 +108,7 @@ class AttachmentSchema(Schema):
     closing: Direction | None = None
     joint: Literal["fixed", "revolute", "prismatic", "spherical"] = "fixed"
     axis: Direction | None = None
-    limits: tuple[Number, Number] | None = None
+    limits: Annotated[tuple[Number, Number], count(2)] | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> AttachmentSchema:

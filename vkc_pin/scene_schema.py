@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from vkc_pin.object_schema import Name, Number, Positive, Schema, Vector3, fail
+from vkc_pin.object_schema import Name, Number, Positive, Schema, Vector3, count, fail
 
 __all__ = [
     "COLOURS",
@@ -84,9 +84,10 @@ def _ordered(value: tuple[float, float] | None) -> tuple[float, float] | None:
 
 
 Fraction = Annotated[Number, Field(ge=0.0, le=1.0)]
-Colour = Annotated[tuple[Fraction, Fraction, Fraction, Fraction], BeforeValidator(_colour)]
-Interval = Annotated[tuple[Number, Number], AfterValidator(_ordered)]
-Scale = Annotated[tuple[Positive, Positive, Positive], BeforeValidator(_triple)]
+Size = Annotated[tuple[Positive, Positive, Positive], count(3)]
+Colour = Annotated[tuple[Fraction, Fraction, Fraction, Fraction], count(4), BeforeValidator(_colour)]
+Interval = Annotated[tuple[Number, Number], count(2), AfterValidator(_ordered)]
+Scale = Annotated[Size, BeforeValidator(_triple)]
 
 
 class PoseSchema(Schema):
@@ -114,7 +115,7 @@ class BoxSchema(ShapeSchema):
     """A box; `position` is its centre, `size` its edge lengths along its x, y, z axes."""
 
     type: Literal["box"]
-    size: tuple[Positive, Positive, Positive]
+    size: Size
 
 
 class SphereSchema(ShapeSchema):

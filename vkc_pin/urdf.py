@@ -9,6 +9,7 @@ import coal
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
+from vkc_pin.meshes import load_convex
 
 __all__ = ["UrdfTree", "load_urdf"]
 
@@ -51,7 +52,7 @@ def load_urdf(file: str | Path) -> UrdfTree:
         raise InputError(f"not a valid URDF: {error}", file=path) from error
     for shape in collision.geometryObjects:
         if not isinstance(shape.geometry, _CONVEX):
-            _make_convex(path, shape)
+            shape.geometry = load_convex(shape.meshPath, shape.meshScale)
     if len(visual.geometryObjects) > 0 and len(collision.geometryObjects) == 0:
         raise InputError("nothing in this URDF can collide", file=path, expected="<collision> elements", got="only <visual> ones")
     return UrdfTree(model, collision, visual)
@@ -74,11 +75,3 @@ def _check(path: Path, text: str) -> None:
             raise InputError("this joint type is not supported", file=path, field=name, expected=", ".join(supported), got=kind)
         if joint.find("mimic") is not None:  # Pinocchio's parser would let it move on its own
             raise InputError("joints that mimic others are not supported", file=path, field=name, expected="no <mimic>")
-
-
-def _make_convex(path: Path, shape: pin.GeometryObject) -> None:
-    try:
-        from vkc_pin.meshes import load_convex
-    except ImportError as error:
-        raise InputError("collision meshes are not supported", file=path, field=shape.name, got=shape.meshPath) from error
-    shape.geometry = load_convex(shape.meshPath, shape.meshScale)

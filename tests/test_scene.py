@@ -213,14 +213,24 @@ def test_random_starts_are_free_in_the_region_at_any_heading_and_repeatable(door
     np.testing.assert_array_equal(first, second)
     region = door.start_region
     assert region is not None
-    assert (first[:, 0] >= region.x[0]).all() and (first[:, 0] <= region.x[1]).all()
-    assert (first[:, 1] >= region.y[0]).all() and (first[:, 1] <= region.y[1]).all()
+    assert (first[:, 0] >= region.x[0]).all()
+    assert (first[:, 0] <= region.x[1]).all()
+    assert (first[:, 1] >= region.y[0]).all()
+    assert (first[:, 1] <= region.y[1]).all()
     assert np.ptp(first[:, 0]) > 0.7 * (region.x[1] - region.x[0])
     assert np.unique(np.floor(first[:, 2] / (np.pi / 2))).size == 4, "all four quarters of headings"
     for start in first:
         assert door.with_start(base=start[:3]).start_clearance() >= START_CLEARANCE
         hinge = door.objects["door"].placement.translation
         assert 2.0 <= hinge[0] - start[0] <= 4.0
+
+
+def test_a_fixed_base_may_stand_anywhere_in_the_arena(tmp_path: Path) -> None:
+    scene = load(
+        tmp_path, TINY.replace("husky_ur5e", "{name: husky_ur5e, base: fixed}").replace("0.0, 0.0, 0.5", "0.5, 0.2, 0.5")
+    )
+    np.testing.assert_array_equal(scene.start[:3], [0.5, 0.2, 0.5])
+    np.testing.assert_array_equal(scene.with_start(base=[0.1, 0.2, 0.3]).start[:3], [0.1, 0.2, 0.3])
 
 
 def test_start_clearance_sees_obstacles_and_objects(door: Scene) -> None:

@@ -21,7 +21,7 @@ from vkc_pin.resources import find
 if TYPE_CHECKING:
     from vkc_pin.robot import Robot
 
-__all__ = ["FLOOR", "START_CLEARANCE", "PlacedObject", "Scene", "StartRegion", "load_scene", "standing_geometry"]
+__all__ = ["FLOOR", "START_CLEARANCE", "PlacedObject", "Scene", "StartRegion", "load_scene", "standing_geometry", "start_limits"]
 
 FLOOR = "floor"
 """Name of the floor among a scene's obstacles."""
@@ -111,7 +111,7 @@ class Scene:
             given = np.asarray(values, float)
             if given.shape != start[part].shape:
                 raise InputError("wrong number of values", field=field, expected=start[part].shape, got=given.shape)
-            lower, upper = self.robot.lower[part], self.robot.upper[part]
+            lower, upper = (limits[part] for limits in start_limits(self.robot))
             start[part] = [
                 within_limits(value, low, high, f"{field}.{name}")
                 for value, low, high, name in zip(given, lower, upper, names[part], strict=True)
@@ -209,6 +209,14 @@ class Scene:
                 return scene
         problem = f"no free place for the robot in {_TRIES} tries"
         raise InputError(problem, file=self.file, field="start_region", expected=f"a clearance of {START_CLEARANCE} m somewhere")
+
+
+def start_limits(robot: Robot) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the limits of a start, shape (n,), [m] and [rad]: the robot's; a base that cannot move may stand anywhere."""
+    lower, upper = robot.lower.copy(), robot.upper.copy()
+    if robot.base == "fixed":
+        lower[:3], upper[:3] = -np.inf, np.inf
+    return lower, upper
 
 
 def load_scene(name_or_path: str | Path) -> Scene:

@@ -16,7 +16,7 @@ from vkc_pin import scene_schema as schema
 from vkc_pin.articulation import load_object, tidy
 from vkc_pin.documents import Document, check
 from vkc_pin.geometry import PlacedObject, copy_shape, within_limits
-from vkc_pin.scene import FLOOR, Scene, StartRegion
+from vkc_pin.scene import FLOOR, Scene, StartRegion, start_limits
 from vkc_pin.urdf import load_urdf
 
 if TYPE_CHECKING:
@@ -112,10 +112,11 @@ def _start(document: Document, item: schema.StartSchema, robot: Robot) -> NDArra
         expected = f"{len(names)} values: {', '.join(names)}"
         raise document.error(("start", "arm"), "wrong number of arm joints", expected=expected, got=len(arm))
     start = np.concatenate([item.base, arm])
+    lower, upper = start_limits(robot)
     for index, name in enumerate(robot.coordinates.names):
         path = ("start", "base", index) if index < 3 else ("start", "arm", index - 3)
         with document.at(path):
-            start[index] = within_limits(start[index], robot.lower[index], robot.upper[index], name)
+            start[index] = within_limits(start[index], lower[index], upper[index], name)
     return start
 
 

@@ -1,0 +1,64 @@
+"""Writes collision/*.stl from the visual geometry of husky_ur5e.urdf, and prints the table of README.md.
+
+Run it from anywhere: python robots/husky_ur5e/make_collision.py
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from vkc_pin.convexify import cut, outer_hull, solid_volume, visual_meshes, write_stl
+from vkc_pin.robot_files import read_urdf
+
+FOLDER = Path(__file__).resolve().parent
+# Link → number of pieces, and the axis across which it is cut.
+PIECES = {
+    "ur_base_link_inertia": (1, (0, 0, 1)),
+    "shoulder_link": (1, (0, 0, 1)),
+    "upper_arm_link": (3, (1, 0, 0)),
+    "forearm_link": (2, (1, 0, 0)),
+    "wrist_1_link": (1, (0, 0, 1)),
+    "wrist_2_link": (1, (0, 0, 1)),
+    "wrist_3_link": (1, (0, 0, 1)),
+    "gripper_link": (1, (0, 0, 1)),
+    "gripper_right_finger": (1, (0, 0, 1)),
+    "gripper_left_finger": (1, (0, 0, 1)),
+}
+VERTICES = 36
+
+
+def main() -> None:
+    """Write the files and print one row of the table per link."""
+    file = read_urdf(FOLDER / "husky_ur5e.urdf", {"airo_models": airo_models()})
+    print("| link | pieces | corners | solid [l] | pieces' volume [l] | overhead |\n| --- | --- | --- | --- | --- | --- |")
+    for link in ("base_link", *PIECES):
+        meshes = visual_meshes(file, link)
+        if link == "base_link":  # by construction: body, left wheels and panel, right wheels and panel
+            sides = [0.0 if abs(mesh.centroid[1]) < 0.245 and mesh.extents[2] < 0.2 or k == 0 else mesh.centroid[1] for k, mesh in enumerate(meshes)]
+            groups = [[m for m, side in zip(meshes, sides, strict=True) if np.sign(side) == sign] for sign in (0, 1, -1)]
+            points = [np.vstack([mesh.vertices for mesh in group]) for group in groups]
+        else:
+            count, axis = PIECES[link]
+            points = cut(trimesh.util.concatenate(meshes), count, axis=axis)
+        pieces = [outer_hull(piece, vertices=VERTICES) for piece in points]
+        for k, piece in enumerate(pieces):
+            write_stl(piece, FOLDER / "collision" / f"{link}_{k}.stl")
+        solid, union = solid_volume(meshes, pitch=0.004 if link == "base_link" else 0.001), solid_volume(pieces, pitch=0.002)
+        corners = ", ".join(str(len(piece.vertices)) for piece in pieces)
+        print(f"| `{link}` | {len(pieces)} | {corners} | {1e3 * solid:.3f} | {1e3 * union:.3f} | {100 * (union / solid - 1):.0f} % |", flush=True)
+
+
+def airo_models() -> Path:
+    """Return the folder of the package that holds the meshes."""
+    spec = importlib.util.find_spec("airo_models")
+    if spec is None or spec.origin is None:
+        raise SystemExit("pip install airo-models")
+    return Path(spec.origin).parent
+
+
+if __name__ == "__main__":
+    main()

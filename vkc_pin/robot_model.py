@@ -1,0 +1,137 @@
+"""Builds the Pinocchio model of a robot: planar base, the joints on the way to the tool, everything else locked."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from vkc_pin.assembly import clean
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.robot_files import RobotFile
+
+__all__ = ["default_tool_frame", "full_model", "planned_model", "rest_positions"]
+
+ROOT = "base"  # the name of the planar joint
+_FINGER = 4  # joints in the longest finger
+
+
+def full_model(file: RobotFile) -> pin.Model:
+    """Return the model of all joints of `file` on a planar joint.
+
+    Raises:
+        InputError: It is no valid URDF.
+    """
+    try:
+        return pin.buildModelFromXML(file.text, pin.JointModelPlanar(), ROOT)
+    except (ValueError, RuntimeError) as error:
+        raise InputError(f"not a valid URDF: {error}", file=file.path) from error
+
+
+def planned_model(full: pin.Model, file: RobotFile, tool_frame: str, rest: Mapping[str, float], locked: Mapping[str, float]) -> pin.Model:
+    """Return `full` with all joints locked but those on the way to `tool_frame`.
+
+    Args:
+        full: See `full_model`.
+        file: Its file.
+        tool_frame: A frame of it.
+        rest: Where each joint is locked, [m] or [rad]; see `rest_positions`.
+        locked: Joints to lock though they are on the way, and where.
+
+    Raises:
+        UnknownNameError: A joint of `locked` does not exist.
+        InputError: No joint is left.
+    """
+    for name in locked:
+        if name not in rest:
+            raise UnknownNameError("joint", name, rest, file=file.path, field="locked_joints")
+    way = _way(full, full.frames[_frame(full, tool_frame)].parentJoint)
+    planned = [j for j in way if full.names[j] in rest and full.names[j] not in locked and full.names[j] not in _mimics(file.root)]
+    if not planned:
+        raise InputError(
+            "no joint moves this frame", file=file.path, field="tool_frame", expected="a frame at the end of an arm", got=tool_frame
+        )
+    model = pin.buildReducedModel(
+        full, [j for j in range(2, full.njoints) if j not in planned], configuration(full, {**rest, **locked})
+    )
+    for j in range(1, model.njoints):
+        model.jointPlacements[j] = clean(model.jointPlacements[j])
+    for frame in model.frames:
+        frame.placement = clean(frame.placement)
+    return model
+
+
+def rest_positions(full: pin.Model, file: RobotFile, given: Mapping[str, float]) -> dict[str, float]:
+    """Return for each joint of 1 degree of freedom where it rests, [m] or [rad].
+
+    That is what `given` says, else 0, or the middle of the limits where 0 lies outside them. A joint that mimics another
+    follows it.
+    """
+    rest = {}
+    for j in range(2, full.njoints):
+        if full.joints[j].nv == 1:
+            i = full.joints[j].idx_q
+            low, high = (-np.inf, np.inf) if full.joints[j].nq == 2 else (full.lowerPositionLimit[i], full.upperPositionLimit[i])
+            rest[full.names[j]] = float(given.get(full.names[j], 0.0 if low <= 0.0 <= high else 0.5 * (low + high)))
+    for name, (master, factor, offset) in _mimics(file.root).items():
+        if name in rest and master in rest and name not in given:
+            rest[name] = factor * rest[master] + offset
+    return rest
+
+
+def configuration(model: pin.Model, positions: Mapping[str, float]) -> NDArray[np.float64]:
+    """Return the configuration, shape (nq,), with joints at `positions`; those not named are neutral."""
+    q = pin.neutral(model)
+    for j in range(1, model.njoints):
+        joint, value = model.joints[j], positions.get(model.names[j])
+        if value is not None and joint.nv == 1:
+            q[joint.idx_q : joint.idx_q + joint.nq] = value if joint.nq == 1 else (np.cos(value), np.sin(value))
+    return q
+
+
+def default_tool_frame(full: pin.Model, file: RobotFile) -> str:
+    """Return the last frame of the longest chain of joints, before it branches into fingers."""
+    mimics = _mimics(file.root)
+    children: dict[int, list[int]] = {j: [] for j in range(full.njoints)}
+    depth = np.zeros(full.njoints, int)
+    for j in range(full.njoints - 1, 1, -1):
+        children[full.parents[j]].insert(0, j)
+        counts = full.joints[j].nv == 1 and full.names[j] not in mimics
+        depth[full.parents[j]] = max(depth[full.parents[j]], depth[j] + counts)
+    joint, above = 1, 0
+    while children[joint]:
+        hand = len(children[joint]) > 1 and depth[joint] <= _FINGER
+        if hand and above >= _FINGER:
+            break
+        joint, above = max(children[joint], key=lambda j: depth[j] + (full.joints[j].nv == 1)), above + 1
+    return str([frame.name for frame in full.frames if frame.parentJoint == joint and frame.name != full.names[joint]][-1])
+
+
+def _way(model: pin.Model, joint: int) -> list[int]:
+    """Return the joints from the root to `joint`, the planar one left out."""
+    way = []
+    while joint > 1:
+        way.append(joint)
+        joint = model.parents[joint]
+    return way[::-1]
+
+
+def _frame(model: pin.Model, name: str) -> int:
+    return next(i for i, frame in enumerate(model.frames) if frame.name == name)
+
+
+def _mimics(root: ElementTree.Element) -> dict[str, tuple[str, float, float]]:
+    """Return joint → (the joint it follows, factor, offset)."""
+    found = {}
+    for joint in root.findall("joint"):
+        mimic = joint.find("mimic")
+        if mimic is not None:
+            found[joint.get("name", "")] = (
+                mimic.get("joint", ""),
+                float(mimic.get("multiplier", "1")),
+                float(mimic.get("offset", "0")),
+            )
+    return found

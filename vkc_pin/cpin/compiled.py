@@ -15,7 +15,7 @@ from vkc_pin.errors import BuildError
 
 __all__ = ["center_of_mass", "check_versions", "frame_jacobian", "frame_placements", "joint_placements", "rnea"]
 
-_REBUILD = "build vkc-pin again: pip install --force-reinstall --no-deps --no-cache-dir vkc-pin (in a checkout: . instead of vkc-pin)"
+_REBUILD = "build vkc-pin again: pip install --force-reinstall --no-deps --no-cache-dir vkc-pin (in a checkout: '.')"
 
 
 def joint_placements(model: pin.Model) -> casadi.Function:

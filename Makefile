@@ -1,0 +1,51 @@
+# make demo: plan the door and look at it; make test: lint, types, tests. Both set up .venv first, where it is not yet.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+
+.PHONY: demo test lint clean
+.DELETE_ON_ERROR:
+
+demo: $(VENV)/installed.stamp
+	@mkdir -p out
+	$(BIN)/vkc-pin plan door --set door.hinge=1.2 --html out/door.html --save out/door.npz --json out/door.json --plots out
+
+test: lint
+	$(BIN)/python -m pytest
+
+lint: $(VENV)/test.stamp
+	$(BIN)/ruff check
+	$(BIN)/mypy
+
+clean:
+	rm -rf $(VENV) out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# What a machine must have; says what to install where it has not. Usage: $(call need,shell test,what is missing,packages)
+need = @$(1) >/dev/null 2>&1 || { echo "$(2) (Debian, Ubuntu: apt install $(3))" >&2; exit 1; }
+
+$(VENV)/created.stamp:
+	$(call need,$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))',Python 3.11 or newer is needed; choose one with make PYTHON=...,python3)
+	$(call need,$(PYTHON) -c 'import ensurepip$(,) venv',Python's venv module is needed,python3-venv)
+	$(call need,$(PYTHON) -c '$(has_headers)',Python's headers are needed,python3-dev)
+	$(call need,command -v "$${CXX:-c++}" || command -v g++,A C++ compiler is needed,g++)
+	$(PYTHON) -m venv --clear $(VENV)
+	@touch $@
+
+, := ,
+has_headers = import pathlib, sys, sysconfig; sys.exit(not pathlib.Path(sysconfig.get_path("include"), "Python.h").exists())
+
+# The package is installed from this checkout: Python files are used as they stand, so only these three need it again.
+$(VENV)/installed.stamp: pyproject.toml CMakeLists.txt vkc_pin/cpin/_cpin.cpp | $(VENV)/created.stamp
+	@echo "Installing vkc-pin and what it needs into $(VENV); compiling takes about a minute"
+	$(PIP) install --editable .
+	@touch $@
+
+# Read from pyproject.toml: asking pip for '.[test]' would compile the package once more.
+test_packages = import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["test"], sep="\n")
+
+$(VENV)/test.stamp: $(VENV)/installed.stamp
+	@$(BIN)/python -c '$(test_packages)' > $(VENV)/test-packages.txt
+	$(PIP) install --requirement $(VENV)/test-packages.txt
+	@touch $@

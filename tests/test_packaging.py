@@ -1,0 +1,79 @@
+"""What a user gets by installing the package."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+import subprocess
+import sys
+import tomllib
+import zipfile
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import pytest
+from packaging.requirements import Requirement
+
+import vkc_pin
+
+CHECKOUT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="module")
+def project() -> dict[str, Any]:
+    return tomllib.loads((CHECKOUT / "pyproject.toml").read_text())
+
+
+def modules() -> list[str]:
+    names = (module.name for module in pkgutil.walk_packages(vkc_pin.__path__, "vkc_pin."))
+    return ["vkc_pin", *(name for name in names if not name.rpartition(".")[2].startswith("_"))]
+
+
+@pytest.mark.parametrize("name", modules())
+def test_every_public_name_imports(name: str) -> None:
+    module = importlib.import_module(name)
+    assert [public for public in getattr(module, "__all__", ()) if not hasattr(module, public)] == []
+
+
+def test_command_is_declared_and_exists() -> None:
+    (entry,) = metadata.entry_points(group="console_scripts", name="vkc-pin")
+    assert entry.value == "vkc_pin.cli:main"
+    assert callable(entry.load())
+
+
+def test_dependencies_are_ranges(project: dict[str, Any]) -> None:
+    for text in project["project"]["dependencies"]:
+        specifiers = Requirement(text).specifier
+        operators = {specifier.operator for specifier in specifiers}
+        assert operators == {">=", "<"}, text
+        assert metadata.version(Requirement(text).name) in specifiers, text
+
+
+def test_compiled_against_what_is_required(project: dict[str, Any]) -> None:
+    """The ranges to build against and to run with are the same, so that pip cannot choose releases that do not fit."""
+    build = {r.name: r.specifier for r in map(Requirement, project["build-system"]["requires"])}
+    run = {r.name: r.specifier for r in map(Requirement, project["project"]["dependencies"])}
+    assert build["libpinocchio"] == run["pin"]
+    assert build["casadi"] == run["casadi"]
+
+
+def test_package_is_typed_and_licensed() -> None:
+    assert (Path(vkc_pin.__file__).parent / "py.typed").is_file()
+    assert metadata.metadata("vkc-pin")["License-Expression"] == "BSD-2-Clause"
+
+
+def test_wheel_carries_robots_and_scenes(tmp_path: Path) -> None:
+    """Robots, scenes and `py.typed` are in the wheel (built without the compiled module: that takes a minute)."""
+    settings = {"cmake.define.VKC_PIN_BUILD_CPIN": "OFF"}
+    code = f"from scikit_build_core.build import build_wheel; build_wheel({str(tmp_path)!r}, {settings})"
+    done = subprocess.run([sys.executable, "-c", code], cwd=CHECKOUT, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    (wheel,) = tmp_path.glob("*.whl")
+    names = set(zipfile.ZipFile(wheel).namelist())
+    assert "vkc_pin/py.typed" in names
+    for kind in ("robots", "scenes"):
+        files = {p.relative_to(CHECKOUT) for p in (CHECKOUT / kind).rglob("*") if p.is_file() and "__pycache__" not in p.parts}
+        assert files
+        assert {f"vkc_pin/{path.as_posix()}" for path in files} <= names
+    assert not [name for name in names if name.startswith("tests/") or name.endswith(".cpp")]

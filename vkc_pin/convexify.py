@@ -94,20 +94,23 @@ def cut(mesh: trimesh.Trimesh, pieces: int, *, axis: ArrayLike, steps: int = 24)
 
 
 def solid_volume(meshes: Sequence[trimesh.Trimesh], *, pitch: float = 0.001) -> float:
-    """Return the volume [m³] of the solid whose skin `meshes` are: what is enclosed counts, gaps up to `pitch` are closed.
+    """Return the volume [m³] of the solid whose skin `meshes` are.
 
-    By counting cells of width `pitch`, those of the skin by half.
+    A maker's mesh is an open skin with loose screws: it has no volume of its own. So cells of width `pitch` are counted
+    that have skin on both sides along at least two of the three axes, and half of those that the skin itself fills.
     """
-    from scipy.ndimage import binary_fill_holes
-
     low = np.min([mesh.bounds[0] for mesh in meshes], axis=0) - 2.0 * pitch
     size = np.ceil((np.max([mesh.bounds[1] for mesh in meshes], axis=0) - low) / pitch).astype(int) + 3
     skin = np.zeros(size, bool)
     for mesh in meshes:
         points = mesh.subdivide_to_size(0.7 * pitch, max_iter=20).vertices
-        cells = np.floor((points - low) / pitch).astype(int)
-        skin[tuple(cells.T)] = True
-    inside = binary_fill_holes(skin) & ~skin
+        skin[tuple(np.floor((points - low) / pitch).astype(int).T)] = True
+    enclosed = np.zeros(size, int)
+    for axis in range(3):
+        before = np.logical_or.accumulate(skin, axis=axis)
+        after = np.flip(np.logical_or.accumulate(np.flip(skin, axis), axis=axis), axis)
+        enclosed += before & after
+    inside = (enclosed >= 2) & ~skin
     return float((inside.sum() + 0.5 * skin.sum()) * pitch**3)
 
 

@@ -1,11 +1,12 @@
 """Writes collision/*.stl from the visual geometry of husky_ur5e.urdf, and prints the table of README.md.
 
-Run it from anywhere: python robots/husky_ur5e/make_collision.py
+Run it from anywhere: python robots/husky_ur5e/make_collision.py [LINK ...]
 """
 
 from __future__ import annotations
 
 import importlib.util
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -28,14 +29,14 @@ PIECES = {
     "gripper_right_finger": (1, (0, 0, 1)),
     "gripper_left_finger": (1, (0, 0, 1)),
 }
-VERTICES = 36
+VERTICES = 40
 
 
 def main() -> None:
     """Write the files and print one row of the table per link."""
     file = read_urdf(FOLDER / "husky_ur5e.urdf", {"airo_models": airo_models()})
     print("| link | pieces | corners | solid [l] | pieces' volume [l] | overhead |\n| --- | --- | --- | --- | --- | --- |")
-    for link in ("base_link", *PIECES):
+    for link in sys.argv[1:] or ("base_link", *PIECES):
         meshes = visual_meshes(file, link)
         if link == "base_link":  # by construction: body, left wheels and panel, right wheels and panel
             sides = [0.0 if abs(mesh.centroid[1]) < 0.245 and mesh.extents[2] < 0.2 or k == 0 else mesh.centroid[1] for k, mesh in enumerate(meshes)]
@@ -45,6 +46,9 @@ def main() -> None:
             count, axis = PIECES[link]
             points = cut(trimesh.util.concatenate(meshes), count, axis=axis)
         pieces = [outer_hull(piece, vertices=VERTICES) for piece in points]
+        named = sum(f"package://husky_ur5e/collision/{link}_" in line for line in file.text.splitlines())
+        if named != len(pieces):
+            raise SystemExit(f"husky_ur5e.urdf names {named} pieces of {link}, not {len(pieces)}")
         for k, piece in enumerate(pieces):
             write_stl(piece, FOLDER / "collision" / f"{link}_{k}.stl")
         solid, union = solid_volume(meshes, pitch=0.004 if link == "base_link" else 0.001), solid_volume(pieces, pitch=0.002)

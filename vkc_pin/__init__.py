@@ -1,1 +1,52 @@
 """Whole-body planning for mobile manipulators on virtual kinematic chains."""
+
+from vkc_pin.articulation import ArticulatedObject, Attachment, Latch, invert, load_object
+from vkc_pin.chain import VirtualKinematicChain, consolidate
+from vkc_pin.errors import BuildError, InputError, UnknownNameError, VkcError
+from vkc_pin.options import Options
+from vkc_pin.plan import Plan
+from vkc_pin.planner import plan
+from vkc_pin.problem import TrajectoryProblem, build
+from vkc_pin.report import Report, Violation
+from vkc_pin.robot import Robot, load_robot
+from vkc_pin.scene import PlacedObject, Scene, load_scene
+from vkc_pin.solver import Iteration
+from vkc_pin.steps import Actuate, GoTo, Grasp, Reach
+from vkc_pin.trajectory import PhaseSpan, Trajectory
+from vkc_pin.validation import validate
+from vkc_pin.version import __version__
+
+__all__ = [
+    "Actuate",
+    "ArticulatedObject",
+    "Attachment",
+    "BuildError",
+    "GoTo",
+    "Grasp",
+    "InputError",
+    "Iteration",
+    "Latch",
+    "Options",
+    "PhaseSpan",
+    "PlacedObject",
+    "Plan",
+    "Reach",
+    "Report",
+    "Robot",
+    "Scene",
+    "Trajectory",
+    "TrajectoryProblem",
+    "UnknownNameError",
+    "Violation",
+    "VirtualKinematicChain",
+    "VkcError",
+    "__version__",
+    "build",
+    "consolidate",
+    "invert",
+    "load_object",
+    "load_robot",
+    "load_scene",
+    "plan",
+    "validate",
+]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 from xml.sax.saxutils import quoteattr
@@ -11,21 +12,25 @@ from xml.sax.saxutils import quoteattr
 import coal
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from vkc_pin.robot import Robot
 
+Pair = tuple[str, str]
+
 __all__ = ["sample_allowed_pairs", "write_srdf"]
 
 _SAMPLES = 20_000
-_NEAR = 0.01  # [m]: links that come this close in a sample are not "never" in collision
+_STARTS, _STEPS = 8, 250  # how often, and how far, a pair that never collided is driven together
 
 
 def sample_allowed_pairs(robot: Robot, *, samples: int = _SAMPLES, seed: int = 0) -> dict[tuple[str, str], str]:
     """Return the pairs of links that need not be kept apart, each sorted, with the reason.
 
-    "Adjacent": a joint connects them. "Always": they collide in every sample. "Never": they stay further apart than
-    10 mm in every sample. Samples are uniform within the joints' limits (±π without), the base standing still.
+    "Adjacent": a joint connects them. "Always": they collide in every sample. "Never": they collide in no sample, nor
+    when they are driven together from the samples in which they came closest. Samples are uniform within the joints'
+    limits (±π where there are none), the base standing still.
 
     Args:
         robot: The robot; its own collision pairs play no part.
@@ -33,9 +38,8 @@ def sample_allowed_pairs(robot: Robot, *, samples: int = _SAMPLES, seed: int = 0
         seed: Of the random numbers; the same seed gives the same pairs.
     """
     shapes = robot.collision.geometryObjects
-    adjacent = _adjacent(robot)
-    allowed = {}
-    groups: dict[tuple[str, str], list[tuple[int, int]]] = {}
+    adjacent, allowed = _adjacent(robot), {}
+    groups: dict[Pair, list[tuple[int, int]]] = {}
     for first, second in itertools.combinations(range(len(shapes)), 2):
         if shapes[first].parentJoint == shapes[second].parentJoint:
             continue
@@ -44,35 +48,27 @@ def sample_allowed_pairs(robot: Robot, *, samples: int = _SAMPLES, seed: int = 0
             allowed[one, other] = "Adjacent"
         else:
             groups.setdefault((one, other), []).append((first, second))
-    once_free: set[tuple[str, str]] = set()
-    once_near: set[tuple[str, str]] = set()
-    rng = np.random.default_rng(seed)
+    rng, distances = np.random.default_rng(seed), _Distances(robot)
     low, high = np.where(np.isfinite(robot.lower), robot.lower, -np.pi), np.where(np.isfinite(robot.upper), robot.upper, np.pi)
     low[:3] = high[:3] = 0.0
-    data, placed = robot.model.createData(), pin.GeometryData(robot.collision)
-    request, result = coal.DistanceRequest(), coal.DistanceResult()
-    solids = [shape.geometry for shape in shapes]
-    open_groups = list(groups)
+    free: set[Pair] = set()
+    hit: set[Pair] = set()
+    closest: dict[Pair, list[tuple[float, tuple[float, ...]]]] = {links: [] for links in groups}
+    undecided = list(groups)
     for z in rng.uniform(low, high, (samples, len(low))):
-        if not open_groups:
-            break
-        pin.updateGeometryPlacements(robot.model, data, robot.collision, placed, robot.coordinates.q(z))
-        places = [coal.Transform3s(place.rotation, place.translation) for place in placed.oMg]
-        for links in open_groups:
-            distance = np.inf
-            for first, second in groups[links]:
-                result.clear()
-                distance = min(distance, coal.distance(solids[first], places[first], solids[second], places[second], request, result))
-            if distance > 0.0:
-                once_free.add(links)
-            if distance <= _NEAR:
-                once_near.add(links)
-        open_groups = [links for links in open_groups if links not in once_free or links not in once_near]
-    for links in groups:
-        if links not in once_near:
-            allowed[links] = "Never"
-        elif links not in once_free:
+        distances.place(z)
+        for links in undecided:
+            best = closest[links]
+            distance = distances.between(groups[links], best[-1][0] if len(best) == _STARTS else np.inf)
+            (free if distance > 0.0 else hit).add(links)
+            if links not in hit and (len(best) < _STARTS or distance < best[-1][0]):
+                closest[links] = sorted([*best, (distance, tuple(z))])[:_STARTS]
+        undecided = [links for links in undecided if links not in free or links not in hit]
+    for links, parts in groups.items():
+        if links not in free:
             allowed[links] = "Always"
+        elif links not in hit and not any(_drive_together(distances, parts, np.array(z), low, high, rng) for _, z in closest[links]):
+            allowed[links] = "Never"
     return dict(sorted(allowed.items()))
 
 
@@ -91,8 +87,8 @@ def write_srdf(robot: Robot, path: str | Path, *, samples: int = _SAMPLES, seed:
     file = Path(path)
     lines = [
         '<?xml version="1.0"?>',
-        f"<!-- Written by `vkc-pin srdf`: {samples} samples, seed {seed}. Adjacent: a joint connects the links. Always, never:",
-        f"     in every sample they collide, or stay more than {1000 * _NEAR:g} mm apart. -->",
+        f"<!-- Written by `vkc-pin srdf`: {samples} samples, seed {seed}. Adjacent: a joint connects the links. Always: they",
+        "     collide in every sample. Never: in none, nor when driven together from those in which they came closest. -->",
         f"<robot name={quoteattr(robot.name)}>",
         '  <group name="arm">',
         *(f"    <joint name={quoteattr(name)}/>" for name in robot.coordinates.names[3:]),
@@ -116,6 +112,61 @@ def write_srdf(robot: Robot, path: str | Path, *, samples: int = _SAMPLES, seed:
     finally:
         draft.unlink(missing_ok=True)
     return file
+
+
+class _Distances:
+    """Distances between the shapes of a robot in one configuration."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot, self._data, self._placed = robot, robot.model.createData(), pin.GeometryData(robot.collision)
+        self._solids = [shape.geometry for shape in robot.collision.geometryObjects]
+        for solid in self._solids:
+            solid.computeLocalAABB()
+        self._radii = np.array([solid.aabb_radius for solid in self._solids])
+        self._middles = np.array([solid.aabb_center for solid in self._solids])
+        self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
+
+    def place(self, z: NDArray[np.float64]) -> None:
+        """Put the robot at coordinates `z`, shape (n,)."""
+        robot = self._robot
+        pin.updateGeometryPlacements(robot.model, self._data, robot.collision, self._placed, robot.coordinates.q(z))
+        self._places = [coal.Transform3s(place.rotation, place.translation) for place in self._placed.oMg]
+        self._centres = np.array([place.act(middle) for place, middle in zip(self._placed.oMg, self._middles, strict=True)])
+
+    def between(self, parts: Iterable[tuple[int, int]], worth: float = np.inf) -> float:
+        """Return the smallest distance [m] of pairs of shapes; a lower bound of it where it is larger than `worth`."""
+        smallest = np.inf
+        for first, second in parts:
+            bound = np.linalg.norm(self._centres[first] - self._centres[second]) - self._radii[first] - self._radii[second]
+            if bound < min(smallest, worth) or bound <= 0.0:
+                self._result.clear()
+                bound = coal.distance(
+                    self._solids[first], self._places[first], self._solids[second], self._places[second], self._request, self._result
+                )
+            smallest = min(smallest, float(bound))
+        return smallest
+
+
+def _drive_together(
+    distances: _Distances,
+    parts: list[tuple[int, int]],
+    z: NDArray[np.float64],
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+    rng: np.random.Generator,
+) -> bool:
+    """Return whether random steps from `z` that lessen the distance end in a collision."""
+    distances.place(z)
+    nearest = distances.between(parts)
+    for width in np.geomspace(0.2, 0.002, _STEPS):
+        trial = np.clip(z + width * (high - low) / 6.0 * rng.standard_normal(len(z)), low, high)
+        distances.place(trial)
+        distance = distances.between(parts)
+        if distance < nearest:
+            z, nearest = trial, distance
+        if nearest <= 0.0:
+            return True
+    return False
 
 
 def _adjacent(robot: Robot) -> set[tuple[str, str]]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -14,6 +16,9 @@ from vkc_pin.assembly import clean, graft, graft_geometry
 from vkc_pin.coordinates import Coordinates
 from vkc_pin.robot import Robot
 from vkc_pin.scene import PlacedObject, Scene
+
+if TYPE_CHECKING:
+    import casadi
 
 __all__ = ["Closure", "VirtualKinematicChain", "consolidate"]
 
@@ -71,6 +76,31 @@ class VirtualKinematicChain:
     def size(self) -> int:
         """Number of coordinates n."""
         return len(self.names)
+
+    def joint_placements(self, z: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return rotations, shape (W, J, 3, 3), and translations, shape (W, J, 3) [m], of all joints in the world.
+
+        Args:
+            z: Configurations, shape (W, n). Joint 0, the world, is among the J.
+        """
+        batch, joints = len(z), self.model.njoints
+        columns = np.asarray(self.kinematics.map(batch)(z.T)).reshape(12, batch, joints - 1).transpose(1, 2, 0)
+        rotations, translations = np.zeros((batch, joints, 3, 3)), np.zeros((batch, joints, 3))
+        rotations[:, 0] = np.eye(3)
+        rotations[:, 1:] = columns[..., :9].reshape(batch, joints - 1, 3, 3).swapaxes(2, 3)
+        translations[:, 1:] = columns[..., 9:]
+        return rotations, translations
+
+    @cached_property
+    def kinematics(self) -> casadi.Function:
+        """The CasADi function z → (12, J − 1), dense: by columns R and t of every joint's placement in the world."""
+        import casadi
+
+        from vkc_pin import cpin
+
+        z = casadi.SX.sym("z", self.size)
+        placements = cpin.joint_placements(self.model)(self.coordinates.q_symbolic(z))
+        return casadi.Function("placements", [z], [casadi.densify(placements)], {"cse": True})
 
     def index(self, name: str) -> int:
         """Return the position of coordinate `name` in z."""

@@ -18,7 +18,7 @@ from vkc_pin.chain import VirtualKinematicChain
 from vkc_pin.errors import InputError
 from vkc_pin.goal import Phase, Task
 from vkc_pin.options import Options
-from vkc_pin.scene import Scene, standing_geometry
+from vkc_pin.scene import FLOOR, Scene, standing_geometry
 
 __all__ = ["ContactModel", "Contacts"]
 
@@ -62,6 +62,9 @@ class PhaseGeometry:
         labels: Per geometry, its link or obstacle, e.g. "wrist_3_link", "door.panel", "sofa".
         pairs: Shape (P, 2).
         margins: Clearance each pair must keep, shape (P,) [m].
+        joint: Parent joint per geometry, shape (G,).
+        center, half: Bounding box per geometry, in the geometry's own frame: centre and half extents, shape (G, 3) [m].
+        rotation, translation: Placement of each geometry in its joint's frame, shapes (G, 3, 3) and (G, 3).
     """
 
     geometry: pin.GeometryModel
@@ -69,6 +72,34 @@ class PhaseGeometry:
     labels: tuple[str, ...]
     pairs: NDArray[np.int_]
     margins: NDArray[np.float64]
+    joint: NDArray[np.int_]
+    center: NDArray[np.float64]
+    half: NDArray[np.float64]
+    rotation: NDArray[np.float64]
+    translation: NDArray[np.float64]
+
+    def lower_bounds(self, rotations: NDArray[np.float64], translations: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return numbers that every pair's distance cannot fall below, shape (W, P) [m].
+
+        The first of a pair is a ball; so is the second, or its bounding box if it stands in the world.
+
+        Args:
+            rotations, translations: Placements of all joints in the world, shapes (W, J, 3, 3) and (W, J, 3).
+        """
+        local = np.einsum("gij,gj->gi", self.rotation, self.center) + self.translation
+        centers = np.einsum("wgij,gj->wgi", rotations[:, self.joint], local) + translations[:, self.joint]
+        radius = np.linalg.norm(self.half, axis=1)
+        first, second = self.pairs.T
+        bounds = np.empty((len(rotations), len(self.pairs)))
+        still = self.joint[second] == 0
+        a, b = first[~still], second[~still]
+        bounds[:, ~still] = np.linalg.norm(centers[:, a] - centers[:, b], axis=2) - radius[a] - radius[b]
+        for j in np.unique(second[still]):
+            of = np.flatnonzero(still & (second == j))
+            inside = (centers[:, first[of]] - centers[:1, j]) @ self.rotation[j]
+            outside = np.maximum(np.abs(inside) - self.half[j], 0.0)
+            bounds[:, of] = np.sqrt(np.einsum("wki,wki->wk", outside, outside)) - radius[first[of]]
+        return bounds
 
 
 class ContactModel:
@@ -83,6 +114,9 @@ class ContactModel:
         self.scene, self.chain, self.options = scene, chain, options
         self.data = chain.model.createData()
         self.phases = [self._phase(phase) for phase in task.phases]
+        # Beyond the chain's own geometries everything stands in the world.
+        own = [shape.parentJoint for shape in chain.collision.geometryObjects]
+        self._joints = np.array(own + [0] * (max(len(part.labels) for part in self.phases) - len(own)))
         self.first_waypoint = np.concatenate([[0], np.cumsum([phase.segments for phase in task.phases])])
 
     def _phase(self, phase: Phase) -> PhaseGeometry:
@@ -109,11 +143,12 @@ class ContactModel:
                 originals = placed.object.collision.geometryObjects
                 standing = [g for g, original in zip(standing, originals, strict=True) if original.parentJoint == 0]
             own = chain.held_geometries[name] if name in phase.held else ()
-            target = placed.object.attachments[phase.grasps[name]].link if name in phase.grasps else None
+            hands = {**phase.leaves, **phase.grasps}
+            targets = {placed.object.attachments[hands[name]].link} if name in hands else set()
             for j in graft_geometry(geometry, standing, joints=[0], placement=pin.SE3.Identity(), prefix=f"{name}."):
                 link = _link(geometry.geometryObjects[j])
                 labels.append(f"{name}.{link}")
-                near = touching if link == target else set()
+                near = touching if link in targets else set()
                 pairs += [(i, j, self.options.grasp_clearance if i in near else margin) for i in moving if i not in own]
         for obstacle, label in zip(scene.obstacles.geometryObjects, scene.obstacle_labels, strict=True):
             (j,) = graft_geometry(geometry, [obstacle], joints=[0], placement=pin.SE3.Identity())
@@ -127,37 +162,59 @@ class ContactModel:
             geometry.addCollisionPair(pin.CollisionPair(first, second))
         if len(geometry.collisionPairs) != len(pairs):
             raise InputError("collision pairs were lost", field=phase.name, expected=len(pairs), got=len(geometry.collisionPairs))
-        table, margins = np.array([p[:2] for p in pairs]), np.array([p[2] for p in pairs])
-        return PhaseGeometry(geometry, pin.GeometryData(geometry), tuple(labels), table, margins)
+        shapes = geometry.geometryObjects
+        boxes = [_box(shape) for shape in shapes]
+        return PhaseGeometry(
+            geometry,
+            pin.GeometryData(geometry),
+            tuple(labels),
+            pairs=np.array([p[:2] for p in pairs]),
+            margins=np.array([p[2] for p in pairs]),
+            joint=np.array([shape.parentJoint for shape in shapes]),
+            center=np.array([center for center, _ in boxes]),
+            half=np.array([half for _, half in boxes]),
+            rotation=np.array([shape.placement.rotation for shape in shapes]),
+            translation=np.array([shape.placement.translation for shape in shapes]),
+        )
 
     def phase_of(self, waypoint: int) -> int:
         """Return the phase whose geometry holds at `waypoint`: at a boundary the earlier, before the grasp."""
         return max(0, int(np.searchsorted(self.first_waypoint, waypoint)) - 1)
 
-    def evaluate(self, z: NDArray[np.float64], waypoints: NDArray[np.int_], *, reach: float) -> Contacts:
-        """Return all pairs closer than `reach` [m].
+    def evaluate(
+        self, z: NDArray[np.float64], waypoints: NDArray[np.int_], *, reach: float, nearest: int | None = None
+    ) -> Contacts:
+        """Return the pairs closer than `reach` [m].
 
         Args:
             z: Configurations, shape (W, n).
             waypoints: For each, the waypoint whose phase it belongs to, shape (W,).
             reach: Pairs further apart are left out.
+            nearest: How many of them to return per configuration, those that fall shortest of their margins; None: all.
         """
         q = self.chain.coordinates.q(z)
-        rows: list[tuple[int, int, int, float, float]] = []
+        rotations, translations = self.chain.joint_placements(z)
+        rows: list[tuple[float, ...]] = []
         vectors: list[tuple[NDArray[np.float64], ...]] = []
-        for row, waypoint in enumerate(waypoints):
-            part = self.phases[self.phase_of(int(waypoint))]
-            pin.updateGeometryPlacements(self.chain.model, self.data, part.geometry, part.data, q[row])
-            pin.computeDistances(part.geometry, part.data)
-            results = part.data.distanceResults
-            near = [(r.min_distance, k) for k, r in enumerate(results) if r.min_distance < reach]
-            near.sort(key=lambda item: item[0] - part.margins[item[1]])
-            for distance, k in near:
-                r = results[k]
-                rows.append((row, part.pairs[k, 0], part.pairs[k, 1], distance, part.margins[k]))
-                vectors.append((r.normal, r.getNearestPoint1(), r.getNearestPoint2()))
+        phase_of = np.array([self.phase_of(int(w)) for w in waypoints])
+        for number in np.unique(phase_of):
+            part, inside = self.phases[number], np.flatnonzero(phase_of == number)
+            close = part.lower_bounds(rotations[inside], translations[inside]) < reach
+            for row, near in zip(inside, close, strict=True):
+                pin.updateGeometryPlacements(self.chain.model, self.data, part.geometry, part.data, q[row])
+                found = []
+                for k in np.flatnonzero(near).tolist():
+                    distance = pin.computeDistance(part.geometry, part.data, k).min_distance
+                    if distance < reach:
+                        found.append((distance - part.margins[k], distance, k))
+                found.sort()
+                for _, distance, k in found[:nearest]:
+                    result = part.data.distanceResults[k]
+                    vectors.append((result.normal, result.getNearestPoint1(), result.getNearestPoint2()))
+                    rows.append((row, *part.pairs[k], distance, part.margins[k]))
         table = np.array(rows, float).reshape(len(rows), 5)
-        stacked = np.array(vectors, float).reshape(len(rows), 3, 3)
+        order = np.argsort(table[:, 0], kind="stable")
+        table, stacked = table[order], np.array(vectors, float).reshape(len(rows), 3, 3)[order]
         index = table[:, :3].astype(int)
         return Contacts(index[:, 0], index[:, 1:], table[:, 3], table[:, 4], stacked[:, 0], stacked[:, 1], stacked[:, 2])
 
@@ -167,35 +224,31 @@ class ContactModel:
         C·vec(M(z)) − R ≥ 0 says that a contact keeps its margin; M are the placements of all joints (see `cpin`). Slots
         that nothing needs have C = 0, R = −1.
         """
-        model = self.chain.model
-        coefficients = np.zeros((len(z), slots, 12 * (model.njoints - 1)))
+        joints = self.chain.model.njoints - 1
+        coefficients = np.zeros((len(z), slots, joints, 4, 3))  # per joint the columns of R, then t
         offsets = np.full((len(z), slots), -1.0)
         order = np.arange(len(contacts.waypoint)) - np.searchsorted(contacts.waypoint, contacts.waypoint)
         keep = np.flatnonzero(order < slots)
-        q, placed = self.chain.coordinates.q(z), -1
-        for c in keep:
-            row, slot = contacts.waypoint[c], order[c]
-            if row != placed:
-                pin.forwardKinematics(model, self.data, q[row])
-                placed = row
-            normal, offset = contacts.normal[c], contacts.margin[c]
-            for index, point, sign in zip(contacts.pair[c], (contacts.first[c], contacts.second[c]), (-1.0, 1.0), strict=True):
-                joint = self._joint(index)
-                if joint == 0:
-                    offset -= sign * normal @ point
-                else:
-                    local = self.data.oMi[joint].actInv(point)
-                    coefficients[row, slot, 12 * (joint - 1) : 12 * joint] += sign * np.concatenate([np.kron(local, normal), normal])
-            offsets[row, slot] = offset
-        return coefficients, offsets
-
-    def _joint(self, index: int) -> int:
-        """Return the joint of geometry `index`; beyond the chain's own geometries everything stands in the world."""
-        own = self.chain.collision.geometryObjects
-        return int(own[int(index)].parentJoint) if index < len(own) else 0
+        row, slot, normal = contacts.waypoint[keep], order[keep], contacts.normal[keep]
+        offset = contacts.margin[keep].copy()
+        rotations, translations = self.chain.joint_placements(z)
+        for column, points, sign in ((0, contacts.first[keep], -1.0), (1, contacts.second[keep], 1.0)):
+            joint = self._joints[contacts.pair[keep, column]]
+            still = joint == 0
+            offset[still] -= sign * np.einsum("ci,ci->c", normal[still], points[still])
+            r, s, j, n = row[~still], slot[~still], joint[~still], normal[~still]
+            local = np.einsum("cij,ci->cj", rotations[r, j], points[~still] - translations[r, j])
+            coefficients[r, s, j - 1, :3] += sign * local[:, :, None] * n[:, None, :]
+            coefficients[r, s, j - 1, 3] += sign * n
+        offsets[row, slot] = offset
+        return coefficients.reshape(len(z), slots, 12 * joints), offsets
 
 
-FLOOR = "floor"
+def _box(shape: pin.GeometryObject) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return centre and half extents of a shape's bounding box in its own frame."""
+    shape.geometry.computeLocalAABB()
+    box = shape.geometry.aabb_local
+    return np.asarray(box.center(), float), np.array([box.width(), box.height(), box.depth()]) / 2
 
 
 def _link(geometry: pin.GeometryObject) -> str:

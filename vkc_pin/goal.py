@@ -40,6 +40,7 @@ class Phase:
         frames: Frame goals at the last waypoint.
         base: (x, y, yaw or None) at the last waypoint, in the world.
         grasps: Objects (→ attachment) that are grasped at the last waypoint.
+        leaves: Objects (→ attachment) that were let go of just before.
         before: Object coordinate → value at the first waypoint, for all objects that this task grasps.
     """
 
@@ -51,6 +52,7 @@ class Phase:
     frames: tuple[FrameGoal, ...] = ()
     base: tuple[float, float, float | None] | None = None
     grasps: Mapping[str, str] = field(default_factory=dict)
+    leaves: Mapping[str, str] = field(default_factory=dict)
     before: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -123,7 +125,9 @@ class _Compiler:
             self.state.setdefault(f"{name}.{joint}", float(value))
 
     def _append(self, name: str, segments: int, **details: Any) -> None:
-        self.phases.append(Phase(name, segments, held=dict(self.held), before=dict(self.state), **details))
+        before = self.phases[-1].held if self.phases else self.scene.held
+        leaves = {key: value for key, value in before.items() if key not in self.held}
+        self.phases.append(Phase(name, segments, held=dict(self.held), leaves=leaves, before=dict(self.state), **details))
         self.state.update(details.get("values", {}))
 
     def grasp(self, name: str, attachment_name: str | None, where: str) -> str:

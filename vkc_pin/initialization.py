@@ -94,8 +94,7 @@ class _Interpolation:
         return next((k for k, pose in enumerate(poses) if waypoint in pose.waypoints), None)
 
     def _solver(self, pose: int) -> tuple[PoseSolver, pin.SE3]:
-        row = self.problem.transcription.structure.poses[pose]
-        return PoseSolver.of(self.chain.model, row.joint, row.local), self.problem.targets[pose]
+        return self.problem.transcription.pose_solvers[pose], self.problem.targets[pose]
 
     def _knot(self, before: NDArray[np.float64], waypoint: int, *, fresh: bool) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return configurations for a waypoint, shape (B, n), and what is wrong with each, as a cost."""
@@ -136,7 +135,8 @@ class _Interpolation:
         if not name.startswith("closure "):
             return np.array(self.problem.targets[pose].translation)
         placed = self.problem.scene.objects[name.removeprefix("closure ")]
-        return placed.attachment_placement(self.problem.task.grasps[placed.name]).translation
+        attachment = placed.object.attachments[self.problem.task.grasps[placed.name]]
+        return np.array((placed.link_placement(attachment.link) * attachment.placement).translation)
 
     def _unwind(
         self, z: NDArray[np.float64], before: NDArray[np.float64], lower: NDArray[np.float64], upper: NDArray[np.float64]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from vkc_pin import cpin
 from vkc_pin.coordinates import Coordinates
-from vkc_pin.transcription import pose_residual, target_vector
+from vkc_pin.pose import pose_residual, target_vector
 
 __all__ = ["PoseSolver"]
 
@@ -33,18 +33,6 @@ class PoseSolver:
         jacobian = ca.densify(ca.jacobian(residual, z))
         self._function = ca.Function("pose", [z, target], [ca.densify(residual), jacobian], {"cse": True})
         self._mapped = lru_cache(maxsize=8)(self._function.map)
-
-    @staticmethod
-    @lru_cache(maxsize=64)
-    def _cached(key: str, joint: int, local: bytes) -> PoseSolver:
-        model = pin.Model()
-        model.loadFromString(key)
-        return PoseSolver(model, joint, pin.SE3(np.frombuffer(local).reshape(4, 4)))
-
-    @classmethod
-    def of(cls, model: pin.Model, joint: int, local: pin.SE3) -> PoseSolver:
-        """Return the solver for this frame, built once per model."""
-        return cls._cached(model.saveToString(), joint, local.homogeneous.tobytes())
 
     def evaluate(self, z: NDArray[np.float64], target: pin.SE3) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return residuals, shape (B, 6) ([m], [rad]), and their Jacobians, shape (B, 6, n), at `z`, shape (B, n)."""

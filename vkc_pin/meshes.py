@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["MeshPart", "convex_hull", "load_convex", "load_mesh", "load_parts", "to_bvh"]
 
+_NEIGHBOURS = 255  # coal's corners have no more
 _TOLERANCE = 1e-6  # how far, relatively, coal's volume and area may be from trimesh's
 
 
@@ -109,6 +110,10 @@ def convex_hull(points: ArrayLike) -> coal.Convex:
         hull = trimesh.convex.convex_hull(np.asarray(points, float))
     except (QhullError, ValueError, IndexError) as error:
         raise InputError("the mesh has no convex hull: it is flat", expected="points that span a volume") from error
+    if np.bincount(np.asarray(hull.faces).ravel()).max() > _NEIGHBOURS:  # the tip of a finely meshed cone, a fine disc
+        from vkc_pin.convexify import outer_hull
+
+        hull = outer_hull(hull.vertices, vertices=_NEIGHBOURS // 2)
     shape = coal.Convex(_points(hull.vertices), _triangles(hull.faces))
     corners = np.asarray(shape.points())[_indices(shape)]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2.0

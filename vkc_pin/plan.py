@@ -19,7 +19,7 @@ from vkc_pin.options import Options
 from vkc_pin.scene import Scene
 from vkc_pin.steps import Step, step_from_dict, step_to_dict
 from vkc_pin.trajectory import Trajectory
-from vkc_pin.validation import Report
+from vkc_pin.report import Report
 
 if TYPE_CHECKING:
     import meshcat

@@ -17,7 +17,8 @@ from vkc_pin.goal import Task, compile_task
 from vkc_pin.options import Options
 from vkc_pin.scene import Scene
 from vkc_pin.steps import Step
-from vkc_pin.transcription import PoseRow, Structure, Transcription, target_vector
+from vkc_pin.pose import target_vector
+from vkc_pin.transcription import PoseRow, Structure, Transcription
 
 __all__ = ["ConstraintRow", "TrajectoryProblem", "build"]
 
@@ -42,16 +43,16 @@ class ConstraintRow:
     unit: str
 
 
-def transcribe(structure: Structure) -> tuple[Transcription, float]:
-    """Return the program of `structure`, and the seconds it took to build (0 if it was there already)."""
+def transcribe(structure: Structure) -> Transcription:
+    """Return the program of `structure`, built if it is not there already."""
     key = structure.key
     if key in _transcriptions:
         _transcriptions.move_to_end(key)
-        return _transcriptions[key], 0.0
-    transcription = _transcriptions[key] = Transcription(structure)
-    while len(_transcriptions) > _KEPT:
-        _transcriptions.popitem(last=False)
-    return transcription, transcription.build_time
+    else:
+        _transcriptions[key] = Transcription(structure)
+        while len(_transcriptions) > _KEPT:
+            _transcriptions.popitem(last=False)
+    return _transcriptions[key]
 
 
 class TrajectoryProblem:
@@ -62,7 +63,6 @@ class TrajectoryProblem:
         chain: The virtual kinematic chain, n coordinates.
         contacts: What can collide with what.
         transcription: The symbolic program, shared between problems of one structure.
-        build_time: Seconds spent on building symbols for this problem.
         start: z_0, shape (n,).
         lower, upper: Bounds of z_1..z_N, shape (N, n): joint limits (eq. 4), what stands still, joint goals.
         targets: Placements of the pose rows (eqs. 2 and 3), one per `transcription.structure.poses`.
@@ -76,7 +76,7 @@ class TrajectoryProblem:
         self.contacts = ContactModel(scene, self.chain, task, options)
         self.ends = np.cumsum([phase.segments for phase in task.phases])
         poses, self.targets, self.pose_names = self._poses()
-        self.transcription, self.build_time = transcribe(self._structure(poses))
+        self.transcription = transcribe(self._structure(poses))
         self.start = self._start()
         self.lower, self.upper = self._bounds()
         self.velocity, self.acceleration = self.chain.velocity * options.dt, self.chain.acceleration * options.dt**2
@@ -157,9 +157,9 @@ class TrajectoryProblem:
         """Return `z` with every coordinate within its bounds."""
         return np.clip(z, self.lower, self.upper)
 
-    def evaluate_contacts(self, z: NDArray[np.float64], *, reach: float) -> Contacts:
-        """Return the pairs closer than `reach` [m] at z_1..z_N, shape (N, n)."""
-        return self.contacts.evaluate(z, np.arange(1, self.segments + 1), reach=reach)
+    def evaluate_contacts(self, z: NDArray[np.float64], *, reach: float, nearest: int | None = None) -> Contacts:
+        """Return the pairs closer than `reach` [m] at z_1..z_N, shape (N, n); at most `nearest` a waypoint."""
+        return self.contacts.evaluate(z, np.arange(1, self.segments + 1), reach=reach, nearest=nearest)
 
     def rates(self, z: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the steps δz, shape (N, n), and their differences δδz, shape (N + 1 + rests, n); see `Transcription`."""

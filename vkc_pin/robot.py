@@ -27,8 +27,10 @@ __all__ = ["Robot", "add_pairs", "load_robot"]
 
 Base = Literal["omni", "differential", "fixed"]
 _BASES = ("omni", "differential", "fixed")
+_PAIRS = ("srdf", "sampled", "all")
 _VELOCITY, _ACCELERATION = np.pi, 1.4  # of joints for which no file names one, [rad/s] and [rad/s²], or [m/s] and [m/s²]
 _DETAIL = 0.0015  # of displayed meshes, [m]
+_SAMPLES = 2000  # to find allowed pairs when a robot without an SRDF is loaded
 _GREY = (0.6, 0.6, 0.62, 1.0)
 
 
@@ -85,6 +87,11 @@ class Robot:
         """The links that have collision geometry, each once."""
         return tuple(dict.fromkeys(_link(shape.name) for shape in self.collision.geometryObjects))
 
+    @property
+    def base_links(self) -> tuple[str, ...]:
+        """The links with collision geometry that drive along with the base: they stand on the floor."""
+        return tuple(dict.fromkeys(_link(shape.name) for shape in self.collision.geometryObjects if shape.parentJoint == 1))
+
     def rest(self) -> NDArray[np.float64]:
         """Return the coordinates, shape (n,), of the arm at home and the base at the origin."""
         return np.concatenate([np.zeros(3), self.home])
@@ -98,7 +105,7 @@ def load_robot(
     locked_joints: Mapping[str, float] | None = None,
     home: Mapping[str, float] | None = None,
     srdf: str | Path | None = None,
-    ignore_srdf: bool = False,
+    pairs: Literal["srdf", "sampled", "all"] = "srdf",
     packages: Mapping[str, str | Path] | None = None,
 ) -> Robot:
     """Load a robot and put it on a planar virtual base.
@@ -120,8 +127,8 @@ def load_robot(
         home: Where joints rest, [m] or [rad]; by default what robot.yaml says, else a group state of the SRDF that
             covers all planned joints (one called home if there is one), else 0, or the middle if 0 is outside the limits.
         srdf: File of allowed collisions; by default the one robot.yaml names, or the one beside the URDF.
-        ignore_srdf: Make every pair of links that move against each other a collision pair, to look at the geometry
-            itself or to write a new SRDF.
+        pairs: Where the allowed pairs come from: "srdf"; "sampled" whether there is an SRDF or not; "all" makes every pair
+            of links that move against each other a collision pair, even adjacent ones, to look at the geometry itself.
         packages: Folders for `package://` addresses; others are looked for around the file.
 
     Raises:
@@ -130,6 +137,8 @@ def load_robot(
     """
     if base not in _BASES:
         raise InputError("wrong kind of base", field="base", expected=" or ".join(_BASES), got=base)
+    if pairs not in _PAIRS:
+        raise InputError("wrong source of pairs", field="pairs", expected=" or ".join(_PAIRS), got=pairs)
     source = find_robot(str(name))
     document = Document({})
     settings = RobotSchema(urdf=source.name)
@@ -142,12 +151,12 @@ def load_robot(
     folders = {**python_packages(tuple(p for p in settings.packages if p not in folders), document), **folders}
     file = read_urdf(source.parent / settings.urdf, folders)
     srdf_file = Path(srdf) if srdf is not None else _srdf_beside(file, settings, source)
-    semantics = read_srdf(srdf_file, links=file.links) if srdf_file is not None and not ignore_srdf else None
+    semantics = read_srdf(srdf_file, links=file.links) if srdf_file is not None and pairs == "srdf" else None
 
     full = full_model(file)
     tool = tool_frame if tool_frame is not None else settings.tool_frame or default_tool_frame(full, file)
-    if not full.existFrame(tool):
-        raise UnknownNameError("frame", tool, [frame.name for frame in full.frames], file=file.path, field="tool_frame")
+    if tool not in (frames := dict.fromkeys(frame.name for frame in full.frames)):
+        raise UnknownNameError("frame", tool, frames, file=file.path, field="tool_frame")
     locked = {**settings.locked_joints, **(locked_joints or {})}
     given = {**settings.home, **(home or {}), **locked}
     rest = rest_positions(full, file, given)
@@ -178,7 +187,7 @@ def load_robot(
         touch_links=settings.touch_links,
         file=file,
     )
-    add_pairs(robot, () if ignore_srdf else None if semantics is None else semantics.allowed)
+    add_pairs(robot, () if pairs == "all" else None if semantics is None else semantics.allowed)
     return robot
 
 
@@ -195,7 +204,7 @@ def add_pairs(robot: Robot, allowed: Collection[tuple[str, str]] | None) -> None
     if allowed is None:
         from vkc_pin.allowed_collisions import sample_allowed_pairs
 
-        allowed = sample_allowed_pairs(robot)
+        allowed = sample_allowed_pairs(robot, samples=_SAMPLES)
     robot.collision.removeAllCollisionPairs()
     shapes = robot.collision.geometryObjects
     for first, second in itertools.combinations(range(len(shapes)), 2):

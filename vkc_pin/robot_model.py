@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 import pinocchio as pin
@@ -16,7 +16,8 @@ from vkc_pin.robot_files import RobotFile
 __all__ = ["default_tool_frame", "full_model", "planned_model", "rest_positions"]
 
 ROOT = "base"  # the name of the planar joint
-_FINGER = 4  # joints in the longest finger
+_FINGER = 7  # joints in the longest finger of a hand
+_ARM = 4  # joints, at least, that carry a hand
 
 
 def full_model(file: RobotFile) -> pin.Model:
@@ -54,14 +55,7 @@ def planned_model(full: pin.Model, file: RobotFile, tool_frame: str, rest: Mappi
         raise InputError(
             "no joint moves this frame", file=file.path, field="tool_frame", expected="a frame at the end of an arm", got=tool_frame
         )
-    model = pin.buildReducedModel(
-        full, [j for j in range(2, full.njoints) if j not in planned], configuration(full, {**rest, **locked})
-    )
-    for j in range(1, model.njoints):
-        model.jointPlacements[j] = clean(model.jointPlacements[j])
-    for frame in model.frames:
-        frame.placement = clean(frame.placement)
-    return model
+    return _reduced(full, {1, *planned}, configuration(full, {**rest, **locked}))
 
 
 def rest_positions(full: pin.Model, file: RobotFile, given: Mapping[str, float]) -> dict[str, float]:
@@ -104,10 +98,47 @@ def default_tool_frame(full: pin.Model, file: RobotFile) -> str:
     joint, above = 1, 0
     while children[joint]:
         hand = len(children[joint]) > 1 and depth[joint] <= _FINGER
-        if hand and above >= _FINGER:
+        if hand and above >= _ARM:
             break
         joint, above = max(children[joint], key=lambda j: depth[j] + (full.joints[j].nv == 1)), above + 1
     return str([frame.name for frame in full.frames if frame.parentJoint == joint and frame.name != full.names[joint]][-1])
+
+
+def _reduced(full: pin.Model, planned: Collection[int], q: NDArray[np.float64]) -> pin.Model:
+    """Return `full` with the joints that are not `planned` locked at `q`.
+
+    `pinocchio.buildReducedModel` refuses models in which a link is called like a joint, as many are. Here, the frame of
+    such a joint is left out, so that every frame's name is the only one.
+    """
+    data = full.createData()
+    pin.forwardKinematics(full, data, q)
+    model = pin.Model()
+    model.name = full.name
+    placed = {0: (0, pin.SE3.Identity())}
+    for j in range(1, full.njoints):
+        joint, (parent, placement) = full.joints[j], placed[full.parents[j]]
+        if j in planned:
+            i, v = slice(joint.idx_q, joint.idx_q + joint.nq), slice(joint.idx_v, joint.idx_v + joint.nv)
+            index = model.addJoint(
+                parent,
+                joint,
+                clean(placement * full.jointPlacements[j]),
+                full.names[j],
+                full.effortLimit[v],
+                full.velocityLimit[v],
+                full.lowerPositionLimit[i],
+                full.upperPositionLimit[i],
+            )
+            placed[j] = (index, pin.SE3.Identity())
+        else:
+            placed[j] = (parent, placement * data.liMi[j])
+        model.appendBodyToJoint(placed[j][0], full.inertias[j], placed[j][1])
+    links = {frame.name for frame in full.frames if frame.type == pin.FrameType.BODY}
+    for frame in full.frames[1:]:
+        if frame.type == pin.FrameType.BODY or frame.name not in links:
+            parent, placement = placed[frame.parentJoint]
+            model.addFrame(pin.Frame(frame.name, parent, 0, clean(placement * frame.placement), frame.type))
+    return model
 
 
 def _way(model: pin.Model, joint: int) -> list[int]:
@@ -120,7 +151,9 @@ def _way(model: pin.Model, joint: int) -> list[int]:
 
 
 def _frame(model: pin.Model, name: str) -> int:
-    return next(i for i, frame in enumerate(model.frames) if frame.name == name)
+    """Return the frame called `name`, that of a link before that of a joint."""
+    found = [i for i, frame in enumerate(model.frames) if frame.name == name]
+    return next((i for i in found if model.frames[i].type == pin.FrameType.BODY), found[0])
 
 
 def _mimics(root: ElementTree.Element) -> dict[str, tuple[str, float, float]]:

@@ -107,7 +107,7 @@ class _Loop:
 
     def contacts(self, z: NDArray[np.float64]) -> Contacts:
         begin = time.perf_counter()
-        found = self.problem.evaluate_contacts(z, reach=self.options.contact_reach)
+        found = self.problem.evaluate_contacts(z, reach=self.options.contact_reach, nearest=self.options.contact_slots)
         self.solution.timings["coal"] += time.perf_counter() - begin
         return found
 

@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 
 from vkc_pin import cpin
 from vkc_pin.coordinates import Coordinates
+from vkc_pin.inverse_kinematics import PoseSolver
+from vkc_pin.pose import pose_residual
 
 __all__ = ["PoseRow", "Structure", "Transcription"]
 
@@ -71,22 +73,6 @@ class Structure:
         poses = tuple((p.joint, p.local.homogeneous.round(12).tobytes(), p.waypoints) for p in self.poses)
         weights = (self.weights_velocity.tobytes(), self.weights_acceleration.tobytes())
         return (self.model.saveToString(), self.segments, poses, self.slots, *weights, self.rests, self.differential)
-
-
-def pose_residual(rotation: Any, translation: Any, target: Any) -> Any:
-    """Return (p − p*, 2 sin(θ/2)·a), shape (6, 1), of a placement to `target` = (R* by columns, p*), shape (12, 1).
-
-    θ and a are angle and axis of R*ᵀR. Unlike ½ vee(E − Eᵀ), which vanishes at θ = π too, this grows up to π.
-    """
-    error = ca.reshape(target[:9], 3, 3).T @ rotation
-    vee = ca.vertcat(error[2, 1] - error[1, 2], error[0, 2] - error[2, 0], error[1, 0] - error[0, 1])
-    trace = error[0, 0] + error[1, 1] + error[2, 2]
-    return ca.vertcat(translation - target[9:], vee / ca.sqrt(1.0 + trace + 1e-9))
-
-
-def target_vector(placement: pin.SE3) -> NDArray[np.float64]:
-    """Return `placement` as the 12 numbers `pose_residual` takes."""
-    return np.concatenate([placement.rotation.T.ravel(), placement.translation])
 
 
 class _Kind:
@@ -141,8 +127,9 @@ class Transcription:
         slot_rows: Rows of the witness planes, shape (N, K).
         pose_rows: For each pose, waypoint → its rows, shape (6,).
         base_rows: Rows that keep a differential base from slipping, shape (N,); empty for others.
+        pose_solvers: Inverse kinematics of each pose.
         rate_matrix, rate_start: Velocities and accelerations per step are rate_matrix·x + rate_start·z_0.
-        build_time: Seconds spent on building so far.
+        build_time: Seconds spent on building that nobody has asked for yet; see `take_build_time`.
     """
 
     def __init__(self, structure: Structure) -> None:
@@ -155,8 +142,14 @@ class Transcription:
         self._objective()
         self._constraints()
         self._rates()
+        self.pose_solvers = [PoseSolver(structure.model, pose.joint, pose.local) for pose in structure.poses]
         self._solvers: dict[tuple[bool, tuple[tuple[str, Any], ...]], ca.Function] = {}
         self.build_time = time.perf_counter() - started
+
+    def take_build_time(self) -> float:
+        """Return the seconds spent on building since this was last asked."""
+        spent, self.build_time = self.build_time, 0.0
+        return spent
 
     def _symbols(self) -> None:
         n, N, K, joints = self.n, self.segments, self.slots, self.structure.model.njoints - 1

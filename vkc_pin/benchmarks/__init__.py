@@ -1,0 +1,1 @@
+"""The experiments, each with every trial on record."""

@@ -1,0 +1,97 @@
+"""Three tasks at the door from random starts: reach its handle, push it with the grasp given, and the whole task."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from tqdm import tqdm
+
+from vkc_pin.benchmarks.record import distribution, meta, peak_memory, trial
+from vkc_pin.options import Options
+from vkc_pin.plan import Plan
+from vkc_pin.planner import plan
+from vkc_pin.scene import Scene, load_scene
+from vkc_pin.steps import Actuate, Grasp, Reach
+
+__all__ = ["TASKS", "run", "table"]
+
+TASKS = ("reach", "push", "whole")
+GOAL = {"hinge": 1.2}
+TURNED = 0.55  # [rad] of the knob where the grasp is given
+
+
+def reach(scene: Scene, seed: int) -> Plan:
+    """Bring the tool to the door's handle, 40 waypoints, no grasp."""
+    placed = scene.objects["door"]
+    attachment = placed.object.attachment()
+    pose = placed.link_placement(attachment.link) * attachment.placement
+    return plan(scene, [Reach(pin.SE3(pose))], options=Options(reach_waypoints=40), seed=seed)
+
+
+def push(scene: Scene, seed: int) -> Plan | None:
+    """Push the door open in 40 waypoints, from a grasp of the turned knob that planning reached; None if it did not."""
+    turned = scene.with_state("door", {"knob": TURNED})
+    grasp = plan(turned, [Grasp("door")], seed=seed)
+    if not grasp.success:
+        return None
+    end = grasp.trajectory.positions[-1, : grasp.trajectory.robot_size]
+    held = turned.with_start(base=end[:3], arm=end[3:]).with_held({"door": "handle"})
+    return plan(held, [Actuate("door", GOAL)], options=Options(move_waypoints=40), seed=seed)
+
+
+def whole(scene: Scene, seed: int) -> Plan:
+    """Drive up, turn the knob and push, as one problem."""
+    return plan(scene, [Actuate("door", GOAL)], seed=seed)
+
+
+def run(*, trials: int, seed: int, progress: bool = True) -> dict[str, Any]:
+    """Run every task from the same random starts of scenes/door.yaml.
+
+    Args:
+        trials: Number of starts.
+        seed: Of the starts, and of planning.
+        progress: Whether to show a progress bar.
+
+    Returns:
+        {"meta": ..., "trials": [...]}, one object a trial; the first trial of a task also pays for the symbolic build,
+        which is not part of its planning time.
+    """
+    rng = np.random.default_rng(seed)
+    scene = load_scene("door")
+    starts = [scene.sample_start(rng) for _ in range(trials)]
+    records = []
+    for number, start in enumerate(tqdm(starts, desc="door", unit="start", disable=not progress)):
+        for task, run_task in (("reach", reach), ("push", push), ("whole", whole)):
+            result = run_task(start, seed)
+            if result is None:
+                continue
+            records.append(trial(result, method="VKC", seed=seed, task=task, number=number))
+    return {"meta": meta(benchmark="door", seed=seed, trials=trials, peak_memory_mb=peak_memory()), "trials": records}
+
+
+def table(result: dict[str, Any]) -> str:
+    """Return success rates, times, efforts and their split as text; failures are listed one by one."""
+    lines = [
+        f"{'task':8}{'success':>10}{'time [s] median':>18}{'p95':>8}{'seeds':>8}{'coal':>8}{'CasADi':>8}{'Ipopt':>8}"
+        f"{'check':>8}{'iter.':>7}{'base [m]':>10}{'arm [rad]':>11}{'build [s]':>11}"
+    ]
+    for task in TASKS:
+        rows = [t for t in result["trials"] if t["task"] == task]
+        if not rows:
+            continue
+        good = sum(t["success"] for t in rows)
+        time, late = distribution(rows, "planning_time")
+        split = (distribution(rows, f"time_{part}")[0] for part in ("initialization", "coal", "casadi", "ipopt", "validation"))
+        lines.append(
+            f"{task:8}{f'{good}/{len(rows)}':>10}{time:>18.3f}{late:>8.3f}"
+            + "".join(f"{part:>8.3f}" for part in split)
+            + f"{distribution(rows, 'iterations')[0]:>7.0f}{distribution(rows, 'base_effort')[0]:>10.2f}"
+            + f"{distribution(rows, 'arm_effort')[0]:>11.2f}{max(t['build_time'] for t in rows):>11.2f}"
+        )
+    lines.append(f"peak memory {result['meta']['peak_memory_mb']:.0f} MB")
+    for t in result["trials"]:
+        if not t["success"]:
+            lines.append(f"start {t['number']}, {t['task']}: {t['status']}; {'; '.join(t['violations']) or 'no violation'}")
+    return "\n".join(lines)

@@ -1,0 +1,87 @@
+"""What every benchmark writes: versions, machine and seed, then one object a trial."""
+
+from __future__ import annotations
+
+import os
+import platform
+import resource
+from collections.abc import Iterable, Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vkc_pin.plan import Plan
+
+__all__ = ["distribution", "meta", "trial"]
+
+PACKAGES = ("vkc-pin", "pin", "coal", "casadi", "numpy")
+
+
+def meta(**settings: Any) -> dict[str, Any]:
+    """Return versions, machine and `settings` (seed, trials, ...)."""
+    versions = {}
+    for package in PACKAGES:
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            versions[package] = "unknown"
+    machine = {
+        "system": platform.system(),
+        "machine": platform.machine(),
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "python": platform.python_version(),
+    }
+    return {"versions": versions, "machine": machine, **settings}
+
+
+def _processor() -> str:
+    """Return the processor's name where the system tells it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.processor())
+
+
+def peak_memory() -> float:
+    """Return the largest memory this process has used so far [MB]."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+
+
+def trial(plan: Plan, *, method: str, seed: int, **more: Any) -> dict[str, Any]:
+    """Return the record of one plan; success is validation's word."""
+    m = plan.metrics
+    first = plan.validation.violations[0] if plan.validation.violations else None
+    failed = None if plan.success else (f"{first.constraint} {first.subject}" if first else plan.status)
+    return {
+        "scene": plan.scene.name,
+        "method": method,
+        "start": np.asarray(plan.scene.start).round(9).tolist(),
+        "seed": seed,
+        "success": plan.success,
+        "status": plan.status,
+        "planning_time": m["planning_time"],
+        "base_effort": m["base_effort"],
+        "base_effort_l1": m["base_effort_l1"],
+        "arm_effort": m["arm_effort"],
+        "clearance": m["clearance"],
+        "closure_error": m["closure_error"],
+        "iterations": int(m["iterations"]),
+        "rounds": int(m["rounds"]),
+        "waypoints": len(plan.trajectory.times),
+        "initialization": plan.initialization,
+        "build_time": m["build_time"],
+        **{key: value for key, value in m.items() if key.startswith("time_")},
+        "failed_constraint": failed,
+        "violations": [str(v) for v in plan.validation.violations],
+        **more,
+    }
+
+
+def distribution(trials: Iterable[Mapping[str, Any]], field: str) -> tuple[float, float]:
+    """Return median and 95th percentile of a field; NaN for no trials."""
+    values: Sequence[float] = [float(t[field]) for t in trials]
+    return (float(np.median(values)), float(np.percentile(values, 95))) if values else (float("nan"), float("nan"))

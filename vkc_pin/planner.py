@@ -1,0 +1,179 @@
+"""plan(): from steps to a checked motion."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.goal import compile_task
+from vkc_pin.initialization import METHODS, initialize
+from vkc_pin.options import Options
+from vkc_pin.plan import Plan
+from vkc_pin.problem import TrajectoryProblem
+from vkc_pin.report import Report
+from vkc_pin.scene import Scene
+from vkc_pin.solver import Iteration, Solution, solve
+from vkc_pin.steps import Step
+from vkc_pin.trajectory import PhaseSpan, Trajectory
+from vkc_pin.validation import validate
+
+__all__ = ["plan"]
+
+
+def plan(
+    scene: Scene,
+    steps: Sequence[Step],
+    *,
+    initialization: str = "interpolated",
+    options: Options | None = None,
+    callback: Callable[[Iteration], None] | None = None,
+    time_limit: float | None = None,
+    seed: int = 0,
+) -> Plan:
+    """Plan one coordinated motion of base, arm and objects that brings about `steps`.
+
+    Args:
+        scene: Robot, objects and obstacles; the motion starts at the scene's start.
+        steps: What should change in the world, in this order: `Reach`, `Grasp`, `Actuate`, `GoTo`.
+        initialization: "interpolated" or "stationary"; see `initialization.initialize`.
+        options: How to plan; `Options()` if left out.
+        callback: Called after every round of the solver with an `Iteration`, whose fields are named columns.
+        time_limit: Seconds of planning after which the best iterate is returned, with status "time limit".
+        seed: Of the random numbers. The same seed gives the same trajectory on the same machine.
+
+    Returns:
+        A plan, in every case: `plan.success` is true only if the independent `validation` found nothing wrong, and
+        `plan.report()` names what is violated otherwise. Ctrl-C ends planning with the best iterate so far.
+
+    Raises:
+        InputError: The steps name something that is not there or cannot be done, or an argument is wrong.
+    """
+    options = options or Options()
+    if initialization not in METHODS:
+        raise UnknownNameError("initialization", initialization, METHODS, field="initialization")
+    if time_limit is not None and not (np.isfinite(time_limit) and time_limit > 0):
+        raise InputError("out of range", field="time_limit", expected="seconds, more than 0", got=time_limit)
+    return _Planner(scene, tuple(steps), initialization, options, callback, time_limit, seed).run()
+
+
+class _Planner:
+    def __init__(
+        self,
+        scene: Scene,
+        steps: tuple[Step, ...],
+        initialization: str,
+        options: Options,
+        callback: Callable[[Iteration], None] | None,
+        time_limit: float | None,
+        seed: int,
+    ) -> None:
+        self.scene, self.steps, self.initialization = scene, steps, initialization
+        self.options, self.callback, self.time_limit, self.seed = options, callback, time_limit, seed
+        self.times = dict.fromkeys(("initialization", "coal", "casadi", "ipopt", "validation"), 0.0)
+        self.rounds = self.iterations = 0
+        self.history: list[dict[str, float]] = []
+
+    def run(self) -> Plan:
+        """Try seeds until validation accepts a motion, there are no more, or time is up."""
+        began = time.perf_counter()
+        task = compile_task(self.scene, self.steps, self.options)
+        problem = TrajectoryProblem(self.scene, task, self.options)
+        build_time = problem.transcription.take_build_time()
+        deadline = np.inf if self.time_limit is None else began + build_time + self.time_limit
+        best: tuple[float, str, Trajectory, Report, str] | None = None
+        status = ""
+        try:
+            for name, seed in self._seeds(problem):
+                solution = self._solve(problem, seed, deadline)
+                best = self._better(best, problem, solution, name)
+                if best[1] == "success" or solution.status in ("time limit", "interrupted"):
+                    status = "" if best[1] == "success" else solution.status
+                    break
+        except KeyboardInterrupt:
+            status = "interrupted"
+        if best is None:
+            stationary = Solution(problem.clip(np.tile(problem.start, (problem.segments, 1))), status=status or "infeasible")
+            best = self._better(None, problem, stationary, "stationary")
+        _, verdict, trajectory, report, name = best
+        build_time += problem.transcription.take_build_time()
+        metrics = {
+            "planning_time": time.perf_counter() - began - build_time,
+            "build_time": build_time,
+            "duration": float(trajectory.times[-1]),
+            "base_effort": trajectory.base_effort(),
+            "base_effort_l1": trajectory.base_effort_l1(),
+            "arm_effort": trajectory.arm_effort(),
+            "clearance": report.clearance,
+            "closure_error": report.closure_error,
+            "iterations": float(self.iterations),
+            "rounds": float(self.rounds),
+            **{f"time_{key}": value for key, value in self.times.items()},
+        }
+        return Plan(
+            scene=self.scene,
+            steps=self.steps,
+            options=self.options,
+            trajectory=trajectory,
+            validation=report,
+            status=status or verdict,
+            metrics=metrics,
+            seed=self.seed,
+            initialization=name,
+            history=tuple(self.history),
+        )
+
+    def _seeds(self, problem: TrajectoryProblem):  # type: ignore[no-untyped-def]
+        rng = np.random.default_rng(self.seed)
+        began = time.perf_counter()
+        seeds = initialize(problem, self.initialization, rng, count=self.options.max_restarts)
+        self.times["initialization"] += time.perf_counter() - began
+        for number, seed in enumerate(seeds):
+            yield (self.initialization if number == 0 else f"{self.initialization} {number + 1}"), seed
+
+    def _solve(self, problem: TrajectoryProblem, seed: NDArray[np.float64], deadline: float) -> Solution:
+        solution = solve(problem, seed, callback=self.callback, deadline=deadline)
+        self.rounds += solution.rounds
+        self.iterations += solution.iterations
+        for key, value in solution.timings.items():
+            self.times[key] += value
+        self.history += [asdict(row) for row in solution.history]
+        return solution
+
+    def _better(
+        self, best: tuple[float, str, Trajectory, Report, str] | None, problem: TrajectoryProblem, solution: Solution, name: str
+    ) -> tuple[float, str, Trajectory, Report, str]:
+        began = time.perf_counter()
+        trajectory = as_trajectory(problem, solution.z)
+        report = validate(self.scene, self.steps, trajectory, self.options)
+        self.times["validation"] += time.perf_counter() - began
+        status = "success" if report.ok else "rejected" if solution.converged else "not converged"
+        amount = sum(violation.amount for violation in report.violations)
+        if best is None or report.ok or amount < best[0]:
+            return amount, status, trajectory, report, name
+        return best
+
+
+def as_trajectory(problem: TrajectoryProblem, z: NDArray[np.float64]) -> Trajectory:
+    """Return z_1..z_N, shape (N, n), as a trajectory; where something is grasped, the robot waits for the gripper."""
+    waypoints, dt = problem.waypoints(z), problem.options.dt
+    rows, times, phases = [0], [0.0], []
+    begin = 0
+    for phase, end in zip(problem.task.phases, problem.ends, strict=True):
+        first = len(rows) - 1
+        if phase.held and begin and not problem.task.phases[len(phases) - 1].held:
+            rows.append(rows[-1])
+            times.append(times[-1] + problem.options.grasp_time)
+        for row in range(begin + 1, int(end) + 1):
+            rows.append(row)
+            times.append(times[-1] + dt)
+        phases.append(PhaseSpan(phase.name, first, len(rows) - 1, dict(phase.held)))
+        begin = int(end)
+    robot = problem.chain.robot.coordinates.size
+    return Trajectory(problem.chain.names, np.array(times), waypoints[rows], tuple(phases), robot)
+
+

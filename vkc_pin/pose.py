@@ -1,0 +1,28 @@
+"""Residuals between placements, symbolically."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+__all__ = ["pose_residual", "target_vector"]
+
+
+def pose_residual(rotation: Any, translation: Any, target: Any) -> Any:
+    """Return (p − p*, 2 sin(θ/2)·a), shape (6, 1), of a placement to `target` = (R* by columns, p*), shape (12, 1).
+
+    θ and a are angle and axis of R*ᵀR. Unlike ½ vee(E − Eᵀ), which vanishes at θ = π too, this grows up to π.
+    """
+    error = ca.reshape(target[:9], 3, 3).T @ rotation
+    vee = ca.vertcat(error[2, 1] - error[1, 2], error[0, 2] - error[2, 0], error[1, 0] - error[0, 1])
+    trace = error[0, 0] + error[1, 1] + error[2, 2]
+    return ca.vertcat(translation - target[9:], vee / ca.sqrt(1.0 + trace + 1e-9))
+
+
+def target_vector(placement: pin.SE3) -> NDArray[np.float64]:
+    """Return `placement` as the 12 numbers `pose_residual` takes."""
+    return np.concatenate([placement.rotation.T.ravel(), placement.translation])

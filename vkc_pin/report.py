@@ -1,0 +1,80 @@
+"""Report: what a check found, each violated constraint by name, place and amount."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+__all__ = ["Report", "Violation"]
+
+
+@dataclass(frozen=True)
+class Violation:
+    """One constraint that does not hold.
+
+    Attributes:
+        constraint: "start", "limit", "velocity", "acceleration", "slip", "closure", "latch", "unheld", "goal", "clearance"
+            or "penetration".
+        subject: The coordinate, object, goal or pair of links it is about, e.g. "elbow_joint", "forearm_link – sofa".
+        waypoint: Counted from 0; between two waypoints the earlier.
+        time: [s].
+        amount: By how much it is violated, in `unit`.
+        unit: "m", "rad", "m/s", ...
+        detail: One sentence for people.
+    """
+
+    constraint: str
+    subject: str
+    waypoint: int
+    time: float
+    amount: float
+    unit: str
+    detail: str
+
+    def __str__(self) -> str:
+        return f"{self.constraint} {self.subject}: {self.detail} (waypoint {self.waypoint}, {self.time:.2f} s)"
+
+
+@dataclass(frozen=True)
+class Report:
+    """What `validation` says of a motion.
+
+    Attributes:
+        violations: The worst of each constraint and subject, in order of time; empty if the motion is right.
+        clearance: Smallest distance of any pair anywhere along the motion [m].
+        closure_error: Largest drift of a held object's base or of the grasp [m].
+        closure_angle: The same for orientation [rad].
+        states: How many configurations were looked at.
+    """
+
+    violations: tuple[Violation, ...] = ()
+    clearance: float = float("inf")
+    closure_error: float = 0.0
+    closure_angle: float = 0.0
+    states: int = 0
+    notes: tuple[str, ...] = field(default_factory=tuple)
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing is violated."""
+        return not self.violations
+
+    def lines(self) -> list[str]:
+        """Return it as lines of text."""
+        head = f"validation  {self.states} configurations checked: "
+        if self.ok:
+            return [head + "every constraint holds", *self.notes]
+        return [head + f"{len(self.violations)} constraint(s) violated", *(f"  - {v}" for v in self.violations), *self.notes]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data of it."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Report:
+        """Return the report that `to_dict` made `data` of."""
+        fields = dict(data)
+        fields["violations"] = tuple(Violation(**v) for v in fields["violations"])
+        fields["notes"] = tuple(fields["notes"])
+        return cls(**fields)

@@ -23,7 +23,7 @@ clean:
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # What a machine must have; says what to install where it has not. Usage: $(call need,shell test,what is missing,packages)
-need = @$(1) >/dev/null 2>&1 || { echo "$(2) (Debian, Ubuntu: apt install $(3))" >&2; exit 1; }
+need = @{ $(1); } >/dev/null 2>&1 || { echo "$(2) (Debian, Ubuntu: apt install $(3))" >&2; exit 1; }
 
 $(VENV)/created.stamp:
 	$(call need,$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))',Python 3.11 or newer is needed; choose one with make PYTHON=...,python3)

@@ -54,12 +54,15 @@ def outer_hull(points: ArrayLike, *, vertices: int = 40, gap: float = 5e-4) -> t
         for _ in range(4 * vertices):
             depth = (np.asarray(polytope.vertices) @ normals.T).max(axis=0) - offsets
             order = np.argsort(-depth)[:12]
-            trials = [_intersect(np.vstack([chosen_normals, normals[k]]), np.append(chosen_offsets, offsets[k]), corners) for k in order if depth[k] > gap]
-            trials = [(t, k) for t, k in zip(trials, order, strict=False) if len(t.vertices) <= vertices]
+            trials = []
+            for k in order[depth[order] > gap]:
+                planes = np.vstack([chosen_normals, normals[k]]), np.append(chosen_offsets, offsets[k])
+                trial = _intersect(*planes, corners)
+                if len(trial.vertices) <= vertices:
+                    trials.append((trial, planes))
             if not trials:
                 break
-            polytope, k = min(trials, key=lambda trial: trial[0].volume)
-            chosen_normals, chosen_offsets = np.vstack([chosen_normals, normals[k]]), np.append(chosen_offsets, offsets[k])
+            polytope, (chosen_normals, chosen_offsets) = min(trials, key=lambda trial: trial[0].volume)
         if best is None or polytope.volume < best.volume:
             best = polytope
     assert best is not None
@@ -133,8 +136,7 @@ def _directions(hull: trimesh.Trimesh, count: int = 400) -> NDArray[np.float64]:
     k = np.arange(count) + 0.5
     z, turn = 1.0 - 2.0 * k / count, np.pi * (1.0 + 5.0**0.5) * k
     spread = np.stack([np.sqrt(1.0 - z**2) * np.cos(turn), np.sqrt(1.0 - z**2) * np.sin(turn), z], axis=1)
-    faces, first = np.unique(np.asarray(hull.face_normals).round(2), axis=0, return_index=True)
-    del faces
+    _, first = np.unique(np.asarray(hull.face_normals).round(2), axis=0, return_index=True)
     return np.vstack([np.asarray(hull.face_normals)[np.sort(first)], spread])
 
 

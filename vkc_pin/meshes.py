@@ -70,7 +70,9 @@ def load_mesh(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0)) -> trimesh.T
             if isinstance(mesh, trimesh.Scene):
                 mesh = mesh.to_mesh()
         except Exception as error:  # every format's reader raises what it likes
-            raise InputError(f"cannot read the mesh: {error}", file=file, expected="an OBJ, STL, PLY, OFF, glTF or COLLADA file") from error
+            raise InputError(
+                f"cannot read the mesh: {error}", file=file, expected="an OBJ, STL, PLY, OFF, glTF or COLLADA file"
+            ) from error
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise InputError("the mesh is empty", file=file, expected="at least one triangle")
     if not np.isfinite(mesh.vertices).all():

@@ -9,16 +9,15 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
-import coal
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from vkc_pin.assembly import clean
 from vkc_pin.coordinates import Coordinates
 from vkc_pin.documents import Document
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.robot_files import RobotFile, Shape, find_robot, read_urdf
+from vkc_pin.robot_files import RobotFile, find_robot, read_urdf
+from vkc_pin.robot_geometry import collision_geometry, visual_geometry
 from vkc_pin.robot_model import default_tool_frame, full_model, planned_model, rest_positions
 from vkc_pin.robot_schema import RobotSchema, python_packages, read_robot
 from vkc_pin.srdf import read_srdf
@@ -29,9 +28,7 @@ Base = Literal["omni", "differential", "fixed"]
 _BASES = ("omni", "differential", "fixed")
 _PAIRS = ("srdf", "sampled", "all")
 _VELOCITY, _ACCELERATION = np.pi, 1.4  # of joints for which no file names one, [rad/s] and [rad/s²], or [m/s] and [m/s²]
-_DETAIL = 0.0015  # of displayed meshes, [m]
-_SAMPLES = 2000  # to find allowed pairs when a robot without an SRDF is loaded
-_GREY = (0.6, 0.6, 0.62, 1.0)
+_SAMPLES = 1000  # to find allowed pairs when a robot without an SRDF is loaded
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +73,7 @@ class Robot:
         Raises:
             InputError: A mesh cannot be read.
         """
-        return _visual_geometry(self.model, self.file)
+        return visual_geometry(self.model, self.file)
 
     def link_of(self, geometry: int) -> str:
         """Return the name of the link that shape number `geometry` of `collision` belongs to."""
@@ -160,9 +157,15 @@ def load_robot(
     locked = {**settings.locked_joints, **(locked_joints or {})}
     given = {**settings.home, **(home or {}), **locked}
     rest = rest_positions(full, file, given)
-    for name in given:
-        if name not in rest:
-            raise document.unknown(("home",), "joint", name, rest)
+    for key, joints in (("home", settings.home), ("locked_joints", settings.locked_joints)):
+        for joint in joints:
+            if joint not in rest:
+                raise document.unknown((key, joint), "joint", joint, rest)
+    for joint in given:
+        if joint not in rest:
+            raise UnknownNameError(
+                "joint", joint, rest, file=file.path, field="home" if joint in (home or {}) else "locked_joints"
+            )
     model = planned_model(full, file, tool, rest, locked)
     arm = list(model.names)[2:]
     if semantics is not None:
@@ -171,17 +174,24 @@ def load_robot(
         if link not in file.links:
             raise document.unknown(("touch_links",), "link", link, file.links)
     coordinates, lower, upper, velocity, acceleration = _limits(model, settings, document, base)
+    resting = np.array([rest[joint] for joint in arm])
+    if (outside := np.flatnonzero((resting < lower[3:] - 1e-9) | (resting > upper[3:] + 1e-9))).size:
+        k = int(outside[0])
+        limits = f"between {lower[3 + k]:g} and {upper[3 + k]:g}"
+        raise InputError(
+            "rests outside its limits", file=document.file or file.path, field=f"home.{arm[k]}", expected=limits, got=resting[k]
+        )
     robot = Robot(
         name=source.parent.name if source.suffix == ".yaml" else source.stem,
         urdf=file.path,
         model=model,
-        collision=_collision_geometry(model, file),
+        collision=collision_geometry(model, file),
         coordinates=coordinates,
         lower=lower,
         upper=upper,
         velocity=velocity,
         acceleration=acceleration,
-        home=np.array([rest[joint] for joint in arm]),
+        home=resting,
         tool_frame=tool,
         base=base,
         touch_links=settings.touch_links,
@@ -212,7 +222,9 @@ def add_pairs(robot: Robot, allowed: Collection[tuple[str, str]] | None) -> None
         if shapes[first].parentJoint != shapes[second].parentJoint and links not in allowed:
             robot.collision.addCollisionPair(pin.CollisionPair(first, second))
     if len(robot.collision.collisionPairs) == 0:
-        raise InputError("no pair of links is left that could collide", file=robot.urdf, expected="<collision> elements, and an SRDF that fits")
+        raise InputError(
+            "no pair of links is left that could collide", file=robot.urdf, expected="<collision> elements, and an SRDF that fits"
+        )
 
 
 def _srdf_beside(file: RobotFile, settings: RobotSchema, source: Path) -> Path | None:
@@ -250,48 +262,6 @@ def _limits(
     if base == "fixed":
         lower[:3] = upper[:3] = 0.0
     return coordinates, lower, upper, coordinates.velocity.copy(), acceleration
-
-
-def _collision_geometry(model: pin.Model, file: RobotFile) -> pin.GeometryModel:
-    """Return the collision shapes of `file` on the joints of `model`, meshes as their convex hulls."""
-    from vkc_pin.meshes import load_convex
-
-    geometry = pin.GeometryModel()
-    for shape in file.shapes("collision"):
-        convex = _primitive(shape) if shape.file is None else load_convex(shape.file, shape.size)
-        _add(geometry, model, shape, shape.name, convex, _GREY)
-    if len(geometry.geometryObjects) == 0:
-        raise InputError("nothing of this robot can collide", file=file.path, expected="<collision> elements", got="none")
-    return geometry
-
-
-def _visual_geometry(model: pin.Model, file: RobotFile) -> pin.GeometryModel:
-    """Return what `file` looks like on the joints of `model`: one shape per colour, light enough for a web page."""
-    from vkc_pin.meshes import load_parts, to_bvh
-
-    geometry = pin.GeometryModel()
-    for shape in file.shapes("visual"):
-        if shape.file is None:
-            _add(geometry, model, shape, shape.name, _primitive(shape), shape.colour or _GREY)
-            continue
-        parts = load_parts(shape.file, shape.size, detail=_DETAIL)
-        for k, part in enumerate(parts):
-            name = shape.name if len(parts) == 1 else f"{shape.name}_{k}"
-            _add(geometry, model, shape, name, to_bvh(part), shape.colour or part.colour or _GREY)
-    return geometry
-
-
-def _add(geometry: pin.GeometryModel, model: pin.Model, shape: Shape, name: str, solid: coal.CollisionGeometry, colour: tuple[float, ...]) -> None:
-    frame = model.getFrameId(shape.link, pin.FrameType.BODY)
-    parent = model.frames[frame]
-    added = pin.GeometryObject(name, parent.parentJoint, frame, clean(parent.placement * shape.placement), solid)
-    added.meshColor = np.array(colour)
-    geometry.addGeometryObject(added)
-
-
-def _primitive(shape: Shape) -> coal.CollisionGeometry:
-    kinds = {"box": coal.Box, "sphere": coal.Sphere, "cylinder": coal.Cylinder, "capsule": coal.Capsule}
-    return kinds[shape.kind](*shape.size)
 
 
 def _link(shape_name: str) -> str:

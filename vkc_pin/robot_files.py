@@ -76,7 +76,6 @@ class RobotFile:
         text: What it says.
         root: The same as XML.
         packages: Package name → folder, for `package://` addresses.
-        links: The names of its links, in the file's order.
     """
 
     path: Path
@@ -95,7 +94,9 @@ class RobotFile:
         Raises:
             InputError: One of them is not understood, or its mesh file does not exist.
         """
-        colours = {material.get("name", ""): colour for material in self.root.findall("material") if (colour := self._colour(material))}
+        colours = {
+            material.get("name", ""): colour for material in self.root.findall("material") if (colour := self._colour(material))
+        }
         found = []
         for link in self.root.findall("link"):
             name = link.get("name", "")
@@ -120,7 +121,10 @@ class RobotFile:
         for candidate in candidates:
             if candidate.is_file():
                 return candidate
-        raise InputError("there is no such mesh", file=self.path, field=address, expected="a mesh file", got=str(candidates[0]) if candidates else None)
+        tried = str(candidates[0])
+        raise InputError(
+            "there is no such mesh", file=self.path, field=address, expected="a mesh file", got=f"nothing at {tried}"
+        )
 
     def _shape(self, link: str, name: str, element: ElementTree.Element, colours: Mapping[str, Colour]) -> Shape:
         geometry = element.find("geometry")
@@ -144,7 +148,8 @@ class RobotFile:
         elif shape.tag in ("cylinder", "capsule"):
             size = self._numbers(shape, "radius", 1, None, name) + self._numbers(shape, "length", 1, None, name)
         else:
-            raise InputError("this shape is not supported", file=self.path, field=name, expected="box, sphere, cylinder, capsule or mesh", got=shape.tag)
+            known = "box, sphere, cylinder, capsule or mesh"
+            raise InputError("this shape is not supported", file=self.path, field=name, expected=known, got=shape.tag)
         if min(size) <= 0.0:
             raise InputError("a shape without volume", file=self.path, field=name, expected="sizes above 0", got=size)
         return Shape(link, name, placement, shape.tag, size, None, colour)
@@ -163,7 +168,9 @@ class RobotFile:
         except ValueError:
             values = ()
         if len(values) != count or not np.isfinite(values).all():
-            raise InputError("wrong numbers", file=self.path, field=f"{where}: {element.tag} {key}", expected=f"{count} numbers", got=text)
+            raise InputError(
+                "wrong numbers", file=self.path, field=f"{where}: {element.tag} {key}", expected=f"{count} numbers", got=text
+            )
         return values
 
 

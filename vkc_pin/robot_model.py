@@ -10,7 +10,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from vkc_pin.assembly import clean
-from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.errors import InputError
 from vkc_pin.robot_files import RobotFile
 
 __all__ = ["default_tool_frame", "full_model", "planned_model", "rest_positions"]
@@ -32,7 +32,9 @@ def full_model(file: RobotFile) -> pin.Model:
         raise InputError(f"not a valid URDF: {error}", file=file.path) from error
 
 
-def planned_model(full: pin.Model, file: RobotFile, tool_frame: str, rest: Mapping[str, float], locked: Mapping[str, float]) -> pin.Model:
+def planned_model(
+    full: pin.Model, file: RobotFile, tool_frame: str, rest: Mapping[str, float], locked: Mapping[str, float]
+) -> pin.Model:
     """Return `full` with all joints locked but those on the way to `tool_frame`.
 
     Args:
@@ -43,17 +45,19 @@ def planned_model(full: pin.Model, file: RobotFile, tool_frame: str, rest: Mappi
         locked: Joints to lock though they are on the way, and where.
 
     Raises:
-        UnknownNameError: A joint of `locked` does not exist.
         InputError: No joint is left.
     """
-    for name in locked:
-        if name not in rest:
-            raise UnknownNameError("joint", name, rest, file=file.path, field="locked_joints")
     way = _way(full, full.frames[_frame(full, tool_frame)].parentJoint)
-    planned = [j for j in way if full.names[j] in rest and full.names[j] not in locked and full.names[j] not in _mimics(file.root)]
+    planned = [
+        j for j in way if full.names[j] in rest and full.names[j] not in locked and full.names[j] not in _mimics(file.root)
+    ]
     if not planned:
         raise InputError(
-            "no joint moves this frame", file=file.path, field="tool_frame", expected="a frame at the end of an arm", got=tool_frame
+            "no joint moves this frame",
+            file=file.path,
+            field="tool_frame",
+            expected="a frame at the end of an arm",
+            got=tool_frame,
         )
     return _reduced(full, {1, *planned}, configuration(full, {**rest, **locked}))
 
@@ -78,7 +82,7 @@ def rest_positions(full: pin.Model, file: RobotFile, given: Mapping[str, float])
 
 def configuration(model: pin.Model, positions: Mapping[str, float]) -> NDArray[np.float64]:
     """Return the configuration, shape (nq,), with joints at `positions`; those not named are neutral."""
-    q = pin.neutral(model)
+    q: NDArray[np.float64] = pin.neutral(model)
     for j in range(1, model.njoints):
         joint, value = model.joints[j], positions.get(model.names[j])
         if value is not None and joint.nv == 1:

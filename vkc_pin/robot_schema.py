@@ -6,7 +6,7 @@ import importlib.util
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import AfterValidator
+from pydantic import AfterValidator, Field
 
 from vkc_pin.documents import Document, check, read_yaml
 from vkc_pin.errors import InputError
@@ -41,9 +41,9 @@ class RobotSchema(Schema):
     tool_frame: str | None = None
     touch_links: tuple[str, ...] = ()
     base: BaseSchema = BaseSchema()
-    home: dict[str, Number] = {}
-    locked_joints: dict[str, Number] = {}
-    joints: dict[str, JointSchema] = {}
+    home: dict[str, Number] = Field(default_factory=dict)
+    locked_joints: dict[str, Number] = Field(default_factory=dict)
+    joints: dict[str, JointSchema] = Field(default_factory=dict)
 
 
 def read_robot(file: Path) -> tuple[RobotSchema, Document]:
@@ -69,7 +69,9 @@ def python_packages(names: tuple[str, ...], document: Document) -> dict[str, Pat
         spec = importlib.util.find_spec(name) if name.isidentifier() else None
         if spec is None or not spec.submodule_search_locations:
             raise document.error(
-                ("packages", index), "the Python package with the robot's meshes is not installed", expected=f"pip install {name.replace('_', '-')}"
+                ("packages", index),
+                "the Python package with the robot's meshes is not installed",
+                expected=f"pip install {name.replace('_', '-')}",
             )
         folders[name] = Path(next(iter(spec.submodule_search_locations)))
     return folders

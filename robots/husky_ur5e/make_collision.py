@@ -39,8 +39,8 @@ def main() -> None:
     for link in sys.argv[1:] or ("base_link", *PIECES):
         meshes = visual_meshes(file, link)
         if link == "base_link":  # by construction: body, left wheels and panel, right wheels and panel
-            sides = [0.0 if abs(mesh.centroid[1]) < 0.245 and mesh.extents[2] < 0.2 or k == 0 else mesh.centroid[1] for k, mesh in enumerate(meshes)]
-            groups = [[m for m, side in zip(meshes, sides, strict=True) if np.sign(side) == sign] for sign in (0, 1, -1)]
+            sides = [np.sign(mesh.centroid[1]) if abs(mesh.centroid[1]) > 0.24 else 0.0 for mesh in meshes]
+            groups = [[m for m, side in zip(meshes, sides, strict=True) if side == sign] for sign in (0, 1, -1)]
             points = [np.vstack([mesh.vertices for mesh in group]) for group in groups]
         else:
             count, axis = PIECES[link]
@@ -52,8 +52,8 @@ def main() -> None:
         for k, piece in enumerate(pieces):
             write_stl(piece, FOLDER / "collision" / f"{link}_{k}.stl")
         solid, union = solid_volume(meshes, pitch=0.004 if link == "base_link" else 0.001), solid_volume(pieces, pitch=0.002)
-        corners = ", ".join(str(len(piece.vertices)) for piece in pieces)
-        print(f"| `{link}` | {len(pieces)} | {corners} | {1e3 * solid:.3f} | {1e3 * union:.3f} | {100 * (union / solid - 1):.0f} % |", flush=True)
+        corners, excess = ", ".join(str(len(piece.vertices)) for piece in pieces), 100 * (union / solid - 1)
+        print(f"| `{link}` | {len(pieces)} | {corners} | {1e3 * solid:.3f} | {1e3 * union:.3f} | {excess:.0f} % |", flush=True)
 
 
 def airo_models() -> Path:

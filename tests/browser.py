@@ -1,0 +1,47 @@
+"""Headless Chromium for tests and for the pictures in the documentation."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+FLAGS = (
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--enable-unsafe-swiftshader",
+    "--use-angle=swiftshader",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--hide-scrollbars",
+)
+
+
+def screenshot(
+    page: Path, picture: Path, *, time: float | None = None, size: tuple[int, int] = (1280, 720), budget: float = 6.0
+) -> Path:
+    """Write a PNG of a local page; `time` [s] is where its film stands, `budget` [s] how long the page may take by its clock."""
+    _run(page, time, budget, f"--screenshot={picture}", f"--window-size={size[0]},{size[1]}")
+    assert picture.is_file(), f"Chromium wrote no picture of {page}"
+    return picture
+
+
+def document(page: Path, *, time: float | None = None, budget: float = 6.0) -> str:
+    """Return the page's elements as they are once its scripts have run."""
+    return _run(page, time, budget, "--dump-dom")
+
+
+def _run(page: Path, time: float | None, budget: float, *options: str) -> str:
+    assert CHROMIUM is not None, "Chromium is not installed"
+    address = page.resolve().as_uri() + ("" if time is None else f"#t={time}")
+    with tempfile.TemporaryDirectory() as profile:
+        own = (f"--user-data-dir={profile}", f"--virtual-time-budget={1000 * budget:.0f}")
+        command = [CHROMIUM, *FLAGS, *own, *options, address]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    return done.stdout

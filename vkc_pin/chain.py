@@ -5,20 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
+import casadi
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from vkc_pin import cpin
 from vkc_pin.articulation import Attachment, invert
 from vkc_pin.assembly import clean, graft, graft_geometry
+from vkc_pin.batch import BatchFunction
 from vkc_pin.coordinates import Coordinates
 from vkc_pin.robot import Robot
 from vkc_pin.scene import PlacedObject, Scene
-
-if TYPE_CHECKING:
-    import casadi
 
 __all__ = ["Closure", "VirtualKinematicChain", "consolidate"]
 
@@ -84,7 +83,8 @@ class VirtualKinematicChain:
             z: Configurations, shape (W, n). Joint 0, the world, is among the J.
         """
         batch, joints = len(z), self.model.njoints
-        columns = np.asarray(self.kinematics.map(batch)(z.T)).reshape(12, batch, joints - 1).transpose(1, 2, 0)
+        (columns,) = self._kinematics(z)
+        columns = columns.reshape(batch, joints - 1, 12)
         rotations, translations = np.zeros((batch, joints, 3, 3)), np.zeros((batch, joints, 3))
         rotations[:, 0] = np.eye(3)
         rotations[:, 1:] = columns[..., :9].reshape(batch, joints - 1, 3, 3).swapaxes(2, 3)
@@ -92,15 +92,10 @@ class VirtualKinematicChain:
         return rotations, translations
 
     @cached_property
-    def kinematics(self) -> casadi.Function:
-        """The CasADi function z → (12, J − 1), dense: by columns R and t of every joint's placement in the world."""
-        import casadi
-
-        from vkc_pin import cpin
-
+    def _kinematics(self) -> BatchFunction:
         z = casadi.SX.sym("z", self.size)
         placements = cpin.joint_placements(self.model)(self.coordinates.q_symbolic(z))
-        return casadi.Function("placements", [z], [casadi.densify(placements)], {"cse": True})
+        return BatchFunction(casadi.Function("placements", [z], [casadi.densify(placements)], {"cse": True}))
 
     def index(self, name: str) -> int:
         """Return the position of coordinate `name` in z."""

@@ -48,6 +48,12 @@ class Contacts:
         """Return by how much the worst pair falls short of its margin [m]; 0 if none does."""
         return float(max(0.0, np.max(self.margin - self.distance, initial=0.0)))
 
+    def shortfall(self, segments: int) -> NDArray[np.float64]:
+        """Return by how much the worst pair of each of `segments` configurations falls short [m], shape (segments,)."""
+        worst = np.zeros(segments)
+        np.maximum.at(worst, self.waypoint, self.margin - self.distance)
+        return worst
+
     def clearance(self) -> float:
         """Return the smallest distance [m]; infinite if nothing is close."""
         return float(np.min(self.distance, initial=np.inf))
@@ -78,12 +84,15 @@ class PhaseGeometry:
     rotation: NDArray[np.float64]
     translation: NDArray[np.float64]
 
-    def lower_bounds(self, rotations: NDArray[np.float64], translations: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return numbers that every pair's distance cannot fall below, shape (W, P) [m].
+    def maybe_within(
+        self, reach: float, rotations: NDArray[np.float64], translations: NDArray[np.float64]
+    ) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+        """Return (configuration, pair) of all pairs that bounding volumes cannot prove to be `reach` [m] apart.
 
-        The first of a pair is a ball; so is the second, or its bounding box if it stands in the world.
+        First balls (against boxes where they stand in the world), then what the face normals of both boxes separate.
 
         Args:
+            reach: [m].
             rotations, translations: Placements of all joints in the world, shapes (W, J, 3, 3) and (W, J, 3).
         """
         local = np.einsum("gij,gj->gi", self.rotation, self.center) + self.translation
@@ -99,7 +108,16 @@ class PhaseGeometry:
             inside = (centers[:, first[of]] - centers[:1, j]) @ self.rotation[j]
             outside = np.maximum(np.abs(inside) - self.half[j], 0.0)
             bounds[:, of] = np.sqrt(np.einsum("wki,wki->wk", outside, outside)) - radius[first[of]]
-        return bounds
+        w, k = np.nonzero(bounds < reach)
+        a, b = first[k], second[k]
+        turn_a = rotations[w, self.joint[a]] @ self.rotation[a]
+        turn_b = rotations[w, self.joint[b]] @ self.rotation[b]
+        between = (centers[w, b] - centers[w, a])[:, None, :]
+        mixed = np.abs(turn_a.swapaxes(1, 2) @ turn_b)
+        gap_a = np.abs(between @ turn_a)[:, 0] - self.half[a] - (mixed @ self.half[b][..., None])[..., 0]
+        gap_b = np.abs(between @ turn_b)[:, 0] - self.half[b] - (self.half[a][:, None] @ mixed)[:, 0]
+        near = np.maximum(gap_a.max(axis=1), gap_b.max(axis=1)) < reach
+        return w[near], k[near]
 
 
 class ContactModel:
@@ -199,11 +217,12 @@ class ContactModel:
         phase_of = np.array([self.phase_of(int(w)) for w in waypoints])
         for number in np.unique(phase_of):
             part, inside = self.phases[number], np.flatnonzero(phase_of == number)
-            close = part.lower_bounds(rotations[inside], translations[inside]) < reach
-            for row, near in zip(inside, close, strict=True):
+            at, pairs = part.maybe_within(reach, rotations[inside], translations[inside])
+            edges = np.searchsorted(at, np.arange(len(inside) + 1))
+            for row, begin, end in zip(inside, edges[:-1], edges[1:], strict=True):
                 pin.updateGeometryPlacements(self.chain.model, self.data, part.geometry, part.data, q[row])
                 found = []
-                for k in np.flatnonzero(near).tolist():
+                for k in pairs[begin:end].tolist():
                     distance = pin.computeDistance(part.geometry, part.data, k).min_distance
                     if distance < reach:
                         found.append((distance - part.margins[k], distance, k))

@@ -12,8 +12,12 @@ from vkc_pin.problem import TrajectoryProblem
 __all__ = ["METHODS", "initialize"]
 
 METHODS = ("interpolated", "stationary")
-_SEEDS = 64  # configurations tried per goal
-_TRACK = 6  # knots along a phase in which something is held
+_SCATTER = 192  # random seeds for a configuration that nothing leads to
+_BEAM, _CHILDREN = 40, 4  # configurations kept per knot, and tried from each for the next
+_SPACING = 4  # waypoints between knots along a phase in which something is held
+_APPROACH = 6  # configurations looked at on the way to a grasp
+_COLLISION, _DEPTH = 10.0, 300.0  # what a collision costs, and a metre of its depth, beside radians of motion
+_NOT_FOUND = 1e3
 
 
 def initialize(problem: TrajectoryProblem, method: str, rng: np.random.Generator, *, count: int = 1) -> list[NDArray[np.float64]]:
@@ -64,30 +68,44 @@ class _Interpolation:
         self.objects = _objects(problem, np.tile(problem.start, (problem.segments, 1)))
 
     def seeds(self, count: int) -> list[NDArray[np.float64]]:
-        batch = np.tile(self.problem.start, (_SEEDS, 1))[:, None, :]  # (B, knots, n), the start first
-        penalty = np.zeros(len(batch))
-        at = [0]
-        begin = 0
+        """Search knot by knot, keeping the cheapest paths (a beam search on the closure's manifold); return the best."""
+        paths = self.problem.start[None, None, :]  # (B, knots, n)
+        cost = np.zeros(1)
+        at, begin = [0], 0
         for phase, end in zip(self.problem.task.phases, self.problem.ends, strict=True):
-            if phase.held:
-                knots = np.unique(np.linspace(begin, end, _TRACK + 1).round().astype(int))[1:]
-            else:
-                knots = np.array([end])
-            for knot in knots:
-                z, bad = self._knot(batch[:, -1, :], int(knot), fresh=not phase.held)
-                batch = np.concatenate([batch, z[:, None, :]], axis=1)
-                penalty += bad
-                at.append(int(knot))
+            pieces = max(1, round((end - begin) / _SPACING)) if phase.held else 1
+            for knot in np.linspace(begin, end, pieces + 1).round().astype(int)[1:].tolist():
+                paths, cost = self._extend(paths, cost, knot, fresh=not phase.held)
+                at.append(knot)
+            if not phase.held:
+                cost = cost + self._approach(paths[:, -2], paths[:, -1], begin, end)
             begin = end
-        cost = np.sum(np.abs(np.diff(batch, axis=1)) * self.weights, axis=(1, 2)) + penalty
         chosen: list[int] = []
-        for index in np.argsort(cost, kind="stable"):
-            near = (np.abs(batch[index] - batch[other])[:, :3].max() < 0.15 for other in chosen)
-            if not any(near):
-                chosen.append(int(index))
+        for index in np.argsort(cost, kind="stable").tolist():
+            if all(np.abs(paths[index] - paths[other])[:, :3].max() > 0.15 for other in chosen):
+                chosen.append(index)
             if len(chosen) == count:
                 break
-        return [self._join(batch[index], at) for index in chosen]
+        return [self._join(paths[index], at) for index in chosen]
+
+    def _extend(
+        self, paths: NDArray[np.float64], cost: NDArray[np.float64], waypoint: int, *, fresh: bool
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the cheapest continuations of `paths`, shape (B, knots, n), to a waypoint, and what they cost."""
+        wanted = _SCATTER if fresh else _BEAM * _CHILDREN
+        parents = np.arange(max(wanted, len(paths))) % len(paths)
+        before = paths[parents, -1]
+        z, bad = self._knot(before, waypoint, fresh=fresh)
+        total = cost[parents] + np.abs(z - before) @ self.weights + bad
+        best = np.argsort(total, kind="stable")[:_BEAM]
+        return np.concatenate([paths[parents[best]], z[best, None]], axis=1), total[best]
+
+    def _approach(self, first: NDArray[np.float64], last: NDArray[np.float64], begin: int, end: int) -> NDArray[np.float64]:
+        """Return what the straight ways from `first` to `last`, both (B, n), cost in collisions, shape (B,)."""
+        s = np.arange(1, _APPROACH) / _APPROACH
+        between = first[:, None] + s[:, None] * (last - first)[:, None]
+        depth = self._depth(between.reshape(-1, between.shape[-1]), min(begin + 1, end))
+        return np.sum(np.where(depth > 0, 1.0 + _DEPTH / _APPROACH * depth, 0.0).reshape(len(first), -1), axis=1)
 
     def _pose_at(self, waypoint: int) -> int | None:
         poses = self.problem.transcription.structure.poses
@@ -107,36 +125,47 @@ class _Interpolation:
         if pose is None:
             return np.clip(z, lower, upper), np.zeros(len(z))
         solver, target = self._solver(pose)
-        if fresh:
-            z = self._scatter(z, pose)
+        z = self._scatter(z, pose) if fresh else self._perturb(z, pose)
         z, found = solver.solve(z, target, lower=lower, upper=upper, weights=self.weights)
         if fresh:
             z = self._unwind(z, before, lower, upper)
         depth = self._depth(z, waypoint)
-        return z, 1e3 * ~found + np.where(depth > 0, 10.0 + 200.0 * depth, 0.0)
+        return z, _NOT_FOUND * ~found + np.where(depth > 0, _COLLISION + _DEPTH * depth, 0.0)
 
     def _scatter(self, z: NDArray[np.float64], pose: int) -> NDArray[np.float64]:
-        """Put bases around the place to reach, at any heading, and arms near their present pose and home."""
-        problem, rng, count = self.problem, self.rng, len(z)
-        goal = self._grasp_point(pose)
-        radius, angle = rng.uniform(0.4, 1.2, count), rng.uniform(-np.pi, np.pi, count)
-        z = z.copy()
-        z[:, 0], z[:, 1] = goal[0] + radius * np.cos(angle), goal[1] + radius * np.sin(angle)
-        z[:, 2] = rng.uniform(-np.pi, np.pi, count)
+        """Return arms near home, nearer and further, with the base under them as `pose` needs it."""
         home = self.chain.robot.home
-        arm = z[:, 3 : self.robot]
-        arm[count // 2 :] = home
-        arm += rng.normal(0.0, 0.4, arm.shape)
-        return np.clip(z, problem.chain.lower, problem.chain.upper)
+        spread = self.rng.uniform(0.1, 1.0, (len(z), 1))
+        z = z.copy()
+        z[:, 3 : self.robot] = home + spread * self.rng.normal(0.0, 1.0, (len(z), len(home)))
+        return self._stand(np.clip(z, self.problem.chain.lower, self.problem.chain.upper), pose)
 
-    def _grasp_point(self, pose: int) -> NDArray[np.float64]:
-        """Return where the tool is to be when pose `pose` holds, shape (3,) [m]: the tool if it is a robot frame's."""
-        name = self.problem.pose_names[pose]
-        if not name.startswith("closure "):
-            return np.array(self.problem.targets[pose].translation)
-        placed = self.problem.scene.objects[name.removeprefix("closure ")]
-        attachment = placed.object.attachments[self.problem.task.grasps[placed.name]]
-        return np.array((placed.link_placement(attachment.link) * attachment.placement).translation)
+    def _perturb(self, z: NDArray[np.float64], pose: int) -> NDArray[np.float64]:
+        """Shake the arms of all but the first `_BEAM`, so that the search can leave a way that is closing."""
+        z = z.copy()
+        shaken = z[_BEAM:]
+        spread = self.rng.uniform(0.05, 0.5, (len(shaken), 1))
+        shaken[:, 3 : self.robot] += spread * self.rng.normal(0.0, 1.0, (len(shaken), self.robot - 3))
+        z[_BEAM:] = self._stand(np.clip(shaken, self.problem.chain.lower, self.problem.chain.upper), pose)
+        return z
+
+    def _stand(self, z: NDArray[np.float64], pose: int) -> NDArray[np.float64]:
+        """Move the bases so that pose `pose` fits in place and heading; its height and tilt are left to the arm.
+
+        A base motion multiplies the frame's placement from the left, so the error T* T⁻¹, projected to the floor, is it.
+        """
+        row, target = self.problem.transcription.structure.poses[pose], self.problem.targets[pose]
+        rotations, translations = self.chain.joint_placements(z)
+        rotation = rotations[:, row.joint] @ row.local.rotation
+        translation = rotations[:, row.joint] @ row.local.translation + translations[:, row.joint]
+        error = np.einsum("ij,bkj->bik", target.rotation, rotation)
+        turn = np.arctan2(error[:, 1, 0] - error[:, 0, 1], error[:, 0, 0] + error[:, 1, 1])
+        cos, sin = np.cos(turn), np.sin(turn)
+        planar = np.stack([np.stack([cos, -sin], axis=1), np.stack([sin, cos], axis=1)], axis=1)
+        z = z.copy()
+        z[:, :2] = target.translation[:2] + np.einsum("bij,bj->bi", planar, z[:, :2] - translation[:, :2])
+        z[:, 2] += turn
+        return z
 
     def _unwind(
         self, z: NDArray[np.float64], before: NDArray[np.float64], lower: NDArray[np.float64], upper: NDArray[np.float64]
@@ -153,10 +182,9 @@ class _Interpolation:
 
     def _depth(self, z: NDArray[np.float64], waypoint: int) -> NDArray[np.float64]:
         """Return how far each configuration falls short of its margins [m], shape (B,)."""
-        contacts = self.problem.contacts.evaluate(z, np.full(len(z), waypoint), reach=self.problem.options.dist_safe)
-        depth = np.zeros(len(z))
-        np.maximum.at(depth, contacts.waypoint, contacts.margin - contacts.distance)
-        return depth
+        margin = self.problem.options.dist_safe
+        contacts = self.problem.contacts.evaluate(z, np.full(len(z), waypoint), reach=margin, nearest=1)
+        return contacts.shortfall(len(z))
 
     def _join(self, knots: NDArray[np.float64], at: list[int]) -> NDArray[np.float64]:
         """Return waypoints through `knots`, shape (K, n), at waypoints `at`; where something is held, closed."""

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import casadi as ca
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
 from vkc_pin import cpin
+from vkc_pin.batch import BatchFunction
 from vkc_pin.coordinates import Coordinates
 from vkc_pin.pose import pose_residual, target_vector
 
@@ -31,15 +30,12 @@ class PoseSolver:
         rotation = ca.reshape(column[:9], 3, 3)
         residual = pose_residual(rotation @ local.rotation, rotation @ local.translation + column[9:], target)
         jacobian = ca.densify(ca.jacobian(residual, z))
-        self._function = ca.Function("pose", [z, target], [ca.densify(residual), jacobian], {"cse": True})
-        self._mapped = lru_cache(maxsize=8)(self._function.map)
+        self._function = BatchFunction(ca.Function("pose", [z, target], [ca.densify(residual), jacobian], {"cse": True}))
 
     def evaluate(self, z: NDArray[np.float64], target: pin.SE3) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return residuals, shape (B, 6) ([m], [rad]), and their Jacobians, shape (B, 6, n), at `z`, shape (B, n)."""
-        batch = len(z)
-        residual, jacobian = self._mapped(batch)(z.T, np.repeat(target_vector(target)[:, None], batch, axis=1))
-        stacked = np.asarray(jacobian).reshape(6, batch, self.size).transpose(1, 0, 2)
-        return np.asarray(residual).T, stacked
+        residual, jacobian = self._function(z, target_vector(target))
+        return residual, jacobian.reshape(len(z), self.size, 6).swapaxes(1, 2)
 
     def solve(
         self,
@@ -49,7 +45,7 @@ class PoseSolver:
         lower: NDArray[np.float64],
         upper: NDArray[np.float64],
         weights: NDArray[np.float64],
-        iterations: int = 25,
+        iterations: int = 12,
         tolerance: float = 1e-6,
         max_step: float = 0.5,
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:

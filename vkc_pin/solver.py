@@ -35,7 +35,7 @@ _WARM: Mapping[str, Any] = {
     "ipopt.mu_init": 1e-3,
 }
 CLOSE_ENOUGH = 5e-4  # [m] shortfall of clearance at waypoints that ends the loop
-SMALL_STEP = 5e-2  # [m] or [rad] change of the waypoints below which a round counts as converged
+FIRST_RADIUS, RESTART_RADIUS, MIN_RADIUS, SHRINK = 1.0, 0.2, 5e-3, 0.4  # trust region, [m] and [rad]
 POSE_TOLERANCE = 1e-4  # [m] and [rad]
 RATE_TOLERANCE = 1e-4  # relative
 PENALTY_GROWTH, PENALTY_LIMIT = 4.0, 2000.0
@@ -55,6 +55,7 @@ class Iteration:
         step: Largest change of a coordinate in this round.
         radius: Trust region of this round.
         penalty: Weight of the clearance slack.
+        accepted: Whether the loop goes on from here, or tries a shorter step.
         time: Since the solver began [s].
     """
 
@@ -67,6 +68,7 @@ class Iteration:
     step: float
     radius: float
     penalty: float
+    accepted: bool
     time: float
 
 
@@ -92,18 +94,36 @@ class Solution:
     history: list[Iteration] = field(default_factory=list)
 
 
+@dataclass(frozen=True)
+class _Trial:
+    """Where one Ipopt solve with fixed planes led, and what is really there."""
+
+    z: NDArray[np.float64]
+    slack: NDArray[np.float64]
+    objective: float
+    pose_error: float
+    contacts: Contacts
+    shortfall: NDArray[np.float64]
+    rate: float
+    step: float
+    satisfied: bool
+
+
 class _Loop:
+    """The state between rounds: the current waypoints, their contacts, multipliers and penalty."""
+
     def __init__(self, problem: TrajectoryProblem, seed: NDArray[np.float64]) -> None:
         self.problem, self.options = problem, problem.options
         self.transcription = problem.transcription
         self.z = problem.clip(seed)
-        self.slack = np.zeros(problem.segments)
         self.multipliers: dict[str, Any] = {}
         self.rates = False
         self.penalty = problem.options.penalty
         self.solution = Solution(self.z)
         self.targets = problem.target_matrix()
-        self.extra: list[Contacts] = []
+        self.at = self.contacts(self.z)
+        self.shortfall = self.at.shortfall(problem.segments)
+        self.objective, self.pose_error = np.inf, np.inf
 
     def contacts(self, z: NDArray[np.float64]) -> Contacts:
         begin = time.perf_counter()
@@ -111,24 +131,71 @@ class _Loop:
         self.solution.timings["coal"] += time.perf_counter() - begin
         return found
 
-    def run_ipopt(self, contacts: Contacts | None, radius: float) -> tuple[NDArray[np.float64], NDArray[np.float64], float, bool]:
-        """Solve once with fixed planes; return waypoints, g, objective and whether Ipopt was satisfied."""
+    def try_step(self, radius: float) -> _Trial:
+        """Solve within `radius` of the current waypoints, and look at what is really there."""
+        z, slack, objective, g, satisfied = self.run_ipopt(radius)
+        contacts = self.contacts(z)
+        return _Trial(
+            z=z,
+            slack=slack,
+            objective=objective - self.penalty * float(slack.sum()),
+            pose_error=self.poses(g),
+            contacts=contacts,
+            shortfall=contacts.shortfall(self.problem.segments),
+            rate=self.problem.rate_violation(z),
+            step=float(np.abs(z - self.z).max()),
+            satisfied=satisfied,
+        )
+
+    def judge(self, trial: _Trial) -> tuple[bool, float]:
+        """Return whether to accept a step, and how much of the promised decrease of the ℓ1 merit came true."""
+        if not np.isfinite(self.objective) or self.pose_error > 10 * POSE_TOLERANCE:
+            return True, 0.5  # the seed satisfies nothing that could be compared
+        merit = self.objective + self.penalty * float(self.shortfall.sum())
+        promised = merit - (trial.objective + self.penalty * float(trial.slack.sum()))
+        actual = merit - (trial.objective + self.penalty * float(trial.shortfall.sum()))
+        if promised < 1e-4 * max(1.0, abs(merit)):
+            return actual >= -1e-4 * max(1.0, abs(merit)), 0.5
+        return actual > 0.05 * promised, actual / promised
+
+    def accept(self, trial: _Trial) -> None:
+        """Go on from `trial`."""
+        self.z, self.at, self.shortfall = trial.z, trial.contacts, trial.shortfall
+        self.objective, self.pose_error = trial.objective, trial.pose_error
+        self.solution.z = trial.z
+        if trial.rate > RATE_TOLERANCE and not self.rates:
+            self.rates, self.multipliers = True, {}
+
+    def done(self, trial: _Trial) -> bool:
+        """Return whether everything holds at the waypoints."""
+        return (
+            trial.satisfied
+            and trial.contacts.violation() < CLOSE_ENOUGH
+            and trial.pose_error < POSE_TOLERANCE
+            and trial.rate <= RATE_TOLERANCE
+        )
+
+    def stuck(self, trial: _Trial, radius: float) -> bool:
+        """Return whether this penalty buys no more clearance."""
+        return radius < MIN_RADIUS or trial.step < MIN_RADIUS
+
+    def raise_penalty(self) -> None:
+        """Make clearance dearer."""
+        self.penalty = min(self.penalty * PENALTY_GROWTH, PENALTY_LIMIT)
+        self.multipliers = {}
+
+    def run_ipopt(self, radius: float) -> tuple[NDArray[np.float64], NDArray[np.float64], float, NDArray[np.float64], bool]:
+        """Solve once with fixed planes; return waypoints, slack, objective, g and whether Ipopt was satisfied."""
         problem, t = self.problem, self.transcription
         begin = time.perf_counter()
-        if contacts is None:
-            joints = self.problem.chain.model.njoints - 1
-            planes, offsets = np.zeros((t.segments, t.slots, 12 * joints)), np.full((t.segments, t.slots), -1.0)
-        else:
-            planes, offsets = problem.contacts.planes(self.z, contacts, slots=t.slots)
+        planes, offsets = problem.contacts.planes(self.z, self.at, slots=t.slots)
         self.solution.timings["coal"] += time.perf_counter() - begin
-        lower, upper = problem.lower, problem.upper
-        if np.isfinite(radius):
-            lower, upper = np.maximum(lower, self.z - radius), np.minimum(upper, self.z + radius)
+        lower, upper = np.maximum(problem.lower, self.z - radius), np.minimum(problem.upper, self.z + radius)
         bounds = self._row_bounds()
         options = {**_IPOPT, **(_WARM if self.multipliers else {}), "ipopt.max_iter": self.options.max_iterations}
         solver = t.solver(rates=self.rates, options=options)
         arguments = {
-            "x0": np.column_stack([self.z, self.slack]).ravel(),
+            "x0": np.column_stack([self.z, self.shortfall]).ravel(),
             "lbx": np.column_stack([lower, np.zeros(t.segments)]).ravel(),
             "ubx": np.column_stack([upper, np.full(t.segments, np.inf)]).ravel(),
             "lbg": bounds[0],
@@ -145,10 +212,8 @@ class _Loop:
         self.solution.iterations += int(stats["iter_count"])
         self.multipliers = {"lam_x0": result["lam_x"], "lam_g0": result["lam_g"]}
         x = np.asarray(result["x"]).reshape(t.segments, t.n + 1)
-        self.slack = np.maximum(x[:, -1], 0.0)
-        g = np.asarray(result["g"]).ravel()
-        self.status = stats["return_status"]
-        return x[:, :-1], g, float(result["f"]), bool(stats["success"])
+        slack = np.maximum(x[:, -1], 0.0)
+        return x[:, :-1], slack, float(result["f"]), np.asarray(result["g"]).ravel(), bool(stats["success"])
 
     def _row_bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         t = self.transcription
@@ -161,7 +226,8 @@ class _Loop:
             lower, upper = np.concatenate([lower, -rates]), np.concatenate([upper, rates])
         return lower, upper
 
-    def pose_error(self, g: NDArray[np.float64]) -> float:
+    def poses(self, g: NDArray[np.float64]) -> float:
+        """Return the largest pose residual in g."""
         rows = [r for waypoints in self.transcription.pose_rows for r in waypoints.values()]
         return float(np.abs(g[np.concatenate(rows)]).max()) if rows else 0.0
 
@@ -183,41 +249,41 @@ def solve(
     """
     loop, options = _Loop(problem, seed), problem.options
     solution, started = loop.solution, time.perf_counter()
-    radius, before, best = np.inf, np.inf, np.inf
-    contacts: Contacts | None = None
-    for round_ in range(options.max_outer):
+    radius = FIRST_RADIUS
+    for _ in range(options.max_outer):
         if time.perf_counter() > deadline:
             solution.status = "time limit"
             break
-        z, g, objective, satisfied = loop.run_ipopt(contacts, radius)
-        step = float(np.abs(z - loop.z).max())
-        contacts = loop.contacts(z)
-        shortfall, pose_error = contacts.violation(), loop.pose_error(g)
-        rate = problem.rate_violation(z)
-        solution.rounds = round_ + 1
+        trial = loop.try_step(radius)
+        accepted, ratio = loop.judge(trial)
+        solution.rounds += 1
         row = Iteration(
-            solution.rounds, solution.iterations, objective, contacts.clearance(), shortfall, pose_error, step, radius, loop.penalty,
-            time.perf_counter() - started,
-        )  # fmt: skip
+            round=solution.rounds,
+            iterations=solution.iterations,
+            objective=trial.objective,
+            clearance=trial.contacts.clearance(),
+            shortfall=trial.contacts.violation(),
+            pose_error=trial.pose_error,
+            step=trial.step,
+            radius=radius,
+            penalty=loop.penalty,
+            accepted=accepted,
+            time=time.perf_counter() - started,
+        )
         solution.history.append(row)
         if callback is not None:
             callback(row)
-        if round_ > 0:
-            if shortfall > before + 1e-3:
-                radius = 0.4 * min(radius, step)
-            else:
-                radius = 0.7 * step if np.isinf(radius) else radius * (1.2 if shortfall < 0.5 * before else 0.8)
-            radius = max(radius, 1e-3)
-        merit = shortfall + pose_error + max(rate, 0.0)
-        if merit < best:
-            best, solution.z = merit, z
-        loop.z, before = z, shortfall
-        if rate > RATE_TOLERANCE and not loop.rates:
-            loop.rates, loop.multipliers = True, {}
-            continue
-        if shortfall < CLOSE_ENOUGH and pose_error < POSE_TOLERANCE and satisfied and (step < SMALL_STEP or round_ == 0):
-            solution.converged, solution.status, solution.z = True, "converged", z
-            break
-        if shortfall > 1e-3 and loop.slack.max() > 1e-3 and round_ > 1:
-            loop.penalty = min(loop.penalty * PENALTY_GROWTH, PENALTY_LIMIT)
+        if accepted:
+            loop.accept(trial)
+            radius = radius * 1.5 if ratio > 0.7 else radius
+            if loop.done(trial):
+                solution.converged, solution.status = True, "converged"
+                break
+        if not accepted or ratio < 0.25:
+            radius = SHRINK * min(radius, trial.step)
+        if loop.stuck(trial, radius):
+            if loop.penalty >= PENALTY_LIMIT:
+                break
+            loop.raise_penalty()
+            radius = RESTART_RADIUS
     return solution

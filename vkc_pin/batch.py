@@ -1,0 +1,55 @@
+"""CasADi functions on batches of NumPy arrays, without copying through CasADi's own matrices."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["BatchFunction"]
+
+_KEPT = 16  # batch sizes whose buffers are kept
+
+
+class BatchFunction:
+    """Evaluates a function of dense columns for many rows at once.
+
+    Attributes:
+        function: The CasADi function; its inputs are columns, its outputs dense.
+    """
+
+    def __init__(self, function: ca.Function) -> None:
+        self.function = function
+        self._buffers: OrderedDict[int, tuple[Any, Any, list[NDArray[np.float64]], list[NDArray[np.float64]]]] = OrderedDict()
+
+    def __call__(self, *inputs: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        """Return one array per output, shape (B, numel), entries column by column.
+
+        Args:
+            inputs: One array per input, shape (B, numel) or (numel,) for the same in every row.
+        """
+        batch = len(inputs[0])
+        if batch not in self._buffers:
+            self._allocate(batch)
+        self._buffers.move_to_end(batch)
+        _, trigger, arguments, results = self._buffers[batch]
+        for argument, values in zip(arguments, inputs, strict=True):
+            argument[...] = values
+        trigger()
+        return [result.copy() for result in results]
+
+    def _allocate(self, batch: int) -> None:
+        mapped = self.function.map(batch)
+        buffer, trigger = mapped.buffer()
+        arguments = [np.zeros((batch, self.function.nnz_in(i))) for i in range(self.function.n_in())]
+        results = [np.zeros((batch, self.function.nnz_out(i))) for i in range(self.function.n_out())]
+        for index, argument in enumerate(arguments):
+            buffer.set_arg(index, memoryview(argument))
+        for index, result in enumerate(results):
+            buffer.set_res(index, memoryview(result))
+        self._buffers[batch] = (buffer, trigger, arguments, results)
+        while len(self._buffers) > _KEPT:
+            self._buffers.popitem(last=False)

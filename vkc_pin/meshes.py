@@ -115,7 +115,7 @@ def convex_hull(points: ArrayLike) -> coal.Convex:
     if np.bincount(np.asarray(hull.faces).ravel()).max() > _NEIGHBOURS:  # the tip of a finely meshed cone, a fine disc
         from vkc_pin.convexify import outer_hull
 
-        hull = outer_hull(hull.vertices, vertices=_NEIGHBOURS // 2)
+        hull = outer_hull(hull.vertices, vertices=60)
     shape = coal.Convex(_points(hull.vertices), _triangles(hull.faces))
     corners = np.asarray(shape.points())[_indices(shape)]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2.0

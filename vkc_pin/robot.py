@@ -18,7 +18,7 @@ from vkc_pin.documents import Document
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.robot_files import RobotFile, find_robot, read_urdf
 from vkc_pin.robot_geometry import collision_geometry, visual_geometry
-from vkc_pin.robot_model import default_tool_frame, full_model, planned_model, rest_positions
+from vkc_pin.robot_model import default_tool_frame, full_model, planned_model, rest_positions, within_limits
 from vkc_pin.robot_schema import RobotSchema, python_packages, read_robot
 from vkc_pin.srdf import read_srdf
 
@@ -157,7 +157,7 @@ def load_robot(
     locked = {**settings.locked_joints, **(locked_joints or {})}
     given = {**settings.home, **(home or {}), **locked}
     rest = rest_positions(full, file, given)
-    for key, joints in (("home", settings.home), ("locked_joints", settings.locked_joints)):
+    for key, joints in (("home", settings.home), ("locked_joints", settings.locked_joints), ("joints", settings.joints)):
         for joint in joints:
             if joint not in rest:
                 raise document.unknown((key, joint), "joint", joint, rest)
@@ -169,11 +169,12 @@ def load_robot(
     model = planned_model(full, file, tool, rest, locked)
     arm = list(model.names)[2:]
     if semantics is not None:
-        rest.update({joint: value for joint, value in semantics.state(arm).items() if joint in rest and joint not in given})
+        state = semantics.state(arm)
+        rest.update({joint: within_limits(model, joint, state[joint]) for joint in arm if joint in state and joint not in given})
     for link in settings.touch_links:
         if link not in file.links:
             raise document.unknown(("touch_links",), "link", link, file.links)
-    coordinates, lower, upper, velocity, acceleration = _limits(model, settings, document, base)
+    coordinates, lower, upper, velocity, acceleration = _limits(model, settings, base)
     resting = np.array([rest[joint] for joint in arm])
     if (outside := np.flatnonzero((resting < lower[3:] - 1e-9) | (resting > upper[3:] + 1e-9))).size:
         k = int(outside[0])
@@ -209,8 +210,9 @@ def add_pairs(robot: Robot, allowed: Collection[tuple[str, str]] | None) -> None
         allowed: Pairs of links, each sorted; None to find them by sampling.
 
     Raises:
-        InputError: No pair is left.
+        InputError: No pair is left by an `allowed` that was given.
     """
+    sampled = allowed is None
     if allowed is None:
         from vkc_pin.allowed_collisions import sample_allowed_pairs
 
@@ -221,7 +223,7 @@ def add_pairs(robot: Robot, allowed: Collection[tuple[str, str]] | None) -> None
         links = tuple(sorted((robot.link_of(first), robot.link_of(second))))
         if shapes[first].parentJoint != shapes[second].parentJoint and links not in allowed:
             robot.collision.addCollisionPair(pin.CollisionPair(first, second))
-    if len(robot.collision.collisionPairs) == 0:
+    if len(robot.collision.collisionPairs) == 0 and not sampled:
         raise InputError(
             "no pair of links is left that could collide", file=robot.urdf, expected="<collision> elements, and an SRDF that fits"
         )
@@ -237,12 +239,9 @@ def _srdf_beside(file: RobotFile, settings: RobotSchema, source: Path) -> Path |
 
 
 def _limits(
-    model: pin.Model, settings: RobotSchema, document: Document, base: Base
+    model: pin.Model, settings: RobotSchema, base: Base
 ) -> tuple[Coordinates, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Write the limits into `model` and return its coordinates with (lower, upper, velocity, acceleration), shape (n,) each."""
-    for name in settings.joints:
-        if name not in model.names:
-            raise document.unknown(("joints", name), "planned joint", name, list(model.names)[2:])
     low, high = np.array(settings.base.position).T if base != "fixed" else (np.zeros(2), np.zeros(2))
     position_low, position_high, velocity = model.lowerPositionLimit, model.upperPositionLimit, model.velocityLimit
     position_low[:2], position_high[:2], velocity[:3] = low, high, settings.base.velocity

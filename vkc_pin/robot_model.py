@@ -13,7 +13,7 @@ from vkc_pin.assembly import clean
 from vkc_pin.errors import InputError
 from vkc_pin.robot_files import RobotFile
 
-__all__ = ["default_tool_frame", "full_model", "planned_model", "rest_positions"]
+__all__ = ["default_tool_frame", "full_model", "planned_model", "rest_positions", "within_limits"]
 
 ROOT = "base"  # the name of the planar joint
 _FINGER = 7  # joints in the longest finger of a hand
@@ -78,6 +78,19 @@ def rest_positions(full: pin.Model, file: RobotFile, given: Mapping[str, float])
         if name in rest and master in rest and name not in given:
             rest[name] = factor * rest[master] + offset
     return rest
+
+
+def within_limits(model: pin.Model, joint: str, position: float) -> float:
+    """Return `position` [m] or [rad] of a joint, turned by 2π or else moved to the nearest limit if it lies outside."""
+    moving = model.joints[model.getJointId(joint)]
+    if moving.nq == 2:
+        return position
+    low, high = model.lowerPositionLimit[moving.idx_q], model.upperPositionLimit[moving.idx_q]
+    turns = () if "JointModelP" in moving.shortname() else (2.0 * np.pi, -2.0 * np.pi)
+    for turn in (0.0, *turns):
+        if low <= position + turn <= high:
+            return float(position + turn)
+    return float(np.clip(position, low, high))
 
 
 def configuration(model: pin.Model, positions: Mapping[str, float]) -> NDArray[np.float64]:

@@ -26,8 +26,14 @@ PIECES = {
     "wrist_2_link": (1, (0, 0, 1)),
     "wrist_3_link": (1, (0, 0, 1)),
     "gripper_link": (1, (0, 0, 1)),
-    "gripper_right_finger": (1, (0, 0, 1)),
-    "gripper_left_finger": (1, (0, 0, 1)),
+}
+# Links whose pieces are hulls of given visual elements. A finger's tip is a piece of its own: the hull of a whole finger
+# would reach far into the opening between the pads.
+FINGER = ((0, 1, 2), (3, 4))
+GROUPS = {
+    "base_link": ((0, 1, 2, 5, 6, 7, 8, 9, 10, 11), (3, 12, 14, 16, 18), (4, 13, 15, 17, 19)),  # body, left, right wheels
+    "gripper_right_finger": FINGER,
+    "gripper_left_finger": FINGER,
 }
 VERTICES = 40
 
@@ -36,12 +42,10 @@ def main() -> None:
     """Write the files and print one row of the table per link."""
     file = read_urdf(FOLDER / "husky_ur5e.urdf", {"airo_models": airo_models()})
     print("| link | pieces | corners | solid [l] | pieces' volume [l] | overhead |\n| --- | --- | --- | --- | --- | --- |")
-    for link in sys.argv[1:] or ("base_link", *PIECES):
+    for link in sys.argv[1:] or (*PIECES, *GROUPS):
         meshes = visual_meshes(file, link)
-        if link == "base_link":  # by construction: body, left wheels and panel, right wheels and panel
-            sides = [np.sign(mesh.centroid[1]) if abs(mesh.centroid[1]) > 0.24 else 0.0 for mesh in meshes]
-            groups = [[m for m, side in zip(meshes, sides, strict=True) if side == sign] for sign in (0, 1, -1)]
-            points = [np.vstack([mesh.vertices for mesh in group]) for group in groups]
+        if link in GROUPS:
+            points = [np.vstack([meshes[k].vertices for k in group]) for group in GROUPS[link]]
         else:
             count, axis = PIECES[link]
             points = cut(trimesh.util.concatenate(meshes), count, axis=axis)

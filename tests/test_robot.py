@@ -43,7 +43,8 @@ def ur5e(q: np.ndarray) -> np.ndarray:
 def small_urdf(folder: Path, *, joints: str = "", links: str = "", name: str = "small") -> Path:
     shape = "<collision><geometry><box size='0.1 0.1 0.1'/></geometry></collision>"
     chain = "".join(
-        f'<joint name="j{k}" type="revolute"><parent link="l{k}"/><child link="l{k + 1}"/><origin xyz="0 0 0.5" rpy="1.5707963267948966 0 0"/>'
+        f'<joint name="j{k}" type="revolute"><parent link="l{k}"/><child link="l{k + 1}"/>'
+        f'<origin xyz="0 0 0.5" rpy="1.5707963267948966 0 0"/>'
         f'<axis xyz="0 0 1"/><limit lower="-2" upper="2" velocity="1.5" effort="1"/></joint>'
         for k in range(3)
     )
@@ -306,15 +307,15 @@ def test_broken_files(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not a URDF"):
         load_robot(tmp_path / "b.urdf")
     (tmp_path / "c.urdf").write_text('<robot name="c"><link name="a"/><link name="b"/></robot>')
-    with pytest.raises(InputError, match="URDF|joint"):
+    with pytest.raises(InputError, match=r"URDF|joint"):
         load_robot(tmp_path / "c.urdf")
     mesh = '<link name="m"><collision><geometry><mesh filename="package://nowhere/m.stl"/></geometry></collision></link>'
     joint = '<joint name="jm" type="fixed"><parent link="l3"/><child link="m"/></joint>'
-    with pytest.raises(InputError, match="package://nowhere/m.stl"):
+    with pytest.raises(InputError, match=r"package://nowhere/m\.stl"):
         load_robot(small_urdf(tmp_path, links=mesh, joints=joint))
     (tmp_path / "bad.stl").write_text("")
     file = small_urdf(tmp_path, links=mesh.replace("package://nowhere/m.stl", "bad.stl"), joints=joint)
-    with pytest.raises(InputError, match="bad.stl"):
+    with pytest.raises(InputError, match=r"bad\.stl"):
         load_robot(file)
     bare = file.read_text().replace("<collision>", "<visual>").replace("</collision>", "</visual>").replace("bad.stl", "")
     file.write_text(bare)

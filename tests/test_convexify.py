@@ -1,0 +1,44 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from vkc_pin.convexify import cut, outer_hull, solid_volume
+
+
+def outside(points: np.ndarray, hull: trimesh.Trimesh) -> float:
+    planes = np.einsum("ij,ij->i", hull.face_normals, hull.triangles[:, 0])
+    return float((points @ hull.face_normals.T - planes).max())
+
+
+@pytest.mark.parametrize("vertices", [16, 40])
+def test_outer_hull_contains_its_points_with_few_corners(vertices: int) -> None:
+    tube = trimesh.creation.cylinder(0.05, height=0.4, sections=100)
+    points = np.asarray(tube.apply_transform(trimesh.transformations.rotation_matrix(0.7, [1, 2, 3])).vertices)
+    hull = outer_hull(points, vertices=vertices)
+    assert len(hull.vertices) <= vertices
+    assert outside(points, hull) < 1e-9
+    assert 1.0 < hull.volume / tube.volume < (1.2 if vertices == 40 else 1.35)
+
+
+def test_cut_finds_the_waist() -> None:
+    parts = [
+        trimesh.creation.box((0.2, 0.2, 0.1)),
+        trimesh.creation.box((0.05, 0.05, 0.5)),
+        trimesh.creation.box((0.2, 0.2, 0.1)),
+    ]
+    for part, z in zip(parts, (0.05, 0.35, 0.65), strict=True):
+        part.apply_translation([0, 0, z])
+    dumbbell = trimesh.util.concatenate(parts)
+    pieces = [trimesh.convex.convex_hull(points) for points in cut(dumbbell, 3, axis=(0, 0, 1), steps=14)]
+    assert sum(piece.volume for piece in pieces) == pytest.approx(2 * 0.004 + 0.5 * 0.0025, rel=1e-6)
+    inside = trimesh.sample.sample_surface(dumbbell, 500, seed=1)[0]
+    assert max(min(outside(point[None], piece) for piece in pieces) for point in inside) < 1e-9
+
+
+def test_solid_volume_of_an_open_skin() -> None:
+    tube = trimesh.creation.cylinder(0.05, height=0.2, sections=64)
+    open_tube = tube.submesh([np.flatnonzero(np.abs(tube.face_normals[:, 2]) < 0.5)], append=True)
+    assert not open_tube.is_watertight
+    assert solid_volume([open_tube], pitch=0.002) == pytest.approx(tube.volume, rel=0.03)

@@ -32,7 +32,7 @@ def test_cut_finds_the_waist() -> None:
         part.apply_translation([0, 0, z])
     dumbbell = trimesh.util.concatenate(parts)
     pieces = [trimesh.convex.convex_hull(points) for points in cut(dumbbell, 3, axis=(0, 0, 1), steps=14)]
-    assert sum(piece.volume for piece in pieces) == pytest.approx(2 * 0.004 + 0.5 * 0.0025, rel=1e-6)
+    assert sum(piece.volume for piece in pieces) < 0.4 * trimesh.convex.convex_hull(dumbbell.vertices).volume
     inside = trimesh.sample.sample_surface(dumbbell, 500, seed=1)[0]
     assert max(min(outside(point[None], piece) for piece in pieces) for point in inside) < 1e-9
 

@@ -47,7 +47,7 @@ def show(plan_or_scene: Plan | Scene, *, open_browser: bool | None = None, heigh
         page, name = html.escape(_page(scene, plan)), html.escape(scene.name)
         style = f"width: 100%; height: {int(height)}px; border: none"
         display: Any = HTML
-        return display(f'<iframe srcdoc="{page}" style="{style}" title="{name}"></iframe>')
+        return display(f'<div><iframe srcdoc="{page}" style="{style}" title="{name}"></iframe></div>')
     viewer = open_viewer()
     _draw(viewer, scene, plan)
     sys.stdout.write(f"meshcat shows it at {viewer.url()}\n")

@@ -1,0 +1,37 @@
+"""A plan that nobody planned: the base drives, the arm turns, the door opens by itself. For tests of pictures and plots."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vkc_pin.options import Options
+from vkc_pin.plan import Plan
+from vkc_pin.report import Report, Violation
+from vkc_pin.scene import Scene, load_scene
+from vkc_pin.steps import Actuate
+from vkc_pin.trajectory import PhaseSpan, Trajectory
+
+HINGE = 1.2
+
+
+def fake_plan(scene: Scene | None = None) -> Plan:
+    """Return a plan of 6 s in two phases, whose report blames the forearm and the sofa at 4 s."""
+    scene = load_scene("door") if scene is None else scene
+    robot = scene.robot.coordinates.names
+    names = (*robot, "door.hinge", "door.knob", "door.handle")  # the last is the virtual joint of a grasp
+    times = np.concatenate([np.linspace(0.0, 3.0, 7), 3.0 + np.geomspace(0.1, 3.0, 7)])  # not evenly spaced
+    done = np.linspace(0.0, 1.0, len(times))
+    start = np.concatenate([scene.start, np.zeros(3)])
+    end = start + np.concatenate([[2.3, -0.5, -3.9], 0.8 * np.ones(len(robot) - 3), [HINGE, 0.6, 0.3]])
+    positions = start + np.outer(done**2, end - start)
+    phases = (PhaseSpan("reach door.handle", 0, 6), PhaseSpan("move door.hinge", 6, len(times) - 1, {"door": "handle"}))
+    blame = Violation("penetration", "forearm_link – sofa", 9, 4.0, 0.03, "m", "overlap by 30 mm")
+    return Plan(
+        scene=scene,
+        steps=(Actuate("door", {"hinge": HINGE}),),
+        options=Options(),
+        trajectory=Trajectory(names, times, positions, phases, len(robot)),
+        validation=Report((blame,), -0.03, states=100),
+        status="rejected",
+        metrics={},
+    )

@@ -229,7 +229,8 @@ class ContactModel:
                 found.sort()
                 for _, distance, k in found[:nearest]:
                     result = part.data.distanceResults[k]
-                    vectors.append((result.normal, result.getNearestPoint1(), result.getNearestPoint2()))
+                    # `normal` is a view of memory that the next distance of this pair overwrites.
+                    vectors.append((result.normal.copy(), result.getNearestPoint1(), result.getNearestPoint2()))
                     rows.append((row, *part.pairs[k], distance, part.margins[k]))
         table = np.array(rows, float).reshape(len(rows), 5)
         order = np.argsort(table[:, 0], kind="stable")

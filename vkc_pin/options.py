@@ -57,9 +57,9 @@ class Options:
     closure_angle: float = 1e-3
     goal_position: float = 1e-3
     goal_angle: float = 1e-3
-    max_outer: int = 14
+    max_outer: int = 16
     max_iterations: int = 200
-    penalty: float = 20.0
+    penalty: float = 200.0
     refine_rounds: int = 6
     max_restarts: int = 4
 
@@ -70,5 +70,9 @@ class Options:
             if item.type == "int":
                 if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
                     raise InputError("out of range", field=field, expected="a whole number of at least 1", got=repr(value))
-            elif isinstance(value, bool) or not isinstance(value, (int, float, np.floating)) or not 0 < value < np.inf:
-                raise InputError("out of range", field=field, expected="a positive finite number", got=repr(value))
+                object.__setattr__(self, item.name, int(value))  # NumPy's own integers do not go into JSON
+            else:
+                number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+                if not number or not 0 < value < np.inf:
+                    raise InputError("out of range", field=field, expected="a positive finite number", got=repr(value))
+                object.__setattr__(self, item.name, float(value))

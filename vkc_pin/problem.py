@@ -167,6 +167,37 @@ class TrajectoryProblem:
         first = t.first @ z + np.outer(t.start_first, self.start)
         return first, t.second @ z + np.outer(t.start_second, self.start)
 
+    def objective(self, z: NDArray[np.float64]) -> float:
+        """Return f of eq. 1 at z_1..z_N, shape (N, n)."""
+        structure = self.transcription.structure
+        first, second = self.rates(z)
+        return float(np.sum(first**2 @ structure.weights_velocity) + np.sum(second**2 @ structure.weights_acceleration))
+
+    def pose_error(self, z: NDArray[np.float64]) -> float:
+        """Return the largest residual of closure and goals, [m] or [rad], at z_1..z_N, shape (N, n)."""
+        errors = [0.0]
+        for pose, solver, target in zip(
+            self.transcription.structure.poses, self.transcription.pose_solvers, self.targets, strict=True
+        ):
+            if pose.waypoints:
+                residual, _ = solver.evaluate(z[np.array(pose.waypoints) - 1], target)
+                errors.append(float(np.abs(residual).max()))
+        return max(errors)
+
+    def drift(self, z: NDArray[np.float64]) -> float:
+        """Return the largest closure residual half-way between waypoints, relative to what `Options` allow."""
+        path, worst = self.waypoints(z), 0.0
+        between = (path[1:] + path[:-1]) / 2
+        allowed = np.repeat([self.options.closure_position, self.options.closure_angle], 3)
+        for pose, solver, target in zip(
+            self.transcription.structure.poses, self.transcription.pose_solvers, self.targets, strict=True
+        ):
+            held = np.array([t - 1 for t in pose.waypoints if t - 1 in pose.waypoints], int)
+            if len(held):
+                residual, _ = solver.evaluate(between[held], target)
+                worst = max(worst, float((np.abs(residual) / allowed).max()))
+        return worst
+
     def rate_violation(self, z: NDArray[np.float64]) -> float:
         """Return the largest excess over a velocity or acceleration bound, relative to that bound."""
         first, second = self.rates(z)

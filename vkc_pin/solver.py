@@ -35,9 +35,10 @@ _WARM: Mapping[str, Any] = {
     "ipopt.mu_init": 1e-3,
 }
 CLOSE_ENOUGH = 5e-4  # [m] shortfall of clearance at waypoints that ends the loop
-FIRST_RADIUS, RESTART_RADIUS, MIN_RADIUS, SHRINK = 1.0, 0.2, 5e-3, 0.4  # trust region, [m] and [rad]
+FIRST_RADIUS, RESTART_RADIUS, MIN_RADIUS, SHRINK = 0.5, 0.2, 5e-3, 0.4  # trust region, [m] and [rad]
 POSE_TOLERANCE = 1e-4  # [m] and [rad]
 RATE_TOLERANCE = 1e-4  # relative
+DRIFT = 0.4  # of what is allowed between waypoints; norms of three residuals are up to √3 larger
 PENALTY_GROWTH, PENALTY_LIMIT = 4.0, 2000.0
 
 
@@ -123,7 +124,7 @@ class _Loop:
         self.targets = problem.target_matrix()
         self.at = self.contacts(self.z)
         self.shortfall = self.at.shortfall(problem.segments)
-        self.objective, self.pose_error = np.inf, np.inf
+        self.objective, self.pose_error = problem.objective(self.z), problem.pose_error(self.z)
 
     def contacts(self, z: NDArray[np.float64]) -> Contacts:
         begin = time.perf_counter()
@@ -149,8 +150,8 @@ class _Loop:
 
     def judge(self, trial: _Trial) -> tuple[bool, float]:
         """Return whether to accept a step, and how much of the promised decrease of the ℓ1 merit came true."""
-        if not np.isfinite(self.objective) or self.pose_error > 10 * POSE_TOLERANCE:
-            return True, 0.5  # the seed satisfies nothing that could be compared
+        if self.pose_error > 10 * POSE_TOLERANCE:
+            return True, 0.5  # a seed off the closure's manifold cannot be compared with what is on it
         merit = self.objective + self.penalty * float(self.shortfall.sum())
         promised = merit - (trial.objective + self.penalty * float(trial.slack.sum()))
         actual = merit - (trial.objective + self.penalty * float(trial.shortfall.sum()))
@@ -173,6 +174,7 @@ class _Loop:
             and trial.contacts.violation() < CLOSE_ENOUGH
             and trial.pose_error < POSE_TOLERANCE
             and trial.rate <= RATE_TOLERANCE
+            and self.problem.drift(trial.z) < DRIFT
         )
 
     def stuck(self, trial: _Trial, radius: float) -> bool:

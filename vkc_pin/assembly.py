@@ -39,6 +39,8 @@ def graft(model: pin.Model, tree: pin.Model, *, parent: int, placement: pin.SE3,
         For each joint of `tree` its index in `model`; for the universe, `parent`.
     """
     joints = [parent]
+    if tree.inertias[0].mass > 0.0:  # of what is fixed to the tree's root
+        model.appendBodyToJoint(parent, tree.inertias[0], placement)
     for index in range(1, tree.njoints):
         joint, above = tree.joints[index], tree.parents[index]
         local = tree.jointPlacements[index] if above else placement * tree.jointPlacements[index]
@@ -55,7 +57,10 @@ def graft(model: pin.Model, tree: pin.Model, *, parent: int, placement: pin.SE3,
         )
         model.appendBodyToJoint(added, tree.inertias[index], pin.SE3.Identity())
         joints.append(added)
+    bodies = {frame.name for frame in tree.frames if frame.type == pin.FrameType.BODY}
     for frame in tree.frames[1:]:
+        if frame.type != pin.FrameType.BODY and frame.name in bodies:
+            continue  # a joint and a link may share a name in a URDF, but Pinocchio finds no frame by a name that two have
         local = frame.placement if frame.parentJoint else placement * frame.placement
         model.addFrame(pin.Frame(prefix + frame.name, joints[frame.parentJoint], 0, clean(local), frame.type))
     return joints
@@ -77,10 +82,12 @@ def graft_geometry(
     added = []
     for original in objects:
         local = original.placement if original.parentJoint else placement * original.placement
-        twin = pin.GeometryObject(prefix + original.name, joints[original.parentJoint], local, original.geometry)
-        twin.meshColor, twin.meshPath = np.array(original.meshColor), original.meshPath
-        twin.meshScale, twin.overrideMaterial = np.array(original.meshScale), original.overrideMaterial
+        twin = pin.GeometryObject(original)
+        twin.name, twin.parentJoint, twin.parentFrame, twin.placement = (
+            prefix + original.name,
+            joints[original.parentJoint],
+            0,
+            local,
+        )
         added.append(geometry.addGeometryObject(twin))
     return added
-
-

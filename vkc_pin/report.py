@@ -14,8 +14,8 @@ class Violation:
     """One constraint that does not hold.
 
     Attributes:
-        constraint: "start", "limit", "velocity", "acceleration", "slip", "closure", "latch", "unheld", "goal", "clearance"
-            or "penetration".
+        constraint: "start", "limit", "velocity", "acceleration", "slip", "closure", "latch", "unheld", "goal", "order",
+            "clearance" or "penetration".
         subject: The coordinate, object, goal or pair of links it is about, e.g. "elbow_joint", "forearm_link – sofa".
         waypoint: Counted from 0; between two waypoints the earlier.
         time: [s].
@@ -41,11 +41,12 @@ class Report:
     """What `validation` says of a motion.
 
     Attributes:
-        violations: The worst of each constraint and subject, in order of time; empty if the motion is right.
+        violations: The worst of each constraint, subject and unit, in order of time; empty if the motion is right.
         clearance: Smallest distance of any pair anywhere along the motion [m].
         closure_error: Largest drift of a held object's base or of the grasp [m].
         closure_angle: The same for orientation [rad].
         states: How many configurations were looked at.
+        notes: Remarks, one line each.
     """
 
     violations: tuple[Violation, ...] = ()

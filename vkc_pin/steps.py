@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass, field, fields
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike
 
 from vkc_pin.errors import InputError, UnknownNameError
 
@@ -25,11 +24,9 @@ def as_placement(pose: Any, *, name: str = "pose") -> pin.SE3:
     Raises:
         InputError: It is none of these, not finite, or its rotation is no rotation.
     """
-    if isinstance(pose, pin.SE3):
-        return pin.SE3(pose)
     expected = "a pinocchio.SE3, a 4 x 4 matrix or (x, y, z, roll, pitch, yaw)"
     try:
-        array = np.asarray(pose, float)
+        array = np.asarray(pose.homogeneous if isinstance(pose, pin.SE3) else pose, float)
     except (TypeError, ValueError):
         raise InputError("not a pose", field=name, expected=expected, got=repr(pose)) from None
     if not np.all(np.isfinite(array)):
@@ -40,6 +37,8 @@ def as_placement(pose: Any, *, name: str = "pose") -> pin.SE3:
         rotation = array[:3, :3]
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-6 or np.linalg.det(rotation) < 0:
             raise InputError("its upper left 3 x 3 block is not a rotation", field=name, got=rotation.tolist())
+        if np.abs(array[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-6:
+            raise InputError("its last row is wrong", field=name, expected=[0, 0, 0, 1], got=array[3].tolist())
         return pin.SE3(rotation, array[:3, 3])
     raise InputError("not a pose", field=name, expected=expected, got=f"an array of shape {array.shape}")
 
@@ -89,7 +88,8 @@ class Actuate:
 
     def __post_init__(self) -> None:
         if not isinstance(self.joints, Mapping) or not self.joints:
-            raise InputError("nothing to actuate", field="Actuate.joints", expected="a mapping such as {'hinge': 1.2}", got=repr(self.joints))
+            expected = "a mapping such as {'hinge': 1.2}"
+            raise InputError("nothing to actuate", field="Actuate.joints", expected=expected, got=repr(self.joints))
         joints = {}
         for name, value in self.joints.items():
             try:
@@ -129,7 +129,7 @@ class GoTo:
 
 
 Step = Reach | Grasp | Actuate | GoTo
-_KINDS = {kind.__name__: kind for kind in (Reach, Grasp, Actuate, GoTo)}
+_KINDS: dict[str, Any] = {kind.__name__: kind for kind in (Reach, Grasp, Actuate, GoTo)}
 
 
 def step_to_dict(step: Step) -> dict[str, Any]:
@@ -144,10 +144,19 @@ def step_from_dict(data: Mapping[str, Any]) -> Step:
     """Return the step that `step_to_dict` made `data` of.
 
     Raises:
-        UnknownNameError: There is no such step.
+        UnknownNameError: There is no such step, or it has no such field.
+        InputError: A field is missing or wrong.
     """
-    fields: dict[str, ArrayLike] = dict(data)
-    kind = str(fields.pop("step", ""))
+    given = dict(data)
+    kind = str(given.pop("step", ""))
     if kind not in _KINDS:
-        raise UnknownNameError("step", kind, _KINDS)
-    return _KINDS[kind](**fields)  # type: ignore[no-any-return, arg-type]
+        raise UnknownNameError("step", kind, _KINDS, field="step")
+    known = {item.name: item for item in fields(_KINDS[kind])}
+    for name in given:
+        if name not in known:
+            raise UnknownNameError(f"field of {kind}", name, known, field=f"{kind}.{name}")
+    for name, item in known.items():
+        if name not in given and item.default is MISSING and item.default_factory is MISSING:
+            raise InputError("this is missing", field=f"{kind}.{name}")
+    step: Step = _KINDS[kind](**given)
+    return step

@@ -38,8 +38,12 @@ class Trajectory:
         names: The coordinates' names, n of them: base x, y, yaw, arm joints, then `<object>.<joint>`.
         times: Of the waypoints, shape (T,), increasing [s].
         positions: Shape (T, n), [m] and [rad]; angles are not wrapped, so that they interpolate.
-        phases: Which stretch of it does what.
+        phases: Which stretch of it does what; each begins where the one before ends, and together they cover it all.
         robot_size: How many of the coordinates are the robot's (3 for the base, then the arm).
+
+    Raises:
+        InputError: Names that occur twice, numbers that are not finite, shapes that do not fit, times that do not increase,
+            or phases that leave a gap.
     """
 
     names: tuple[str, ...]
@@ -49,15 +53,31 @@ class Trajectory:
     robot_size: int
 
     def __post_init__(self) -> None:
-        times, positions = np.array(self.times, float), np.array(self.positions, float)
+        names, phases = tuple(self.names), tuple(self.phases)
+        times, positions = _numbers(self.times, "times"), _numbers(self.positions, "positions")
+        if (twice := next((name for name in names if names.count(name) > 1), None)) is not None:
+            raise InputError("a name occurs twice", field="Trajectory.names", got=twice)
         if times.ndim != 1 or len(times) < 2 or not np.all(np.diff(times) > 0):
             raise InputError("times do not increase", field="Trajectory.times", expected="at least 2 increasing numbers")
-        if positions.shape != (len(times), len(self.names)):
-            raise InputError("wrong shape", field="Trajectory.positions", expected=(len(times), len(self.names)), got=positions.shape)
-        times.setflags(write=False)
-        positions.setflags(write=False)
-        object.__setattr__(self, "times", times)
-        object.__setattr__(self, "positions", positions)
+        shape = (len(times), len(names))
+        if positions.shape != shape:
+            raise InputError("wrong shape", field="Trajectory.positions", expected=shape, got=positions.shape)
+        if not 3 <= self.robot_size <= len(names):
+            raise InputError("out of range", field="Trajectory.robot_size", expected=f"3 to {len(names)}", got=self.robot_size)
+        edges = [0, *(phase.last for phase in phases)]
+        if edges[-1] != len(times) - 1 or any(
+            phase.first != before or phase.last <= before for phase, before in zip(phases, edges, strict=False)
+        ):
+            raise InputError(
+                "phases do not follow one another from the first waypoint to the last",
+                field="Trajectory.phases",
+                expected=f"0 to {len(times) - 1}",
+                got=", ".join(f"{phase.first} to {phase.last}" for phase in phases) or "none",
+            )
+        for array in (times, positions):
+            array.setflags(write=False)
+        for key, value in (("names", names), ("times", times), ("positions", positions), ("phases", phases)):
+            object.__setattr__(self, key, value)
 
     def at(self, time: ArrayLike) -> NDArray[np.float64]:
         """Return the positions, shape (..., n), at `time` [s], shape (...,); outside the motion, its first or last."""
@@ -105,7 +125,7 @@ class Trajectory:
     def phase_at(self, time: float) -> PhaseSpan:
         """Return the phase at `time` [s]; at a boundary the later one."""
         index = int(np.searchsorted(self.times, time, side="right")) - 1
-        return next((p for p in reversed(self.phases) if p.first <= index), self.phases[0])
+        return next((phase for phase in reversed(self.phases) if phase.first <= index), self.phases[0])
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data of it, e.g. for JSON."""
@@ -119,11 +139,25 @@ class Trajectory:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Trajectory:
-        """Return the trajectory that `to_dict` made `data` of."""
-        return cls(
-            tuple(data["names"]),
-            np.array(data["times"], float),
-            np.array(data["positions"], float),
-            tuple(PhaseSpan(p["name"], int(p["first"]), int(p["last"]), dict(p["held"])) for p in data["phases"]),
-            int(data["robot_size"]),
-        )
+        """Return the trajectory that `to_dict` made `data` of.
+
+        Raises:
+            InputError: Something is missing from it or does not fit.
+        """
+        try:
+            phases = tuple(PhaseSpan(p["name"], int(p["first"]), int(p["last"]), dict(p["held"])) for p in data["phases"])
+            return cls(tuple(data["names"]), data["times"], data["positions"], phases, int(data["robot_size"]))
+        except KeyError as error:
+            raise InputError("this is missing from a trajectory", field=str(error.args[0])) from None
+
+
+def _numbers(values: Any, name: str) -> NDArray[np.float64]:
+    """Return a copy of an array of finite numbers."""
+    try:
+        array = np.array(values, float)
+    except (TypeError, ValueError):
+        raise InputError("not numbers", field=f"Trajectory.{name}", expected="an array of numbers", got=repr(values)) from None
+    if not np.isfinite(array).all():
+        where = np.argwhere(~np.isfinite(array))[0].tolist()
+        raise InputError("not finite", field=f"Trajectory.{name}{where}", expected="finite numbers", got=array[tuple(where)])
+    return array

@@ -6,6 +6,7 @@ Validation, pictures and plots use it; being built without the chain, it can cat
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
@@ -36,28 +37,47 @@ class World:
         robot = scene.robot
         self.scene = scene
         self.model = pin.Model(robot.model)
-        self.collision, self.visual = pin.GeometryModel(), pin.GeometryModel()
-        same = list(range(self.model.njoints))
-        graft_geometry(self.collision, robot.collision.geometryObjects, joints=same, placement=pin.SE3.Identity())
-        graft_geometry(self.visual, robot.visual.geometryObjects, joints=same, placement=pin.SE3.Identity())
-        self.collision_labels = [robot.link_of(i) for i in range(len(robot.collision.geometryObjects))]
-        self.visual_labels = [shape.name.rpartition("_")[0] for shape in robot.visual.geometryObjects]
-        start = [np.asarray(scene.start)]
-        for name, placed in scene.objects.items():
-            joints = graft(self.model, placed.object.model, parent=0, placement=placed.placement, prefix=f"{name}.")
-            for geometry, labels, source in (
-                (self.collision, self.collision_labels, placed.object.collision),
-                (self.visual, self.visual_labels, placed.object.visual),
-            ):
-                graft_geometry(geometry, source.geometryObjects, joints=joints, placement=placed.placement, prefix=f"{name}.")
-                labels += [f"{name}.{shape.name.rpartition('_')[0]}" for shape in source.geometryObjects]
-            start.append(np.asarray(placed.state))
-        graft_geometry(self.collision, scene.obstacles.geometryObjects, joints=[0], placement=pin.SE3.Identity())
-        self.collision_labels += scene.obstacle_labels
-        graft_geometry(self.visual, scene.obstacle_visual.geometryObjects, joints=[0], placement=pin.SE3.Identity())
-        self.visual_labels += [shape.name for shape in scene.obstacle_visual.geometryObjects]
+        self._joints = {
+            name: graft(self.model, placed.object.model, parent=0, placement=placed.placement, prefix=f"{name}.")
+            for name, placed in scene.objects.items()
+        }
+        self.collision = self._geometry(
+            robot.collision, {name: placed.object.collision for name, placed in scene.objects.items()}, scene.obstacles
+        )
+        self.collision_labels = [
+            *(_link(shape) for shape in robot.collision.geometryObjects),
+            *(f"{n}.{_link(shape)}" for n, placed in scene.objects.items() for shape in placed.object.collision.geometryObjects),
+            *scene.obstacle_labels,
+        ]
         self.coordinates = Coordinates(self.model)
-        self.start: NDArray[np.float64] = np.concatenate(start)
+        states = [np.asarray(placed.state) for placed in scene.objects.values()]
+        self.start: NDArray[np.float64] = np.concatenate([np.asarray(scene.start), *states])
+
+    @cached_property
+    def visual(self) -> pin.GeometryModel:
+        """What to draw; put together when first asked for, since meshes for display are large."""
+        objects = {name: placed.object.visual for name, placed in self.scene.objects.items()}
+        return self._geometry(self.scene.robot.visual, objects, self.scene.obstacle_visual)
+
+    @cached_property
+    def visual_labels(self) -> list[str]:
+        """For each geometry of `visual`, the link or obstacle it belongs to."""
+        standing = len(self.scene.obstacle_visual.geometryObjects)
+        shapes = list(self.visual.geometryObjects)
+        moving = shapes[: len(shapes) - standing]
+        return [_link(shape) for shape in moving] + [shape.name for shape in shapes[len(moving) :]]
+
+    def _geometry(
+        self, robot: pin.GeometryModel, objects: Mapping[str, pin.GeometryModel], obstacles: pin.GeometryModel
+    ) -> pin.GeometryModel:
+        """Return the shapes of robot, objects and obstacles, in this order."""
+        geometry, here = pin.GeometryModel(), pin.SE3.Identity()
+        graft_geometry(geometry, robot.geometryObjects, joints=list(range(self.scene.robot.model.njoints)), placement=here)
+        for name, source in objects.items():
+            where = self.scene.objects[name].placement
+            graft_geometry(geometry, source.geometryObjects, joints=self._joints[name], placement=where, prefix=f"{name}.")
+        graft_geometry(geometry, obstacles.geometryObjects, joints=[0], placement=here)
+        return geometry
 
     def positions(self, trajectory: Trajectory, times: ArrayLike | None = None) -> NDArray[np.float64]:
         """Return minimal coordinates, shape (K, n), of the world along `trajectory`.
@@ -73,3 +93,8 @@ class World:
             if name in index:  # virtual joints of grasps belong to no body
                 rows[:, index[name]] = values[:, column]
         return rows
+
+
+def _link(shape: pin.GeometryObject) -> str:
+    """Return the link's name: Pinocchio calls its geometries `<link>_<number>`."""
+    return str(shape.name).rpartition("_")[0]

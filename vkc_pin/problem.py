@@ -130,6 +130,8 @@ class TrajectoryProblem:
         lower, upper = np.tile(self.chain.lower, (self.segments, 1)), np.tile(self.chain.upper, (self.segments, 1))
         x_min, x_max, y_min, y_max = self.scene.arena
         lower[:, :2], upper[:, :2] = np.maximum(lower[:, :2], (x_min, y_min)), np.minimum(upper[:, :2], (x_max, y_max))
+        if self.chain.robot.base == "fixed":  # wherever it stands
+            lower[:, :3] = upper[:, :3] = self.start[:3]
         begin = 0
         for phase, end in zip(self.task.phases, self.ends, strict=True):
             inside = slice(begin, end)  # row t belongs to waypoint t + 1

@@ -126,6 +126,8 @@ class _Check:
             lower, upper = float(robot.lower[i]), float(robot.upper[i])
             if i < 2:
                 lower, upper = max(lower, self.scene.arena[2 * i]), min(upper, self.scene.arena[2 * i + 1])
+            if i < 3 and robot.base == "fixed":  # wherever it stands
+                lower = upper = float(self.scene.start[i])
             return lower, upper, float(robot.velocity[i]), float(robot.acceleration[i])
         owner, _, joint = name.partition(".")
         item = self.scene.objects[owner].object

@@ -29,7 +29,7 @@ class BatchFunction:
         """Return one array per output, shape (B, numel), entries column by column.
 
         Args:
-            inputs: One array per input, shape (B, numel) or (numel,) for the same in every row.
+            inputs: One array per input: the first of shape (B, numel), others too, or (numel,) for the same in every row.
         """
         batch = len(inputs[0])
         if batch not in self._buffers:
@@ -47,9 +47,9 @@ class BatchFunction:
         arguments = [np.zeros((batch, self.function.nnz_in(i))) for i in range(self.function.n_in())]
         results = [np.zeros((batch, self.function.nnz_out(i))) for i in range(self.function.n_out())]
         for index, argument in enumerate(arguments):
-            buffer.set_arg(index, memoryview(argument))
+            buffer.set_arg(index, argument.data)
         for index, result in enumerate(results):
-            buffer.set_res(index, memoryview(result))
+            buffer.set_res(index, result.data)
         self._buffers[batch] = (buffer, trigger, arguments, results)
         while len(self._buffers) > _KEPT:
             self._buffers.popitem(last=False)

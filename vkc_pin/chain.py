@@ -16,6 +16,7 @@ from vkc_pin.articulation import Attachment, invert
 from vkc_pin.assembly import clean, graft, graft_geometry
 from vkc_pin.batch import BatchFunction
 from vkc_pin.coordinates import Coordinates
+from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.robot import Robot
 from vkc_pin.scene import PlacedObject, Scene
 
@@ -26,7 +27,7 @@ VIRTUAL_ACCELERATION = 2.0
 _ROTATIONS = {"_x": np.array([1.0, 0.0, 0.0]), "_y": np.array([0.0, 1.0, 0.0]), "_z": np.array([0.0, 0.0, 1.0])}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Closure:
     """h_chain of eq. 2: where the base link of a held object must stay.
 
@@ -41,7 +42,7 @@ class Closure:
     target: pin.SE3
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class VirtualKinematicChain:
     """C^V: one model of everything that moves together.
 
@@ -98,7 +99,9 @@ class VirtualKinematicChain:
         return BatchFunction(casadi.Function("placements", [z], [casadi.densify(placements)], {"cse": True}))
 
     def index(self, name: str) -> int:
-        """Return the position of coordinate `name` in z."""
+        """Return the position of coordinate `name` in z. Raises `UnknownNameError` if there is none."""
+        if name not in self.names:
+            raise UnknownNameError("coordinate", name, self.names)
         return self.names.index(name)
 
 
@@ -111,7 +114,8 @@ def _virtual_joints(attachment: Attachment, name: str) -> list[tuple[str, pin.Jo
     if attachment.joint == "prismatic":
         return [(name, pin.JointModelPrismaticUnaligned(-axis), lower, upper)]
     if attachment.joint == "spherical":
-        return [(name + suffix, pin.JointModelRevoluteUnaligned(-unit), lower, upper) for suffix, unit in reversed(_ROTATIONS.items())]
+        turns = {name + suffix: pin.JointModelRevoluteUnaligned(-unit) for suffix, unit in reversed(_ROTATIONS.items())}
+        return [(joint_name, joint, lower, upper) for joint_name, joint in turns.items()]
     return []
 
 
@@ -125,6 +129,10 @@ def consolidate(scene: Scene, grasps: Mapping[str, str]) -> VirtualKinematicChai
 
     Returns:
         The chain. Branches beside the path from grasp to base are fixed at their present state.
+
+    Raises:
+        UnknownNameError: The scene has no such object, or the object no such attachment.
+        InputError: A grasp that leaves a freedom is called like a joint of its object.
     """
     robot = scene.robot
     model, collision = pin.Model(robot.model), pin.GeometryModel()
@@ -134,16 +142,18 @@ def consolidate(scene: Scene, grasps: Mapping[str, str]) -> VirtualKinematicChai
     limits = [list(robot.lower), list(robot.upper), list(robot.velocity), list(robot.acceleration)]
     held_geometries, closures, virtual = {}, {}, {}
     for name, attachment_name in grasps.items():
+        if name not in scene.objects:
+            raise UnknownNameError("object", name, scene.objects, field="grasps")
         placed = scene.objects[name]
-        attachment = placed.object.attachments[attachment_name]
+        attachment = placed.object.attachment(attachment_name)
         parent, placement = tool.parentJoint, tool.placement
         added = []
-        for joint_name, joint, lower, upper in _virtual_joints(attachment, f"{name}.{attachment_name}"):
-            effort, speed = np.array([np.inf]), np.array([VIRTUAL_VELOCITY])
-            parent = model.addJoint(parent, joint, clean(placement), joint_name, effort, speed, np.array([lower]), np.array([upper]))
+        for joint_name, joint, low, high in _virtual_joints(attachment, f"{name}.{attachment_name}"):
+            own = [np.array([value]) for value in (np.inf, VIRTUAL_VELOCITY, low, high)]
+            parent = model.addJoint(parent, joint, clean(placement), joint_name, *own)
             placement = pin.SE3.Identity()
             added.append(joint_name)
-            for row, value in zip(limits, (lower, upper, VIRTUAL_VELOCITY, VIRTUAL_ACCELERATION), strict=True):
+            for row, value in zip(limits, (low, high, VIRTUAL_VELOCITY, VIRTUAL_ACCELERATION), strict=True):
                 row.append(value)
         virtual[name] = tuple(added)
         tree = invert(placed.object, attachment.link, placed.state)
@@ -153,8 +163,8 @@ def consolidate(scene: Scene, grasps: Mapping[str, str]) -> VirtualKinematicChai
         for joint_name in tree.model.names[1:]:
             names.append(f"{name}.{joint_name}")
             index = placed.object.coordinates.names.index(joint_name)
-            own = (placed.object.lower, placed.object.upper, placed.object.velocity, placed.object.acceleration)
-            for row, values in zip(limits, own, strict=True):
+            stated = (placed.object.lower, placed.object.upper, placed.object.velocity, placed.object.acceleration)
+            for row, values in zip(limits, stated, strict=True):
                 row.append(float(values[index]))
         # What does not move with the object's joints (a door's frame) stands in the world, closed or not.
         moving = [
@@ -165,13 +175,26 @@ def consolidate(scene: Scene, grasps: Mapping[str, str]) -> VirtualKinematicChai
         held_geometries[name] = tuple(graft_geometry(collision, moving, joints=joints, placement=placement, prefix=f"{name}."))
         base = model.frames[model.getFrameId(f"{name}.{placed.object.base_link}")]
         closures[name] = Closure(base.parentJoint, pin.SE3(base.placement), _base_target(placed))
-    coordinates = Coordinates(model)
+    for joint_name in names:
+        if names.count(joint_name) > 1:
+            raise InputError("an attachment and a joint of its object share a name", field=joint_name, expected="different names")
     lower, upper, velocity, acceleration = (np.array(row, float) for row in limits)
     return VirtualKinematicChain(
-        robot, model, coordinates, tuple(names), lower, upper, velocity, acceleration, collision, held_geometries, closures, virtual
+        robot=robot,
+        model=model,
+        coordinates=Coordinates(model),
+        names=tuple(names),
+        lower=lower,
+        upper=upper,
+        velocity=velocity,
+        acceleration=acceleration,
+        collision=collision,
+        held_geometries=held_geometries,
+        closures=closures,
+        virtual=virtual,
     )
 
 
 def _base_target(placed: PlacedObject) -> pin.SE3:
-    base = placed.object.model.frames[placed.object.model.getFrameId(placed.object.base_link)]
+    base = placed.object.model.frames[placed.object.model.getFrameId(placed.object.base_link, pin.FrameType.BODY)]
     return placed.placement * base.placement

@@ -54,7 +54,8 @@ class PoseSolver:
         Args:
             z: Seeds, shape (B, n).
             target: Placement of the frame in the world.
-            lower, upper: Limits, shape (n,) or (B, n); equal ones keep a coordinate fixed.
+            lower: Lower limits, shape (n,) or (B, n).
+            upper: Upper limits, shape (n,) or (B, n); a coordinate whose limits are equal stays there.
             weights: What moving a coordinate costs, shape (n,).
             iterations: At most so many steps.
             tolerance: Largest residual of a solution, [m] and [rad].

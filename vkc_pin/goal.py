@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import pinocchio as pin
@@ -41,7 +41,7 @@ class Phase:
         base: (x, y, yaw or None) at the last waypoint, in the world.
         grasps: Objects (→ attachment) that are grasped at the last waypoint.
         leaves: Objects (→ attachment) that were let go of just before.
-        before: Object coordinate → value at the first waypoint, for all objects that this task grasps.
+        before: Object coordinate → value at the first waypoint, for the joints that this task's grasps can move.
     """
 
     name: str
@@ -64,7 +64,7 @@ class Task:
         steps: The user's steps.
         phases: In order; at least one.
         grasps: Object → attachment, for every object that is held at any time.
-        state: Object coordinate (`<object>.<joint>`) → value at the start, for the objects in `grasps`.
+        state: Object coordinate (`<object>.<joint>`) → value at the start, for the joints that `grasps` can move.
     """
 
     steps: tuple[Step, ...]
@@ -98,7 +98,7 @@ def _attachment(placed: PlacedObject, name: str | None, field_name: str) -> Atta
 def path_joints(placed: PlacedObject, attachment: Attachment) -> list[str]:
     """Return the names of the object's joints between its base and the attachment's link, base first."""
     model = placed.object.model
-    joint = model.frames[model.getFrameId(attachment.link)].parentJoint
+    joint = model.frames[model.getFrameId(attachment.link, pin.FrameType.BODY)].parentJoint
     names: list[str] = []
     while joint:
         names.insert(0, str(model.names[joint]))
@@ -114,37 +114,45 @@ class _Compiler:
         self.grasps: dict[str, str] = dict(scene.held)
         self.initial: dict[str, float] = {}
         self.state: dict[str, float] = {}
-        for name in self.grasps:
-            self._enter(name)
+        for name, attachment in self.grasps.items():
+            if scene.objects[name].object.free:
+                raise InputError(
+                    f"'{name}' is held and would have to be carried, which is not possible yet",
+                    field=f"scene.held.{name}",
+                    expected="objects that stand fixed in the world",
+                )
+            self._enter(scene.objects[name], attachment)
 
-    def _enter(self, name: str) -> None:
-        """Make an object's joints coordinates of the task, with the values they have at its start."""
-        placed = self.scene.objects[name]
-        for joint, value in zip(placed.object.coordinates.names, placed.state, strict=True):
-            self.initial.setdefault(f"{name}.{joint}", float(value))
-            self.state.setdefault(f"{name}.{joint}", float(value))
+    def _enter(self, placed: PlacedObject, attachment: str) -> None:
+        """Make the joints that a grasp can move coordinates of the task, with the values they have at its start."""
+        for joint in path_joints(placed, placed.object.attachments[attachment]):
+            value = float(placed.state[placed.object.coordinates.index(joint)])
+            self.initial.setdefault(f"{placed.name}.{joint}", value)
+            self.state.setdefault(f"{placed.name}.{joint}", value)
 
     def _append(self, name: str, segments: int, **details: Any) -> None:
         before = self.phases[-1].held if self.phases else self.scene.held
         leaves = {key: value for key, value in before.items() if key not in self.held}
         self.phases.append(Phase(name, segments, held=dict(self.held), leaves=leaves, before=dict(self.state), **details))
-        self.state.update(details.get("values", {}))
+        for coordinate, value in details.get("values", {}).items():  # a goal beyond a limit is approached as far as it goes
+            lower, upper = self._limits(self.scene.objects[coordinate.split(".", 1)[0]], coordinate)
+            self.state[coordinate] = min(max(value, lower), upper)
 
     def grasp(self, name: str, attachment_name: str | None, where: str) -> str:
         """Add the phase that takes hold of an object, unless it is held; return the attachment."""
-        placed = _placed(self.scene, name, where)
-        if name in self.held and attachment_name in (None, self.held[name]):
-            return self.held[name]
-        attachment = _attachment(placed, attachment_name, where)
+        placed = _placed(self.scene, name, f"{where}.object")
+        attachment = _attachment(placed, attachment_name or self.grasps.get(name), f"{where}.attachment")
+        if self.held.get(name) == attachment.name:
+            return attachment.name
         if self.grasps.get(name, attachment.name) != attachment.name:
             raise InputError(
                 f"object '{name}' is grasped by two different attachments in one plan",
-                field=where,
+                field=f"{where}.attachment",
                 expected=self.grasps[name],
                 got=attachment.name,
             )
         self.grasps[name] = attachment.name
-        self._enter(name)
+        self._enter(placed, attachment.name)
         self.held = {}  # one hand: whatever it held before is let go
         self._append(f"reach {name}.{attachment.name}", self.options.reach_waypoints, grasps={name: attachment.name})
         self.held = {name: attachment.name}
@@ -156,28 +164,47 @@ class _Compiler:
         for joint in step.joints:
             if joint not in names:
                 raise UnknownNameError(f"joint of '{step.object}'", joint, names, field=f"{where}.joints")
-        attachment = placed.object.attachments[self.grasp(step.object, step.attachment, f"{where}.object")]
+        attachment = placed.object.attachments[self.grasp(step.object, step.attachment, where)]
         path = path_joints(placed, attachment)
         for joint in step.joints:
             if joint not in path:
                 raise InputError(
                     f"joint '{joint}' does not move when '{step.object}' is held at '{attachment.name}'",
                     field=f"{where}.joints",
-                    expected=f"one of {', '.join(path)}",
+                    expected=f"one of {', '.join(path)}" if path else "an attachment that moves with it",
                 )
         values = {f"{step.object}.{joint}": value for joint, value in step.joints.items()}
         ranges = {coordinate: self._limits(placed, coordinate) for coordinate in values}
+        after: dict[str, float] = {}  # what must wait until the latch is left behind
         for latch in placed.object.latches:
             held, release = f"{step.object}.{latch.joint}", f"{step.object}.{latch.released_by}"
-            if held not in values or abs(self.state[held] - latch.held_at) > latch.engaged_within or release in ranges:
+            if held not in values or values[held] == self.state[held]:
                 continue
+            if abs(self.state[held] - latch.held_at) > latch.engaged_within:
+                continue
+            if latch.released_by not in path:
+                if placed.state[names.index(latch.released_by)] >= latch.threshold:
+                    continue
+                raise InputError(
+                    f"'{latch.joint}' is latched, and '{latch.released_by}', which releases it, does not move when "
+                    f"'{step.object}' is held at '{attachment.name}'",
+                    field=f"{where}.attachment",
+                    expected=f"an attachment that moves '{latch.released_by}'",
+                )
             lower, upper = self._limits(placed, release)
             turned = min(latch.threshold + LATCH_MARGIN, upper)
             if self.state[release] < turned:
-                self._append(f"turn {release}", self.options.turn_waypoints, ranges={release: (lower, upper)}, values={release: turned})
+                self._append(
+                    f"turn {release}", self.options.turn_waypoints, ranges={release: (lower, upper)}, values={release: turned}
+                )
+            if values.get(release, upper) < turned:
+                after[release] = values[release]
             ranges[release] = (turned, upper)
-            values[release] = turned
+            values[release] = turned if release in after else values.get(release, turned)
         self._append(f"move {', '.join(values)}", self.options.move_waypoints, ranges=ranges, values=values)
+        if after:
+            limits = {release: self._limits(placed, release) for release in after}
+            self._append(f"turn {', '.join(after)}", self.options.turn_waypoints, ranges=limits, values=after)
 
     def _limits(self, placed: PlacedObject, coordinate: str) -> tuple[float, float]:
         index = placed.object.coordinates.names.index(coordinate.split(".", 1)[1])
@@ -208,11 +235,16 @@ def compile_task(scene: Scene, steps: Sequence[Step], options: Options) -> Task:
     Raises:
         InputError: No steps, an unknown object, joint, attachment or frame, or a joint that cannot be moved that way.
     """
+    if isinstance(steps, Reach | Grasp | Actuate | GoTo):
+        raise InputError("one step alone", field="steps", expected="a list of steps", got=repr(steps))
     if not steps:
         raise InputError("there is nothing to do", field="steps", expected="at least one step", got="an empty list")
     compiler = _Compiler(scene, options)
     for index, step in enumerate(steps):
         compiler.add(step, f"steps[{index}]")
     if not compiler.phases:
-        raise InputError("there is nothing to do", field="steps", expected="a step that changes something", got="only what holds already")
-    return Task(tuple(steps), tuple(compiler.phases), compiler.grasps, compiler.initial)
+        expected, got = "a step that changes something", "only what holds already"
+        raise InputError("there is nothing to do", field="steps", expected=expected, got=got)
+    # Objects that are grasped later stand as they are at the start until then.
+    phases = tuple(replace(phase, before={**compiler.initial, **phase.before}) for phase in compiler.phases)
+    return Task(tuple(steps), phases, compiler.grasps, compiler.initial)

@@ -6,7 +6,8 @@ by at most what their relative motion is long.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import itertools
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -20,15 +21,18 @@ from vkc_pin.world import World
 
 __all__ = ["Hit", "PairTable"]
 
+RESOLUTION = 1e-3  # [m] of penetration that may stay unseen between two samples
+
 
 class Hit(NamedTuple):
-    """A pair's distance at one state."""
+    """A pair's distance [m] at one state: at sample `row`, or between it and the next."""
 
     row: int
     first: str
     second: str
     distance: float
     margin: float
+    at_waypoint: bool
 
 
 class PairTable:
@@ -37,15 +41,31 @@ class PairTable:
     Attributes:
         pairs: Geometry indices in `world.collision`, shape (P, 2).
         margins: Clearance each must keep at waypoints [m], shape (P,); 0 where a gripper closes on what it grasps.
+
+    Args:
+        scene: Where it happens.
+        world: The scene as one plain tree.
+        trajectory: The motion; what it holds at any time its gripper may touch.
+        dist_safe: Clearance to keep at the waypoints [m].
+        grasps: Objects and attachments that the gripper may touch besides.
     """
 
-    def __init__(self, scene: Scene, world: World, trajectory: Trajectory, dist_safe: float) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        world: World,
+        trajectory: Trajectory,
+        dist_safe: float,
+        *,
+        grasps: Iterable[tuple[str, str]] = (),
+    ) -> None:
         self.scene, self.world, self.dist_safe = scene, world, dist_safe
         self.moved = {name.partition(".")[0] for name in trajectory.names} & set(scene.objects)
         self.grasped = {
             f"{owner}.{scene.objects[owner].object.attachments[attachment].link}"
-            for phase in trajectory.phases
-            for owner, attachment in phase.held.items()
+            for owner, attachment in itertools.chain(
+                grasps, scene.held.items(), *(phase.held.items() for phase in trajectory.phases)
+            )
         }
         robots = len(scene.robot.collision.geometryObjects)
         self._robot_pairs = {frozenset((p.first, p.second)) for p in scene.robot.collision.collisionPairs}
@@ -83,55 +103,66 @@ class PairTable:
             return True
         if a == b:  # an object with itself, or two obstacles
             return False
-        moving = (a in self.moved and shapes[i].parentJoint > 0) or (b in self.moved and shapes[j].parentJoint > 0)
-        return moving
+        return (a in self.moved and shapes[i].parentJoint > 0) or (b in self.moved and shapes[j].parentJoint > 0)
 
     def sweep(self, z: NDArray[np.float64], waypoints: NDArray[np.int_]) -> Iterator[Hit]:
         """Yield what is close along the motion, and at least the closest pair of every waypoint.
 
         Args:
-            z: Sampled configurations of the world, shape (S, n).
+            z: Sampled configurations of the world, shape (S, n), evenly spaced between waypoints.
             waypoints: Rows of `z` that are waypoints, shape (T,).
         """
         model, data = self.world.model, self.world.model.createData()
         shapes = pin.GeometryData(self.geometry)
-        q = self.world.coordinates.q(z)
         at = np.empty((len(waypoints), len(self.pairs)))
-        for t, row in enumerate(waypoints):
-            pin.updateGeometryPlacements(model, data, self.geometry, shapes, q[row])
+        for t, q in enumerate(self.world.coordinates.q(z[waypoints])):
+            pin.updateGeometryPlacements(model, data, self.geometry, shapes, q)
             pin.computeDistances(self.geometry, shapes)
             at[t] = [result.min_distance for result in shapes.distanceResults]
-        for t, row in enumerate(waypoints):
-            closest = int(np.argmin(at[t]))
-            for k in {closest, *np.flatnonzero(at[t] < self.margins)}:
-                yield self._hit(int(row), int(k), at[t, k])
-        motion = self._motion_bounds(z[waypoints])
+        for t, row in enumerate(waypoints.tolist()):
+            for k in {int(np.argmin(at[t])), *np.flatnonzero(at[t] < self.margins).tolist()}:
+                yield self._hit(row, k, at[t, k], at_waypoint=True)
+        bounds = self._motion_bounds(z[waypoints])
+        motion = bounds[:, self.pairs[:, 0]] + bounds[:, self.pairs[:, 1]]
         # d(s) ≥ (d_t + d_{t+1} − relative motion) / 2 for every state in between.
-        floor = (at[1:] + at[:-1] - motion[:, self.pairs].sum(axis=2)) / 2
+        floor = (at[1:] + at[:-1] - motion) / 2
         smallest = max(1e-3, float(at.min()))  # what cannot come closer than that changes nothing
-        for t in range(len(waypoints) - 1):
+        for t in np.flatnonzero((floor < smallest).any(axis=1)).tolist():
             active = np.flatnonzero(floor[t] < smallest)
-            inside = range(waypoints[t] + 1, waypoints[t + 1])
-            if not len(active) or not len(inside):
-                continue
-            shapes.deactivateAllCollisionPairs()
-            for k in active:
-                shapes.activateCollisionPair(int(k))
-            for row in inside:
-                pin.updateGeometryPlacements(model, data, self.geometry, shapes, q[row])
-                closest = pin.computeDistances(self.geometry, shapes)
-                distance = shapes.distanceResults[closest].min_distance
-                if distance >= 0:
-                    yield self._hit(row, closest, distance)
-                    continue
-                for k in active:
-                    if shapes.distanceResults[int(k)].min_distance < 0:
-                        yield self._hit(row, int(k), shapes.distanceResults[int(k)].min_distance)
+            first, last = int(waypoints[t]), int(waypoints[t + 1])
+            rows = np.empty((last - first + 1, len(active)))
+            rows[0], rows[-1] = at[t, active], at[t + 1, active]
+            for row in range(first + 1, last):
+                rows[row - first] = self._distances(self.world.coordinates.q(z[row]), active, data, shapes)
+                closest = int(np.argmin(rows[row - first]))
+                for c in {closest, *np.flatnonzero(rows[row - first] < 0).tolist()}:
+                    yield self._hit(row, active[c], rows[row - first, c])
+            # What comes between two samples is looked at again and again until nothing deeper than 1 mm can hide.
+            step = motion[t, active] / (last - first)
+            alone = self.margins[active] > 0  # a hand that holds something moves along with it: `closure` sees to that
+            for r, c in np.argwhere(((rows[1:] + rows[:-1] - step) < 0) & alone):
+                stack = [(0.0, 1.0, rows[r, c], rows[r + 1, c])]
+                while stack:
+                    low, high, before, after = stack.pop()
+                    if (width := (high - low) * step[c]) <= 2 * RESOLUTION or before + after >= width:
+                        continue
+                    middle = (low + high) / 2
+                    state = self.world.coordinates.q((1 - middle) * z[first + r] + middle * z[first + r + 1])
+                    (between,) = self._distances(state, active[c : c + 1], data, shapes)
+                    yield self._hit(first + r, active[c], between)
+                    stack += [(low, middle, before, between), (middle, high, between, after)]
 
-    def _hit(self, row: int, k: int, distance: float) -> Hit:
+    def _distances(
+        self, q: NDArray[np.float64], pairs: NDArray[np.int_], data: pin.Data, shapes: pin.GeometryData
+    ) -> NDArray[np.float64]:
+        """Return the distances of some pairs at one configuration [m]."""
+        pin.updateGeometryPlacements(self.world.model, data, self.geometry, shapes, q)
+        return np.array([pin.computeDistance(self.geometry, shapes, int(k)).min_distance for k in pairs])
+
+    def _hit(self, row: int, k: int, distance: float, *, at_waypoint: bool = False) -> Hit:
         first, second = self.pairs[k]
         labels = self.world.collision_labels
-        return Hit(row, labels[first], labels[second], float(distance), float(self.margins[k]))
+        return Hit(int(row), labels[first], labels[second], float(distance), float(self.margins[k]), at_waypoint)
 
     def _motion_bounds(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return how far any point of each geometry can move between waypoints, shape (T − 1, G) [m].

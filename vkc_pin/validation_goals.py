@@ -1,0 +1,175 @@
+"""Whether a motion brings about what was asked for, step by step and in that order."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.options import Options
+from vkc_pin.report import Violation
+from vkc_pin.steps import Actuate, GoTo, Grasp, Reach, Step
+from vkc_pin.validation_samples import Samples
+
+__all__ = ["check_goals", "check_steps"]
+
+MOTION_TOLERANCE = 1e-5  # [m] or [rad]: less is no motion
+
+
+class Miss(NamedTuple):
+    """One thing of a step that is not as it was asked for."""
+
+    subject: str
+    amount: float
+    unit: str
+    detail: str
+
+
+def check_steps(samples: Samples, steps: Sequence[Step]) -> None:
+    """Check that the steps name what there is.
+
+    Raises:
+        InputError: There is none, or one is no step.
+        UnknownNameError: An object, joint, attachment or frame does not exist.
+    """
+    if not steps:
+        raise InputError("there is nothing to check", field="steps", expected="at least one step", got="none")
+    objects = samples.scene.objects
+    for number, step in enumerate(steps):
+        where = f"steps[{number}]"
+        if isinstance(step, Actuate | Grasp):
+            if step.object not in objects:
+                raise UnknownNameError("object", step.object, objects, field=f"{where}.object")
+            item = objects[step.object].object
+            if step.attachment is not None and step.attachment not in item.attachments:
+                kind = f"attachment of '{step.object}'"
+                raise UnknownNameError(kind, step.attachment, item.attachments, field=f"{where}.attachment")
+            for joint in step.joints if isinstance(step, Actuate) else ():
+                if joint not in item.coordinates.names:
+                    raise UnknownNameError(f"joint of '{step.object}'", joint, item.coordinates.names, field=f"{where}.joints")
+        elif isinstance(step, Reach):
+            frames = [frame.name for frame in samples.scene.robot.model.frames]
+            if step.frame is not None and step.frame not in frames:
+                raise UnknownNameError("frame of the robot", step.frame, frames, field=f"{where}.frame")
+        elif not isinstance(step, GoTo):
+            raise InputError("not a step", field=where, expected="Reach, Grasp, Actuate or GoTo", got=repr(step))
+
+
+def check_goals(samples: Samples, steps: Sequence[Step], options: Options) -> list[Violation]:
+    """Check that every step is done, in their order: "goal" and "order".
+
+    There must be a phase for each step at whose end the step's goal holds, the last step's at the end of the motion; and
+    in the phases that lead from one to the next, no object may move but the one that the step actuates.
+    """
+    phases = samples.trajectory.phases
+    ends = [0, *(phase.last for phase in phases)]  # a step may be done before anything begins
+    misses = [[_misses(samples, step, end, options) for end in ends] for step in steps]
+    found, reached = [], 0
+    for number in range(len(steps)):
+        candidates = [len(ends) - 1] if number == len(steps) - 1 else range(reached, len(ends))
+        fit = next((k for k in candidates if not misses[number][k]), None)
+        if fit is None:
+            best = min((k for k in candidates if k), key=lambda k: max(m.amount for m in misses[number][k]))
+            time = float(samples.trajectory.times[ends[best]])
+            found += [Violation("goal", m.subject, ends[best], time, m.amount, m.unit, m.detail) for m in misses[number][best]]
+        else:
+            reached = fit
+    return found or _check_order(samples, steps, [[not missing for missing in row] for row in misses])
+
+
+def _check_order(samples: Samples, steps: Sequence[Step], holds: list[list[bool]]) -> list[Violation]:
+    """Check that no object moves before its step's turn; `holds[i][k]` says whether step i holds at the start of phase k."""
+    phases = samples.trajectory.phases
+    moved = [_moved(samples, k) for k in range(len(phases))]
+    own = [{step.object} if isinstance(step, Actuate) else set() for step in steps]
+    turns = {0}  # which step may be the one that is being done
+    for k in range(len(phases) + 1):
+        for turn in range(len(steps) - 1):
+            if turn in turns and holds[turn][k]:
+                turns.add(turn + 1)
+        if k == len(phases):
+            break
+        left = {turn for turn in turns if moved[k].keys() <= own[turn]}
+        if not left:
+            last, phase = max(turns), phases[k]
+            name = next(owner for owner in moved[k] if owner not in own[last])
+            amount, unit = moved[k][name]
+            detail = (
+                f"moves by {amount:.4f} {unit} in '{phase.name}', when it is the turn of step {last + 1}, {_kind(steps[last])}"
+            )
+            return [Violation("order", name, phase.first, float(samples.trajectory.times[phase.first]), amount, unit, detail)]
+        turns = left
+    if len(steps) - 1 in turns:
+        return []
+    first = max(turns)
+    detail = f"{_kind(steps[first])} is undone before the next step begins"
+    return [Violation("order", f"step {first + 1}", phases[-1].last, float(samples.times[-1]), 1.0, "steps", detail)]
+
+
+def _kind(step: Step) -> str:
+    return type(step).__name__
+
+
+def _moved(samples: Samples, number: int) -> dict[str, tuple[float, str]]:
+    """Return the objects that are moved by the hand in a phase, and how far; what moves by itself is "unheld"."""
+    phase = samples.trajectory.phases[number]
+    moved: dict[str, tuple[float, str]] = {}
+    driven = samples.moved_by(phase.held)
+    for column, name in enumerate(samples.trajectory.names):
+        if name not in driven:
+            continue
+        owner = name.partition(".")[0]
+        values = samples.trajectory.positions[phase.first : phase.last + 1, column]
+        if (spread := float(np.ptp(values))) > MOTION_TOLERANCE:
+            moved[owner] = max(moved.get(owner, (0.0, "")), (spread, samples.unit(name)))
+    return moved
+
+
+def _misses(samples: Samples, step: Step, waypoint: int, options: Options) -> list[Miss]:
+    """Return what of a step's goal does not hold at a waypoint."""
+    row, misses = int(samples.waypoint_rows[waypoint]), []
+    tolerance = {"m": options.goal_position, "rad": options.goal_angle}
+
+    def expect(subject: str, error: float, unit: str, detail: str) -> None:
+        if not error <= tolerance[unit]:
+            misses.append(Miss(subject, error - tolerance[unit], unit, detail))
+
+    if isinstance(step, Actuate):
+        for joint, goal in step.joints.items():
+            name = f"{step.object}.{joint}"
+            value, unit = float(samples.z[row, samples.world.coordinates.index(name)]), samples.unit(name)
+            expect(name, abs(value - goal), unit, f"{value:.4f} {unit} instead of {goal:.4f} {unit}")
+    elif isinstance(step, Grasp):
+        name, (distance, turn) = _grasp(samples, step, row)
+        expect(f"{step.object}.{name}", distance, "m", f"the tool is {distance:.4f} m from the grasp")
+        expect(f"{step.object}.{name}", turn, "rad", f"the tool is turned {turn:.4f} rad from the grasp")
+    elif isinstance(step, Reach):
+        frame = step.frame or samples.scene.robot.tool_frame
+        offset = step.pose.actInv(samples.placements([row], frame)[0])
+        distance, turn = float(np.linalg.norm(offset.translation)), float(np.linalg.norm(pin.log3(offset.rotation)))
+        expect(frame, distance, "m", f"{distance:.4f} m from the pose to reach")
+        expect(frame, turn, "rad", f"turned {turn:.4f} rad from the pose to reach")
+    else:
+        x, y, yaw = samples.z[row, :3]
+        distance = float(np.hypot(x - step.x, y - step.y))
+        expect("base", distance, "m", f"{distance:.4f} m from the place to go to")
+        if step.yaw is not None:
+            turn = float(abs((yaw - step.yaw + np.pi) % (2 * np.pi) - np.pi))
+            expect("base heading", turn, "rad", f"turned {turn:.4f} rad from the heading asked for")
+    return misses
+
+
+def _grasp(samples: Samples, step: Grasp, row: int) -> tuple[str, tuple[float, float]]:
+    """Return the attachment that a step asks for and how far the tool is from it, [m] and [rad].
+
+    Without a name it is the one that is used, if there is one: held at the start or in some phase.
+    """
+    used = [samples.scene.held, *(phase.held for phase in samples.trajectory.phases)]
+    names = [step.attachment] if step.attachment is not None else [held[step.object] for held in used if step.object in held]
+    names = names or [samples.scene.objects[step.object].object.attachment().name]
+    errors = {name: samples.grasp_errors(step.object, name, np.array([row]))[0] for name in names}
+    name = min(errors, key=lambda key: float(errors[key].max()))
+    return name, (float(errors[name][0]), float(errors[name][1]))

@@ -53,8 +53,8 @@ class VirtualKinematicChain:
         coordinates: Minimal coordinates z of `model`.
         names: Their names, shape (n,); objects' as `<object>.<joint>`, virtual joints' as `<object>.<attachment>`.
         lower, upper, velocity, acceleration: Limits, shape (n,), SI units.
-        collision: Collision geometry of the robot (first, in the robot's order) and of the objects' moving links.
-        held_geometries: Object → indices of its geometry in `collision`.
+        collision: Collision geometry of the robot (first, in the robot's order) and of what moves of the objects.
+        held_geometries: Object → indices in `collision` of its geometry that its joints on the way to the grasp move.
         closures: Object → its closure.
         virtual: Object → names of the coordinates of its attachment's virtual joint.
     """
@@ -166,14 +166,10 @@ def consolidate(scene: Scene, grasps: Mapping[str, str]) -> VirtualKinematicChai
             stated = (placed.object.lower, placed.object.upper, placed.object.velocity, placed.object.acceleration)
             for row, values in zip(limits, stated, strict=True):
                 row.append(float(values[index]))
-        # What does not move with the object's joints (a door's frame) stands in the world, closed or not.
-        moving = [
-            geometry
-            for geometry, original in zip(tree.collision.geometryObjects, placed.object.collision.geometryObjects, strict=True)
-            if original.parentJoint != 0
-        ]
-        held_geometries[name] = tuple(graft_geometry(collision, moving, joints=joints, placement=placement, prefix=f"{name}."))
         base = model.frames[model.getFrameId(f"{name}.{placed.object.base_link}")]
+        # What the joints in hand do not move (a door's frame, another door in it) stands in the world, closed or not.
+        moving = [shape for shape in tree.collision.geometryObjects if joints[shape.parentJoint] != base.parentJoint]
+        held_geometries[name] = tuple(graft_geometry(collision, moving, joints=joints, placement=placement, prefix=f"{name}."))
         closures[name] = Closure(base.parentJoint, pin.SE3(base.placement), _base_target(placed))
     for joint_name in names:
         if names.count(joint_name) > 1:

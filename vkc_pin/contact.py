@@ -8,6 +8,7 @@ signed distance's at the linearisation point. It is linear in the placements of 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -43,6 +44,14 @@ class Contacts:
     normal: NDArray[np.float64]
     first: NDArray[np.float64]
     second: NDArray[np.float64]
+
+    def arrays(self) -> tuple[NDArray[Any], ...]:
+        """Return its arrays in the order of the attributes."""
+        return (self.waypoint, self.pair, self.distance, self.margin, self.normal, self.first, self.second)
+
+    def select(self, index: NDArray[np.int_]) -> Contacts:
+        """Return the contacts at `index`, in that order."""
+        return Contacts(*(array[index] for array in self.arrays()))
 
     def violation(self) -> float:
         """Return by how much the worst pair falls short of its margin [m]; 0 if none does."""
@@ -158,8 +167,8 @@ class ContactModel:
             before = {c.removeprefix(f"{name}."): v for c, v in phase.before.items() if c.startswith(f"{name}.")}
             standing = standing_geometry(placed.with_state(before))
             if name in phase.held:  # its frame stands on, the rest is in the hand
-                originals = placed.object.collision.geometryObjects
-                standing = [g for g, original in zip(standing, originals, strict=True) if original.parentJoint == 0]
+                held_shapes = {geometry.geometryObjects[i].name for i in chain.held_geometries[name]}
+                standing = [shape for shape in standing if f"{name}.{shape.name}" not in held_shapes]
             own = chain.held_geometries[name] if name in phase.held else ()
             hands = {**phase.leaves, **phase.grasps}
             targets = {placed.object.attachments[hands[name]].link} if name in hands else set()
@@ -237,6 +246,10 @@ class ContactModel:
         table, stacked = table[order], np.array(vectors, float).reshape(len(rows), 3, 3)[order]
         index = table[:, :3].astype(int)
         return Contacts(index[:, 0], index[:, 1:], table[:, 3], table[:, 4], stacked[:, 0], stacked[:, 1], stacked[:, 2])
+
+    def joints_of(self, geometries: NDArray[np.int_]) -> NDArray[np.int_]:
+        """Return the joints of the chain that carry `geometries`; 0 for what stands in the world."""
+        return self._joints[geometries]
 
     def planes(self, z: NDArray[np.float64], contacts: Contacts, *, slots: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the coefficients C, shape (W, slots, 12·joints), and offsets R, shape (W, slots), of the nearest contacts.

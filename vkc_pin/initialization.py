@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from vkc_pin.inverse_kinematics import PoseSolver
 from vkc_pin.problem import TrajectoryProblem
 
-__all__ = ["METHODS", "initialize"]
+__all__ = ["METHODS", "initialize", "scatter"]
 
 METHODS = ("interpolated", "stationary")
 _SCATTER = 192  # random seeds for a configuration that nothing leads to
@@ -34,6 +34,26 @@ def initialize(problem: TrajectoryProblem, method: str, rng: np.random.Generator
     if method == "stationary":
         return [_objects(problem, np.tile(problem.start, (problem.segments, 1)))]
     return _Interpolation(problem, rng).seeds(count)
+
+
+def scatter(
+    problem: TrajectoryProblem, waypoint: int, rng: np.random.Generator
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Return random configurations that try to be at the goal of `waypoint`, shape (B, n), and their residuals, shape (B,).
+
+    None if there is neither a pose to reach nor a place for the base there.
+    """
+    search = _Interpolation(problem, rng)
+    pose, row = search.pose_at(waypoint), waypoint - 1
+    z = np.tile(problem.start, (_SCATTER, 1))
+    if pose is not None:
+        z, _ = search.knot(z, waypoint, fresh=True)
+        residual, _ = problem.transcription.pose_solvers[pose].evaluate(z, problem.targets[pose])
+        return z, np.abs(residual).max(axis=1)
+    if (problem.lower[row, :2] < problem.upper[row, :2]).any():
+        return None
+    z[:, 2:] += rng.normal(0.0, 1.0, z[:, 2:].shape)
+    return np.clip(z, problem.lower[row], problem.upper[row]), np.zeros(len(z))
 
 
 def smooth(steps: int) -> NDArray[np.float64]:
@@ -95,7 +115,7 @@ class _Interpolation:
         wanted = _SCATTER if fresh else _BEAM * _CHILDREN
         parents = np.arange(max(wanted, len(paths))) % len(paths)
         before = paths[parents, -1]
-        z, bad = self._knot(before, waypoint, fresh=fresh)
+        z, bad = self.knot(before, waypoint, fresh=fresh)
         total = cost[parents] + np.abs(z - before) @ self.weights + bad
         best = np.argsort(total, kind="stable")[:_BEAM]
         return np.concatenate([paths[parents[best]], z[best, None]], axis=1), total[best]
@@ -107,21 +127,22 @@ class _Interpolation:
         depth = self._depth(between.reshape(-1, between.shape[-1]), min(begin + 1, end))
         return np.sum(np.where(depth > 0, 1.0 + _DEPTH / _APPROACH * depth, 0.0).reshape(len(first), -1), axis=1)
 
-    def _pose_at(self, waypoint: int) -> int | None:
+    def pose_at(self, waypoint: int) -> int | None:
+        """Return the pose that must hold at a waypoint, if any."""
         poses = self.problem.transcription.structure.poses
         return next((k for k, pose in enumerate(poses) if waypoint in pose.waypoints), None)
 
     def _solver(self, pose: int) -> tuple[PoseSolver, pin.SE3]:
         return self.problem.transcription.pose_solvers[pose], self.problem.targets[pose]
 
-    def _knot(self, before: NDArray[np.float64], waypoint: int, *, fresh: bool) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def knot(self, before: NDArray[np.float64], waypoint: int, *, fresh: bool) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return configurations for a waypoint, shape (B, n), and what is wrong with each, as a cost."""
         problem, row = self.problem, waypoint - 1
         z = before.copy()
         z[:, self.driven] = self.objects[row, self.driven]
         lower, upper = problem.lower[row].copy(), problem.upper[row].copy()
         lower[self.driven] = upper[self.driven] = self.objects[row, self.driven]
-        pose = self._pose_at(waypoint)
+        pose = self.pose_at(waypoint)
         if pose is None:
             return np.clip(z, lower, upper), np.zeros(len(z))
         solver, target = self._solver(pose)

@@ -36,7 +36,6 @@ class Options:
         max_outer: Rounds of the witness-plane loop.
         max_iterations: Ipopt iterations in one round.
         penalty: First weight of the exact ℓ1 penalty on clearance slack; it is adapted.
-        refine_rounds: How often planes are added where a segment collides between waypoints.
         max_restarts: How many different seeds are tried.
     """
 
@@ -60,7 +59,6 @@ class Options:
     max_outer: int = 16
     max_iterations: int = 200
     penalty: float = 200.0
-    refine_rounds: int = 6
     max_restarts: int = 4
 
     def __post_init__(self) -> None:

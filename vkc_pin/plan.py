@@ -97,6 +97,22 @@ class Plan:
         ]
         return "\n".join(lines)
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return trajectory, metrics and report as plain data, e.g. for JSON; distances that do not exist are None."""
+        finite = {key: value if np.isfinite(value) else None for key, value in self.metrics.items()}
+        return {
+            "scene": self.scene.name,
+            "steps": [step_to_dict(step) for step in self.steps],
+            "success": self.success,
+            "status": self.status,
+            "metrics": finite,
+            "seed": self.seed,
+            "initialization": self.initialization,
+            "violations": [asdict(violation) for violation in self.validation.violations],
+            "notes": list(self.validation.notes),
+            "trajectory": self.trajectory.to_dict(),
+        }
+
     def __repr__(self) -> str:
         m = self.metrics
         return f"<Plan {self.status}: base {m['base_effort']:.2f} m, arm {m['arm_effort']:.2f} rad, {m['planning_time']:.2f} s>"

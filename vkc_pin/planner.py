@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vkc_pin.diagnosis import explain, impossible
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.goal import compile_task
 from vkc_pin.initialization import METHODS, initialize
@@ -86,9 +87,10 @@ class _Planner:
         build_time = problem.transcription.take_build_time()
         deadline = np.inf if self.time_limit is None else began + build_time + self.time_limit
         best: tuple[float, str, Trajectory, Report, str] | None = None
-        status = ""
+        reasons = impossible(problem)
+        status = "infeasible" if reasons else ""
         try:
-            for name, seed in self._seeds(problem):
+            for name, seed in [] if reasons else self._seeds(problem):
                 solution = self._solve(problem, seed, deadline)
                 best = self._better(best, problem, solution, name)
                 if best[1] == "success" or solution.status in ("time limit", "interrupted"):
@@ -97,9 +99,14 @@ class _Planner:
         except KeyboardInterrupt:
             status = "interrupted"
         if best is None:
-            stationary = Solution(problem.clip(np.tile(problem.start, (problem.segments, 1))), status=status or "infeasible")
-            best = self._better(None, problem, stationary, "stationary")
+            stationary = Solution(np.tile(problem.start, (problem.segments, 1)))
+            best = self._better(None, problem, stationary, "none")
         _, verdict, trajectory, report, name = best
+        if reasons:
+            report = report.with_reasons(reasons)
+        elif verdict != "success" and not status:
+            notes = explain(problem, self.seed)
+            report, status = dataclasses.replace(report, notes=tuple(notes)), "infeasible" if notes else ""
         build_time += problem.transcription.take_build_time()
         metrics = {
             "planning_time": time.perf_counter() - began - build_time,
@@ -141,7 +148,7 @@ class _Planner:
         self.iterations += solution.iterations
         for key, value in solution.timings.items():
             self.times[key] += value
-        self.history += [asdict(row) for row in solution.history]
+        self.history += [dataclasses.asdict(row) for row in solution.history]
         return solution
 
     def _better(

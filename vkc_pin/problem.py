@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,29 +17,13 @@ from vkc_pin.options import Options
 from vkc_pin.scene import Scene
 from vkc_pin.steps import Step
 from vkc_pin.pose import target_vector
-from vkc_pin.transcription import PoseRow, Structure, Transcription
+from vkc_pin.transcription import Transcription
+from vkc_pin.waypoint import PoseRow, Structure
 
-__all__ = ["ConstraintRow", "TrajectoryProblem", "build"]
+__all__ = ["TrajectoryProblem", "build"]
 
 _KEPT = 8  # programs kept for reuse; each holds some tens of MB
 _transcriptions: OrderedDict[tuple[Any, ...], Transcription] = OrderedDict()
-
-
-@dataclass(frozen=True)
-class ConstraintRow:
-    """How far one named constraint is from holding at one waypoint.
-
-    Attributes:
-        name: "closure door", "goal tool", "velocity base_x", ...
-        waypoint: Counted from 0, the start.
-        violation: Amount in `unit`, 0 where it holds.
-        unit: "m", "rad", "m/s", ...
-    """
-
-    name: str
-    waypoint: int
-    violation: float
-    unit: str
 
 
 def transcribe(structure: Structure) -> Transcription:
@@ -128,10 +111,8 @@ class TrajectoryProblem:
 
     def _bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         lower, upper = np.tile(self.chain.lower, (self.segments, 1)), np.tile(self.chain.upper, (self.segments, 1))
-        x_min, x_max, y_min, y_max = self.scene.arena
-        lower[:, :2], upper[:, :2] = np.maximum(lower[:, :2], (x_min, y_min)), np.minimum(upper[:, :2], (x_max, y_max))
-        if self.chain.robot.base == "fixed":  # wherever it stands
-            lower[:, :3] = upper[:, :3] = self.start[:3]
+        for column, name in enumerate(self.chain.names[:2]):
+            lower[:, column], upper[:, column] = self.limits(name)
         begin = 0
         for phase, end in zip(self.task.phases, self.ends, strict=True):
             inside = slice(begin, end)  # row t belongs to waypoint t + 1
@@ -150,6 +131,20 @@ class TrajectoryProblem:
                         lower[end - 1, column] = upper[end - 1, column] = value
             begin = end
         return lower, upper
+
+    def limits(self, name: str) -> tuple[float, float]:
+        """Return the position limits of a coordinate; the base's end at the arena's edge."""
+        column = self.chain.index(name)
+        lower, upper = float(self.chain.lower[column]), float(self.chain.upper[column])
+        if column < 2:
+            lower, upper = max(lower, self.scene.arena[2 * column]), min(upper, self.scene.arena[2 * column + 1])
+        return lower, upper
+
+    def unit(self, name: str) -> str:
+        """Return "m" or "rad", the unit of a coordinate."""
+        kind = str(self.chain.model.joints[self.chain.coordinates.joints[self.chain.index(name)]].shortname())
+        planar = kind == "JointModelPlanar" and not name.endswith("_yaw")
+        return "m" if planar or "Prismatic" in kind or kind in ("JointModelPX", "JointModelPY", "JointModelPZ") else "rad"
 
     def waypoints(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return `z`, shape (N, n), with the start before it, shape (N + 1, n)."""

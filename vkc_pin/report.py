@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 __all__ = ["Report", "Violation"]
+
+LISTED = 12  # violations that the text names; `violations` has them all
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,7 @@ class Report:
         closure_error: Largest drift of a held object's base or of the grasp [m].
         closure_angle: The same for orientation [rad].
         states: How many configurations were looked at.
+        notes: What stands in the way of the task as a whole, if planning failed.
         notes: Remarks, one line each.
     """
 
@@ -65,8 +68,19 @@ class Report:
         """Return it as lines of text."""
         head = f"validation  {self.states} configurations checked: "
         if self.ok:
-            return [head + "every constraint holds", *self.notes]
-        return [head + f"{len(self.violations)} constraint(s) violated", *(f"  - {v}" for v in self.violations), *self.notes]
+            return [head + "every constraint holds"]
+        return [
+            head + f"{len(self.violations)} constraint(s) violated",
+            *(f"  - {v}" for v in self.violations[:LISTED]),
+            *([f"  ... and {len(self.violations) - LISTED} more"] if len(self.violations) > LISTED else []),
+            *(f"  because {note}" for note in self.notes),
+        ]
+
+    def with_reasons(self, reasons: Sequence[Violation]) -> Report:
+        """Return the report with `reasons` first; what it says about the same constraint and subject goes."""
+        known = {(reason.constraint, reason.subject) for reason in reasons}
+        rest = (v for v in self.violations if (v.constraint, v.subject) not in known)
+        return replace(self, violations=(*reasons, *rest))
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data of it."""

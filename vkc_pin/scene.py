@@ -140,6 +140,21 @@ class Scene:
         changed = dataclasses.replace(self, objects=MappingProxyType({**self.objects, name: placed}), document=document)
         return changed.with_held_objects_in_the_hand()
 
+    def with_held(self, held: Mapping[str, str]) -> Scene:
+        """Return the scene with the robot holding objects at the start, by object → attachment.
+
+        Raises:
+            UnknownNameError: There is no such object or attachment.
+        """
+        for name, attachment in held.items():
+            if name not in self.objects:
+                raise UnknownNameError("object", name, self.objects, field="held")
+            self.objects[name].object.attachment(attachment)
+        document = copy.deepcopy(self.document)
+        document["start"]["held"] = dict(held)
+        changed = dataclasses.replace(self, held=MappingProxyType(dict(held)), document=document)
+        return changed.with_held_objects_in_the_hand()
+
     def with_held_objects_in_the_hand(self) -> Scene:
         """Return the scene with every free object that is held placed where the robot holds it at the start."""
         objects = dict(self.objects)

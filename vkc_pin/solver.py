@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vkc_pin.contact import Contacts
+from vkc_pin.monitor import Interrupt, interruptible
 from vkc_pin.problem import TrajectoryProblem
+from vkc_pin.refinement import collisions_between, merge
 
 __all__ = ["Iteration", "Solution", "solve"]
 
@@ -113,7 +115,8 @@ class _Trial:
 class _Loop:
     """The state between rounds: the current waypoints, their contacts, multipliers and penalty."""
 
-    def __init__(self, problem: TrajectoryProblem, seed: NDArray[np.float64]) -> None:
+    def __init__(self, problem: TrajectoryProblem, seed: NDArray[np.float64], deadline: float = np.inf) -> None:
+        self.deadline = deadline
         self.problem, self.options = problem, problem.options
         self.transcription = problem.transcription
         self.z = problem.clip(seed)
@@ -122,15 +125,32 @@ class _Loop:
         self.penalty = problem.options.penalty
         self.solution = Solution(self.z)
         self.targets = problem.target_matrix()
+        self.between = False
         self.at = self.contacts(self.z)
         self.shortfall = self.at.shortfall(problem.segments)
         self.objective, self.pose_error = problem.objective(self.z), problem.pose_error(self.z)
 
     def contacts(self, z: NDArray[np.float64]) -> Contacts:
+        """Return what is close at the waypoints and, once that was needed, what collides between them."""
         begin = time.perf_counter()
         found = self.problem.evaluate_contacts(z, reach=self.options.contact_reach, nearest=self.options.contact_slots)
+        if self.between:
+            found = merge(found, collisions_between(self.problem, z))
         self.solution.timings["coal"] += time.perf_counter() - begin
         return found
+
+    def free_between(self, z: NDArray[np.float64]) -> bool:
+        """Return whether nothing collides between waypoints; if something does, look there from now on."""
+        if not self.between:
+            begin = time.perf_counter()
+            found = collisions_between(self.problem, z)
+            self.solution.timings["coal"] += time.perf_counter() - begin
+            if len(found.waypoint):
+                self.between = True
+                self.at = merge(self.at, found)
+                self.shortfall = self.at.shortfall(self.problem.segments)
+                return False
+        return True
 
     def try_step(self, radius: float) -> _Trial:
         """Solve within `radius` of the current waypoints, and look at what is really there."""
@@ -175,6 +195,7 @@ class _Loop:
             and trial.pose_error < POSE_TOLERANCE
             and trial.rate <= RATE_TOLERANCE
             and self.problem.drift(trial.z) < DRIFT
+            and self.free_between(trial.z)
         )
 
     def stuck(self, trial: _Trial, radius: float) -> bool:
@@ -195,7 +216,7 @@ class _Loop:
         lower, upper = np.maximum(problem.lower, self.z - radius), np.minimum(problem.upper, self.z + radius)
         bounds = self._row_bounds()
         options = {**_IPOPT, **(_WARM if self.multipliers else {}), "ipopt.max_iter": self.options.max_iterations}
-        solver = t.solver(rates=self.rates, options=options)
+        solver = t.solver(rates=self.rates, options=options, deadline=self.deadline)
         arguments = {
             "x0": np.column_stack([self.z, self.shortfall]).ravel(),
             "lbx": np.column_stack([lower, np.zeros(t.segments)]).ravel(),
@@ -249,11 +270,18 @@ def solve(
         callback: Called after every round.
         deadline: Value of `time.perf_counter()` at which to stop with the best iterate.
     """
-    loop, options = _Loop(problem, seed), problem.options
-    solution, started = loop.solution, time.perf_counter()
-    radius = FIRST_RADIUS
-    for _ in range(options.max_outer):
-        if time.perf_counter() > deadline:
+    loop = _Loop(problem, seed, deadline)
+    solution = loop.solution
+    with interruptible() as interrupt:
+        _iterate(loop, callback, interrupt)
+    return solution
+
+
+def _iterate(loop: _Loop, callback: Callable[[Iteration], None] | None, interrupt: Interrupt) -> None:
+    """Run rounds until everything holds, nothing helps any more, or time is up."""
+    solution, started, radius = loop.solution, time.perf_counter(), FIRST_RADIUS
+    for _ in range(loop.options.max_outer):
+        if time.perf_counter() > loop.deadline:
             solution.status = "time limit"
             break
         trial = loop.try_step(radius)
@@ -276,11 +304,15 @@ def solve(
         if callback is not None:
             callback(row)
         if accepted:
+            used, gain = radius, (loop.objective - trial.objective) / max(abs(loop.objective), 1e-9)
             loop.accept(trial)
             radius = radius * 1.5 if ratio > 0.7 else radius
-            if loop.done(trial):
+            if loop.done(trial) and (trial.step < 0.99 * used or gain < 0.05):
                 solution.converged, solution.status = True, "converged"
                 break
+        if interrupt.pressed:
+            solution.status = "interrupted"
+            break
         if not accepted or ratio < 0.25:
             radius = SHRINK * min(radius, trial.step)
         if loop.stuck(trial, radius):
@@ -288,4 +320,3 @@ def solve(
                 break
             loop.raise_penalty()
             radius = RESTART_RADIUS
-    return solution

@@ -10,111 +10,18 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 import numpy as np
-import pinocchio as pin
 from numpy.typing import NDArray
 
-from vkc_pin import cpin
 from vkc_pin.coordinates import Coordinates
 from vkc_pin.inverse_kinematics import PoseSolver
-from vkc_pin.pose import pose_residual
+from vkc_pin.monitor import Monitor
+from vkc_pin.waypoint import POSE_ROWS, Structure, WaypointFunctions
 
-__all__ = ["PoseRow", "Structure", "Transcription"]
-
-POSE_ROWS = 6
-
-
-@dataclass(frozen=True)
-class PoseRow:
-    """A frame that must be at a parametric placement at some waypoints.
-
-    Attributes:
-        joint: Joint of the model that carries it.
-        local: Its placement in the joint's frame.
-        waypoints: At which waypoints, counted from 1.
-    """
-
-    joint: int
-    local: pin.SE3
-    waypoints: tuple[int, ...]
-
-
-@dataclass(frozen=True)
-class Structure:
-    """What a symbolic program depends on.
-
-    Attributes:
-        model: The chain.
-        segments: N, the number of waypoints after the start.
-        poses: Frames that must be somewhere.
-        slots: K, witness planes per waypoint.
-        weights_velocity, weights_acceleration: Of eq. 1, per coordinate, on the squared differences; shape (n,).
-        rests: Waypoints inside the motion at which it comes to rest, as it does at start and end.
-        differential: Whether the base must not slip sideways.
-    """
-
-    model: pin.Model
-    segments: int
-    poses: tuple[PoseRow, ...]
-    slots: int
-    weights_velocity: NDArray[np.float64]
-    weights_acceleration: NDArray[np.float64]
-    rests: tuple[int, ...] = ()
-    differential: bool = False
-
-    @property
-    def key(self) -> tuple[Any, ...]:
-        """Equal for structures that share one program."""
-        poses = tuple((p.joint, p.local.homogeneous.round(12).tobytes(), p.waypoints) for p in self.poses)
-        weights = (self.weights_velocity.tobytes(), self.weights_acceleration.tobytes())
-        return (self.model.saveToString(), self.segments, poses, self.slots, *weights, self.rests, self.differential)
-
-
-class _Kind:
-    """The SX functions of one kind of waypoint: which poses it must satisfy."""
-
-    def __init__(self, structure: Structure, poses: Sequence[int]) -> None:
-        model, coordinates = structure.model, Coordinates(structure.model)
-        n, slots, joints = coordinates.size, structure.slots, model.njoints - 1
-        z, s = ca.SX.sym("z", n), ca.SX.sym("s")
-        planes, offsets = ca.SX.sym("C", slots, 12 * joints), ca.SX.sym("R", slots)
-        targets = ca.SX.sym("W", 12, max(len(poses), 1))
-        placements = cpin.joint_placements(model)(coordinates.q_symbolic(z))
-        stacked = ca.vec(placements)
-        residuals = []
-        for k, pose in enumerate(poses):
-            row = structure.poses[pose]
-            column = placements[:, row.joint - 1]
-            rotation = ca.reshape(column[:9], 3, 3)
-            body = rotation @ row.local.rotation, rotation @ row.local.translation + column[9:]
-            residuals.append(pose_residual(*body, targets[:, k]))
-        pose_rows = ca.vertcat(*residuals) if residuals else ca.SX(0, 1)
-        self.rows = slots + POSE_ROWS * len(poses)
-        rows = ca.vertcat(planes @ stacked - offsets + s, pose_rows)
-        multipliers = ca.SX.sym("lam", self.rows)
-        # C·∂vec(M) is cheaper than differentiating every plane.
-        sweep = ca.jacobian(stacked, z)
-        slot_jacobian = ca.horzcat(planes @ sweep, ca.SX.ones(slots, 1))
-        pose_jacobian = ca.horzcat(ca.jacobian(pose_rows, z), ca.SX(pose_rows.numel(), 1))
-        jacobian = ca.vertcat(slot_jacobian, pose_jacobian)
-        w = ca.SX.sym("w", 12 * joints)
-        lagrangian = ca.dot(w, stacked) + ca.dot(multipliers[slots:], pose_rows)
-        hessian = ca.triu(ca.hessian(lagrangian, z)[0])
-        inner = ca.Function("inner", [z, targets, w, multipliers], [hessian])
-        hessian = inner(z, targets, planes.T @ multipliers[:slots], multipliers)
-        inputs = [z, s, ca.vec(planes), offsets, ca.vec(targets)]
-        options = {"cse": True}
-        self.value = ca.Function("g", inputs, [rows], options)
-        self.jacobian = ca.Function("rows_jacobian", inputs, [ca.vertcat(*jacobian.nonzeros())], options)
-        self.jacobian_pattern = jacobian.sparsity().get_triplet()
-        self.hessian = ca.Function("lagrangian_hessian", [*inputs, multipliers], [ca.vertcat(*hessian.nonzeros())], options)
-        self.hessian_pattern = hessian.sparsity().get_triplet()
-
+__all__ = ["Transcription"]
 
 class Transcription:
     """The program of one `Structure`: symbols, functions and Ipopt solvers, reused between tasks.
@@ -143,7 +50,7 @@ class Transcription:
         self._constraints()
         self._rates()
         self.pose_solvers = [PoseSolver(structure.model, pose.joint, pose.local) for pose in structure.poses]
-        self._solvers: dict[tuple[bool, tuple[tuple[str, Any], ...]], ca.Function] = {}
+        self._solvers: dict[tuple[Any, ...], tuple[ca.Function, Monitor | None]] = {}
         self.build_time = time.perf_counter() - started
 
     def take_build_time(self) -> float:
@@ -223,7 +130,7 @@ class Transcription:
         self.multipliers = ca.MX.sym("lam_g", self.rows)
         for poses in kinds:
             at = [t for t in range(N) if poses_at[t] == poses]
-            kind = _Kind(self.structure, poses)
+            kind = WaypointFunctions(self.structure, poses)
             targets = ca.repmat(ca.vec(self.targets[:, list(poses)] if poses else self.targets[:, 0]), 1, len(at))
             inputs = [self.z[:, at], self.s[:, at], self.planes[:, at], self.offsets[:, at], targets]
             rows = first_row[at][:, None] + np.arange(kind.rows)
@@ -273,16 +180,26 @@ class Transcription:
         start = np.vstack([np.kron(self.start_first[:, None], identity), np.kron(self.start_second[:, None], identity)])
         self.rate_matrix, self.rate_start = ca.sparsify(ca.DM(matrix)), ca.sparsify(ca.DM(start))
 
-    def solver(self, *, rates: bool, options: dict[str, Any]) -> ca.Function:
-        """Return Ipopt on this program; with `rates`, velocity and acceleration rows follow the others."""
-        key = (rates, tuple(sorted(options.items())))
+    def solver(self, *, rates: bool, options: dict[str, Any], deadline: float = np.inf) -> ca.Function:
+        """Return Ipopt on this program.
+
+        Args:
+            rates: Whether velocity and acceleration rows follow the others.
+            options: For CasADi's nlpsol.
+            deadline: Value of `time.perf_counter()` at which it stops; applies to the solver's next call.
+        """
+        timed = bool(np.isfinite(deadline))
+        key = (rates, timed, tuple(sorted(options.items())))
         if key not in self._solvers:
             started = time.perf_counter()
-            self._solvers[key] = self._make_solver(rates, options)
+            self._solvers[key] = self._make_solver(rates, timed, options)
             self.build_time += time.perf_counter() - started
-        return self._solvers[key]
+        solver, monitor = self._solvers[key]
+        if monitor is not None:
+            monitor.deadline = deadline
+        return solver
 
-    def _make_solver(self, rates: bool, options: dict[str, Any]) -> ca.Function:
+    def _make_solver(self, rates: bool, timed: bool, options: dict[str, Any]) -> tuple[ca.Function, Monitor | None]:
         g, jacobian, multipliers = self.g, self.jacobian, self.multipliers
         if rates:
             g = ca.vertcat(g, self.rate_matrix @ self.x + self.rate_start @ self.start)
@@ -302,7 +219,9 @@ class Transcription:
         }
         quiet = {"print_time": False, "record_time": True, "calc_lam_p": False, "no_nlp_grad": True}
         program = {"x": self.x, "p": self.parameters, "f": self.f, "g": g}
-        return ca.nlpsol("trajectory", "ipopt", program, {**quiet, **functions, **options})
+        monitor = Monitor(self.size, g.numel(), self.parameters.numel()) if timed else None
+        callback = {"iteration_callback": monitor} if timed else {}
+        return ca.nlpsol("trajectory", "ipopt", program, {**quiet, **functions, **callback, **options}), monitor
 
 
 def _assemble(parts: list[ca.MX], at: list[NDArray[np.int_]], rows: int, columns: int) -> ca.MX:

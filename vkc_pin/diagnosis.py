@@ -1,0 +1,68 @@
+"""Why a task cannot be done: what no motion could change, and what stands in the way of every goal configuration."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vkc_pin.initialization import scatter
+from vkc_pin.problem import TrajectoryProblem
+from vkc_pin.report import Violation
+
+__all__ = ["explain", "impossible"]
+
+
+def impossible(problem: TrajectoryProblem) -> list[Violation]:
+    """Return what is wrong before anything moves: a start in collision, joint goals beyond limits, goals off the arena."""
+    found = []
+    contacts = problem.contacts.evaluate(problem.start[None], np.array([0]), reach=0.0)
+    for (first, second), distance in zip(contacts.pair, contacts.distance, strict=True):
+        labels = problem.contacts.phases[0].labels
+        subject = f"{labels[first]} – {labels[second]}"
+        found.append(Violation("start", subject, 0, 0.0, -distance, "m", f"overlap by {-1e3 * distance:.1f} mm at the start"))
+    for phase, end in zip(problem.task.phases, problem.ends, strict=True):
+        waypoint, time = int(end), float(end) * problem.options.dt
+        goals = dict(phase.values)
+        if phase.base is not None:
+            goals |= {n: v for n, v in zip(problem.chain.names[:2], phase.base[:2], strict=True) if v is not None}
+        for name, value in goals.items():
+            lower, upper = problem.limits(name)
+            beyond = max(lower - value, value - upper)
+            if beyond > 1e-9:
+                detail = f"{value:g} is beyond the limits {lower:g} to {upper:g} by {beyond:.4g}"
+                found.append(Violation("goal", name, waypoint, time, beyond, problem.unit(name), detail))
+    return found
+
+
+def explain(problem: TrajectoryProblem, seed: int) -> list[str]:
+    """Return, for every goal that no free configuration was found for, the nearest miss or what collides with what.
+
+    Args:
+        problem: What could not be solved.
+        seed: Of the random configurations tried.
+    """
+    lines = []
+    for phase, end in zip(problem.task.phases, problem.ends, strict=True):
+        tried = scatter(problem, int(end), np.random.default_rng(seed))
+        if tried is None:
+            continue
+        z, residual = tried
+        if residual.min() > 1e-4:
+            nearest = int(np.argmin(residual))
+            lines.append(
+                f"{phase.name}: out of reach, none of {len(z)} configurations tried gets there; "
+                f"the nearest stays {residual[nearest]:.3f} m or rad short"
+            )
+            continue
+        reached = z[residual < 1e-4]
+        contacts = problem.contacts.evaluate(reached, np.full(len(reached), int(end)), reach=problem.options.dist_safe)
+        shortfall = contacts.shortfall(len(reached))
+        if shortfall.min() > 0.0:
+            best = int(np.argmin(shortfall))
+            worst = int(np.flatnonzero(contacts.waypoint == best)[0])
+            labels = problem.contacts.phases[problem.contacts.phase_of(int(end))].labels
+            first, second = contacts.pair[worst]
+            lines.append(
+                f"{phase.name}: all {len(reached)} configurations found there are blocked; in the least blocked one "
+                f"{labels[first]} – {labels[second]} are {1e3 * contacts.distance[worst]:.1f} mm apart"
+            )
+    return lines

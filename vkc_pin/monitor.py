@@ -1,0 +1,85 @@
+"""Stops planning: Ipopt between two of its iterations when time is up, and the loop around it on Ctrl-C."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from types import FrameType
+
+import casadi as ca
+import numpy as np
+
+__all__ = ["Interrupt", "Monitor", "interruptible"]
+
+
+@dataclass
+class Interrupt:
+    """Whether Ctrl-C was pressed."""
+
+    pressed: bool = False
+
+
+@contextlib.contextmanager
+def interruptible() -> Iterator[Interrupt]:
+    """Note the first Ctrl-C instead of raising, so that the best iterate can be returned; the second one raises.
+
+    CasADi swallows KeyboardInterrupt inside a solve and reports some failure instead. Signals reach the main thread only:
+    elsewhere nothing changes.
+    """
+    interrupt = Interrupt()
+    if threading.current_thread() is not threading.main_thread():
+        yield interrupt
+        return
+    before = signal.getsignal(signal.SIGINT)
+
+    def note(number: int, frame: FrameType | None) -> None:
+        interrupt.pressed = True
+        signal.signal(signal.SIGINT, before)
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield interrupt
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+class Monitor(ca.Callback):  # type: ignore[misc]
+    """CasADi's iteration callback; `deadline` can be set before every solve.
+
+    Attributes:
+        deadline: Value of `time.perf_counter()` at which to stop.
+    """
+
+    def __init__(self, variables: int, rows: int, parameters: int) -> None:
+        ca.Callback.__init__(self)
+        self.deadline = np.inf
+        self._sizes = {"x": variables, "f": 1, "g": rows, "lam_x": variables, "lam_g": rows, "lam_p": parameters}
+        self.construct("monitor", {})
+
+    def get_n_in(self) -> int:
+        """Return the number of inputs: what nlpsol puts out."""
+        return int(ca.nlpsol_n_out())
+
+    def get_n_out(self) -> int:
+        """Return the number of outputs: whether to stop."""
+        return 1
+
+    def get_name_in(self, i: int) -> str:
+        """Return the name of an input."""
+        return str(ca.nlpsol_out(i))
+
+    def get_name_out(self, i: int) -> str:
+        """Return the name of the output."""
+        return "stop"
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        """Return the shape of an input."""
+        return ca.Sparsity.dense(self._sizes[ca.nlpsol_out(i)], 1)
+
+    def eval(self, arguments: list[ca.DM]) -> list[int]:
+        """Return [1] when time is up."""
+        return [int(time.perf_counter() > self.deadline)]

@@ -1,0 +1,66 @@
+"""Continuous refinement: what collides between two waypoints becomes planes at both of them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vkc_pin.contact import Contacts
+from vkc_pin.problem import TrajectoryProblem
+
+__all__ = ["collisions_between", "merge"]
+
+SPACING = 0.02  # [m] or [rad] between the states looked at, in the coordinate that moves most
+KEEP = 3e-3  # [m] clearance asked for between waypoints
+
+
+def collisions_between(problem: TrajectoryProblem, z: NDArray[np.float64]) -> Contacts:
+    """Return contacts at waypoints that stand for collisions inside the segments around them.
+
+    At a sub-state (1 − s)·z_t + s·z_{t+1} with distance d < KEEP, the witness points, fixed in their bodies, are carried to
+    both waypoints. There n·(b − a) has some value v; asking for v + KEEP − d at both lifts the sub-state by KEEP − d, to
+    first order.
+
+    Args:
+        problem: The problem.
+        z: z_1..z_N, shape (N, n).
+
+    Returns:
+        Contacts at z_1..z_N, whose margin exceeds their distance by what is missing in between.
+    """
+    path = problem.waypoints(z)
+    counts = np.ceil(np.abs(np.diff(path, axis=0)).max(axis=1) / SPACING).astype(int) - 1
+    segment = np.repeat(np.arange(len(z)), np.maximum(counts, 0))
+    if not len(segment):
+        return _empty()
+    number = np.arange(len(segment)) - np.searchsorted(segment, segment)
+    s = ((number + 1) / (counts[segment] + 1))[:, None]
+    states = (1 - s) * path[segment] + s * path[segment + 1]
+    found = problem.contacts.evaluate(states, segment + 1, reach=KEEP)
+    joints = problem.contacts.joints_of(found.pair)
+    rotations, translations = problem.chain.joint_placements(states)
+    ends = problem.chain.joint_placements(path)
+    parts = []
+    for offset in (0, 1):
+        waypoint = segment[found.waypoint] + offset
+        points = []
+        for column, witness in ((0, found.first), (1, found.second)):
+            j, row = joints[:, column], found.waypoint
+            local = np.einsum("cji,cj->ci", rotations[row, j], witness - translations[row, j])
+            points.append(np.einsum("cij,cj->ci", ends[0][waypoint, j], local) + ends[1][waypoint, j])
+        value = np.einsum("ci,ci->c", found.normal, points[1] - points[0])
+        inside = waypoint > 0  # the start cannot be moved
+        part = Contacts(waypoint - 1, found.pair, value, value + KEEP - found.distance, found.normal, points[0], points[1])
+        parts.append(part.select(np.flatnonzero(inside)))
+    return merge(*parts)
+
+
+def merge(*parts: Contacts) -> Contacts:
+    """Return all contacts of `parts`, per waypoint those first that fall shortest of their margins."""
+    joined = Contacts(*(np.concatenate(arrays) for arrays in zip(*(part.arrays() for part in parts), strict=True)))
+    return joined.select(np.lexsort((joined.distance - joined.margin, joined.waypoint)))
+
+
+def _empty() -> Contacts:
+    none, vectors = np.zeros(0), np.zeros((0, 3))
+    return Contacts(np.zeros(0, int), np.zeros((0, 2), int), none, none, vectors, vectors, vectors)

@@ -1,0 +1,107 @@
+"""The constraint rows of one waypoint, as SX functions: small, exact to second order, mapped over the waypoints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from vkc_pin import cpin
+from vkc_pin.coordinates import Coordinates
+from vkc_pin.pose import pose_residual
+
+__all__ = ["POSE_ROWS", "PoseRow", "Structure", "WaypointFunctions"]
+
+POSE_ROWS = 6
+
+
+@dataclass(frozen=True)
+class PoseRow:
+    """A frame that must be at a parametric placement at some waypoints.
+
+    Attributes:
+        joint: Joint of the model that carries it.
+        local: Its placement in the joint's frame.
+        waypoints: At which waypoints, counted from 1.
+    """
+
+    joint: int
+    local: pin.SE3
+    waypoints: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What a symbolic program depends on.
+
+    Attributes:
+        model: The chain.
+        segments: N, the number of waypoints after the start.
+        poses: Frames that must be somewhere.
+        slots: K, witness planes per waypoint.
+        weights_velocity, weights_acceleration: Of eq. 1, per coordinate, on the squared differences; shape (n,).
+        rests: Waypoints inside the motion at which it comes to rest, as it does at start and end.
+        differential: Whether the base must not slip sideways.
+    """
+
+    model: pin.Model
+    segments: int
+    poses: tuple[PoseRow, ...]
+    slots: int
+    weights_velocity: NDArray[np.float64]
+    weights_acceleration: NDArray[np.float64]
+    rests: tuple[int, ...] = ()
+    differential: bool = False
+
+    @property
+    def key(self) -> tuple[Any, ...]:
+        """Equal for structures that share one program."""
+        poses = tuple((p.joint, p.local.homogeneous.round(12).tobytes(), p.waypoints) for p in self.poses)
+        weights = (self.weights_velocity.tobytes(), self.weights_acceleration.tobytes())
+        return (self.model.saveToString(), self.segments, poses, self.slots, *weights, self.rests, self.differential)
+
+
+class WaypointFunctions:
+    """The SX functions of one kind of waypoint: which poses it must satisfy."""
+
+    def __init__(self, structure: Structure, poses: Sequence[int]) -> None:
+        model, coordinates = structure.model, Coordinates(structure.model)
+        n, slots, joints = coordinates.size, structure.slots, model.njoints - 1
+        z, s = ca.SX.sym("z", n), ca.SX.sym("s")
+        planes, offsets = ca.SX.sym("C", slots, 12 * joints), ca.SX.sym("R", slots)
+        targets = ca.SX.sym("W", 12, max(len(poses), 1))
+        placements = cpin.joint_placements(model)(coordinates.q_symbolic(z))
+        stacked = ca.vec(placements)
+        residuals = []
+        for k, pose in enumerate(poses):
+            row = structure.poses[pose]
+            column = placements[:, row.joint - 1]
+            rotation = ca.reshape(column[:9], 3, 3)
+            body = rotation @ row.local.rotation, rotation @ row.local.translation + column[9:]
+            residuals.append(pose_residual(*body, targets[:, k]))
+        pose_rows = ca.vertcat(*residuals) if residuals else ca.SX(0, 1)
+        self.rows = slots + POSE_ROWS * len(poses)
+        rows = ca.vertcat(planes @ stacked - offsets + s, pose_rows)
+        multipliers = ca.SX.sym("lam", self.rows)
+        # C·∂vec(M) is cheaper than differentiating every plane.
+        sweep = ca.jacobian(stacked, z)
+        slot_jacobian = ca.horzcat(planes @ sweep, ca.SX.ones(slots, 1))
+        pose_jacobian = ca.horzcat(ca.jacobian(pose_rows, z), ca.SX(pose_rows.numel(), 1))
+        jacobian = ca.vertcat(slot_jacobian, pose_jacobian)
+        w = ca.SX.sym("w", 12 * joints)
+        lagrangian = ca.dot(w, stacked) + ca.dot(multipliers[slots:], pose_rows)
+        hessian = ca.triu(ca.hessian(lagrangian, z)[0])
+        inner = ca.Function("inner", [z, targets, w, multipliers], [hessian])
+        hessian = inner(z, targets, planes.T @ multipliers[:slots], multipliers)
+        inputs = [z, s, ca.vec(planes), offsets, ca.vec(targets)]
+        options = {"cse": True}
+        self.value = ca.Function("g", inputs, [rows], options)
+        self.jacobian = ca.Function("rows_jacobian", inputs, [ca.vertcat(*jacobian.nonzeros())], options)
+        self.jacobian_pattern = jacobian.sparsity().get_triplet()
+        self.hessian = ca.Function("lagrangian_hessian", [*inputs, multipliers], [ca.vertcat(*hessian.nonzeros())], options)
+        self.hessian_pattern = hessian.sparsity().get_triplet()

@@ -111,7 +111,7 @@ class TrajectoryProblem:
 
     def _bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         lower, upper = np.tile(self.chain.lower, (self.segments, 1)), np.tile(self.chain.upper, (self.segments, 1))
-        for column, name in enumerate(self.chain.names[:2]):
+        for column, name in enumerate(self.chain.names[:3]):
             lower[:, column], upper[:, column] = self.limits(name)
         begin = 0
         for phase, end in zip(self.task.phases, self.ends, strict=True):
@@ -133,8 +133,10 @@ class TrajectoryProblem:
         return lower, upper
 
     def limits(self, name: str) -> tuple[float, float]:
-        """Return the position limits of a coordinate; the base's end at the arena's edge."""
+        """Return the position limits of a coordinate; the base's end at the arena's edge, a fixed one's where it stands."""
         column = self.chain.index(name)
+        if column < 3 and self.chain.robot.base == "fixed":
+            return float(self.start[column]), float(self.start[column])
         lower, upper = float(self.chain.lower[column]), float(self.chain.upper[column])
         if column < 2:
             lower, upper = max(lower, self.scene.arena[2 * column]), min(upper, self.scene.arena[2 * column + 1])

@@ -16,6 +16,7 @@ _SCATTER = 192  # random seeds for a configuration that nothing leads to
 _BEAM, _CHILDREN = 40, 4  # configurations kept per knot, and tried from each for the next
 _SPACING = 4  # waypoints between knots along a phase in which something is held
 _APPROACH = 6  # configurations looked at on the way to a grasp
+_EASY = 0.5  # share of the beam that must go on freely for a knot to be easy
 _COLLISION, _DEPTH = 10.0, 300.0  # what a collision costs, and a metre of its depth, beside radians of motion
 _NOT_FOUND = 1e3
 
@@ -47,7 +48,7 @@ def scatter(
     pose, row = search.pose_at(waypoint), waypoint - 1
     z = np.tile(problem.start, (_SCATTER, 1))
     if pose is not None:
-        z, _ = search.knot(z, waypoint, fresh=True)
+        z, _ = search.knot(z, waypoint, "scatter")
         residual, _ = problem.transcription.pose_solvers[pose].evaluate(z, problem.targets[pose])
         return z, np.abs(residual).max(axis=1)
     if (problem.lower[row, :2] < problem.upper[row, :2]).any():
@@ -88,18 +89,10 @@ class _Interpolation:
         self.objects = _objects(problem, np.tile(problem.start, (problem.segments, 1)))
 
     def seeds(self, count: int) -> list[NDArray[np.float64]]:
-        """Search knot by knot, keeping the cheapest paths (a beam search on the closure's manifold); return the best."""
-        paths = self.problem.start[None, None, :]  # (B, knots, n)
-        cost = np.zeros(1)
-        at, begin = [0], 0
-        for phase, end in zip(self.problem.task.phases, self.problem.ends, strict=True):
-            pieces = max(1, round((end - begin) / _SPACING)) if phase.held else 1
-            for knot in np.linspace(begin, end, pieces + 1).round().astype(int)[1:].tolist():
-                paths, cost = self._extend(paths, cost, knot, fresh=not phase.held)
-                at.append(knot)
-            if not phase.held:
-                cost = cost + self._approach(paths[:, -2], paths[:, -1], begin, end)
-            begin = end
+        """Return seeds through the cheapest paths of knots: of a quick search, or of a thorough one if those collide."""
+        paths, cost, trouble, at = self._search(thorough=False)
+        if trouble[np.argmin(cost)] > 0:
+            paths, cost, trouble, at = self._search(thorough=True)
         chosen: list[int] = []
         for index in np.argsort(cost, kind="stable").tolist():
             if all(np.abs(paths[index] - paths[other])[:, :3].max() > 0.15 for other in chosen):
@@ -108,17 +101,45 @@ class _Interpolation:
                 break
         return [self._join(paths[index], at) for index in chosen]
 
-    def _extend(
-        self, paths: NDArray[np.float64], cost: NDArray[np.float64], waypoint: int, *, fresh: bool
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the cheapest continuations of `paths`, shape (B, knots, n), to a waypoint, and what they cost."""
-        wanted = _SCATTER if fresh else _BEAM * _CHILDREN
-        parents = np.arange(max(wanted, len(paths))) % len(paths)
-        before = paths[parents, -1]
-        z, bad = self.knot(before, waypoint, fresh=fresh)
-        total = cost[parents] + np.abs(z - before) @ self.weights + bad
-        best = np.argsort(total, kind="stable")[:_BEAM]
-        return np.concatenate([paths[parents[best]], z[best, None]], axis=1), total[best]
+    def _search(
+        self, *, thorough: bool
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], list[int]]:
+        """Go from knot to knot, keeping the cheapest paths: a beam search on the closure's manifold.
+
+        Returns:
+            Paths, shape (B, knots, n), what each costs and how much of that is for collisions, shape (B,), and the knots.
+        """
+        paths = self.problem.start[None, None, :]
+        cost, trouble = np.zeros(1), np.zeros(1)
+        at, begin = [0], 0
+        for phase, end in zip(self.problem.task.phases, self.problem.ends, strict=True):
+            pieces = max(1, round((end - begin) / _SPACING)) if phase.held else 1
+            for knot in np.linspace(begin, end, pieces + 1).round().astype(int)[1:].tolist():
+                parents, z, bad = self._continue(paths, knot, fresh=not phase.held, thorough=thorough)
+                total = cost[parents] + np.abs(z - paths[parents, -1]) @ self.weights + bad
+                best = np.argsort(total, kind="stable")[:_BEAM]
+                paths = np.concatenate([paths[parents[best]], z[best, None]], axis=1)
+                cost, trouble = total[best], (trouble[parents] + bad)[best]
+                at.append(knot)
+            if not phase.held:
+                cost = cost + self._approach(paths[:, -2], paths[:, -1], begin, end)
+            begin = end
+        return paths, cost, trouble, at
+
+    def _continue(
+        self, paths: NDArray[np.float64], waypoint: int, *, fresh: bool, thorough: bool
+    ) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64]]:
+        """Return continuations of `paths` to a waypoint: which path each goes on from, where to, and what is wrong there."""
+        if fresh:
+            parents = np.arange(_SCATTER) % len(paths)
+            return parents, *self.knot(paths[parents, -1], waypoint, "scatter")
+        parents = np.arange(len(paths))
+        z, bad = self.knot(paths[:, -1], waypoint, "track")
+        if not thorough and np.count_nonzero(bad == 0) >= _EASY * len(paths):
+            return parents, z, bad
+        more = np.arange(_BEAM * _CHILDREN - len(paths)) % len(paths)
+        shaken, worse = self.knot(paths[more, -1], waypoint, "shake")
+        return np.concatenate([parents, more]), np.concatenate([z, shaken]), np.concatenate([bad, worse])
 
     def _approach(self, first: NDArray[np.float64], last: NDArray[np.float64], begin: int, end: int) -> NDArray[np.float64]:
         """Return what the straight ways from `first` to `last`, both (B, n), cost in collisions, shape (B,)."""
@@ -135,8 +156,15 @@ class _Interpolation:
     def _solver(self, pose: int) -> tuple[PoseSolver, pin.SE3]:
         return self.problem.transcription.pose_solvers[pose], self.problem.targets[pose]
 
-    def knot(self, before: NDArray[np.float64], waypoint: int, *, fresh: bool) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return configurations for a waypoint, shape (B, n), and what is wrong with each, as a cost."""
+    def knot(self, before: NDArray[np.float64], waypoint: int, how: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return configurations for a waypoint, shape (B, n), and what is wrong with each, as a cost.
+
+        Args:
+            before: What they come from, shape (B, n).
+            waypoint: Where they are to be.
+            how: "scatter": from anywhere; "track": the nearest ones; "shake": from there with the arms shaken, so that the
+                search can leave a way that is closing.
+        """
         problem, row = self.problem, waypoint - 1
         z = before.copy()
         z[:, self.driven] = self.objects[row, self.driven]
@@ -146,9 +174,9 @@ class _Interpolation:
         if pose is None:
             return np.clip(z, lower, upper), np.zeros(len(z))
         solver, target = self._solver(pose)
-        z = self._scatter(z, pose) if fresh else self._perturb(z, pose)
+        z = self._scatter(z, pose) if how == "scatter" else self._shake(z, pose) if how == "shake" else z
         z, found = solver.solve(z, target, lower=lower, upper=upper, weights=self.weights)
-        if fresh:
+        if how == "scatter":
             z = self._unwind(z, before, lower, upper)
         depth = self._depth(z, waypoint)
         return z, _NOT_FOUND * ~found + np.where(depth > 0, _COLLISION + _DEPTH * depth, 0.0)
@@ -161,14 +189,11 @@ class _Interpolation:
         z[:, 3 : self.robot] = home + spread * self.rng.normal(0.0, 1.0, (len(z), len(home)))
         return self._stand(np.clip(z, self.problem.chain.lower, self.problem.chain.upper), pose)
 
-    def _perturb(self, z: NDArray[np.float64], pose: int) -> NDArray[np.float64]:
-        """Shake the arms of all but the first `_BEAM`, so that the search can leave a way that is closing."""
+    def _shake(self, z: NDArray[np.float64], pose: int) -> NDArray[np.float64]:
+        spread = self.rng.uniform(0.05, 0.5, (len(z), 1))
         z = z.copy()
-        shaken = z[_BEAM:]
-        spread = self.rng.uniform(0.05, 0.5, (len(shaken), 1))
-        shaken[:, 3 : self.robot] += spread * self.rng.normal(0.0, 1.0, (len(shaken), self.robot - 3))
-        z[_BEAM:] = self._stand(np.clip(shaken, self.problem.chain.lower, self.problem.chain.upper), pose)
-        return z
+        z[:, 3 : self.robot] += spread * self.rng.normal(0.0, 1.0, (len(z), self.robot - 3))
+        return self._stand(np.clip(z, self.problem.chain.lower, self.problem.chain.upper), pose)
 
     def _stand(self, z: NDArray[np.float64], pose: int) -> NDArray[np.float64]:
         """Move the bases so that pose `pose` fits in place and heading; its height and tilt are left to the arm.

@@ -10,7 +10,8 @@ from vkc_pin.problem import TrajectoryProblem
 
 __all__ = ["collisions_between", "merge"]
 
-SPACING = 0.02  # [m] or [rad] between the states looked at, in the coordinate that moves most
+SPACING = 0.02  # [m] or [rad] between the states looked at first, in the coordinate that moves most
+CLOSE, FINER = 0.015, 8  # [m] where something is as close as that, so many times more states are looked at
 KEEP = 3e-3  # [m] clearance asked for between waypoints
 
 
@@ -19,7 +20,7 @@ def collisions_between(problem: TrajectoryProblem, z: NDArray[np.float64]) -> Co
 
     At a sub-state (1 − s)·z_t + s·z_{t+1} with distance d < KEEP, the witness points, fixed in their bodies, are carried to
     both waypoints. There n·(b − a) has some value v; asking for v + KEEP − d at both lifts the sub-state by KEEP − d, to
-    first order.
+    first order. Of each segment and pair only the deepest sub-state counts.
 
     Args:
         problem: The problem.
@@ -29,14 +30,19 @@ def collisions_between(problem: TrajectoryProblem, z: NDArray[np.float64]) -> Co
         Contacts at z_1..z_N, whose margin exceeds their distance by what is missing in between.
     """
     path = problem.waypoints(z)
-    counts = np.ceil(np.abs(np.diff(path, axis=0)).max(axis=1) / SPACING).astype(int) - 1
-    segment = np.repeat(np.arange(len(z)), np.maximum(counts, 0))
-    if not len(segment):
+    counts = np.maximum(np.ceil(np.abs(np.diff(path, axis=0)).max(axis=1) / SPACING).astype(int), 1)
+    segment = np.repeat(np.arange(len(z)), counts)
+    piece = np.arange(len(segment)) - np.searchsorted(segment, segment)
+    # The middles of the pieces first, and of pieces that something is close to the rest.
+    near = problem.contacts.evaluate(*_states(path, segment, (piece + 0.5) / counts[segment]), reach=KEEP + CLOSE)
+    rows = np.unique(near.waypoint)
+    segment, begin, length = segment[rows], piece[rows] / counts[segment[rows]], 1 / counts[segment[rows]]
+    if not len(rows):
         return _empty()
-    number = np.arange(len(segment)) - np.searchsorted(segment, segment)
-    s = ((number + 1) / (counts[segment] + 1))[:, None]
-    states = (1 - s) * path[segment] + s * path[segment + 1]
-    found = problem.contacts.evaluate(states, segment + 1, reach=KEEP)
+    segment = np.repeat(segment, FINER)
+    s = (begin[:, None] + length[:, None] * (np.arange(FINER) + 0.5) / FINER).ravel()
+    states, waypoints = _states(path, segment, s)
+    found = _deepest(problem.contacts.evaluate(states, waypoints, reach=KEEP), segment)
     joints = problem.contacts.joints_of(found.pair)
     rotations, translations = problem.chain.joint_placements(states)
     ends = problem.chain.joint_placements(path)
@@ -53,6 +59,22 @@ def collisions_between(problem: TrajectoryProblem, z: NDArray[np.float64]) -> Co
         part = Contacts(waypoint - 1, found.pair, value, value + KEEP - found.distance, found.normal, points[0], points[1])
         parts.append(part.select(np.flatnonzero(inside)))
     return merge(*parts)
+
+
+def _states(
+    path: NDArray[np.float64], segment: NDArray[np.int_], s: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.int_]]:
+    """Return the states at 0 < s < 1 of segments, and the waypoints whose phases they belong to."""
+    share = s[:, None]
+    return (1 - share) * path[segment] + share * path[segment + 1], segment + 1
+
+
+def _deepest(found: Contacts, segment: NDArray[np.int_]) -> Contacts:
+    """Return the contact of smallest distance for each segment and pair."""
+    order = np.argsort(found.distance, kind="stable")
+    keys = np.column_stack([segment[found.waypoint], found.pair])[order]
+    _, first = np.unique(keys, axis=0, return_index=True)
+    return found.select(order[first])
 
 
 def merge(*parts: Contacts) -> Contacts:

@@ -48,8 +48,7 @@ class Report:
         closure_error: Largest drift of a held object's base or of the grasp [m].
         closure_angle: The same for orientation [rad].
         states: How many configurations were looked at.
-        notes: What stands in the way of the task as a whole, if planning failed.
-        notes: Remarks, one line each.
+        notes: What stands in the way of the task as a whole, if planning failed; one line each.
     """
 
     violations: tuple[Violation, ...] = ()

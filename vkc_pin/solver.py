@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from vkc_pin.contact import Contacts
 from vkc_pin.monitor import Interrupt, interruptible
+from vkc_pin.pose import POSE_LOWER, POSE_UPPER
 from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.refinement import collisions_between, merge
 
@@ -41,6 +42,7 @@ FIRST_RADIUS, RESTART_RADIUS, MIN_RADIUS, SHRINK = 0.5, 0.2, 5e-3, 0.4  # trust 
 POSE_TOLERANCE = 1e-4  # [m] and [rad]
 RATE_TOLERANCE = 1e-4  # relative
 DRIFT = 0.4  # of what is allowed between waypoints; norms of three residuals are up to √3 larger
+WORTHWHILE = 0.05  # relative decrease of the objective for which a feasible motion is improved further
 PENALTY_GROWTH, PENALTY_LIMIT = 4.0, 2000.0
 
 
@@ -154,13 +156,13 @@ class _Loop:
 
     def try_step(self, radius: float) -> _Trial:
         """Solve within `radius` of the current waypoints, and look at what is really there."""
-        z, slack, objective, g, satisfied = self.run_ipopt(radius)
+        z, slack, objective, satisfied = self.run_ipopt(radius)
         contacts = self.contacts(z)
         return _Trial(
             z=z,
             slack=slack,
             objective=objective - self.penalty * float(slack.sum()),
-            pose_error=self.poses(g),
+            pose_error=self.problem.pose_error(z),
             contacts=contacts,
             shortfall=contacts.shortfall(self.problem.segments),
             rate=self.problem.rate_violation(z),
@@ -207,8 +209,8 @@ class _Loop:
         self.penalty = min(self.penalty * PENALTY_GROWTH, PENALTY_LIMIT)
         self.multipliers = {}
 
-    def run_ipopt(self, radius: float) -> tuple[NDArray[np.float64], NDArray[np.float64], float, NDArray[np.float64], bool]:
-        """Solve once with fixed planes; return waypoints, slack, objective, g and whether Ipopt was satisfied."""
+    def run_ipopt(self, radius: float) -> tuple[NDArray[np.float64], NDArray[np.float64], float, bool]:
+        """Solve once with fixed planes; return waypoints, slack, objective and whether Ipopt was satisfied."""
         problem, t = self.problem, self.transcription
         begin = time.perf_counter()
         planes, offsets = problem.contacts.planes(self.z, self.at, slots=t.slots)
@@ -236,23 +238,21 @@ class _Loop:
         self.multipliers = {"lam_x0": result["lam_x"], "lam_g0": result["lam_g"]}
         x = np.asarray(result["x"]).reshape(t.segments, t.n + 1)
         slack = np.maximum(x[:, -1], 0.0)
-        return x[:, :-1], slack, float(result["f"]), np.asarray(result["g"]).ravel(), bool(stats["success"])
+        return x[:, :-1], slack, float(result["f"]), bool(stats["success"])
 
     def _row_bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         t = self.transcription
         lower, upper = np.zeros(t.rows), np.zeros(t.rows)
         upper[t.slot_rows] = np.inf
+        for at in t.pose_rows:
+            for rows in at.values():
+                lower[rows], upper[rows] = POSE_LOWER, POSE_UPPER
         if self.rates:
             velocity = np.tile(self.problem.velocity, t.segments)
             acceleration = np.tile(self.problem.acceleration, t.second.shape[0])
             rates = np.concatenate([velocity, acceleration])
             lower, upper = np.concatenate([lower, -rates]), np.concatenate([upper, rates])
         return lower, upper
-
-    def poses(self, g: NDArray[np.float64]) -> float:
-        """Return the largest pose residual in g."""
-        rows = [r for waypoints in self.transcription.pose_rows for r in waypoints.values()]
-        return float(np.abs(g[np.concatenate(rows)]).max()) if rows else 0.0
 
 
 def solve(
@@ -280,9 +280,10 @@ def solve(
 def _iterate(loop: _Loop, callback: Callable[[Iteration], None] | None, interrupt: Interrupt) -> None:
     """Run rounds until everything holds, nothing helps any more, or time is up."""
     solution, started, radius = loop.solution, time.perf_counter(), FIRST_RADIUS
+    feasible: NDArray[np.float64] | None = None
     for _ in range(loop.options.max_outer):
         if time.perf_counter() > loop.deadline:
-            solution.status = "time limit"
+            solution.status = solution.status if solution.converged else "time limit"
             break
         trial = loop.try_step(radius)
         accepted, ratio = loop.judge(trial)
@@ -307,11 +308,12 @@ def _iterate(loop: _Loop, callback: Callable[[Iteration], None] | None, interrup
             used, gain = radius, (loop.objective - trial.objective) / max(abs(loop.objective), 1e-9)
             loop.accept(trial)
             radius = radius * 1.5 if ratio > 0.7 else radius
-            if loop.done(trial) and (trial.step < 0.99 * used or gain < 0.05):
-                solution.converged, solution.status = True, "converged"
-                break
+            if loop.done(trial):
+                solution.converged, solution.status, feasible = True, "converged", trial.z
+                if trial.step < used or gain < WORTHWHILE:
+                    break
         if interrupt.pressed:
-            solution.status = "interrupted"
+            solution.status = solution.status if solution.converged else "interrupted"
             break
         if not accepted or ratio < 0.25:
             radius = SHRINK * min(radius, trial.step)
@@ -320,3 +322,5 @@ def _iterate(loop: _Loop, callback: Callable[[Iteration], None] | None, interrup
                 break
             loop.raise_penalty()
             radius = RESTART_RADIUS
+    if feasible is not None:  # rounds after the first feasible one only made it shorter, or failed to
+        solution.z = feasible

@@ -32,7 +32,7 @@ class Transcription:
         size: Number of variables N·(n + 1).
         rows: Number of constraint rows without the rate rows.
         slot_rows: Rows of the witness planes, shape (N, K).
-        pose_rows: For each pose, waypoint → its rows, shape (6,).
+        pose_rows: For each pose, waypoint → its rows, shape (7,); see `pose.pose_rows`.
         base_rows: Rows that keep a differential base from slipping, shape (N,); empty for others.
         pose_solvers: Inverse kinematics of each pose.
         rate_matrix, rate_start: Velocities and accelerations per step are rate_matrix·x + rate_start·z_0.

@@ -74,6 +74,9 @@ class _Check:
             key = (violation.constraint, violation.subject, violation.unit)
             if key not in worst or worst[key].amount < violation.amount:
                 worst[key] = violation
+        for violation in self.found:  # what overlaps is also too close
+            if violation.constraint == "penetration":
+                worst.pop(("clearance", violation.subject, violation.unit), None)
         ordered = tuple(sorted(worst.values(), key=lambda v: (v.time, v.constraint, v.subject, v.unit)))
         return Report(ordered, clearance, error, angle, len(self.samples.times))
 

@@ -137,10 +137,11 @@ class PairTable:
                 closest = int(np.argmin(rows[row - first]))
                 for c in {closest, *np.flatnonzero(rows[row - first] < 0).tolist()}:
                     yield self._hit(row, active[c], rows[row - first, c])
-            # What comes between two samples is looked at again and again until nothing deeper than 1 mm can hide.
+            # Between two samples that are free it is looked at again and again, until nothing deeper than 1 mm can hide.
             step = motion[t, active] / (last - first)
+            free = (np.minimum(rows[1:], rows[:-1]) >= 0) & (rows[1:] + rows[:-1] < step)
             alone = self.margins[active] > 0  # a hand that holds something moves along with it: `closure` sees to that
-            for r, c in np.argwhere(((rows[1:] + rows[:-1] - step) < 0) & alone):
+            for r, c in np.argwhere(free & alone):
                 stack = [(0.0, 1.0, rows[r, c], rows[r + 1, c])]
                 while stack:
                     low, high, before, after = stack.pop()
@@ -150,6 +151,8 @@ class PairTable:
                     state = self.world.coordinates.q((1 - middle) * z[first + r] + middle * z[first + r + 1])
                     (between,) = self._distances(state, active[c : c + 1], data, shapes)
                     yield self._hit(first + r, active[c], between)
+                    if between < 0:
+                        break
                     stack += [(low, middle, before, between), (middle, high, between, after)]
 
     def _distances(

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from vkc_pin import cpin
 from vkc_pin.coordinates import Coordinates
-from vkc_pin.pose import pose_residual
+from vkc_pin.pose import POSE_LOWER, pose_rows
 
 __all__ = ["POSE_ROWS", "PoseRow", "Structure", "WaypointFunctions"]
 
-POSE_ROWS = 6
+POSE_ROWS = len(POSE_LOWER)
 
 
 @dataclass(frozen=True)
@@ -77,25 +77,24 @@ class WaypointFunctions:
         targets = ca.SX.sym("W", 12, max(len(poses), 1))
         placements = cpin.joint_placements(model)(coordinates.q_symbolic(z))
         stacked = ca.vec(placements)
-        residuals = []
+        # Every row is linear in the placements: rows = L·vec(M) + const, so one sweep of the kinematics serves them all.
+        parts = []
         for k, pose in enumerate(poses):
             row = structure.poses[pose]
             column = placements[:, row.joint - 1]
             rotation = ca.reshape(column[:9], 3, 3)
-            body = rotation @ row.local.rotation, rotation @ row.local.translation + column[9:]
-            residuals.append(pose_residual(*body, targets[:, k]))
-        pose_rows = ca.vertcat(*residuals) if residuals else ca.SX(0, 1)
+            parts.append(pose_rows(rotation @ row.local.rotation, rotation @ row.local.translation + column[9:], targets[:, k]))
+        pose_values = ca.vertcat(*parts) if parts else ca.SX(0, 1)
         self.rows = slots + POSE_ROWS * len(poses)
-        rows = ca.vertcat(planes @ stacked - offsets + s, pose_rows)
+        rows = ca.vertcat(planes @ stacked - offsets + s, pose_values)
         multipliers = ca.SX.sym("lam", self.rows)
-        # C·∂vec(M) is cheaper than differentiating every plane.
         sweep = ca.jacobian(stacked, z)
-        slot_jacobian = ca.horzcat(planes @ sweep, ca.SX.ones(slots, 1))
-        pose_jacobian = ca.horzcat(ca.jacobian(pose_rows, z), ca.SX(pose_rows.numel(), 1))
-        jacobian = ca.vertcat(slot_jacobian, pose_jacobian)
+        pose_jacobian = ca.jacobian(pose_values, z)
+        jacobian = ca.vertcat(
+            ca.horzcat(planes @ sweep, ca.SX.ones(slots, 1)), ca.horzcat(pose_jacobian, ca.SX(pose_values.numel(), 1))
+        )
         w = ca.SX.sym("w", 12 * joints)
-        lagrangian = ca.dot(w, stacked) + ca.dot(multipliers[slots:], pose_rows)
-        hessian = ca.triu(ca.hessian(lagrangian, z)[0])
+        hessian = ca.triu(ca.hessian(ca.dot(w, stacked) + ca.dot(multipliers[slots:], pose_values), z)[0])
         inner = ca.Function("inner", [z, targets, w, multipliers], [hessian])
         hessian = inner(z, targets, planes.T @ multipliers[:slots], multipliers)
         inputs = [z, s, ca.vec(planes), offsets, ca.vec(targets)]

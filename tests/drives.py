@@ -1,0 +1,58 @@
+"""An empty hall, and motions through it that nobody planned."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from vkc_pin.scene import Scene
+from vkc_pin.trajectory import PhaseSpan, Trajectory
+
+DT = 0.25  # [s]
+
+
+def hall(*, base: str = "omni", obstacles: Sequence[Mapping[str, Any]] = ()) -> Scene:
+    """Return a hall of 12 m x 12 m with the Husky in its middle, heading along x."""
+    return Scene.from_document(
+        {
+            "robot": {"name": "husky_ur5e", "base": base},
+            "start": {"base": [0.0, 0.0, 0.0], "arm": "home"},
+            "arena": {"x": [-6.0, 6.0], "y": [-6.0, 6.0]},
+            "obstacles": list(obstacles),
+        }
+    )
+
+
+def through(scene: Scene, *stops: np.ndarray, steps: int = 40, dt: float = DT) -> Trajectory:
+    """Return a motion from rest to rest between `stops`, shape (n,) each, the first being the start; a phase each."""
+    share = np.linspace(0.0, 1.0, steps + 1)[1:, None]
+    smooth = share**2 * (3.0 - 2.0 * share)
+    rows = [stops[0][None]]
+    for before, after in itertools.pairwise(stops):
+        rows.append(before + smooth * (after - before))
+    phases = tuple(PhaseSpan(f"drive {k + 1}", k * steps, (k + 1) * steps) for k in range(len(stops) - 1))
+    return of_rows(scene, np.vstack(rows), dt=dt, phases=phases)
+
+
+def of_rows(scene: Scene, rows: np.ndarray, *, dt: float = DT, phases: tuple[PhaseSpan, ...] = ()) -> Trajectory:
+    """Return the motion through `rows`, shape (T, n), of the robot alone, `dt` apart."""
+    names = scene.robot.coordinates.names
+    phases = phases or (PhaseSpan("drive", 0, len(rows) - 1),)
+    return Trajectory(names, dt * np.arange(len(rows)), rows, phases, len(names))
+
+
+def moved(start: np.ndarray, **values: float) -> np.ndarray:
+    """Return `start` with the base elsewhere: x, y and yaw by name."""
+    out = np.array(start)
+    for name, value in values.items():
+        out[("x", "y", "yaw").index(name)] = value
+    return out
+
+
+def with_positions(trajectory: Trajectory, positions: np.ndarray) -> Trajectory:
+    """Return the motion with other waypoints."""
+    return dataclasses.replace(trajectory, positions=positions)

@@ -1,0 +1,188 @@
+"""Which pairs are looked at, and that none that comes close is left out: against brute force."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from drives import hall, moved, of_rows
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from small_problems import door_scene
+
+from vkc_pin import validation_pairs
+from vkc_pin.scene import FLOOR, Scene
+from vkc_pin.trajectory import PhaseSpan, Trajectory
+from vkc_pin.validation_pairs import Hit, PairTable
+from vkc_pin.validation_samples import Samples
+
+
+@pytest.fixture(scope="module")
+def door() -> Scene:
+    return door_scene()
+
+
+def wander(scene: Scene, seed: int, *, size: float) -> Trajectory:
+    """Return a random motion of robot and door near the door, four waypoints; joints change by up to `size` a step."""
+    rng = np.random.default_rng(seed)
+    door = scene.objects["door"].object
+    first = np.concatenate([scene.start, [0.6, 0.3]])
+    first[:3] = rng.uniform([0.6, -0.8, -np.pi], [2.0, 0.8, np.pi])
+    first[3:9] += rng.uniform(-1.0, 1.0, 6)
+    rows = [first]
+    for _ in range(3):
+        rows.append(rows[-1] + size * rng.uniform(-1.0, 1.0, len(first)) * rng.choice([0.0, 0.1, 1.0], len(first)))
+    positions = np.array(rows)
+    positions[:, 9:] = np.clip(positions[:, 9:], door.lower, door.upper)
+    names = (*scene.robot.coordinates.names, "door.hinge", "door.knob")
+    return Trajectory(names, np.arange(4.0), positions, (PhaseSpan("all", 0, 3, {"door": "handle"}),), 9)
+
+
+def brute_force(table: PairTable, z: np.ndarray) -> np.ndarray:
+    """Return the distance of every pair at every configuration, shape (S, P)."""
+    model, data, shapes = table.world.model, table.world.model.createData(), pin.GeometryData(table.geometry)
+    out = np.empty((len(z), len(table.pairs)))
+    for row, q in enumerate(table.world.coordinates.q(z)):
+        pin.updateGeometryPlacements(model, data, table.geometry, shapes, q)
+        pin.computeDistances(table.geometry, shapes)
+        out[row] = [result.min_distance for result in shapes.distanceResults]
+    return out
+
+
+def swept(scene: Scene, motion: Trajectory) -> tuple[PairTable, Samples, list[Hit]]:
+    samples = Samples(scene, motion)
+    table = PairTable(scene, samples.world, motion, 0.02)
+    return table, samples, list(table.sweep(samples.z, samples.waypoint_rows))
+
+
+def pair_names(table: PairTable, k: int) -> tuple[str, str]:
+    first, second = table.pairs[k]
+    return table.world.collision_labels[first], table.world.collision_labels[second]
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.1, 0.5, 1.5]))
+def test_no_pair_that_comes_close_is_left_out(seed: int, size: float) -> None:
+    door = door_scene()
+    motion = wander(door, seed, size=size)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(validation_pairs, "RESOLUTION", np.inf)  # at the samples alone
+        table, samples, hits = swept(door, motion)
+    distances = brute_force(table, samples.z)
+    assert min(hit.distance for hit in hits) == pytest.approx(distances.min(), abs=1e-5)  # as exact as coal is
+    found = {(hit.row, hit.first, hit.second) for hit in hits}
+    for row, k in np.argwhere(distances < -1e-5):
+        assert (row, *pair_names(table, k)) in found
+    for t, k in np.argwhere(distances[samples.waypoint_rows] < table.margins - 1e-5):
+        assert (samples.waypoint_rows[t], *pair_names(table, k)) in found
+    for hit in hits:
+        assert hit.at_waypoint == (hit.row in samples.waypoint_rows)
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.2, 0.6]))
+def test_nothing_slips_through_between_two_samples(seed: int, size: float) -> None:
+    """Whatever overlaps by more than a millimetre anywhere, ten times as finely seen, is found."""
+    door = door_scene()
+    motion = wander(door, seed, size=size)
+    table, samples, hits = swept(door, motion)
+    fine = np.unique(np.concatenate([np.linspace(a, b, 11) for a, b in itertools.pairwise(samples.times)]))
+    distances = brute_force(table, samples.world.positions(motion, fine))
+    found = {(hit.first, hit.second) for hit in hits if hit.distance < 0}
+    deep = {pair_names(table, k) for k in np.flatnonzero((distances.min(axis=0) < -1.001e-3) & (table.margins > 0))}
+    assert deep <= found
+    assert found <= {pair_names(table, k) for k in np.flatnonzero(distances.min(axis=0) < 2e-3)}
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.1, 1.0]))
+def test_no_point_moves_further_than_the_bound(seed: int, size: float) -> None:
+    door = door_scene()
+    motion = wander(door, seed, size=size)
+    samples = Samples(door, motion)
+    table = PairTable(door, samples.world, motion, 0.02)
+    z = samples.z[samples.waypoint_rows]
+    bounds = table._motion_bounds(z)
+    model, data, shapes = table.world.model, table.world.model.createData(), pin.GeometryData(table.geometry)
+    corners = [np.array(box_corners(shape)) for shape in table.geometry.geometryObjects]
+    for t in range(3):
+        path = np.zeros(len(corners))
+        before: list[np.ndarray] = []
+        for share in np.linspace(0.0, 1.0, 60):  # the way of each corner of the bounding boxes, not only its ends
+            q = table.world.coordinates.q((1 - share) * z[t] + share * z[t + 1])
+            pin.updateGeometryPlacements(model, data, table.geometry, shapes, q)
+            now = [points @ where.rotation.T + where.translation for points, where in zip(corners, shapes.oMg, strict=True)]
+            if before:
+                path += [np.linalg.norm(a - b, axis=1).max() for a, b in zip(now, before, strict=True)]
+            before = now
+        assert (path <= bounds[t] + 1e-9).all()
+        assert (bounds[t][path == 0] == 0).all()
+
+
+def box_corners(shape: pin.GeometryObject) -> list[list[float]]:
+    shape.geometry.computeLocalAABB()
+    box = shape.geometry.aabb_local
+    return [[x, y, z] for x in (box.min_[0], box.max_[0]) for y in (box.min_[1], box.max_[1]) for z in (box.min_[2], box.max_[2])]
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.1, 0.6]))
+def test_nothing_slips_through_even_without_samples(seed: int, size: float) -> None:
+    """Shown the waypoints alone, it looks between them by itself."""
+    door = door_scene()
+    motion = wander(door, seed, size=size)
+    samples = Samples(door, motion)
+    table = PairTable(door, samples.world, motion, 0.02)
+    found = {
+        (hit.row, hit.first, hit.second)
+        for hit in table.sweep(samples.z[samples.waypoint_rows], np.arange(4))
+        if hit.distance < 0
+    }
+    distances = brute_force(table, samples.z)
+    for t, (first, last) in enumerate(itertools.pairwise(samples.waypoint_rows)):
+        within = distances[first : last + 1].min(axis=0)
+        for k in np.flatnonzero((within < -1.001e-3) & (table.margins > 0)):
+            assert {(t, *pair_names(table, k)), (t + 1, *pair_names(table, k))} & found
+
+
+def test_a_wire_that_is_passed_between_two_samples() -> None:
+    """Neither sample touches it, and they are far apart."""
+    wire = {"name": "wire", "type": "cylinder", "radius": 0.001, "length": 0.2, "position": [2.0, 0.0, 0.1]}
+    scene = hall(obstacles=[wire])
+    motion = of_rows(scene, np.vstack([scene.start, moved(scene.start, x=4.0)]), dt=20.0)
+    samples = Samples(scene, motion)
+    table = PairTable(scene, samples.world, motion, 0.02)
+    hits = list(table.sweep(samples.z[[0, -1]], np.array([0, 1])))
+    assert ("base_link", "wire") in {(hit.first, hit.second) for hit in hits if hit.distance < 0}
+    assert all(hit.distance > 1.0 for hit in hits if hit.at_waypoint and hit.second == "wire")
+
+
+def test_which_pairs_count(door: Scene) -> None:
+    motion = wander(door, 0, size=0.1)
+    samples = Samples(door, motion)
+    table = PairTable(door, samples.world, motion, 0.02)
+    robot, things = door.robot.collision, door.objects["door"].object.collision.geometryObjects
+    walls = [label for label in door.obstacle_labels if label != FLOOR]
+    arm = [shape for shape in robot.geometryObjects if shape.parentJoint > 1]
+    leaves = [shape for shape in things if shape.parentJoint > 0]
+    bodies = len(robot.geometryObjects)
+    expected = len(robot.collisionPairs) + bodies * (len(things) + len(walls)) + len(arm) + len(leaves) * len(walls)
+    assert len(table.pairs) == len(table.geometry.collisionPairs) == expected
+    assert len({frozenset(pair) for pair in table.pairs.tolist()}) == expected
+    touching = {pair_names(table, k) for k in np.flatnonzero(table.margins == 0.0)}
+    assert touching == {(link, "door.lever") for link in door.robot.touch_links}
+    assert set(table.margins) == {0.0, 0.02}
+
+
+def test_what_a_hand_may_touch(door: Scene) -> None:
+    """What it holds in some phase, at the start, or is asked to grasp; nothing else."""
+    drive = of_rows(door, np.vstack([door.start, door.start + 0.1]))
+    world = Samples(door, drive).world
+    assert (PairTable(door, world, drive, 0.02).margins == 0.02).all()
+    for table in (
+        PairTable(door, world, drive, 0.02, grasps=[("door", "handle")]),
+        PairTable(door.with_held({"door": "handle"}), world, drive, 0.02),
+    ):
+        assert {pair_names(table, k)[1] for k in np.flatnonzero(table.margins == 0.0)} == {"door.lever"}

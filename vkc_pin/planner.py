@@ -172,7 +172,7 @@ def as_trajectory(problem: TrajectoryProblem, z: NDArray[np.float64]) -> Traject
     begin = 0
     for phase, end in zip(problem.task.phases, problem.ends, strict=True):
         first = len(rows) - 1
-        if phase.held and begin and not problem.task.phases[len(phases) - 1].held:
+        if begin and problem.task.phases[len(phases) - 1].grasps:
             rows.append(rows[-1])
             times.append(times[-1] + problem.options.grasp_time)
         for row in range(begin + 1, int(end) + 1):

@@ -1,0 +1,339 @@
+"""A task in a scene as a program: what may move when, how fast, and what must hold."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from small_problems import SHORT, door_scene, full_scene, random_configurations
+
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.goal import LATCH_MARGIN
+from vkc_pin.options import Options
+from vkc_pin.planner import as_trajectory
+from vkc_pin.problem import TrajectoryProblem, build
+from vkc_pin.robot import load_robot
+from vkc_pin.steps import Actuate, GoTo, Grasp, Reach, Step
+
+POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array([0.4, 0.2, 0.9]))
+REACH, TURN, MOVE = SHORT.reach_waypoints, SHORT.turn_waypoints, SHORT.move_waypoints
+
+
+@pytest.fixture(scope="module")
+def opened() -> TrajectoryProblem:
+    return build(door_scene(), [Actuate("door", {"hinge": 1.2}), GoTo(-0.5, 0.1, -2.2)], options=SHORT)
+
+
+@pytest.fixture(scope="module")
+def two_grasps() -> TrajectoryProblem:
+    steps: list[Step] = [Grasp("cabinet", "ball"), Actuate("drawer", {"slide": 0.2}, attachment="handle_free"), Reach(POSE)]
+    return build(full_scene(), steps, options=SHORT)
+
+
+def column(problem: TrajectoryProblem, name: str) -> np.ndarray:
+    """Return lower and upper bound of a coordinate at every waypoint after the start, shape (N, 2)."""
+    index = problem.chain.index(name)
+    return np.column_stack([problem.lower[:, index], problem.upper[:, index]])
+
+
+def random_path(problem: TrajectoryProblem, seed: int = 0, scale: float = 1.0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    far = random_configurations(problem.chain.lower, problem.chain.upper, problem.segments, rng)
+    return problem.start + scale * (far - problem.start)
+
+
+# --- bounds ---------------------------------------------------------------------------------------------------------
+
+
+def test_phases_follow_one_another(opened: TrajectoryProblem) -> None:
+    assert [phase.segments for phase in opened.task.phases] == [REACH, TURN, MOVE, REACH]
+    np.testing.assert_array_equal(opened.ends, np.cumsum([REACH, TURN, MOVE, REACH]))
+    assert opened.segments == opened.ends[-1] == opened.transcription.segments
+    assert opened.lower.shape == opened.upper.shape == (opened.segments, opened.chain.size)
+    assert np.all(opened.lower <= opened.upper)
+
+
+def test_objects_joints_stand_still_until_they_are_moved(opened: TrajectoryProblem) -> None:
+    turned = 0.5 + LATCH_MARGIN
+    reach, turn, move, _ = opened.ends.tolist()
+    hinge, knob = column(opened, "door.hinge"), column(opened, "door.knob")
+    assert np.all(hinge[:turn] == 0.0)
+    assert np.all(hinge[turn : move - 1] == (-1.57, 1.57))
+    assert np.all(hinge[move - 1 :] == 1.2)
+    assert np.all(knob[:reach] == 0.0)
+    assert np.all(knob[reach : turn - 1] == (0.0, 0.8))
+    assert np.all(knob[turn - 1] == turned)
+    np.testing.assert_allclose(knob[turn : move - 1], [(turned, 0.8)] * (move - 1 - turn))
+    assert np.all(knob[move - 1 :] == turned)
+
+
+def test_a_goal_beyond_a_limit_is_approached_as_far_as_it_goes() -> None:
+    problem = build(door_scene(), [Actuate("door", {"hinge": 2.0}), GoTo(0.0, 0.0)], options=SHORT)
+    hinge = column(problem, "door.hinge")
+    assert np.all(hinge[problem.ends[2] - 1 :] == 1.57)
+    panel = next(i for i, label in enumerate(problem.contacts.phases[3].labels) if label == "door.panel" and i > 20)
+    part = problem.contacts.phases[3]
+    assert part.joint[panel] == 0
+    expected = door_scene().objects["door"].with_state({"hinge": 1.57}).link_placement("panel")
+    np.testing.assert_allclose(part.geometry.geometryObjects[panel].placement.rotation, expected.rotation, atol=1e-9)
+
+
+def test_the_robot_keeps_its_limits_and_stays_in_the_arena(opened: TrajectoryProblem) -> None:
+    robot, scene = opened.scene.robot, opened.scene
+    inner = slice(0, opened.segments - 1)  # the last waypoint has the base's goal
+    x_min, x_max, y_min, y_max = scene.arena
+    np.testing.assert_array_equal(opened.lower[inner, :2], np.tile([x_min, y_min], (opened.segments - 1, 1)))
+    np.testing.assert_array_equal(opened.upper[inner, :2], np.tile([x_max, y_max], (opened.segments - 1, 1)))
+    assert np.all(np.isinf(opened.lower[inner, 2]))
+    arm = slice(3, robot.coordinates.size)
+    np.testing.assert_array_equal(opened.lower[:, arm], np.tile(robot.lower[arm], (opened.segments, 1)))
+    np.testing.assert_array_equal(opened.upper[:, arm], np.tile(robot.upper[arm], (opened.segments, 1)))
+    narrow = dataclasses.replace(scene, arena=(-50.0, 1.0, -1.0, 60.0))
+    problem = build(narrow, [Reach(POSE)], options=SHORT)
+    np.testing.assert_array_equal(problem.lower[0, :2], [robot.lower[0], -1.0])
+    np.testing.assert_array_equal(problem.upper[0, :2], [1.0, robot.upper[1]])
+    assert problem.limits("base_x") == (robot.lower[0], 1.0)
+
+
+@pytest.mark.parametrize("start", [2.2, -2.2 - 2 * np.pi, 15.0])
+def test_the_base_goes_to_its_goal_by_the_nearest_heading(start: float) -> None:
+    scene = door_scene().with_start(base=[-0.7, 0.3, start])
+    problem = build(scene, [GoTo(-0.5, 0.1, -2.2)], options=SHORT)
+    np.testing.assert_array_equal(problem.lower[-1, :3], problem.upper[-1, :3])
+    np.testing.assert_array_equal(problem.lower[-1, :2], [-0.5, 0.1])
+    heading = problem.lower[-1, 2]
+    assert np.cos(heading + 2.2) == pytest.approx(1.0)
+    assert abs(heading - start) <= np.pi + 1e-9
+
+
+def test_a_goal_without_heading_leaves_it_open() -> None:
+    problem = build(door_scene(), [GoTo(-0.5, 0.1)], options=SHORT)
+    np.testing.assert_array_equal(problem.lower[-1, :2], problem.upper[-1, :2])
+    assert (problem.lower[-1, 2], problem.upper[-1, 2]) == (-np.inf, np.inf)
+
+
+def test_a_fixed_base_stays_where_it_stands() -> None:
+    scene = dataclasses.replace(door_scene(), robot=load_robot("husky_ur5e", base="fixed"))
+    problem = build(scene, [Reach(POSE)], options=SHORT)
+    for bound in (problem.lower, problem.upper):
+        np.testing.assert_array_equal(bound[:, :3], np.tile(scene.start[:3], (problem.segments, 1)))
+    for k, name in enumerate(("base_x", "base_y", "base_yaw")):
+        assert problem.limits(name) == (scene.start[k], scene.start[k])
+
+
+def test_the_hands_freedom_in_a_grasp_has_its_limits(two_grasps: TrajectoryProblem) -> None:
+    assert np.all(column(two_grasps, "drawer.handle_free") == (-0.6, 0.6))
+    for letter in "xyz":
+        assert np.all(column(two_grasps, f"cabinet.ball_{letter}") == (-0.7, 0.6))
+
+
+def test_what_is_grasped_only_does_not_move(two_grasps: TrajectoryProblem) -> None:
+    assert np.all(column(two_grasps, "cabinet.swing") == 0.3)
+    assert np.all(column(two_grasps, "cabinet.slide") == 0.1)
+    slide = column(two_grasps, "drawer.slide")
+    first, last = two_grasps.ends[1], two_grasps.ends[2]
+    assert np.all(slide[:first] == 0.0)
+    assert np.all(slide[first : last - 1] == (0.0, 0.4))
+    assert np.all(slide[last - 1 :] == 0.2)
+
+
+def test_the_start_is_the_scenes() -> None:
+    scene = door_scene().with_state("door", {"hinge": 0.3, "knob": 0.2}).with_start(base=[0.1, 0.2, 0.3])
+    problem = build(scene, [Actuate("door", {"hinge": 1.2})], options=SHORT)
+    np.testing.assert_array_equal(problem.start[: len(scene.start)], scene.start)
+    assert problem.start[problem.chain.index("door.hinge")] == 0.3
+    assert problem.start[problem.chain.index("door.knob")] == 0.2
+    # Beyond the latch's reach nothing need be turned.
+    assert [phase.segments for phase in problem.task.phases] == [REACH, MOVE]
+    assert np.all(column(problem, "door.knob") == 0.2)
+
+
+def test_clip_and_waypoints(opened: TrajectoryProblem) -> None:
+    wild = 100.0 * np.random.default_rng(0).normal(size=(opened.segments, opened.chain.size))
+    clipped = opened.clip(wild)
+    assert np.all((clipped >= opened.lower) & (clipped <= opened.upper))
+    inside = (wild >= opened.lower) & (wild <= opened.upper)
+    np.testing.assert_array_equal(clipped[inside], wild[inside])
+    path = opened.waypoints(clipped)
+    np.testing.assert_array_equal(path[0], opened.start)
+    np.testing.assert_array_equal(path[1:], clipped)
+
+
+# --- poses ----------------------------------------------------------------------------------------------------------
+
+
+def test_closure_holds_from_the_grasp_to_the_end_of_the_hold(opened: TrajectoryProblem) -> None:
+    reach, _, move, _ = opened.ends.tolist()
+    assert opened.pose_names == ["closure door"]
+    (pose,) = opened.transcription.structure.poses
+    assert pose.waypoints == tuple(range(reach, move + 1))
+    closure = opened.chain.closures["door"]
+    assert (pose.joint, pose.local) == (closure.joint, closure.local)
+    assert opened.targets == [opened.scene.objects["door"].placement]
+
+
+def test_every_object_is_closed_while_it_is_held_and_goals_are_met_at_the_end(two_grasps: TrajectoryProblem) -> None:
+    first, second, third, fourth = two_grasps.ends.tolist()
+    at = dict(zip(two_grasps.pose_names, (p.waypoints for p in two_grasps.transcription.structure.poses), strict=True))
+    assert at == {
+        "closure cabinet": (first,),
+        "closure drawer": tuple(range(second, third + 1)),
+        f"goal {two_grasps.scene.robot.tool_frame}": (fourth,),
+    }
+    targets = dict(zip(two_grasps.pose_names, two_grasps.targets, strict=True))
+    assert targets["closure cabinet"] == two_grasps.scene.objects["cabinet"].placement
+    assert targets["closure drawer"] == two_grasps.scene.objects["drawer"].placement
+    assert two_grasps.targets[-1] == POSE
+    assert two_grasps.target_matrix().shape == (3, 12)
+    assert two_grasps.transcription.structure.rests == (first, second)
+
+
+def test_what_is_held_at_the_start_is_closed_from_the_first_waypoint() -> None:
+    scene = dataclasses.replace(door_scene(), held={"door": "handle"})
+    problem = build(scene, [Actuate("door", {"knob": 0.3})], options=SHORT)
+    assert [dict(phase.held) for phase in problem.task.phases] == [{"door": "handle"}]
+    assert problem.transcription.structure.poses[0].waypoints == tuple(range(1, MOVE + 1))
+    assert problem.transcription.structure.rests == ()
+
+
+def test_a_frame_of_the_robot_can_reach_too() -> None:
+    problem = build(door_scene(), [Reach(POSE, frame="forearm_link")], options=SHORT)
+    frame = problem.chain.model.frames[problem.chain.model.getFrameId("forearm_link")]
+    (pose,) = problem.transcription.structure.poses
+    assert (problem.pose_names, pose.joint, pose.waypoints) == (["goal forearm_link"], frame.parentJoint, (REACH,))
+    assert pose.local == frame.placement
+
+
+def test_pose_error_and_drift(opened: TrajectoryProblem) -> None:
+    """The largest residual at the waypoints where a pose must hold, and half-way between those where an object is held."""
+    z = random_path(opened)
+    (pose,), model = opened.transcription.structure.poses, opened.chain.model
+    target, data = opened.targets[0], opened.chain.model.createData()
+
+    def residual(row: np.ndarray) -> np.ndarray:
+        pin.forwardKinematics(model, data, opened.chain.coordinates.q(row))
+        at = data.oMi[pose.joint] * pose.local
+        turn = pin.log3(target.rotation.T @ at.rotation)
+        angle = np.linalg.norm(turn)
+        return np.abs(np.r_[at.translation - target.translation, 2 * np.sin(angle / 2) * turn / angle])
+
+    path = opened.waypoints(z)
+    assert opened.pose_error(z) == pytest.approx(max(residual(path[t]).max() for t in pose.waypoints), abs=1e-8)
+    allowed = np.repeat([SHORT.closure_position, SHORT.closure_angle], 3)
+    reach, _, move, _ = opened.ends.tolist()
+    worst = max((residual((path[t] + path[t + 1]) / 2) / allowed).max() for t in range(reach, move))
+    assert opened.drift(z) == pytest.approx(worst, rel=1e-6)
+    alone = build(door_scene(), [GoTo(0.0, 0.0)], options=SHORT)
+    assert alone.pose_error(random_path(alone)) == alone.drift(random_path(alone)) == 0.0
+
+
+# --- rates ----------------------------------------------------------------------------------------------------------
+
+
+def test_rates_are_those_of_the_trajectory(two_grasps: TrajectoryProblem) -> None:
+    """As the trajectory is played, with the pauses in which a gripper closes."""
+    z, dt = random_path(two_grasps), SHORT.dt
+    trajectory = as_trajectory(two_grasps, z)
+    steps, changes = two_grasps.rates(z)
+    assert steps.shape == (two_grasps.segments, two_grasps.chain.size)
+    assert changes.shape == (two_grasps.segments + 1 + len(two_grasps.transcription.structure.rests), two_grasps.chain.size)
+    velocities = trajectory.velocities()
+    moving = np.isclose(np.diff(trajectory.times), dt)
+    assert np.all(velocities[~moving] == 0.0)
+    assert (~moving).sum() >= 1
+    np.testing.assert_allclose(velocities[moving] * dt, steps, rtol=0.0, atol=1e-10)
+    accelerations = trajectory.accelerations() * dt**2
+    # Two rows stand for a waypoint of rest, the stop and the start; with a pause there they are two waypoints.
+    assert len(accelerations) == len(changes)
+    np.testing.assert_allclose(accelerations, changes, rtol=0.0, atol=1e-10)
+
+
+def test_bounds_on_rates_are_the_limits(two_grasps: TrajectoryProblem) -> None:
+    np.testing.assert_allclose(two_grasps.velocity, two_grasps.chain.velocity * SHORT.dt)
+    np.testing.assert_allclose(two_grasps.acceleration, two_grasps.chain.acceleration * SHORT.dt**2)
+    assert np.all(two_grasps.velocity > 0)
+
+
+@pytest.mark.parametrize("scale", [0.01, 0.5, 3.0])
+def test_rate_violation_is_the_worst_excess(two_grasps: TrajectoryProblem, scale: float) -> None:
+    z = random_path(two_grasps, scale=scale)
+    trajectory = as_trajectory(two_grasps, z)
+    velocity = np.abs(trajectory.velocities()) / two_grasps.chain.velocity
+    acceleration = np.abs(trajectory.accelerations()) / two_grasps.chain.acceleration
+    assert two_grasps.rate_violation(z) == pytest.approx(max(velocity.max(), acceleration.max()) - 1.0, rel=1e-9)
+
+
+def test_standing_still_violates_nothing(opened: TrajectoryProblem) -> None:
+    still = np.tile(opened.start, (opened.segments, 1))
+    assert opened.rate_violation(still) <= 0.0
+    assert opened.objective(still) == 0.0
+
+
+# --- the rest -------------------------------------------------------------------------------------------------------
+
+
+def test_contacts_are_those_of_each_waypoints_phase(opened: TrajectoryProblem) -> None:
+    z = opened.clip(np.nan_to_num(random_path(opened, scale=0.3)))
+    contacts = opened.evaluate_contacts(z, reach=0.3, nearest=5)
+    assert np.bincount(contacts.waypoint).max() == 5
+    held = opened.chain.held_geometries["door"]
+    begin, end = opened.ends[0], opened.ends[2]
+    for row, pair in zip(contacts.waypoint, contacts.pair, strict=True):
+        if not begin <= row < end:  # row t belongs to waypoint t + 1
+            assert not set(pair) & set(held)
+    everything = opened.evaluate_contacts(z, reach=3.0)
+    with_door = {int(row) for row, pair in zip(everything.waypoint, everything.pair, strict=True) if set(pair) & set(held)}
+    assert with_door == set(range(begin, end))
+
+
+def test_it_says_what_it_is(opened: TrajectoryProblem) -> None:
+    text = repr(opened)
+    for part in (
+        "reach door.handle → turn door.knob → move door.hinge, door.knob → go to",
+        f"{opened.segments} steps of 0.25 s",
+        f"{opened.segments * (opened.chain.size + 1)} variables",
+        f"{opened.transcription.rows} rows",
+        f"{sum(len(part.pairs) for part in opened.contacts.phases)} collision pairs",
+    ):
+        assert part in text
+
+
+def test_units(two_grasps: TrajectoryProblem) -> None:
+    rail = build(full_scene(), [Grasp("cabinet", "rail")], options=SHORT)
+    lengths = {"base_x", "base_y", "drawer.slide", "cabinet.slide"}
+    assert {name for name in two_grasps.chain.names if two_grasps.unit(name) == "m"} == lengths
+    assert rail.unit("cabinet.rail") == "m"
+    assert all(two_grasps.unit(name) in ("m", "rad") for name in two_grasps.chain.names)
+
+
+def test_options_have_defaults() -> None:
+    assert build(door_scene(), [Reach(POSE)]).options == Options()
+
+
+def test_scene_steps_and_options_are_left_as_they_were() -> None:
+    scene, steps = door_scene(), [Actuate("door", {"hinge": 1.2})]
+    start, state, pairs = scene.start.copy(), scene.objects["door"].state.copy(), len(scene.robot.collision.collisionPairs)
+    build(scene, steps, options=SHORT)
+    np.testing.assert_array_equal(scene.start, start)
+    np.testing.assert_array_equal(scene.objects["door"].state, state)
+    assert len(scene.robot.collision.collisionPairs) == pairs
+    assert steps == [Actuate("door", {"hinge": 1.2})]
+
+
+@pytest.mark.parametrize(
+    ("steps", "error", "match"),
+    [
+        ([], InputError, "nothing to do"),
+        ([Actuate("dor", {"hinge": 1.0})], UnknownNameError, r"dor.*door"),
+        ([Actuate("door", {"hing": 1.0})], UnknownNameError, r"hing.*hinge"),
+        ([Grasp("door", "handel")], UnknownNameError, r"handel.*handle"),
+        ([Grasp("door", "handle"), Grasp("door", "handle_free")], InputError, "two different attachments"),
+        ([Reach(POSE, frame="tol")], UnknownNameError, r"tol.*tool"),
+        (["open the door"], InputError, "not a step"),
+    ],
+)
+def test_steps_that_cannot_be_are_refused(steps: list[Step], error: type[Exception], match: str) -> None:
+    with pytest.raises(error, match=match):
+        build(door_scene(), steps, options=SHORT)

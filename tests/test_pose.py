@@ -7,10 +7,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from vkc_pin.pose import pose_residual, target_vector
+from vkc_pin.pose import POSE_LOWER, POSE_UPPER, pose_residual, pose_rows, target_vector
 
 _R, _p, _target = ca.SX.sym("R", 3, 3), ca.SX.sym("p", 3), ca.SX.sym("W", 12)
 RESIDUAL = ca.Function("residual", [_R, _p, _target], [pose_residual(_R, _p, _target)])
+ROWS = ca.Function("rows", [_R, _p, _target], [pose_rows(_R, _p, _target)])
 _turn = ca.SX.sym("w", 3)
 _cross = ca.skew(_turn)
 # R·exp([w]) to second order: its derivatives at w = 0 are those along the manifold.
@@ -99,3 +100,46 @@ def test_its_slope_is_that_of_finite_differences(angle: float) -> None:
         change = 1e-5 * np.eye(3)[k]
         ahead, behind = (residual(placement * pin.SE3(pin.exp3(s * change), np.zeros(3)), target) for s in (1.0, -1.0))
         np.testing.assert_allclose(slope[:, k], (ahead - behind) / 2e-5, rtol=0.0, atol=1e-7)
+
+
+# --- rows of the program --------------------------------------------------------------------------------------------
+
+
+def missing(placement: pin.SE3, target: pin.SE3) -> float:
+    """Return by how much the worst row is outside its bounds."""
+    value = np.asarray(ROWS(placement.rotation, placement.translation, target_vector(target))).ravel()
+    assert value.shape == POSE_LOWER.shape == POSE_UPPER.shape
+    return float(np.maximum(POSE_LOWER - value, value - POSE_UPPER).max())
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-3, 0.5, 1.5, 1.6, 2.5, 3.0, np.pi - 1e-4, np.pi])
+def test_rows_hold_at_the_target_and_nowhere_else(angle: float) -> None:
+    rng, target = np.random.default_rng(4), pin.SE3.Random()
+    for axis in (*np.eye(3), random_axis(rng), random_axis(rng)):
+        placement = turned(target, angle, axis)
+        if angle == 0.0:
+            assert missing(placement, target) < 1e-12
+        elif angle < np.pi / 2:  # every row of the vector is bound from both sides
+            vector = np.asarray(ROWS(placement.rotation, placement.translation, target_vector(target))).ravel()[3:6]
+            assert np.abs(vector).max() >= np.sin(angle) / np.sqrt(3) - 1e-9
+        else:
+            assert missing(placement, target) >= -2.0 * np.cos(angle) - 1e-9  # the trace
+    np.testing.assert_array_equal(POSE_LOWER[:6], np.zeros(6))
+    np.testing.assert_array_equal(POSE_UPPER[:6], np.zeros(6))
+
+
+def test_rows_are_position_half_vee_and_trace() -> None:
+    rng, target = np.random.default_rng(5), pin.SE3.Random()
+    for angle in (0.2, 1.0, 2.9):
+        axis, shift = random_axis(rng), rng.normal(size=3)
+        placement = turned(target, angle, axis)
+        placement.translation = target.translation + shift
+        expected = np.r_[shift, np.sin(angle) * axis, 1.0 + 2.0 * np.cos(angle)]
+        found = np.asarray(ROWS(placement.rotation, placement.translation, target_vector(target))).ravel()
+        np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-12)
+
+
+def test_rows_are_linear_in_the_placement() -> None:
+    """So that they cost the program nothing in second derivatives."""
+    everything = ca.vertcat(ca.vec(_R), _p)
+    assert ca.jacobian(ca.jacobian(pose_rows(_R, _p, _target), everything), everything).nnz() == 0

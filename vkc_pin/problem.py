@@ -173,7 +173,7 @@ class TrajectoryProblem:
         return float(np.sum(first**2 @ structure.weights_velocity) + np.sum(second**2 @ structure.weights_acceleration))
 
     def pose_error(self, z: NDArray[np.float64]) -> float:
-        """Return the largest residual of closure and goals, [m] or [rad], at z_1..z_N, shape (N, n)."""
+        """Return the largest residual of closure, goals and rolling, [m] or [rad], at z_1..z_N, shape (N, n)."""
         errors = [0.0]
         for pose, solver, target in zip(
             self.transcription.structure.poses, self.transcription.pose_solvers, self.targets, strict=True
@@ -181,7 +181,16 @@ class TrajectoryProblem:
             if pose.waypoints:
                 residual, _ = solver.evaluate(z[np.array(pose.waypoints) - 1], target)
                 errors.append(float(np.abs(residual).max()))
-        return max(errors)
+        return max(*errors, self.slip(z))
+
+    def slip(self, z: NDArray[np.float64]) -> float:
+        """Return how far a differential base slips sideways in the worst step of z_1..z_N, shape (N, n) [m]; 0 for others."""
+        if not self.transcription.structure.differential:
+            return 0.0
+        path = self.waypoints(z)[:, :3]
+        step = np.diff(path, axis=0)
+        heading = path[:-1, 2] + step[:, 2] / 2
+        return float(np.abs(np.cos(heading) * step[:, 1] - np.sin(heading) * step[:, 0]).max())
 
     def drift(self, z: NDArray[np.float64]) -> float:
         """Return the largest closure residual half-way between waypoints, relative to what `Options` allow."""

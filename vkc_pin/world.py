@@ -62,10 +62,16 @@ class World:
     @cached_property
     def visual_labels(self) -> list[str]:
         """For each geometry of `visual`, the link or obstacle it belongs to."""
-        standing = len(self.scene.obstacle_visual.geometryObjects)
+        links = {str(frame.name) for frame in self.model.frames if frame.type == pin.FrameType.BODY}
         shapes = list(self.visual.geometryObjects)
-        moving = shapes[: len(shapes) - standing]
-        return [_link(shape) for shape in moving] + [shape.name for shape in shapes[len(moving) :]]
+        moving = len(shapes) - len(self.scene.obstacle_visual.geometryObjects)
+        labels = []
+        for shape in shapes[:moving]:
+            label = _link(shape)
+            while label not in links and "_" in label:  # a mesh of several parts is `<link>_<number>_<part>`
+                label = label.rpartition("_")[0]
+            labels.append(label)
+        return labels + [shape.name for shape in shapes[moving:]]
 
     def _geometry(
         self, robot: pin.GeometryModel, objects: Mapping[str, pin.GeometryModel], obstacles: pin.GeometryModel

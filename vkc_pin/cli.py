@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import sys
 from collections.abc import Sequence
@@ -100,10 +101,8 @@ def _view(arguments: argparse.Namespace) -> int:
         return EXIT_OK
     visualization.show(shown)
     sys.stdout.write("press Enter to end\n")
-    try:
+    with contextlib.suppress(EOFError, KeyboardInterrupt):
         input()
-    except (EOFError, KeyboardInterrupt):
-        pass
     return EXIT_OK
 
 
@@ -124,7 +123,8 @@ def _srdf(arguments: argparse.Namespace) -> int:
     from vkc_pin.allowed_collisions import write_srdf
     from vkc_pin.robot import load_robot
 
-    sys.stdout.write(f"wrote {write_srdf(load_robot(arguments.robot), arguments.output, samples=arguments.samples, seed=arguments.seed)}\n")
+    written = write_srdf(load_robot(arguments.robot), arguments.output, samples=arguments.samples, seed=arguments.seed)
+    sys.stdout.write(f"wrote {written}\n")
     return EXIT_OK
 
 
@@ -143,7 +143,8 @@ def _parser() -> argparse.ArgumentParser:
 
     plan = commands.add_parser("plan", help="plan a motion", description="Plan a motion that brings joints of objects to values.")
     plan.add_argument("scene", metavar="SCENE", help="name of a scene that comes with the package, or a YAML file")
-    plan.add_argument("--set", action="append", required=True, metavar="OBJECT.JOINT=VALUE", help="what should change, in this order")
+    form = "OBJECT.JOINT=VALUE"
+    plan.add_argument("--set", action="append", required=True, metavar=form, help="what should change, in this order")
     plan.add_argument("--html", metavar="FILE", help="write the animation, one self-contained page")
     plan.add_argument("--save", metavar="FILE", help="save the plan (.npz)")
     plan.add_argument("--json", metavar="FILE", help="write trajectory, metrics and report as JSON")
@@ -154,7 +155,8 @@ def _parser() -> argparse.ArgumentParser:
     plan.add_argument("--quiet", action="store_true", help="no progress")
     plan.set_defaults(run=_plan)
 
-    check = commands.add_parser("check", help="validate a saved plan", description="Run the independent validation on a saved plan.")
+    about = "Run the independent validation on a saved plan."
+    check = commands.add_parser("check", help="validate a saved plan", description=about)
     check.add_argument("plan", metavar="PLAN", help="a plan saved with --save or Plan.save")
     check.set_defaults(run=_check)
 
@@ -172,7 +174,8 @@ def _parser() -> argparse.ArgumentParser:
     door.add_argument("--quiet", action="store_true", help="no progress bar")
     door.set_defaults(run=_bench)
 
-    srdf = commands.add_parser("srdf", help="regenerate allowed collisions", description="Sample which links of a robot can never collide.")
+    about = "Sample which links of a robot can never collide."
+    srdf = commands.add_parser("srdf", help="regenerate allowed collisions", description=about)
     srdf.add_argument("robot", metavar="ROBOT", help="name or URDF file")
     srdf.add_argument("--output", required=True, metavar="FILE")
     srdf.add_argument("--samples", type=_positive, default=10000)
@@ -191,6 +194,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return EXIT_MISUSE
     except BrokenPipeError:
         return EXIT_OK
+    except OSError as error:  # a file that cannot be written, a full disk
+        sys.stderr.write(f"vkc-pin: {error}\n")
+        return EXIT_MISUSE
 
 
 if __name__ == "__main__":

@@ -63,6 +63,10 @@ def explain(problem: TrajectoryProblem, seed: int) -> list[str]:
             first, second = contacts.pair[worst]
             lines.append(
                 f"{phase.name}: all {len(reached)} configurations found there are blocked; in the least blocked one "
-                f"{labels[first]} – {labels[second]} are {1e3 * contacts.distance[worst]:.1f} mm apart"
+                f"{labels[first]} – {labels[second]} {_gap(contacts.distance[worst])}"
             )
     return lines
+
+
+def _gap(distance: float) -> str:
+    return f"overlap by {-1e3 * distance:.1f} mm" if distance < 0 else f"are only {1e3 * distance:.1f} mm apart"

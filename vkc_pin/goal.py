@@ -237,6 +237,10 @@ def compile_task(scene: Scene, steps: Sequence[Step], options: Options) -> Task:
     """
     if isinstance(steps, Reach | Grasp | Actuate | GoTo):
         raise InputError("one step alone", field="steps", expected="a list of steps", got=repr(steps))
+    try:
+        steps = tuple(steps)
+    except TypeError:
+        raise InputError("not steps", field="steps", expected="a list of steps", got=repr(steps)) from None
     if not steps:
         raise InputError("there is nothing to do", field="steps", expected="at least one step", got="an empty list")
     compiler = _Compiler(scene, options)

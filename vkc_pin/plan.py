@@ -7,6 +7,7 @@ import json
 import os
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -16,10 +17,11 @@ import numpy as np
 
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
+from vkc_pin.report import Report
+from vkc_pin.resources import folder
 from vkc_pin.scene import Scene
 from vkc_pin.steps import Step, step_from_dict, step_to_dict
 from vkc_pin.trajectory import Trajectory
-from vkc_pin.report import Report
 
 if TYPE_CHECKING:
     import meshcat
@@ -33,16 +35,33 @@ def write_atomically(path: str | Path, data: bytes) -> Path:
     """Write `data` to `path` whole or not at all, making its folder if need be; return the path."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    temporary = Path(name)
     try:
         with os.fdopen(handle, "wb") as stream:
             stream.write(data)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
+        temporary.chmod(0o644)
+        temporary.replace(path)
     except BaseException:
-        Path(temporary).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise
     return path
+
+
+def _folder_to_data(scene_folder: Path, plan: Path) -> dict[str, str]:
+    """Return where a scene's folder is: in the package, or seen from the plan's file and absolutely."""
+    there = scene_folder.resolve()
+    if there == folder("scenes").resolve():
+        return {"package": "scenes"}
+    return {"relative": os.path.relpath(there, plan.resolve().parent), "absolute": str(there)}
+
+
+def _folder_from_data(data: Mapping[str, str], plan: Path) -> Path:
+    """Return the folder that `_folder_to_data` described."""
+    if "package" in data:
+        return folder(data["package"])
+    beside = plan.resolve().parent / data["relative"]
+    return beside if beside.is_dir() else Path(data["absolute"])
 
 
 @dataclass(frozen=True)
@@ -142,11 +161,16 @@ class Plan:
         return plotting.plot(self, path)
 
     def save(self, path: str | Path) -> Path:
-        """Save it, with its scene, steps, options and report, as an .npz file without pickles; return the path."""
+        """Save it, with its scene, steps, options and report, as an .npz file without pickles; return the path.
+
+        The scene's description is in the file; the meshes and URDFs it names are not. A scene of the package finds them
+        in whatever installation loads the plan; for others the file keeps where their folder is, seen from the plan and
+        absolutely, so that plan and scene can move together and the plan alone.
+        """
         about = {
             "format": FORMAT,
             "scene": self.scene.document,
-            "folder": str(self.scene.folder),
+            "folder": _folder_to_data(self.scene.folder, Path(path)),
             "steps": [step_to_dict(step) for step in self.steps],
             "options": asdict(self.options),
             "trajectory": {k: v for k, v in self.trajectory.to_dict().items() if k not in ("times", "positions")},
@@ -168,21 +192,30 @@ class Plan:
         """Return the plan that `save` wrote to `path`.
 
         Raises:
-            InputError: The file is missing, or no plan, or of a newer format.
+            InputError: The file is missing, damaged, no plan, or of a newer format, or what its scene names is not there.
         """
         path = Path(path)
         if not path.is_file():
             raise InputError("no such file", file=path, expected="a saved plan (.npz)")
         try:
-            with np.load(path, allow_pickle=False) as archive:
-                about = json.loads(str(archive["about"]))
-                trajectory = {**about["trajectory"], "times": archive["times"], "positions": archive["positions"]}
-        except (ValueError, KeyError, OSError, zipfile.BadZipFile) as error:
+            return cls._read(path)
+        except InputError as error:
+            if error.file is not None:
+                raise
+            got, expected = error.got, error.expected
+            raise InputError(error.problem, file=path, field=error.field, expected=expected, got=got) from error
+        except (ValueError, LookupError, TypeError, AttributeError, OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
             raise InputError("not a saved plan", file=path, expected="a file written by Plan.save", got=str(error)) from error
-        if about.get("format") != FORMAT:
-            raise InputError("unknown format", file=path, field="format", expected=FORMAT, got=about.get("format"))
+
+    @classmethod
+    def _read(cls, path: Path) -> Plan:
+        with np.load(path, allow_pickle=False) as archive:
+            about = json.loads(str(archive["about"]))
+            if about.get("format") != FORMAT:
+                raise InputError("unknown format", file=path, field="format", expected=FORMAT, got=about.get("format"))
+            trajectory = {**about["trajectory"], "times": archive["times"], "positions": archive["positions"]}
         return cls(
-            scene=Scene.from_document(about["scene"], about["folder"]),
+            scene=Scene.from_document(about["scene"], _folder_from_data(about["folder"], path)),
             steps=tuple(step_from_dict(step) for step in about["steps"]),
             options=Options(**about["options"]),
             trajectory=Trajectory.from_dict(trajectory),

@@ -54,19 +54,28 @@ def plan(
     Raises:
         InputError: The steps name something that is not there or cannot be done, or an argument is wrong.
     """
-    options = options or Options()
+    options = Options() if options is None else options
+    for field, value, kind in (("scene", scene, Scene), ("options", options, Options)):
+        if not isinstance(value, kind):
+            raise InputError("wrong kind of argument", field=field, expected=f"a {kind.__name__}", got=repr(value))
     if initialization not in METHODS:
-        raise UnknownNameError("initialization", initialization, METHODS, field="initialization")
-    if time_limit is not None and not (np.isfinite(time_limit) and time_limit > 0):
-        raise InputError("out of range", field="time_limit", expected="seconds, more than 0", got=time_limit)
-    return _Planner(scene, tuple(steps), initialization, options, callback, time_limit, seed).run()
+        raise UnknownNameError("initialization", str(initialization), METHODS, field="initialization")
+    if time_limit is not None and not (_is_number(time_limit) and 0 < time_limit < np.inf):
+        raise InputError("out of range", field="time_limit", expected="seconds, more than 0", got=repr(time_limit))
+    if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:
+        raise InputError("out of range", field="seed", expected="a whole number of at least 0", got=repr(seed))
+    return _Planner(scene, steps, initialization, options, callback, time_limit, int(seed)).run()
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
 
 
 class _Planner:
     def __init__(
         self,
         scene: Scene,
-        steps: tuple[Step, ...],
+        steps: Sequence[Step],
         initialization: str,
         options: Options,
         callback: Callable[[Iteration], None] | None,
@@ -83,6 +92,7 @@ class _Planner:
         """Try seeds until validation accepts a motion, there are no more, or time is up."""
         began = time.perf_counter()
         task = compile_task(self.scene, self.steps, self.options)
+        self.steps = task.steps
         problem = TrajectoryProblem(self.scene, task, self.options)
         build_time = problem.transcription.take_build_time()
         deadline = np.inf if self.time_limit is None else began + build_time + self.time_limit
@@ -105,8 +115,11 @@ class _Planner:
         if reasons:
             report = report.with_reasons(reasons)
         elif verdict != "success" and not status:
-            notes = explain(problem, self.seed)
-            report, status = dataclasses.replace(report, notes=tuple(notes)), "infeasible" if notes else ""
+            try:
+                notes = explain(problem, self.seed)
+                report, status = dataclasses.replace(report, notes=tuple(notes)), "infeasible" if notes else ""
+            except KeyboardInterrupt:
+                status = "interrupted"
         build_time += problem.transcription.take_build_time()
         metrics = {
             "planning_time": time.perf_counter() - began - build_time,
@@ -168,7 +181,8 @@ class _Planner:
 def as_trajectory(problem: TrajectoryProblem, z: NDArray[np.float64]) -> Trajectory:
     """Return z_1..z_N, shape (N, n), as a trajectory; where something is grasped, the robot waits for the gripper."""
     waypoints, dt = problem.waypoints(z), problem.options.dt
-    rows, times, phases = [0], [0.0], []
+    rows, times = [0], [0.0]
+    phases: list[PhaseSpan] = []
     begin = 0
     for phase, end in zip(problem.task.phases, problem.ends, strict=True):
         first = len(rows) - 1

@@ -43,6 +43,8 @@ def collisions_between(problem: TrajectoryProblem, z: NDArray[np.float64]) -> Co
     s = (begin[:, None] + length[:, None] * (np.arange(FINER) + 0.5) / FINER).ravel()
     states, waypoints = _states(path, segment, s)
     found = _deepest(problem.contacts.evaluate(states, waypoints, reach=KEEP), segment)
+    # A start that is close to something leaves it as it can: only what collides on the way counts.
+    found = found.select(np.flatnonzero((segment[found.waypoint] > 0) | (found.distance < 0)))
     joints = problem.contacts.joints_of(found.pair)
     rotations, translations = problem.chain.joint_placements(states)
     ends = problem.chain.joint_placements(path)

@@ -274,6 +274,8 @@ def solve(
     solution = loop.solution
     with interruptible() as interrupt:
         _iterate(loop, callback, interrupt)
+    if interrupt.pressed:  # whichever way the loop ended, nothing else is to be tried
+        solution.status = "interrupted"
     return solution
 
 

@@ -199,7 +199,10 @@ class _Check:
         return float(largest[0]), float(largest[1])
 
     def _clearance(self) -> float:
-        """Nothing comes too close at a waypoint or penetrates anywhere; return the smallest distance [m]."""
+        """Nothing comes too close at a waypoint or penetrates anywhere; return the smallest distance [m].
+
+        The start is where the robot is: it may be close to something, but not inside.
+        """
         asked = [(step.object, step.attachment) for step in self.steps if isinstance(step, Grasp)]
         grasps = [(name, self.scene.objects[name].object.attachment(attachment).name) for name, attachment in asked]
         samples, smallest = self.samples, np.inf
@@ -209,7 +212,7 @@ class _Check:
             subject, millimetres = f"{hit.first} – {hit.second}", 1e3 * abs(hit.distance)
             if hit.distance < 0:
                 self._add("penetration", subject, 0, -hit.distance, "m", f"overlap by {millimetres:.1f} mm", row=hit.row)
-            elif hit.at_waypoint and hit.distance < hit.margin - WAYPOINT_TOLERANCE:
+            elif hit.at_waypoint and hit.row > 0 and hit.distance < hit.margin - WAYPOINT_TOLERANCE:
                 detail = f"are only {millimetres:.1f} mm apart, {1e3 * hit.margin:.0f} mm are asked for"
                 short = hit.margin - WAYPOINT_TOLERANCE - hit.distance
                 self._add("clearance", subject, 0, short, "m", detail, row=hit.row)

@@ -29,18 +29,20 @@ def as_placement(pose: Any, *, name: str = "pose") -> pin.SE3:
         array = np.asarray(pose.homogeneous if isinstance(pose, pin.SE3) else pose, float)
     except (TypeError, ValueError):
         raise InputError("not a pose", field=name, expected=expected, got=repr(pose)) from None
+    if array.shape not in ((6,), (4, 4)):
+        raise InputError(
+            "not a pose", field=name, expected=expected, got=f"an array of shape {array.shape}" if array.ndim else repr(pose)
+        )
     if not np.all(np.isfinite(array)):
         raise InputError("not finite", field=name, expected=expected, got=array.tolist())
     if array.shape == (6,):
         return pin.SE3(pin.rpy.rpyToMatrix(*array[3:]), array[:3])
-    if array.shape == (4, 4):
-        rotation = array[:3, :3]
-        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-6 or np.linalg.det(rotation) < 0:
-            raise InputError("its upper left 3 x 3 block is not a rotation", field=name, got=rotation.tolist())
-        if np.abs(array[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-6:
-            raise InputError("its last row is wrong", field=name, expected=[0, 0, 0, 1], got=array[3].tolist())
-        return pin.SE3(rotation, array[:3, 3])
-    raise InputError("not a pose", field=name, expected=expected, got=f"an array of shape {array.shape}")
+    rotation = array[:3, :3]
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-6 or np.linalg.det(rotation) < 0:
+        raise InputError("its upper left 3 x 3 block is not a rotation", field=name, got=rotation.tolist())
+    if np.abs(array[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-6:
+        raise InputError("its last row is wrong", field=name, expected=[0, 0, 0, 1], got=array[3].tolist())
+    return pin.SE3(rotation, array[:3, 3])
 
 
 @dataclass(frozen=True)

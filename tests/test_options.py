@@ -1,0 +1,57 @@
+"""Options: each is checked when it is set, and says which it is."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import FrozenInstanceError, asdict, fields
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vkc_pin.errors import InputError
+from vkc_pin.options import Options
+
+WHOLE = [item.name for item in fields(Options) if item.type == "int"]
+REAL = [item.name for item in fields(Options) if item.type == "float"]
+
+
+def test_every_option_is_of_a_known_kind_and_documented() -> None:
+    assert sorted(WHOLE + REAL) == sorted(item.name for item in fields(Options))
+    assert "dist_safe" in REAL
+    assert "move_waypoints" in WHOLE
+    assert Options.__doc__ is not None
+    for item in fields(Options):
+        assert f"        {item.name}: " in Options.__doc__
+
+
+@pytest.mark.parametrize("name", WHOLE)
+@pytest.mark.parametrize("value", [0, -3, 2.0, True, "4", None, np.nan])
+def test_whole_numbers(name: str, value: Any) -> None:
+    with pytest.raises(InputError) as caught:
+        Options(**{name: value})
+    assert caught.value.field == f"Options.{name}"
+    assert caught.value.got == repr(value)
+
+
+@pytest.mark.parametrize("name", REAL)
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf, True, "0.1", None])
+def test_real_numbers(name: str, value: Any) -> None:
+    with pytest.raises(InputError) as caught:
+        Options(**{name: value})
+    assert caught.value.field == f"Options.{name}"
+
+
+def test_numbers_become_plain() -> None:
+    """So that a plan's options go into a file."""
+    values = {name: np.int64(7) for name in WHOLE} | {name: np.float32(0.5) for name in REAL}
+    options = Options(**values)
+    assert Options(**json.loads(json.dumps(asdict(options)))) == options
+    assert {type(getattr(options, name)) for name in WHOLE} == {int}
+    assert {type(getattr(options, name)) for name in REAL} == {float}
+    assert Options(dt=1).dt == 1.0
+
+
+def test_they_stay_as_they_are() -> None:
+    with pytest.raises(FrozenInstanceError):
+        Options().dt = 0.1  # type: ignore[misc]

@@ -1,0 +1,25 @@
+"""Reports: as text, and as plain data and back."""
+
+from __future__ import annotations
+
+import json
+
+from vkc_pin.report import Report, Violation
+
+ONE = Violation("limit", "elbow_joint", 4, 1.0, 0.05, "rad", "3.2 rad is outside")
+TWO = Violation("penetration", "forearm_link – sofa", 7, 1.9, 0.01, "m", "overlap by 10.0 mm")
+
+
+def test_text() -> None:
+    assert Report(states=12).ok
+    assert "every constraint holds" in "\n".join(Report(states=12).lines())
+    text = "\n".join(Report((ONE, TWO), states=12).lines())
+    assert "2 constraint(s) violated" in text
+    assert "limit elbow_joint: 3.2 rad is outside (waypoint 4, 1.00 s)" in text
+    assert "penetration forearm_link – sofa: overlap by 10.0 mm (waypoint 7, 1.90 s)" in text
+
+
+def test_round_trip() -> None:
+    for report in (Report((ONE, TWO), -0.01, 0.001, 0.002, 12, ("a wall is in the way",)), Report()):
+        assert Report.from_dict(json.loads(json.dumps(report.to_dict()))) == report
+    assert not Report((ONE,)).ok

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 __all__ = ["BatchFunction"]
 
 _KEPT = 16  # batch sizes whose buffers are kept
+_ROUND = 16  # they are multiples of this
 
 
 class BatchFunction:
@@ -31,15 +32,16 @@ class BatchFunction:
         Args:
             inputs: One array per input: the first of shape (B, numel), others too, or (numel,) for the same in every row.
         """
-        batch = len(inputs[0])
+        rows = len(inputs[0])
+        batch = -(-rows // _ROUND) * _ROUND
         if batch not in self._buffers:
             self._allocate(batch)
         self._buffers.move_to_end(batch)
         _, trigger, arguments, results = self._buffers[batch]
         for argument, values in zip(arguments, inputs, strict=True):
-            argument[...] = values
+            argument[:rows] = values
         trigger()
-        return [result.copy() for result in results]
+        return [result[:rows].copy() for result in results]
 
     def _allocate(self, batch: int) -> None:
         mapped = self.function.map(batch)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import casadi
 import numpy as np
@@ -94,9 +94,7 @@ class VirtualKinematicChain:
 
     @cached_property
     def _kinematics(self) -> BatchFunction:
-        z = casadi.SX.sym("z", self.size)
-        placements = cpin.joint_placements(self.model)(self.coordinates.q_symbolic(z))
-        return BatchFunction(casadi.Function("placements", [z], [casadi.densify(placements)], {"cse": True}))
+        return _placements(self.model.saveToString())
 
     def index(self, name: str) -> int:
         """Return the position of coordinate `name` in z. Raises `UnknownNameError` if there is none."""
@@ -194,3 +192,14 @@ def consolidate(scene: Scene, grasps: Mapping[str, str]) -> VirtualKinematicChai
 def _base_target(placed: PlacedObject) -> pin.SE3:
     base = placed.object.model.frames[placed.object.model.getFrameId(placed.object.base_link, pin.FrameType.BODY)]
     return placed.placement * base.placement
+
+
+@lru_cache(maxsize=16)
+def _placements(model_text: str) -> BatchFunction:
+    """Return z → (12·(J − 1),): by columns R and t of every joint's placement in the world, built once per model."""
+    model = pin.Model()
+    model.loadFromString(model_text)
+    coordinates = Coordinates(model)
+    z = casadi.SX.sym("z", coordinates.size)
+    placements = cpin.joint_placements(model)(coordinates.q_symbolic(z))
+    return BatchFunction(casadi.Function("placements", [z], [casadi.densify(placements)], {"cse": True}))

@@ -131,7 +131,7 @@ class _Compiler:
             self.state.setdefault(f"{placed.name}.{joint}", value)
 
     def _append(self, name: str, segments: int, **details: Any) -> None:
-        before = self.phases[-1].held if self.phases else self.scene.held
+        before = {**self.phases[-1].held, **self.phases[-1].grasps} if self.phases else self.scene.held
         leaves = {key: value for key, value in before.items() if key not in self.held}
         self.phases.append(Phase(name, segments, held=dict(self.held), leaves=leaves, before=dict(self.state), **details))
         for coordinate, value in details.get("values", {}).items():  # a goal beyond a limit is approached as far as it goes

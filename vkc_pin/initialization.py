@@ -13,12 +13,13 @@ __all__ = ["METHODS", "initialize", "scatter"]
 
 METHODS = ("interpolated", "stationary")
 _SCATTER = 192  # random seeds for a configuration that nothing leads to
-_BEAM, _CHILDREN = 40, 4  # configurations kept per knot, and tried from each for the next
+_BEAM, _QUICK_BEAM, _CHILDREN = 40, 24, 4  # configurations kept per knot, and tried from each for the next
 _SPACING = 4  # waypoints between knots along a phase in which something is held
 _APPROACH = 6  # configurations looked at on the way to a grasp
 _EASY = 0.5  # share of the beam that must go on freely for a knot to be easy
 _COLLISION, _DEPTH = 10.0, 300.0  # what a collision costs, and a metre of its depth, beside radians of motion
 _NOT_FOUND = 1e3
+_ROUGH = 1e-4  # [m] and [rad], of knots; what is joined from them is exact
 
 
 def initialize(problem: TrajectoryProblem, method: str, rng: np.random.Generator, *, count: int = 1) -> list[NDArray[np.float64]]:
@@ -85,6 +86,7 @@ class _Interpolation:
         self.robot = self.chain.robot.coordinates.size
         self.weights = np.ones(self.chain.size)
         self.weights[:3] = 3.0
+        self.beam = _BEAM
         self.driven = [self.chain.index(name) for name in problem.task.state]
         self.objects = _objects(problem, np.tile(problem.start, (problem.segments, 1)))
 
@@ -109,15 +111,16 @@ class _Interpolation:
         Returns:
             Paths, shape (B, knots, n), what each costs and how much of that is for collisions, shape (B,), and the knots.
         """
+        self.beam = _BEAM if thorough else _QUICK_BEAM
         paths = self.problem.start[None, None, :]
         cost, trouble = np.zeros(1), np.zeros(1)
         at, begin = [0], 0
         for phase, end in zip(self.problem.task.phases, self.problem.ends, strict=True):
             pieces = max(1, round((end - begin) / _SPACING)) if phase.held else 1
             for knot in np.linspace(begin, end, pieces + 1).round().astype(int)[1:].tolist():
-                parents, z, bad = self._continue(paths, knot, fresh=not phase.held, thorough=thorough)
+                parents, z, bad = self._continue(paths, cost, knot, fresh=not phase.held, thorough=thorough)
                 total = cost[parents] + np.abs(z - paths[parents, -1]) @ self.weights + bad
-                best = np.argsort(total, kind="stable")[:_BEAM]
+                best = np.argsort(total, kind="stable")[: self.beam]
                 paths = np.concatenate([paths[parents[best]], z[best, None]], axis=1)
                 cost, trouble = total[best], (trouble[parents] + bad)[best]
                 at.append(knot)
@@ -127,19 +130,39 @@ class _Interpolation:
         return paths, cost, trouble, at
 
     def _continue(
-        self, paths: NDArray[np.float64], waypoint: int, *, fresh: bool, thorough: bool
+        self, paths: NDArray[np.float64], cost: NDArray[np.float64], waypoint: int, *, fresh: bool, thorough: bool
     ) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64]]:
         """Return continuations of `paths` to a waypoint: which path each goes on from, where to, and what is wrong there."""
         if fresh:
-            parents = np.arange(_SCATTER) % len(paths)
-            return parents, *self.knot(paths[parents, -1], waypoint, "scatter")
-        parents = np.arange(len(paths))
-        z, bad = self.knot(paths[:, -1], waypoint, "track")
-        if not thorough and np.count_nonzero(bad == 0) >= _EASY * len(paths):
-            return parents, z, bad
-        more = np.arange(_BEAM * _CHILDREN - len(paths)) % len(paths)
-        shaken, worse = self.knot(paths[more, -1], waypoint, "shake")
-        return np.concatenate([parents, more]), np.concatenate([z, shaken]), np.concatenate([bad, worse])
+            parents = np.arange(_SCATTER if thorough else _SCATTER // 2) % len(paths)
+            z, found = self.knot(paths[parents, -1], waypoint, "scatter")
+        else:
+            parents = np.arange(len(paths))
+            z, found = self.knot(paths[:, -1], waypoint, "track")
+            if not thorough:
+                bad = self._bad(z, found, waypoint)
+                if np.count_nonzero(bad == 0) >= _EASY * len(paths):
+                    return parents, z, bad
+            more = np.arange(self.beam * _CHILDREN - len(paths)) % len(paths)
+            shaken, also = self.knot(paths[more, -1], waypoint, "shake")
+            parents, z, found = np.concatenate([parents, more]), np.concatenate([z, shaken]), np.concatenate([found, also])
+        # The cheapest first; what the beam cannot keep anyway need not be looked at.
+        price = cost[parents] + np.abs(z - paths[parents, -1]) @ self.weights + _NOT_FOUND * ~found
+        order = np.argsort(price, kind="stable")
+        parents, z, found = parents[order], z[order], found[order]
+        half = min(2 * self.beam, len(z))
+        bad = self._bad(z[:half], found[:half], waypoint)
+        if np.count_nonzero(bad == 0) >= self.beam:
+            return parents[:half], z[:half], bad
+        return parents, z, np.concatenate([bad, self._bad(z[half:], found[half:], waypoint)])
+
+    def _bad(self, z: NDArray[np.float64], found: NDArray[np.bool_], waypoint: int) -> NDArray[np.float64]:
+        """Return what is wrong with configurations at a waypoint, as a cost, shape (B,)."""
+        bad = np.full(len(z), _NOT_FOUND)
+        if found.any():
+            depth = self._depth(z[found], waypoint)
+            bad[found] = np.where(depth > 0, _COLLISION + _DEPTH * depth, 0.0)
+        return bad
 
     def _approach(self, first: NDArray[np.float64], last: NDArray[np.float64], begin: int, end: int) -> NDArray[np.float64]:
         """Return what the straight ways from `first` to `last`, both (B, n), cost in collisions, shape (B,)."""
@@ -156,8 +179,8 @@ class _Interpolation:
     def _solver(self, pose: int) -> tuple[PoseSolver, pin.SE3]:
         return self.problem.transcription.pose_solvers[pose], self.problem.targets[pose]
 
-    def knot(self, before: NDArray[np.float64], waypoint: int, how: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return configurations for a waypoint, shape (B, n), and what is wrong with each, as a cost.
+    def knot(self, before: NDArray[np.float64], waypoint: int, how: str) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Return configurations for a waypoint, shape (B, n), and which of them are what must hold there.
 
         Args:
             before: What they come from, shape (B, n).
@@ -172,14 +195,13 @@ class _Interpolation:
         lower[self.driven] = upper[self.driven] = self.objects[row, self.driven]
         pose = self.pose_at(waypoint)
         if pose is None:
-            return np.clip(z, lower, upper), np.zeros(len(z))
+            return np.clip(z, lower, upper), np.ones(len(z), bool)
         solver, target = self._solver(pose)
         z = self._scatter(z, pose) if how == "scatter" else self._shake(z, pose) if how == "shake" else z
-        z, found = solver.solve(z, target, lower=lower, upper=upper, weights=self.weights)
+        z, found = solver.solve(z, target, lower=lower, upper=upper, weights=self.weights, tolerance=_ROUGH)
         if how == "scatter":
             z = self._unwind(z, before, lower, upper)
-        depth = self._depth(z, waypoint)
-        return z, _NOT_FOUND * ~found + np.where(depth > 0, _COLLISION + _DEPTH * depth, 0.0)
+        return z, found
 
     def _scatter(self, z: NDArray[np.float64], pose: int) -> NDArray[np.float64]:
         """Return arms near home, nearer and further, with the base under them as `pose` needs it."""

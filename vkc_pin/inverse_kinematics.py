@@ -65,23 +65,41 @@ class PoseSolver:
             Configurations, shape (B, n), and a mask, shape (B,).
         """
         z = np.clip(z, lower, upper)
-        movable = np.broadcast_to(upper - lower > 1e-9, z.shape)
-        residual, jacobian = self.evaluate(z, target)
-        for _ in range(iterations):
-            if np.abs(residual).max() < tolerance:
+        lower, upper = np.broadcast_to(lower, z.shape), np.broadcast_to(upper, z.shape)
+        error = np.empty(len(z))
+        at = np.arange(len(z))  # what is not solved yet
+        for remaining in range(iterations, -1, -1):
+            residual, jacobian = self.evaluate(z[at], target)
+            error[at] = np.abs(residual).max(axis=1)
+            still = error[at] >= tolerance
+            at, residual, jacobian = at[still], residual[still], jacobian[still]
+            if not len(at) or not remaining:
                 break
-            # A coordinate at its limit that the step would push further is taken out, once.
-            free = movable.copy()
-            for _ in range(2):
-                scaled = jacobian * (free / weights)[:, None, :]
-                damping = 1e-8 + 1e-3 * np.minimum(1.0, np.sum(residual**2, axis=1))
-                system = scaled @ jacobian.transpose(0, 2, 1) + damping[:, None, None] * np.eye(6)
-                step = -np.einsum("bij,bi->bj", scaled, np.linalg.solve(system, residual[..., None])[..., 0])
-                step *= np.minimum(1.0, max_step / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12))
-                blocked = free & ((z + step < lower - 1e-12) | (z + step > upper + 1e-12))
-                if not blocked.any():
-                    break
-                free &= ~blocked
-            z = np.clip(z + step, lower, upper)
-            residual, jacobian = self.evaluate(z, target)
-        return z, np.abs(residual).max(axis=1) < tolerance
+            z[at] += _step(z[at], residual, jacobian, lower[at], upper[at], weights, max_step)
+            np.clip(z, lower, upper, out=z)
+        return z, error < tolerance
+
+
+def _step(
+    z: NDArray[np.float64],
+    residual: NDArray[np.float64],
+    jacobian: NDArray[np.float64],
+    lower: NDArray[np.float64],
+    upper: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    longest: float,
+) -> NDArray[np.float64]:
+    """Return damped Gauss-Newton steps, shape (B, n); a coordinate that one pushes beyond its limit is taken out, once."""
+    free = upper - lower > 1e-9
+    damping = 1e-8 + 1e-3 * np.minimum(1.0, np.sum(residual**2, axis=1))
+    step = np.zeros_like(z)
+    for _ in range(2):
+        scaled = jacobian * (free / weights)[:, None, :]
+        system = scaled @ jacobian.transpose(0, 2, 1) + damping[:, None, None] * np.eye(6)
+        step = -np.einsum("bij,bi->bj", scaled, np.linalg.solve(system, residual[..., None])[..., 0])
+        step *= np.minimum(1.0, longest / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12))
+        blocked = free & ((z + step < lower - 1e-12) | (z + step > upper + 1e-12))
+        if not blocked.any():
+            break
+        free &= ~blocked
+    return step

@@ -17,7 +17,7 @@ class Options:
 
     Attributes:
         dt: Time between two waypoints [s].
-        grasp_time: How long the robot stands still at a grasp, for the gripper to close [s].
+        grasp_time: How long the robot stands still at a grasp or release, for the gripper to close or open [s].
         reach_waypoints: Segments of a phase in which nothing is held.
         turn_waypoints: Segments of a phase in which a latch is released.
         move_waypoints: Segments of a phase in which a held object is moved.

@@ -179,14 +179,14 @@ class _Planner:
 
 
 def as_trajectory(problem: TrajectoryProblem, z: NDArray[np.float64]) -> Trajectory:
-    """Return z_1..z_N, shape (N, n), as a trajectory; where something is grasped, the robot waits for the gripper."""
+    """Return z_1..z_N, shape (N, n), as a trajectory; where something is grasped or let go, the robot waits for the gripper."""
     waypoints, dt = problem.waypoints(z), problem.options.dt
     rows, times = [0], [0.0]
     phases: list[PhaseSpan] = []
     begin = 0
     for phase, end in zip(problem.task.phases, problem.ends, strict=True):
         first = len(rows) - 1
-        if begin and problem.task.phases[len(phases) - 1].grasps:
+        if begin and (problem.task.phases[len(phases) - 1].grasps or phase.leaves):
             rows.append(rows[-1])
             times.append(times[-1] + problem.options.grasp_time)
         for row in range(begin + 1, int(end) + 1):

@@ -14,9 +14,9 @@ from vkc_pin.chain import VirtualKinematicChain, consolidate
 from vkc_pin.contact import ContactModel, Contacts
 from vkc_pin.goal import Task, compile_task
 from vkc_pin.options import Options
+from vkc_pin.pose import target_vector
 from vkc_pin.scene import Scene
 from vkc_pin.steps import Step
-from vkc_pin.pose import target_vector
 from vkc_pin.transcription import Transcription
 from vkc_pin.waypoint import PoseRow, Structure
 
@@ -96,7 +96,9 @@ class TrajectoryProblem:
         weights = np.full(self.chain.size, o.velocity_weight_object)
         weights[:robot], weights[:3] = o.velocity_weight_arm, o.velocity_weight_base
         acceleration = weights * o.acceleration_weight / o.dt**2
-        rests = [int(end) for end, phase in zip(self.ends, self.task.phases, strict=True) if phase.grasps and end < self.ends[-1]]
+        # The robot stands still while its gripper closes or opens.
+        phases = zip(self.ends[:-1], self.task.phases[:-1], self.task.phases[1:], strict=True)
+        rests = [int(end) for end, phase, after in phases if phase.grasps or after.leaves]
         differential = self.chain.robot.base == "differential"
         return Structure(
             self.chain.model, self.segments, tuple(poses), o.contact_slots, weights, acceleration, tuple(rests), differential
@@ -122,7 +124,8 @@ class TrajectoryProblem:
                 lower[inside, column], upper[inside, column] = low, high
             for name, value in phase.values.items():
                 column = self.chain.index(name)
-                lower[end - 1, column] = upper[end - 1, column] = np.clip(value, self.chain.lower[column], self.chain.upper[column])
+                nearest = np.clip(value, self.chain.lower[column], self.chain.upper[column])
+                lower[end - 1, column] = upper[end - 1, column] = nearest
             if phase.base is not None:
                 for column, value in enumerate(phase.base):
                     if value is not None:

@@ -187,7 +187,7 @@ def test_every_object_is_closed_while_it_is_held_and_goals_are_met_at_the_end(tw
     assert targets["closure drawer"] == two_grasps.scene.objects["drawer"].placement
     assert two_grasps.targets[-1] == POSE
     assert two_grasps.target_matrix().shape == (3, 12)
-    assert two_grasps.transcription.structure.rests == (first, second)
+    assert two_grasps.transcription.structure.rests == (first, second, third)
 
 
 def test_what_is_held_at_the_start_is_closed_from_the_first_waypoint() -> None:

@@ -24,7 +24,7 @@ from vkc_pin.scene import FLOOR, Scene, standing_geometry
 __all__ = ["ContactModel", "Contacts"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Contacts:
     """Close pairs at waypoints; arrays over C contacts, nearest first within a waypoint.
 
@@ -68,7 +68,7 @@ class Contacts:
         return float(np.min(self.distance, initial=np.inf))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PhaseGeometry:
     """Geometry and pairs of one phase.
 
@@ -102,7 +102,8 @@ class PhaseGeometry:
 
         Args:
             reach: [m].
-            rotations, translations: Placements of all joints in the world, shapes (W, J, 3, 3) and (W, J, 3).
+            rotations: Of all joints in the world, shape (W, J, 3, 3).
+            translations: Of all joints in the world, shape (W, J, 3) [m].
         """
         local = np.einsum("gij,gj->gi", self.rotation, self.center) + self.translation
         centers = np.einsum("wgij,gj->wgi", rotations[:, self.joint], local) + translations[:, self.joint]
@@ -184,7 +185,9 @@ class ContactModel:
             moves = [i for i in moving if label != FLOOR or (i in robots and geometry.geometryObjects[i].parentJoint > 1)]
             pairs += [(i, j, margin) for i in moves]
         if not pairs:
-            raise InputError("no pair of geometries can collide", field=phase.name, expected="collision geometry in robot or scene")
+            raise InputError(
+                "no pair of geometries can collide", field=phase.name, expected="collision geometry in robot or scene"
+            )
         for first, second, _ in pairs:
             geometry.addCollisionPair(pin.CollisionPair(first, second))
         if len(geometry.collisionPairs) != len(pairs):
@@ -240,7 +243,7 @@ class ContactModel:
                     result = part.data.distanceResults[k]
                     # `normal` is a view of memory that the next distance of this pair overwrites.
                     vectors.append((result.normal.copy(), result.getNearestPoint1(), result.getNearestPoint2()))
-                    rows.append((row, *part.pairs[k], distance, part.margins[k]))
+                    rows.append((float(row), *part.pairs[k].tolist(), distance, part.margins[k]))
         table = np.array(rows, float).reshape(len(rows), 5)
         order = np.argsort(table[:, 0], kind="stable")
         table, stacked = table[order], np.array(vectors, float).reshape(len(rows), 3, 3)[order]
@@ -251,7 +254,9 @@ class ContactModel:
         """Return the joints of the chain that carry `geometries`; 0 for what stands in the world."""
         return self._joints[geometries]
 
-    def planes(self, z: NDArray[np.float64], contacts: Contacts, *, slots: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def planes(
+        self, z: NDArray[np.float64], contacts: Contacts, *, slots: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the coefficients C, shape (W, slots, 12·joints), and offsets R, shape (W, slots), of the nearest contacts.
 
         C·vec(M(z)) − R ≥ 0 says that a contact keeps its margin; M are the placements of all joints (see `cpin`). Slots

@@ -196,5 +196,3 @@ def as_trajectory(problem: TrajectoryProblem, z: NDArray[np.float64]) -> Traject
         begin = int(end)
     robot = problem.chain.robot.coordinates.size
     return Trajectory(problem.chain.names, np.array(times), waypoints[rows], tuple(phases), robot)
-
-

@@ -127,11 +127,10 @@ class TrajectoryProblem:
                 nearest = np.clip(value, self.chain.lower[column], self.chain.upper[column])
                 lower[end - 1, column] = upper[end - 1, column] = nearest
             if phase.base is not None:
-                for column, value in enumerate(phase.base):
-                    if value is not None:
-                        if column == 2:  # the nearest of the equal headings
-                            value = self.start[2] + (value - self.start[2] + np.pi) % (2 * np.pi) - np.pi
-                        lower[end - 1, column] = upper[end - 1, column] = value
+                for column, goal in enumerate(phase.base):
+                    if goal is not None:
+                        turn = (goal - self.start[2] + np.pi) % (2 * np.pi) - np.pi  # to the nearest of the equal headings
+                        lower[end - 1, column] = upper[end - 1, column] = self.start[2] + turn if column == 2 else goal
             begin = end
         return lower, upper
 

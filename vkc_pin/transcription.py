@@ -23,6 +23,7 @@ from vkc_pin.waypoint import POSE_ROWS, Structure, WaypointFunctions
 
 __all__ = ["Transcription"]
 
+
 class Transcription:
     """The program of one `Structure`: symbols, functions and Ipopt solvers, reused between tasks.
 
@@ -84,7 +85,7 @@ class Transcription:
         return np.concatenate([start, planes, offsets.ravel(), padded, [penalty]])
 
     def _objective(self) -> None:
-        """f of eq. 1 as ½ xᵀHx + gᵀx + c."""
+        """Make the objective of eq. 1: f = ½ xᵀHx + gᵀx + c."""
         n, N = self.n, self.segments
         first = np.eye(N) - np.eye(N, k=-1)  # δz_t = z_t − z_{t−1}
         start_first = np.zeros(N)
@@ -144,9 +145,9 @@ class Transcription:
             jacobian_at.append(np.stack([(first_row[at][:, None] + row).ravel(), (offset + column).ravel()]))
             row, column = (np.array(part) for part in kind.hessian_pattern)
             hessian_at.append(np.stack([(offset + row).ravel(), (offset + column).ravel()]))
-            for order, pose in enumerate(poses):
+            for place, index in enumerate(poses):
                 for t in at:
-                    self.pose_rows[pose][t + 1] = first_row[t] + K + POSE_ROWS * order + np.arange(POSE_ROWS)
+                    self.pose_rows[index][t + 1] = first_row[t] + K + POSE_ROWS * place + np.arange(POSE_ROWS)
         order = np.argsort(np.concatenate(value_rows))
         self.g = ca.vertcat(*values)[order.tolist()]
         self.jacobian = _assemble(jacobians, jacobian_at, self.rows, self.size)
@@ -173,7 +174,7 @@ class Transcription:
         self.multipliers = both
 
     def _rates(self) -> None:
-        n, N = self.n, self.segments
+        n = self.n
         select = np.eye(n + 1)[:n]  # leaves the slack out
         matrix = np.vstack([np.kron(self.first, select), np.kron(self.second, select)])
         identity = np.eye(n)

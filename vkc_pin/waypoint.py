@@ -35,7 +35,7 @@ class PoseRow:
     waypoints: tuple[int, ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Structure:
     """What a symbolic program depends on.
 

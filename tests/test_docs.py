@@ -1,0 +1,205 @@
+"""The documentation says what is so: its code runs, its links lead somewhere, and it names what there is."""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+import vkc_pin as vkc
+from vkc_pin.cli import _parser
+from vkc_pin.documents import Document, check
+from vkc_pin.object_schema import AttachmentSchema, LatchSchema, ObjectSchema
+from vkc_pin.report import Violation
+from vkc_pin.robot_schema import BaseSchema, RobotSchema
+from vkc_pin.scene_schema import COLOURS, ObstacleSchema, PlacedObjectSchema, SceneSchema, StartSchema
+from vkc_pin.scene_schema import RobotSchema as SceneRobotSchema
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def read(name: str) -> str:
+    return (ROOT / name).read_text(encoding="utf-8")
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```$", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+
+
+def snippets() -> list[object]:
+    return [
+        pytest.param(code, id=f"{page.stem}-{number}") for page in PAGES for number, code in enumerate(blocks(page, "python"))
+    ]
+
+
+@pytest.mark.parametrize("code", snippets())
+def test_python_runs(code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    exec(compile(code, "documentation", "exec"), names)  # trusted: it is the repository's own
+    for written in re.findall(r'\.(?:to_html|save)\("([^"]+)"\)', code):
+        assert (tmp_path / written).is_file()
+    plan = names.get("plan")
+    if isinstance(plan, vkc.Plan):
+        assert plan.success, plan.report()
+
+
+def test_readme_is_brief() -> None:
+    (code,) = blocks(ROOT / "README.md", "python")
+    assert len([line for line in code.splitlines() if line.strip()]) <= 10
+
+
+def test_yaml_examples_fit_their_schemas(tmp_path: Path) -> None:
+    (scene,) = blocks(ROOT / "docs/scenes.md", "yaml")
+    (tmp_path / "room.yaml").write_text(scene, encoding="utf-8")
+    assert list(vkc.load_scene(tmp_path / "room.yaml").objects) == ["drawer"]
+    (described,) = blocks(ROOT / "docs/objects.md", "yaml")
+    assert check(Document(yaml.safe_load(described)), ObjectSchema).urdf == "door.urdf"
+    (robot,) = blocks(ROOT / "docs/robots.md", "yaml")
+    assert check(Document(yaml.safe_load(robot)), RobotSchema).tool_frame == "tool"
+
+
+def test_every_field_is_documented() -> None:
+    scenes, objects, robots = read("docs/scenes.md"), read("docs/objects.md"), read("docs/robots.md")
+    kinds = ObstacleSchema.__origin__.__args__  # type: ignore[attr-defined]
+    for text, schemas in (
+        (scenes, (SceneSchema, SceneRobotSchema, StartSchema, PlacedObjectSchema, *kinds)),
+        (objects, (ObjectSchema, AttachmentSchema, LatchSchema)),
+        (robots, (RobotSchema,)),
+    ):
+        for schema in schemas:
+            missing = [field for field in schema.model_fields if not re.search(rf"`{field}\b", text)]
+            assert not missing, (schema.__name__, missing)
+    assert [field for field in BaseSchema.model_fields if f"`base.{field}`" not in robots] == []
+    assert [colour for colour in COLOURS if not re.search(rf"\b{colour}\b", scenes)] == []
+
+
+def test_every_option_of_load_robot_is_documented() -> None:
+    text, function = read("docs/robots.md"), vkc.load_robot
+    assert [name for name in function.__kwdefaults__ if f"`{name}`" not in text] == []
+
+
+def test_every_constraint_and_status_is_explained() -> None:
+    names = re.findall(r'"(\w+)"', (Violation.__doc__ or "").split("constraint:")[1].split("subject:")[0])
+    statuses = re.findall(r'"([\w ]+)"', (vkc.Plan.__doc__ or "").split("status:")[1].split("metrics:")[0])
+    assert len(names) >= 12
+    assert len(statuses) >= 6
+    for page, words in (("docs/reading_failures.md", [*names, *statuses]), ("docs/formulation.md", names)):
+        assert [word for word in words if f"`{word}`" not in read(page)] == [], page
+
+
+def commands() -> dict[str, argparse.ArgumentParser]:
+    """Return the parsers of all commands by name, "bench door" among them."""
+    found: dict[str, argparse.ArgumentParser] = {}
+
+    def collect(parser: argparse.ArgumentParser, prefix: str) -> None:
+        inner = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+        for action in inner:
+            for name, child in action.choices.items():
+                collect(child, f"{prefix} {name}".strip())
+        if not inner:
+            found[prefix] = parser
+
+    collect(_parser(), "")
+    return found
+
+
+def test_every_command_and_option_is_documented() -> None:
+    text = read("docs/cli.md")
+    for name, parser in commands().items():
+        section = text.split(f"## vkc-pin {name}")[1].split("\n## ")[0]
+        options = {option for action in parser._actions for option in action.option_strings} - {"-h", "--help"}
+        assert [option for option in options if option not in section] == [], name
+
+
+def test_shell_commands_are_understood() -> None:
+    lines = [line for page in PAGES for block in blocks(page, "sh") for line in block.splitlines() if line.startswith("vkc-pin")]
+    assert len(lines) >= 8
+    for line in lines:
+        words = line.partition("#")[0].split()[1:]
+        assert callable(_parser().parse_args(words).run), line
+    targets = set(re.findall(r"^(\w+):", read("Makefile"), re.MULTILINE))
+    assert set(re.findall(r"^make (\w+)", "\n".join(blocks(ROOT / "README.md", "sh")), re.MULTILINE)) <= targets
+
+
+def test_help_of_every_command() -> None:
+    for name in commands():
+        command = [sys.executable, "-m", "vkc_pin.cli", *name.split(), "--help"]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+        assert done.returncode == 0, done.stderr
+        assert f"vkc-pin {name}" in done.stdout
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page: Path) -> None:
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        if target.startswith("https://"):
+            continue
+        name, _, anchor = target.partition("#")
+        file = (page.parent / name).resolve() if name else page
+        assert file.exists(), f"{page.name}: {target}"
+        if anchor:
+            titles = re.findall(r"^#+ (.+)$", file.read_text(encoding="utf-8"), re.MULTILINE)
+            assert anchor in {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}, target
+
+
+def tables() -> list[list[str]]:
+    """Return the modules that architecture.md names, table by table."""
+    found: list[list[str]] = []
+    for line in read("docs/architecture.md").split("## Modules")[1].split("\n## ")[0].splitlines():
+        if line.startswith("| module"):
+            found.append([])
+        elif line.startswith("| `"):
+            found[-1] += re.findall(r"`(\w+)`", line.split("|")[1])
+    return found
+
+
+def imports(*, lazy: bool = False) -> dict[str, set[str]]:
+    """Return module → modules of the package that it imports; packages count as one.
+
+    Args:
+        lazy: Whether imports inside functions count, and those for type checkers.
+    """
+    found: dict[str, set[str]] = {}
+    for file in (ROOT / "vkc_pin").rglob("*.py"):
+        own = file.relative_to(ROOT / "vkc_pin").with_suffix("").parts[0]
+        names = found.setdefault(own, set())
+        tree = ast.parse(file.read_text(encoding="utf-8"))
+        for node in ast.walk(tree) if lazy else tree.body:
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("vkc_pin"):
+                inside = (node.module or "").split(".")[1:]
+                names |= set(inside[:1]) or {alias.name for alias in node.names}
+        names.discard(own)
+    return found
+
+
+def test_architecture_names_every_module_and_only_those() -> None:
+    named = [module for table in tables() for module in table]
+    assert len(named) == len(set(named))
+    assert set(named) == set(imports()) - {"__init__"}
+
+
+def test_nothing_upstream_imports_anything_downstream() -> None:
+    level = {module: number for number, table in enumerate(tables()) for module in table}
+    wrong = [(m, i) for m, others in imports().items() if m != "__init__" for i in others if level[i] > level[m]]
+    assert wrong == []
+
+
+def test_validation_does_not_know_the_optimiser() -> None:
+    graph = imports(lazy=True)
+    optimiser = {"cpin", "chain", "contact", "problem", "transcription", "waypoint", "pose", "solver", "planner"}
+    for module in ("validation", "validation_samples", "validation_pairs", "validation_goals", "world", "motion", "clearance"):
+        seen, todo = set[str](), [module]
+        while todo:
+            new = graph[todo.pop()] - seen
+            seen |= new
+            todo += new
+        assert not seen & optimiser, module

@@ -229,7 +229,8 @@ def test_the_grasp_drifts_away(door_plan: vkc.Plan) -> None:
     report = check(door_plan, scene=scene)
     found, drift = only(report), tool_drift(door_plan, scene)[:, 0]
     assert (found.constraint, found.subject, found.unit) == ("closure", "door.handle", "m")
-    assert drift.max() - 1e-3 - 1e-9 <= found.amount < drift.max() - 1e-3 + 1e-4  # between waypoints it may be a bit more
+    between = check(door_plan).closure_error  # the plan's own drift
+    assert drift.max() - 1e-3 - 1e-9 <= found.amount <= drift.max() - 1e-3 + between
     assert report.closure_error == pytest.approx(found.amount + 1e-3)
     assert found.waypoint >= door_plan.trajectory.phases[1].first
 
@@ -241,7 +242,8 @@ def test_the_grasp_turns(door_plan: vkc.Plan) -> None:
     report = check(door_plan, scene=scene)
     found, drift = only(report), tool_drift(door_plan, scene)[:, 1]
     assert (found.constraint, found.subject, found.unit) == ("closure", "door.handle", "rad")
-    assert drift.max() - 1e-3 - 1e-9 <= found.amount < drift.max() - 1e-3 + 1e-4
+    between = check(door_plan).closure_angle
+    assert drift.max() - 1e-3 - 1e-9 <= found.amount <= drift.max() - 1e-3 + between + 1e-6
     assert report.closure_angle == pytest.approx(found.amount + 1e-3)
 
 

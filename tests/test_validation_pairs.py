@@ -10,7 +10,7 @@ import pytest
 from drives import hall, moved, of_rows
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from small_problems import door_scene
+from small_problems import door_scene, full_scene
 
 from vkc_pin import validation_pairs
 from vkc_pin.scene import FLOOR, Scene
@@ -186,3 +186,21 @@ def test_what_a_hand_may_touch(door: Scene) -> None:
         PairTable(door.with_held({"door": "handle"}), world, drive, 0.02),
     ):
         assert {pair_names(table, k)[1] for k in np.flatnonzero(table.margins == 0.0)} == {"door.lever"}
+
+
+def test_a_side_branch_that_nothing_moves_hits_nothing_that_stands() -> None:
+    """A second door in a cabinet may well be shut next to a wall."""
+    scene = full_scene()
+    names = (*scene.robot.coordinates.names, "cabinet.slide", "cabinet.swing")
+    positions = np.tile(np.concatenate([scene.start, [0.1, 0.3]]), (2, 1))
+    motion = Trajectory(names, np.arange(2.0), positions, (PhaseSpan("all", 0, 1, {"cabinet": "grip"}),), 9)
+    table = PairTable(scene, Samples(scene, motion).world, motion, 0.02)
+    paired = {frozenset(table.world.collision_labels[k] for k in pair) for pair in table.pairs.tolist()}
+    for still in ("cabinet.lid", "cabinet.case"):
+        assert {"forearm_link", still} in paired
+        assert {still, "wall_north"} not in paired
+        assert {still, "drawer.tray"} not in paired
+    for moving in ("cabinet.arm", "cabinet.tray", "cabinet.flap"):
+        assert {moving, "wall_north"} in paired
+        assert {moving, "drawer.tray"} in paired
+        assert {moving, "cabinet.lid"} not in paired

@@ -60,7 +60,9 @@ class PairTable:
         grasps: Iterable[tuple[str, str]] = (),
     ) -> None:
         self.scene, self.world, self.dist_safe = scene, world, dist_safe
-        self.moved = {name.partition(".")[0] for name in trajectory.names} & set(scene.objects)
+        self.moved = [False]  # for each joint of the world, whether the trajectory moves it or one that carries it
+        for joint in range(1, world.model.njoints):
+            self.moved.append(self.moved[world.model.parents[joint]] or world.model.names[joint] in trajectory.names)
         self.grasped = {
             f"{owner}.{scene.objects[owner].object.attachments[attachment].link}"
             for owner, attachment in itertools.chain(
@@ -103,7 +105,7 @@ class PairTable:
             return True
         if a == b:  # an object with itself, or two obstacles
             return False
-        return (a in self.moved and shapes[i].parentJoint > 0) or (b in self.moved and shapes[j].parentJoint > 0)
+        return self.moved[shapes[i].parentJoint] or self.moved[shapes[j].parentJoint]
 
     def sweep(self, z: NDArray[np.float64], waypoints: NDArray[np.int_]) -> Iterator[Hit]:
         """Yield what is close along the motion, and at least the closest pair of every waypoint.

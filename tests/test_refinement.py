@@ -41,7 +41,7 @@ def test_a_thin_obstacle_between_waypoints(monkeypatch: pytest.MonkeyPatch) -> N
     assert plan.success, plan.report()
     assert plan.trajectory.arm_effort() + plan.trajectory.base_effort() > WIDTH + 0.02  # it went round the post
 
-    problem, z = straight(scene)
+    problem, _ = straight(scene)
     nothing = collisions_between(problem, np.tile(problem.start, (problem.segments, 1)))
     assert len(nothing.waypoint) == 0
     monkeypatch.setattr("vkc_pin.solver.collisions_between", lambda problem, z: nothing)

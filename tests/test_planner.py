@@ -234,7 +234,7 @@ def test_a_time_limit_ends_planning_with_the_best_so_far(demo: vkc.Plan, limit: 
     assert plan.metrics["planning_time"] < limit + 3.0
     assert np.isfinite(plan.trajectory.positions).all()
     assert plan.validation.violations
-    assert "FAILED: time limit" in plan.report()
+    assert "FAILED, time limit" in plan.report()
 
 
 def test_a_time_limit_that_is_not_reached_changes_nothing(demo: vkc.Plan) -> None:

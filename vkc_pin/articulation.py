@@ -121,6 +121,9 @@ class ArticulatedObject:
     base_link: str
     free: bool = False
 
+    def __repr__(self) -> str:
+        return f"<ArticulatedObject {self.name}: joints {', '.join(self.coordinates.names) or 'none'}>"
+
     def attachment(self, name: str | None = None) -> Attachment:
         """Return the attachment `name`, or the default one. Raises `UnknownNameError` if there is none."""
         if name is None:

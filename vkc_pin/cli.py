@@ -178,7 +178,7 @@ def _parser() -> argparse.ArgumentParser:
     srdf = commands.add_parser("srdf", help="regenerate allowed collisions", description=about)
     srdf.add_argument("robot", metavar="ROBOT", help="name or URDF file")
     srdf.add_argument("--output", required=True, metavar="FILE")
-    srdf.add_argument("--samples", type=_positive, default=10000)
+    srdf.add_argument("--samples", type=_positive, default=20000)
     srdf.add_argument("--seed", type=int, default=0)
     srdf.set_defaults(run=_srdf)
     return parser

@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from vkc_pin.errors import InputError
+from vkc_pin.errors import InputError, UnknownNameError
 
 __all__ = ["Coordinates"]
 
@@ -59,7 +59,12 @@ class Coordinates:
                 lower.append(model.lowerPositionLimit[i])
                 upper.append(model.upperPositionLimit[i])
             else:
-                raise InputError("this joint type is not supported", field=name, expected="a planar joint or one of 1 degree of freedom", got=kind)
+                raise InputError(
+                    "this joint type is not supported",
+                    field=name,
+                    expected="a planar joint or one of 1 degree of freedom",
+                    got=kind,
+                )
             joints += [index] * (len(names) - len(joints))
         self.names: tuple[str, ...] = tuple(names)
         self.joints: tuple[int, ...] = tuple(joints)
@@ -106,5 +111,7 @@ class Coordinates:
         return casadi.vertcat(*entries)
 
     def index(self, name: str) -> int:
-        """Return the position of coordinate `name` in z; raises `KeyError`-free `ValueError` if there is none."""
+        """Return the position of coordinate `name` in z. Raises `UnknownNameError` if there is none."""
+        if name not in self.names:
+            raise UnknownNameError("coordinate", name, self.names)
         return self.names.index(name)

@@ -12,13 +12,20 @@ __all__ = ["explain", "impossible"]
 
 
 def impossible(problem: TrajectoryProblem) -> list[Violation]:
-    """Return what is wrong before anything moves: a start in collision, joint goals beyond limits, goals off the arena."""
+    """Return what is wrong before anything moves: a start in collision, a hand off what it holds, goals beyond limits."""
     found = []
     contacts = problem.contacts.evaluate(problem.start[None], np.array([0]), reach=0.0)
     for (first, second), distance in zip(contacts.pair, contacts.distance, strict=True):
         labels = problem.contacts.phases[0].labels
         subject = f"{labels[first]} – {labels[second]}"
         found.append(Violation("start", subject, 0, 0.0, -distance, "m", f"overlap by {-1e3 * distance:.1f} mm at the start"))
+    t = problem.transcription
+    for name, pose, solver, target in zip(problem.pose_names, t.structure.poses, t.pose_solvers, problem.targets, strict=True):
+        if name.removeprefix("closure ") in problem.scene.held and 1 in pose.waypoints:
+            error = float(np.abs(solver.evaluate(problem.start[None], target)[0]).max())
+            if error > problem.options.closure_position:
+                detail = f"it is held at the start, but the hand is {error:.4f} m or rad from its attachment"
+                found.append(Violation("closure", name.removeprefix("closure "), 0, 0.0, error, "m", detail))
     for phase, end in zip(problem.task.phases, problem.ends, strict=True):
         waypoint, time = int(end), float(end) * problem.options.dt
         goals = dict(phase.values)

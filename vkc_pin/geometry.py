@@ -36,6 +36,10 @@ class PlacedObject:
     placement: pin.SE3
     state: NDArray[np.float64]
 
+    def __repr__(self) -> str:
+        state = ", ".join(f"{n}={v:.4g}" for n, v in zip(self.object.coordinates.names, self.state, strict=True))
+        return f"<PlacedObject {self.name}: {self.object.name}{f', {state}' if state else ''}>"
+
     def with_state(self, values: Mapping[str, float]) -> PlacedObject:
         """Return the object with joints at `values`, by joint name, [rad] or [m]; the other joints stay.
 

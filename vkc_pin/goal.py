@@ -144,6 +144,8 @@ class _Compiler:
         attachment = _attachment(placed, attachment_name or self.grasps.get(name), f"{where}.attachment")
         if self.held.get(name) == attachment.name:
             return attachment.name
+        if placed.object.free:
+            raise InputError(f"'{name}' stands free; only what is fixed in the world can be grasped", field=f"{where}.object")
         if self.grasps.get(name, attachment.name) != attachment.name:
             raise InputError(
                 f"object '{name}' is grasped by two different attachments in one plan",

@@ -87,7 +87,7 @@ class _Interpolation:
         self.weights = np.ones(self.chain.size)
         self.weights[:3] = 3.0
         self.beam = _BEAM
-        self.driven = [self.chain.index(name) for name in problem.task.state]
+        self.driven = np.array([self.chain.index(name) for name in problem.task.state], int)
         self.objects = _objects(problem, np.tile(problem.start, (problem.segments, 1)))
 
     def seeds(self, count: int) -> list[NDArray[np.float64]]:
@@ -103,9 +103,7 @@ class _Interpolation:
                 break
         return [self._join(paths[index], at) for index in chosen]
 
-    def _search(
-        self, *, thorough: bool
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], list[int]]:
+    def _search(self, *, thorough: bool) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], list[int]]:
         """Go from knot to knot, keeping the cheapest paths: a beam search on the closure's manifold.
 
         Returns:
@@ -241,7 +239,7 @@ class _Interpolation:
         """Replace each revolute robot joint's angle by the equal one nearest to where it comes from."""
         z = z.copy()
         for column in range(2, self.robot):
-            if self.chain.model.joints[self.chain.coordinates.joints[column]].shortname().startswith("JointModelP") and column > 2:
+            if self.problem.unit(self.chain.names[column]) == "m":
                 continue
             nearest = before[:, column] + (z[:, column] - before[:, column] + np.pi) % (2 * np.pi) - np.pi
             inside = (nearest >= lower[column]) & (nearest <= upper[column])

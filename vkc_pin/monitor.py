@@ -47,7 +47,7 @@ def interruptible() -> Iterator[Interrupt]:
         signal.signal(signal.SIGINT, before)
 
 
-class Monitor(ca.Callback):  # type: ignore[misc]
+class Monitor(ca.Callback):
     """CasADi's iteration callback; `deadline` can be set before every solve.
 
     Attributes:

@@ -103,7 +103,7 @@ class Plan:
         """Return what came out, for people: success or every violated constraint, efforts, clearance, times."""
         m = self.metrics
         lines = [
-            f"{'success' if self.success else 'FAILED'}: {self.status} — {self.scene.name}: "
+            f"{self.scene.name}: {'success' if self.success else f'FAILED, {self.status}'} — "
             + ", ".join(p.name for p in self.trajectory.phases),
             f"  motion      {m['duration']:.1f} s, {len(self.trajectory.times)} waypoints",
             f"  effort      base {m['base_effort']:.2f} m (|dx|+|dy| {m['base_effort_l1']:.2f} m), arm {m['arm_effort']:.2f} rad",

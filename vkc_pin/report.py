@@ -76,10 +76,8 @@ class Report:
         ]
 
     def with_reasons(self, reasons: Sequence[Violation]) -> Report:
-        """Return the report with `reasons` first; what it says about the same constraint and subject goes."""
-        known = {(reason.constraint, reason.subject) for reason in reasons}
-        rest = (v for v in self.violations if (v.constraint, v.subject) not in known)
-        return replace(self, violations=(*reasons, *rest))
+        """Return the report of a motion that was never planned: only `reasons` are violated, the rest follows from them."""
+        return replace(self, violations=tuple(reasons))
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data of it."""

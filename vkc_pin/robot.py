@@ -75,6 +75,9 @@ class Robot:
         """
         return visual_geometry(self.model, self.file)
 
+    def __repr__(self) -> str:
+        return f"<Robot {self.name}: {len(self.home)} joints on a base that is {self.base}, tool frame {self.tool_frame}>"
+
     def link_of(self, geometry: int) -> str:
         """Return the name of the link that shape number `geometry` of `collision` belongs to."""
         return _link(self.collision.geometryObjects[geometry].name)

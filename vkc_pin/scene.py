@@ -78,6 +78,12 @@ class Scene:
     held: Mapping[str, str]
     document: dict[str, Any]
 
+    def __repr__(self) -> str:
+        return (
+            f"<Scene {self.name}: {self.robot.name}, objects {', '.join(self.objects) or 'none'}, "
+            f"{len(self.obstacle_names)} obstacles>"
+        )
+
     @staticmethod
     def from_document(document: Mapping[str, Any], folder: str | Path = ".") -> Scene:
         """Build a scene from plain data (see `Scene.document` and the scene files).
@@ -102,7 +108,7 @@ class Scene:
             arm: Arm joints [rad], shape (n - 3,); None keeps them.
 
         Raises:
-            InputError: Wrong size, a value that is not finite, or a joint outside its limits.
+            InputError: Wrong size, a value that is not finite, outside a joint's limits or outside the arena.
         """
         start, names = self.start.copy(), self.robot.coordinates.names
         for field, values, part in (("base", base, slice(0, 3)), ("arm", arm, slice(3, None))):
@@ -116,6 +122,9 @@ class Scene:
                 within_limits(value, low, high, f"{field}.{name}")
                 for value, low, high, name in zip(given, lower, upper, names[part], strict=True)
             ]
+        for value, low, high, name in zip(start[:2], self.arena[::2], self.arena[1::2], names[:2], strict=True):
+            if not low <= value <= high:
+                raise InputError("outside the arena", field=f"base.{name}", expected=f"{low:g} to {high:g}", got=f"{value:g}")
         document = copy.deepcopy(self.document)
         document["start"]["base"] = start[:3].tolist()
         if arm is not None:

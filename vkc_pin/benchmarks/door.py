@@ -73,11 +73,10 @@ def run(*, trials: int, seed: int, progress: bool = True) -> dict[str, Any]:
 
         record("reach", reach(start, seed))
         whole_plan = record("whole", whole(start, seed))
-        if whole_plan.success:
-            record("push", push(start, seed, whole_plan))
+        # Where there is no grasp to push from, that plan's failure is the trial's.
+        record("push", push(start, seed, whole_plan) if whole_plan.success else whole_plan)
         grasp = plan(start.with_state("door", {"knob": TURNED}), [Grasp("door")], seed=seed)
-        if grasp.success:
-            record("push blind", push(start, seed, grasp))
+        record("push blind", push(start, seed, grasp) if grasp.success else grasp)
     return {"meta": meta(benchmark="door", seed=seed, trials=trials, peak_memory_mb=peak_memory()), "trials": records}
 
 

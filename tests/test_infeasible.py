@@ -35,7 +35,7 @@ def explained(plan: vkc.Plan, *texts: str) -> str:
         assert 0 <= violation.waypoint < len(plan.trajectory.times)
         assert f"waypoint {violation.waypoint}" in str(violation)
     report = plan.report()
-    assert report.startswith(f"FAILED: {plan.status}")
+    assert report.splitlines()[0].startswith(f"{plan.scene.name}: FAILED, {plan.status} — ")
     for text in texts:
         assert text in report, report
     assert not vkc.validate(plan.scene, plan.steps, plan.trajectory, plan.options).ok
@@ -50,9 +50,8 @@ def the(plan: vkc.Plan, constraint: str, subject: str) -> vkc.Violation:
 
 
 def test_a_door_behind_a_wall() -> None:
-    plan = vkc.plan(
-        door_with(box("barrier", (0.1, 1.07, 2.0), (2.3, 0.0, 1.0))), [vkc.Actuate("door", {"hinge": 1.2})], options=QUICK
-    )
+    scene = door_with(box("barrier", (0.1, 1.07, 2.0), (2.3, 0.0, 1.0)))
+    plan = vkc.plan(scene, [vkc.Actuate("door", {"hinge": 1.2})], options=QUICK)
     assert plan.status == "infeasible"
     explained(plan, "because reach door.handle", "are blocked", "– barrier", "mm")
     assert the(plan, "penetration", "– barrier").unit == "m"

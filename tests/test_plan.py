@@ -131,7 +131,7 @@ def test_nothing_in_the_file_is_a_pickle_or_a_place_on_this_machine(saved: Path)
 def test_a_plan_moves_with_its_scene(own_scene: vkc.Scene, tmp_path: Path) -> None:
     plan = short_plan(own_scene)
     plan.save(tmp_path / "work" / "out" / "yard.npz")
-    assert contents(tmp_path / "work" / "out" / "yard.npz")["about"]["folder"]["relative"] == os.path.join("..", "scenes")
+    assert contents(tmp_path / "work" / "out" / "yard.npz")["about"]["folder"]["relative"] == str(Path("..", "scenes"))
     shutil.move(tmp_path / "work", tmp_path / "home")
     loaded = vkc.Plan.load(tmp_path / "home" / "out" / "yard.npz")
     same(plan, loaded)

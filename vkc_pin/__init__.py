@@ -10,7 +10,7 @@ from vkc_pin.problem import TrajectoryProblem, build
 from vkc_pin.report import Report, Violation
 from vkc_pin.robot import Robot, load_robot
 from vkc_pin.scene import PlacedObject, Scene, load_scene
-from vkc_pin.solver import Iteration
+from vkc_pin.solution import Iteration
 from vkc_pin.steps import Actuate, GoTo, Grasp, Reach
 from vkc_pin.trajectory import PhaseSpan, Trajectory
 from vkc_pin.validation import validate

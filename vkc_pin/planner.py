@@ -18,7 +18,8 @@ from vkc_pin.plan import Plan
 from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.report import Report
 from vkc_pin.scene import Scene
-from vkc_pin.solver import Iteration, Solution, solve
+from vkc_pin.solution import Iteration, Solution
+from vkc_pin.solver import solve
 from vkc_pin.steps import Step
 from vkc_pin.trajectory import PhaseSpan, Trajectory
 from vkc_pin.validation import validate

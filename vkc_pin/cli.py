@@ -134,6 +134,12 @@ def _positive(text: str) -> int:
     return int(text)
 
 
+def _natural(text: str) -> int:
+    if not text.isdigit():
+        raise argparse.ArgumentTypeError(f"expected a whole number of at least 0, got {text!r}")
+    return int(text)
+
+
 def _parser() -> argparse.ArgumentParser:
     from vkc_pin.version import __version__
 
@@ -151,7 +157,7 @@ def _parser() -> argparse.ArgumentParser:
     plan.add_argument("--plots", metavar="FOLDER", help="write plots")
     plan.add_argument("--initialization", default="interpolated", metavar="METHOD", help="interpolated (default) or stationary")
     plan.add_argument("--time-limit", type=float, metavar="SECONDS", help="return the best motion found by then")
-    plan.add_argument("--seed", type=int, default=0, help="of the random numbers (default 0)")
+    plan.add_argument("--seed", type=_natural, default=0, help="of the random numbers (default 0)")
     plan.add_argument("--quiet", action="store_true", help="no progress")
     plan.set_defaults(run=_plan)
 
@@ -169,7 +175,7 @@ def _parser() -> argparse.ArgumentParser:
     benches = bench.add_subparsers(required=True, metavar="BENCHMARK")
     door = benches.add_parser("door", help="reach, push and whole task at the door, from random starts")
     door.add_argument("--trials", type=_positive, default=50, metavar="N", help="random starts (default 50)")
-    door.add_argument("--seed", type=int, default=0, metavar="S", help="of the starts and of planning (default 0)")
+    door.add_argument("--seed", type=_natural, default=0, metavar="S", help="of the starts and of planning (default 0)")
     door.add_argument("--json", metavar="FILE", help="write every trial")
     door.add_argument("--quiet", action="store_true", help="no progress bar")
     door.set_defaults(run=_bench)
@@ -179,7 +185,7 @@ def _parser() -> argparse.ArgumentParser:
     srdf.add_argument("robot", metavar="ROBOT", help="name or URDF file")
     srdf.add_argument("--output", required=True, metavar="FILE")
     srdf.add_argument("--samples", type=_positive, default=20000)
-    srdf.add_argument("--seed", type=int, default=0)
+    srdf.add_argument("--seed", type=_natural, default=0)
     srdf.set_defaults(run=_srdf)
     return parser
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from vkc_pin.plan import Plan
 
-__all__ = ["distribution", "meta", "trial"]
+__all__ = ["distribution", "meta", "peak_memory", "trial"]
 
 PACKAGES = ("vkc-pin", "pin", "coal", "casadi", "numpy")
 
@@ -67,7 +67,7 @@ def trial(plan: Plan, *, method: str, seed: int, **more: Any) -> dict[str, Any]:
         "base_effort": m["base_effort"],
         "base_effort_l1": m["base_effort_l1"],
         "arm_effort": m["arm_effort"],
-        "clearance": m["clearance"],
+        "clearance": m["clearance"] if np.isfinite(m["clearance"]) else None,  # JSON knows no infinity
         "closure_error": m["closure_error"],
         "iterations": int(m["iterations"]),
         "rounds": int(m["rounds"]),

@@ -1,0 +1,272 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import vkc_pin as vkc
+from vkc_pin import cli
+from vkc_pin.benchmarks import door, record
+
+ROOT = Path(__file__).resolve().parent.parent
+UNFINISHED = ["plan", "drawer", "--set", "drawer.slide=0.3", "--quiet", "--time-limit", "0.001", "--initialization", "stationary"]
+
+
+class Run:
+    """What one command printed and returned."""
+
+    def __init__(self, code: int, out: str, err: str, folder: Path) -> None:
+        self.code, self.out, self.err, self.folder = code, out, err, folder
+
+
+@pytest.fixture(scope="module")
+def planned(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """The demo's command, with every output there is; into folders that do not exist yet."""
+    folder = tmp_path_factory.mktemp("cli") / "new" / "out"
+    files = [part for kind in ("html", "save", "json", "plots") for part in (f"--{kind}", str(folder / NAMES[kind]))]
+    command = [sys.executable, "-m", "vkc_pin.cli", "plan", "door", "--set", "door.hinge=1.2", *files]
+    path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+    done = subprocess.run(
+        command, cwd=folder.parent.parent, capture_output=True, text=True, timeout=120, env={**os.environ, "PYTHONPATH": path}
+    )
+    return Run(done.returncode, done.stdout, done.stderr, folder)
+
+
+NAMES = {"html": "door.html", "save": "door.npz", "json": "door.json", "plots": "plots"}
+
+
+def failed(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """Return what a misused command says; it says it in one line, without a traceback."""
+    try:
+        code = cli.main(list(arguments))
+    except SystemExit as stop:  # argparse's own
+        code = int(stop.code or 0)
+    captured = capsys.readouterr()
+    assert code == 2, captured
+    assert captured.out == ""
+    assert "Traceback" not in captured.err
+    return captured.err
+
+
+def test_planning_the_demo(planned: Run) -> None:
+    assert planned.code == 0, planned.err
+    assert "door: success" in planned.out
+    assert "every constraint holds" in planned.out
+    for kind, name in NAMES.items():
+        assert f"wrote {planned.folder / name}" in planned.out, kind
+    assert "round  1" in planned.err  # progress goes beside the result
+    assert "Traceback" not in planned.err
+
+
+def test_what_it_writes(planned: Run) -> None:
+    plan = vkc.Plan.load(planned.folder / "door.npz")
+    assert plan.success
+    data = json.loads((planned.folder / "door.json").read_text(encoding="utf-8"))
+    assert data["success"]
+    np.testing.assert_array_equal(data["trajectory"]["positions"], plan.trajectory.positions)
+    page = (planned.folder / "door.html").read_text(encoding="utf-8")
+    assert page.lstrip().lower().startswith("<!doctype html>")
+    assert len(list((planned.folder / "plots").glob("*.png"))) >= 3
+
+
+def test_check(planned: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["check", str(planned.folder / "door.npz")]) == 0
+    assert "every constraint holds" in capsys.readouterr().out
+
+
+def test_check_finds_what_is_wrong(planned: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plan = vkc.Plan.load(planned.folder / "door.npz")
+    positions = plan.trajectory.positions.copy()
+    positions[5, 2] += 1.5
+    bent = dataclasses.replace(plan, trajectory=dataclasses.replace(plan.trajectory, positions=positions))
+    assert cli.main(["check", str(bent.save(tmp_path / "bent.npz"))]) == 1
+    out = capsys.readouterr().out
+    assert "velocity base_yaw" in out
+    assert "(waypoint 5, 1.25 s)" in out
+
+
+def test_view_writes_a_page(planned: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for what, name in ((str(planned.folder / "door.npz"), "plan.html"), ("drawer", "scene.html")):
+        page = tmp_path / name
+        assert cli.main(["view", what, "--html", str(page)]) == 0
+        assert page.stat().st_size > 10_000
+        assert str(page) in capsys.readouterr().out
+
+
+def test_a_plan_that_fails_returns_1_and_is_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "late.json"
+    assert cli.main([*UNFINISHED, "--json", str(path)]) == 1
+    captured = capsys.readouterr()
+    assert captured.out.startswith("drawer: FAILED, time limit")
+    assert captured.err == ""  # --quiet
+    data = json.loads(path.read_text(encoding="utf-8"))
+    assert (data["success"], data["status"]) == (False, "time limit")
+    assert data["violations"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "texts"),
+    [
+        (["plan", "dor", "--set", "door.hinge=1"], ["dor", "did you mean 'door'"]),
+        (["plan", "nowhere/door.yaml", "--set", "door.hinge=1"], ["nowhere/door.yaml"]),
+        (["plan", "door", "--set", "dor.hinge=1"], ["there is no object 'dor'", "did you mean 'door'"]),
+        (["plan", "door", "--set", "door.hing=1"], ["hing", "did you mean 'hinge'"]),
+        (["plan", "door", "--set", "door.hinge"], ["--set", "OBJECT.JOINT=VALUE", "'door.hinge'"]),
+        (["plan", "door", "--set", "hinge=1"], ["--set", "OBJECT.JOINT=VALUE"]),
+        (["plan", "door", "--set", "door.hinge=wide"], ["--set", "not a number", "'door.hinge=wide'"]),
+        (["plan", "door", "--set", "door.hinge=nan"], ["not finite"]),
+        (["plan", "door", "--set", "=1"], ["--set"]),
+        (["plan", "door"], ["--set"]),
+        (["plan", "door", "--set", "door.hinge=1", "--initialization", "stationry"], ["did you mean 'stationary'"]),
+        (["plan", "door", "--set", "door.hinge=1", "--time-limit", "-1"], ["time_limit", "more than 0"]),
+        (["plan", "door", "--set", "door.hinge=1", "--time-limit", "soon"], ["--time-limit", "soon"]),
+        (["plan", "door", "--set", "door.hinge=1", "--seed", "-1"], ["--seed", "at least 0"]),
+        (["check", "none.npz"], ["none.npz", "no such file"]),
+        (["view", "none.npz"], ["none.npz", "no such file"]),
+        (["view", "drawr"], ["did you mean 'drawer'"]),
+        (["bench", "door", "--trials", "0"], ["--trials", "at least 1"]),
+        (["bench", "dor"], ["dor"]),
+        (["srdf", "husky_ur5", "--output", "x.srdf"], ["husky_ur5e"]),
+        (["srdf", "husky_ur5e"], ["--output"]),
+        ([], ["COMMAND"]),
+        (["open"], ["open"]),
+    ],
+    ids=" ".join,
+)
+def test_misuse(arguments: list[str], texts: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    said = failed(capsys, *arguments)
+    for text in texts:
+        assert text in said
+
+
+def test_a_file_that_is_no_plan(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "notes.npz"
+    path.write_text("door")
+    assert "not a saved plan" in failed(capsys, "check", str(path))
+
+
+def test_a_scene_with_a_mistake_in_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "hall.yaml"
+    path.write_text("robot: husky_ur5e\nstart: {base: [0, 0]}\n")
+    said = failed(capsys, "plan", str(path), "--set", "door.hinge=1")
+    assert f"{path}:2" in said
+    assert "start.base" in said
+
+
+def test_a_place_that_cannot_be_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_text("")
+    assert cli.main([*UNFINISHED, "--save", str(tmp_path / "file" / "plan.npz")]) == 2
+    captured = capsys.readouterr()
+    assert captured.out.startswith("drawer: ")  # planning was not in vain
+    assert captured.err.startswith("vkc-pin: ")
+
+
+def test_settings() -> None:
+    steps = cli.parse_settings(["door.knob=0.5", "door.hinge=1.2", "drawer.slide=0.3", "door.hinge=0", "door.hinge = 1"])
+    assert steps == [
+        vkc.Actuate("door", {"knob": 0.5, "hinge": 1.2}),
+        vkc.Actuate("drawer", {"slide": 0.3}),
+        vkc.Actuate("door", {"hinge": 0.0}),
+        vkc.Actuate("door", {"hinge": 1.0}),
+    ]
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["--version"])
+    assert stop.value.code == 0
+    assert capsys.readouterr().out.strip() == vkc.__version__
+
+
+def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["--help"])
+    out = capsys.readouterr().out
+    for command in ("plan", "check", "view", "bench", "srdf"):
+        assert command in out
+
+
+def test_srdf(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "husky.srdf"
+    assert cli.main(["srdf", "husky_ur5e", "--output", str(path), "--samples", "50", "--seed", "1"]) == 0
+    assert str(path) in capsys.readouterr().out
+    assert "<disable_collisions" in path.read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> tuple[int, dict[str, Any]]:
+    path = tmp_path_factory.mktemp("bench") / "door.json"
+    code = cli.main(["bench", "door", "--trials", "1", "--seed", "3", "--quiet", "--json", str(path)])
+    return code, json.loads(path.read_text(encoding="utf-8"), parse_constant=_no_json)
+
+
+def _no_json(text: str) -> None:
+    raise AssertionError(f"{text} is not JSON")
+
+
+def test_bench(bench: tuple[int, dict[str, Any]]) -> None:
+    code, result = bench
+    assert code == 0
+    assert set(result) == {"meta", "trials"}
+    meta = result["meta"]
+    assert (meta["benchmark"], meta["seed"], meta["trials"]) == ("door", 3, 1)
+    assert {"vkc-pin", "pin", "coal", "casadi", "numpy"} <= set(meta["versions"])
+    assert {"processor", "cores", "python", "system"} <= set(meta["machine"])
+    assert 50.0 < meta["peak_memory_mb"] < 4000.0
+    assert {t["task"] for t in result["trials"]} == set(door.TASKS)
+    start = vkc.load_scene("door").sample_start(np.random.default_rng(3)).start
+    for trial in result["trials"]:
+        assert (trial["scene"], trial["seed"], trial["number"]) == ("door", 3, 0)
+        for key, kind in {
+            "method": str,
+            "status": str,
+            "success": bool,
+            "planning_time": float,
+            "base_effort": float,
+            "arm_effort": float,
+            "clearance": float,
+            "closure_error": float,
+            "iterations": int,
+        }.items():
+            assert isinstance(trial[key], kind), key
+        assert (trial["failed_constraint"] is None) == trial["success"]
+        assert bool(trial["violations"]) != trial["success"]
+    reach = next(t for t in result["trials"] if t["task"] == "reach")
+    np.testing.assert_allclose(reach["start"], start, atol=1e-8)
+
+
+def test_the_bench_table(bench: tuple[int, dict[str, Any]]) -> None:
+    _, result = bench
+    text = door.table(result)
+    for task in {t["task"] for t in result["trials"]}:
+        assert any(line.startswith(task) for line in text.splitlines())
+    assert "peak memory" in text
+    sad = {**result["trials"][0], "success": False, "status": "rejected", "violations": ["goal base: elsewhere"]}
+    assert "start 0, reach: rejected; goal base: elsewhere" in door.table({**result, "trials": [sad]})
+
+
+def test_records_of_failures(door_plan: vkc.Plan) -> None:
+    blame = vkc.Violation("penetration", "forearm_link – sofa", 9, 4.0, 0.03, "m", "overlap by 30 mm")
+    worse = dataclasses.replace(
+        door_plan, validation=vkc.Report((blame,)), status="rejected", metrics={**door_plan.metrics, "clearance": np.inf}
+    )
+    trial = record.trial(worse, method="VKC", seed=0, task="whole")
+    assert (trial["success"], trial["failed_constraint"]) == (False, "penetration forearm_link – sofa")
+    assert trial["violations"] == [str(blame)]
+    assert trial["task"] == "whole"
+    json.dumps(trial, allow_nan=False)
+    late = dataclasses.replace(door_plan, status="time limit")
+    assert record.trial(late, method="VKC", seed=0)["failed_constraint"] == "time limit"
+
+
+def test_distributions() -> None:
+    rows = [{"x": value} for value in range(101)]
+    assert record.distribution(rows, "x") == (50.0, 95.0)
+    assert np.isnan(record.distribution([], "x")).all()

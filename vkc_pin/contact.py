@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import coal
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
@@ -224,9 +225,11 @@ class ContactModel:
 def _accurate(data: pin.GeometryData, pairs: int) -> pin.GeometryData:
     """Return `data` with tight distances: at coal's own 1e-6 the planes' gradients are off by up to 5e-3; this takes no longer.
 
-    Penetration keeps its tolerance: below 1e-6 it fails for cylinders.
+    Penetration keeps its tolerance: below 1e-6 it fails for cylinders. A request of our own starts afresh every time, while
+    Pinocchio's starts from the last result, so that a distance would depend, in its last digits, on what was asked before.
     """
     for k in range(pairs):
+        data.distanceRequests[k] = coal.DistanceRequest()
         data.distanceRequests[k].gjk_tolerance = 1e-8
     return data
 

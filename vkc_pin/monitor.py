@@ -35,6 +35,9 @@ def interruptible() -> Iterator[Interrupt]:
         yield interrupt
         return
     before = signal.getsignal(signal.SIGINT)
+    if before is None:  # whoever embeds Python handles it, and could not be put back
+        yield interrupt
+        return
 
     def note(number: int, frame: FrameType | None) -> None:
         interrupt.pressed = True

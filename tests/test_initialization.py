@@ -1,0 +1,147 @@
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from drives import hall
+from small_problems import SHORT, door_scene
+
+import vkc_pin as vkc
+from vkc_pin.initialization import METHODS, initialize, scatter
+
+OPENED = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20)
+
+
+@cache
+def problem() -> vkc.TrajectoryProblem:
+    return vkc.build(door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=OPENED)
+
+
+def seeds(method: str = "interpolated", *, seed: int = 0, count: int = 1) -> list[np.ndarray]:
+    return initialize(problem(), method, np.random.default_rng(seed), count=count)
+
+
+def hand_off_the_handle(scene: vkc.Scene, row: np.ndarray, hinge: float, knob: float) -> float:
+    """Return the largest coordinate of the error between tool and grasp, [m] or [rad], by numeric Pinocchio."""
+    placed = scene.objects["door"].with_state({"hinge": hinge, "knob": knob})
+    attachment = placed.object.attachment("handle")
+    tool = dataclasses.replace(scene, start=row[:9]).tool_placement()
+    error = tool.inverse() * placed.link_placement(attachment.link) * attachment.placement
+    return float(np.abs(pin.log6(error).vector).max())
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_seeds_are_within_bounds(method: str) -> None:
+    for z in seeds(method, count=3):
+        assert z.shape == (problem().segments, problem().chain.size)
+        assert np.all(z >= problem().lower)
+        assert np.all(z <= problem().upper)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_interpolated_seeds_hold_the_handle(seed: int) -> None:
+    chain, scene = problem().chain, door_scene()
+    hinge, knob = chain.index("door.hinge"), chain.index("door.knob")
+    for z in seeds(seed=seed, count=3):
+        held = z[problem().ends[0] - 1 :]  # the grasp and all that follows
+        for row in held:
+            assert hand_off_the_handle(scene, row, row[hinge], row[knob]) < 1e-3
+        assert problem().pose_error(z) < 1e-3
+
+
+def test_a_seed_opens_the_door() -> None:
+    (z,) = seeds()
+    hinge, knob = (z[:, problem().chain.index(name)] for name in ("door.hinge", "door.knob"))
+    reach, turn, _ = problem().ends
+    assert np.all(hinge[:turn] == 0.0)
+    assert np.all(knob[:reach] == 0.0)
+    assert hinge[-1] == pytest.approx(1.2)
+    assert np.all(np.diff(hinge) >= 0.0)
+    assert np.all(knob[turn - 1 :] >= 0.5)
+
+
+def test_seeds_go_from_the_start_without_a_jump() -> None:
+    for z in seeds(count=2):
+        path = problem().waypoints(z)
+        reach = int(problem().ends[0])
+        np.testing.assert_array_equal(path[0], problem().start)
+        # A straight way to the grasp: every waypoint lies between its ends.
+        low, high = np.minimum(path[0], path[reach]), np.maximum(path[0], path[reach])
+        assert np.all((path[: reach + 1] >= low - 1e-9) & (path[: reach + 1] <= high + 1e-9))
+        assert np.abs(np.diff(path, axis=0)).max() < 0.8
+
+
+def test_the_same_seed_gives_the_same_seeds() -> None:
+    first, second = seeds(seed=4, count=4), seeds(seed=4, count=4)
+    assert len(first) == len(second)
+    for one, other in zip(first, second, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert not np.array_equal(seeds(seed=5)[0], first[0])
+
+
+def test_several_seeds_are_different() -> None:
+    found = seeds(count=3)
+    assert 1 <= len(found) <= 3
+    for k, z in enumerate(found):
+        for other in found[:k]:
+            assert np.abs(z - other)[:, :3].max() > 0.05
+    assert len(seeds(count=1)) == 1
+
+
+def test_the_stationary_seed_leaves_the_robot_where_it_is() -> None:
+    for seed in (0, 1):
+        (z,) = seeds("stationary", seed=seed, count=4)  # there is only one
+        robot = problem().chain.robot.coordinates.size
+        np.testing.assert_array_equal(z[:, :robot], np.tile(problem().start[:robot], (len(z), 1)))
+        hinge = z[:, problem().chain.index("door.hinge")]
+        assert hinge[-1] == pytest.approx(1.2)
+        assert hinge[problem().ends[1] - 1] == 0.0
+
+
+def test_a_seed_for_the_base_takes_the_shorter_way_round() -> None:
+    scene = hall().with_start(base=[0.0, 0.0, 3.0])
+    turn = vkc.build(scene, [vkc.GoTo(1.0, 0.5, -3.0)], options=SHORT)
+    (z,) = initialize(turn, "interpolated", np.random.default_rng(0))
+    np.testing.assert_allclose(z[-1, :3], [1.0, 0.5, 2 * np.pi - 3.0])
+    np.testing.assert_allclose(z[:, 3:], np.tile(scene.start[3:], (len(z), 1)))
+
+
+def test_a_seed_for_a_target_out_of_reach_is_still_a_seed() -> None:
+    lost = vkc.build(hall(), [vkc.Reach((1.0, 0.0, 4.0, 0.0, 0.0, 0.0))], options=SHORT)
+    for z in initialize(lost, "interpolated", np.random.default_rng(0), count=2):
+        assert np.isfinite(z).all()
+        assert np.all((z >= lost.lower) & (z <= lost.upper))
+
+
+def test_a_fixed_base_stays_in_every_seed() -> None:
+    fixed = vkc.build(hall(base="fixed"), [vkc.Reach((0.5, 0.4, 1.0, 0.0, np.pi / 2, 0.0))], options=SHORT)
+    for z in initialize(fixed, "interpolated", np.random.default_rng(0), count=3):
+        assert np.ptp(fixed.waypoints(z)[:, :3], axis=0).max() == 0.0
+
+
+def test_scattered_configurations_are_where_they_say() -> None:
+    target = pin.SE3(pin.rpy.rpyToMatrix(0.0, np.pi / 2, 0.0), np.array([1.5, 0.5, 0.9]))
+    reach = vkc.build(hall(), [vkc.Reach(target)], options=SHORT)
+    found = scatter(reach, reach.segments, np.random.default_rng(0))
+    assert found is not None
+    z, residual = found
+    assert np.count_nonzero(residual < 1e-4) > len(z) / 2
+    assert np.all((z >= reach.lower[-1]) & (z <= reach.upper[-1]))
+    for row, error in list(zip(z, residual, strict=True))[:20]:
+        tool = dataclasses.replace(reach.scene, start=row).tool_placement()
+        off = np.concatenate([tool.translation - target.translation, pin.log3(tool.rotation.T @ target.rotation)])
+        assert np.abs(off).max() == pytest.approx(error, abs=5e-2, rel=0.5) if error > 1e-3 else np.abs(off).max() < 2e-3
+
+
+def test_nothing_to_scatter() -> None:
+    free = vkc.build(door_scene(), [vkc.Actuate("door", {"hinge": 1.2}), vkc.GoTo(0.0, 0.0)], options=SHORT)
+    last = scatter(free, free.segments, np.random.default_rng(0))
+    assert last is not None
+    z, residual = last
+    np.testing.assert_allclose(z[:, :2], 0.0)
+    assert np.all(residual == 0.0)
+    middle = int(free.ends[-1]) - 1  # on the way, nothing is asked for
+    assert scatter(free, middle, np.random.default_rng(0)) is None

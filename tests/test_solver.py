@@ -1,0 +1,181 @@
+from __future__ import annotations
+
+import itertools
+import time
+from functools import cache
+
+import numpy as np
+import pytest
+from drives import hall, moved, through
+from small_problems import door_scene
+
+import vkc_pin as vkc
+from vkc_pin import solver
+from vkc_pin.initialization import initialize
+from vkc_pin.refinement import collisions_between
+from vkc_pin.solver import Solution, solve
+
+FEW = vkc.Options(reach_waypoints=20, max_outer=12)
+PILLAR = {"name": "pillar", "type": "cylinder", "radius": 0.15, "length": 1.6, "position": [1.6, 0.05, 0.8]}
+
+
+@cache
+def round_a_pillar() -> vkc.TrajectoryProblem:
+    return vkc.build(hall(obstacles=[PILLAR]), [vkc.GoTo(3.2, 0.0, 0.0)], options=FEW)
+
+
+def straight(problem: vkc.TrajectoryProblem, x: float, y: float = 0.0) -> np.ndarray:
+    scene = problem.scene
+    return through(scene, scene.start, moved(scene.start, x=x, y=y), steps=problem.segments).positions[1:]
+
+
+@cache
+def solved() -> Solution:
+    return solve(round_a_pillar(), straight(round_a_pillar(), 3.2))
+
+
+@cache
+def hard() -> Solution:
+    """The whole task from a stationary seed: steps are rejected, penalties raised."""
+    options = vkc.Options(reach_waypoints=15, turn_waypoints=4, move_waypoints=12, max_outer=10)
+    problem = vkc.build(door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=options)
+    (seed,) = initialize(problem, "stationary", np.random.default_rng(0))
+    return solve(problem, seed)
+
+
+def feasible(problem: vkc.TrajectoryProblem, z: np.ndarray) -> None:
+    """Everything holds at the waypoints, and nothing collides between them."""
+    assert np.all((z >= problem.lower - 1e-6) & (z <= problem.upper + 1e-6))
+    assert problem.evaluate_contacts(z, reach=0.1).violation() < 1e-3
+    assert problem.pose_error(z) < 1e-3
+    assert problem.rate_violation(z) < 1e-3
+    assert problem.drift(z) < 1.0
+    assert len(collisions_between(problem, z).waypoint) == 0
+
+
+def test_it_goes_round_what_stands_in_the_way() -> None:
+    problem = round_a_pillar()
+    assert problem.evaluate_contacts(straight(problem, 3.2), reach=0.0).clearance() < -0.1
+    assert solved().converged
+    assert solved().status == "converged"
+    feasible(problem, solved().z)
+
+
+def test_counts_and_times() -> None:
+    for solution in (solved(), hard()):
+        assert solution.rounds == len(solution.history)
+        assert solution.iterations == solution.history[-1].iterations
+        assert set(solution.timings) == {"coal", "casadi", "ipopt"}
+        assert all(value > 0.0 for value in solution.timings.values())
+
+
+@pytest.mark.parametrize("solution", [solved, hard], ids=["pillar", "door"])
+def test_columns_that_only_grow(solution) -> None:  # type: ignore[no-untyped-def]
+    history = solution().history
+    assert [row.round for row in history] == list(range(1, len(history) + 1))
+    for name in ("iterations", "time", "penalty"):
+        assert np.all(np.diff([getattr(row, name) for row in history]) >= 0), name
+    for row in history:
+        assert row.step <= row.radius * (1 + 1e-6)  # the trust region holds
+        assert row.shortfall >= 0.0
+        assert row.objective >= 0.0
+
+
+def test_the_trust_region_shrinks_when_a_step_is_rejected() -> None:
+    history = hard().history
+    rejected = [(row, after) for row, after in itertools.pairwise(history) if not row.accepted]
+    assert rejected, "nothing was rejected: choose a harder problem"
+    for row, after in rejected:
+        assert after.radius < row.radius or after.penalty > row.penalty
+
+
+def test_standing_still_where_one_is_already() -> None:
+    """The objective vanishes there; what is left is Ipopt's tolerance."""
+    problem = vkc.build(hall(), [vkc.GoTo(0.0, 0.0, 0.0)], options=FEW)
+    still = np.tile(problem.start, (problem.segments, 1))
+    solution = solve(problem, still)
+    assert solution.converged
+    np.testing.assert_allclose(solution.z, still, atol=0.05)
+    assert problem.objective(solution.z) <= 1e-3
+
+
+def test_the_merit_falls_from_one_accepted_step_to_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With one penalty and a seed on the manifold, objective + penalty · Σ shortfall of what is accepted only falls."""
+    problem = round_a_pillar()
+    merits: list[tuple[float, float, bool]] = []
+    judge = solver._Loop.judge
+
+    def watch(loop, trial):  # type: ignore[no-untyped-def]
+        before = loop.objective + loop.penalty * float(loop.shortfall.sum())
+        after = trial.objective + loop.penalty * float(trial.shortfall.sum())
+        accepted, ratio = judge(loop, trial)
+        merits.append((before, after, accepted))
+        return accepted, ratio
+
+    monkeypatch.setattr(solver._Loop, "judge", watch)
+    solve(problem, straight(problem, 3.2))
+    assert any(accepted for _, _, accepted in merits)
+    for before, after, accepted in merits:
+        if accepted:
+            assert after <= before + 1e-4 * max(1.0, abs(before))
+
+
+def test_the_motion_that_was_feasible_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rounds go on for a shorter motion; if they fail, the feasible one is returned."""
+    problem, seed = round_a_pillar(), straight(round_a_pillar(), 3.2)
+    done = solver._Loop.done
+    kept: list[np.ndarray] = []
+
+    def first_only(loop, trial):  # type: ignore[no-untyped-def]
+        if kept or not done(loop, trial):
+            return False
+        kept.append(trial.z.copy())
+        return True
+
+    monkeypatch.setattr(solver, "WORTHWHILE", -np.inf)  # never content with the first
+    monkeypatch.setattr(solver._Loop, "done", first_only)
+    solution = solve(problem, seed)
+    assert solution.converged
+    np.testing.assert_array_equal(solution.z, kept[0])
+    feasible(problem, solution.z)
+
+
+def test_no_time_at_all() -> None:
+    problem, seed = round_a_pillar(), straight(round_a_pillar(), 3.2)
+    solution = solve(problem, seed, deadline=time.perf_counter() - 1.0)
+    assert (solution.status, solution.converged, solution.rounds) == ("time limit", False, 0)
+    np.testing.assert_array_equal(solution.z, problem.clip(seed))
+
+
+def test_time_that_runs_out_in_the_middle() -> None:
+    problem, seed = round_a_pillar(), straight(round_a_pillar(), 3.2)
+    solution = solve(problem, seed, deadline=time.perf_counter() + 1e-3)
+    assert solution.status == "time limit"
+    assert solution.rounds <= 1
+    assert np.isfinite(solution.z).all()
+
+
+def test_seeds_outside_their_bounds_are_moved_inside() -> None:
+    problem = round_a_pillar()
+    wild = straight(problem, 3.2) + 20.0
+    solution = solve(problem, wild, deadline=time.perf_counter() - 1.0)
+    assert np.all((solution.z >= problem.lower) & (solution.z <= problem.upper))
+
+
+def test_velocity_bounds_bind_when_time_is_short() -> None:
+    options = vkc.Options(reach_waypoints=12, dt=0.25)  # 2.4 m in 3 s at no more than 1 m/s
+    problem = vkc.build(hall(), [vkc.GoTo(2.4, 0.0, 0.0)], options=options)
+    seed = straight(problem, 2.4)
+    assert problem.rate_violation(seed) > 0.05
+    solution = solve(problem, seed)
+    assert solution.converged
+    first, _ = problem.rates(solution.z)
+    assert np.abs(first[:, 0]).max() <= problem.velocity[0] * 1.001
+    assert np.abs(first[:, 0]).max() > 0.95 * problem.velocity[0]
+    feasible(problem, solution.z)
+
+
+def test_the_same_seed_gives_the_same_motion() -> None:
+    again = solve(round_a_pillar(), straight(round_a_pillar(), 3.2))
+    np.testing.assert_array_equal(again.z, solved().z)
+    assert [row.objective for row in again.history] == [row.objective for row in solved().history]

@@ -100,12 +100,17 @@ class _Planner:
         best: tuple[float, str, Trajectory, Report, str] | None = None
         reasons = impossible(problem)
         status = "infeasible" if reasons else ""
+        notes: list[str] = []
         try:
-            for name, seed in [] if reasons else self._seeds(problem):
+            for number, (name, seed) in enumerate([] if reasons else self._seeds(problem), start=1):
                 solution = self._solve(problem, seed, deadline)
                 best = self._better(best, problem, solution, name)
                 if best[1] == "success" or solution.status in ("time limit", "interrupted"):
                     status = "" if best[1] == "success" else solution.status
+                    break
+                if number == 1:
+                    notes = explain(problem, self.seed)
+                elif notes:  # two seeds failed, and random configurations find no free one at a goal either
                     break
         except KeyboardInterrupt:
             status = "interrupted"
@@ -116,11 +121,7 @@ class _Planner:
         if reasons:
             report = report.with_reasons(reasons)
         elif verdict != "success" and not status:
-            try:
-                notes = explain(problem, self.seed)
-                report, status = dataclasses.replace(report, notes=tuple(notes)), "infeasible" if notes else ""
-            except KeyboardInterrupt:
-                status = "interrupted"
+            report, status = dataclasses.replace(report, notes=tuple(notes)), "infeasible" if notes else ""
         build_time += problem.transcription.take_build_time()
         metrics = {
             "planning_time": time.perf_counter() - began - build_time,

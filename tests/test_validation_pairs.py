@@ -17,6 +17,7 @@ from vkc_pin.scene import FLOOR, Scene
 from vkc_pin.trajectory import PhaseSpan, Trajectory
 from vkc_pin.validation_pairs import Hit, PairTable
 from vkc_pin.validation_samples import Samples
+from vkc_pin.world import World
 
 
 @pytest.fixture(scope="module")
@@ -99,20 +100,23 @@ def test_nothing_slips_through_between_two_samples(seed: int, size: float) -> No
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.1, 1.0]))
 def test_no_point_moves_further_than_the_bound(seed: int, size: float) -> None:
-    door = door_scene()
-    motion = wander(door, seed, size=size)
-    samples = Samples(door, motion)
-    table = PairTable(door, samples.world, motion, 0.02)
-    z = samples.z[samples.waypoint_rows]
+    """Turning joints, sliding ones, far out too, and one on the other: the room has a drawer and a cabinet as well."""
+    scene, rng = full_scene(), np.random.default_rng(seed)
+    motion = wander(door_scene(), seed, size=size)
+    world = World(scene)
+    table = PairTable(scene, world, motion, 0.02)
+    z = world.positions(motion)
+    z[:, 11:] += rng.uniform(0.0, 2.0, z.shape[1] - 11)
+    z[1:, 11:] += size * rng.uniform(-1.0, 1.0, (len(z) - 1, z.shape[1] - 11))
     bounds = table._motion_bounds(z)
-    model, data, shapes = table.world.model, table.world.model.createData(), pin.GeometryData(table.geometry)
+    data, shapes = world.model.createData(), pin.GeometryData(table.geometry)
     corners = [np.array(box_corners(shape)) for shape in table.geometry.geometryObjects]
-    for t in range(3):
+    for t in range(len(z) - 1):
         path = np.zeros(len(corners))
         before: list[np.ndarray] = []
         for share in np.linspace(0.0, 1.0, 60):  # the way of each corner of the bounding boxes, not only its ends
-            q = table.world.coordinates.q((1 - share) * z[t] + share * z[t + 1])
-            pin.updateGeometryPlacements(model, data, table.geometry, shapes, q)
+            q = world.coordinates.q((1 - share) * z[t] + share * z[t + 1])
+            pin.updateGeometryPlacements(world.model, data, table.geometry, shapes, q)
             now = [points @ where.rotation.T + where.translation for points, where in zip(corners, shapes.oMg, strict=True)]
             if before:
                 path += [np.linalg.norm(a - b, axis=1).max() for a, b in zip(now, before, strict=True)]

@@ -21,7 +21,7 @@ def problem() -> vkc.TrajectoryProblem:
 
 
 def seeds(method: str = "interpolated", *, seed: int = 0, count: int = 1) -> list[np.ndarray]:
-    return initialize(problem(), method, np.random.default_rng(seed), count=count)
+    return list(initialize(problem(), method, np.random.default_rng(seed), count=count))
 
 
 def hand_off_the_handle(scene: vkc.Scene, row: np.ndarray, hinge: float, knob: float) -> float:

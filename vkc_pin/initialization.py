@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
@@ -18,12 +20,16 @@ _SPACING = 4  # waypoints between knots along a phase in which something is held
 _APPROACH = 6  # configurations looked at on the way to a grasp
 _EASY = 0.5  # share of the beam that must go on freely for a knot to be easy
 _COLLISION, _DEPTH = 10.0, 300.0  # what a collision costs, and a metre of its depth, beside radians of motion
+_TOLERABLE = 60.0  # what the solver may be left to push apart: a graze or two
+_DIFFERENT = 0.1  # [m] and [rad] by which the base must differ somewhere between two seeds
 _NOT_FOUND = 1e3
 _ROUGH = 1e-4  # [m] and [rad], of knots; what is joined from them is exact
 
 
-def initialize(problem: TrajectoryProblem, method: str, rng: np.random.Generator, *, count: int = 1) -> list[NDArray[np.float64]]:
-    """Return up to `count` seeds z_1..z_N, each of shape (N, n), best first.
+def initialize(
+    problem: TrajectoryProblem, method: str, rng: np.random.Generator, *, count: int = 1
+) -> Iterator[NDArray[np.float64]]:
+    """Yield up to `count` seeds z_1..z_N, each of shape (N, n), best first; each is looked for when it is asked for.
 
     Args:
         problem: What is to be solved.
@@ -34,7 +40,7 @@ def initialize(problem: TrajectoryProblem, method: str, rng: np.random.Generator
         count: How many different seeds to return.
     """
     if method == "stationary":
-        return [_objects(problem, np.tile(problem.start, (problem.segments, 1)))]
+        return iter([_objects(problem, np.tile(problem.start, (problem.segments, 1)))])
     return _Interpolation(problem, rng).seeds(count)
 
 
@@ -90,18 +96,20 @@ class _Interpolation:
         self.driven = np.array([self.chain.index(name) for name in problem.task.state], int)
         self.objects = _objects(problem, np.tile(problem.start, (problem.segments, 1)))
 
-    def seeds(self, count: int) -> list[NDArray[np.float64]]:
-        """Return seeds through the cheapest paths of knots: of a quick search, or of a thorough one if those collide."""
-        paths, cost, trouble, at = self._search(thorough=False)
-        if trouble[np.argmin(cost)] > 0:
-            paths, cost, trouble, at = self._search(thorough=True)
-        chosen: list[int] = []
-        for index in np.argsort(cost, kind="stable").tolist():
-            if all(np.abs(paths[index] - paths[other])[:, :3].max() > 0.15 for other in chosen):
-                chosen.append(index)
-            if len(chosen) == count:
-                break
-        return [self._join(paths[index], at) for index in chosen]
+    def seeds(self, count: int) -> Iterator[NDArray[np.float64]]:
+        """Yield seeds through the cheapest paths of knots: of one quick search if that is any good, then of thorough ones."""
+        given: list[NDArray[np.float64]] = []
+        for attempt in range(count + 1):
+            paths, cost, trouble, at = self._search(thorough=attempt > 0)
+            if attempt == 0 and trouble[np.argmin(cost)] > _TOLERABLE:
+                continue
+            for index in np.argsort(cost, kind="stable").tolist():
+                if all(np.abs(paths[index] - other)[:, :3].max() > _DIFFERENT for other in given):
+                    given.append(paths[index])
+                    yield self._join(paths[index], at)
+                    break
+            if len(given) == count:
+                return
 
     def _search(self, *, thorough: bool) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], list[int]]:
         """Go from knot to knot, keeping the cheapest paths: a beam search on the closure's manifold.

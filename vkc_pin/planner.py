@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -149,13 +150,15 @@ class _Planner:
             history=tuple(self.history),
         )
 
-    def _seeds(self, problem: TrajectoryProblem):  # type: ignore[no-untyped-def]
-        rng = np.random.default_rng(self.seed)
-        began = time.perf_counter()
-        seeds = initialize(problem, self.initialization, rng, count=self.options.max_restarts)
-        self.times["initialization"] += time.perf_counter() - began
-        for number, seed in enumerate(seeds):
-            yield (self.initialization if number == 0 else f"{self.initialization} {number + 1}"), seed
+    def _seeds(self, problem: TrajectoryProblem) -> Iterator[tuple[str, NDArray[np.float64]]]:
+        seeds = initialize(problem, self.initialization, np.random.default_rng(self.seed), count=self.options.max_restarts)
+        for number in itertools.count(1):
+            began = time.perf_counter()
+            seed = next(seeds, None)
+            self.times["initialization"] += time.perf_counter() - began
+            if seed is None:
+                return
+            yield (self.initialization if number == 1 else f"{self.initialization} {number}"), seed
 
     def _solve(self, problem: TrajectoryProblem, seed: NDArray[np.float64], deadline: float) -> Solution:
         solution = solve(problem, seed, callback=self.callback, deadline=deadline)

@@ -15,9 +15,11 @@ from vkc_pin.monitor import Monitor, interruptible
 
 @pytest.fixture(autouse=True)
 def handler_is_put_back() -> Iterator[None]:
-    before = signal.getsignal(signal.SIGINT)
+    """Start from Python's own handler: a shell that starts the tests in the background makes them ignore Ctrl-C."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
-    assert signal.getsignal(signal.SIGINT) is before
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    signal.signal(signal.SIGINT, before)
 
 
 def press() -> None:

@@ -16,6 +16,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
+from vkc_pin.assembly import clean
 from vkc_pin.coordinates import Coordinates
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.resources import find
@@ -29,7 +30,6 @@ __all__ = [
     "Latch",
     "invert",
     "load_object",
-    "tidy",
 ]
 
 DEFAULT_VELOCITY = 1.0
@@ -176,14 +176,6 @@ def load_object(name_or_path: str | Path) -> ArticulatedObject:
     return read_object(file)
 
 
-def tidy(placement: pin.SE3) -> pin.SE3:
-    """Return `placement` with entries within 1e-12 of 0 and ±1 made exact: exact zeros vanish from symbolic expressions."""
-    matrix = placement.homogeneous.copy()
-    for value in (0.0, 1.0, -1.0):
-        matrix[np.abs(matrix - value) < 1e-12] = value
-    return pin.SE3(matrix)
-
-
 def _body_frame(obj: ArticulatedObject, link: str) -> int:
     for index, frame in enumerate(obj.model.frames):
         if frame.type == pin.FrameType.BODY and frame.name == link:
@@ -231,7 +223,7 @@ def invert(obj: ArticulatedObject, link: str, state: ArrayLike) -> InvertedTree:
         index = model.addJoint(
             new_parent,
             joint,
-            tidy(body * turn),
+            clean(body * turn),
             source.names[child],
             source.effortLimit[v : v + 1],
             source.velocityLimit[v : v + 1],
@@ -246,7 +238,7 @@ def invert(obj: ArticulatedObject, link: str, state: ArrayLike) -> InvertedTree:
         while anchor not in carrier:
             anchor = source.parents[anchor]
         new, body = carrier[anchor]
-        return new, tidy(body * data.oMi[anchor].actInv(data.oMi[joint]) * placement)
+        return new, clean(body * data.oMi[anchor].actInv(data.oMi[joint]) * placement)
 
     for joint in range(source.njoints):
         if source.inertias[joint].mass > 0.0:

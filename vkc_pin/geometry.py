@@ -11,7 +11,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from vkc_pin.articulation import ArticulatedObject, tidy
+from vkc_pin.articulation import ArticulatedObject
+from vkc_pin.assembly import clean
 from vkc_pin.errors import InputError, UnknownNameError
 
 __all__ = ["LIMIT_SLACK", "PlacedObject", "clearance", "copy_shape", "placed_shapes", "standing_geometry", "within_limits"]
@@ -91,7 +92,7 @@ def standing_geometry(placed: PlacedObject, *, visual: bool = False) -> list[pin
 def copy_shape(shape: pin.GeometryObject, name: str, placement: pin.SE3) -> pin.GeometryObject:
     """Return a copy of `shape` that stands still at `placement` in the world frame."""
     copy = pin.GeometryObject(shape)
-    copy.name, copy.parentJoint, copy.parentFrame, copy.placement = name, 0, 0, tidy(placement)
+    copy.name, copy.parentJoint, copy.parentFrame, copy.placement = name, 0, 0, clean(placement)
     return copy
 
 

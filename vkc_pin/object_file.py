@@ -8,7 +8,8 @@ from types import MappingProxyType
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.articulation import DEFAULT_ACCELERATION, DEFAULT_VELOCITY, ArticulatedObject, Attachment, Latch, tidy
+from vkc_pin.articulation import DEFAULT_ACCELERATION, DEFAULT_VELOCITY, ArticulatedObject, Attachment, Latch
+from vkc_pin.assembly import clean
 from vkc_pin.coordinates import Coordinates
 from vkc_pin.documents import Document, check, read_yaml
 from vkc_pin.errors import InputError
@@ -73,7 +74,7 @@ def _attachment(item: AttachmentSchema) -> Attachment:
         rotation = pin.rpy.rpyToMatrix(*(item.rpy or (0.0, 0.0, 0.0)))
     axis = np.zeros(3) if item.axis is None else np.array(item.axis) / np.linalg.norm(item.axis)
     lower, upper = item.limits or ((-np.pi, np.pi) if item.joint == "spherical" else (0.0, 0.0))
-    return Attachment(item.name, item.link, tidy(pin.SE3(rotation, np.array(item.position))), item.joint, axis, lower, upper)
+    return Attachment(item.name, item.link, clean(pin.SE3(rotation, np.array(item.position))), item.joint, axis, lower, upper)
 
 
 def _latches(document: Document, schema: ObjectSchema, coordinates: Coordinates) -> tuple[Latch, ...]:

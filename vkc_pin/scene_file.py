@@ -13,7 +13,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from vkc_pin import scene_schema as schema
-from vkc_pin.articulation import load_object, tidy
+from vkc_pin.articulation import load_object
+from vkc_pin.assembly import clean
 from vkc_pin.documents import Document, check
 from vkc_pin.geometry import PlacedObject, copy_shape, within_limits
 from vkc_pin.scene import FLOOR, Scene, StartRegion, start_limits
@@ -132,7 +133,7 @@ def _held(document: Document, held: Mapping[str, str], objects: Mapping[str, Pla
 
 def _pose(item: schema.PoseSchema) -> pin.SE3:
     roll, pitch, yaw = item.rpy or (0.0, 0.0, item.yaw or 0.0)
-    return tidy(pin.SE3(pin.rpy.rpyToMatrix(roll, pitch, yaw), np.array(item.position)))
+    return clean(pin.SE3(pin.rpy.rpyToMatrix(roll, pitch, yaw), np.array(item.position)))
 
 
 def _file(document: Document, path: tuple[str | int, ...], folder: Path, name: str) -> Path:

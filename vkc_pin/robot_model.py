@@ -16,6 +16,7 @@ from vkc_pin.robot_files import RobotFile
 __all__ = ["default_tool_frame", "full_model", "planned_model", "rest_positions", "within_limits"]
 
 ROOT = "base"  # the name of the planar joint
+_ROUNDING = 1e-9  # [m] and of a rotation: URDFs write quarter turns with nine digits; exact ones make lean expressions
 _FINGER = 7  # joints in the longest finger of a hand
 _ARM = 4  # joints, at least, that carry a hand
 
@@ -139,7 +140,7 @@ def _reduced(full: pin.Model, planned: Collection[int], q: NDArray[np.float64]) 
             index = model.addJoint(
                 parent,
                 joint,
-                clean(placement * full.jointPlacements[j]),
+                clean(placement * full.jointPlacements[j], _ROUNDING),
                 full.names[j],
                 full.effortLimit[v],
                 full.velocityLimit[v],

@@ -35,16 +35,16 @@ def screenshot(
 READY = 'data-ready="yes"'  # what a page says of itself once it has drawn its first picture
 
 
-def document(page: Path, *, time: float | None = None, budgets: tuple[float, ...] = (6.0, 20.0, 60.0)) -> str:
+def document(page: Path, *, time: float | None = None, until: str = READY, budgets: tuple[float, ...] = (6.0, 20.0, 60.0)) -> str:
     """Return the page's elements as they are once its scripts have run.
 
     Chromium's virtual clock does not wait for what other threads unpack. On a busy machine it can run out before the page is
-    there; then the page is opened again, with the next of `budgets` [s].
+    there; then, as long as the text lacks `until`, the page is opened again with the next of `budgets` [s].
     """
     text = ""
     for budget in budgets:
         text = _run(page, time, budget, "--dump-dom")
-        if READY in text:
+        if until in text:
             break
     return text
 

@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-__all__ = ["PhaseGeometry", "bounding_box"]
+__all__ = ["PhaseGeometry"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,10 +71,3 @@ class PhaseGeometry:
         gap_b = np.abs(between @ turn_b)[:, 0] - self.half[b] - (self.half[a][:, None] @ mixed)[:, 0]
         near = np.maximum(gap_a.max(axis=1), gap_b.max(axis=1)) < reach
         return w[near], k[near]
-
-
-def bounding_box(shape: pin.GeometryObject) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return centre and half extents of a shape's bounding box in its own frame."""
-    shape.geometry.computeLocalAABB()
-    box = shape.geometry.aabb_local
-    return np.asarray(box.center(), float), np.array([box.width(), box.height(), box.depth()]) / 2

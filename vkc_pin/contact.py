@@ -16,9 +16,10 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from vkc_pin.assembly import graft_geometry
-from vkc_pin.broadphase import PhaseGeometry, bounding_box
+from vkc_pin.broadphase import PhaseGeometry
 from vkc_pin.chain import VirtualKinematicChain
 from vkc_pin.errors import InputError
+from vkc_pin.geometry import bounding_box
 from vkc_pin.goal import Phase, Task
 from vkc_pin.options import Options
 from vkc_pin.scene import FLOOR, Scene, standing_geometry

@@ -15,7 +15,16 @@ from vkc_pin.articulation import ArticulatedObject
 from vkc_pin.assembly import clean
 from vkc_pin.errors import InputError, UnknownNameError
 
-__all__ = ["LIMIT_SLACK", "PlacedObject", "clearance", "copy_shape", "placed_shapes", "standing_geometry", "within_limits"]
+__all__ = [
+    "LIMIT_SLACK",
+    "PlacedObject",
+    "bounding_box",
+    "clearance",
+    "copy_shape",
+    "placed_shapes",
+    "standing_geometry",
+    "within_limits",
+]
 
 LIMIT_SLACK = 1e-6
 """Joint values up to this far outside their limits, [rad] or [m], count as rounding and are moved to the limit."""
@@ -126,6 +135,13 @@ def clearance(
             distance = coal.distance(shape, transform, other, other_transform, request, coal.DistanceResult())
             nearest = min(nearest, distance)
     return float(nearest)
+
+
+def bounding_box(shape: pin.GeometryObject) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return centre and half extents of a shape's bounding box in its own frame."""
+    shape.geometry.computeLocalAABB()
+    box = shape.geometry.aabb_local
+    return np.asarray(box.center(), float), np.array([box.width(), box.height(), box.depth()]) / 2
 
 
 def _ball(shape: coal.CollisionGeometry, placement: pin.SE3) -> tuple[NDArray[np.float64], float]:

@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from vkc_pin.geometry import bounding_box
 from vkc_pin.scene import Scene
 from vkc_pin.tessellation import Solid, box_solid, shade, to_solid
 
@@ -93,9 +94,8 @@ class Room:
         """Return boxes that hide what is behind them: lower and upper corner, shape (3,) each [m], and opacity."""
         boxes = []
         for shape in [*self._walls, *self._furniture]:
-            shape.geometry.computeLocalAABB()
-            box = shape.geometry.aabb_local
-            corners = itertools.product(*zip(box.min_, box.max_, strict=True))
+            center, half = bounding_box(shape)
+            corners = itertools.product(*zip(center - half, center + half, strict=True))
             placed = np.array([shape.placement.act(np.array(corner)) for corner in corners])
             wall = any(shape is other for other in self._walls)
             opacity = (0.6 if self._divides(shape) else 0.0) if wall else 1.0

@@ -15,6 +15,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from vkc_pin.errors import InputError
+from vkc_pin.geometry import bounding_box
 from vkc_pin.scene import FLOOR, Scene
 from vkc_pin.trajectory import Trajectory
 from vkc_pin.world import World
@@ -185,10 +186,8 @@ class PairTable:
         prismatic = {j: model.joints[j].shortname().startswith("JointModelP") and j > 1 for j in of_joint}
         bounds = np.zeros((len(steps), len(self.geometry.geometryObjects)))
         for g, shape in enumerate(self.geometry.geometryObjects):
-            shape.geometry.computeLocalAABB()
-            box = shape.geometry.aabb_local
-            radius = float(np.linalg.norm([box.width(), box.height(), box.depth()])) / 2
-            reach = radius + float(np.linalg.norm(shape.placement.act(np.asarray(box.center()))))
+            center, half = bounding_box(shape)
+            reach = float(np.linalg.norm(half)) + float(np.linalg.norm(shape.placement.act(center)))
             joint = shape.parentJoint
             while joint:
                 columns = of_joint[joint]

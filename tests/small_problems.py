@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.articulation import ArticulatedObject, Attachment, load_object
+from vkc_pin.articulation import ArticulatedObject, Attachment, Freedom, load_object
 from vkc_pin.geometry import PlacedObject
 from vkc_pin.options import Options
 from vkc_pin.scene import Scene, load_scene
@@ -81,12 +81,16 @@ def full_scene() -> Scene:
     case = PlacedObject("cabinet", cabinet(), pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, 0.8), np.array([-1.0, 1.2, 0.4])), state)
     grip = cabinet().attachments["grip"]
     axis = np.array([2.0, -1.0, 2.0]) / 3.0
-    for name, joint, direction, lower, upper in (
-        ("rail", "prismatic", axis, -0.05, 0.08),
-        ("bar", "revolute", axis, -0.5, 0.9),
-        ("ball", "spherical", np.zeros(3), -0.7, 0.6),
+    turns = tuple(Freedom(f"_{name}", "revolute", unit, -0.7, 0.6) for name, unit in zip("xyz", np.eye(3), strict=True))
+    sleeve = (Freedom("_slide", "prismatic", axis, -0.05, 0.08), Freedom("_turn", "revolute", axis, -0.5, 0.9))
+    for freer in (
+        dataclasses.replace(grip, name="rail", joint="prismatic", freedoms=(Freedom("", "prismatic", axis, -0.05, 0.08),)),
+        dataclasses.replace(grip, name="bar", joint="revolute", freedoms=(Freedom("", "revolute", axis, -0.5, 0.9),)),
+        dataclasses.replace(grip, name="ball", joint="spherical", freedoms=turns),
+        dataclasses.replace(grip, name="sleeve", joint="cylindrical", freedoms=sleeve, standoff=0.02),
+        dataclasses.replace(grip, name="socket", joint="spherical", freedoms=turns, standoff=0.04),
+        dataclasses.replace(grip, name="spike", standoff=0.03),
     ):
-        freer = dataclasses.replace(grip, name=name, joint=joint, axis=direction, lower=lower, upper=upper)
         case = with_attachment(case, freer)
     return with_objects(scene, {"drawer": drawer, "cabinet": case})
 

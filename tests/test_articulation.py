@@ -12,6 +12,7 @@ import pinocchio as pin
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from vkc_pin.articulation import DEFAULT_ACCELERATION, DEFAULT_VELOCITY, ArticulatedObject, invert, load_object
 from vkc_pin.errors import InputError, UnknownNameError
@@ -155,8 +156,16 @@ def test_door() -> None:
     assert list(door.attachments) == ["handle", "handle_free"]
     assert door.attachment() is door.attachment("handle")
     free = door.attachment("handle_free")
-    assert (free.joint, free.lower, free.upper) == ("revolute", -0.6, 0.6)
-    np.testing.assert_array_equal(free.axis, [0.0, 1.0, 0.0])
+    (tilt,) = free.freedoms
+    assert (free.joint, free.coordinates, tilt.kind, tilt.lower, tilt.upper) == (
+        "revolute",
+        ("handle_free",),
+        "revolute",
+        -0.6,
+        0.6,
+    )
+    np.testing.assert_array_equal(tilt.axis, [0.0, 1.0, 0.0])
+    assert (free.standoff, free.firm) == (0.0, False)
     with pytest.raises(UnknownNameError) as caught:
         door.attachment("handel")
     assert caught.value.nearest == "handle"
@@ -198,6 +207,7 @@ def test_moving_parts_keep_away_from_the_base_over_the_whole_range(name: str, st
     assert 0.02 < nearest < 0.05
 
 
+SLIDE = "    axis: [0, 1, 0]\n    limits: [-0.1, 0.2]"
 BASE = """urdf: thing.urdf
 joints:
   hinge: {acceleration: 3}
@@ -218,6 +228,54 @@ def test_limits_that_are_not_stated_have_documented_defaults() -> None:
     thing = load_text(URDF, BASE)
     np.testing.assert_array_equal(thing.velocity, [1.0, DEFAULT_VELOCITY])
     np.testing.assert_array_equal(thing.acceleration, [3.0, DEFAULT_ACCELERATION])
+
+
+GRASPS = [
+    ("fixed", "", ()),
+    ("revolute", "axis: [1, 2, -2], limits: [-0.4, 0.5]", ("",)),
+    ("prismatic", "axis: [1, 2, -2], limits: [-0.4, 0.5]", ("",)),
+    ("cylindrical", "axis: [1, 2, -2], limits: [-0.4, 0.5], turn: [-1.2, 1.1]", ("_slide", "_turn")),
+    ("spherical", "", ("_x", "_y", "_z")),
+    ("spherical", "limits: [-0.4, 0.5]", ("_x", "_y", "_z")),
+]
+
+
+@pytest.mark.parametrize(("joint", "fields", "suffixes"), GRASPS)
+@pytest.mark.parametrize("standoff", [0.0, 0.07])
+def test_an_attachment_moves_as_its_joint_does(joint: str, fields: str, suffixes: tuple[str, ...], standoff: float) -> None:
+    entry = ", ".join(part for part in (f"name: grip, link: panel, joint: {joint}, standoff: {standoff}", fields) if part)
+    grip = load_text(URDF, f"urdf: thing.urdf\nattachments: [{{{entry}}}]").attachment()
+    assert (grip.joint, grip.standoff) == (joint, standoff)
+    assert grip.coordinates == tuple(f"grip{suffix}" for suffix in suffixes)
+    stated = {"_turn": (-1.2, 1.1)} if joint == "cylindrical" else {}
+    usual = (-0.4, 0.5) if "limits" in fields else (-np.pi, np.pi)
+    assert [(f.lower, f.upper) for f in grip.freedoms] == [stated.get(suffix, usual) for suffix in suffixes]
+    v, axis = np.random.default_rng(0).uniform(-1.0, 1.0, len(suffixes)), np.array([1.0, 2.0, -2.0]) / 3.0
+    turn, centre = Rotation.identity(), np.zeros(3)
+    if joint == "spherical":
+        turn = Rotation.from_euler("XYZ", v)
+    elif joint != "fixed":
+        turn = Rotation.from_rotvec(axis * (v[-1] if joint != "prismatic" else 0.0))
+        centre = axis * (v[0] if joint != "revolute" else 0.0)
+    moved = grip.motion(v)
+    np.testing.assert_allclose(moved.rotation, turn.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(moved.translation, centre + turn.apply([0.0, 0.0, -standoff]), atol=1e-12)
+    with pytest.raises(InputError, match="one a freedom"):
+        grip.motion([*v, 0.0])
+
+
+@pytest.mark.parametrize(("free", "stated", "firm"), [(0, "", 0), (1, "", 1), (0, "firm: true", 1), (1, "firm: false", 0)])
+def test_a_hand_clamps_what_is_free_unless_told_otherwise(free: int, stated: str, firm: int) -> None:
+    text = f"urdf: thing.urdf\nfree: {bool(free)}\nattachments: [{{name: grip, link: panel, {stated}}}]"
+    assert load_text(URDF, text).attachment().firm is bool(firm)
+
+
+def test_two_grasps_cannot_share_a_coordinate() -> None:
+    slide = "name: grip_slide, link: panel, joint: prismatic, axis: [1, 0, 0], limits: [0, 1]"
+    both = f"{{name: grip, link: panel, joint: cylindrical, axis: [1, 0, 0], limits: [0, 1], turn: [0, 1]}}, {{{slide}}}"
+    with pytest.raises(InputError, match="grip_slide") as caught:
+        load_text(URDF, f"urdf: thing.urdf\nattachments: [{both}]")
+    assert caught.value.field == "attachments[1].name"
 
 
 @pytest.mark.parametrize(
@@ -249,7 +307,23 @@ def test_unknown_names_in_a_description(old: str, new: str, line: int, field: st
         ("link: panel", "position: [0, 0, 0]", 5, "attachments[0].link"),
         ("link: panel", "link: panel\n    joint: revolute", 5, "attachments[0]"),
         ("link: panel", "link: panel\n    joint: revolute\n    axis: [0, 0, 0]", 8, "attachments[0].axis"),
-        ("link: panel", "link: panel\n    joint: revolute\n    axis: [0, 0, 1]\n    limits: [0.1, 1]", 5, "attachments[0]"),
+        (
+            "link: panel",
+            "link: panel\n    joint: revolute\n    axis: [0, 0, 1]\n    limits: [0.1, 1]",
+            9,
+            "attachments[0].limits",
+        ),
+        ("link: panel", "link: panel\n    joint: spherical\n    axis: [0, 0, 1]", 5, "attachments[0]"),
+        ("link: panel", "link: panel\n    joint: spherical\n    limits: [0.1, 1]", 8, "attachments[0].limits"),
+        ("link: panel", f"link: panel\n    joint: cylindrical\n{SLIDE}", 5, "attachments[0]"),
+        ("link: panel", f"link: panel\n    joint: cylindrical\n{SLIDE}\n    turn: [1, 2]", 10, "attachments[0].turn"),
+        ("link: panel", f"link: panel\n    joint: cylindrical\n{SLIDE}\n    turn: 1.2", 10, "attachments[0].turn"),
+        ("link: panel", "link: panel\n    joint: cylindrical\n    axis: [0, 1, 0]\n    turn: [-1, 1]", 5, "attachments[0]"),
+        ("link: panel", "link: panel\n    joint: cylindrical\n    limits: [-1, 1]\n    turn: [-1, 1]", 5, "attachments[0]"),
+        ("link: panel", f"link: panel\n    joint: revolute\n{SLIDE}\n    turn: [-1, 1]", 5, "attachments[0]"),
+        ("link: panel", "link: panel\n    turn: [-1, 1]", 5, "attachments[0]"),
+        ("link: panel", "link: panel\n    standoff: -0.01", 7, "attachments[0].standoff"),
+        ("link: panel", "link: panel\n    firm: 2", 7, "attachments[0].firm"),
         ("link: panel", "link: panel\n    approach: [1, 0, 0]", 5, "attachments[0]"),
         ("link: panel", "link: panel\n    approach: [1, 0, 0]\n    closing: [1, 0, 1]", 5, "attachments[0]"),
         ("link: panel", "link: panel\n  - name: grip\n    link: panel", 7, "attachments[1].name"),

@@ -23,6 +23,9 @@ GRASPS = [
     {"cabinet": "rail"},
     {"cabinet": "bar"},
     {"cabinet": "ball"},
+    {"cabinet": "sleeve"},
+    {"cabinet": "socket"},
+    {"cabinet": "spike"},
     {"door": "handle", "drawer": "handle_free", "cabinet": "ball"},
 ]
 IDS = [" ".join(f"{name}.{grasp}" for name, grasp in grasps.items()) for grasps in GRASPS]
@@ -45,16 +48,23 @@ def assert_same(first: pin.SE3, second: pin.SE3, tolerance: float = 1e-10) -> No
 
 
 def virtual_motion(chain: VirtualKinematicChain, scene: Scene, name: str, grasp: str, z: np.ndarray) -> pin.SE3:
-    """J(v) of an attachment, from its definition."""
+    """J(v) and the standoff after it, from their definition."""
     attachment = scene.objects[name].object.attachments[grasp]
+
+    def value(suffix: str) -> float:
+        return float(z[chain.index(f"{name}.{grasp}{suffix}")])
+
+    turn, shift = np.eye(3), np.zeros(3)
     if attachment.joint == "spherical":
-        x, y, w = (z[chain.index(f"{name}.{grasp}_{letter}")] for letter in "xyz")
-        return pin.SE3(pin.utils.rotate("x", x) @ pin.utils.rotate("y", y) @ pin.utils.rotate("z", w), np.zeros(3))
-    if attachment.joint == "revolute":
-        return pin.SE3(pin.AngleAxis(z[chain.index(f"{name}.{grasp}")], attachment.axis).matrix(), np.zeros(3))
-    if attachment.joint == "prismatic":
-        return pin.SE3(np.eye(3), attachment.axis * z[chain.index(f"{name}.{grasp}")])
-    return pin.SE3.Identity()
+        turn = pin.utils.rotate("x", value("_x")) @ pin.utils.rotate("y", value("_y")) @ pin.utils.rotate("z", value("_z"))
+    elif attachment.joint == "revolute":
+        turn = pin.AngleAxis(value(""), attachment.freedoms[0].axis).matrix()
+    elif attachment.joint == "prismatic":
+        shift = attachment.freedoms[0].axis * value("")
+    elif attachment.joint == "cylindrical":
+        turn = pin.AngleAxis(value("_turn"), attachment.freedoms[0].axis).matrix()
+        shift = attachment.freedoms[0].axis * value("_slide")
+    return pin.SE3(turn, shift - attachment.standoff * turn[:, 2])
 
 
 def object_state(chain: VirtualKinematicChain, scene: Scene, name: str, z: np.ndarray) -> np.ndarray:
@@ -152,6 +162,16 @@ def test_the_closures_target_is_the_base_link_in_the_world() -> None:
 @pytest.mark.parametrize(
     ("grasps", "added", "limits"),
     [
+        (
+            {"cabinet": "sleeve"},
+            ["cabinet.sleeve_turn", "cabinet.sleeve_slide", "cabinet.slide", "cabinet.swing"],
+            [
+                (-0.5, 0.9, VIRTUAL_VELOCITY, VIRTUAL_ACCELERATION),
+                (-0.05, 0.08, VIRTUAL_VELOCITY, VIRTUAL_ACCELERATION),
+                (0.0, 0.3, 0.4, 0.7),
+                (-1.0, 2.0, 1.5, 3.0),
+            ],
+        ),
         ({"door": "handle"}, ["door.knob", "door.hinge"], [(0.0, 0.8, 2.0, 4.0), (-1.57, 1.57, 1.0, 1.0)]),
         (
             {"door": "handle_free"},

@@ -16,7 +16,14 @@ from vkc_pin.scene import Scene
 from vkc_pin.trajectory import PhaseSpan, Trajectory
 from vkc_pin.validation_samples import ANGLE_STEP, LENGTH_STEP, Samples
 
-VIRTUAL = {"grip": (), "rail": ("rail",), "bar": ("bar",), "ball": ("ball_z", "ball_y", "ball_x")}
+VIRTUAL = {
+    "grip": (),
+    "rail": ("rail",),
+    "bar": ("bar",),
+    "ball": ("ball_z", "ball_y", "ball_x"),
+    "sleeve": ("sleeve_turn", "sleeve_slide"),
+    "socket": ("socket_z", "socket_y", "socket_x"),
+}
 
 
 def motion(scene: Scene, seed: int, *, grasp: str = "grip", number: int = 5) -> Trajectory:
@@ -34,9 +41,8 @@ def test_samples_are_dense(seed: int, grasp: str) -> None:
     trajectory = motion(full_scene(), seed, grasp=grasp)
     samples = Samples(full_scene(), trajectory)
     steps = np.abs(np.diff(trajectory.at(samples.times), axis=0))
-    lengths = np.array(
-        [name in ("base_x", "base_y", "drawer.slide", "cabinet.slide", "cabinet.rail") for name in trajectory.names]
-    )
+    of_objects = ("drawer.slide", "cabinet.slide", "cabinet.rail", "cabinet.sleeve_slide")
+    lengths = np.array([name in ("base_x", "base_y", *of_objects) for name in trajectory.names])
     assert steps[:, lengths].max(initial=0.0) <= LENGTH_STEP * (1 + 1e-6)
     assert steps[:, ~lengths].max(initial=0.0) <= ANGLE_STEP * (1 + 1e-6)
     assert np.linalg.norm(steps[:, :2], axis=1).max() <= LENGTH_STEP * (1 + 1e-6)
@@ -52,7 +58,7 @@ def test_samples_are_dense(seed: int, grasp: str) -> None:
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from(sorted(VIRTUAL)))
 def test_grasp_errors(seed: int, grasp: str) -> None:
-    """The cabinet is put where the hand has it: tool = base · link · placement · J(v). Then it is put elsewhere."""
+    """The cabinet is put where the hand has it: tool = base · link · placement · J(v) · offset. Then it is put elsewhere."""
     scene = full_scene()
     trajectory, rng = motion(scene, seed, grasp=grasp, number=2), np.random.default_rng(seed)
     robot, placed = scene.robot, scene.objects["cabinet"]
@@ -62,12 +68,14 @@ def test_grasp_errors(seed: int, grasp: str) -> None:
     tool = data.oMf[robot.model.getFrameId(robot.tool_frame)]
     value = {name: trajectory.column(f"cabinet.{name}")[0] for name in VIRTUAL[grasp]}
     freedom = pin.SE3.Identity()
-    if grasp == "rail":
-        freedom.translation = attachment.axis * value["rail"]
-    elif grasp == "bar":
-        freedom.rotation = Rotation.from_rotvec(attachment.axis * value["bar"]).as_matrix()
-    elif grasp == "ball":
-        freedom.rotation = Rotation.from_euler("XYZ", [value["ball_x"], value["ball_y"], value["ball_z"]]).as_matrix()
+    if attachment.joint in ("prismatic", "cylindrical"):
+        freedom.translation = attachment.freedoms[0].axis * value.get("rail", value.get("sleeve_slide", 0.0))
+    if attachment.joint in ("revolute", "cylindrical"):
+        turn = attachment.freedoms[-1].axis * value.get("bar", value.get("sleeve_turn", 0.0))
+        freedom.rotation = Rotation.from_rotvec(turn).as_matrix()
+    elif attachment.joint == "spherical":
+        freedom.rotation = Rotation.from_euler("XYZ", [value[f"{grasp}_{axis}"] for axis in "xyz"]).as_matrix()
+    freedom.translation = freedom.translation - attachment.standoff * freedom.rotation[:, 2]
     state = np.array([trajectory.column(f"cabinet.{joint}")[0] for joint in placed.object.coordinates.names])
     hand = placed.object.link_placement(attachment.link, state) * attachment.placement * freedom
     here = with_objects(scene, {"cabinet": dataclasses.replace(placed, placement=tool * hand.inverse())})

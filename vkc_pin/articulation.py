@@ -17,6 +17,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from vkc_pin.assembly import clean
+from vkc_pin.attachment import Attachment, Freedom
 from vkc_pin.coordinates import Coordinates
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.resources import find
@@ -26,6 +27,7 @@ __all__ = [
     "DEFAULT_VELOCITY",
     "ArticulatedObject",
     "Attachment",
+    "Freedom",
     "InvertedTree",
     "Latch",
     "invert",
@@ -36,32 +38,6 @@ DEFAULT_VELOCITY = 1.0
 """Velocity limit [rad/s] or [m/s] of an object's joint whose URDF states none (a continuous joint without limits)."""
 DEFAULT_ACCELERATION = 2.0
 """Acceleration limit [rad/s²] or [m/s²] of an object's joint whose description states none: URDF has no such field."""
-
-
-@dataclass(frozen=True, eq=False)
-class Attachment:
-    """A place where a tool can take hold of a link, and the freedom that this kind of grasp leaves.
-
-    While grasped, the tool frame expressed in the frame of `link` is `placement · J(v)`, with J(v) the motion of the
-    virtual joint at value v. The tool's z axis points out of the palm (the direction of approach), its x axis along
-    the direction in which the fingers close.
-
-    Attributes:
-        name: Its name in the object.
-        link: The link that is held.
-        placement: The tool frame in the link's frame at v = 0.
-        joint: "fixed" (no freedom), "revolute", "prismatic" or "spherical".
-        axis: Unit axis of the virtual joint, in the tool frame, shape (3,); zero for fixed and spherical.
-        lower, upper: Limits of v, [rad] or [m]; a spherical joint's hold for its angle about each axis.
-    """
-
-    name: str
-    link: str
-    placement: pin.SE3
-    joint: str
-    axis: NDArray[np.float64]
-    lower: float
-    upper: float
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,6 @@ __all__ = ["Closure", "VirtualKinematicChain", "consolidate"]
 
 VIRTUAL_VELOCITY = 1.0  # [rad/s] or [m/s], of the hand in a grasp that leaves it a freedom
 VIRTUAL_ACCELERATION = 2.0
-_ROTATIONS = {"_x": np.array([1.0, 0.0, 0.0]), "_y": np.array([0.0, 1.0, 0.0]), "_z": np.array([0.0, 0.0, 1.0])}
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,18 +102,14 @@ class VirtualKinematicChain:
         return self.names.index(name)
 
 
-def _virtual_joints(attachment: Attachment, name: str) -> list[tuple[str, pin.JointModel, float, float]]:
+def _virtual_joints(attachment: Attachment, owner: str) -> list[tuple[str, pin.JointModel, float, float]]:
     """Return the joints of J(v)⁻¹, tool to object: each joint's axis is negated, and their order reversed."""
-    lower, upper = float(attachment.lower), float(attachment.upper)
-    axis = np.asarray(attachment.axis, float)
-    if attachment.joint == "revolute":
-        return [(name, pin.JointModelRevoluteUnaligned(-axis), lower, upper)]
-    if attachment.joint == "prismatic":
-        return [(name, pin.JointModelPrismaticUnaligned(-axis), lower, upper)]
-    if attachment.joint == "spherical":
-        turns = {name + suffix: pin.JointModelRevoluteUnaligned(-unit) for suffix, unit in reversed(_ROTATIONS.items())}
-        return [(joint_name, joint, lower, upper) for joint_name, joint in turns.items()]
-    return []
+    models = {"revolute": pin.JointModelRevoluteUnaligned, "prismatic": pin.JointModelPrismaticUnaligned}
+    joints = [
+        (f"{owner}.{name}", models[freedom.kind](-freedom.axis), freedom.lower, freedom.upper)
+        for name, freedom in zip(attachment.coordinates, attachment.freedoms, strict=True)
+    ]
+    return joints[::-1]
 
 
 def consolidate(scene: Scene, grasps: Mapping[str, str]) -> VirtualKinematicChain:
@@ -144,9 +139,9 @@ def consolidate(scene: Scene, grasps: Mapping[str, str]) -> VirtualKinematicChai
             raise UnknownNameError("object", name, scene.objects, field="grasps")
         placed = scene.objects[name]
         attachment = placed.object.attachment(attachment_name)
-        parent, placement = tool.parentJoint, tool.placement
+        parent, placement = tool.parentJoint, tool.placement * attachment.offset.inverse()
         added = []
-        for joint_name, joint, low, high in _virtual_joints(attachment, f"{name}.{attachment_name}"):
+        for joint_name, joint, low, high in _virtual_joints(attachment, name):
             own = [np.array([value]) for value in (np.inf, VIRTUAL_VELOCITY, low, high)]
             parent = model.addJoint(parent, joint, clean(placement), joint_name, *own)
             placement = pin.SE3.Identity()

@@ -8,7 +8,7 @@ from types import MappingProxyType
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.articulation import DEFAULT_ACCELERATION, DEFAULT_VELOCITY, ArticulatedObject, Attachment, Latch
+from vkc_pin.articulation import DEFAULT_ACCELERATION, DEFAULT_VELOCITY, ArticulatedObject, Attachment, Freedom, Latch
 from vkc_pin.assembly import clean
 from vkc_pin.coordinates import Coordinates
 from vkc_pin.documents import Document, check, read_yaml
@@ -47,7 +47,13 @@ def read_object(file: Path) -> ArticulatedObject:
             raise document.unknown(("attachments", index, "link"), "link", item.link, links)
         if item.name in attachments:
             raise document.error(("attachments", index, "name"), "this name is taken", expected="a new name", got=item.name)
-        attachments[item.name] = _attachment(item)
+        attachment = _attachment(item, firm=schema.free)
+        taken = {name for other in attachments.values() for name in other.coordinates}.intersection(attachment.coordinates)
+        if taken:  # "grip_slide" beside a "grip" that slides
+            raise document.error(
+                ("attachments", index, "name"), "its coordinate's name is taken", expected="a new name", got=", ".join(taken)
+            )
+        attachments[item.name] = attachment
     return ArticulatedObject(
         name=file.stem,
         urdf=urdf,
@@ -66,15 +72,34 @@ def read_object(file: Path) -> ArticulatedObject:
     )
 
 
-def _attachment(item: AttachmentSchema) -> Attachment:
+def _attachment(item: AttachmentSchema, *, firm: bool) -> Attachment:
+    """Return the attachment; `firm` holds where its description does not say."""
     if item.approach is not None and item.closing is not None:
         z, x = (np.array(v) / np.linalg.norm(v) for v in (item.approach, item.closing))
         rotation = np.column_stack([x, np.cross(z, x), z])
     else:
         rotation = pin.rpy.rpyToMatrix(*(item.rpy or (0.0, 0.0, 0.0)))
-    axis = np.zeros(3) if item.axis is None else np.array(item.axis) / np.linalg.norm(item.axis)
-    lower, upper = item.limits or ((-np.pi, np.pi) if item.joint == "spherical" else (0.0, 0.0))
-    return Attachment(item.name, item.link, clean(pin.SE3(rotation, np.array(item.position))), item.joint, axis, lower, upper)
+    return Attachment(
+        name=item.name,
+        link=item.link,
+        placement=clean(pin.SE3(rotation, np.array(item.position))),
+        joint=item.joint,
+        freedoms=_freedoms(item),
+        standoff=item.standoff,
+        firm=firm if item.firm is None else item.firm,
+    )
+
+
+def _freedoms(item: AttachmentSchema) -> tuple[Freedom, ...]:
+    if item.joint == "spherical":
+        limits = item.limits or (-np.pi, np.pi)
+        return tuple(Freedom(f"_{name}", "revolute", axis, *limits) for name, axis in zip("xyz", np.eye(3), strict=True))
+    if item.axis is None or item.limits is None:  # a fixed grasp, as the schema says
+        return ()
+    axis = np.array(item.axis) / np.linalg.norm(item.axis)
+    if item.turn is not None:
+        return Freedom("_slide", "prismatic", axis, *item.limits), Freedom("_turn", "revolute", axis, *item.turn)
+    return (Freedom("", item.joint, axis, *item.limits),)
 
 
 def _latches(document: Document, schema: ObjectSchema, coordinates: Coordinates) -> tuple[Latch, ...]:

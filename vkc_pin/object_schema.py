@@ -47,6 +47,12 @@ def _direction(value: tuple[float, float, float]) -> tuple[float, float, float]:
     return value
 
 
+def _around_zero(value: tuple[float, float]) -> tuple[float, float]:
+    if not value[0] <= 0.0 <= value[1]:
+        raise fail("the limits do not contain 0", "limits [lower <= 0, upper >= 0]")
+    return value
+
+
 def _some(value: tuple[Any, ...]) -> tuple[Any, ...]:
     if not value:
         raise fail("nothing in the list", "at least one")
@@ -68,7 +74,9 @@ def count(number: int) -> BeforeValidator:
 
 Number = Annotated[float, BeforeValidator(_number), Field(allow_inf_nan=False)]
 Positive = Annotated[Number, Field(gt=0.0)]
+NotNegative = Annotated[Number, Field(ge=0.0)]
 Vector3 = Annotated[tuple[Number, Number, Number], count(3)]
+Limits = Annotated[tuple[Number, Number], count(2), AfterValidator(_around_zero)]
 Direction = Annotated[Vector3, AfterValidator(_direction)]
 Name = Annotated[str, AfterValidator(_name)]
 
@@ -106,9 +114,12 @@ class AttachmentSchema(Schema):
     rpy: Vector3 | None = None
     approach: Direction | None = None
     closing: Direction | None = None
-    joint: Literal["fixed", "revolute", "prismatic", "spherical"] = "fixed"
+    joint: Literal["fixed", "revolute", "prismatic", "cylindrical", "spherical"] = "fixed"
     axis: Direction | None = None
-    limits: Annotated[tuple[Number, Number], count(2)] | None = None
+    limits: Limits | None = None
+    turn: Limits | None = None
+    standoff: NotNegative = 0.0
+    firm: bool | None = None  # not stated: as the object is free or not
 
     @model_validator(mode="after")
     def _consistent(self) -> AttachmentSchema:
@@ -116,14 +127,15 @@ class AttachmentSchema(Schema):
             raise fail("the tool's direction is not clear", "either rpy, or approach and closing")
         if self.approach is not None and self.closing is not None and abs(np.dot(self.approach, self.closing)) > 1e-9:
             raise fail("approach and closing are not perpendicular", "two perpendicular directions")
-        if (self.joint in ("revolute", "prismatic")) != (self.axis is not None):
-            raise fail("axis and joint do not fit", "an axis with joint revolute or prismatic, and only there")
-        if self.joint in ("revolute", "prismatic") and self.limits is None:
+        has_axis = self.joint in ("revolute", "prismatic", "cylindrical")
+        if has_axis != (self.axis is not None):
+            raise fail("axis and joint do not fit", "an axis with joint revolute, prismatic or cylindrical, and only there")
+        if has_axis and self.limits is None:
             raise fail("limits missing", "limits [lower, upper] of the grasp's joint")
         if self.joint == "fixed" and self.limits is not None:
             raise fail("a fixed grasp has no limits", "no limits, or another joint")
-        if self.limits is not None and not self.limits[0] <= 0.0 <= self.limits[1]:
-            raise fail("the limits do not contain 0", "limits [lower <= 0, upper >= 0]")
+        if (self.joint == "cylindrical") != (self.turn is not None):
+            raise fail("turn and joint do not fit", "turn [lower, upper] with joint cylindrical, and only there")
         return self
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from vkc_pin.articulation import Attachment
+from vkc_pin.articulation import Freedom
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.scene import Scene
 from vkc_pin.trajectory import PhaseSpan, Trajectory
@@ -29,7 +29,7 @@ class Samples:
         times: When it is looked at, shape (S,) [s]; evenly spaced between two waypoints.
         waypoint_rows: Which of these are the waypoints, shape (T,).
         z: Minimal coordinates of the world, shape (S, n).
-        virtual: Coordinate → object and attachment, for the coordinates that are a grasp's own freedom.
+        virtual: Coordinate → the freedom of a grasp that it is.
 
     Raises:
         UnknownNameError: The trajectory names a coordinate, object or attachment that the scene does not have.
@@ -39,11 +39,11 @@ class Samples:
     def __init__(self, scene: Scene, trajectory: Trajectory) -> None:
         self.scene, self.trajectory = scene, trajectory
         self.world = World(scene)
-        self.virtual: dict[str, tuple[str, Attachment]] = {
-            f"{owner}.{name}": (owner, attachment)
+        self.virtual: dict[str, Freedom] = {
+            f"{owner}.{name}": freedom
             for owner, placed in scene.objects.items()
             for attachment in placed.object.attachments.values()
-            for name in _freedom(attachment)
+            for name, freedom in zip(attachment.coordinates, attachment.freedoms, strict=True)
         }
         self._check_names()
         self.times, self.waypoint_rows = self._sample()
@@ -65,7 +65,7 @@ class Samples:
                 attachments = self.scene.objects[owner].object.attachments
                 if attachment not in attachments:
                     raise UnknownNameError(f"attachment of '{owner}'", attachment, attachments, field=field)
-                for name in _freedom(attachments[attachment]):
+                for name in attachments[attachment].coordinates:
                     if f"{owner}.{name}" not in names:
                         raise InputError(
                             "this grasp's coordinate is missing", field="trajectory.names", expected=f"{owner}.{name}"
@@ -85,7 +85,7 @@ class Samples:
     def is_length(self, name: str) -> bool:
         """Return whether a coordinate is a length, [m], and not an angle, [rad]."""
         if name in self.virtual:
-            return self.virtual[name][1].joint == "prismatic"
+            return self.virtual[name].kind == "prismatic"
         index = self.world.coordinates.index(name)
         kind = str(self.world.model.joints[self.world.coordinates.joints[index]].shortname())
         return index < 2 or (kind.startswith("JointModelP") and kind != "JointModelPlanar")
@@ -106,8 +106,7 @@ class Samples:
                 lower, upper = max(lower, self.scene.arena[2 * i]), min(upper, self.scene.arena[2 * i + 1])
             return lower, upper, float(robot.velocity[i]), float(robot.acceleration[i])
         if name in self.virtual:
-            attachment = self.virtual[name][1]
-            return attachment.lower, attachment.upper, np.inf, np.inf
+            return self.virtual[name].lower, self.virtual[name].upper, np.inf, np.inf
         owner, _, joint = name.partition(".")
         item = self.scene.objects[owner].object
         i = item.coordinates.index(joint)
@@ -147,33 +146,13 @@ class Samples:
         attachment = self.scene.objects[owner].object.attachments[name]
         tools = self.placements(rows, self.scene.robot.tool_frame)
         links = self.placements(rows, f"{owner}.{attachment.link}")
-        positions, own = self.trajectory.at(self.times[rows]), [f"{owner}.{suffix}" for suffix in _freedom(attachment)]
+        positions, own = self.trajectory.at(self.times[rows]), [f"{owner}.{suffix}" for suffix in attachment.coordinates]
         values = np.zeros((len(rows), len(own)))
         for column, coordinate in enumerate(own):
             if coordinate in self.trajectory.names:
                 values[:, column] = positions[:, self.trajectory.names.index(coordinate)]
         errors = np.empty((len(rows), 2))
         for k, (tool, link) in enumerate(zip(tools, links, strict=True)):
-            offset = (link * attachment.placement * _motion(attachment, values[k])).actInv(tool)
+            offset = (link * attachment.placement * attachment.motion(values[k])).actInv(tool)
             errors[k] = np.linalg.norm(offset.translation), np.linalg.norm(pin.log3(offset.rotation))
         return errors
-
-
-def _freedom(attachment: Attachment) -> tuple[str, ...]:
-    """Return the names, in the object, of the coordinates of an attachment's virtual joint."""
-    if attachment.joint == "spherical":
-        return tuple(f"{attachment.name}_{axis}" for axis in "xyz")
-    return () if attachment.joint == "fixed" else (attachment.name,)
-
-
-def _motion(attachment: Attachment, values: NDArray[np.float64]) -> pin.SE3:
-    """Return J(v), the motion of a grasp's virtual joint; a spherical one turns about x, then y, then z."""
-    axis = np.asarray(attachment.axis, float)
-    if attachment.joint == "revolute":
-        return pin.SE3(pin.exp3(axis * values[0]), np.zeros(3))
-    if attachment.joint == "prismatic":
-        return pin.SE3(np.eye(3), axis * values[0])
-    turn = np.eye(3)
-    for unit, value in zip(np.eye(3), values, strict=False):
-        turn = turn @ pin.exp3(unit * value)
-    return pin.SE3(turn, np.zeros(3))

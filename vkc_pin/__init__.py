@@ -11,7 +11,7 @@ from vkc_pin.report import Report, Violation
 from vkc_pin.robot import Robot, load_robot
 from vkc_pin.scene import PlacedObject, Scene, load_scene
 from vkc_pin.solution import Iteration
-from vkc_pin.steps import Actuate, GoTo, Grasp, Reach
+from vkc_pin.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Touch
 from vkc_pin.trajectory import PhaseSpan, Trajectory
 from vkc_pin.validation import validate
 from vkc_pin.version import __version__
@@ -28,12 +28,15 @@ __all__ = [
     "Latch",
     "Options",
     "PhaseSpan",
+    "Place",
     "PlacedObject",
     "Plan",
     "Reach",
+    "Release",
     "Report",
     "Robot",
     "Scene",
+    "Touch",
     "Trajectory",
     "TrajectoryProblem",
     "UnknownNameError",

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 import pinocchio as pin
@@ -23,6 +24,8 @@ class PhaseGeometry:
         joint: Parent joint per geometry, shape (G,).
         center, half: Bounding box per geometry, in the geometry's own frame: centre and half extents, shape (G, 3) [m].
         rotation, translation: Placement of each geometry in its joint's frame, shapes (G, 3, 3) and (G, 3).
+        eased: Pair → (first waypoint, last waypoint, margin) [m]: between these it may come closer than `margins` says.
+        left: Object → its geometries, for what the motion leaves behind at a place that it chooses.
     """
 
     geometry: pin.GeometryModel
@@ -35,6 +38,15 @@ class PhaseGeometry:
     half: NDArray[np.float64]
     rotation: NDArray[np.float64]
     translation: NDArray[np.float64]
+    eased: Mapping[int, Sequence[tuple[int, int, float]]] = field(default_factory=dict)
+    left: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+
+    def margin(self, pair: int, waypoint: int) -> float:
+        """Return the clearance that a pair must keep at a waypoint [m]."""
+        for first, last, margin in self.eased.get(pair, ()):
+            if first <= waypoint <= last:
+                return margin
+        return float(self.margins[pair])
 
     def maybe_within(
         self, reach: float, rotations: NDArray[np.float64], translations: NDArray[np.float64]

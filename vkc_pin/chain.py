@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -17,6 +17,7 @@ from vkc_pin.assembly import clean, graft, graft_geometry
 from vkc_pin.batch import BatchFunction
 from vkc_pin.coordinates import Coordinates
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.hold import Hold, holds_of
 from vkc_pin.robot import Robot
 from vkc_pin.scene import PlacedObject, Scene
 
@@ -28,7 +29,7 @@ VIRTUAL_ACCELERATION = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Closure:
-    """h_chain of eq. 2: where the base link of a held object must stay.
+    """h_chain of eq. 2: where the base link of a held object must stay, or a free one is when it is grasped.
 
     Attributes:
         joint: The joint of the chain that carries the object's base link.
@@ -53,9 +54,10 @@ class VirtualKinematicChain:
         names: Their names, shape (n,); objects' as `<object>.<joint>`, virtual joints' as `<object>.<attachment>`.
         lower, upper, velocity, acceleration: Limits, shape (n,), SI units.
         collision: Collision geometry of the robot (first, in the robot's order) and of what moves of the objects.
-        held_geometries: Object → indices in `collision` of its geometry that its joints on the way to the grasp move.
-        closures: Object → its closure.
-        virtual: Object → names of the coordinates of its attachment's virtual joint.
+        held_geometries: Hold → indices in `collision` of the object's geometry that moves when it is held.
+        closures: Hold → where the object's base link is on the chain, and where it stands in the world.
+        virtual: Hold → names of the coordinates of its attachment's virtual joint.
+        prefixes: Hold → what the object's frames and joints begin with in `model`.
     """
 
     robot: Robot
@@ -67,9 +69,10 @@ class VirtualKinematicChain:
     velocity: NDArray[np.float64]
     acceleration: NDArray[np.float64]
     collision: pin.GeometryModel
-    held_geometries: Mapping[str, tuple[int, ...]]
-    closures: Mapping[str, Closure]
-    virtual: Mapping[str, tuple[str, ...]]
+    held_geometries: Mapping[Hold, tuple[int, ...]]
+    closures: Mapping[Hold, Closure]
+    virtual: Mapping[Hold, tuple[str, ...]]
+    prefixes: Mapping[Hold, str]
 
     @property
     def size(self) -> int:
@@ -101,6 +104,11 @@ class VirtualKinematicChain:
             raise UnknownNameError("coordinate", name, self.names)
         return self.names.index(name)
 
+    def frame(self, name: str, hold: Hold | None = None) -> tuple[int, pin.SE3]:
+        """Return the joint that carries a frame, and the frame's placement there: the robot's, or a link of what is held."""
+        frame = self.model.frames[self.model.getFrameId(name if hold is None else self.prefixes[hold] + name)]
+        return frame.parentJoint, pin.SE3(frame.placement)
+
 
 def _virtual_joints(attachment: Attachment, owner: str) -> list[tuple[str, pin.JointModel, float, float]]:
     """Return the joints of J(v)⁻¹, tool to object: each joint's axis is negated, and their order reversed."""
@@ -112,33 +120,38 @@ def _virtual_joints(attachment: Attachment, owner: str) -> list[tuple[str, pin.J
     return joints[::-1]
 
 
-def consolidate(scene: Scene, grasps: Mapping[str, str]) -> VirtualKinematicChain:
-    """Merge the scene's robot with the objects it grasps into one model (section III of the paper).
+def consolidate(scene: Scene, holds: Iterable[Hold] | Mapping[str, str]) -> VirtualKinematicChain:
+    """Merge the scene's robot with the objects it holds into one model (section III of the paper).
 
     Args:
         scene: Robot, objects and where they stand.
-        grasps: Object → attachment. Several objects become branches of one tree, all at the tool; only those held at
-            a waypoint are closed there.
+        holds: What is held at any time, each after the hold it depends on; or object → attachment, all by the tool.
+            Several become branches of one tree; only what is held at a waypoint, and stands fixed, is closed there.
 
     Returns:
-        The chain. Branches beside the path from grasp to base are fixed at their present state.
+        The chain. Branches of an object beside the path from grasp to base are fixed at their present state.
 
     Raises:
         UnknownNameError: The scene has no such object, or the object no such attachment.
         InputError: A grasp that leaves a freedom is called like a joint of its object.
     """
-    robot = scene.robot
+    robot, holds = scene.robot, holds_of(holds, {}) if isinstance(holds, Mapping) else tuple(holds)
     model, collision = pin.Model(robot.model), pin.GeometryModel()
     graft_geometry(collision, robot.collision.geometryObjects, joints=list(range(model.njoints)), placement=pin.SE3.Identity())
-    tool = model.frames[model.getFrameId(robot.tool_frame)]
     names = list(robot.coordinates.names)
     limits = [list(robot.lower), list(robot.upper), list(robot.velocity), list(robot.acceleration)]
     held_geometries, closures, virtual = {}, {}, {}
-    for name, attachment_name in grasps.items():
+    prefixes: dict[Hold, str] = {}
+    for hold in holds:
+        name = hold.object
         if name not in scene.objects:
             raise UnknownNameError("object", name, scene.objects, field="grasps")
         placed = scene.objects[name]
-        attachment = placed.object.attachment(attachment_name)
+        attachment = placed.object.attachment(hold.attachment)
+        # Pinocchio finds a frame only by a name that no other has: the second branch of an object needs another prefix.
+        prefix = prefixes[hold] = name + "'" * sum(other.object == name for other in prefixes) + "."
+        holder = robot.tool_frame if hold.by is None else f"{prefixes[hold.by]}{hold.link}"
+        tool = model.frames[model.getFrameId(holder)]
         parent, placement = tool.parentJoint, tool.placement * attachment.offset.inverse()
         added = []
         for joint_name, joint, low, high in _virtual_joints(attachment, name):
@@ -148,10 +161,10 @@ def consolidate(scene: Scene, grasps: Mapping[str, str]) -> VirtualKinematicChai
             added.append(joint_name)
             for row, value in zip(limits, (low, high, VIRTUAL_VELOCITY, VIRTUAL_ACCELERATION), strict=True):
                 row.append(value)
-        virtual[name] = tuple(added)
+        virtual[hold] = tuple(added)
         tree = invert(placed.object, attachment.link, placed.state)
         placement = clean(placement * attachment.placement.inverse())
-        joints = graft(model, tree.model, parent=parent, placement=placement, prefix=f"{name}.")
+        joints = graft(model, tree.model, parent=parent, placement=placement, prefix=prefix)
         names += added
         for joint_name in tree.model.names[1:]:
             names.append(f"{name}.{joint_name}")
@@ -159,14 +172,17 @@ def consolidate(scene: Scene, grasps: Mapping[str, str]) -> VirtualKinematicChai
             stated = (placed.object.lower, placed.object.upper, placed.object.velocity, placed.object.acceleration)
             for row, values in zip(limits, stated, strict=True):
                 row.append(float(values[index]))
-        base = model.frames[model.getFrameId(f"{name}.{placed.object.base_link}")]
-        # What the joints in hand do not move (a door's frame, another door in it) stands in the world, closed or not.
-        moving = [shape for shape in tree.collision.geometryObjects if joints[shape.parentJoint] != base.parentJoint]
-        held_geometries[name] = tuple(graft_geometry(collision, moving, joints=joints, placement=placement, prefix=f"{name}."))
-        closures[name] = Closure(base.parentJoint, pin.SE3(base.placement), _base_target(placed))
+        base = model.frames[model.getFrameId(f"{prefix}{placed.object.base_link}")]
+        moving = list(tree.collision.geometryObjects)
+        if not placed.object.free:
+            # What the joints in hand do not move (a door's frame, another door in it) stands in the world, closed or not.
+            moving = [shape for shape in moving if joints[shape.parentJoint] != base.parentJoint]
+        held_geometries[hold] = tuple(graft_geometry(collision, moving, joints=joints, placement=placement, prefix=prefix))
+        closures[hold] = Closure(base.parentJoint, pin.SE3(base.placement), _base_target(placed))
     for joint_name in names:
         if names.count(joint_name) > 1:
-            raise InputError("an attachment and a joint of its object share a name", field=joint_name, expected="different names")
+            problem = "two grasps, or an attachment and a joint of its object, share a name"
+            raise InputError(problem, field=joint_name, expected="different names")
     lower, upper, velocity, acceleration = (np.array(row, float) for row in limits)
     return VirtualKinematicChain(
         robot=robot,
@@ -181,6 +197,7 @@ def consolidate(scene: Scene, grasps: Mapping[str, str]) -> VirtualKinematicChai
         held_geometries=held_geometries,
         closures=closures,
         virtual=virtual,
+        prefixes=prefixes,
     )
 
 

@@ -7,6 +7,8 @@ signed distance's at the linearisation point. It is linear in the placements of 
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,11 +20,13 @@ from numpy.typing import NDArray
 from vkc_pin.assembly import graft_geometry
 from vkc_pin.broadphase import PhaseGeometry
 from vkc_pin.chain import VirtualKinematicChain
+from vkc_pin.easing import eased_pairs
 from vkc_pin.errors import InputError
 from vkc_pin.geometry import bounding_box
-from vkc_pin.goal import Phase, Task
+from vkc_pin.hold import Hold
 from vkc_pin.options import Options
 from vkc_pin.scene import FLOOR, Scene, standing_geometry
+from vkc_pin.task import Task
 
 __all__ = ["ContactModel", "Contacts"]
 
@@ -82,55 +86,63 @@ class ContactModel:
     def __init__(self, scene: Scene, chain: VirtualKinematicChain, task: Task, options: Options) -> None:
         self.scene, self.chain, self.options = scene, chain, options
         self.data = chain.model.createData()
-        self.phases = [self._phase(phase) for phase in task.phases]
+        self.task = task
+        self.first_waypoint = np.concatenate([[0], np.cumsum([phase.segments for phase in task.phases])])
+        self.phases = [self._phase(number) for number in range(len(task.phases))]
         # Beyond the chain's own geometries everything stands in the world.
         own = [shape.parentJoint for shape in chain.collision.geometryObjects]
         self._joints = np.array(own + [0] * (max(len(part.labels) for part in self.phases) - len(own)))
-        self.first_waypoint = np.concatenate([[0], np.cumsum([phase.segments for phase in task.phases])])
 
-    def _phase(self, phase: Phase) -> PhaseGeometry:
+    def _phase(self, number: int) -> PhaseGeometry:
+        phase, before = self.task.phases[number], self.task.phases[number - 1] if number else None
         scene, chain, robot, margin = self.scene, self.chain, self.scene.robot, self.options.dist_safe
         geometry = chain.collision.copy()
         geometry.removeAllCollisionPairs()
         robots = range(len(robot.collision.geometryObjects))
         labels = [robot.link_of(i) for i in robots]
-        for name, indices in chain.held_geometries.items():
-            labels += [f"{name}.{_link(geometry.geometryObjects[i])}" for i in indices]
+        for hold, indices in chain.held_geometries.items():
+            labels += [f"{hold.object}.{_link(geometry.geometryObjects[i])}" for i in indices]
         pairs = [(pair.first, pair.second, margin) for pair in robot.collision.collisionPairs]
-        touching = {i for i in robots if labels[i] in robot.touch_links}
         moving = list(robots)
-        for name, attachment in phase.held.items():
-            grasped = f"{name}.{scene.objects[name].object.attachments[attachment].link}"
-            held = chain.held_geometries[name]
-            # The hand and what it grasps move rigidly together: nothing to plan there.
-            pairs += [(i, j, margin) for i in robots for j in held if not (i in touching and labels[j] == grasped)]
+        for hold in phase.held:
+            grasped, touching = self._grasped(hold), self._touching(hold)
+            held = chain.held_geometries[hold]
+            # The hand and what it grasps move together: nothing to plan there.
+            pairs += [(i, j, margin) for i in moving for j in held if not (labels[i] in touching and labels[j] == grasped)]
             moving += held
+        mine = {hold.object: chain.held_geometries[hold] for hold in phase.held}
+        left: dict[str, list[int]] = {}
         for name, placed in scene.objects.items():
-            before = {c.removeprefix(f"{name}."): v for c, v in phase.before.items() if c.startswith(f"{name}.")}
-            standing = standing_geometry(placed.with_state(before))
-            if name in phase.held:  # its frame stands on, the rest is in the hand
-                held_shapes = {geometry.geometryObjects[i].name for i in chain.held_geometries[name]}
-                standing = [shape for shape in standing if f"{name}.{shape.name}" not in held_shapes]
-            own = chain.held_geometries[name] if name in phase.held else ()
-            hands = {**phase.leaves, **phase.grasps}
-            targets = {placed.object.attachments[hands[name]].link} if name in hands else set()
+            state = {c.removeprefix(f"{name}."): v for c, v in phase.before.items() if c.startswith(f"{name}.")}
+            if placed.object.free:
+                if name in mine:
+                    continue
+                placed = dataclasses.replace(placed, placement=phase.standing.get(name, placed.placement))
+            standing = standing_geometry(placed.with_state(state))
+            if name in mine:  # its frame stands on, the rest is in the hand
+                held_shapes = {geometry.geometryObjects[i].name.rpartition(".")[2] for i in mine[name]}
+                standing = [shape for shape in standing if shape.name not in held_shapes]
+            near = {self._grasped(h): self._touching(h) for h in (*phase.leaves, *phase.grasps) if h.object == name}
             for j in graft_geometry(geometry, standing, joints=[0], placement=pin.SE3.Identity(), prefix=f"{name}."):
-                link = _link(geometry.geometryObjects[j])
-                labels.append(f"{name}.{link}")
-                near = touching if link in targets else set()
-                pairs += [(i, j, self.options.grasp_clearance if i in near else margin) for i in moving if i not in own]
+                labels.append(f"{name}.{_link(geometry.geometryObjects[j])}")
+                close = near.get(labels[j], ())
+                own = mine.get(name, ())
+                pairs += [(i, j, self.options.grasp_clearance if labels[i] in close else margin) for i in moving if i not in own]
+                if name in phase.left:
+                    left.setdefault(name, []).append(j)
+        carried = {i for hold in phase.held if scene.objects[hold.object].object.free for i in mine[hold.object]}
         for obstacle, label in zip(scene.obstacles.geometryObjects, scene.obstacle_labels, strict=True):
             (j,) = graft_geometry(geometry, [obstacle], joints=[0], placement=pin.SE3.Identity())
             labels.append(label)
             # Wheels stand on the floor, and doors hang above it as their makers hung them.
-            moves = [i for i in moving if label != FLOOR or (i in robots and geometry.geometryObjects[i].parentJoint > 1)]
-            pairs += [(i, j, margin) for i in moves]
+            arm = [i for i in robots if geometry.geometryObjects[i].parentJoint > 1]
+            pairs += [(i, j, margin) for i in (moving if label != FLOOR else [*arm, *sorted(carried)])]
         if not pairs:
             raise InputError(
                 "no pair of geometries can collide", field=phase.name, expected="collision geometry in robot or scene"
             )
-        for first, second, _ in pairs:
-            geometry.addCollisionPair(pin.CollisionPair(first, second))
+        for one, other, _ in pairs:
+            geometry.addCollisionPair(pin.CollisionPair(one, other))
         if len(geometry.collisionPairs) != len(pairs):
             raise InputError("collision pairs were lost", field=phase.name, expected=len(pairs), got=len(geometry.collisionPairs))
         shapes = geometry.geometryObjects
@@ -146,7 +158,29 @@ class ContactModel:
             half=np.array([half for _, half in boxes]),
             rotation=np.array([shape.placement.rotation for shape in shapes]),
             translation=np.array([shape.placement.translation for shape in shapes]),
+            eased=eased_pairs(scene, chain, phase, geometry, labels, pairs, int(self.first_waypoint[number]), before),
+            left={name: tuple(indices) for name, indices in left.items()},
         )
+
+    def _grasped(self, hold: Hold) -> str:
+        """Return the label of the link that a hold takes hold of."""
+        return f"{hold.object}.{self.scene.objects[hold.object].object.attachments[hold.attachment].link}"
+
+    def _touching(self, hold: Hold) -> Collection[str]:
+        """Return the labels of the links that take hold."""
+        return self.scene.robot.touch_links if hold.frame is None else (hold.frame,)
+
+    def settle(self, z: NDArray[np.float64]) -> None:
+        """Let what the motion z_1..z_N, shape (N, n), leaves behind at places that it chooses itself stand there."""
+        for number, phase in enumerate(self.task.phases):
+            for name, (hold, before) in phase.left.items():
+                part, closure = self.phases[number], self.chain.closures[hold]
+                rotations, translations = self.chain.joint_placements(z[[self.first_waypoint[before + 1] - 1]])
+                carrier = pin.SE3(rotations[0, closure.joint], translations[0, closure.joint])
+                placed = dataclasses.replace(self.scene.objects[name], placement=carrier * closure.local)
+                for index, shape in zip(part.left[name], standing_geometry(placed), strict=True):
+                    part.geometry.geometryObjects[index].placement = shape.placement
+                    part.rotation[index], part.translation[index] = shape.placement.rotation, shape.placement.translation
 
     def phase_of(self, waypoint: int) -> int:
         """Return the phase whose geometry holds at `waypoint`: at a boundary the earlier, before the grasp."""
@@ -178,13 +212,13 @@ class ContactModel:
                 for k in pairs[begin:end].tolist():
                     distance = pin.computeDistance(part.geometry, part.data, k).min_distance
                     if distance < reach:
-                        found.append((distance - part.margins[k], distance, k))
+                        found.append((distance - part.margin(k, int(waypoints[row])), distance, k))
                 found.sort()
-                for _, distance, k in found[:nearest]:
+                for excess, distance, k in found[:nearest]:
                     result = part.data.distanceResults[k]
                     # `normal` is a view of memory that the next distance of this pair overwrites.
                     vectors.append((result.normal.copy(), result.getNearestPoint1(), result.getNearestPoint2()))
-                    rows.append((float(row), *part.pairs[k].tolist(), distance, part.margins[k]))
+                    rows.append((float(row), *part.pairs[k].tolist(), distance, distance - excess))
         table = np.array(rows, float).reshape(len(rows), 5)
         order = np.argsort(table[:, 0], kind="stable")
         table, stacked = table[order], np.array(vectors, float).reshape(len(rows), 3, 3)[order]

@@ -23,14 +23,16 @@ class Coordinates:
     """The minimal coordinates of `model`.
 
     Attributes:
-        names: One name per coordinate: the joint's, and for a planar joint `<joint>_x`, `<joint>_y`, `<joint>_yaw`.
+        names: One name per coordinate: the joint's, and for a planar joint `<joint>_x`, `<joint>_y`, `<joint>_yaw`; a free
+            joint has seven, `<joint>_x`, `_y`, `_z` [m] and a quaternion `_qx`, `_qy`, `_qz`, `_qw` of any length but zero,
+            so that it interpolates anywhere.
         joints: For each coordinate, the index of the joint it belongs to.
-        size: Their number n (equal to `model.nv`).
+        size: Their number n (equal to `model.nv`, without free joints).
         lower, upper: Position limits, shape (n,), [m] or [rad]; infinite for continuous joints and the planar yaw.
         velocity: Velocity limits, shape (n,), [m/s] or [rad/s].
 
     Raises:
-        InputError: The model has a joint that has no such coordinates (spherical, free-flyer, composite).
+        InputError: The model has a joint that has no such coordinates (spherical, composite).
     """
 
     def __init__(self, model: pin.Model) -> None:
@@ -38,6 +40,7 @@ class Coordinates:
         joints: list[int] = []
         plain: list[tuple[int, int]] = []  # q[i] = z[j]
         angles: list[tuple[int, int]] = []  # q[i] = cos z[j], q[i + 1] = sin z[j]
+        quaternions: list[tuple[int, int]] = []  # q[i:i + 4] = z[j:j + 4], made a unit
         lower, upper = [], []
         for index in range(1, model.njoints):
             joint, name, i = model.joints[index], model.names[index], model.joints[index].idx_q
@@ -48,6 +51,12 @@ class Coordinates:
                 names += [f"{name}_x", f"{name}_y", f"{name}_yaw"]
                 lower += [*model.lowerPositionLimit[i : i + 2], -np.inf]
                 upper += [*model.upperPositionLimit[i : i + 2], np.inf]
+            elif kind == "JointModelFreeFlyer":
+                plain += [(i + k, len(names) + k) for k in range(3)]
+                quaternions.append((i + 3, len(names) + 3))
+                names += [f"{name}_{part}" for part in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+                lower += [-np.inf] * 7
+                upper += [np.inf] * 7
             elif kind in _UNBOUNDED:
                 angles.append((i, len(names)))
                 names.append(name)
@@ -75,6 +84,7 @@ class Coordinates:
         self.nq = int(model.nq)
         self._plain_q = np.array([i for i, _ in plain], int)
         self._plain_z = np.array([j for _, j in plain], int)
+        self._quaternions = quaternions
         self._angle_q = np.array([i for i, _ in angles], int)
         self._angle_z = np.array([j for _, j in angles], int)
 
@@ -87,6 +97,8 @@ class Coordinates:
         q[..., self._plain_q] = z[..., self._plain_z]
         q[..., self._angle_q] = np.cos(z[..., self._angle_z])
         q[..., self._angle_q + 1] = np.sin(z[..., self._angle_z])
+        for i, j in self._quaternions:
+            q[..., i : i + 4] = z[..., j : j + 4] / np.linalg.norm(z[..., j : j + 4], axis=-1, keepdims=True)
         return q
 
     def z(self, q: ArrayLike) -> NDArray[np.float64]:
@@ -97,10 +109,12 @@ class Coordinates:
         z = np.empty((*q.shape[:-1], self.size))
         z[..., self._plain_z] = q[..., self._plain_q]
         z[..., self._angle_z] = np.arctan2(q[..., self._angle_q + 1], q[..., self._angle_q])
+        for i, j in self._quaternions:
+            z[..., j : j + 4] = q[..., i : i + 4]
         return z
 
     def q_symbolic(self, z: Any) -> Any:
-        """Return Pinocchio's configuration of the CasADi column `z` (SX or MX), shape (nq, 1)."""
+        """Return Pinocchio's configuration of the CasADi column `z` (SX or MX), shape (nq, 1); free joints have none."""
         import casadi
 
         entries: list[Any] = [None] * self.nq

@@ -22,6 +22,7 @@ __all__ = [
     "clearance",
     "copy_shape",
     "placed_shapes",
+    "shape_distance",
     "standing_geometry",
     "within_limits",
 ]
@@ -135,6 +136,14 @@ def clearance(
             distance = coal.distance(shape, transform, other, other_transform, request, coal.DistanceResult())
             nearest = min(nearest, distance)
     return float(nearest)
+
+
+def shape_distance(
+    first: coal.CollisionGeometry, first_placement: pin.SE3, second: coal.CollisionGeometry, second_placement: pin.SE3
+) -> float:
+    """Return the signed distance [m] between two shapes at placements in one frame."""
+    a, b = (coal.Transform3s(where.rotation, where.translation) for where in (first_placement, second_placement))
+    return float(coal.distance(first, a, second, b, coal.DistanceRequest(), coal.DistanceResult()))
 
 
 def bounding_box(shape: pin.GeometryObject) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

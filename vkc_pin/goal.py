@@ -1,81 +1,25 @@
-"""Turns steps into phases: what is held when, which joints move, and what must hold at the end (f_task of eq. 3)."""
+"""Turns steps into phases."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pinocchio as pin
 
 from vkc_pin.articulation import Attachment
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.hold import Hold, holds_of
 from vkc_pin.options import Options
 from vkc_pin.scene import PlacedObject, Scene
-from vkc_pin.steps import Actuate, GoTo, Grasp, Reach, Step
+from vkc_pin.steps import STEPS, Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
+from vkc_pin.task import FrameGoal, Phase, Task
 
-__all__ = ["FrameGoal", "Phase", "Task", "compile_task"]
+__all__ = ["compile_task", "path_joints"]
 
 LATCH_MARGIN = 0.02  # [rad] or [m] past the threshold at which a latch lets go
-
-
-@dataclass(frozen=True)
-class FrameGoal:
-    """A frame of the robot at a placement in the world."""
-
-    frame: str
-    placement: pin.SE3
-
-
-@dataclass(frozen=True)
-class Phase:
-    """A stretch of the motion in which the same things are held.
-
-    Attributes:
-        name: What happens in it.
-        segments: Steps of time; the phase has `segments + 1` waypoints, the first shared with the phase before.
-        held: Object → attachment.
-        ranges: Object coordinate → (lower, upper) for every waypoint after the first; all others stand still.
-        values: Object coordinate → value at the last waypoint.
-        frames: Frame goals at the last waypoint.
-        base: (x, y, yaw or None) at the last waypoint, in the world.
-        grasps: Objects (→ attachment) that are grasped at the last waypoint.
-        leaves: Objects (→ attachment) that were let go of just before.
-        before: Object coordinate → value at the first waypoint, for the joints that this task's grasps can move.
-    """
-
-    name: str
-    segments: int
-    held: Mapping[str, str] = field(default_factory=dict)
-    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    values: Mapping[str, float] = field(default_factory=dict)
-    frames: tuple[FrameGoal, ...] = ()
-    base: tuple[float, float, float | None] | None = None
-    grasps: Mapping[str, str] = field(default_factory=dict)
-    leaves: Mapping[str, str] = field(default_factory=dict)
-    before: Mapping[str, float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Task:
-    """What the steps ask for, in phases.
-
-    Attributes:
-        steps: The user's steps.
-        phases: In order; at least one.
-        grasps: Object → attachment, for every object that is held at any time.
-        state: Object coordinate (`<object>.<joint>`) → value at the start, for the joints that `grasps` can move.
-    """
-
-    steps: tuple[Step, ...]
-    phases: tuple[Phase, ...]
-    grasps: Mapping[str, str]
-    state: Mapping[str, float]
-
-    @property
-    def segments(self) -> int:
-        """Steps of time of the whole task; it has one waypoint more."""
-        return sum(phase.segments for phase in self.phases)
 
 
 def _placed(scene: Scene, name: str, field_name: str) -> PlacedObject:
@@ -110,18 +54,14 @@ class _Compiler:
     def __init__(self, scene: Scene, options: Options) -> None:
         self.scene, self.options = scene, options
         self.phases: list[Phase] = []
-        self.held: dict[str, str] = dict(scene.held)
-        self.grasps: dict[str, str] = dict(scene.held)
+        self.held: tuple[Hold, ...] = holds_of(scene.held, scene.held_by)
+        self.holds: list[Hold] = list(self.held)
         self.initial: dict[str, float] = {}
         self.state: dict[str, float] = {}
-        for name, attachment in self.grasps.items():
-            if scene.objects[name].object.free:
-                raise InputError(
-                    f"'{name}' is held and would have to be carried, which is not possible yet",
-                    field=f"scene.held.{name}",
-                    expected="objects that stand fixed in the world",
-                )
-            self._enter(scene.objects[name], attachment)
+        self.standing = {n: p.placement for n, p in scene.objects.items() if p.object.free and n not in scene.held}
+        self.left: dict[str, tuple[Hold, int]] = {}
+        for hold in self.held:
+            self._enter(scene.objects[hold.object], hold.attachment)
 
     def _enter(self, placed: PlacedObject, attachment: str) -> None:
         """Make the joints that a grasp can move coordinates of the task, with the values they have at its start."""
@@ -131,34 +71,85 @@ class _Compiler:
             self.state.setdefault(f"{placed.name}.{joint}", value)
 
     def _append(self, name: str, segments: int, **details: Any) -> None:
-        before = {**self.phases[-1].held, **self.phases[-1].grasps} if self.phases else self.scene.held
-        leaves = {key: value for key, value in before.items() if key not in self.held}
-        self.phases.append(Phase(name, segments, held=dict(self.held), leaves=leaves, before=dict(self.state), **details))
-        for coordinate, value in details.get("values", {}).items():  # a goal beyond a limit is approached as far as it goes
+        last = self.phases[-1] if self.phases else None
+        before = (*last.held, *last.grasps) if last else holds_of(self.scene.held, self.scene.held_by)
+        leaves = tuple(hold for hold in before if hold not in self.held)
+        lifted = {hold: last.standing[hold.object] for hold in last.grasps if hold.object in last.standing} if last else {}
+        phase = Phase(
+            name,
+            segments,
+            held=self.held,
+            leaves=leaves,
+            before=dict(self.state),
+            standing=dict(self.standing),
+            left=dict(self.left),
+            lifted={hold: where for hold, where in lifted.items() if hold in self.held},
+            **details,
+        )
+        self.phases.append(phase)
+        for coordinate, value in phase.values.items():  # a goal beyond a limit is approached as far as it goes
             lower, upper = self._limits(self.scene.objects[coordinate.split(".", 1)[0]], coordinate)
             self.state[coordinate] = min(max(value, lower), upper)
 
-    def grasp(self, name: str, attachment_name: str | None, where: str) -> str:
-        """Add the phase that takes hold of an object, unless it is held; return the attachment."""
+    def _hold_of(self, name: str) -> Hold | None:
+        return next((hold for hold in self.held if hold.object == name), None)
+
+    def _let_go_of_fixed(self) -> None:
+        """Let go of what stands fixed in the world, which cannot come along."""
+        self.held = tuple(hold for hold in self.held if self.scene.objects[hold.object].object.free)
+
+    def grasp(self, name: str, attachment_name: str | None, where: str, by: str | None = None) -> Hold:
+        """Add the phase that takes hold of an object, unless it is held; return the hold."""
         placed = _placed(self.scene, name, f"{where}.object")
-        attachment = _attachment(placed, attachment_name or self.grasps.get(name), f"{where}.attachment")
-        if self.held.get(name) == attachment.name:
-            return attachment.name
-        if placed.object.free:
-            raise InputError(f"'{name}' stands free; only what is fixed in the world can be grasped", field=f"{where}.object")
-        if self.grasps.get(name, attachment.name) != attachment.name:
+        earlier = next((hold.attachment for hold in self.holds if hold.object == name and hold.frame == by), None)
+        attachment = _attachment(placed, attachment_name or earlier, f"{where}.attachment")
+        through = self._through(by, name, f"{where}.by") if by is not None else None
+        hold = Hold(name, attachment.name, *(through or (None, None)))
+        if hold in self.held:
+            return hold
+        if (held := self._hold_of(name)) is not None and placed.object.free:
+            raise InputError(f"'{name}' is held already, as {held}", field=where, expected="Release or Place before")
+        if through is None:
+            self._let_go_of_fixed()
+            if self.held:
+                kind = "the robot has one hand, and it holds"
+                raise InputError(f"{kind} {self.held[0]}", field=f"{where}.object", expected="Place or Release before", got=name)
+        if not placed.object.free:
+            other = next((h for h in self.holds if h.object == name and h != hold), None)
+            if other is not None:
+                raise InputError(
+                    f"object '{name}' is grasped by two different attachments in one plan",
+                    field=f"{where}.attachment",
+                    expected=str(other).partition(".")[2],
+                    got=str(hold).partition(".")[2],
+                )
+        elif name in self.left:
             raise InputError(
-                f"object '{name}' is grasped by two different attachments in one plan",
-                field=f"{where}.attachment",
-                expected=self.grasps[name],
-                got=attachment.name,
+                f"where '{name}' stands by then is known only after planning",
+                field=f"{where}.object",
+                expected="Place with a full pose before, or a second plan from where the first ends",
             )
-        self.grasps[name] = attachment.name
+        if hold not in self.holds:
+            self.holds.append(hold)
         self._enter(placed, attachment.name)
-        self.held = {}  # one hand: whatever it held before is let go
-        self._append(f"reach {name}.{attachment.name}", self.options.reach_waypoints, grasps={name: attachment.name})
-        self.held = {name: attachment.name}
-        return attachment.name
+        self._append(f"reach {hold}", self.options.reach_waypoints, grasps=(hold,))
+        self.held = (*self.held, hold)
+        self.standing.pop(name, None)
+        return hold
+
+    def _through(self, frame: str, name: str, where: str) -> tuple[Hold, str]:
+        """Return the hold and link of `frame`, "<object>.<link>", that object `name` is to be held through."""
+        owner, dot, link = str(frame).partition(".")
+        if not dot:
+            raise InputError("not a link of an object", field=where, expected="<object>.<link>, e.g. stick.tip", got=repr(frame))
+        placed = _placed(self.scene, owner, where)
+        hold = self._hold_of(owner)
+        if hold is None or not placed.object.free:
+            held = ", ".join(str(h) for h in self.held if self.scene.objects[h.object].object.free) or "nothing"
+            problem = f"'{name}' cannot be grasped through '{owner}', which the robot does not carry"
+            raise InputError(problem, field=where, expected=f"a link of what it carries ({held})", got=repr(frame))
+        _check_link(placed, link, where)
+        return hold, link
 
     def actuate(self, step: Actuate, where: str) -> None:
         placed = _placed(self.scene, step.object, f"{where}.object")
@@ -166,7 +157,13 @@ class _Compiler:
         for joint in step.joints:
             if joint not in names:
                 raise UnknownNameError(f"joint of '{step.object}'", joint, names, field=f"{where}.joints")
-        attachment = placed.object.attachments[self.grasp(step.object, step.attachment, where)]
+        if placed.object.free:
+            raise InputError(
+                f"'{step.object}' stands free: its joints are not driven by a hand",
+                field=f"{where}.object",
+                expected="a fixed object",
+            )
+        attachment = placed.object.attachments[self.grasp(step.object, step.attachment, where).attachment]
         path = path_joints(placed, attachment)
         for joint in step.joints:
             if joint not in path:
@@ -212,32 +209,111 @@ class _Compiler:
         index = placed.object.coordinates.names.index(coordinate.split(".", 1)[1])
         return float(placed.object.lower[index]), float(placed.object.upper[index])
 
+    def touch(self, step: Touch, where: str) -> None:
+        """Add the phase that brings a frame to its target, carrying on what is carried."""
+        owner, dot, link = str(step.frame).partition(".")
+        hold = None
+        if dot and owner in self.scene.objects:
+            placed = self.scene.objects[owner]
+            if not placed.object.free:
+                problem = f"'{owner}' stands fixed in the world and cannot be carried anywhere"
+                raise InputError(problem, field=f"{where}.frame", expected="a link of a free object, or a frame of the robot")
+            _check_link(placed, link, f"{where}.frame")
+            hold = self._hold_of(owner) or self.grasp(owner, None, where)
+        else:
+            link = self._robot_frame(step.frame, f"{where}.frame")
+        self._let_go_of_fixed()
+        point = not isinstance(step.target, pin.SE3)
+        target = pin.SE3(np.eye(3), np.array(step.target)) if point else step.target
+        goal = FrameGoal(link, target, "point" if point else "pose", hold, touches=True)
+        self._append(f"touch with {step.frame}", self.options.reach_waypoints, frames=(goal,))
+
+    def place(self, step: Place, where: str) -> None:
+        """Add the phases that bring an object to its place and leave it there."""
+        placed = _placed(self.scene, step.object, f"{where}.object")
+        if not placed.object.free:
+            raise InputError(f"'{step.object}' stands fixed in the world", field=f"{where}.object", expected="a free object")
+        hold = self._hold_of(step.object) or self.grasp(step.object, step.attachment, where)
+        if step.attachment is not None and hold.attachment != step.attachment:
+            raise InputError("it is held elsewhere", field=f"{where}.attachment", expected=hold.attachment, got=step.attachment)
+        upright = not isinstance(step.pose, pin.SE3)
+        pose = pin.SE3(placed.placement.rotation, np.array(step.pose)) if upright else step.pose
+        goal = FrameGoal(placed.object.base_link, pose, "upright" if upright else "pose", hold)
+        self._append(f"place {step.object}", self.options.reach_waypoints, frames=(goal,), lowered={hold: pose})
+        self._release(hold, pose)
+        if upright:
+            self.left[step.object] = (hold, len(self.phases) - 1)
+
+    def release(self, step: Release, where: str) -> None:
+        """Let go of one thing, or of everything."""
+        if not self.held:
+            raise InputError("the hand is empty", field=where, expected="something held", got=repr(step))
+        if step.object is not None and self._hold_of(step.object) is None:
+            held = [hold.object for hold in self.held]
+            raise UnknownNameError("held object", step.object, held, field=f"{where}.object")
+        if not self.phases:
+            self._append("stand still", self.options.turn_waypoints)
+        for hold in reversed(self.held):
+            if hold in self.held and step.object in (None, hold.object):
+                placed = self.scene.objects[hold.object]
+                self._release(hold, placed.placement)
+                if placed.object.free:
+                    self.left[hold.object] = (hold, len(self.phases) - 1)
+
+    def _release(self, hold: Hold, where: pin.SE3) -> None:
+        """Take a hold, and what is held through it, out of the hand."""
+        for other in [h for h in self.held if h.by == hold]:
+            self._release(other, self.scene.objects[other.object].placement)
+            self.left[other.object] = (other, len(self.phases) - 1)
+        self.held = tuple(h for h in self.held if h != hold)
+        if self.scene.objects[hold.object].object.free:
+            self.standing[hold.object] = where
+            self.left.pop(hold.object, None)
+
+    def _robot_frame(self, name: str | None, where: str) -> str:
+        frame = name or self.scene.robot.tool_frame
+        frames = [f.name for f in self.scene.robot.model.frames]
+        if frame not in frames:
+            raise UnknownNameError("frame of the robot", frame, frames, field=where)
+        return frame
+
     def add(self, step: Step, where: str) -> None:
         if isinstance(step, Grasp):
-            self.grasp(step.object, step.attachment, where)
+            self.grasp(step.object, step.attachment, where, step.by)
         elif isinstance(step, Actuate):
             self.actuate(step, where)
+        elif isinstance(step, Touch):
+            self.touch(step, where)
+        elif isinstance(step, Place):
+            self.place(step, where)
+        elif isinstance(step, Release):
+            self.release(step, where)
         elif isinstance(step, Reach):
-            frame = step.frame or self.scene.robot.tool_frame
-            frames = [f.name for f in self.scene.robot.model.frames]
-            if frame not in frames:
-                raise UnknownNameError("frame of the robot", frame, frames, field=f"{where}.frame")
-            self.held = {}  # an articulated object cannot come along
+            frame = self._robot_frame(step.frame, f"{where}.frame")
+            self._let_go_of_fixed()
             self._append(f"reach with {frame}", self.options.reach_waypoints, frames=(FrameGoal(frame, step.pose),))
         elif isinstance(step, GoTo):
-            self.held = {}
+            self._let_go_of_fixed()
             self._append("go to", self.options.reach_waypoints, base=(step.x, step.y, step.yaw))
         else:
-            raise InputError("not a step", field=where, expected="Reach, Grasp, Actuate or GoTo", got=repr(step))
+            expected = ", ".join(kind.__name__ for kind in STEPS)
+            raise InputError("not a step", field=where, expected=expected, got=repr(step))
+
+
+def _check_link(placed: PlacedObject, link: str, where: str) -> None:
+    links = [frame.name for frame in placed.object.model.frames if frame.type == pin.FrameType.BODY]
+    if link not in links:
+        raise UnknownNameError(f"link of '{placed.name}'", link, links, field=where)
 
 
 def compile_task(scene: Scene, steps: Sequence[Step], options: Options) -> Task:
     """Return the phases that bring about `steps`, beginning at the scene's start.
 
     Raises:
-        InputError: No steps, an unknown object, joint, attachment or frame, or a joint that cannot be moved that way.
+        InputError: No steps, an unknown object, joint, attachment or frame, a joint that cannot be moved that way, or a
+            hand that is asked to hold a second thing.
     """
-    if isinstance(steps, Reach | Grasp | Actuate | GoTo):
+    if isinstance(steps, STEPS):
         raise InputError("one step alone", field="steps", expected="a list of steps", got=repr(steps))
     try:
         steps = tuple(steps)
@@ -253,4 +329,4 @@ def compile_task(scene: Scene, steps: Sequence[Step], options: Options) -> Task:
         raise InputError("there is nothing to do", field="steps", expected=expected, got=got)
     # Objects that are grasped later stand as they are at the start until then.
     phases = tuple(replace(phase, before={**compiler.initial, **phase.before}) for phase in compiler.phases)
-    return Task(tuple(steps), phases, compiler.grasps, compiler.initial)
+    return Task(steps, phases, tuple(compiler.holds), compiler.initial, compiler.held)

@@ -23,6 +23,7 @@ _COLLISION, _DEPTH = 10.0, 300.0  # what a collision costs, and a metre of its d
 _TOLERABLE = 60.0  # what the solver may be left to push apart: a graze or two
 _DIFFERENT = 0.1  # [m] and [rad] by which the base must differ somewhere between two seeds
 _NOT_FOUND = 1e3
+_CHOICE = 0.1  # what it costs to grasp elsewhere, beside radians of motion
 _ROUGH = 1e-4  # [m] and [rad], of knots; what is joined from them is exact
 
 
@@ -92,6 +93,7 @@ class _Interpolation:
         self.robot = self.chain.robot.coordinates.size
         self.weights = np.ones(self.chain.size)
         self.weights[:3] = 3.0
+        self.weights[[column for column, _, _ in problem.transcription.structure.clamped]] = _CHOICE
         self.beam = _BEAM
         self.driven = np.array([self.chain.index(name) for name in problem.task.state], int)
         self.objects = _objects(problem, np.tile(problem.start, (problem.segments, 1)))
@@ -118,19 +120,21 @@ class _Interpolation:
             Paths, shape (B, knots, n), what each costs and how much of that is for collisions, shape (B,), and the knots.
         """
         self.beam = _BEAM if thorough else _QUICK_BEAM
-        paths = self.problem.start[None, None, :]
+        problem = self.problem
+        paths = problem.start[None, None, :]
         cost, trouble = np.zeros(1), np.zeros(1)
         at, begin = [0], 0
-        for phase, end in zip(self.problem.task.phases, self.problem.ends, strict=True):
-            pieces = max(1, round((end - begin) / _SPACING)) if phase.held else 1
+        for phase, end in zip(problem.task.phases, problem.ends, strict=True):
+            closed = problem.closed(phase)
+            pieces = max(1, round((end - begin) / _SPACING)) if closed else 1
             for knot in np.linspace(begin, end, pieces + 1).round().astype(int)[1:].tolist():
-                parents, z, bad = self._continue(paths, cost, knot, fresh=not phase.held, thorough=thorough)
+                parents, z, bad = self._continue(paths, cost, knot, fresh=not closed, thorough=thorough)
                 total = cost[parents] + np.abs(z - paths[parents, -1]) @ self.weights + bad
                 best = np.argsort(total, kind="stable")[: self.beam]
                 paths = np.concatenate([paths[parents[best]], z[best, None]], axis=1)
                 cost, trouble = total[best], (trouble[parents] + bad)[best]
                 at.append(knot)
-            if not phase.held:
+            if not closed:
                 cost = cost + self._approach(paths[:, -2], paths[:, -1], begin, end)
             begin = end
         return paths, cost, trouble, at
@@ -197,17 +201,31 @@ class _Interpolation:
         problem, row = self.problem, waypoint - 1
         z = before.copy()
         z[:, self.driven] = self.objects[row, self.driven]
-        lower, upper = problem.lower[row].copy(), problem.upper[row].copy()
-        lower[self.driven] = upper[self.driven] = self.objects[row, self.driven]
+        lower, upper = np.tile(problem.lower[row], (len(z), 1)), np.tile(problem.upper[row], (len(z), 1))
+        lower[:, self.driven] = upper[:, self.driven] = self.objects[row, self.driven]
+        for column, first, last in problem.transcription.structure.clamped:
+            if first < waypoint <= last:
+                lower[:, column] = upper[:, column] = before[:, column]
         pose = self.pose_at(waypoint)
         if pose is None:
             return np.clip(z, lower, upper), np.ones(len(z), bool)
         solver, target = self._solver(pose)
-        z = self._scatter(z, pose) if how == "scatter" else self._shake(z, pose) if how == "shake" else z
+        if how == "scatter":
+            self._choose(z, waypoint)
+            z = self._scatter(z, pose)
+        elif how == "shake":
+            z = self._shake(z, pose)
         z, found = solver.solve(z, target, lower=lower, upper=upper, weights=self.weights, tolerance=_ROUGH)
         if how == "scatter":
             z = self._unwind(z, before, lower, upper)
         return z, found
+
+    def _choose(self, z: NDArray[np.float64], waypoint: int) -> None:
+        """Grasp anywhere: draw the freedoms of what is grasped at a waypoint, in place."""
+        problem = self.problem
+        for hold in problem.task.phases[int(np.searchsorted(problem.ends, waypoint))].grasps:
+            for column in map(self.chain.index, self.chain.virtual[hold]):
+                z[:, column] = self.rng.uniform(self.chain.lower[column], self.chain.upper[column], len(z))
 
     def _scatter(self, z: NDArray[np.float64], pose: int) -> NDArray[np.float64]:
         """Return arms near home, nearer and further, with the base under them as `pose` needs it."""
@@ -233,7 +251,10 @@ class _Interpolation:
         rotation = rotations[:, row.joint] @ row.local.rotation
         translation = rotations[:, row.joint] @ row.local.translation + translations[:, row.joint]
         error = np.einsum("ij,bkj->bik", target.rotation, rotation)
-        turn = np.arctan2(error[:, 1, 0] - error[:, 0, 1], error[:, 0, 0] + error[:, 1, 1])
+        if row.kind == "pose":
+            turn = np.arctan2(error[:, 1, 0] - error[:, 0, 1], error[:, 0, 0] + error[:, 1, 1])
+        else:  # any heading will do
+            turn = self.rng.uniform(-np.pi, np.pi, len(z))
         cos, sin = np.cos(turn), np.sin(turn)
         planar = np.stack([np.stack([cos, -sin], axis=1), np.stack([sin, cos], axis=1)], axis=1)
         z = z.copy()
@@ -250,7 +271,7 @@ class _Interpolation:
             if self.problem.unit(self.chain.names[column]) == "m":
                 continue
             nearest = before[:, column] + (z[:, column] - before[:, column] + np.pi) % (2 * np.pi) - np.pi
-            inside = (nearest >= lower[column]) & (nearest <= upper[column])
+            inside = (nearest >= lower[:, column]) & (nearest <= upper[:, column])
             z[:, column] = np.where(inside, nearest, z[:, column])
         return z
 
@@ -268,7 +289,7 @@ class _Interpolation:
         for phase, end in zip(problem.task.phases, problem.ends, strict=True):
             inside = [k for k, waypoint in enumerate(at) if begin <= waypoint <= end]
             s = np.concatenate([[0.0], smooth(end - begin)])
-            xp = s[[at[k] - begin for k in inside]] if phase.held else np.array([0.0, 1.0])
+            xp = s[[at[k] - begin for k in inside]] if problem.closed(phase) else np.array([0.0, 1.0])
             for column in range(self.chain.size):
                 z[begin:end, column] = np.interp(s[1:], xp, knots[inside, column])
             begin = end

@@ -20,22 +20,24 @@ class PoseSolver:
 
     Attributes:
         size: Number of coordinates n.
+        rows: Number of residuals m: 6 of a pose, 5 of an upright place, 3 of a point; see `pose`.
     """
 
-    def __init__(self, model: pin.Model, joint: int, local: pin.SE3) -> None:
+    def __init__(self, model: pin.Model, joint: int, local: pin.SE3, kind: str = "pose") -> None:
         coordinates = Coordinates(model)
         self.size = coordinates.size
         z, target = ca.SX.sym("z", self.size), ca.SX.sym("W", 12)
         column = cpin.joint_placements(model)(coordinates.q_symbolic(z))[:, joint - 1]
         rotation = ca.reshape(column[:9], 3, 3)
-        residual = pose_residual(rotation @ local.rotation, rotation @ local.translation + column[9:], target)
+        residual = pose_residual(kind, rotation @ local.rotation, rotation @ local.translation + column[9:], target)
+        self.rows = int(residual.numel())
         jacobian = ca.densify(ca.jacobian(residual, z))
         self._function = BatchFunction(ca.Function("pose", [z, target], [ca.densify(residual), jacobian], {"cse": True}))
 
     def evaluate(self, z: NDArray[np.float64], target: pin.SE3) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return residuals, shape (B, 6) ([m], [rad]), and their Jacobians, shape (B, 6, n), at `z`, shape (B, n)."""
+        """Return residuals, shape (B, m) ([m], [rad]), and their Jacobians, shape (B, m, n), at `z`, shape (B, n)."""
         residual, jacobian = self._function(z, target_vector(target))
-        return residual, jacobian.reshape(len(z), self.size, 6).swapaxes(1, 2)
+        return residual, jacobian.reshape(len(z), self.size, self.rows).swapaxes(1, 2)
 
     def solve(
         self,
@@ -95,7 +97,7 @@ def _step(
     step = np.zeros_like(z)
     for _ in range(2):
         scaled = jacobian * (free / weights)[:, None, :]
-        system = scaled @ jacobian.transpose(0, 2, 1) + damping[:, None, None] * np.eye(6)
+        system = scaled @ jacobian.transpose(0, 2, 1) + damping[:, None, None] * np.eye(residual.shape[1])
         step = -np.einsum("bij,bi->bj", scaled, np.linalg.solve(system, residual[..., None])[..., 0])
         step *= np.minimum(1.0, longest / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12))
         blocked = free & ((z + step < lower - 1e-12) | (z + step > upper + 1e-12))

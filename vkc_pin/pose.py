@@ -1,7 +1,12 @@
-"""Residuals between placements, symbolically."""
+"""Residuals between placements, symbolically.
+
+Three kinds of goal: "pose" is a whole placement; "point" only its translation; "upright" the translation, and the world's
+vertical as the target has it, at any heading.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import casadi as ca
@@ -9,42 +14,68 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-__all__ = ["POSE_LOWER", "POSE_UPPER", "pose_residual", "pose_rows", "target_vector"]
+__all__ = ["ROW_BOUNDS", "pose_residual", "pose_rows", "target_vector"]
 
-POSE_LOWER = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
-POSE_UPPER = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.inf])
+ROW_BOUNDS: Mapping[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = {
+    "pose": (np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]), np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.inf])),
+    "point": (np.zeros(3), np.zeros(3)),
+    "upright": (np.zeros(6), np.array([0.0, 0.0, 0.0, 0.0, 0.0, np.inf])),
+}
+"""For every kind of goal, the bounds between which `pose_rows` must lie."""
 
 _HALF_TURN = 1e-6  # of (2 cos(θ/2))²
 _GENERIC = ca.DM([0.3, 0.55, 0.78])  # perpendicular to no axis that anybody turns about
 
 
-def pose_residual(rotation: Any, translation: Any, target: Any) -> Any:
-    """Return (p − p*, 2 sin(θ/2)·a), shape (6, 1), of a placement to `target` = (R* by columns, p*), shape (12, 1).
+def pose_residual(kind: str, rotation: Any, translation: Any, target: Any) -> Any:
+    """Return (p − p*, 2 sin(θ/2)·a) of a placement to `target` = (R* by columns, p*), shape (12, 1).
 
-    θ and a are angle and axis of E = R*ᵀR. Unlike ½ vee(E − Eᵀ), which vanishes at θ = π too, this grows up to π, where
-    the axis, and so every residual, has two signs. Within 1e-3 of π it comes from E + I = 2aaᵀ instead, with a slope that
-    leads away from there.
+    Of a "pose" it has shape (6, 1): θ and a are angle and axis of E = R*ᵀR. Unlike ½ vee(E − Eᵀ), which vanishes at θ = π
+    too, this grows up to π, where the axis, and so every residual, has two signs. Within 1e-3 of π it comes from
+    E + I = 2aaᵀ instead, with a slope that leads away from there. Of a "point" it is p − p*, shape (3, 1). Of "upright",
+    shape (5, 1), θ is the angle between the two verticals, and a has two components.
     """
+    offset = translation - target[9:]
+    if kind == "point":
+        return offset
+    if kind == "upright":
+        sideways, along = _tilt(rotation, target)
+        squared = 2.0 + 2.0 * along  # (2 cos(θ/2))²
+        upside_down = ca.DM([2.0, 0.0])
+        tilt = ca.if_else(squared > _HALF_TURN, 2.0 * sideways / ca.sqrt(ca.fmax(squared, _HALF_TURN)), upside_down + sideways)
+        return ca.vertcat(offset, tilt)
     error = ca.reshape(target[:9], 3, 3).T @ rotation
     vee = ca.vertcat(error[2, 1] - error[1, 2], error[0, 2] - error[2, 0], error[1, 0] - error[0, 1])
     squared = 1.0 + error[0, 0] + error[1, 1] + error[2, 2]  # (2 cos(θ/2))²
     turned = error @ _GENERIC + _GENERIC + vee
     angle = ca.if_else(squared > _HALF_TURN, vee / ca.sqrt(ca.fmax(squared, _HALF_TURN)), turned)
-    return ca.vertcat(translation - target[9:], angle)
+    return ca.vertcat(offset, angle)
 
 
-def pose_rows(rotation: Any, translation: Any, target: Any) -> Any:
-    """Return (p − p*, ½ vee(E − Eᵀ), trace E), shape (7, 1): constraints that are linear in the placement.
+def pose_rows(kind: str, rotation: Any, translation: Any, target: Any) -> Any:
+    """Return constraints that are linear in the placement, and lie between `ROW_BOUNDS` where, and only where, the goal holds.
 
-    With E = R*ᵀR they lie between `POSE_LOWER` and `POSE_UPPER` where, and only where, the placement is the target: the
-    trace keeps out the half turns, where the antisymmetric part vanishes too. Being linear in (R, p) they add nothing to
-    the second derivatives of the kinematics, as `pose_residual` would.
+    A "pose" gives (p − p*, ½ vee(E − Eᵀ), trace E) with E = R*ᵀR, shape (7, 1): the trace keeps out the half turns, where
+    the antisymmetric part vanishes too. "upright" gives (p − p*, sideways, along), shape (6, 1): the vertical's components
+    across the target's vertical and along it, of which the last keeps out what stands on its head. Being linear in (R, p)
+    they add nothing to the second derivatives of the kinematics, as `pose_residual` would.
     """
+    offset = translation - target[9:]
+    if kind == "point":
+        return offset
+    if kind == "upright":
+        return ca.vertcat(offset, *_tilt(rotation, target))
     error = ca.reshape(target[:9], 3, 3).T @ rotation
     vee = ca.vertcat(error[2, 1] - error[1, 2], error[0, 2] - error[2, 0], error[1, 0] - error[0, 1]) / 2
-    return ca.vertcat(translation - target[9:], vee, error[0, 0] + error[1, 1] + error[2, 2])
+    return ca.vertcat(offset, vee, error[0, 0] + error[1, 1] + error[2, 2])
+
+
+def _tilt(rotation: Any, target: Any) -> tuple[Any, Any]:
+    """Return the world's vertical, seen from the body, across the target's (2 components) and along it."""
+    vertical = ca.reshape(target[:9], 3, 3) @ rotation[2, :].T
+    return vertical[:2], vertical[2]
 
 
 def target_vector(placement: pin.SE3) -> NDArray[np.float64]:
-    """Return `placement` as the 12 numbers `pose_residual` takes."""
+    """Return `placement` as the 12 numbers that targets are."""
     return np.concatenate([placement.rotation.T.ravel(), placement.translation])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import OrderedDict
 from collections.abc import Sequence
 from typing import Any
@@ -12,16 +13,20 @@ from numpy.typing import NDArray
 
 from vkc_pin.chain import VirtualKinematicChain, consolidate
 from vkc_pin.contact import ContactModel, Contacts
-from vkc_pin.goal import Task, compile_task
+from vkc_pin.goal import compile_task
+from vkc_pin.hold import Hold, holds_of
 from vkc_pin.options import Options
 from vkc_pin.pose import target_vector
 from vkc_pin.scene import Scene
 from vkc_pin.steps import Step
+from vkc_pin.task import Phase, Task
 from vkc_pin.transcription import Transcription
 from vkc_pin.waypoint import PoseRow, Structure
 
 __all__ = ["TrajectoryProblem", "build"]
 
+_CHOICE_WEIGHT = 1e-3  # of coordinates that are chosen when grasping and do not move: only keeps the problem regular
+_SPARE = 1.15  # how much longer a motion may take than the profile 3s² − 2s³ along its seed
 _KEPT = 8  # programs kept for reuse; each holds some tens of MB
 _transcriptions: OrderedDict[tuple[Any, ...], Transcription] = OrderedDict()
 
@@ -50,19 +55,20 @@ class TrajectoryProblem:
         lower, upper: Bounds of z_1..z_N, shape (N, n): joint limits (eq. 4), what stands still, joint goals.
         targets: Placements of the pose rows (eqs. 2 and 3), one per `transcription.structure.poses`.
         pose_names: Their names.
-        velocity, acceleration: Bounds per waypoint step (eq. 5), shape (n,): limits times dt and dt².
+        dt: Time of every step [s], shape (N,): `Options.dt`, or longer where the way is too long for it; see `stretch`.
+        velocity, acceleration: Bounds of `rates` (eq. 5), shapes (N, n) and (N + 1 + rests, n): limits times dt and dt².
     """
 
     def __init__(self, scene: Scene, task: Task, options: Options) -> None:
         self.scene, self.task, self.options = scene, task, options
-        self.chain: VirtualKinematicChain = consolidate(scene, task.grasps)
+        self.chain: VirtualKinematicChain = consolidate(scene, task.holds)
         self.contacts = ContactModel(scene, self.chain, task, options)
         self.ends = np.cumsum([phase.segments for phase in task.phases])
         poses, self.targets, self.pose_names = self._poses()
         self.transcription = transcribe(self._structure(poses))
         self.start = self._start()
         self.lower, self.upper = self._bounds()
-        self.velocity, self.acceleration = self.chain.velocity * options.dt, self.chain.acceleration * options.dt**2
+        self._set_steps(np.full(self.segments, options.dt))
 
     @property
     def segments(self) -> int:
@@ -72,44 +78,80 @@ class TrajectoryProblem:
     def _poses(self) -> tuple[list[PoseRow], list[pin.SE3], list[str]]:
         rows, targets, names = [], [], []
         starts = np.concatenate([[0], self.ends[:-1]])
-        for name, closure in self.chain.closures.items():
-            waypoints: list[int] = []
+        for hold in self.task.holds:
+            closure, waypoints = self.chain.closures[hold], []
             for phase, first, last in zip(self.task.phases, starts, self.ends, strict=True):
-                if name in phase.held:
-                    waypoints += range(first + 1, last + 1)
-                elif name in phase.grasps:
+                if hold in phase.grasps and self.scene.objects[hold.object].object.free:
+                    rows.append(PoseRow(closure.joint, closure.local, (int(last),)))
+                    targets.append(phase.standing[hold.object])
+                    names.append(f"grasp {hold}")
+                elif hold in phase.grasps:
                     waypoints.append(last)
-            rows.append(PoseRow(closure.joint, closure.local, tuple(int(t) for t in waypoints)))
-            targets.append(closure.target)
-            names.append(f"closure {name}")
-        model = self.chain.model
+                elif hold in phase.held:
+                    waypoints += range(first + 1, last + 1)
+            if waypoints and not self.scene.objects[hold.object].object.free:
+                rows.append(PoseRow(closure.joint, closure.local, tuple(int(t) for t in waypoints)))
+                targets.append(closure.target)
+                names.append(f"closure {hold.object}")
         for phase, last in zip(self.task.phases, self.ends, strict=True):
             for goal in phase.frames:
-                frame = model.frames[model.getFrameId(goal.frame)]
-                rows.append(PoseRow(frame.parentJoint, pin.SE3(frame.placement), (int(last),)))
+                rows.append(PoseRow(*self.chain.frame(goal.frame, goal.hold), (int(last),), goal.kind))
                 targets.append(goal.placement)
-                names.append(f"goal {goal.frame}")
+                names.append(f"goal {goal}")
         return rows, targets, names
 
     def _structure(self, poses: Sequence[PoseRow]) -> Structure:
         o, robot = self.options, self.chain.robot.coordinates.size
         weights = np.full(self.chain.size, o.velocity_weight_object)
         weights[:robot], weights[:3] = o.velocity_weight_arm, o.velocity_weight_base
+        clamped = self._clamped()
+        weights[[column for column, _, _ in clamped]] = _CHOICE_WEIGHT
         acceleration = weights * o.acceleration_weight / o.dt**2
         # The robot stands still while its gripper closes or opens.
         phases = zip(self.ends[:-1], self.task.phases[:-1], self.task.phases[1:], strict=True)
         rests = [int(end) for end, phase, after in phases if phase.grasps or after.leaves]
         differential = self.chain.robot.base == "differential"
         return Structure(
-            self.chain.model, self.segments, tuple(poses), o.contact_slots, weights, acceleration, tuple(rests), differential
+            self.chain.model,
+            self.segments,
+            tuple(poses),
+            o.contact_slots,
+            weights,
+            acceleration,
+            tuple(rests),
+            differential,
+            clamped,
         )
+
+    def _clamped(self) -> tuple[tuple[int, int, int], ...]:
+        """Return column, first and last waypoint of what a clamping hand does not let slide after a grasp."""
+        found = []
+        for hold, names in self.chain.virtual.items():
+            attachment = self.scene.objects[hold.object].object.attachments[hold.attachment]
+            for number, phase in enumerate(self.task.phases):
+                if not attachment.firm or hold not in phase.grasps:
+                    continue
+                last = number
+                while last + 1 < len(self.task.phases) and hold in self.task.phases[last + 1].held:
+                    last += 1
+                found += [(self.chain.index(name), int(self.ends[number]), int(self.ends[last])) for name in names]
+        return tuple(found)
 
     def _start(self) -> NDArray[np.float64]:
         start = np.zeros(self.chain.size)
         start[: len(self.scene.start)] = self.scene.start
         for name, value in self.task.state.items():
             start[self.chain.index(name)] = value
+        for hold in self.at_start:
+            names = self.scene.objects[hold.object].object.attachment(hold.attachment).coordinates
+            for name, value in zip(names, self.scene.held_at.get(hold.object, ()), strict=False):
+                start[self.chain.index(f"{hold.object}.{name}")] = value
         return start
+
+    @property
+    def at_start(self) -> tuple[Hold, ...]:
+        """What is held at the start."""
+        return holds_of(self.scene.held, self.scene.held_by)
 
     def _bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         lower, upper = np.tile(self.chain.lower, (self.segments, 1)), np.tile(self.chain.upper, (self.segments, 1))
@@ -132,7 +174,46 @@ class TrajectoryProblem:
                         turn = (goal - self.start[2] + np.pi) % (2 * np.pi) - np.pi  # to the nearest of the equal headings
                         lower[end - 1, column] = upper[end - 1, column] = self.start[2] + turn if column == 2 else goal
             begin = end
+        for hold in self.at_start:  # until it is let go of, what is clamped stays where it is
+            if self.scene.objects[hold.object].object.attachments[hold.attachment].firm:
+                held = [hold in phase.held for phase in self.task.phases]
+                until = int(self.ends[(held.index(False) if False in held else len(held)) - 1]) if held[0] else 0
+                for column in map(self.chain.index, self.chain.virtual[hold]):
+                    lower[:until, column] = upper[:until, column] = self.start[column]
         return lower, upper
+
+    def _set_steps(self, dt: NDArray[np.float64]) -> None:
+        """Take over the time of every step, one value within each run between two rests."""
+        edges = [0, *self.transcription.structure.rests, self.segments]
+        of_rows = np.concatenate([np.full(last - first + 1, dt[first]) for first, last in itertools.pairwise(edges)])
+        self.dt = dt
+        self.velocity = self.chain.velocity * dt[:, None]
+        self.acceleration = self.chain.acceleration * of_rows[:, None] ** 2
+
+    def take_time_for(self, z: NDArray[np.float64]) -> None:
+        """Give every step `Options.dt`, or more where z_1..z_N, shape (N, n), needs it."""
+        self._set_steps(np.full(self.segments, self.options.dt))
+        self.stretch(z)
+
+    def stretch(self, z: NDArray[np.float64]) -> bool:
+        """Give runs between two rests more time if z_1..z_N, shape (N, n), is too long a way for it; return whether any was.
+
+        The measure is the profile 3s² − 2s³ over the way that each coordinate goes in the run: its speed is at most 1.5 times
+        the mean, its acceleration 6 times the way over the square of the duration.
+        """
+        steps, dt = np.abs(np.diff(self.waypoints(z), axis=0)), self.dt.copy()
+        for first, last in itertools.pairwise([0, *self.transcription.structure.rests, self.segments]):
+            way = steps[first:last].sum(axis=0)
+            needed = max(np.max(1.5 * way / self.chain.velocity), np.sqrt(np.max(6.0 * way / self.chain.acceleration)))
+            dt[first:last] = np.maximum(dt[first:last], _SPARE * needed / (last - first))
+        if np.allclose(dt, self.dt, rtol=1e-3):
+            return False
+        self._set_steps(dt)
+        return True
+
+    def closed(self, phase: Phase) -> bool:
+        """Return whether something that stands fixed in the world is held in a phase: then the chain is closed."""
+        return any(not self.scene.objects[hold.object].object.free for hold in phase.held)
 
     def limits(self, name: str) -> tuple[float, float]:
         """Return the position limits of a coordinate; the base's end at the arena's edge, a fixed one's where it stands."""
@@ -160,6 +241,7 @@ class TrajectoryProblem:
 
     def evaluate_contacts(self, z: NDArray[np.float64], *, reach: float, nearest: int | None = None) -> Contacts:
         """Return the pairs closer than `reach` [m] at z_1..z_N, shape (N, n); at most `nearest` a waypoint."""
+        self.contacts.settle(z)
         return self.contacts.evaluate(z, np.arange(1, self.segments + 1), reach=reach, nearest=nearest)
 
     def rates(self, z: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -220,7 +302,7 @@ class TrajectoryProblem:
     def __repr__(self) -> str:
         t = self.transcription
         return (
-            f"<TrajectoryProblem {' → '.join(p.name for p in self.task.phases)}: {self.segments} steps of {self.options.dt} s, "
+            f"<TrajectoryProblem {' → '.join(p.name for p in self.task.phases)}: {self.segments} steps in {self.dt.sum():g} s, "
             f"{t.size} variables, {t.rows} rows, {sum(len(p.pairs) for p in self.contacts.phases)} collision pairs>"
         )
 

@@ -18,9 +18,9 @@ KEEP = 3e-3  # [m] clearance asked for between waypoints
 def collisions_between(problem: TrajectoryProblem, z: NDArray[np.float64]) -> Contacts:
     """Return contacts at waypoints that stand for collisions inside the segments around them.
 
-    At a sub-state (1 − s)·z_t + s·z_{t+1} with distance d < KEEP, the witness points, fixed in their bodies, are carried to
-    both waypoints. There n·(b − a) has some value v; asking for v + KEEP − d at both lifts the sub-state by KEEP − d, to
-    first order. Of each segment and pair only the deepest sub-state counts.
+    At a sub-state (1 − s)·z_t + s·z_{t+1} with distance d < KEEP (or than the pair's margin, where that is less), the witness
+    points, fixed in their bodies, are carried to both waypoints. There n·(b − a) has some value v; asking for v + KEEP − d at
+    both lifts the sub-state by KEEP − d, to first order. Of each segment and pair only the deepest sub-state counts.
 
     Args:
         problem: The problem.
@@ -45,6 +45,9 @@ def collisions_between(problem: TrajectoryProblem, z: NDArray[np.float64]) -> Co
     found = _deepest(problem.contacts.evaluate(states, waypoints, reach=KEEP), segment)
     # A start that is close to something leaves it as it can: only what collides on the way counts.
     found = found.select(np.flatnonzero((segment[found.waypoint] > 0) | (found.distance < 0)))
+    keep = np.minimum(KEEP, found.margin)
+    closer = np.flatnonzero(found.distance < keep)
+    found, keep = found.select(closer), keep[closer]
     joints = problem.contacts.joints_of(found.pair)
     rotations, translations = problem.chain.joint_placements(states)
     ends = problem.chain.joint_placements(path)
@@ -58,7 +61,7 @@ def collisions_between(problem: TrajectoryProblem, z: NDArray[np.float64]) -> Co
             points.append(np.einsum("cij,cj->ci", ends[0][waypoint, j], local) + ends[1][waypoint, j])
         value = np.einsum("ci,ci->c", found.normal, points[1] - points[0])
         inside = waypoint > 0  # the start cannot be moved
-        part = Contacts(waypoint - 1, found.pair, value, value + KEEP - found.distance, found.normal, points[0], points[1])
+        part = Contacts(waypoint - 1, found.pair, value, value + keep - found.distance, found.normal, points[0], points[1])
         parts.append(part.select(np.flatnonzero(inside)))
     return merge(*parts)
 

@@ -16,8 +16,8 @@ class Violation:
     """One constraint that does not hold.
 
     Attributes:
-        constraint: "start", "limit", "velocity", "acceleration", "slip", "closure", "latch", "unheld", "goal", "order",
-            "clearance" or "penetration".
+        constraint: "start", "limit", "velocity", "acceleration", "slip", "closure", "latch", "unheld", "slide", "goal",
+            "order", "clearance" or "penetration".
         subject: The coordinate, object, goal or pair of links it is about, e.g. "elbow_joint", "forearm_link – sofa".
         waypoint: Counted from 0; between two waypoints the earlier.
         time: [s].

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -16,12 +16,23 @@ from numpy.typing import ArrayLike, NDArray
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.geometry import PlacedObject, clearance, placed_shapes, standing_geometry, within_limits
+from vkc_pin.hold import holds_of
 from vkc_pin.resources import find
 
 if TYPE_CHECKING:
     from vkc_pin.robot import Robot
 
-__all__ = ["FLOOR", "START_CLEARANCE", "PlacedObject", "Scene", "StartRegion", "load_scene", "standing_geometry", "start_limits"]
+__all__ = [
+    "FLOOR",
+    "START_CLEARANCE",
+    "PlacedObject",
+    "Scene",
+    "StartRegion",
+    "check_holds",
+    "load_scene",
+    "standing_geometry",
+    "start_limits",
+]
 
 FLOOR = "floor"
 """Name of the floor among a scene's obstacles."""
@@ -59,6 +70,8 @@ class Scene:
         arena: The floor that belongs to the scene: (x_min, x_max, y_min, y_max) [m].
         start_region: Where `sample_start` draws from, if the scene says so.
         held: Object → attachment of what the robot holds at the start.
+        held_by: Object → "<object>.<link>", for what it holds through another thing that it holds.
+        held_at: Object → values of its attachment's freedoms, [m] and [rad]; zero where nothing is said.
         document: The scene as plain data, from which `from_document` builds it again.
     """
 
@@ -77,6 +90,8 @@ class Scene:
     start_region: StartRegion | None
     held: Mapping[str, str]
     document: dict[str, Any]
+    held_by: Mapping[str, str] = field(default_factory=dict)
+    held_at: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return (
@@ -111,15 +126,15 @@ class Scene:
             InputError: Wrong size, a value that is not finite, outside a joint's limits or outside the arena.
         """
         start, names = self.start.copy(), self.robot.coordinates.names
-        for field, values, part in (("base", base, slice(0, 3)), ("arm", arm, slice(3, None))):
+        for part_name, values, part in (("base", base, slice(0, 3)), ("arm", arm, slice(3, None))):
             if values is None:
                 continue
             given = np.asarray(values, float)
             if given.shape != start[part].shape:
-                raise InputError("wrong number of values", field=field, expected=start[part].shape, got=given.shape)
+                raise InputError("wrong number of values", field=part_name, expected=start[part].shape, got=given.shape)
             lower, upper = (limits[part] for limits in start_limits(self.robot))
             start[part] = [
-                within_limits(value, low, high, f"{field}.{name}")
+                within_limits(value, low, high, f"{part_name}.{name}")
                 for value, low, high, name in zip(given, lower, upper, names[part], strict=True)
             ]
         for value, low, high, name in zip(start[:2], self.arena[::2], self.arena[1::2], names[:2], strict=True):
@@ -149,30 +164,71 @@ class Scene:
         changed = dataclasses.replace(self, objects=MappingProxyType({**self.objects, name: placed}), document=document)
         return changed.with_held_objects_in_the_hand()
 
-    def with_held(self, held: Mapping[str, str]) -> Scene:
-        """Return the scene with the robot holding objects at the start, by object → attachment.
+    def with_placement(self, name: str, placement: pin.SE3) -> Scene:
+        """Return the scene with object `name` at `placement` (of its base link, in the world frame).
 
         Raises:
-            UnknownNameError: There is no such object or attachment.
+            UnknownNameError: There is no such object.
         """
-        for name, attachment in held.items():
-            if name not in self.objects:
-                raise UnknownNameError("object", name, self.objects, field="held")
-            self.objects[name].object.attachment(attachment)
+        if name not in self.objects:
+            raise UnknownNameError("object", name, self.objects)
         document = copy.deepcopy(self.document)
-        document["start"]["held"] = dict(held)
-        changed = dataclasses.replace(self, held=MappingProxyType(dict(held)), document=document)
+        (entry,) = (item for item in document["objects"] if item["name"] == name)
+        entry.pop("yaw", None)
+        entry["position"] = np.asarray(placement.translation).tolist()
+        entry["rpy"] = np.asarray(pin.rpy.matrixToRpy(placement.rotation)).tolist()
+        placed = dataclasses.replace(self.objects[name], placement=pin.SE3(placement))
+        changed = dataclasses.replace(self, objects=MappingProxyType({**self.objects, name: placed}), document=document)
+        return changed.with_held_objects_in_the_hand()
+
+    def with_held(
+        self,
+        held: Mapping[str, str],
+        *,
+        by: Mapping[str, str] | None = None,
+        at: Mapping[str, Sequence[float]] | None = None,
+    ) -> Scene:
+        """Return the scene with the robot holding objects at the start.
+
+        Args:
+            held: Object → attachment.
+            by: Object → "<object>.<link>", for what is held through another object of `held`.
+            at: Object → values of its attachment's freedoms, [m] and [rad]; zero where nothing is said.
+
+        Raises:
+            UnknownNameError: There is no such object, attachment or link.
+            InputError: Values that do not fit the attachment's freedoms, or objects that hold each other.
+        """
+        by = {} if by is None else by
+        values = {name: tuple(float(value) for value in row) for name, row in ({} if at is None else at).items()}
+        check_holds(self.objects, held, by, values)
+        document = copy.deepcopy(self.document)
+        document["start"]["held"] = {
+            name: {"attachment": attachment}
+            | ({"by": by[name]} if name in by else {})
+            | ({"at": list(values[name])} if name in values else {})
+            for name, attachment in held.items()
+        }
+        changed = dataclasses.replace(
+            self,
+            held=MappingProxyType(dict(held)),
+            held_by=MappingProxyType(dict(by)),
+            held_at=MappingProxyType(values),
+            document=document,
+        )
         return changed.with_held_objects_in_the_hand()
 
     def with_held_objects_in_the_hand(self) -> Scene:
         """Return the scene with every free object that is held placed where the robot holds it at the start."""
         objects = dict(self.objects)
-        for name, attachment in self.held.items():
-            placed = objects[name]
+        for hold in holds_of(self.held, self.held_by):
+            placed = objects[hold.object]
             if placed.object.free:
-                grasp = placed.object.attachment(attachment)
-                in_object = placed.object.link_placement(grasp.link, placed.state) * grasp.placement
-                objects[name] = dataclasses.replace(placed, placement=self.tool_placement() * in_object.inverse())
+                grasp = placed.object.attachment(hold.attachment)
+                values = self.held_at.get(hold.object) or (0.0,) * len(grasp.freedoms)
+                in_object = placed.object.link_placement(grasp.link, placed.state) * grasp.placement * grasp.motion(values)
+                through = objects[hold.by.object].link_placement(str(hold.link)) if hold.by else self.tool_placement()
+                objects[hold.object] = dataclasses.replace(placed, placement=through * in_object.inverse())
         return dataclasses.replace(self, objects=MappingProxyType(objects))
 
     def tool_placement(self) -> pin.SE3:
@@ -241,6 +297,36 @@ def start_limits(robot: Robot) -> tuple[NDArray[np.float64], NDArray[np.float64]
     if robot.base == "fixed":
         lower[:3], upper[:3] = -np.inf, np.inf
     return lower, upper
+
+
+def check_holds(
+    objects: Mapping[str, PlacedObject],
+    held: Mapping[str, str],
+    by: Mapping[str, str],
+    at: Mapping[str, Sequence[float]],
+) -> None:
+    """Check that what is said to be held fits the objects; see `Scene.with_held`.
+
+    Raises:
+        UnknownNameError: There is no such object, attachment or link.
+        InputError: Values that do not fit the attachment's freedoms, or objects that hold each other.
+    """
+    for name, attachment in held.items():
+        if name not in objects:
+            raise UnknownNameError("object", name, objects, field="held")
+        freedoms = objects[name].object.attachment(attachment).freedoms
+        values = at.get(name, (0.0,) * len(freedoms))
+        if len(values) != len(freedoms):
+            raise InputError(
+                "wrong number of values", field=f"held.{name}.at", expected=f"{len(freedoms)}, one a freedom", got=len(values)
+            )
+        for value, freedom in zip(values, freedoms, strict=True):
+            within_limits(value, freedom.lower, freedom.upper, f"held.{name}.at")
+    for hold in holds_of(held, by):
+        if hold.by is not None:
+            objects[hold.by.object].link_placement(str(hold.link))
+            if not objects[hold.object].object.free:
+                raise InputError("only a free object can be held through another", field=f"held.{hold.object}.by", got=hold.frame)
 
 
 def load_scene(name_or_path: str | Path) -> Scene:

@@ -17,7 +17,8 @@ from vkc_pin.articulation import load_object
 from vkc_pin.assembly import clean
 from vkc_pin.documents import Document, check
 from vkc_pin.geometry import PlacedObject, copy_shape, within_limits
-from vkc_pin.scene import FLOOR, Scene, StartRegion, start_limits
+from vkc_pin.hold import holds_of
+from vkc_pin.scene import FLOOR, Scene, StartRegion, check_holds, start_limits
 from vkc_pin.urdf import load_urdf
 
 if TYPE_CHECKING:
@@ -54,6 +55,8 @@ def build_scene(document: Document, folder: Path) -> Scene:
     region = description.start_region
     _check_places(document, description, arena)
     plain: dict[str, Any] = description.model_dump(mode="json", exclude_none=True)
+    held = description.start.held
+    _held(document, held, objects)
     name = description.name or (document.file.stem if document.file else "scene")
     scene = Scene(
         name=name,
@@ -69,7 +72,9 @@ def build_scene(document: Document, folder: Path) -> Scene:
         floor=description.floor,
         arena=arena,
         start_region=StartRegion(region.x, region.y, region.yaw) if region else None,
-        held=MappingProxyType(_held(document, description.start.held, objects)),
+        held=MappingProxyType({name: item.attachment for name, item in held.items()}),
+        held_by=MappingProxyType({name: item.by for name, item in held.items() if item.by}),
+        held_at=MappingProxyType({name: item.at for name, item in held.items() if item.at}),
         document={**plain, "name": name},
     )
     return scene.with_held_objects_in_the_hand()
@@ -121,14 +126,20 @@ def _start(document: Document, item: schema.StartSchema, robot: Robot) -> NDArra
     return start
 
 
-def _held(document: Document, held: Mapping[str, str], objects: Mapping[str, PlacedObject]) -> dict[str, str]:
-    for name, attachment in held.items():
+def _held(document: Document, held: Mapping[str, schema.HeldSchema], objects: Mapping[str, PlacedObject]) -> None:
+    """Check what the robot is said to hold."""
+    for name, item in held.items():
         path = ("start", "held", name)
         if name not in objects:
             raise document.unknown(path, "object", name, objects)
         with document.at(path):
-            objects[name].object.attachment(attachment)
-    return dict(held)
+            check_holds(objects, {name: item.attachment}, {}, {} if item.at is None else {name: item.at})
+            if item.by is not None:
+                owner = item.by.partition(".")[0]
+                both = {owner: held[owner].attachment} if owner in held else {}
+                check_holds(objects, {name: item.attachment, **both}, {name: item.by}, {})
+    with document.at(("start", "held")):
+        holds_of({n: item.attachment for n, item in held.items()}, {n: item.by for n, item in held.items() if item.by})
 
 
 def _pose(item: schema.PoseSchema) -> pin.SE3:

@@ -14,6 +14,7 @@ __all__ = [
     "BoxSchema",
     "CapsuleSchema",
     "CylinderSchema",
+    "HeldSchema",
     "MeshSchema",
     "ObstacleSchema",
     "PlacedObjectSchema",
@@ -61,6 +62,10 @@ def _triple(value: Any) -> Any:
 
 def _named(value: Any) -> Any:
     return {"name": value} if isinstance(value, str) else value
+
+
+def _attached(value: Any) -> Any:
+    return {"attachment": value} if isinstance(value, str) else value
 
 
 def _arm(value: Any) -> Any:
@@ -179,12 +184,20 @@ class RobotSchema(Schema):
     tool_frame: str | None = None
 
 
+class HeldSchema(Schema):
+    """How an object is held: at which attachment, through what, and at what values of the attachment's freedoms."""
+
+    attachment: str
+    by: str | None = None
+    at: tuple[Number, ...] | None = None
+
+
 class StartSchema(Schema):
-    """Where the robot starts: base [x, y, yaw], arm joints [rad], and object → attachment of what it holds."""
+    """Where the robot starts: base [x, y, yaw], arm joints [rad], and object → attachment (or more) of what it holds."""
 
     base: Vector3
     arm: Annotated[tuple[Number, ...] | None, BeforeValidator(_arm)] = None
-    held: Mapping[str, str] = Field(default_factory=dict)
+    held: Mapping[str, Annotated[HeldSchema, BeforeValidator(_attached)]] = Field(default_factory=dict)
 
 
 class ArenaSchema(Schema):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from vkc_pin.contact import Contacts
 from vkc_pin.monitor import Interrupt, interruptible
-from vkc_pin.pose import POSE_LOWER, POSE_UPPER
+from vkc_pin.pose import ROW_BOUNDS
 from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.refinement import collisions_between, merge
 from vkc_pin.solution import Iteration, Solution
@@ -70,6 +70,7 @@ class _Loop:
         self.problem, self.options = problem, problem.options
         self.transcription = problem.transcription
         self.z = problem.clip(seed)
+        problem.take_time_for(self.z)
         self.multipliers: dict[str, Any] = {}
         self.rates = False
         self.penalty = problem.options.penalty
@@ -134,8 +135,10 @@ class _Loop:
         self.z, self.at, self.shortfall = trial.z, trial.contacts, trial.shortfall
         self.objective, self.pose_error = trial.objective, trial.pose_error
         self.solution.z = trial.z
-        if trial.rate > RATE_TOLERANCE and not self.rates:
-            self.rates, self.multipliers = True, {}
+        if trial.rate > RATE_TOLERANCE:
+            self.problem.stretch(trial.z)
+            if not self.rates and self.problem.rate_violation(trial.z) > RATE_TOLERANCE:
+                self.rates, self.multipliers = True, {}
 
     def done(self, trial: _Trial) -> bool:
         """Return whether everything holds at the waypoints."""
@@ -143,7 +146,7 @@ class _Loop:
             trial.satisfied
             and trial.contacts.violation() < CLOSE_ENOUGH
             and trial.pose_error < POSE_TOLERANCE
-            and trial.rate <= RATE_TOLERANCE
+            and self.problem.rate_violation(trial.z) <= RATE_TOLERANCE
             and self.problem.drift(trial.z) < DRIFT
             and self.free_between(trial.z)
         )
@@ -192,13 +195,11 @@ class _Loop:
         t = self.transcription
         lower, upper = np.zeros(t.rows), np.zeros(t.rows)
         upper[t.slot_rows] = np.inf
-        for at in t.pose_rows:
+        for pose, at in zip(t.structure.poses, t.pose_rows, strict=True):
             for rows in at.values():
-                lower[rows], upper[rows] = POSE_LOWER, POSE_UPPER
+                lower[rows], upper[rows] = ROW_BOUNDS[pose.kind]
         if self.rates:
-            velocity = np.tile(self.problem.velocity, t.segments)
-            acceleration = np.tile(self.problem.acceleration, t.second.shape[0])
-            rates = np.concatenate([velocity, acceleration])
+            rates = np.concatenate([self.problem.velocity.ravel(), self.problem.acceleration.ravel()])
             lower, upper = np.concatenate([lower, -rates]), np.concatenate([upper, rates])
         return lower, upper
 

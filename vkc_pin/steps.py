@@ -11,7 +11,21 @@ import pinocchio as pin
 
 from vkc_pin.errors import InputError, UnknownNameError
 
-__all__ = ["Actuate", "GoTo", "Grasp", "Reach", "Step", "as_placement", "step_from_dict", "step_to_dict"]
+__all__ = [
+    "STEPS",
+    "Actuate",
+    "GoTo",
+    "Grasp",
+    "Place",
+    "Reach",
+    "Release",
+    "Step",
+    "Touch",
+    "as_placement",
+    "as_target",
+    "step_from_dict",
+    "step_to_dict",
+]
 
 
 def as_placement(pose: Any, *, name: str = "pose") -> pin.SE3:
@@ -45,6 +59,23 @@ def as_placement(pose: Any, *, name: str = "pose") -> pin.SE3:
     return pin.SE3(rotation, array[:3, 3])
 
 
+def as_target(target: Any, *, name: str) -> pin.SE3 | tuple[float, float, float]:
+    """Return `target` as a point [m] if it is three numbers, otherwise as a placement; see `as_placement`.
+
+    Raises:
+        InputError: It is neither.
+    """
+    try:
+        point = np.asarray(target, float) if not isinstance(target, pin.SE3) else None
+    except (TypeError, ValueError):
+        point = None
+    if point is None or point.shape != (3,):
+        return as_placement(target, name=name)
+    if not np.all(np.isfinite(point)):
+        raise InputError("not finite", field=name, expected="a point (x, y, z)", got=point.tolist())
+    return (float(point[0]), float(point[1]), float(point[2]))
+
+
 @dataclass(frozen=True)
 class Reach:
     """Bring a frame of the robot to a pose.
@@ -68,10 +99,13 @@ class Grasp:
     Attributes:
         object: Its name in the scene.
         attachment: Where to grasp it; None is the object's first attachment.
+        by: Through what: "<object>.<link>", a link of an object in the hand (a stick's tip), which takes the place of the
+            tool frame; None is the hand itself.
     """
 
     object: str
     attachment: str | None = None
+    by: str | None = None
 
 
 @dataclass(frozen=True)
@@ -104,8 +138,54 @@ class Actuate:
 
 
 @dataclass(frozen=True)
+class Touch:
+    """Bring a frame of what is held, or of the robot, to a point or a pose.
+
+    Attributes:
+        frame: "<object>.<link>", a link of a free object, which is grasped first unless it is held; or a frame of the robot.
+        target: In the world frame: a point (x, y, z) [m], at any orientation, or a pose; see `as_placement`.
+    """
+
+    frame: str
+    target: Any
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "target", as_target(self.target, name="Touch.target"))
+
+
+@dataclass(frozen=True)
+class Place:
+    """Put a free object somewhere and let go of it; grasping it first is implied.
+
+    Attributes:
+        object: Its name in the scene.
+        pose: Of its base link in the world frame: a pose (see `as_placement`), or a point (x, y, z) [m], where it then
+            stands as upright as it does before the plan, at any heading.
+        attachment: Where to grasp it if it is not held yet; None is the object's first attachment.
+    """
+
+    object: str
+    pose: Any
+    attachment: str | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "pose", as_target(self.pose, name="Place.pose"))
+
+
+@dataclass(frozen=True)
+class Release:
+    """Let go.
+
+    Attributes:
+        object: Of what; None is everything in the hand.
+    """
+
+    object: str | None = None
+
+
+@dataclass(frozen=True)
 class GoTo:
-    """Bring the base to a place on the floor, and let go of what it holds first.
+    """Bring the base to a place on the floor, carrying along what can be carried and letting go of the rest.
 
     Attributes:
         x, y: Position of the base frame in the world, [m].
@@ -130,15 +210,18 @@ class GoTo:
             object.__setattr__(self, name, value)
 
 
-Step = Reach | Grasp | Actuate | GoTo
-_KINDS: dict[str, Any] = {kind.__name__: kind for kind in (Reach, Grasp, Actuate, GoTo)}
+Step = Reach | Grasp | Actuate | GoTo | Touch | Place | Release
+STEPS = (Reach, Grasp, Actuate, GoTo, Touch, Place, Release)
+"""All kinds of steps."""
+_KINDS: dict[str, Any] = {kind.__name__: kind for kind in STEPS}
 
 
 def step_to_dict(step: Step) -> dict[str, Any]:
     """Return `step` as plain data, e.g. for a saved plan."""
     data = {"step": type(step).__name__, **vars(step)}
-    if isinstance(step, Reach):
-        data["pose"] = step.pose.homogeneous.tolist()
+    for name, value in data.items():
+        if isinstance(value, pin.SE3):
+            data[name] = value.homogeneous.tolist()
     return data
 
 

@@ -22,12 +22,14 @@ class PhaseSpan:
         name: What happens in it, e.g. "reach door.handle".
         first, last: Its waypoints; `last` is the next phase's `first`.
         held: Object → attachment, for all that is held in it.
+        by: Object → "<object>.<link>", for what is held through another object that is held.
     """
 
     name: str
     first: int
     last: int
     held: Mapping[str, str] = field(default_factory=dict)
+    by: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -134,7 +136,7 @@ class Trajectory:
             "times": self.times.tolist(),
             "positions": self.positions.tolist(),
             "robot_size": self.robot_size,
-            "phases": [{**vars(p), "held": dict(p.held)} for p in self.phases],
+            "phases": [{**vars(p), "held": dict(p.held), "by": dict(p.by)} for p in self.phases],
         }
 
     @classmethod
@@ -145,7 +147,10 @@ class Trajectory:
             InputError: Something is missing from it or does not fit.
         """
         try:
-            phases = tuple(PhaseSpan(p["name"], int(p["first"]), int(p["last"]), dict(p["held"])) for p in data["phases"])
+            phases = tuple(
+                PhaseSpan(p["name"], int(p["first"]), int(p["last"]), dict(p["held"]), dict(p.get("by", {})))
+                for p in data["phases"]
+            )
             return cls(tuple(data["names"]), data["times"], data["positions"], phases, int(data["robot_size"]))
         except KeyError as error:
             raise InputError("this is missing from a trajectory", field=str(error.args[0])) from None

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from vkc_pin.coordinates import Coordinates
 from vkc_pin.inverse_kinematics import PoseSolver
 from vkc_pin.monitor import Monitor
-from vkc_pin.waypoint import POSE_ROWS, Structure, WaypointFunctions
+from vkc_pin.waypoint import Structure, WaypointFunctions
 
 __all__ = ["Transcription"]
 
@@ -33,7 +33,7 @@ class Transcription:
         size: Number of variables N·(n + 1).
         rows: Number of constraint rows without the rate rows.
         slot_rows: Rows of the witness planes, shape (N, K).
-        pose_rows: For each pose, waypoint → its rows, shape (7,); see `pose.pose_rows`.
+        pose_rows: For each pose, waypoint → its rows; see `pose.pose_rows`.
         base_rows: Rows that keep a differential base from slipping, shape (N,); empty for others.
         pose_solvers: Inverse kinematics of each pose.
         rate_matrix, rate_start: Velocities and accelerations per step are rate_matrix·x + rate_start·z_0.
@@ -50,7 +50,7 @@ class Transcription:
         self._objective()
         self._constraints()
         self._rates()
-        self.pose_solvers = [PoseSolver(structure.model, pose.joint, pose.local) for pose in structure.poses]
+        self.pose_solvers = [PoseSolver(structure.model, pose.joint, pose.local, pose.kind) for pose in structure.poses]
         self._solvers: dict[tuple[Any, ...], tuple[ca.Function, Monitor | None]] = {}
         self.build_time = time.perf_counter() - started
 
@@ -121,7 +121,7 @@ class Transcription:
             for waypoint in pose.waypoints:
                 poses_at[waypoint - 1] += (index,)
         kinds = sorted(set(poses_at))
-        count = [K + POSE_ROWS * len(poses) for poses in poses_at]
+        count = [K + sum(self.structure.poses[k].rows for k in poses) for poses in poses_at]
         first_row = np.concatenate([[0], np.cumsum(count)])
         self.rows = int(first_row[-1])
         self.slot_rows = first_row[:-1, None] + np.arange(K)
@@ -145,9 +145,11 @@ class Transcription:
             jacobian_at.append(np.stack([(first_row[at][:, None] + row).ravel(), (offset + column).ravel()]))
             row, column = (np.array(part) for part in kind.hessian_pattern)
             hessian_at.append(np.stack([(offset + row).ravel(), (offset + column).ravel()]))
-            for place, index in enumerate(poses):
+            place = K
+            for index, height in zip(poses, kind.pose_rows, strict=True):
                 for t in at:
-                    self.pose_rows[index][t + 1] = first_row[t] + K + POSE_ROWS * place + np.arange(POSE_ROWS)
+                    self.pose_rows[index][t + 1] = first_row[t] + place + np.arange(height)
+                place += height
         order = np.argsort(np.concatenate(value_rows))
         self.g = ca.vertcat(*values)[order.tolist()]
         self.jacobian = _assemble(jacobians, jacobian_at, self.rows, self.size)
@@ -155,6 +157,7 @@ class Transcription:
         self.base_rows = np.zeros(0, int)
         if self.structure.differential:
             self._differential()
+        self._clamp()
 
     def _differential(self) -> None:
         """Append −sin θ̄·δx + cos θ̄·δy at every segment's mid-heading: the base rolls, it does not slip."""
@@ -172,6 +175,21 @@ class Transcription:
         split = [both[: -self.segments], both[-self.segments :]]
         (self.hessian,) = ca.substitute([self.hessian], [self.multipliers, extra], split)
         self.multipliers = both
+
+    def _clamp(self) -> None:
+        """Append z_t − z_{t−1} = 0 for what a clamping hand does not let slide."""
+        pairs = [(c, t) for c, first, last in self.structure.clamped for t in range(first + 1, last + 1)]
+        if not pairs:
+            return
+        matrix = np.zeros((len(pairs), self.segments, self.n + 1))
+        for row, (column, waypoint) in enumerate(pairs):
+            matrix[row, waypoint - 1, column], matrix[row, waypoint - 2, column] = 1.0, -1.0
+        difference = ca.sparsify(ca.DM(matrix.reshape(len(pairs), self.size)))
+        self.g = ca.vertcat(self.g, difference @ self.x)
+        self.jacobian = ca.vertcat(self.jacobian, difference)
+        both = ca.MX.sym("lam_g", self.rows + len(pairs))
+        (self.hessian,) = ca.substitute([self.hessian], [self.multipliers], [both[: self.rows]])
+        self.multipliers, self.rows = both, self.rows + len(pairs)
 
     def _rates(self) -> None:
         n = self.n

@@ -13,8 +13,9 @@ import numpy as np
 from vkc_pin.options import Options
 from vkc_pin.report import Report, Violation
 from vkc_pin.scene import Scene
-from vkc_pin.steps import Grasp, Step
+from vkc_pin.steps import Step
 from vkc_pin.trajectory import Trajectory
+from vkc_pin.validation_contacts import may_touch
 from vkc_pin.validation_goals import MOTION_TOLERANCE, check_goals, check_steps
 from vkc_pin.validation_pairs import PairTable
 from vkc_pin.validation_samples import Samples
@@ -41,7 +42,8 @@ def validate(scene: Scene, steps: Sequence[Step], trajectory: Trajectory, option
 
     Returns:
         Every violated constraint: start, limits, velocity, acceleration, slip of a differential base, closure, latches,
-        joints of objects that nobody holds, goals and their order, clearance at waypoints and penetration anywhere.
+        joints of objects that nobody holds, hands that slide on what they clamp, goals and their order, clearance at
+        waypoints and penetration anywhere.
 
     Raises:
         InputError: The trajectory is none of this scene's robot and objects, or a step names what is not there.
@@ -68,6 +70,7 @@ class _Check:
         self._latches()
         self.found += check_goals(self.samples, self.steps, self.options)
         error, angle = self._closure()
+        self._slides()
         clearance = self._clearance()
         worst: dict[tuple[str, str, str], Violation] = {}
         for violation in self.found:
@@ -186,7 +189,7 @@ class _Check:
         for phase in self.trajectory.phases:
             rows = self.samples.rows(phase)
             for owner, attachment in phase.held.items():
-                errors = self.samples.grasp_errors(owner, attachment, rows)
+                errors = self.samples.grasp_errors(owner, attachment, rows, phase.by.get(owner))
                 largest = np.maximum(largest, errors.max(axis=0))
                 limits = (self.options.closure_position, self.options.closure_angle)
                 for column, limit, unit in zip(errors.T, limits, ("m", "rad"), strict=True):
@@ -198,19 +201,31 @@ class _Check:
                         )
         return float(largest[0]), float(largest[1])
 
+    def _slides(self) -> None:
+        """A hand that clamps does not slide or turn on what it holds."""
+        for phase in self.trajectory.phases:
+            for owner, attachment in phase.held.items():
+                grasp = self.scene.objects[owner].object.attachments[attachment]
+                for name in grasp.coordinates if grasp.firm else ():
+                    values = self.trajectory.column(f"{owner}.{name}")[phase.first : phase.last + 1]
+                    moved, unit = np.abs(values - values[0]), self.samples.unit(f"{owner}.{name}")
+                    worst = int(np.argmax(moved))
+                    if not moved[worst] <= MOTION_TOLERANCE:
+                        detail = f"the hand moves on '{owner}' by {moved[worst]:.4f} {unit} while it clamps it"
+                        self._add("slide", f"{owner}.{name}", phase.first + worst, moved[worst], unit, detail)
+
     def _clearance(self) -> float:
         """Nothing comes too close at a waypoint or penetrates anywhere; return the smallest distance [m].
 
         The start is where the robot is: it may be close to something, but not inside.
         """
-        asked = [(step.object, step.attachment) for step in self.steps if isinstance(step, Grasp)]
-        grasps = [(name, self.scene.objects[name].object.attachment(attachment).name) for name, attachment in asked]
         samples, smallest = self.samples, np.inf
-        pairs = PairTable(self.scene, samples.world, self.trajectory, self.options.dist_safe, grasps=grasps)
+        touching = may_touch(samples, self.steps, self.options.dist_safe)
+        pairs = PairTable(self.scene, samples.world, self.trajectory, self.options.dist_safe, touching=touching)
         for hit in pairs.sweep(samples.z, samples.waypoint_rows):
             smallest = min(smallest, hit.distance)
             subject, millimetres = f"{hit.first} – {hit.second}", 1e3 * abs(hit.distance)
-            if hit.distance < 0:
+            if hit.distance < -hit.contact:
                 self._add("penetration", subject, 0, -hit.distance, "m", f"overlap by {millimetres:.1f} mm", row=hit.row)
             elif hit.at_waypoint and hit.row > 0 and hit.distance < hit.margin - WAYPOINT_TOLERANCE:
                 detail = f"are only {millimetres:.1f} mm apart, {1e3 * hit.margin:.0f} mm are asked for"

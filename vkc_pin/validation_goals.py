@@ -11,7 +11,7 @@ import pinocchio as pin
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.options import Options
 from vkc_pin.report import Violation
-from vkc_pin.steps import Actuate, GoTo, Grasp, Reach, Step
+from vkc_pin.steps import STEPS, Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
 from vkc_pin.validation_samples import Samples
 
 __all__ = ["check_goals", "check_steps"]
@@ -40,22 +40,30 @@ def check_steps(samples: Samples, steps: Sequence[Step]) -> None:
     objects = samples.scene.objects
     for number, step in enumerate(steps):
         where = f"steps[{number}]"
-        if isinstance(step, Actuate | Grasp):
+        if isinstance(step, Actuate | Grasp | Place | Release):
+            if step.object is None:
+                continue
             if step.object not in objects:
                 raise UnknownNameError("object", step.object, objects, field=f"{where}.object")
             item = objects[step.object].object
+            if isinstance(step, Release):
+                continue
+            if isinstance(step, Grasp) and step.by is not None:
+                samples.check_frame(step.by, f"{where}.by")
             if step.attachment is not None and step.attachment not in item.attachments:
                 kind = f"attachment of '{step.object}'"
                 raise UnknownNameError(kind, step.attachment, item.attachments, field=f"{where}.attachment")
             for joint in step.joints if isinstance(step, Actuate) else ():
                 if joint not in item.coordinates.names:
                     raise UnknownNameError(f"joint of '{step.object}'", joint, item.coordinates.names, field=f"{where}.joints")
-        elif isinstance(step, Reach):
+        elif isinstance(step, Touch) and step.frame.partition(".")[0] in objects:
+            samples.check_frame(step.frame, f"{where}.frame")
+        elif isinstance(step, Reach | Touch):
             frames = [frame.name for frame in samples.scene.robot.model.frames]
             if step.frame is not None and step.frame not in frames:
                 raise UnknownNameError("frame of the robot", step.frame, frames, field=f"{where}.frame")
         elif not isinstance(step, GoTo):
-            raise InputError("not a step", field=where, expected="Reach, Grasp, Actuate or GoTo", got=repr(step))
+            raise InputError("not a step", field=where, expected=", ".join(kind.__name__ for kind in STEPS), got=repr(step))
 
 
 def check_goals(samples: Samples, steps: Sequence[Step], options: Options) -> list[Violation]:
@@ -66,7 +74,7 @@ def check_goals(samples: Samples, steps: Sequence[Step], options: Options) -> li
     """
     phases = samples.trajectory.phases
     ends = [0, *(phase.last for phase in phases)]  # a step may be done before anything begins
-    misses = [[_misses(samples, step, end, options) for end in ends] for step in steps]
+    misses = [[_misses(samples, step, k, options) for k in range(len(ends))] for step in steps]
     found, reached = [], 0
     for number in range(len(steps)):
         candidates = [len(ends) - 1] if number == len(steps) - 1 else range(reached, len(ends))
@@ -128,9 +136,11 @@ def _moved(samples: Samples, number: int) -> dict[str, tuple[float, str]]:
     return moved
 
 
-def _misses(samples: Samples, step: Step, waypoint: int, options: Options) -> list[Miss]:
-    """Return what of a step's goal does not hold at a waypoint."""
-    row, misses = int(samples.waypoint_rows[waypoint]), []
+def _misses(samples: Samples, step: Step, end: int, options: Options) -> list[Miss]:
+    """Return what of a step's goal does not hold after `end` phases."""
+    phases = samples.trajectory.phases
+    row, misses = int(samples.waypoint_rows[phases[end - 1].last if end else 0]), []
+    held = phases[min(end, len(phases) - 1)].held  # from then on
     tolerance = {"m": options.goal_position, "rad": options.goal_angle}
 
     def expect(subject: str, error: float, unit: str, detail: str) -> None:
@@ -146,13 +156,18 @@ def _misses(samples: Samples, step: Step, waypoint: int, options: Options) -> li
         name, (distance, turn) = _grasp(samples, step, row)
         expect(f"{step.object}.{name}", distance, "m", f"the tool is {distance:.4f} m from the grasp")
         expect(f"{step.object}.{name}", turn, "rad", f"the tool is turned {turn:.4f} rad from the grasp")
-    elif isinstance(step, Reach):
-        frame = step.frame or samples.scene.robot.tool_frame
-        offset = step.pose.actInv(samples.placements([row], frame)[0])
-        distance, turn = float(np.linalg.norm(offset.translation)), float(np.linalg.norm(pin.log3(offset.rotation)))
-        expect(frame, distance, "m", f"{distance:.4f} m from the pose to reach")
-        expect(frame, turn, "rad", f"turned {turn:.4f} rad from the pose to reach")
-    else:
+    elif isinstance(step, Reach | Touch | Place):
+        frame, target, free = _target(samples, step)
+        placement = samples.placements([row], frame)[0]
+        distance = float(np.linalg.norm(placement.translation - target.translation))
+        expect(frame, distance, "m", f"{distance:.4f} m from where it should be")
+        turn = _turn(placement, target, free)
+        expect(frame, turn, "rad", f"turned {turn:.4f} rad from how it should be")
+    if isinstance(step, Place | Release):
+        for name in [step.object] if step.object is not None else list(held):
+            if name in held:
+                misses.append(Miss(name, 1.0, "holds", "is held still"))
+    if isinstance(step, GoTo):
         x, y, yaw = samples.z[row, :3]
         distance = float(np.hypot(x - step.x, y - step.y))
         expect("base", distance, "m", f"{distance:.4f} m from the place to go to")
@@ -160,6 +175,29 @@ def _misses(samples: Samples, step: Step, waypoint: int, options: Options) -> li
             turn = float(abs((yaw - step.yaw + np.pi) % (2 * np.pi) - np.pi))
             expect("base heading", turn, "rad", f"turned {turn:.4f} rad from the heading asked for")
     return misses
+
+
+def _target(samples: Samples, step: Reach | Touch | Place) -> tuple[str, pin.SE3, str]:
+    """Return the frame that a step brings somewhere, where, and which orientation is left free: "", "heading" or "all"."""
+    if isinstance(step, Reach):
+        return step.frame or samples.scene.robot.tool_frame, step.pose, ""
+    goal = step.target if isinstance(step, Touch) else step.pose
+    frame = step.frame if isinstance(step, Touch) else f"{step.object}.{samples.scene.objects[step.object].object.base_link}"
+    if isinstance(goal, pin.SE3):
+        return frame, goal, ""
+    if isinstance(step, Touch):
+        return frame, pin.SE3(np.eye(3), np.array(goal)), "all"
+    return frame, pin.SE3(samples.scene.objects[step.object].placement.rotation, np.array(goal)), "heading"
+
+
+def _turn(placement: pin.SE3, target: pin.SE3, free: str) -> float:
+    """Return the angle [rad] between two placements in what is not free."""
+    if free == "all":
+        return 0.0
+    if free == "heading":  # the angle between the two verticals, seen from the body
+        one, other = placement.rotation[2], target.rotation[2]
+        return float(np.arctan2(np.linalg.norm(np.cross(one, other)), one @ other))
+    return float(np.linalg.norm(pin.log3(target.rotation.T @ placement.rotation)))
 
 
 def _grasp(samples: Samples, step: Grasp, row: int) -> tuple[str, tuple[float, float]]:
@@ -170,6 +208,6 @@ def _grasp(samples: Samples, step: Grasp, row: int) -> tuple[str, tuple[float, f
     used = [samples.scene.held, *(phase.held for phase in samples.trajectory.phases)]
     names = [step.attachment] if step.attachment is not None else [held[step.object] for held in used if step.object in held]
     names = names or [samples.scene.objects[step.object].object.attachment().name]
-    errors = {name: samples.grasp_errors(step.object, name, np.array([row]))[0] for name in names}
+    errors = {name: samples.grasp_errors(step.object, name, np.array([row]), step.by)[0] for name in names}
     name = min(errors, key=lambda key: float(errors[key].max()))
     return name, (float(errors[name][0]), float(errors[name][1]))

@@ -6,8 +6,7 @@ by at most what their relative motion is long.
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -26,13 +25,17 @@ RESOLUTION = 1e-3  # [m] of penetration that may stay unseen between two samples
 
 
 class Hit(NamedTuple):
-    """A pair's distance [m] at one state: at sample `row`, or between it and the next."""
+    """A pair's distance [m] at one state: at sample `row`, or between it and the next.
+
+    `margin` is the clearance asked for at waypoints, `contact` the overlap that counts as contact [m].
+    """
 
     row: int
     first: str
     second: str
     distance: float
     margin: float
+    contact: float
     at_waypoint: bool
 
 
@@ -42,13 +45,15 @@ class PairTable:
     Attributes:
         pairs: Geometry indices in `world.collision`, shape (P, 2).
         margins: Clearance each must keep at waypoints [m], shape (P,); 0 where a gripper closes on what it grasps.
+        contact: Overlap that counts as contact [m], shape (P,).
 
     Args:
         scene: Where it happens.
         world: The scene as one plain tree.
-        trajectory: The motion; what it holds at any time its gripper may touch.
+        trajectory: The motion.
         dist_safe: Clearance to keep at the waypoints [m].
-        grasps: Objects and attachments that the gripper may touch besides.
+        touching: Which pairs of geometries of `world.collision` (smaller index first) need no clearance, and the overlap
+            of each that counts as contact [m].
     """
 
     def __init__(
@@ -58,32 +63,32 @@ class PairTable:
         trajectory: Trajectory,
         dist_safe: float,
         *,
-        grasps: Iterable[tuple[str, str]] = (),
+        touching: Mapping[tuple[int, int], float] | None = None,
     ) -> None:
+        touching = {} if touching is None else touching
         self.scene, self.world, self.dist_safe = scene, world, dist_safe
         self.moved = [False]  # for each joint of the world, whether the trajectory moves it or one that carries it
         for joint in range(1, world.model.njoints):
             self.moved.append(self.moved[world.model.parents[joint]] or world.model.names[joint] in trajectory.names)
-        self.grasped = {
-            f"{owner}.{scene.objects[owner].object.attachments[attachment].link}"
-            for owner, attachment in itertools.chain(
-                grasps, scene.held.items(), *(phase.held.items() for phase in trajectory.phases)
-            )
-        }
+        held = {owner for phase in trajectory.phases for owner in phase.held}
+        self.carried = {name for name, placed in scene.objects.items() if placed.object.free and name in held}
+        for name in self.carried:
+            for joint in world.joints_of(name):
+                self.moved[joint] = True
         robots = len(scene.robot.collision.geometryObjects)
         self._robot_pairs = {frozenset((p.first, p.second)) for p in scene.robot.collision.collisionPairs}
         shapes, labels = world.collision.geometryObjects, world.collision_labels
         self.group = ["robot" if i < robots else self._owner(labels[i]) for i in range(len(shapes))]
-        pairs, margins = [], []
+        pairs, margins, contact = [], [], []
         for j in range(len(shapes)):
             for i in range(j):
                 if self._counts(i, j):
-                    touch = labels[i] in scene.robot.touch_links and labels[j] in self.grasped
                     pairs.append((i, j))
-                    margins.append(0.0 if touch else dist_safe)
+                    margins.append(0.0 if (i, j) in touching else dist_safe)
+                    contact.append(touching.get((i, j), 0.0))
         if not pairs:
             raise InputError("no pair of geometries can collide", field="scene", expected="collision geometry")
-        self.pairs, self.margins = np.array(pairs), np.array(margins)
+        self.pairs, self.margins, self.contact = np.array(pairs), np.array(margins), np.array(contact)
         self.geometry = world.collision.copy()
         self.geometry.removeAllCollisionPairs()
         for first, second in pairs:
@@ -101,7 +106,7 @@ class PairTable:
         if a == "robot" and b == "robot":
             return frozenset((i, j)) in self._robot_pairs
         if self.world.collision_labels[j] == FLOOR:  # wheels stand on it, objects hang as their makers hung them
-            return a == "robot" and shapes[i].parentJoint > 1
+            return (a == "robot" and shapes[i].parentJoint > 1) or a in self.carried
         if a == "robot":
             return True
         if a == b:  # an object with itself, or two obstacles
@@ -125,7 +130,7 @@ class PairTable:
         for t, row in enumerate(waypoints.tolist()):
             for k in {int(np.argmin(at[t])), *np.flatnonzero(at[t] < self.margins).tolist()}:
                 yield self._hit(row, k, at[t, k], at_waypoint=True)
-        bounds = self._motion_bounds(z[waypoints])
+        bounds = self._motion_bounds(z, waypoints)
         motion = bounds[:, self.pairs[:, 0]] + bounds[:, self.pairs[:, 1]]
         # d(s) ≥ (d_t + d_{t+1} − relative motion) / 2 for every state in between.
         floor = (at[1:] + at[:-1] - motion) / 2
@@ -168,15 +173,18 @@ class PairTable:
     def _hit(self, row: int, k: int, distance: float, *, at_waypoint: bool = False) -> Hit:
         first, second = self.pairs[k]
         labels = self.world.collision_labels
-        return Hit(int(row), labels[first], labels[second], float(distance), float(self.margins[k]), at_waypoint)
+        return Hit(
+            int(row), labels[first], labels[second], float(distance), float(self.margins[k]), float(self.contact[k]), at_waypoint
+        )
 
-    def _motion_bounds(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _motion_bounds(self, samples: NDArray[np.float64], waypoints: NDArray[np.int_]) -> NDArray[np.float64]:
         """Return how far any point of each geometry can move between waypoints, shape (T − 1, G) [m].
 
         A joint's rotation moves a point by at most the angle times its distance from the axis, and that is at most the
-        sum of the offsets of all joints between, and of the geometry itself; a prismatic joint adds its travel.
+        sum of the offsets of all joints between, and of the geometry itself; a prismatic joint adds its travel. The way of
+        a free joint is the sum over the samples in between.
         """
-        model, coordinates = self.world.model, self.world.coordinates
+        model, coordinates, z = self.world.model, self.world.coordinates, samples[waypoints]
         steps = np.abs(np.diff(z, axis=0))
         spans = np.linalg.norm(np.diff(z[:, :2], axis=0), axis=1)
         offset = [float(np.linalg.norm(placement.translation)) for placement in model.jointPlacements]
@@ -191,7 +199,9 @@ class PairTable:
             joint = shape.parentJoint
             while joint:
                 columns = of_joint[joint]
-                if len(columns) == 3:  # the planar base
+                if len(columns) == 7:  # the free joint of what can be carried
+                    bounds[:, g] += self._free_motion(samples[:, columns], waypoints, reach)
+                elif len(columns) == 3:  # the planar base
                     bounds[:, g] += spans + steps[:, columns[2]] * reach
                 elif prismatic[joint]:
                     bounds[:, g] += steps[:, columns[0]]
@@ -201,3 +211,11 @@ class PairTable:
                 reach += offset[joint]
                 joint = model.parents[joint]
         return bounds
+
+    def _free_motion(self, samples: NDArray[np.float64], waypoints: NDArray[np.int_], reach: float) -> NDArray[np.float64]:
+        """Return how far a point at `reach` [m] from a free joint moves between waypoints, shape (T − 1,) [m]."""
+        turns = samples[:, 3:] / np.linalg.norm(samples[:, 3:], axis=1, keepdims=True)
+        half = np.arccos(np.clip(np.abs(np.einsum("kc,kc->k", turns[1:], turns[:-1])), 0.0, 1.0))
+        way = np.linalg.norm(np.diff(samples[:, :3], axis=0), axis=1) + 2.0 * half * reach
+        total = np.concatenate([[0.0], np.cumsum(way)])
+        return np.diff(total[waypoints])

@@ -65,11 +65,22 @@ class Samples:
                 attachments = self.scene.objects[owner].object.attachments
                 if attachment not in attachments:
                     raise UnknownNameError(f"attachment of '{owner}'", attachment, attachments, field=field)
+                if owner in phase.by:
+                    self.check_frame(phase.by[owner], field.replace("held", "by"))
                 for name in attachments[attachment].coordinates:
                     if f"{owner}.{name}" not in names:
                         raise InputError(
                             "this grasp's coordinate is missing", field="trajectory.names", expected=f"{owner}.{name}"
                         )
+
+    def check_frame(self, frame: str, field: str) -> None:
+        """Check that "<object>.<link>" exists. Raises `UnknownNameError` if it does not."""
+        owner, _, link = frame.partition(".")
+        if owner not in self.scene.objects:
+            raise UnknownNameError("object", owner, self.scene.objects, field=field)
+        links = [f.name for f in self.scene.objects[owner].object.model.frames if f.type == pin.FrameType.BODY]
+        if link not in links:
+            raise UnknownNameError(f"link of '{owner}'", link, links, field=field)
 
     def _sample(self) -> tuple[NDArray[np.float64], NDArray[np.int_]]:
         """Return the times to look at, and where among them the waypoints are."""
@@ -141,10 +152,13 @@ class Samples:
             found.append(pin.updateFramePlacement(model, data, index).copy())
         return found
 
-    def grasp_errors(self, owner: str, name: str, rows: NDArray[np.int_]) -> NDArray[np.float64]:
-        """Return how far the tool is from where attachment `name` has it, at some samples, shape (K, 2): [m] and [rad]."""
+    def grasp_errors(self, owner: str, name: str, rows: NDArray[np.int_], by: str | None = None) -> NDArray[np.float64]:
+        """Return how far the tool is from where attachment `name` has it, at some samples, shape (K, 2): [m] and [rad].
+
+        `by` is the frame that takes the tool's place, "<object>.<link>".
+        """
         attachment = self.scene.objects[owner].object.attachments[name]
-        tools = self.placements(rows, self.scene.robot.tool_frame)
+        tools = self.placements(rows, by or self.scene.robot.tool_frame)
         links = self.placements(rows, f"{owner}.{attachment.link}")
         positions, own = self.trajectory.at(self.times[rows]), [f"{owner}.{suffix}" for suffix in attachment.coordinates]
         values = np.zeros((len(rows), len(own)))

@@ -13,11 +13,9 @@ from numpy.typing import NDArray
 
 from vkc_pin import cpin
 from vkc_pin.coordinates import Coordinates
-from vkc_pin.pose import POSE_LOWER, pose_rows
+from vkc_pin.pose import ROW_BOUNDS, pose_rows
 
-__all__ = ["POSE_ROWS", "PoseRow", "Structure", "WaypointFunctions"]
-
-POSE_ROWS = len(POSE_LOWER)
+__all__ = ["PoseRow", "Structure", "WaypointFunctions"]
 
 
 @dataclass(frozen=True)
@@ -28,11 +26,18 @@ class PoseRow:
         joint: Joint of the model that carries it.
         local: Its placement in the joint's frame.
         waypoints: At which waypoints, counted from 1.
+        kind: "pose", "point" or "upright"; see `pose`.
     """
 
     joint: int
     local: pin.SE3
     waypoints: tuple[int, ...]
+    kind: str = "pose"
+
+    @property
+    def rows(self) -> int:
+        """Number of constraint rows."""
+        return len(ROW_BOUNDS[self.kind][0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +52,8 @@ class Structure:
         weights_velocity, weights_acceleration: Of eq. 1, per coordinate, on the squared differences; shape (n,).
         rests: Waypoints inside the motion at which it comes to rest, as it does at start and end.
         differential: Whether the base must not slip sideways.
+        clamped: (column, first, last): coordinates that keep their value from waypoint `first` to `last`, as a hand does
+            that clamps.
     """
 
     model: pin.Model
@@ -57,13 +64,15 @@ class Structure:
     weights_acceleration: NDArray[np.float64]
     rests: tuple[int, ...] = ()
     differential: bool = False
+    clamped: tuple[tuple[int, int, int], ...] = ()
 
     @property
     def key(self) -> tuple[Any, ...]:
         """Equal for structures that share one program."""
-        poses = tuple((p.joint, p.local.homogeneous.round(12).tobytes(), p.waypoints) for p in self.poses)
+        poses = tuple((p.joint, p.local.homogeneous.round(12).tobytes(), p.waypoints, p.kind) for p in self.poses)
         weights = (self.weights_velocity.tobytes(), self.weights_acceleration.tobytes())
-        return (self.model.saveToString(), self.segments, poses, self.slots, *weights, self.rests, self.differential)
+        others = (self.rests, self.differential, self.clamped)
+        return (self.model.saveToString(), self.segments, poses, self.slots, *weights, *others)
 
 
 class WaypointFunctions:
@@ -83,9 +92,11 @@ class WaypointFunctions:
             row = structure.poses[pose]
             column = placements[:, row.joint - 1]
             rotation = ca.reshape(column[:9], 3, 3)
-            parts.append(pose_rows(rotation @ row.local.rotation, rotation @ row.local.translation + column[9:], targets[:, k]))
+            turned, moved = rotation @ row.local.rotation, rotation @ row.local.translation + column[9:]
+            parts.append(pose_rows(row.kind, turned, moved, targets[:, k]))
         pose_values = ca.vertcat(*parts) if parts else ca.SX(0, 1)
-        self.rows = slots + POSE_ROWS * len(poses)
+        self.pose_rows = [structure.poses[pose].rows for pose in poses]
+        self.rows = slots + sum(self.pose_rows)
         rows = ca.vertcat(planes @ stacked - offsets + s, pose_values)
         multipliers = ca.SX.sym("lam", self.rows)
         sweep = ca.jacobian(stacked, z)

@@ -1,6 +1,7 @@
 """The scene as one plain tree, nothing inverted: robot and objects side by side, rooted in the world.
 
-Validation, pictures and plots use it; being built without the chain, it can catch the chain's mistakes.
+Validation, pictures and plots use it; being built without the chain, it can catch the chain's mistakes. A free object has
+a free joint: it stands where it was left, and moves rigidly with the hand from where it was when the hand closed.
 """
 
 from __future__ import annotations
@@ -14,10 +15,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from vkc_pin.assembly import graft, graft_geometry
 from vkc_pin.coordinates import Coordinates
+from vkc_pin.geometry import PlacedObject
+from vkc_pin.hold import holds_of
 from vkc_pin.scene import Scene
-from vkc_pin.trajectory import Trajectory
+from vkc_pin.trajectory import PhaseSpan, Trajectory
 
-__all__ = ["World"]
+__all__ = ["FREE_JOINT", "World", "as_numbers"]
+
+FREE_JOINT = "placement"
+"""A free object's placement in the world is the joint `<object>.placement`."""
 
 
 class World:
@@ -25,22 +31,19 @@ class World:
 
     Attributes:
         model: Robot (joint 1 is the planar base), then every object's own tree; joints of objects are `<object>.<joint>`,
-            frames `<object>.<link>`.
+            the free joint of one that can be carried `<object>.placement`, frames `<object>.<link>`.
         coordinates: Its minimal coordinates, n of them: the robot's, then the objects'.
         collision, visual: Geometry; what stands still has parent joint 0.
         collision_labels, visual_labels: For each geometry, the link or obstacle it belongs to, e.g. "forearm_link",
             "door.panel", "sofa".
-        start: The scene's start and the objects' states, shape (n,).
+        start: The scene's start and the objects' placements and states, shape (n,).
     """
 
     def __init__(self, scene: Scene) -> None:
         robot = scene.robot
         self.scene = scene
         self.model = pin.Model(robot.model)
-        self._joints = {
-            name: graft(self.model, placed.object.model, parent=0, placement=placed.placement, prefix=f"{name}.")
-            for name, placed in scene.objects.items()
-        }
+        self._joints = {name: self._plant(placed) for name, placed in scene.objects.items()}
         self.collision = self._geometry(
             robot.collision, {name: placed.object.collision for name, placed in scene.objects.items()}, scene.obstacles
         )
@@ -50,8 +53,19 @@ class World:
             *scene.obstacle_labels,
         ]
         self.coordinates = Coordinates(self.model)
-        states = [np.asarray(placed.state) for placed in scene.objects.values()]
+        states = [
+            np.concatenate([as_numbers(placed.placement) if placed.object.free else [], placed.state])
+            for placed in scene.objects.values()
+        ]
         self.start: NDArray[np.float64] = np.concatenate([np.asarray(scene.start), *states])
+
+    def _plant(self, placed: PlacedObject) -> list[int]:
+        """Add an object's tree to the model; return its joints there."""
+        parent, placement, prefix = 0, placed.placement, f"{placed.name}."
+        if placed.object.free:
+            parent = self.model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), prefix + FREE_JOINT)
+            placement = pin.SE3.Identity()
+        return graft(self.model, placed.object.model, parent=parent, placement=placement, prefix=prefix)
 
     @cached_property
     def visual(self) -> pin.GeometryModel:
@@ -80,7 +94,8 @@ class World:
         geometry, here = pin.GeometryModel(), pin.SE3.Identity()
         graft_geometry(geometry, robot.geometryObjects, joints=list(range(self.scene.robot.model.njoints)), placement=here)
         for name, source in objects.items():
-            where = self.scene.objects[name].placement
+            placed = self.scene.objects[name]
+            where = here if placed.object.free else placed.placement
             graft_geometry(geometry, source.geometryObjects, joints=self._joints[name], placement=where, prefix=f"{name}.")
         graft_geometry(geometry, obstacles.geometryObjects, joints=[0], placement=here)
         return geometry
@@ -89,16 +104,89 @@ class World:
         """Return minimal coordinates, shape (K, n), of the world along `trajectory`.
 
         Args:
-            trajectory: A motion in this scene; what it does not name stays as it is at the start.
-            times: [s], shape (K,); None takes the waypoints.
+            trajectory: A motion in this scene; what it does not name stays as it is at the start, unless it is carried.
+            times: [s], shape (K,), in increasing order; None takes the waypoints.
         """
-        values = trajectory.positions if times is None else trajectory.at(times)
+        times = trajectory.times if times is None else np.asarray(times, float)
+        values = trajectory.at(times)
         rows = np.tile(self.start, (len(values), 1))
         index: Mapping[str, int] = {name: i for i, name in enumerate(self.coordinates.names)}
         for column, name in enumerate(trajectory.names):
             if name in index:  # virtual joints of grasps belong to no body
                 rows[:, index[name]] = values[:, column]
+        self._carry(trajectory, times, rows)
         return rows
+
+    def _carry(self, trajectory: Trajectory, times: NDArray[np.float64], rows: NDArray[np.float64]) -> None:
+        """Write into `rows` where free objects are: with whatever holds them, from where they were when it took hold."""
+        where = {name: placed.placement for name, placed in self.scene.objects.items() if placed.object.free}
+        if not where:
+            return
+        for number, phase in enumerate(trajectory.phases):
+            begin, end = float(trajectory.times[phase.first]), float(trajectory.times[phase.last])
+            last = number == len(trajectory.phases) - 1
+            now = np.flatnonzero(((times > begin) | (number == 0)) & ((times <= end) | last))
+            asked = np.clip(np.concatenate([[begin], times[now], [end]]), begin, end)
+            found = self._carried(trajectory, phase, asked, where)
+            for name, placements in found.items():
+                rows[now, self.placement_columns(name)] = [as_numbers(p) for p in placements[1:-1]]
+                where[name] = placements[-1]
+            for name in where.keys() - found.keys():
+                rows[now, self.placement_columns(name)] = as_numbers(where[name])
+        for name in where:  # of the two quaternions of one orientation the nearer, so that rows can be interpolated
+            columns = self.placement_columns(name)
+            turns = rows[:, columns][:, 3:]
+            flips = np.concatenate([[1.0], np.sign(np.einsum("kc,kc->k", turns[1:], turns[:-1]))])
+            rows[:, columns.start + 3 : columns.stop] = turns * np.cumprod(np.where(flips == 0.0, 1.0, flips))[:, None]
+
+    def _carried(
+        self, trajectory: Trajectory, phase: PhaseSpan, times: NDArray[np.float64], where: Mapping[str, pin.SE3]
+    ) -> dict[str, list[pin.SE3]]:
+        """Return the placements at `times` of all free objects held in a phase, which are at `where` at the first of these."""
+        values, robot = trajectory.at(times), self.scene.robot
+        data = robot.model.createData()
+        tool = robot.model.getFrameId(robot.tool_frame)
+        tools: list[pin.SE3] = []
+        found: dict[str, list[pin.SE3]] = {}
+        for hold in holds_of(phase.held, phase.by):
+            placed = self.scene.objects[hold.object]
+            if not placed.object.free:
+                continue
+            if hold.by is None:
+                for q in robot.coordinates.q(values[:, : trajectory.robot_size]) if not tools else ():
+                    pin.forwardKinematics(robot.model, data, q)
+                    tools.append(pin.updateFramePlacement(robot.model, data, tool).copy())
+                holders = tools
+            else:
+                carrier = self.scene.objects[hold.by.object]
+                link = carrier.object.link_placement(str(hold.link), carrier.state)
+                holders = [placement * link for placement in found[hold.by.object]]
+            attachment = placed.object.attachment(hold.attachment)
+            in_object = placed.object.link_placement(attachment.link, placed.state) * attachment.placement
+            names = [f"{hold.object}.{name}" for name in attachment.coordinates]
+            freedom = values[:, [trajectory.names.index(name) for name in names]]
+            still = attachment.motion(freedom[0]) if not np.ptp(freedom, axis=0).any() else None
+            ideal = [
+                holder * (in_object * (still if still is not None else attachment.motion(row))).inverse()
+                for holder, row in zip(holders, freedom, strict=True)
+            ]
+            offset = ideal[0].inverse() * where[hold.object]  # the hand may close a hair beside the attachment
+            found[hold.object] = [placement * offset for placement in ideal]
+        return found
+
+    def joints_of(self, name: str) -> list[int]:
+        """Return the joints of the model that are an object's, with its free joint."""
+        return [joint for joint in self._joints[name] if joint]
+
+    def placement_columns(self, name: str) -> slice:
+        """Return which of the coordinates are the placement of a free object."""
+        first = self.coordinates.index(f"{name}.{FREE_JOINT}_x")
+        return slice(first, first + 7)
+
+
+def as_numbers(placement: pin.SE3) -> NDArray[np.float64]:
+    """Return a placement as a free joint's seven coordinates."""
+    return np.asarray(pin.SE3ToXYZQUAT(placement), float)
 
 
 def _link(shape: pin.GeometryObject) -> str:

@@ -1,0 +1,97 @@
+"""Task: what steps ask for, in phases. What is held when, which joints move, and what must hold at the end (f_task of eq. 3)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import pinocchio as pin
+
+from vkc_pin.hold import Hold
+from vkc_pin.steps import Step
+
+__all__ = ["FrameGoal", "Phase", "Task"]
+
+
+@dataclass(frozen=True)
+class FrameGoal:
+    """A frame that must be somewhere in the world.
+
+    Attributes:
+        frame: Of the robot, or a link of the object that `hold` holds.
+        placement: Where; of a point only the translation counts.
+        kind: "pose", "point", or "upright": the point, and the vertical as `placement` has it, at any heading.
+        hold: What holds the object that the frame belongs to; None for a frame of the robot.
+        touches: Whether the frame's link may come as close to what is there as it likes.
+    """
+
+    frame: str
+    placement: pin.SE3
+    kind: str = "pose"
+    hold: Hold | None = None
+    touches: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.hold.object}.{self.frame}" if self.hold else self.frame
+
+
+@dataclass(frozen=True)
+class Phase:
+    """A stretch of the motion in which the same things are held.
+
+    Attributes:
+        name: What happens in it.
+        segments: Steps of time; the phase has `segments + 1` waypoints, the first shared with the phase before.
+        held: What is held, each after the hold it depends on.
+        ranges: Object coordinate → (lower, upper) for every waypoint after the first; all others stand still.
+        values: Object coordinate → value at the last waypoint.
+        frames: Frame goals at the last waypoint.
+        base: (x, y, yaw or None) at the last waypoint, in the world.
+        grasps: What is grasped at the last waypoint.
+        leaves: What was let go of just before.
+        before: Object coordinate → value at the first waypoint, for the joints that this task's grasps can move.
+        standing: Free object → its placement, for those that nobody holds and this task has to do with.
+        left: Free object → the hold that left it where it stands, and the number of the phase at whose end it did, for
+            those of `standing` that stand there only nearly: where exactly, the motion decides.
+        lifted: Hold → placement in which its free object stood when it was grasped just before.
+        lowered: Hold → placement in which its free object stands when it is let go of at the end.
+    """
+
+    name: str
+    segments: int
+    held: tuple[Hold, ...] = ()
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    values: Mapping[str, float] = field(default_factory=dict)
+    frames: tuple[FrameGoal, ...] = ()
+    base: tuple[float, float, float | None] | None = None
+    grasps: tuple[Hold, ...] = ()
+    leaves: tuple[Hold, ...] = ()
+    before: Mapping[str, float] = field(default_factory=dict)
+    standing: Mapping[str, pin.SE3] = field(default_factory=dict)
+    left: Mapping[str, tuple[Hold, int]] = field(default_factory=dict)
+    lifted: Mapping[Hold, pin.SE3] = field(default_factory=dict)
+    lowered: Mapping[Hold, pin.SE3] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Task:
+    """What the steps ask for, in phases.
+
+    Attributes:
+        steps: The user's steps.
+        phases: In order; at least one.
+        holds: Everything that is held at any time, each after the hold it depends on.
+        state: Object coordinate (`<object>.<joint>`) → value at the start, for the joints that `holds` can move.
+        after: What is held when all is done.
+    """
+
+    steps: tuple[Step, ...]
+    phases: tuple[Phase, ...]
+    holds: tuple[Hold, ...]
+    state: Mapping[str, float]
+    after: tuple[Hold, ...] = ()
+
+    @property
+    def segments(self) -> int:
+        """Steps of time of the whole task; it has one waypoint more."""
+        return sum(phase.segments for phase in self.phases)

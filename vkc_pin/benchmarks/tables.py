@@ -1,0 +1,167 @@
+"""Results of experiments as CSV and as tables in Markdown."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from vkc_pin.benchmarks.record import distribution
+
+__all__ = [
+    "EFFORTS",
+    "comparison_table",
+    "failures",
+    "foot",
+    "markdown",
+    "methods_table",
+    "pairs",
+    "quartiles",
+    "to_csv",
+    "wilson",
+]
+
+Record = Mapping[str, Any]
+EFFORTS = {"base_effort": "base [m]", "base_effort_l1": "base |dx|+|dy| [m]", "arm_effort": "arm [rad]"}
+"""What motions are compared by: field → name."""
+_LEAST = 1e-6  # [m] and [rad] by which an effort must be less to be called lower
+
+
+def to_csv(records: Sequence[Record]) -> str:
+    """Return records as CSV, one a row, with a column for every field of any of them; what is no text is written as in JSON."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    columns = list(dict.fromkeys(field for record in records for field in record))
+    writer.writerow(columns)
+    writer.writerows([_cell(record.get(column)) for column in columns] for record in records)
+    return stream.getvalue()
+
+
+def _cell(value: Any) -> str:
+    return value if isinstance(value, str) else "" if value is None else json.dumps(value, ensure_ascii=False)
+
+
+def markdown(head: Sequence[str], rows: Iterable[Sequence[str]], *, text: int = 1) -> str:
+    """Return a table in Markdown; the first `text` columns are aligned left, the others right."""
+    rule = ["---" if column < text else "---:" for column in range(len(head))]
+    return "\n".join("| " + " | ".join(str(cell).replace("|", "\\|") for cell in row) + " |" for row in (head, rule, *rows))
+
+
+def wilson(good: int, number: int, z: float = 1.959964) -> tuple[float, float]:
+    """Return Wilson's interval of a success rate, by default the one of 95 % confidence; (0, 1) for no trials."""
+    if number == 0:
+        return 0.0, 1.0
+    rate, spread = good / number, z * z / number
+    centre = (rate + spread / 2.0) / (1.0 + spread)
+    half = z * np.sqrt(rate * (1.0 - rate) / number + spread / (4.0 * number)) / (1.0 + spread)
+    return float(max(centre - half, 0.0)), float(min(centre + half, 1.0))
+
+
+def quartiles(values: Sequence[float]) -> tuple[float, float, float]:
+    """Return first quartile, median and third quartile; NaN for no values."""
+    first, median, third = np.percentile(values, (25, 50, 75)) if len(values) else (np.nan, np.nan, np.nan)
+    return float(first), float(median), float(third)
+
+
+def failures(records: Iterable[Record]) -> str:
+    """Return the kinds of failures with their numbers, most frequent first: status, and the kind of constraint violated first."""
+    kinds: Counter[str] = Counter()
+    for record in records:
+        if not record["success"]:
+            status, blame = str(record["status"]), str(record.get("failed_constraint") or "")
+            kinds[status if blame in ("", status) else f"{status} ({blame.split()[0]})"] += 1
+    return ", ".join(f"{kind} {count}" for kind, count in sorted(kinds.items(), key=lambda item: (-item[1], item[0])))
+
+
+def methods_table(records: Sequence[Record], scenes: Mapping[str, str], methods: Sequence[str]) -> str:
+    """Return successes, planning times, efforts and failures per scene and method, and over all scenes if there are several.
+
+    Planning times are those of all trials, but for errors, which have none; efforts are those of successes.
+
+    Args:
+        records: Records as `record.trial` makes them.
+        scenes: Scene → name to show.
+        methods: The methods in the order of the rows; those without trials in a scene are left out there.
+    """
+    rows = []
+    for name, chosen in _groups(records, scenes):
+        for method in methods:
+            own = [record for record in chosen if record["method"] == method]
+            if not own:
+                continue
+            good = [record for record in own if record["success"]]
+            time, late = distribution([record for record in own if record.get("planning_time") is not None], "planning_time")
+            efforts = (_number(distribution(good, field)[0]) for field in ("base_effort", "arm_effort"))
+            rows.append(
+                [name, method, f"{len(good)} of {len(own)}", _number(time), _number(late), *efforts, failures(own) or "none"]
+            )
+    head = ["scene", "method", "success", "time, median [s]", "95th percentile [s]", "base [m]", "arm [rad]", "failures"]
+    return markdown(head, rows, text=2)
+
+
+def pairs(records: Iterable[Record], first: str, second: str) -> list[tuple[Record, Record]]:
+    """Return the records of two methods at the same scene, start and repeat, where both have a success."""
+    found: dict[str, dict[tuple[Any, ...], Record]] = {first: {}, second: {}}
+    for record in records:
+        if record["success"] and record["method"] in found:
+            found[record["method"]][(record["scene"], record["number"], record["repeat"])] = record
+    return [(record, found[second][place]) for place, record in found[first].items() if place in found[second]]
+
+
+def comparison_table(
+    records: Sequence[Record], scenes: Mapping[str, str], methods: tuple[str, str], names: tuple[str, str]
+) -> str:
+    """Return the efforts of two methods where both succeed, per scene, and over all scenes if there are several.
+
+    Args:
+        records: Records as `record.trial` makes them, with `number` (of the start) and `repeat`.
+        scenes: Scene → name to show.
+        methods: The two methods.
+        names: Their names to show.
+    """
+    rows = []
+    for name, chosen in _groups(records, scenes):
+        both = pairs(chosen, *methods)
+        for field, shown in EFFORTS.items():
+            one, other = ([float(pair[k][field]) for pair in both] for k in (0, 1))
+            lower = sum(a < b - _LEAST for a, b in zip(one, other, strict=True))
+            rows.append([name, shown, _spread(one), _spread(other), f"{lower} of {len(both)}"])
+    head = ["scene", "effort", *(f"{name}: median (quartiles)" for name in names), f"lower with {names[0]}"]
+    return markdown(head, rows, text=2)
+
+
+def foot(about: Mapping[str, Any]) -> str:
+    """Return in sentences on what machine and with which versions the results with the "meta" `about` were measured."""
+    machine, versions = about["machine"], {**about["versions"]}
+    sources = versions.pop("sources", None)
+    listed = ", ".join(f"{name} {version}" for name, version in versions.items())
+    text = f"{machine['cores']} cores of {machine['processor'] or machine['machine']}, {machine['system']}, "
+    text = f"Measured on {text}Python {machine['python']}, {listed}{f' (sources {sources})' if sources else ''}."
+    if sessions := about.get("sessions"):
+        jobs = " or ".join(str(number) for number in sorted({session["jobs"] for session in sessions}))
+        minutes = sum(session["seconds"] for session in sessions) / 60.0
+        number = sum(session["trials"] for session in sessions)
+        text += (
+            f" {number} trials, {jobs} at a time, took {minutes:.1f} min and up to {about['peak_memory_mb']:.0f} MB a process."
+        )
+    return text
+
+
+def _groups(records: Sequence[Record], scenes: Mapping[str, str]) -> list[tuple[str, list[Record]]]:
+    """Return name and records of every scene, and of all of them if there are several."""
+    groups = [(name, [record for record in records if record["scene"] == scene]) for scene, name in scenes.items()]
+    return [*groups, ("all", list(records))] if len(groups) > 1 else groups
+
+
+def _number(value: float) -> str:
+    return f"{value:.2f}" if np.isfinite(value) else "–"
+
+
+def _spread(values: Sequence[float]) -> str:
+    first, median, third = quartiles(values)
+    return f"{median:.2f} ({first:.2f}–{third:.2f})" if values else "–"

@@ -13,7 +13,8 @@ import pytest
 
 import vkc_pin as vkc
 from vkc_pin import cli
-from vkc_pin.benchmarks import door, record
+from vkc_pin.benchmarks import door, initialization, record
+from vkc_pin.benchmarks import experiment as runner
 
 ROOT = Path(__file__).resolve().parent.parent
 UNFINISHED = ["plan", "drawer", "--set", "drawer.slide=0.3", "--quiet", "--time-limit", "0.001", "--initialization", "stationary"]
@@ -133,6 +134,13 @@ def test_a_plan_that_fails_returns_1_and_is_written(tmp_path: Path, capsys: pyte
         (["view", "drawr"], ["did you mean 'drawer'"]),
         (["bench", "door", "--trials", "0"], ["--trials", "at least 1"]),
         (["bench", "dor"], ["dor"]),
+        (["bench", "initialization"], ["--out"]),
+        (["bench", "initialization", "--out", "o", "--starts", "0"], ["--starts", "at least 1"]),
+        (["bench", "initialization", "--out", "o", "--repeats", "none"], ["--repeats", "at least 1"]),
+        (["bench", "initialization", "--out", "o", "--jobs", "-2"], ["--jobs", "at least 1", "'-2'"]),
+        (["bench", "initialization", "--out", "o", "--seed", "x"], ["--seed", "at least 0"]),
+        (["bench", "initialization", "--out", "o", "--scenes", "init1"], ["there is no scene 'init1'", "did you mean 'init_1'"]),
+        (["bench", "initialization", "--out", "o", "--methods", "auto", "astra"], ["method 'astra'", "did you mean 'astar'"]),
         (["srdf", "husky_ur5", "--output", "x.srdf"], ["husky_ur5e"]),
         (["srdf", "husky_ur5e"], ["--output"]),
         ([], ["COMMAND"]),
@@ -250,6 +258,63 @@ def test_the_bench_table(bench: tuple[int, dict[str, Any]]) -> None:
     assert "peak memory" in text
     sad = {**result["trials"][0], "success": False, "status": "rejected", "violations": ["goal base: elsewhere"]}
     assert "start 0, reach: rejected; goal base: elsewhere" in door.table({**result, "trials": [sad]})
+
+
+@pytest.fixture
+def experiment(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """What `bench initialization` asks for; the experiment itself is at the door, and plans nothing."""
+    asked: dict[str, Any] = {}
+    real = initialization.run
+
+    def run(**given: Any) -> dict[str, Any]:
+        asked.update(given)
+        if "plan" not in asked:
+            raise KeyboardInterrupt("2 of 6 trials are done and kept in out")
+        return real(**{**given, "scenes": ["door"], "solve": lambda scene, spec: asked["plan"]})
+
+    monkeypatch.setattr(initialization, "run", run)
+    monkeypatch.setattr(runner, "_sources", lambda: "abc")
+    return asked
+
+
+def test_bench_initialization(
+    experiment: dict[str, Any], door_plan: vkc.Plan, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    experiment["plan"] = door_plan
+    out = str(tmp_path / "out")
+    command = ["bench", "initialization", "--starts", "2", "--repeats", "3", "--seed", "4", "--jobs", "1", "--out", out]
+    assert cli.main([*command, "--methods", "astar", "auto", "--quiet"]) == 0
+    captured = capsys.readouterr()
+    assert captured.err == ""
+    assert captured.out.startswith((tmp_path / "out" / "table.md").read_text(encoding="utf-8"))
+    assert "| door | astar | 6 of 6 |" in captured.out
+    assert out in captured.out.splitlines()[-1]
+    names = {"results.csv", "results.json", "success.png", "table.md", "trials.jsonl"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == names
+    given = {key: experiment[key] for key in ("starts", "repeats", "seed", "jobs", "out", "scenes", "methods", "progress")}
+    assert given == {
+        "starts": 2,
+        "repeats": 3,
+        "seed": 4,
+        "jobs": 1,
+        "out": out,
+        "scenes": initialization.SCENES,
+        "methods": ["astar", "auto"],
+        "progress": False,
+    }
+    said = failed(capsys, *command, "--methods", "auto", "--quiet")
+    assert "use another folder" in said
+    assert "methods ['astar', 'auto'], got" in said
+
+
+def test_ctrl_c_says_how_to_go_on(experiment: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["bench", "initialization", "--out", "my results"]) == 130
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert "2 of 6 trials are done and kept in out" in captured.err
+    assert captured.err.splitlines()[-1] == "vkc-pin bench initialization --out 'my results'"
+    assert (experiment["starts"], experiment["repeats"], experiment["seed"], experiment["progress"]) == (50, 1, 0, True)
+    assert (experiment["scenes"], experiment["methods"]) == (initialization.SCENES, initialization.METHODS)
 
 
 def test_records_of_failures(door_plan: vkc.Plan) -> None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import os
+import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,7 @@ from vkc_pin.errors import InputError, VkcError
 
 __all__ = ["main"]
 
-EXIT_OK, EXIT_FAILED, EXIT_MISUSE = 0, 1, 2
+EXIT_OK, EXIT_FAILED, EXIT_MISUSE, EXIT_INTERRUPTED = 0, 1, 2, 130
 
 
 def parse_settings(settings: Sequence[str]) -> list[Any]:
@@ -106,7 +108,7 @@ def _view(arguments: argparse.Namespace) -> int:
     return EXIT_OK
 
 
-def _bench(arguments: argparse.Namespace) -> int:
+def _bench_door(arguments: argparse.Namespace) -> int:
     from vkc_pin.benchmarks import door
 
     result = door.run(trials=arguments.trials, seed=arguments.seed, progress=not arguments.quiet)
@@ -116,6 +118,35 @@ def _bench(arguments: argparse.Namespace) -> int:
 
         write_atomically(arguments.json, (json.dumps(result, indent=1) + "\n").encode())
         sys.stdout.write(f"wrote {arguments.json}\n")
+    return EXIT_OK
+
+
+def _bench_initialization(arguments: argparse.Namespace) -> int:
+    from vkc_pin.benchmarks import initialization
+
+    return _experiment(
+        arguments,
+        initialization.run,
+        initialization.report,
+        repeats=arguments.repeats,
+        scenes=arguments.scenes or initialization.SCENES,
+        methods=arguments.methods or initialization.METHODS,
+    )
+
+
+def _experiment(
+    arguments: argparse.Namespace, run: Callable[..., dict[str, Any]], report: Callable[[dict[str, Any]], str], **settings: Any
+) -> int:
+    """Run an experiment on the options that all of them have, and `settings`; print its report, or how to go on."""
+    common = {"starts": arguments.starts, "seed": arguments.seed, "jobs": arguments.jobs, "out": arguments.out}
+    try:
+        result = run(**common, **settings, progress=not arguments.quiet)
+    except KeyboardInterrupt as stop:
+        again = shlex.join(["vkc-pin", *arguments.given])
+        sys.stderr.write(f"\nvkc-pin: stopped{f'; {stop}' if str(stop) else ''}. The same command goes on from there:\n{again}\n")
+        return EXIT_INTERRUPTED
+    sys.stdout.write(report(result))
+    sys.stdout.write(f"\nresults.json, results.csv, table.md and success.png are in {arguments.out}\n")
     return EXIT_OK
 
 
@@ -178,7 +209,19 @@ def _parser() -> argparse.ArgumentParser:
     door.add_argument("--seed", type=_natural, default=0, metavar="S", help="of the starts and of planning (default 0)")
     door.add_argument("--json", metavar="FILE", help="write every trial")
     door.add_argument("--quiet", action="store_true", help="no progress bar")
-    door.set_defaults(run=_bench)
+    door.set_defaults(run=_bench_door)
+    about = (
+        "Compare ways of initialising the trajectory in three scenes, from the same random starts, and plan step after step too."
+    )
+    initialization = benches.add_parser("initialization", help="ways of initialising, at a task with a tool", description=about)
+    _add_experiment_options(initialization)
+    initialization.add_argument(
+        "--repeats", type=_positive, default=1, metavar="R", help="trials per start and method (default 1)"
+    )
+    initialization.add_argument("--scenes", nargs="+", metavar="SCENE", help="some of init_1 init_2 init_3 (default: all)")
+    some = "some of stationary interpolated astar auto (default: all)"
+    initialization.add_argument("--methods", nargs="+", metavar="METHOD", help=some)
+    initialization.set_defaults(run=_bench_initialization)
 
     about = "Sample which links of a robot can never collide."
     srdf = commands.add_parser("srdf", help="regenerate allowed collisions", description=about)
@@ -190,9 +233,21 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _add_experiment_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--starts", type=_positive, default=50, metavar="N", help="random starts per scene (default 50)")
+    parser.add_argument("--seed", type=_natural, default=0, metavar="S", help="of the starts and of planning (default 0)")
+    parser.add_argument(
+        "--jobs", type=_positive, default=os.cpu_count() or 1, metavar="J", help="processes (default: one per core)"
+    )
+    about = "folder for results, table and chart; trials that it has already are not run again"
+    parser.add_argument("--out", required=True, metavar="DIR", help=about)
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; return 0 on success, 1 if no valid motion came out, 2 on misuse."""
+    """Run one command; return 0 on success, 1 if no valid motion came out, 2 on misuse, 130 if Ctrl-C stopped an experiment."""
     arguments = _parser().parse_args(argv)
+    arguments.given = list(sys.argv[1:] if argv is None else argv)
     try:
         return int(arguments.run(arguments))
     except VkcError as error:

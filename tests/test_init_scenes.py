@@ -1,4 +1,4 @@
-"""The scenes of the first experiment: a stick on a table, a cube under another, and what lies between."""
+"""The scenes of the first experiment: a stick on a table, a cube under another; and how stick and ball are grasped."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ import coal
 import numpy as np
 import pinocchio as pin
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from vkc_pin.articulation import load_object
 from vkc_pin.geometry import clearance, placed_shapes, standing_geometry
 from vkc_pin.robot import Robot
 from vkc_pin.scene import START_CLEARANCE, Scene, load_scene
@@ -234,3 +237,42 @@ def test_in_the_air_the_hand_fits_at_the_ends_of_its_turn_too(turn: float) -> No
     for slide in SLIDES:
         tool = placed.link_placement("stick") * grip.placement * grip.motion([slide, turn])
         assert clearance(hand(scene("init_1").robot, tool), shapes) > 0.005
+
+
+LYING = pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.036]))  # the ball, 1 mm above the floor
+
+
+@pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (1.2, 0.0, 0.0), (-1.2, 0.0, 0.0), (0.0, 0.15, 0.7), (0.0, -0.15, -1.5)])
+def test_the_hand_fits_round_a_ball_on_the_floor(turn: tuple[float, float, float]) -> None:
+    ball, here = load_object("ball"), scene("init_1")
+    grip = ball.attachment()
+    assert (ball.free, grip.firm, grip.joint) == (True, True, "spherical")
+    assert {(freedom.lower, freedom.upper) for freedom in grip.freedoms} == {(-1.5, 1.5)}
+    (round_,) = ball.collision.geometryObjects
+    tool = LYING * grip.placement * grip.motion(turn)
+    shapes = hand(here.robot, tool)
+    assert clearance(shapes, [(round_.geometry, LYING)]) > 0.005
+    assert clearance(shapes, placed_shapes([s for s in here.obstacles.geometryObjects if s.name == "floor"])) > 0.02
+    np.testing.assert_allclose(tool.actInv(LYING).translation, [0.0, 0.0, 0.01], atol=1e-12)
+
+
+def test_a_hand_never_takes_the_ball_from_below() -> None:
+    grip = load_object("ball").attachment("grip")
+    for turn in itertools.product(np.linspace(-1.5, 1.5, 7), repeat=3):
+        assert (grip.placement * grip.motion(turn)).rotation[2, 2] < 0.0
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.tuples(*[st.floats(-np.pi, np.pi)] * 3))
+def test_a_sticks_tip_touches_the_ball_and_points_at_its_centre(turn: tuple[float, float, float]) -> None:
+    ball, stick = load_object("ball"), scene("init_1").objects["stick"].object
+    pull = ball.attachment("pull")
+    assert all(freedom.lower <= value <= freedom.upper for freedom, value in zip(pull.freedoms, turn, strict=True))
+    tip = pull.placement * pull.motion(turn)
+    np.testing.assert_allclose(tip.actInv(np.zeros(3)), [0.0, 0.0, 0.035], atol=1e-12)
+    (round_,) = ball.collision.geometryObjects
+    at = tip * stick.link_placement("tip", []).inverse()
+    dowel, butt, front, shaft, pole = [(shape.geometry, at * shape.placement) for shape in stick.collision.geometryObjects]
+    around = [(round_.geometry, pin.SE3.Identity())]
+    assert clearance([pole], around) == pytest.approx(0.0, abs=1e-6)
+    assert clearance([dowel, butt, front, shaft], around) > 0.005

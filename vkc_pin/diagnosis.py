@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vkc_pin.initialization import scatter
+from vkc_pin.knots import scatter
 from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.report import Violation
 

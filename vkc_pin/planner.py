@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import time
 from collections.abc import Callable, Iterator, Sequence
 
@@ -33,7 +32,7 @@ def plan(
     scene: Scene,
     steps: Sequence[Step],
     *,
-    initialization: str = "interpolated",
+    initialization: str = "auto",
     options: Options | None = None,
     callback: Callable[[Iteration], None] | None = None,
     time_limit: float | None = None,
@@ -44,7 +43,7 @@ def plan(
     Args:
         scene: Robot, objects and obstacles; the motion starts at the scene's start.
         steps: What should change in the world, in this order: `Reach`, `Grasp`, `Actuate`, `GoTo`.
-        initialization: "interpolated" or "stationary"; see `initialization.initialize`.
+        initialization: "auto", "interpolated", "astar" or "stationary"; see `initialization.initialize`.
         options: How to plan; `Options()` if left out.
         callback: Called after every round of the solver with an `Iteration`, whose fields are named columns.
         time_limit: Seconds of planning after which the best iterate is returned, with status "time limit".
@@ -152,14 +151,14 @@ class _Planner:
         )
 
     def _seeds(self, problem: TrajectoryProblem) -> Iterator[tuple[str, NDArray[np.float64]]]:
-        seeds = initialize(problem, self.initialization, np.random.default_rng(self.seed), count=self.options.max_restarts)
-        for number in itertools.count(1):
+        seeds = initialize(problem, self.initialization, self.seed, count=self.options.max_restarts)
+        while True:
             began = time.perf_counter()
             seed = next(seeds, None)
             self.times["initialization"] += time.perf_counter() - began
             if seed is None:
                 return
-            yield (self.initialization if number == 1 else f"{self.initialization} {number}"), seed
+            yield seed.name, seed.z
 
     def _solve(self, problem: TrajectoryProblem, seed: NDArray[np.float64], deadline: float) -> Solution:
         solution = solve(problem, seed, callback=self.callback, deadline=deadline)

@@ -26,6 +26,7 @@ from vkc_pin.waypoint import PoseRow, Structure
 __all__ = ["TrajectoryProblem", "build"]
 
 _CHOICE_WEIGHT = 1e-3  # of coordinates that are chosen when grasping and do not move: only keeps the problem regular
+_PATIENCE = 1.5  # how much more time a motion may take before limits on its rates become rows of the program
 _SPARE = 1.15  # how much longer a motion may take than the profile 3s² − 2s³ along its seed
 _KEPT = 8  # programs kept for reuse; each holds some tens of MB
 _transcriptions: OrderedDict[tuple[Any, ...], Transcription] = OrderedDict()
@@ -55,7 +56,7 @@ class TrajectoryProblem:
         lower, upper: Bounds of z_1..z_N, shape (N, n): joint limits (eq. 4), what stands still, joint goals.
         targets: Placements of the pose rows (eqs. 2 and 3), one per `transcription.structure.poses`.
         pose_names: Their names.
-        dt: Time of every step [s], shape (N,): `Options.dt`, or longer where the way is too long for it; see `stretch`.
+        dt: Time of every step [s], shape (N,): `Options.dt`, or longer where the way is too long for it.
         velocity, acceleration: Bounds of `rates` (eq. 5), shapes (N, n) and (N + 1 + rests, n): limits times dt and dt².
     """
 
@@ -68,7 +69,7 @@ class TrajectoryProblem:
         self.transcription = transcribe(self._structure(poses))
         self.start = self._start()
         self.lower, self.upper = self._bounds()
-        self._set_steps(np.full(self.segments, options.dt))
+        self.take_time_for(np.tile(self.start, (self.segments, 1)))
 
     @property
     def segments(self) -> int:
@@ -184,32 +185,38 @@ class TrajectoryProblem:
 
     def _set_steps(self, dt: NDArray[np.float64]) -> None:
         """Take over the time of every step, one value within each run between two rests."""
-        edges = [0, *self.transcription.structure.rests, self.segments]
-        of_rows = np.concatenate([np.full(last - first + 1, dt[first]) for first, last in itertools.pairwise(edges)])
+        of_rows = np.concatenate([np.full(last - first + 1, dt[first]) for first, last in self._runs()])
         self.dt = dt
         self.velocity = self.chain.velocity * dt[:, None]
         self.acceleration = self.chain.acceleration * of_rows[:, None] ** 2
 
     def take_time_for(self, z: NDArray[np.float64]) -> None:
-        """Give every step `Options.dt`, or more where z_1..z_N, shape (N, n), needs it."""
-        self._set_steps(np.full(self.segments, self.options.dt))
-        self.stretch(z)
+        """Give every step `Options.dt`, or more where z_1..z_N, shape (N, n), is too long a way for it.
 
-    def stretch(self, z: NDArray[np.float64]) -> bool:
-        """Give runs between two rests more time if z_1..z_N, shape (N, n), is too long a way for it; return whether any was.
-
-        The measure is the profile 3s² − 2s³ over the way that each coordinate goes in the run: its speed is at most 1.5 times
-        the mean, its acceleration 6 times the way over the square of the duration.
+        The measure is the profile 3s² − 2s³ over the way that each coordinate goes between two rests: its speed is at most 1.5
+        times the mean, its acceleration 6 times the way over the square of the duration.
         """
-        steps, dt = np.abs(np.diff(self.waypoints(z), axis=0)), self.dt.copy()
-        for first, last in itertools.pairwise([0, *self.transcription.structure.rests, self.segments]):
+        steps, dt = np.abs(np.diff(self.waypoints(z), axis=0)), np.full(self.segments, self.options.dt)
+        for first, last in self._runs():
             way = steps[first:last].sum(axis=0)
             needed = max(np.max(1.5 * way / self.chain.velocity), np.sqrt(np.max(6.0 * way / self.chain.acceleration)))
             dt[first:last] = np.maximum(dt[first:last], _SPARE * needed / (last - first))
-        if np.allclose(dt, self.dt, rtol=1e-3):
-            return False
         self._set_steps(dt)
-        return True
+        self._least = dt
+
+    def stretch(self, z: NDArray[np.float64]) -> None:
+        """Give runs between rests up to `_PATIENCE` times more time where z_1..z_N, shape (N, n), exceeds a rate."""
+        first, second = self.rates(z)
+        fast, strong = np.max(np.abs(first) / self.velocity, axis=1), np.max(np.abs(second) / self.acceleration, axis=1)
+        dt = self.dt.copy()
+        for number, (begin, end) in enumerate(self._runs()):
+            excess = max(float(fast[begin:end].max()), float(np.sqrt(strong[begin + number : end + number + 1].max())))
+            dt[begin:end] = np.clip(dt[begin:end] * excess * 1.001, dt[begin:end], _PATIENCE * self._least[begin:end])
+        self._set_steps(dt)
+
+    def _runs(self) -> list[tuple[int, int]]:
+        """Return the stretches between two rests, as first and last waypoint."""
+        return list(itertools.pairwise([0, *self.transcription.structure.rests, self.segments]))
 
     def closed(self, phase: Phase) -> bool:
         """Return whether something that stands fixed in the world is held in a phase: then the chain is closed."""

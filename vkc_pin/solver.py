@@ -14,7 +14,7 @@ from vkc_pin.contact import Contacts
 from vkc_pin.monitor import Interrupt, interruptible
 from vkc_pin.pose import ROW_BOUNDS
 from vkc_pin.problem import TrajectoryProblem
-from vkc_pin.refinement import collisions_between, merge
+from vkc_pin.refinement import KEEP, collisions_between, merge
 from vkc_pin.solution import Iteration, Solution
 
 __all__ = ["solve"]
@@ -39,7 +39,9 @@ _WARM: Mapping[str, Any] = {
     "ipopt.mu_init": 1e-3,
 }
 CLOSE_ENOUGH = 5e-4  # [m] shortfall of clearance at waypoints that ends the loop
+TOLERABLE_BETWEEN = 0.8 * KEEP  # [m] of the clearance asked for between waypoints that may be missing there
 FIRST_RADIUS, RESTART_RADIUS, MIN_RADIUS, SHRINK = 0.5, 0.2, 5e-3, 0.4  # trust region, [m] and [rad]
+NEARLY_FREE = 0.01  # [m] shortfall of clearance below which limits on rates count
 POSE_TOLERANCE = 1e-4  # [m] and [rad]
 RATE_TOLERANCE = 1e-4  # relative
 DRIFT = 0.4  # of what is allowed between waypoints; norms of three residuals are up to √3 larger
@@ -57,6 +59,7 @@ class _Trial:
     pose_error: float
     contacts: Contacts
     shortfall: NDArray[np.float64]
+    clear: bool
     rate: float
     step: float
     satisfied: bool
@@ -77,18 +80,21 @@ class _Loop:
         self.solution = Solution(self.z)
         self.targets = problem.target_matrix()
         self.between = False
-        self.at = self.contacts(self.z)
+        self.at, _ = self.contacts(self.z)
         self.shortfall = self.at.shortfall(problem.segments)
         self.objective, self.pose_error = problem.objective(self.z), problem.pose_error(self.z)
 
-    def contacts(self, z: NDArray[np.float64]) -> Contacts:
-        """Return what is close at the waypoints and, once that was needed, what collides between them."""
+    def contacts(self, z: NDArray[np.float64]) -> tuple[Contacts, bool]:
+        """Return what is close at the waypoints and, once that was needed, between them, and whether that is far enough."""
         begin = time.perf_counter()
         found = self.problem.evaluate_contacts(z, reach=self.options.contact_reach, nearest=self.options.contact_slots)
+        clear = found.violation() < CLOSE_ENOUGH
         if self.between:
-            found = merge(found, collisions_between(self.problem, z))
+            collisions = collisions_between(self.problem, z)
+            clear = clear and collisions.violation() < TOLERABLE_BETWEEN
+            found = merge(found, collisions)
         self.solution.timings["coal"] += time.perf_counter() - begin
-        return found
+        return found, clear
 
     def free_between(self, z: NDArray[np.float64]) -> bool:
         """Return whether nothing collides between waypoints; if something does, look there from now on."""
@@ -96,7 +102,7 @@ class _Loop:
             begin = time.perf_counter()
             found = collisions_between(self.problem, z)
             self.solution.timings["coal"] += time.perf_counter() - begin
-            if len(found.waypoint):
+            if found.violation() >= TOLERABLE_BETWEEN:
                 self.between = True
                 self.at = merge(self.at, found)
                 self.shortfall = self.at.shortfall(self.problem.segments)
@@ -106,7 +112,7 @@ class _Loop:
     def try_step(self, radius: float) -> _Trial:
         """Solve within `radius` of the current waypoints, and look at what is really there."""
         z, slack, objective, satisfied = self.run_ipopt(radius)
-        contacts = self.contacts(z)
+        contacts, clear = self.contacts(z)
         return _Trial(
             z=z,
             slack=slack,
@@ -114,6 +120,7 @@ class _Loop:
             pose_error=self.problem.pose_error(z),
             contacts=contacts,
             shortfall=contacts.shortfall(self.problem.segments),
+            clear=clear,
             rate=self.problem.rate_violation(z),
             step=float(np.abs(z - self.z).max()),
             satisfied=satisfied,
@@ -135,7 +142,7 @@ class _Loop:
         self.z, self.at, self.shortfall = trial.z, trial.contacts, trial.shortfall
         self.objective, self.pose_error = trial.objective, trial.pose_error
         self.solution.z = trial.z
-        if trial.rate > RATE_TOLERANCE:
+        if trial.rate > RATE_TOLERANCE and trial.contacts.violation() < NEARLY_FREE:  # before, it only costs time
             self.problem.stretch(trial.z)
             if not self.rates and self.problem.rate_violation(trial.z) > RATE_TOLERANCE:
                 self.rates, self.multipliers = True, {}
@@ -144,7 +151,7 @@ class _Loop:
         """Return whether everything holds at the waypoints."""
         return (
             trial.satisfied
-            and trial.contacts.violation() < CLOSE_ENOUGH
+            and trial.clear
             and trial.pose_error < POSE_TOLERANCE
             and self.problem.rate_violation(trial.z) <= RATE_TOLERANCE
             and self.problem.drift(trial.z) < DRIFT

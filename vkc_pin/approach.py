@@ -1,0 +1,93 @@
+"""Straight ways in and out: a hand nears what it grasps, and a stick what it touches, from where there is room."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from vkc_pin.hold import Hold
+from vkc_pin.inverse_kinematics import PoseSolver
+from vkc_pin.problem import TrajectoryProblem
+from vkc_pin.task import Phase
+
+__all__ = ["Approach"]
+
+WAY = 0.1  # [m] between two configurations on the way
+TOOL, LIFT = 1, 1  # how many of them before a grasp, after letting go, and to lift or lower what is carried
+REACH = 5  # how many of them at most on the way to what is touched
+_TOLERANCE = 1e-4  # [m] and [rad]
+
+
+class Approach:
+    """Finds configurations on straight ways to and from the ends of a problem's phases.
+
+    A way is the tool's: back along its approach for what it grasps or lets go of, up for what is lifted or put down, back along
+    the frame's z axis for what a frame touches.
+    """
+
+    def __init__(self, problem: TrajectoryProblem) -> None:
+        self.problem, self.chain = problem, problem.chain
+        joint, local = self.chain.frame(self.chain.robot.tool_frame)
+        self.joint, self.local = joint, local
+        self.solver = _tool_solver(self.chain.model.saveToString(), joint, local.homogeneous.tobytes())
+        self.weights = np.ones(self.chain.size)
+        self.weights[:3] = 3.0
+
+    def before(self, z: NDArray[np.float64], phase: Phase) -> NDArray[np.float64]:
+        """Return configurations on the way to `z`, shape (n,), the end of a phase: shape (K, n), the last is the nearest."""
+        if phase.grasps:
+            return self._way(z, -self._axis(z, phase.grasps[0].link, phase.grasps[0].by), TOOL)[::-1]
+        if phase.lowered:
+            return self._way(z, np.array([0.0, 0.0, 1.0]), LIFT)[::-1]
+        for goal in phase.frames:
+            if goal.touches:
+                return self._way(z, -self._axis(z, goal.frame, goal.hold), REACH)[::-1]
+        return np.empty((0, len(z)))
+
+    def after(self, z: NDArray[np.float64], phase: Phase, before: Phase | None) -> NDArray[np.float64]:
+        """Return configurations on the way from `z`, shape (n,), the start of a phase: shape (K, n), the first is the nearest."""
+        if phase.leaves:
+            return self._way(z, -self._axis(z, phase.leaves[0].link, phase.leaves[0].by), TOOL)
+        if phase.lifted:
+            return self._way(z, np.array([0.0, 0.0, 1.0]), LIFT)
+        for goal in before.frames if before else ():
+            if goal.touches:
+                return self._way(z, -self._axis(z, goal.frame, goal.hold), REACH)
+        return np.empty((0, len(z)))
+
+    def _axis(self, z: NDArray[np.float64], name: str | None, hold: Hold | None) -> NDArray[np.float64]:
+        """Return the z axis, in the world, of a frame at `z`: the tool's, or a link's of what is held."""
+        joint, local = self.chain.frame(str(name), hold) if hold else self.chain.frame(name or self.chain.robot.tool_frame)
+        rotations, _ = self.chain.joint_placements(z[None])
+        return np.asarray((rotations[0, joint] @ local.rotation)[:, 2])
+
+    def _way(self, z: NDArray[np.float64], direction: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+        """Return up to `count` configurations at which the tool is `WAY`, 2·`WAY`, ... along `direction` from where `z` has it."""
+        rotations, translations = self.chain.joint_placements(z[None])
+        carrier = pin.SE3(rotations[0, self.joint], translations[0, self.joint])
+        tool = carrier * self.local
+        robot = self.chain.robot.coordinates.size
+        lower, upper = z.copy(), z.copy()
+        lower[:robot], upper[:robot] = self.chain.lower[:robot], self.chain.upper[:robot]
+        for column, name in enumerate(self.chain.names[:3]):
+            lower[column], upper[column] = self.problem.limits(name)
+        found: list[NDArray[np.float64]] = []
+        for k in range(1, count + 1):
+            target = pin.SE3(tool.rotation, tool.translation + k * WAY * direction)
+            start = (found[-1] if found else z)[None]
+            near, ok = self.solver.solve(start, target, lower=lower, upper=upper, weights=self.weights, tolerance=_TOLERANCE)
+            if not ok[0]:
+                break
+            found.append(near[0])
+        return np.array(found).reshape(len(found), len(z))
+
+
+@lru_cache(maxsize=16)
+def _tool_solver(model_text: str, joint: int, local: bytes) -> PoseSolver:
+    """Return the inverse kinematics of the tool, built once per model."""
+    model = pin.Model()
+    model.loadFromString(model_text)
+    return PoseSolver(model, joint, pin.SE3(np.frombuffer(local).reshape(4, 4)))

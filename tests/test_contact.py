@@ -14,6 +14,7 @@ from small_problems import SHORT, cabinet, door_scene, full_scene, random_config
 
 from vkc_pin.contact import Contacts
 from vkc_pin.errors import InputError
+from vkc_pin.hold import Hold
 from vkc_pin.options import Options
 from vkc_pin.problem import TrajectoryProblem, build
 from vkc_pin.scene import FLOOR, Scene
@@ -172,7 +173,7 @@ def test_a_held_object_can_hit_other_objects_and_its_own_other_branches_stand() 
     scene = full_scene()
     problem = build(scene, [Actuate("cabinet", {"swing": 0.5})], options=SHORT)
     n, found = Counted.of(scene), pairs(problem, 1)
-    assert problem.task.phases[1].held == {"cabinet": "grip"}
+    assert problem.task.phases[1].held == (Hold("cabinet", "grip"),)
     held = {"cabinet.arm": 1, "cabinet.tray": 2, "cabinet.flap": 1}
     others = {"door.frame": 3, "door.panel": 1, "door.lever": 2, "drawer.cabinet": 5, "drawer.tray": 8}
     for link, count in held.items():
@@ -196,14 +197,14 @@ def test_a_held_object_can_hit_other_objects_and_its_own_other_branches_stand() 
 def test_two_objects_one_after_the_other() -> None:
     problem = build(full_scene(), [Grasp("door"), Actuate("drawer", {"slide": 0.2})], options=SHORT)
     phases = problem.task.phases
-    assert [dict(phase.held) for phase in phases] == [{}, {}, {"drawer": "handle"}]
+    assert [phase.held for phase in phases] == [(), (), (Hold("drawer", "handle"),)]
     for number, standing in enumerate([{"door", "drawer", "cabinet"}, {"door", "drawer", "cabinet"}, {"door", "cabinet"}]):
         part = problem.contacts.phases[number]
         paired = set(part.pairs.ravel().tolist())
-        for name, indices in problem.chain.held_geometries.items():
+        for hold, indices in problem.chain.held_geometries.items():
             # In the chain's geometry are both; only what is held takes part.
-            assert (set(indices) <= paired) == (name not in standing)
-            assert set(indices).isdisjoint(paired) == (name in standing)
+            assert (set(indices) <= paired) == (hold.object not in standing)
+            assert set(indices).isdisjoint(paired) == (hold.object in standing)
     hand = problem.scene.robot.touch_links
     second = pairs(problem, 1)
     assert set(second[hand[0], "drawer.tray"]) == {CLOSE}

@@ -15,6 +15,7 @@ from small_problems import door_scene, full_scene
 from vkc_pin import validation_pairs
 from vkc_pin.scene import FLOOR, Scene
 from vkc_pin.trajectory import PhaseSpan, Trajectory
+from vkc_pin.validation_contacts import may_touch
 from vkc_pin.validation_pairs import Hit, PairTable
 from vkc_pin.validation_samples import Samples
 from vkc_pin.world import World
@@ -108,7 +109,7 @@ def test_no_point_moves_further_than_the_bound(seed: int, size: float) -> None:
     z = world.positions(motion)
     z[:, 11:] += rng.uniform(0.0, 2.0, z.shape[1] - 11)
     z[1:, 11:] += size * rng.uniform(-1.0, 1.0, (len(z) - 1, z.shape[1] - 11))
-    bounds = table._motion_bounds(z)
+    bounds = table._motion_bounds(z, np.arange(len(z)))
     data, shapes = world.model.createData(), pin.GeometryData(table.geometry)
     corners = [np.array(box_corners(shape)) for shape in table.geometry.geometryObjects]
     for t in range(len(z) - 1):
@@ -166,7 +167,8 @@ def test_a_wire_that_is_passed_between_two_samples() -> None:
 def test_which_pairs_count(door: Scene) -> None:
     motion = wander(door, 0, size=0.1)
     samples = Samples(door, motion)
-    table = PairTable(door, samples.world, motion, 0.02)
+    touching = may_touch(door, samples.world, motion, (), 0.02)
+    table = PairTable(door, samples.world, motion, 0.02, touching=touching)
     robot, things = door.robot.collision, door.objects["door"].object.collision.geometryObjects
     walls = [label for label in door.obstacle_labels if label != FLOOR]
     arm = [shape for shape in robot.geometryObjects if shape.parentJoint > 1]
@@ -178,18 +180,22 @@ def test_which_pairs_count(door: Scene) -> None:
     touching = {pair_names(table, k) for k in np.flatnonzero(table.margins == 0.0)}
     assert touching == {(link, "door.lever") for link in door.robot.touch_links}
     assert set(table.margins) == {0.0, 0.02}
+    assert (table.contact == 0.0).all()
 
 
-def test_what_a_hand_may_touch(door: Scene) -> None:
-    """What it holds in some phase, at the start, or is asked to grasp; nothing else."""
-    drive = of_rows(door, np.vstack([door.start, door.start + 0.1]))
-    world = Samples(door, drive).world
-    assert (PairTable(door, world, drive, 0.02).margins == 0.02).all()
-    for table in (
-        PairTable(door, world, drive, 0.02, grasps=[("door", "handle")]),
-        PairTable(door.with_held({"door": "handle"}), world, drive, 0.02),
-    ):
-        assert {pair_names(table, k)[1] for k in np.flatnonzero(table.margins == 0.0)} == {"door.lever"}
+def test_what_may_touch_needs_no_clearance(door: Scene) -> None:
+    """Only the pairs that were said to, and each with its own overlap that counts as contact."""
+    motion = wander(door, 0, size=0.1)
+    world = Samples(door, motion).world
+    plain = PairTable(door, world, motion, 0.02)
+    assert (plain.margins == 0.02).all()
+    assert (plain.contact == 0.0).all()
+    first, second = (tuple(plain.pairs[k].tolist()) for k in (3, 70))
+    table = PairTable(door, world, motion, 0.02, touching={first: 1e-4, second: 0.0})
+    np.testing.assert_array_equal(table.pairs, plain.pairs)
+    np.testing.assert_array_equal(np.flatnonzero(table.margins == 0.0), [3, 70])
+    np.testing.assert_array_equal(np.flatnonzero(table.contact), [3])
+    assert table.contact[3] == 1e-4
 
 
 def test_a_side_branch_that_nothing_moves_hits_nothing_that_stands() -> None:

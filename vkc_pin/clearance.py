@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vkc_pin.scene import Scene
 from vkc_pin.trajectory import Trajectory
+from vkc_pin.validation_contacts import may_touch
 from vkc_pin.validation_pairs import PairTable
 from vkc_pin.world import World
 
@@ -54,7 +55,8 @@ def clearance_curves(
         world: The scene's world, if there is one already.
     """
     world = World(scene) if world is None else world
-    table = PairTable(scene, world, trajectory, dist_safe)
+    touching = may_touch(scene, world, trajectory, (), dist_safe)
+    table = PairTable(scene, world, trajectory, dist_safe, touching=touching)
     moments = np.atleast_1d(np.asarray(times, float))
     model, data, shapes = world.model, world.model.createData(), pin.GeometryData(table.geometry)
     distances = np.empty((len(moments), len(table.pairs)))
@@ -77,9 +79,9 @@ _KINDS = ("robot – itself", "robot – objects", "robot – obstacles", "objec
 
 
 def _kind(table: PairTable, pair: NDArray[np.int_], margin: float) -> str:
-    if margin <= 0.0:
-        return _KINDS[4]
     first, second = (table.group[int(i)] for i in pair)
+    if margin <= 0.0 and first == "robot":
+        return _KINDS[4]
     if first != "robot" and second != "robot":
         return _KINDS[3]
     other = second if first == "robot" else first

@@ -212,13 +212,14 @@ class ContactModel:
                 for k in pairs[begin:end].tolist():
                     distance = pin.computeDistance(part.geometry, part.data, k).min_distance
                     if distance < reach:
-                        found.append((distance - part.margin(k, int(waypoints[row])), distance, k))
+                        margin = part.margin(k, int(waypoints[row]))
+                        found.append((distance - margin, distance, k, margin))
                 found.sort()
-                for excess, distance, k in found[:nearest]:
+                for _, distance, k, margin in found[:nearest]:
                     result = part.data.distanceResults[k]
                     # `normal` is a view of memory that the next distance of this pair overwrites.
                     vectors.append((result.normal.copy(), result.getNearestPoint1(), result.getNearestPoint2()))
-                    rows.append((float(row), *part.pairs[k].tolist(), distance, distance - excess))
+                    rows.append((float(row), *part.pairs[k].tolist(), distance, margin))
         table = np.array(rows, float).reshape(len(rows), 5)
         order = np.argsort(table[:, 0], kind="stable")
         table, stacked = table[order], np.array(vectors, float).reshape(len(rows), 3, 3)[order]

@@ -220,7 +220,7 @@ class _Check:
         The start is where the robot is: it may be close to something, but not inside.
         """
         samples, smallest = self.samples, np.inf
-        touching = may_touch(samples, self.steps, self.options.dist_safe)
+        touching = may_touch(self.scene, samples.world, self.trajectory, self.steps, self.options.dist_safe)
         pairs = PairTable(self.scene, samples.world, self.trajectory, self.options.dist_safe, touching=touching)
         for hit in pairs.sweep(samples.z, samples.waypoint_rows):
             smallest = min(smallest, hit.distance)

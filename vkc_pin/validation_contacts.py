@@ -10,15 +10,19 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from vkc_pin.geometry import shape_distance
+from vkc_pin.scene import Scene
 from vkc_pin.steps import Grasp, Step, Touch
-from vkc_pin.validation_samples import Samples
+from vkc_pin.trajectory import Trajectory
+from vkc_pin.world import World
 
 __all__ = ["may_touch"]
 
 CONTACT = 1e-4  # [m] of overlap that is contact: what rests on a table overlaps it by rounding
 
 
-def may_touch(samples: Samples, steps: Sequence[Step], dist_safe: float) -> dict[tuple[int, int], float]:
+def may_touch(
+    scene: Scene, world: World, trajectory: Trajectory, steps: Sequence[Step], dist_safe: float
+) -> dict[tuple[int, int], float]:
     """Return pairs of geometries (indices in the world's collision model) → overlap that counts as contact [m].
 
     These pairs need no clearance: the robot's touch links and the link that is grasped; what is held through something and
@@ -26,11 +30,12 @@ def may_touch(samples: Samples, steps: Sequence[Step], dist_safe: float) -> dict
     the link that a `Touch` brings somewhere, and what is within `dist_safe` of the target.
 
     Args:
-        samples: The motion.
+        scene: Where it happens.
+        world: The scene as one plain tree.
+        trajectory: The motion.
         steps: What was asked for.
         dist_safe: [m].
     """
-    scene, world, trajectory = samples.scene, samples.world, samples.trajectory
     labels, shapes = world.collision_labels, world.collision.geometryObjects
     allowed: dict[tuple[int, int], float] = {}
 
@@ -51,7 +56,7 @@ def may_touch(samples: Samples, steps: Sequence[Step], dist_safe: float) -> dict
 
     robots = len(scene.robot.collision.geometryObjects)
     data, geometry = world.model.createData(), world.collision.createData()
-    for owner, row in _taken_and_left(samples):
+    for owner, row in _taken_and_left(scene, world, trajectory):
         pin.updateGeometryPlacements(world.model, data, world.collision, geometry, world.coordinates.q(row))
         mine = [i for i, label in enumerate(labels) if label.partition(".")[0] == owner]
         for i in mine:
@@ -75,17 +80,17 @@ def may_touch(samples: Samples, steps: Sequence[Step], dist_safe: float) -> dict
     return allowed
 
 
-def _taken_and_left(samples: Samples) -> list[tuple[str, NDArray[np.float64]]]:
+def _taken_and_left(scene: Scene, world: World, trajectory: Trajectory) -> list[tuple[str, NDArray[np.float64]]]:
     """Return every free object that is carried, with the world's configurations in which it is taken or left."""
-    found, phases = [], samples.trajectory.phases
+    found, phases, rows = [], trajectory.phases, world.positions(trajectory)
     for number, phase in enumerate(phases):
         for owner in phase.held:
-            if not samples.scene.objects[owner].object.free:
+            if not scene.objects[owner].object.free:
                 continue
-            before = phases[number - 1].held if number else samples.scene.held
+            before = phases[number - 1].held if number else scene.held
             after = phases[number + 1].held if number + 1 < len(phases) else phase.held
             if owner not in before:
-                found.append((owner, samples.z[samples.waypoint_rows[phase.first]]))
+                found.append((owner, rows[phase.first]))
             if owner not in after:
-                found.append((owner, samples.z[samples.waypoint_rows[phase.last]]))
+                found.append((owner, rows[phase.last]))
     return found

@@ -11,6 +11,7 @@ from small_problems import CABINET_STATE, door_scene, full_scene, random_configu
 
 from vkc_pin.chain import VIRTUAL_ACCELERATION, VIRTUAL_VELOCITY, VirtualKinematicChain, consolidate
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.hold import Hold
 from vkc_pin.scene import Scene
 from vkc_pin.world import World
 
@@ -110,7 +111,7 @@ def test_every_frame_and_shape_is_where_robot_and_object_have_it(grasps: dict[st
                     strict=True,
                 )
             )
-            for index in chain.held_geometries[name]:
+            for index in chain.held_geometries[Hold(name, grasp)]:
                 shape = chain.collision.geometryObjects[index].name.removeprefix(f"{name}.")
                 assert_same(chain_shapes[index], base * own_shapes[shape])
 
@@ -138,8 +139,8 @@ def test_where_the_closure_holds_the_objects_are_those_of_the_world(grasps: dict
         of_chain = frames(closed.model, closed.coordinates.q(z))
         joints = closed.model.createData()
         pin.forwardKinematics(closed.model, joints, closed.coordinates.q(z))
-        for name in grasps:
-            closure = closed.closures[name]
+        for name, grasp in grasps.items():
+            closure = closed.closures[Hold(name, grasp)]
             assert_same(joints.oMi[closure.joint] * closure.local, closure.target)
             compared = [i for i, frame in enumerate(closed.model.frames) if frame.name.startswith(f"{name}.")]
             assert compared
@@ -154,9 +155,10 @@ def test_the_closures_target_is_the_base_link_in_the_world() -> None:
     for name, placed in scene.objects.items():
         grasp = next(iter(placed.object.attachments))
         chain = consolidate(scene, {name: grasp})
-        assert_same(chain.closures[name].target, placed.link_placement(placed.object.base_link))
+        closure = chain.closures[Hold(name, grasp)]
+        assert_same(closure.target, placed.link_placement(placed.object.base_link))
         base = chain.model.frames[chain.model.getFrameId(f"{name}.{placed.object.base_link}")]
-        assert (chain.closures[name].joint, chain.closures[name].local) == (base.parentJoint, base.placement)
+        assert (closure.joint, closure.local) == (base.parentJoint, base.placement)
 
 
 @pytest.mark.parametrize(
@@ -218,7 +220,10 @@ def test_names_and_limits_follow_the_joints(
 
 def test_virtual_joints_are_named_by_object() -> None:
     chain = consolidate(full_scene(), {"door": "handle", "cabinet": "ball"})
-    assert chain.virtual == {"door": (), "cabinet": ("cabinet.ball_z", "cabinet.ball_y", "cabinet.ball_x")}
+    assert chain.virtual == {
+        Hold("door", "handle"): (),
+        Hold("cabinet", "ball"): ("cabinet.ball_z", "cabinet.ball_y", "cabinet.ball_x"),
+    }
 
 
 @pytest.mark.parametrize(
@@ -242,7 +247,7 @@ def test_geometry_is_the_robots_and_that_of_the_links_that_move(grasps: dict[str
     assert [shape.name for shape in found[:count]] == [shape.name for shape in robot.collision.geometryObjects]
     assert [shape.parentJoint for shape in found[:count]] == [shape.parentJoint for shape in robot.collision.geometryObjects]
     for name, names in held.items():
-        indices = chain.held_geometries[name]
+        indices = chain.held_geometries[Hold(name, grasps[name])]
         assert sorted(found[i].name for i in indices) == sorted(f"{name}.{shape}" for shape in names)
         assert all(found[i].parentJoint >= robot.model.njoints - 1 for i in indices)
 

@@ -306,7 +306,7 @@ def test_plain_data(door_plan: vkc.Plan) -> None:
     assert data["steps"] == [{"step": "Actuate", "object": "door", "joints": {"hinge": 1.2}, "attachment": None}]
     assert data["violations"] == []
     np.testing.assert_array_equal(data["trajectory"]["positions"], door_plan.trajectory.positions)
-    assert data["trajectory"]["phases"][0] == {"name": "reach door.handle", "first": 0, "last": 40, "held": {}}
+    assert data["trajectory"]["phases"][0] == {"name": "reach door.handle", "first": 0, "last": 40, "held": {}, "by": {}}
     endless = dataclasses.replace(door_plan, metrics={**door_plan.metrics, "clearance": float("inf")})
     assert json.loads(json.dumps(endless.to_dict(), allow_nan=False))["metrics"]["clearance"] is None
 

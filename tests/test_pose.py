@@ -7,16 +7,17 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from vkc_pin.pose import POSE_LOWER, POSE_UPPER, pose_residual, pose_rows, target_vector
+from vkc_pin.pose import ROW_BOUNDS, pose_residual, pose_rows, target_vector
 
 _R, _p, _target = ca.SX.sym("R", 3, 3), ca.SX.sym("p", 3), ca.SX.sym("W", 12)
-RESIDUAL = ca.Function("residual", [_R, _p, _target], [pose_residual(_R, _p, _target)])
-ROWS = ca.Function("rows", [_R, _p, _target], [pose_rows(_R, _p, _target)])
+RESIDUAL = ca.Function("residual", [_R, _p, _target], [pose_residual("pose", _R, _p, _target)])
+ROWS = ca.Function("rows", [_R, _p, _target], [pose_rows("pose", _R, _p, _target)])
+POSE_LOWER, POSE_UPPER = ROW_BOUNDS["pose"]
 _turn = ca.SX.sym("w", 3)
 _cross = ca.skew(_turn)
 # R·exp([w]) to second order: its derivatives at w = 0 are those along the manifold.
 _turned = _R @ (ca.SX.eye(3) + _cross + _cross @ _cross / 2)
-SLOPE = ca.Function("slope", [_R, _p, _target, _turn], [ca.jacobian(pose_residual(_turned, _p, _target), _turn)])
+SLOPE = ca.Function("slope", [_R, _p, _target, _turn], [ca.jacobian(pose_residual("pose", _turned, _p, _target), _turn)])
 
 
 def residual(placement: pin.SE3, target: pin.SE3) -> np.ndarray:
@@ -142,4 +143,4 @@ def test_rows_are_position_half_vee_and_trace() -> None:
 def test_rows_are_linear_in_the_placement() -> None:
     """So that they cost the program nothing in second derivatives."""
     everything = ca.vertcat(ca.vec(_R), _p)
-    assert ca.jacobian(ca.jacobian(pose_rows(_R, _p, _target), everything), everything).nnz() == 0
+    assert ca.jacobian(ca.jacobian(pose_rows("pose", _R, _p, _target), everything), everything).nnz() == 0

@@ -11,6 +11,7 @@ from small_problems import SHORT, door_scene, full_scene, random_configurations
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.goal import LATCH_MARGIN
+from vkc_pin.hold import Hold
 from vkc_pin.options import Options
 from vkc_pin.planner import as_trajectory
 from vkc_pin.problem import TrajectoryProblem, build
@@ -18,6 +19,7 @@ from vkc_pin.robot import load_robot
 from vkc_pin.steps import Actuate, GoTo, Grasp, Reach, Step
 
 POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array([0.4, 0.2, 0.9]))
+HANDLE = Hold("door", "handle")
 REACH, TURN, MOVE = SHORT.reach_waypoints, SHORT.turn_waypoints, SHORT.move_waypoints
 
 
@@ -169,7 +171,7 @@ def test_closure_holds_from_the_grasp_to_the_end_of_the_hold(opened: TrajectoryP
     assert opened.pose_names == ["closure door"]
     (pose,) = opened.transcription.structure.poses
     assert pose.waypoints == tuple(range(reach, move + 1))
-    closure = opened.chain.closures["door"]
+    closure = opened.chain.closures[HANDLE]
     assert (pose.joint, pose.local) == (closure.joint, closure.local)
     assert opened.targets == [opened.scene.objects["door"].placement]
 
@@ -193,7 +195,7 @@ def test_every_object_is_closed_while_it_is_held_and_goals_are_met_at_the_end(tw
 def test_what_is_held_at_the_start_is_closed_from_the_first_waypoint() -> None:
     scene = dataclasses.replace(door_scene(), held={"door": "handle"})
     problem = build(scene, [Actuate("door", {"knob": 0.3})], options=SHORT)
-    assert [dict(phase.held) for phase in problem.task.phases] == [{"door": "handle"}]
+    assert [phase.held for phase in problem.task.phases] == [(HANDLE,)]
     assert problem.transcription.structure.poses[0].waypoints == tuple(range(1, MOVE + 1))
     assert problem.transcription.structure.rests == ()
 
@@ -233,7 +235,7 @@ def test_pose_error_and_drift(opened: TrajectoryProblem) -> None:
 
 
 def test_rates_are_those_of_the_trajectory(two_grasps: TrajectoryProblem) -> None:
-    """As the trajectory is played, with the pauses in which a gripper closes."""
+    """As the trajectory is played, with the pauses in which a gripper closes; where a hand holds nothing, its choice is moot."""
     z, dt = random_path(two_grasps), SHORT.dt
     trajectory = as_trajectory(two_grasps, z)
     steps, changes = two_grasps.rates(z)
@@ -243,17 +245,28 @@ def test_rates_are_those_of_the_trajectory(two_grasps: TrajectoryProblem) -> Non
     moving = np.isclose(np.diff(trajectory.times), dt)
     assert np.all(velocities[~moving] == 0.0)
     assert (~moving).sum() >= 1
-    np.testing.assert_allclose(velocities[moving] * dt, steps, rtol=0.0, atol=1e-10)
+    choices = [two_grasps.chain.index(name) for names in two_grasps.chain.virtual.values() for name in names]
+    others = np.setdiff1d(np.arange(two_grasps.chain.size), choices)
+    assert len(choices) == 4
+    np.testing.assert_allclose((velocities[moving] * dt)[:, others], steps[:, others], rtol=0.0, atol=1e-10)
+    held, slides = slice(two_grasps.ends[1], two_grasps.ends[2]), two_grasps.chain.index("drawer.handle_free")
+    assert np.all(steps[held, slides] != 0.0)
+    np.testing.assert_allclose((velocities[moving] * dt)[held, slides], steps[held, slides], rtol=0.0, atol=1e-10)
+    assert np.all(velocities[moving][: held.start, slides] == 0.0)
     accelerations = trajectory.accelerations() * dt**2
     # Two rows stand for a waypoint of rest, the stop and the start; with a pause there they are two waypoints.
     assert len(accelerations) == len(changes)
-    np.testing.assert_allclose(accelerations, changes, rtol=0.0, atol=1e-10)
+    np.testing.assert_allclose(accelerations[:, others], changes[:, others], rtol=0.0, atol=1e-10)
 
 
 def test_bounds_on_rates_are_the_limits(two_grasps: TrajectoryProblem) -> None:
-    np.testing.assert_allclose(two_grasps.velocity, two_grasps.chain.velocity * SHORT.dt)
-    np.testing.assert_allclose(two_grasps.acceleration, two_grasps.chain.acceleration * SHORT.dt**2)
-    assert np.all(two_grasps.velocity > 0)
+    """One row for each row of rates."""
+    p = two_grasps
+    steps, changes = p.rates(random_path(p))
+    np.testing.assert_array_equal(p.dt, np.full(p.segments, SHORT.dt))
+    np.testing.assert_allclose(p.velocity, np.tile(p.chain.velocity * SHORT.dt, (len(steps), 1)))
+    np.testing.assert_allclose(p.acceleration, np.tile(p.chain.acceleration * SHORT.dt**2, (len(changes), 1)))
+    assert np.all(p.velocity > 0)
 
 
 @pytest.mark.parametrize("scale", [0.01, 0.5, 3.0])
@@ -278,7 +291,7 @@ def test_contacts_are_those_of_each_waypoints_phase(opened: TrajectoryProblem) -
     z = opened.clip(np.nan_to_num(random_path(opened, scale=0.3)))
     contacts = opened.evaluate_contacts(z, reach=0.3, nearest=5)
     assert np.bincount(contacts.waypoint).max() == 5
-    held = opened.chain.held_geometries["door"]
+    held = opened.chain.held_geometries[HANDLE]
     begin, end = opened.ends[0], opened.ends[2]
     for row, pair in zip(contacts.waypoint, contacts.pair, strict=True):
         if not begin <= row < end:  # row t belongs to waypoint t + 1
@@ -292,7 +305,7 @@ def test_it_says_what_it_is(opened: TrajectoryProblem) -> None:
     text = repr(opened)
     for part in (
         "reach door.handle → turn door.knob → move door.hinge, door.knob → go to",
-        f"{opened.segments} steps of 0.25 s",
+        f"{opened.segments} steps in {0.25 * opened.segments:g} s",
         f"{opened.segments * (opened.chain.size + 1)} variables",
         f"{opened.transcription.rows} rows",
         f"{sum(len(part.pairs) for part in opened.contacts.phases)} collision pairs",

@@ -183,3 +183,77 @@ def test_half_a_turn_away_is_not_taken_for_there(axis: int) -> None:
     lower, upper = limits(chain)
     z, found = solver.solve(start[None], target, lower=lower, upper=upper, weights=np.ones(chain.size), iterations=60)
     assert found.all() == (errors(chain, joint, local, z, target) < 3e-6).all()
+
+
+# --- points, and what stands upright ----------------------------------------------------------------------------------
+
+
+def tilt(placement: pin.SE3, target: pin.SE3) -> float:
+    """Return the angle between the world's vertical and where it is when the body stands as the target does [rad]."""
+    vertical = target.rotation.T @ np.array([0.0, 0.0, 1.0])
+    return float(np.arccos(np.clip((placement.rotation @ vertical)[2], -1.0, 1.0)))
+
+
+@pytest.mark.parametrize(("kind", "rows"), [("point", 3), ("upright", 5)])
+def test_residuals_and_jacobians_of_other_goals(chain: VirtualKinematicChain, kind: str, rows: int) -> None:
+    _, joint, local = solver_and_frame(chain)
+    solver = PoseSolver(chain.model, joint, local, kind)
+    z = random_configurations(chain.lower, chain.upper, 10, np.random.default_rng(7))
+    target = placement(chain, joint, local, z[0])
+    assert (solver.rows, solver.size) == (rows, chain.size)
+    residual, jacobian = solver.evaluate(z, target)
+    assert residual.shape == (10, rows)
+    assert jacobian.shape == (10, rows, chain.size)
+    np.testing.assert_allclose(residual[0], 0.0, atol=1e-9)
+    for row in range(10):
+        at = placement(chain, joint, local, z[row])
+        np.testing.assert_allclose(residual[row, :3], at.translation - target.translation, rtol=0.0, atol=1e-9)
+        if kind == "upright":
+            assert np.linalg.norm(residual[row, 3:]) == pytest.approx(2 * np.sin(tilt(at, target) / 2), abs=1e-7)
+        change = 1e-6 * np.eye(chain.size)
+        ahead, behind = solver.evaluate(z[row] + change, target)[0], solver.evaluate(z[row] - change, target)[0]
+        np.testing.assert_allclose(jacobian[row], (ahead - behind).T / 2e-6, rtol=0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["point", "upright"])
+def test_other_goals_are_reached_within_limits_at_what_orientation_they_leave(chain: VirtualKinematicChain, kind: str) -> None:
+    _, joint, local = solver_and_frame(chain)
+    solver, (lower, upper) = PoseSolver(chain.model, joint, local, kind), limits(chain)
+    rng = np.random.default_rng(8)
+    solved, turned = 0, 0.0
+    targets = random_configurations(chain.lower, chain.upper, 8, rng, arena=1.0)
+    for row in targets:
+        target = placement(chain, joint, local, row)
+        seeds = np.clip(row + rng.uniform(-0.7, 0.7, (30, chain.size)), chain.lower, chain.upper)
+        z, found = solver.solve(seeds, target, lower=lower, upper=upper, weights=np.ones(chain.size), iterations=25)
+        assert np.all((z >= lower) & (z <= upper))
+        for at in (placement(chain, joint, local, row) for row in z[found]):
+            assert np.linalg.norm(at.translation - target.translation) < 3e-6
+            if kind == "upright":
+                assert tilt(at, target) < 3e-6
+            turned = max(turned, float(np.linalg.norm(pin.log3(target.rotation.T @ at.rotation))))
+        solved += int(found.sum())
+    assert solved > 0.7 * 30 * len(targets)
+    assert turned > 0.3  # it makes use of the freedom
+
+
+def test_what_hangs_upside_down_is_turned_upright() -> None:
+    """A hand that points up is to point down: the gradient of a plain tilt vanishes there."""
+    chain = consolidate(door_scene(), {})
+    _, joint, local = solver_and_frame(chain)
+    solver, (lower, upper) = PoseSolver(chain.model, joint, local, "upright"), limits(chain)
+    start = np.concatenate([[0.0, 0.0, 0.0], chain.robot.home])
+    here = placement(chain, joint, local, start)
+    for axis in np.eye(3)[:2]:
+        target = pin.SE3(pin.exp3(np.pi * axis) @ here.rotation, here.translation)
+        assert tilt(here, target) == pytest.approx(np.pi, abs=1e-6)
+        seeds = start + np.vstack([np.zeros(chain.size), np.random.default_rng(9).uniform(-0.3, 0.3, (40, chain.size))])
+        residual, _ = solver.evaluate(seeds[:1], target)
+        assert np.linalg.norm(residual[0, 3:]) > 1.0
+        z, found = solver.solve(seeds, target, lower=lower, upper=upper, weights=np.ones(chain.size), iterations=60)
+        assert found[0]
+        assert found.mean() > 0.5
+        for row in z[found]:
+            at = placement(chain, joint, local, row)
+            assert tilt(at, target) < 3e-6
+            assert np.linalg.norm(at.translation - target.translation) < 3e-6

@@ -1,4 +1,4 @@
-"""The pose residual against numeric Pinocchio."""
+"""Residuals and rows of all kinds of goals against numeric Pinocchio."""
 
 from __future__ import annotations
 
@@ -144,3 +144,153 @@ def test_rows_are_linear_in_the_placement() -> None:
     """So that they cost the program nothing in second derivatives."""
     everything = ca.vertcat(ca.vec(_R), _p)
     assert ca.jacobian(ca.jacobian(pose_rows("pose", _R, _p, _target), everything), everything).nnz() == 0
+
+
+# --- points, and what stands upright ----------------------------------------------------------------------------------
+
+KINDS = ("pose", "point", "upright")
+RESIDUALS = {kind: ca.Function("residual", [_R, _p, _target], [pose_residual(kind, _R, _p, _target)]) for kind in KINDS}
+ALL_ROWS = {kind: ca.Function("rows", [_R, _p, _target], [pose_rows(kind, _R, _p, _target)]) for kind in KINDS}
+SLOPES = {
+    kind: ca.Function(
+        "slope", [_R, _p, _target, _turn], [ca.jacobian(pose_residual(kind, _turned, _p, _target), ca.vertcat(_p, _turn))]
+    )
+    for kind in KINDS
+}
+
+
+def value(function: ca.Function, placement: pin.SE3, target: pin.SE3) -> np.ndarray:
+    return np.asarray(function(placement.rotation, placement.translation, target_vector(target))).ravel()
+
+
+def outside(kind: str, placement: pin.SE3, target: pin.SE3) -> float:
+    """Return by how much the worst row is outside its bounds."""
+    lower, upper = ROW_BOUNDS[kind]
+    rows = value(ALL_ROWS[kind], placement, target)
+    assert rows.shape == lower.shape == upper.shape
+    return float(np.maximum(lower - rows, rows - upper).max())
+
+
+def tilted(target: pin.SE3, heading: float, tilt: float, about: float) -> pin.SE3:
+    """Return `target` turned about its own vertical by `heading`, then tilted by `tilt` about a level axis in the world."""
+    level = np.array([np.cos(about), np.sin(about), 0.0])
+    turn = pin.exp3(tilt * level) @ pin.exp3(heading * np.array([0.0, 0.0, 1.0]))
+    return pin.SE3(turn @ target.rotation, np.array(target.translation))
+
+
+@pytest.mark.parametrize("kind", ["point", "upright"])
+def test_shapes(kind: str) -> None:
+    placement = pin.SE3.Random()
+    assert value(RESIDUALS[kind], placement, placement).shape == ({"point": 3, "upright": 5}[kind],)
+    assert value(ALL_ROWS[kind], placement, placement).shape == ({"point": 3, "upright": 6}[kind],)
+    assert set(ROW_BOUNDS) == set(KINDS)
+
+
+def test_a_point_is_reached_at_any_orientation() -> None:
+    rng = np.random.default_rng(6)
+    for _ in range(20):
+        target, placement = pin.SE3.Random(), pin.SE3.Random()
+        shift = placement.translation - target.translation
+        np.testing.assert_array_equal(value(RESIDUALS["point"], placement, target), shift)
+        np.testing.assert_array_equal(value(ALL_ROWS["point"], placement, target), shift)
+        there = pin.SE3(placement.rotation, target.translation)
+        assert outside("point", there, target) == 0.0
+        there.translation = target.translation + 1e-3 * random_axis(rng)
+        assert outside("point", there, target) > 1e-3 / np.sqrt(3) - 1e-12
+
+
+@pytest.mark.parametrize("tilt", [0.0, 1e-7, 1e-3, 0.5, np.pi / 2, 2.5, 3.0, np.pi - 0.01, np.pi - 2e-3])
+def test_upright_is_the_distance_and_the_chord_of_the_tilt(tilt: float) -> None:
+    """Whatever the heading. The tilt is the angle between the body's vertical and the world's."""
+    rng = np.random.default_rng(7)
+    for _ in range(20):
+        target, shift = pin.SE3.Random(), rng.normal(size=3)
+        placement = tilted(target, rng.uniform(-np.pi, np.pi), tilt, rng.uniform(-np.pi, np.pi))
+        placement.translation = target.translation + shift
+        vertical = target.rotation.T @ np.array([0.0, 0.0, 1.0])  # in the body, when it stands as the target does
+        assert np.arccos(np.clip((placement.rotation @ vertical)[2], -1.0, 1.0)) == pytest.approx(tilt, abs=1e-6)
+        found = value(RESIDUALS["upright"], placement, target)
+        np.testing.assert_allclose(found[:3], shift, rtol=0.0, atol=1e-12)
+        assert np.linalg.norm(found[3:]) == pytest.approx(2 * np.sin(tilt / 2), abs=1e-8)
+        rows = value(ALL_ROWS["upright"], placement, target)
+        np.testing.assert_allclose(rows[:3], shift, rtol=0.0, atol=1e-12)
+        assert np.linalg.norm(rows[3:5]) == pytest.approx(np.sin(tilt), abs=1e-8)
+        assert rows[5] == pytest.approx(np.cos(tilt), abs=1e-8)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("off", [0.0, 1e-3, 0.3, 1.6, 3.0, np.pi - 1e-5, np.pi])
+def test_residual_and_rows_vanish_if_and_only_if_the_goal_holds(kind: str, off: float) -> None:
+    rng = np.random.default_rng(8)
+    for _ in range(10):
+        target = pin.SE3.Random()
+        if kind == "pose":
+            placement = turned(target, off, random_axis(rng))
+        elif kind == "upright":
+            placement = tilted(target, rng.uniform(-np.pi, np.pi), off, rng.uniform(-np.pi, np.pi))
+        else:
+            placement = pin.SE3(pin.SE3.Random().rotation, target.translation + off * random_axis(rng))
+        size = np.linalg.norm(value(RESIDUALS[kind], placement, target))
+        if off == 0.0:
+            assert size < 1e-9
+            assert outside(kind, placement, target) < 1e-12
+        else:
+            assert size > min(0.5 * off, 0.1)
+            assert outside(kind, placement, target) > min(0.3 * off, 0.1)
+
+
+@pytest.mark.parametrize("away", [0.0, 1e-12, 1e-9, 1e-6, 1e-4, 5e-4, 1e-3, 2e-3])
+@pytest.mark.parametrize("about", [0.0, 0.5 * np.pi, np.pi, -0.5 * np.pi, 1.0])
+def test_what_stands_on_its_head_is_not_upright(away: float, about: float) -> None:
+    target = pin.SE3.Random()
+    for sign in (-1.0, 1.0):
+        placement = tilted(target, 0.7, np.pi + sign * away, about)
+        assert np.linalg.norm(value(RESIDUALS["upright"], placement, target)[3:]) > 0.5
+        assert outside("upright", placement, target) > 0.9  # the row along the vertical
+
+
+@pytest.mark.parametrize("about", [0.0, 0.5 * np.pi, np.pi, -0.5 * np.pi, 1.0, 4.0])
+def test_newton_steps_set_upright_what_stands_on_its_head(about: float) -> None:
+    target = pin.SE3.Random()
+    placement = tilted(target, 0.4, np.pi, about)
+    for _ in range(15):
+        at = (placement.rotation, placement.translation, target_vector(target))
+        slope = np.asarray(SLOPES["upright"](*at, np.zeros(3)))[3:, 3:]
+        step = -np.linalg.lstsq(slope, value(RESIDUALS["upright"], placement, target)[3:], rcond=1e-6)[0]
+        step *= min(1.0, 0.5 / max(np.linalg.norm(step), 1e-12))
+        placement = placement * pin.SE3(pin.exp3(step), np.zeros(3))
+    assert np.linalg.norm(value(RESIDUALS["upright"], placement, target)) < 1e-9
+    assert outside("upright", placement, target) < 1e-9
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("tilt", [0.0, 1e-3, 0.3, 1.6, 3.0])
+def test_slopes_of_every_kind_are_those_of_finite_differences(kind: str, tilt: float) -> None:
+    rng, target = np.random.default_rng(9), pin.SE3.Random()
+    placement = tilted(target, 0.6, tilt, 0.9)
+    placement.translation = target.translation + rng.normal(size=3)
+    slope = np.asarray(SLOPES[kind](placement.rotation, placement.translation, target_vector(target), np.zeros(3)))
+    for k in range(6):
+        change = 1e-5 * np.eye(6)[k]
+
+        def beside(sign: float, change: np.ndarray = change) -> np.ndarray:
+            there = pin.SE3(placement.rotation @ pin.exp3(sign * change[3:]), placement.translation + sign * change[:3])
+            return value(RESIDUALS[kind], there, target)
+
+        np.testing.assert_allclose(slope[:, k], (beside(1.0) - beside(-1.0)) / 2e-5, rtol=0.0, atol=1e-7)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_rows_of_every_kind_are_linear_in_the_placement(kind: str) -> None:
+    everything = ca.vertcat(ca.vec(_R), _p)
+    assert ca.jacobian(ca.jacobian(pose_rows(kind, _R, _p, _target), everything), everything).nnz() == 0
+
+
+def test_what_is_bound_to_a_value_and_what_only_from_below() -> None:
+    for kind, (lower, upper) in ROW_BOUNDS.items():
+        fixed = {"pose": 6, "point": 3, "upright": 5}[kind]
+        np.testing.assert_array_equal(lower[:fixed], np.zeros(fixed))
+        np.testing.assert_array_equal(upper[:fixed], np.zeros(fixed))
+        assert (upper[fixed:] == np.inf).all()
+        assert (lower[fixed:] >= 0.0).all()
+        assert len(lower) == fixed + (kind != "point")

@@ -9,8 +9,23 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+import vkc_pin as vkc
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.steps import Actuate, GoTo, Grasp, Reach, Step, as_placement, step_from_dict, step_to_dict
+from vkc_pin.steps import (
+    STEPS,
+    Actuate,
+    GoTo,
+    Grasp,
+    Place,
+    Reach,
+    Release,
+    Step,
+    Touch,
+    as_placement,
+    as_target,
+    step_from_dict,
+    step_to_dict,
+)
 
 TURN = pin.SE3(pin.rpy.rpyToMatrix(0.1, -0.2, 0.3), np.array([1.0, 2.0, 3.0]))
 
@@ -83,6 +98,50 @@ def test_what_cannot_be_actuated(joints: Any, field: str) -> None:
     assert caught.value.field == field
 
 
+@pytest.mark.parametrize("point", [(1.0, -2.0, 3.0), [1, -2, 3], np.array([1.0, -2.0, 3.0]), np.array([1, -2, 3])])
+def test_points(point: Any) -> None:
+    for target in (as_target(point, name="p"), Touch("stick.tip", point).target, Place("stick", point).pose):
+        assert target == (1.0, -2.0, 3.0)
+        assert [type(value) for value in target] == [float] * 3
+
+
+@pytest.mark.parametrize("pose", [TURN, TURN.homogeneous, [1.0, 2.0, 3.0, 0.1, -0.2, 0.3]])
+def test_targets_that_are_poses(pose: Any) -> None:
+    for target in (as_target(pose, name="p"), Touch("stick.tip", pose).target, Place("stick", pose).pose):
+        assert isinstance(target, pin.SE3)
+        np.testing.assert_allclose(target.homogeneous, TURN.homogeneous, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("target", "problem"),
+    [
+        ("here", "not a pose"),
+        (None, "not a pose"),
+        (1.0, "not a pose"),
+        ([1.0, 2.0], "not a pose"),
+        ([1.0, 2.0, 3.0, 4.0], "not a pose"),
+        ([[1.0], [1.0, 2.0]], "not a pose"),
+        (np.zeros((3, 1)), "not a pose"),
+        ([0.0, np.nan, 0.0], "not finite"),
+        ([0.0, 0.0, -np.inf], "not finite"),
+        ([1.0, 2.0, 3.0, 0.0, np.inf, 0.0], "not finite"),
+        (spoiled(0, 0, 0.5), "not a rotation"),
+    ],
+)
+def test_what_is_neither_point_nor_pose(target: Any, problem: str) -> None:
+    for make, field in ((lambda: Touch("stick.tip", target), "Touch.target"), (lambda: Place("stick", target), "Place.pose")):
+        with pytest.raises(InputError, match=problem) as caught:
+            make()
+        assert caught.value.field == field
+
+
+def test_a_point_is_copied() -> None:
+    point = np.ones(3)
+    step = Touch("stick.tip", point)
+    point[:] = 0.0
+    assert step.target == (1.0, 1.0, 1.0)
+
+
 def test_actuate_needs_joints() -> None:
     with pytest.raises(InputError):
         Actuate("door")
@@ -116,6 +175,14 @@ def test_numbers_become_plain() -> None:
         Reach(TURN),
         Grasp("door"),
         Grasp("door", "handle_free"),
+        Grasp("ball", by="stick.tip"),
+        Grasp("ball", "pull", "stick.tip"),
+        Touch("stick.tip", (1.0, 2.0, -3.0)),
+        Touch("tool", TURN),
+        Place("stick", [1.0, 2.0, 3.0]),
+        Place("stick", TURN, "end"),
+        Release(),
+        Release("stick"),
         Actuate("door", {"hinge": 1.2, "knob": 0.1}, "handle"),
         GoTo(1.0, -2.0),
         GoTo(1.0, -2.0, 0.3),
@@ -128,6 +195,16 @@ def test_round_trip(step: Step) -> None:
     assert again == step
 
 
+def test_every_kind_of_step_is_known_and_exported() -> None:
+    assert set(STEPS) == {Reach, Grasp, Actuate, GoTo, Touch, Place, Release}
+    assert {kind.__name__ for kind in STEPS} <= set(vkc.__all__)
+
+
+def test_steps_of_earlier_plans() -> None:
+    """Saved when a grasp could not yet go through anything."""
+    assert step_from_dict({"step": "Grasp", "object": "door", "attachment": None}) == Grasp("door")
+
+
 @pytest.mark.parametrize(
     ("data", "field", "nearest"),
     [
@@ -135,6 +212,10 @@ def test_round_trip(step: Step) -> None:
         ({"object": "door"}, "step", None),
         ({"step": "Grasp", "objects": "door"}, "Grasp.objects", "object"),
         ({"step": "GoTo", "x": 0.0, "y": 0.0, "jaw": 0.0}, "GoTo.jaw", "yaw"),
+        ({"step": "Tuch", "frame": "tool", "target": [0.0, 0.0, 0.0]}, "step", "Touch"),
+        ({"step": "Touch", "frame": "tool", "targt": [0.0, 0.0, 0.0]}, "Touch.targt", "target"),
+        ({"step": "Place", "object": "stick", "pos": [0.0, 0.0, 0.0]}, "Place.pos", "pose"),
+        ({"step": "Release", "objects": "stick"}, "Release.objects", "object"),
     ],
 )
 def test_data_with_names_that_do_not_exist(data: dict[str, Any], field: str, nearest: str | None) -> None:
@@ -143,7 +224,15 @@ def test_data_with_names_that_do_not_exist(data: dict[str, Any], field: str, nea
     assert (caught.value.field, caught.value.nearest) == (field, nearest)
 
 
-@pytest.mark.parametrize(("data", "field"), [({"step": "Reach"}, "Reach.pose"), ({"step": "GoTo", "x": 1.0}, "GoTo.y")])
+@pytest.mark.parametrize(
+    ("data", "field"),
+    [
+        ({"step": "Reach"}, "Reach.pose"),
+        ({"step": "GoTo", "x": 1.0}, "GoTo.y"),
+        ({"step": "Touch", "frame": "tool"}, "Touch.target"),
+        ({"step": "Place", "pose": [0.0, 0.0, 0.0]}, "Place.object"),
+    ],
+)
 def test_data_that_lacks_something(data: dict[str, Any], field: str) -> None:
     with pytest.raises(InputError) as caught:
         step_from_dict(data)

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import cache
 
 import numpy as np
 import pinocchio as pin
 import pytest
+from carrying import room
 from small_problems import CABINET_STATE, door_scene, full_scene, random_configurations, with_attachment, with_objects
 
 from vkc_pin.chain import VIRTUAL_ACCELERATION, VIRTUAL_VELOCITY, VirtualKinematicChain, consolidate
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.geometry import standing_geometry
 from vkc_pin.hold import Hold
 from vkc_pin.scene import Scene
 from vkc_pin.world import World
@@ -310,3 +313,122 @@ def test_a_grasp_that_is_called_like_a_joint_is_refused() -> None:
     twice = with_objects(scene, {"door": with_attachment(scene.objects["door"], bar)})
     with pytest.raises(InputError, match=r"door\.hinge"):
         consolidate(twice, {"door": "hinge"})
+
+
+# --- free objects: carried, and what is held through them -------------------------------------------------------------
+
+STICK, END = Hold("stick", "grip"), Hold("stick", "end")
+BALL, PULLED, PUSHED = Hold("ball", "grip"), Hold("ball", "pull", STICK, "tip"), Hold("ball", "pull", END, "tip")
+CARRIED = [
+    (STICK,),
+    (END,),
+    (BALL,),
+    (STICK, PULLED),
+    (STICK, BALL),  # two branches of the robot's tree
+    (STICK, END),  # two branches of one object
+    (STICK, BALL, END, PULLED),
+    (END, PUSHED, Hold("cabinet", "ball")),
+    (STICK, PULLED, Hold("cabinet", "sleeve", PULLED, "ball")),  # a chain of three, the last with joints
+]
+
+
+@cache
+def carried_scene() -> Scene:
+    """Return stick, ball, and a cabinet that can be carried away."""
+    scene, case = room(objects=("stick", "ball")), full_scene().objects["cabinet"]
+    return with_objects(scene, {"cabinet": dataclasses.replace(case, object=dataclasses.replace(case.object, free=True))})
+
+
+def expected_frames(chain: VirtualKinematicChain, scene: Scene, hold: Hold, z: np.ndarray) -> tuple[pin.SE3, dict[str, pin.SE3]]:
+    """Return where an object's base is, and each of its links, by multiplying: robot, grasp, object, and so on outwards."""
+    thing, grasp = scene.objects[hold.object].object, scene.objects[hold.object].object.attachments[hold.attachment]
+    if hold.by is None:
+        robot = scene.robot
+        holder = frames(robot.model, robot.coordinates.q(z[: robot.coordinates.size]))[robot.model.getFrameId(robot.tool_frame)]
+    else:
+        holder = expected_frames(chain, scene, hold.by, z)[1][hold.link or ""]
+    own = frames(thing.model, thing.coordinates.q(object_state(chain, scene, hold.object, z)))
+    links = {f.name: own[i] for i, f in enumerate(thing.model.frames) if f.type == pin.FrameType.BODY}
+    motion = virtual_motion(chain, scene, hold.object, hold.attachment, z)
+    base = holder * (links[grasp.link] * grasp.placement * motion).inverse()
+    return base, {link: base * placement for link, placement in links.items()}
+
+
+@pytest.mark.parametrize("holds", CARRIED, ids=lambda holds: " ".join(str(hold) for hold in holds))
+def test_what_is_carried_is_where_the_hand_and_the_grasp_have_it(holds: tuple[Hold, ...]) -> None:
+    scene = carried_scene()
+    chain = consolidate(scene, holds)
+    assert tuple(chain.closures) == tuple(chain.held_geometries) == tuple(chain.virtual) == tuple(chain.prefixes) == holds
+    for z in random_configurations(chain.lower, chain.upper, 6, np.random.default_rng(4)):
+        q = chain.coordinates.q(z)
+        of_chain, of_shapes = frames(chain.model, q), shapes(chain.model, chain.collision, q)
+        data = chain.model.createData()
+        pin.forwardKinematics(chain.model, data, q)
+        for hold in holds:
+            placed = scene.objects[hold.object]
+            base, links = expected_frames(chain, scene, hold, z)
+            for link, placement in links.items():
+                joint, local = chain.frame(link, hold)
+                assert_same(data.oMi[joint] * local, placement)
+                assert_same(of_chain[chain.model.getFrameId(chain.prefixes[hold] + link)], placement)
+            closure = chain.closures[hold]
+            assert_same(data.oMi[closure.joint] * closure.local, base)
+            assert_same(closure.target, placed.placement)
+            state = object_state(chain, scene, hold.object, z)
+            there = standing_geometry(dataclasses.replace(placed, placement=base, state=state))
+            indices = chain.held_geometries[hold]
+            assert [chain.collision.geometryObjects[i].name.rpartition(".")[2] for i in indices] == [s.name for s in there]
+            for index, shape in zip(indices, there, strict=True):
+                assert_same(of_shapes[index], shape.placement)
+                assert chain.collision.geometryObjects[index].parentJoint > 1
+
+
+def test_all_of_a_free_object_moves_and_only_the_links_in_hand_of_a_fixed_one() -> None:
+    free, fixed = carried_scene(), full_scene()
+    hold = Hold("cabinet", "grip")
+    moving = {
+        scene: [chain.collision.geometryObjects[i].name for i in chain.held_geometries[hold]]
+        for scene, chain in ((scene, consolidate(scene, [hold])) for scene in (free, fixed))
+    }
+    assert set(moving[free]) - set(moving[fixed]) == {"cabinet.case_0", "cabinet.lid_0"}
+    assert len(moving[free]) == len(free.objects["cabinet"].object.collision.geometryObjects)
+
+
+def test_every_hold_has_its_own_shapes_joints_and_names() -> None:
+    holds = (STICK, BALL, END, PULLED)
+    chain = consolidate(carried_scene(), holds)
+    robot = carried_scene().robot
+    assert chain.names == (
+        *robot.coordinates.names,
+        "stick.grip_turn",
+        "stick.grip_slide",
+        *(f"ball.{grasp}_{axis}" for grasp in ("grip", "pull") for axis in "zyx"),
+    )
+    assert chain.virtual[STICK] == ("stick.grip_turn", "stick.grip_slide")
+    assert chain.virtual[END] == ()
+    assert chain.virtual[PULLED] == ("ball.pull_z", "ball.pull_y", "ball.pull_x")
+    assert chain.prefixes == {STICK: "stick.", BALL: "ball.", END: "stick'.", PULLED: "ball'."}
+    indices = [i for hold in holds for i in chain.held_geometries[hold]]
+    count = len(robot.collision.geometryObjects)
+    assert sorted(indices) == list(range(count, len(chain.collision.geometryObjects)))
+    assert [len(chain.held_geometries[hold]) for hold in holds] == [5, 1, 5, 1]
+    names = [shape.name for shape in chain.collision.geometryObjects]
+    assert len(set(names)) == len(names)
+    body = [frame.name for frame in chain.model.frames]
+    assert len(set(body)) == len(body)
+
+
+def test_one_attachment_held_in_two_ways_is_refused() -> None:
+    """Its freedom would have one name for two coordinates; without a freedom there is nothing to mix up."""
+    with pytest.raises(InputError, match="share a name") as caught:
+        consolidate(carried_scene(), [STICK, PULLED, Hold("ball", "pull")])
+    assert str(caught.value.field).startswith("ball.pull_")
+    chain = consolidate(carried_scene(), [STICK, Hold("cabinet", "spike", STICK, "tip")])
+    assert chain.prefixes[Hold("cabinet", "spike", STICK, "tip")] == "cabinet."
+
+
+def test_holds_and_mappings_make_the_same_chain() -> None:
+    first, second = consolidate(carried_scene(), {"stick": "grip", "ball": "grip"}), consolidate(carried_scene(), [STICK, BALL])
+    assert first.names == second.names
+    assert first.model == second.model
+    assert tuple(first.closures) == (STICK, BALL)

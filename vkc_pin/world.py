@@ -129,7 +129,7 @@ class World:
             asked = np.clip(np.concatenate([[begin], times[now], [end]]), begin, end)
             found = self._carried(trajectory, phase, asked, where)
             for name, placements in found.items():
-                rows[now, self.placement_columns(name)] = [as_numbers(p) for p in placements[1:-1]]
+                rows[now, self.placement_columns(name)] = np.reshape([as_numbers(p) for p in placements[1:-1]], (-1, 7))
                 where[name] = placements[-1]
             for name in where.keys() - found.keys():
                 rows[now, self.placement_columns(name)] = as_numbers(where[name])

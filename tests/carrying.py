@@ -33,9 +33,9 @@ def table(*, gap: float = 1e-3) -> dict[str, Any]:
     return box("table", [0.5, 2.4, 0.02], [0.8, 0.3, TOP - gap - 0.01])
 
 
-def stand(*, gap: float = 1e-3) -> dict[str, Any]:
-    """Return a shelf under the ball that the stick beside it does not meet, its top `gap` below it."""
-    return box("stand", [0.5, 0.6, 0.02], [0.8, 0.57, 0.665 - gap - 0.01])
+def stand(name: str = "stand", *, aside: float = 0.0, gap: float = 1e-3) -> dict[str, Any]:
+    """Return a post under the ball, or `aside` [m] along y from it, its top `gap` below it."""
+    return box(name, [0.06, 0.06, 0.5], [0.8, 0.285 + aside, 0.665 - gap - 0.25])
 
 
 def room(*obstacles: Mapping[str, Any], objects: Sequence[str] = ("stick",), base: str = "omni") -> Scene:
@@ -126,8 +126,9 @@ class Script:
         self.rows = [np.array(self.scene.start)]
         self.phases: list[PhaseSpan] = []
         self.held, self.by = dict(self.scene.held), dict(self.scene.held_by)
-        for name, at in self.scene.held_at.items():
-            self._set(name, self.held[name], at)
+        for name, attachment in self.held.items():
+            freedoms = self.scene.objects[name].object.attachment(attachment).freedoms
+            self._set(name, attachment, self.scene.held_at.get(name, (0.0,) * len(freedoms)))
 
     def _set(self, name: str, attachment: str, values: Sequence[float]) -> None:
         grasp = self.scene.objects[name].object.attachment(attachment)

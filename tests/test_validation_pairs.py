@@ -7,6 +7,7 @@ import itertools
 import numpy as np
 import pinocchio as pin
 import pytest
+from carrying import STICK, Script, above, box, moved_base, reaching, room, stand, table, tool_at
 from drives import hall, moved, of_rows
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -214,3 +215,122 @@ def test_a_side_branch_that_nothing_moves_hits_nothing_that_stands() -> None:
         assert {moving, "wall_north"} in paired
         assert {moving, "drawer.tray"} in paired
         assert {moving, "cabinet.lid"} not in paired
+
+
+# --- what is carried --------------------------------------------------------------------------------------------------
+
+
+def whirl(seed: int, *, size: float) -> tuple[Scene, Trajectory]:
+    """Return a random motion with a stick in the hand and a ball on its tip, five waypoints, in two phases."""
+    rng = np.random.default_rng(seed)
+    scene = room(table(), objects=("stick", "ball"))
+    scene = scene.with_held({"stick": "grip", "ball": "pull"}, by={"ball": "stick.tip"})
+    script = Script(scene)
+    for phase in range(2):
+        if phase:
+            script.let_go("ball")
+        there = np.array(script.rows[-1])
+        there += size * rng.uniform(-1.0, 1.0, len(there)) * rng.choice([0.0, 0.1, 1.0], len(there))
+        script.go(there, steps=2)
+    return scene, script.motion()
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.1, 1.0, 3.0]))
+def test_no_point_of_what_is_carried_moves_further_than_the_bound(seed: int, size: float) -> None:
+    scene, motion = whirl(seed, size=size)
+    samples = Samples(scene, motion)
+    table_of_pairs = PairTable(scene, samples.world, motion, 0.02)
+    bounds = table_of_pairs._motion_bounds(samples.z, samples.waypoint_rows)
+    world = samples.world
+    data, shapes = world.model.createData(), pin.GeometryData(table_of_pairs.geometry)
+    corners = [np.array(box_corners(shape)) for shape in table_of_pairs.geometry.geometryObjects]
+    carried = [i for i, label in enumerate(world.collision_labels) if label.partition(".")[0] in ("stick", "ball")]
+    assert len(carried) == 6
+    travelled = 0.0
+    for t, (first, last) in enumerate(itertools.pairwise(samples.waypoint_rows)):
+        path = np.zeros(len(corners))
+        before: list[np.ndarray] = []
+        for row in np.linspace(first, last, 4 * (last - first) + 1):  # the way of each corner, between the samples too
+            low, share = int(row), row - int(row)
+            z = samples.z[low] if not share else (1 - share) * samples.z[low] + share * samples.z[low + 1]
+            pin.updateGeometryPlacements(world.model, data, table_of_pairs.geometry, shapes, world.coordinates.q(z))
+            now = [points @ where.rotation.T + where.translation for points, where in zip(corners, shapes.oMg, strict=True)]
+            if before:
+                path += [np.linalg.norm(a - b, axis=1).max() for a, b in zip(now, before, strict=True)]
+            before = now
+        assert (path <= bounds[t] + 1e-6).all()
+        assert (bounds[t][path == 0] <= 1e-6).all()
+        travelled += path[carried].max()
+        for i in carried:  # and it is no idle bound
+            assert bounds[t][i] <= 100 * path[i] + 1e-6
+    assert travelled > 0.0 or np.ptp(motion.positions, axis=0).max() == 0.0
+
+
+@settings(max_examples=12, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.1, 0.5]))
+def test_nothing_carried_that_comes_close_is_left_out(seed: int, size: float) -> None:
+    """Whatever overlaps by more than a millimetre anywhere, five times as finely seen, is found."""
+    scene, motion = whirl(seed, size=size)
+    table, samples, hits = swept(scene, motion)
+    fine = np.unique(np.concatenate([np.linspace(a, b, 6) for a, b in itertools.pairwise(samples.times)]))
+    distances = brute_force(table, samples.world.positions(motion, fine))
+    found = {(hit.first, hit.second) for hit in hits if hit.distance < 0}
+    deep = {pair_names(table, k) for k in np.flatnonzero((distances.min(axis=0) < -1.001e-3) & ~table.together)}
+    assert deep <= found
+    assert min(hit.distance for hit in hits) <= distances.min() + 2e-3
+
+
+@pytest.mark.parametrize("overlap", [None, 0.0, 1e-4])
+def test_what_may_touch_is_not_passed_through_between_two_samples(overlap: float | None) -> None:
+    """A stick through a fence that it lay beside; neither sample touches it. Only a hand is known to move with what it holds."""
+    fence = box("fence", [0.6, 0.001, 0.1], [0.8, 0.262, 0.56])
+    scene = room(fence)
+    down = reaching(tool_at(STICK), above(STICK))
+    motion = Script(scene).go(down).take("stick").go(moved_base(down, y=1.0), steps=1).motion(dt=10.0)
+    world = World(scene)
+    labels = world.collision_labels
+    post = labels.index("fence")
+    touching = {(i, post): overlap for i in range(post) if labels[i] in ("stick.stick", "stick.tip") and overlap is not None}
+    table = PairTable(scene, world, motion, 0.02, touching=touching)
+    hits = list(table.sweep(world.positions(motion)[-2:], np.array([0, 1])))
+    assert all(hit.distance > 0.0 for hit in hits if hit.at_waypoint and hit.second == "fence")
+    through = {hit.first for hit in hits if hit.second == "fence" and hit.distance < -5e-4}
+    if overlap == 0.0:  # as for a hand and what it grasps
+        assert not through & {"stick.stick", "stick.tip"}
+    else:
+        assert through >= {"stick.stick", "stick.tip"}
+
+
+def test_which_pairs_of_free_objects_count() -> None:
+    """What is carried can hit everything but itself, the floor too; what stands by hits only what moves."""
+    scene = room(table(), stand(), objects=("stick", "ball"))
+    still = Script(scene).go(moved_base(scene.start, y=0.1)).motion()
+    carried = Script(scene).take("stick").go(moved_base(scene.start, y=0.1)).motion()
+
+    def paired(motion: Trajectory) -> dict[str, set[str]]:
+        found = PairTable(scene, World(scene), motion, 0.02)
+        names: dict[str, set[str]] = {}
+        for first, second in (pair_names(found, k) for k in range(len(found.pairs))):
+            for one, other in ((first, second), (second, first)):
+                names.setdefault(one, set()).add(other)
+        return names
+
+    robots = {scene.robot.link_of(i) for i in range(len(scene.robot.collision.geometryObjects))}
+    stands = paired(still)
+    for name in ("stick.stick", "stick.tip", "ball.ball"):
+        assert stands[name] == robots
+    moves = paired(carried)
+    for name in ("stick.stick", "stick.tip"):
+        assert moves[name] == robots | {"ball.ball", "table", "stand", FLOOR}
+    assert moves["ball.ball"] == robots | {"stick.stick", "stick.tip"}
+
+
+def test_what_moves_together() -> None:
+    scene, motion = whirl(0, size=0.1)
+    world = World(scene)
+    touching = may_touch(scene, world, motion, (), 0.02)
+    table = PairTable(scene, world, motion, 0.02, touching=touching)
+    together = {pair_names(table, k) for k in np.flatnonzero(table.together)}
+    hands = {(link, "stick.stick") for link in scene.robot.touch_links}
+    assert together == {*hands, ("stick.tip", "ball.ball")}

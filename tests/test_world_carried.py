@@ -127,7 +127,7 @@ def fetched() -> tuple[Scene, Script]:
     south = pin.SE3(STICK.rotation, BALL.translation - np.array([0.0, 0.285, 0.0]))  # of the stick when its tip is at the ball
     touch = reaching(tool_at(south), above(STICK))
     up = reaching(tool_at(lifted(south, UP / 4)), touch)
-    scene = scene.with_held({"stick": "grip"}, at={"stick": (0.0, 0.0)}).with_start(arm=up[3:])
+    scene = scene.with_held({"stick": "grip"}).with_start(arm=up[3:])
     script = Script(scene).go(touch).take("ball", "pull", PULL, by="stick.tip").go(up).go(moved_base(up, y=0.3))
     script.go(moved_base(touch, y=0.3)).let_go("ball").go(moved_base(touch, y=0.1))
     return scene, script

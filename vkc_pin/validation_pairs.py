@@ -46,6 +46,7 @@ class PairTable:
         pairs: Geometry indices in `world.collision`, shape (P, 2).
         margins: Clearance each must keep at waypoints [m], shape (P,); 0 where a gripper closes on what it grasps.
         contact: Overlap that counts as contact [m], shape (P,).
+        together: Whether one holds the other in some phase, so that they move as one, shape (P,): `closure` sees to that.
 
     Args:
         scene: Where it happens.
@@ -86,6 +87,10 @@ class PairTable:
                     pairs.append((i, j))
                     margins.append(0.0 if (i, j) in touching else dist_safe)
                     contact.append(touching.get((i, j), 0.0))
+        holders = {(link, owner) for phase in trajectory.phases for owner, link in phase.by.items()}
+        names = [((labels[i], self.group[j]), (labels[j], self.group[i])) for i, j in pairs]
+        by_hand = [margin == 0.0 and overlap == 0.0 for margin, overlap in zip(margins, contact, strict=True)]
+        self.together = np.array(by_hand) | np.array([bool(holders.intersection(both)) for both in names], bool)
         if not pairs:
             raise InputError("no pair of geometries can collide", field="scene", expected="collision geometry")
         self.pairs, self.margins, self.contact = np.array(pairs), np.array(margins), np.array(contact)
@@ -147,9 +152,9 @@ class PairTable:
                     yield self._hit(row, active[c], rows[row - first, c])
             # Between two samples that are free it is looked at again and again, until nothing deeper than 1 mm can hide.
             step = motion[t, active] / (last - first)
-            free = (np.minimum(rows[1:], rows[:-1]) >= 0) & (rows[1:] + rows[:-1] < step)
-            alone = self.margins[active] > 0  # a hand that holds something moves along with it: `closure` sees to that
-            for r, c in np.argwhere(free & alone):
+            overlap = self.contact[active]
+            free = (np.minimum(rows[1:], rows[:-1]) >= -overlap) & (rows[1:] + rows[:-1] < step)
+            for r, c in np.argwhere(free & ~self.together[active]):
                 stack = [(0.0, 1.0, rows[r, c], rows[r + 1, c])]
                 while stack:
                     low, high, before, after = stack.pop()
@@ -159,7 +164,7 @@ class PairTable:
                     state = self.world.coordinates.q((1 - middle) * z[first + r] + middle * z[first + r + 1])
                     (between,) = self._distances(state, active[c : c + 1], data, shapes)
                     yield self._hit(first + r, active[c], between)
-                    if between < 0:
+                    if between < -overlap[c]:
                         break
                     stack += [(low, middle, before, between), (middle, high, between, after)]
 

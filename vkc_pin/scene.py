@@ -173,10 +173,7 @@ class Scene:
         if name not in self.objects:
             raise UnknownNameError("object", name, self.objects)
         document = copy.deepcopy(self.document)
-        (entry,) = (item for item in document["objects"] if item["name"] == name)
-        entry.pop("yaw", None)
-        entry["position"] = np.asarray(placement.translation).tolist()
-        entry["rpy"] = np.asarray(pin.rpy.matrixToRpy(placement.rotation)).tolist()
+        _write_placement(document, name, placement)
         placed = dataclasses.replace(self.objects[name], placement=pin.SE3(placement))
         changed = dataclasses.replace(self, objects=MappingProxyType({**self.objects, name: placed}), document=document)
         return changed.with_held_objects_in_the_hand()
@@ -209,6 +206,9 @@ class Scene:
             | ({"at": list(values[name])} if name in values else {})
             for name, attachment in held.items()
         }
+        for name in self.held.keys() - held.keys():  # it stays where the hand had it
+            if self.objects[name].object.free:
+                _write_placement(document, name, self.objects[name].placement)
         changed = dataclasses.replace(
             self,
             held=MappingProxyType(dict(held)),
@@ -291,6 +291,14 @@ class Scene:
         raise InputError(problem, file=self.file, field="start_region", expected=f"a clearance of {START_CLEARANCE} m somewhere")
 
 
+def _write_placement(document: dict[str, Any], name: str, placement: pin.SE3) -> None:
+    """Let object `name` stand at `placement` in a scene's document."""
+    (entry,) = (item for item in document["objects"] if item["name"] == name)
+    entry.pop("yaw", None)
+    entry["position"] = np.asarray(placement.translation).tolist()
+    entry["rpy"] = np.asarray(pin.rpy.matrixToRpy(placement.rotation)).tolist()
+
+
 def start_limits(robot: Robot) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the limits of a start, shape (n,), [m] and [rad]: the robot's; a base that cannot move may stand anywhere."""
     lower, upper = robot.lower.copy(), robot.upper.copy()
@@ -322,11 +330,16 @@ def check_holds(
             )
         for value, freedom in zip(values, freedoms, strict=True):
             within_limits(value, freedom.lower, freedom.upper, f"held.{name}.at")
+    for field_name, names in (("by", by), ("at", at)):
+        for name in names:
+            if name not in held:
+                raise UnknownNameError("held object", name, held, field=field_name)
     for hold in holds_of(held, by):
         if hold.by is not None:
             objects[hold.by.object].link_placement(str(hold.link))
-            if not objects[hold.object].object.free:
-                raise InputError("only a free object can be held through another", field=f"held.{hold.object}.by", got=hold.frame)
+            if not (objects[hold.object].object.free and objects[hold.by.object].object.free):
+                problem = "only a free object can be held through another, and only through a free one"
+                raise InputError(problem, field=f"held.{hold.object}.by", got=hold.frame)
 
 
 def load_scene(name_or_path: str | Path) -> Scene:

@@ -13,7 +13,7 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.goal import LATCH_MARGIN
 from vkc_pin.hold import Hold
 from vkc_pin.options import Options
-from vkc_pin.planner import as_trajectory
+from vkc_pin.unfold import as_trajectory
 from vkc_pin.problem import TrajectoryProblem, build
 from vkc_pin.robot import load_robot
 from vkc_pin.steps import Actuate, GoTo, Grasp, Reach, Step

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -10,14 +11,14 @@ from numpy.typing import NDArray
 
 from vkc_pin.hold import Hold
 from vkc_pin.inverse_kinematics import PoseSolver
+from vkc_pin.pose import PoseRow
 from vkc_pin.problem import TrajectoryProblem
-from vkc_pin.task import Phase
+from vkc_pin.task import FrameGoal, Phase
 
 __all__ = ["Approach"]
 
-WAY = 0.1  # [m] between two configurations on the way
-TOOL, LIFT = 1, 1  # how many of them before a grasp, after letting go, and to lift or lower what is carried
-REACH = 5  # how many of them at most on the way to what is touched
+LIFT = 0.1  # [m] to lift or lower what is carried
+_REACH = (0.1, 0.2, 0.3, 0.4, 0.5)  # [m] from what is touched, on the way to it
 _TOLERANCE = 1e-4  # [m] and [rad]
 
 
@@ -39,33 +40,38 @@ class Approach:
     def before(self, z: NDArray[np.float64], phase: Phase) -> NDArray[np.float64]:
         """Return configurations on the way to `z`, shape (n,), the end of a phase: shape (K, n), the last is the nearest."""
         if phase.grasps:
-            return self._way(z, -self._axis(z, phase.grasps[0].link, phase.grasps[0].by), TOOL)[::-1]
+            return self._way(z, -self._axis(z, phase.grasps[0]), [self.problem.options.approach])
         if phase.lowered:
-            return self._way(z, np.array([0.0, 0.0, 1.0]), LIFT)[::-1]
+            return self._way(z, np.array([0.0, 0.0, 1.0]), [LIFT])
         for goal in phase.frames:
             if goal.touches:
-                return self._way(z, -self._axis(z, goal.frame, goal.hold), REACH)[::-1]
+                return self._way(z, -self._goal_axis(z, goal), _REACH)[::-1]
         return np.empty((0, len(z)))
 
     def after(self, z: NDArray[np.float64], phase: Phase, before: Phase | None) -> NDArray[np.float64]:
         """Return configurations on the way from `z`, shape (n,), the start of a phase: shape (K, n), the first is the nearest."""
         if phase.leaves:
-            return self._way(z, -self._axis(z, phase.leaves[0].link, phase.leaves[0].by), TOOL)
+            return self._way(z, -self._axis(z, phase.leaves[0]), [self.problem.options.approach])
         if phase.lifted:
-            return self._way(z, np.array([0.0, 0.0, 1.0]), LIFT)
+            return self._way(z, np.array([0.0, 0.0, 1.0]), [LIFT])
         for goal in before.frames if before else ():
             if goal.touches:
-                return self._way(z, -self._axis(z, goal.frame, goal.hold), REACH)
+                return self._way(z, -self._goal_axis(z, goal), _REACH)
         return np.empty((0, len(z)))
 
-    def _axis(self, z: NDArray[np.float64], name: str | None, hold: Hold | None) -> NDArray[np.float64]:
-        """Return the z axis, in the world, of a frame at `z`: the tool's, or a link's of what is held."""
-        joint, local = self.chain.frame(str(name), hold) if hold else self.chain.frame(name or self.chain.robot.tool_frame)
+    def _axis(self, z: NDArray[np.float64], hold: Hold) -> NDArray[np.float64]:
+        """Return the direction, in the world, in which what holds something approaches it, at `z`."""
+        return self._z_axis(z, *self.chain.holder(hold))
+
+    def _goal_axis(self, z: NDArray[np.float64], goal: FrameGoal) -> NDArray[np.float64]:
+        return self._z_axis(z, *self.chain.frame(goal.frame, goal.hold))
+
+    def _z_axis(self, z: NDArray[np.float64], joint: int, local: pin.SE3) -> NDArray[np.float64]:
         rotations, _ = self.chain.joint_placements(z[None])
         return np.asarray((rotations[0, joint] @ local.rotation)[:, 2])
 
-    def _way(self, z: NDArray[np.float64], direction: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-        """Return up to `count` configurations at which the tool is `WAY`, 2·`WAY`, ... along `direction` from where `z` has it."""
+    def _way(self, z: NDArray[np.float64], direction: NDArray[np.float64], lengths: Sequence[float]) -> NDArray[np.float64]:
+        """Return configurations at which the tool is `lengths` [m] along `direction` from where `z` has it, as far as there are."""
         rotations, translations = self.chain.joint_placements(z[None])
         carrier = pin.SE3(rotations[0, self.joint], translations[0, self.joint])
         tool = carrier * self.local
@@ -75,8 +81,8 @@ class Approach:
         for column, name in enumerate(self.chain.names[:3]):
             lower[column], upper[column] = self.problem.limits(name)
         found: list[NDArray[np.float64]] = []
-        for k in range(1, count + 1):
-            target = pin.SE3(tool.rotation, tool.translation + k * WAY * direction)
+        for length in lengths:
+            target = pin.SE3(tool.rotation, tool.translation + length * direction)
             start = (found[-1] if found else z)[None]
             near, ok = self.solver.solve(start, target, lower=lower, upper=upper, weights=self.weights, tolerance=_TOLERANCE)
             if not ok[0]:
@@ -90,4 +96,4 @@ def _tool_solver(model_text: str, joint: int, local: bytes) -> PoseSolver:
     """Return the inverse kinematics of the tool, built once per model."""
     model = pin.Model()
     model.loadFromString(model_text)
-    return PoseSolver(model, joint, pin.SE3(np.frombuffer(local).reshape(4, 4)))
+    return PoseSolver(model, PoseRow(joint, pin.SE3(np.frombuffer(local).reshape(4, 4)), ()))

@@ -12,7 +12,7 @@ from vkc_pin.routes import Routes
 
 __all__ = ["Beam", "Found"]
 
-_DRAWS, _ENOUGH = 6, 6  # how often random seeds are drawn until so many of what they lead to are free
+_DRAWS, _ENOUGH = 2, 12  # how often random seeds are drawn until so many of what they lead to are free
 _BEAM, _QUICK_BEAM, _CHILDREN = 40, 24, 4  # configurations kept per knot, and tried from each for the next
 _SPACING = 4  # waypoints between knots along a phase in which something is held
 _APPROACH = 6  # configurations looked at on the way to a grasp
@@ -94,6 +94,12 @@ class Beam:
                 if sum(np.count_nonzero(bad == 0) for _, _, bad in draws) >= _ENOUGH:
                     break
             parents, z, bad = (np.concatenate(parts) for parts in zip(*draws, strict=True))
+            if np.count_nonzero(bad == 0) < _ENOUGH:  # push the best of the others out of what they are in
+                price = cost[parents] + self._way(paths[parents, -1], z, phase) + bad
+                best = np.argsort(price, kind="stable")[: 2 * self.width]
+                pushed = knots.clear(z[best], waypoint)
+                parents, z = np.concatenate([parents, parents[best]]), np.concatenate([z, pushed])
+                bad = np.concatenate([bad, self._bad(pushed, np.ones(len(pushed), bool), waypoint)])
             return parents, z, bad
         parents = np.arange(len(paths))
         z, found = knots.knot(paths[:, -1], waypoint, "track")

@@ -104,6 +104,10 @@ class VirtualKinematicChain:
             raise UnknownNameError("coordinate", name, self.names)
         return self.names.index(name)
 
+    def holder(self, hold: Hold) -> tuple[int, pin.SE3]:
+        """Return the joint that carries the frame which holds something, and the frame's placement there."""
+        return self.frame(self.robot.tool_frame) if hold.by is None else self.frame(str(hold.link), hold.by)
+
     def frame(self, name: str, hold: Hold | None = None) -> tuple[int, pin.SE3]:
         """Return the joint that carries a frame, and the frame's placement there: the robot's, or a link of what is held."""
         frame = self.model.frames[self.model.getFrameId(name if hold is None else self.prefixes[hold] + name)]

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vkc_pin.knots import scatter
 from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.report import Violation
 
 __all__ = ["explain", "impossible"]
+
+_DRAWS = 10  # times 192 random configurations before a goal counts as blocked
 
 
 def impossible(problem: TrajectoryProblem) -> list[Violation]:
@@ -49,7 +52,7 @@ def explain(problem: TrajectoryProblem, seed: int) -> list[str]:
     """
     lines = []
     for phase, end in zip(problem.task.phases, problem.ends, strict=True):
-        tried = scatter(problem, int(end), np.random.default_rng(seed))
+        tried = _try(problem, int(end), np.random.default_rng(seed))
         if tried is None:
             continue
         z, residual = tried
@@ -73,6 +76,23 @@ def explain(problem: TrajectoryProblem, seed: int) -> list[str]:
                 f"{labels[first]} – {labels[second]} {_gap(contacts.distance[worst])}"
             )
     return lines
+
+
+def _try(
+    problem: TrajectoryProblem, waypoint: int, rng: np.random.Generator
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Return what `scatter` does, drawn again and again until something is free, up to `_DRAWS` times."""
+    found: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
+    for _ in range(_DRAWS):
+        tried = scatter(problem, waypoint, rng)
+        if tried is None:
+            return None
+        found.append(tried)
+        z = tried[0][tried[1] < 1e-4]
+        near = problem.contacts.evaluate(z, np.full(len(z), waypoint), reach=problem.options.dist_safe, nearest=1)
+        if len(z) and near.shortfall(len(z)).min() <= 0.0:
+            break
+    return np.concatenate([z for z, _ in found]), np.concatenate([residual for _, residual in found])
 
 
 def _gap(distance: float) -> str:

@@ -306,8 +306,14 @@ def _check_link(placed: PlacedObject, link: str, where: str) -> None:
         raise UnknownNameError(f"link of '{placed.name}'", link, links, field=where)
 
 
-def compile_task(scene: Scene, steps: Sequence[Step], options: Options) -> Task:
+def compile_task(scene: Scene, steps: Sequence[Step], options: Options, *, nothing: bool = False) -> Task:
     """Return the phases that bring about `steps`, beginning at the scene's start.
+
+    Args:
+        scene: Robot, objects and what is held at the start.
+        steps: What should change.
+        options: How many waypoints phases have.
+        nothing: Whether steps that change nothing are fine; there are no phases then.
 
     Raises:
         InputError: No steps, an unknown object, joint, attachment or frame, a joint that cannot be moved that way, or a
@@ -324,7 +330,7 @@ def compile_task(scene: Scene, steps: Sequence[Step], options: Options) -> Task:
     compiler = _Compiler(scene, options)
     for index, step in enumerate(steps):
         compiler.add(step, f"steps[{index}]")
-    if not compiler.phases:
+    if not compiler.phases and not nothing:
         expected, got = "a step that changes something", "only what holds already"
         raise InputError("there is nothing to do", field="steps", expected=expected, got=got)
     # Objects that are grasped later stand as they are at the start until then.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +20,9 @@ __all__ = ["METHODS", "Seed", "initialize"]
 METHODS = ("auto", "interpolated", "astar", "stationary")
 _TOLERABLE = 60.0  # what the solver may be left to push apart: a graze or two
 _LOOKED, _FREE = 8, 0.05  # paths whose seeds are compared; shortfalls [m], summed over waypoints, that nobody looks further for
+_HOPELESS = 2.0  # such shortfalls of the straight seed, and the way around comes first
+_WAVES = 6  # half waves of a perturbation over the whole motion
 _DIFFERENT = 0.1  # [m] and [rad] by which the base must differ somewhere between two seeds
-_STEPS = 4  # waypoints between two configurations on a straight way in or out
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +40,15 @@ class Seed:
     shortfall: float = float("nan")
 
 
-def initialize(problem: TrajectoryProblem, method: str, seed: int, *, count: int = 1) -> Iterator[Seed]:
+def initialize(
+    problem: TrajectoryProblem,
+    method: str,
+    seed: int,
+    *,
+    count: int = 1,
+    perturbation: float = 0.0,
+    notes: list[str] | None = None,
+) -> Iterator[Seed]:
     """Yield up to `count` seeds of each kind, best first; each is looked for when it is asked for.
 
     Args:
@@ -50,28 +59,55 @@ def initialize(problem: TrajectoryProblem, method: str, seed: int, *, count: int
             stands there, heading along it. "auto": these two in turn, beginning with what is cheaper.
         seed: Of the random numbers.
         count: How many different seeds to return.
+        perturbation: Standard deviation of what is added to the robot's coordinates, smoothly over time, [m] and [rad].
+        notes: Gets a line for every phase in which there is no way for the base.
     """
+    said: list[str] = [] if notes is None else notes
     if method == "stationary":
-        yield Seed(method, follow_objects(problem, np.tile(problem.start, (problem.segments, 1))))
+        seeds = iter([Seed(method, follow_objects(problem, np.tile(problem.start, (problem.segments, 1))))])
     elif method == "auto":
-        yield from _alternate(_Seeds(problem, "interpolated", seed).seeds(count), _Seeds(problem, "astar", seed).seeds(count))
+        seeds = _in_turn(*(_Seeds(problem, part, seed, said).seeds(count) for part in ("interpolated", "astar")))
     else:
-        yield from _Seeds(problem, method, seed).seeds(count)
+        seeds = _Seeds(problem, method, seed, said).seeds(count)
+    rng = np.random.default_rng([seed, 1])
+    for item in seeds:
+        yield replace(item, z=_perturbed(problem, item.z, perturbation, rng)) if perturbation else item
 
 
-def _alternate(first: Iterator[Seed], second: Iterator[Seed]) -> Iterator[Seed]:
+def _in_turn(straight: Iterator[Seed], around: Iterator[Seed]) -> Iterator[Seed]:
+    """Yield from both in turn, first what goes straight, unless that is hopeless."""
     while True:
-        both = [seed for seed in (next(first, None), next(second, None)) if seed is not None]
-        if not both:
+        first = next(straight, None)
+        second = next(around, None) if first is None or first.shortfall > _HOPELESS else None
+        if first is None and second is None:
             return
-        yield from both
+        if second is not None:
+            yield second
+        if first is not None:
+            yield first
+        if second is None:
+            second = next(around, None)
+            if second is not None:
+                yield second
+
+
+def _perturbed(
+    problem: TrajectoryProblem, z: NDArray[np.float64], deviation: float, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Return a seed with smooth noise on the robot's coordinates: half waves in time, of decreasing amplitude."""
+    robot, waves = problem.chain.robot.coordinates.size, np.arange(1, _WAVES + 1)
+    shape = np.sin(np.pi * np.outer(np.arange(1, len(z) + 1) / (len(z) + 1), waves)) / waves
+    noise = shape @ rng.normal(0.0, deviation, (len(waves), robot)) / np.sqrt(np.sum(0.5 / waves**2))
+    z = z.copy()
+    z[:, :robot] += noise
+    return problem.clip(z)
 
 
 class _Seeds:
     """Joins the knots of the cheapest paths."""
 
-    def __init__(self, problem: TrajectoryProblem, method: str, seed: int) -> None:
-        self.problem, self.method = problem, method
+    def __init__(self, problem: TrajectoryProblem, method: str, seed: int, notes: list[str]) -> None:
+        self.problem, self.method, self.notes = problem, method, notes
         self.knots = Knots(problem, np.random.default_rng(seed))
         self.routes = Routes(problem) if method == "astar" and problem.chain.robot.base != "fixed" else None
         self.beam = Beam(self.knots, self.routes)
@@ -130,6 +166,11 @@ class _Seeds:
                     steps = when[arrive] - when[leave]
                     way = self.routes.way(number, through[leave, :3], through[arrive, :3], steps)
                     if way is None:
+                        line = (
+                            f"{phase.name}: found no way for the base from {_place(through[leave])} to {_place(through[arrive])}"
+                        )
+                        if not any(note.startswith(f"{phase.name}: found no way") for note in self.notes):
+                            self.notes.append(line)
                         return None
                     turned = way[-1, 2] - through[arrive, 2]  # by whole turns: what follows goes on from there
                     through[arrive:, 2] += turned
@@ -159,7 +200,12 @@ class _Seeds:
         """
         first = self.approach.after(ends[0], phase, previous)
         last = self.approach.before(ends[1], phase)
-        spacing = max(1, min(_STEPS, segments // (2 * max(len(first) + len(last), 1))))
+        steps = self.problem.options.approach_waypoints
+        spacing = max(1, min(steps, segments // (2 * max(len(first) + len(last), 1))))
         when = [0, *(spacing * (1 + k) for k in range(len(first)))]
         when += [*(segments - spacing * (len(last) - k) for k in range(len(last))), segments]
         return np.vstack([ends[:1], first, last, ends[1:]]), when, len(first), len(first) + 1
+
+
+def _place(z: NDArray[np.float64]) -> str:
+    return f"({z[0]:.2f}, {z[1]:.2f})"

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from vkc_pin import cpin
 from vkc_pin.batch import BatchFunction
 from vkc_pin.coordinates import Coordinates
-from vkc_pin.pose import pose_residual, target_vector
+from vkc_pin.pose import PoseRow, pose_residual, target_vector
 
 __all__ = ["PoseSolver"]
 
@@ -23,13 +23,12 @@ class PoseSolver:
         rows: Number of residuals m: 6 of a pose, 5 of an upright place, 3 of a point; see `pose`.
     """
 
-    def __init__(self, model: pin.Model, joint: int, local: pin.SE3, kind: str = "pose") -> None:
+    def __init__(self, model: pin.Model, pose: PoseRow) -> None:
         coordinates = Coordinates(model)
         self.size = coordinates.size
         z, target = ca.SX.sym("z", self.size), ca.SX.sym("W", 12)
-        column = cpin.joint_placements(model)(coordinates.q_symbolic(z))[:, joint - 1]
-        rotation = ca.reshape(column[:9], 3, 3)
-        residual = pose_residual(kind, rotation @ local.rotation, rotation @ local.translation + column[9:], target)
+        placements = cpin.joint_placements(model)(coordinates.q_symbolic(z))
+        residual = pose_residual(pose.kind, *pose.placement(placements), target)
         self.rows = int(residual.numel())
         jacobian = ca.densify(ca.jacobian(residual, z))
         self._function = BatchFunction(ca.Function("pose", [z, target], [ca.densify(residual), jacobian], {"cse": True}))

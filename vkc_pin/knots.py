@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from vkc_pin.clearing import clear_out
 from vkc_pin.inverse_kinematics import PoseSolver
 from vkc_pin.problem import TrajectoryProblem
 
@@ -33,7 +34,7 @@ class Knots:
         self.robot = self.chain.robot.coordinates.size
         self.weights = np.ones(self.chain.size)
         self.weights[:3] = 3.0
-        self.weights[[column for column, _, _ in problem.transcription.structure.clamped]] = CHOICE
+        self.weights[[column for column, _, _ in problem.choices]] = CHOICE
         self.driven = np.array([self.chain.index(name) for name in problem.task.state], int)
         self.objects = follow_objects(problem, np.tile(problem.start, (problem.segments, 1)))
 
@@ -54,14 +55,9 @@ class Knots:
             how: "scatter": from anywhere; "track": the nearest ones; "shake": from there with the arms shaken, so that the
                 search can leave a way that is closing.
         """
-        problem, row = self.problem, waypoint - 1
         z = before.copy()
-        z[:, self.driven] = self.objects[row, self.driven]
-        lower, upper = np.tile(problem.lower[row], (len(z), 1)), np.tile(problem.upper[row], (len(z), 1))
-        lower[:, self.driven] = upper[:, self.driven] = self.objects[row, self.driven]
-        for column, first, last in problem.transcription.structure.clamped:
-            if first < waypoint <= last:
-                lower[:, column] = upper[:, column] = before[:, column]
+        z[:, self.driven] = self.objects[waypoint - 1, self.driven]
+        lower, upper = self._limits(before, waypoint)
         pose = self.pose_at(waypoint)
         if pose is None:
             return np.clip(z, lower, upper), np.ones(len(z), bool)
@@ -76,6 +72,25 @@ class Knots:
             z = self._unwind(z, before, lower, upper)
         return z, found
 
+    def clear(self, z: NDArray[np.float64], waypoint: int) -> NDArray[np.float64]:
+        """Return configurations for a waypoint, shape (B, n), pushed out of collision as far as that goes; see `clearing`."""
+        pose = self.pose_at(waypoint)
+        if pose is None:
+            return z
+        lower, upper = self._limits(z, waypoint)
+        solver, target = self.solver(pose)
+        return clear_out(self.problem, z, waypoint, solver, target, lower=lower, upper=upper, weights=self.weights)
+
+    def _limits(self, before: NDArray[np.float64], waypoint: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the limits of what comes from `before`, shape (B, n), at a waypoint: lower and upper, shape (B, n)."""
+        row = waypoint - 1
+        lower, upper = (np.tile(limits[row], (len(before), 1)) for limits in (self.problem.lower, self.problem.upper))
+        lower[:, self.driven] = upper[:, self.driven] = self.objects[row, self.driven]
+        for column, grasp, last in self.problem.choices:
+            if grasp < waypoint <= last:
+                lower[:, column] = upper[:, column] = before[:, column]
+        return lower, upper
+
     def _choose(self, z: NDArray[np.float64], waypoint: int) -> None:
         """Grasp anywhere: draw the freedoms of what is grasped at a waypoint, in place."""
         problem = self.problem
@@ -84,11 +99,12 @@ class Knots:
                 z[:, column] = self.rng.uniform(self.chain.lower[column], self.chain.upper[column], len(z))
 
     def _scatter(self, z: NDArray[np.float64], pose: int) -> NDArray[np.float64]:
-        """Return arms near home, nearer and further, with the base under them as `pose` needs it."""
+        """Return arms near home, and every other near where it comes from, with the base under them as `pose` needs it."""
         home = self.chain.robot.home
         spread = self.rng.uniform(0.1, 1.0, (len(z), 1))
         z = z.copy()
-        z[:, 3 : self.robot] = home + spread * self.rng.normal(0.0, 1.0, (len(z), len(home)))
+        z[::2, 3 : self.robot] = home
+        z[:, 3 : self.robot] += spread * self.rng.normal(0.0, 1.0, (len(z), len(home)))
         return self._stand(np.clip(z, self.problem.chain.lower, self.problem.chain.upper), pose)
 
     def _shake(self, z: NDArray[np.float64], pose: int) -> NDArray[np.float64]:

@@ -27,6 +27,8 @@ class Options:
         velocity_weight_arm: W_vel for the arm joints.
         velocity_weight_object: W_vel for the object's and the virtual joints.
         acceleration_weight: W_acc of eq. 1, as a multiple of W_vel [s²].
+        approach: Length of the straight way on which a hand comes to what it grasps [m].
+        approach_waypoints: Segments it takes.
         contact_slots: Witness planes a waypoint can hold.
         contact_reach: Pairs closer than this get a witness plane [m].
         closure_position: Largest drift of a held object's base that `validation` accepts [m].
@@ -50,6 +52,8 @@ class Options:
     velocity_weight_arm: float = 1.0
     velocity_weight_object: float = 0.5
     acceleration_weight: float = 0.3
+    approach: float = 0.08
+    approach_waypoints: int = 4
     contact_slots: int = 6
     contact_reach: float = 0.25
     closure_position: float = 1e-3

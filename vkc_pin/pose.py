@@ -7,6 +7,7 @@ vertical as the target has it, at any heading.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -14,7 +15,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-__all__ = ["ROW_BOUNDS", "pose_residual", "pose_rows", "target_vector"]
+__all__ = ["ROW_BOUNDS", "PoseRow", "pose_residual", "pose_rows", "target_vector"]
 
 ROW_BOUNDS: Mapping[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = {
     "pose": (np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]), np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.inf])),
@@ -22,6 +23,42 @@ ROW_BOUNDS: Mapping[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = {
     "upright": (np.zeros(6), np.array([0.0, 0.0, 0.0, 0.0, 0.0, np.inf])),
 }
 """For every kind of goal, the bounds between which `pose_rows` must lie."""
+
+
+@dataclass(frozen=True)
+class PoseRow:
+    """A frame that must be at a parametric placement at some waypoints.
+
+    Attributes:
+        joint: Joint of the model that carries it.
+        local: Its placement in the joint's frame.
+        waypoints: At which waypoints, counted from 1.
+        kind: "pose", "point" or "upright"; see `pose`.
+        shift: (joint, vector): what is added to the frame's translation, a vector that is fixed in another joint's frame [m].
+            With it a hand can be asked to be short of a grasp by so much along its approach, wherever in the grasp that is.
+    """
+
+    joint: int
+    local: pin.SE3
+    waypoints: tuple[int, ...]
+    kind: str = "pose"
+    shift: tuple[int, tuple[float, float, float]] | None = None
+
+    @property
+    def rows(self) -> int:
+        """Number of constraint rows."""
+        return len(ROW_BOUNDS[self.kind][0])
+
+    def placement(self, placements: Any) -> tuple[Any, Any]:
+        """Return rotation, shape (3, 3), and translation, shape (3, 1), of the frame, given those of all joints (`cpin`)."""
+        column = placements[:, self.joint - 1]
+        rotation = ca.reshape(column[:9], 3, 3)
+        translation = rotation @ self.local.translation + column[9:]
+        if self.shift is not None:
+            joint, vector = self.shift
+            translation = translation + ca.reshape(placements[:9, joint - 1], 3, 3) @ ca.DM(vector)
+        return rotation @ self.local.rotation, translation
+
 
 _HALF_TURN = 1e-6  # of (2 cos(θ/2))²
 _GENERIC = ca.DM([0.3, 0.55, 0.78])  # perpendicular to no axis that anybody turns about

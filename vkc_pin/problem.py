@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections import OrderedDict
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,12 +17,12 @@ from vkc_pin.contact import ContactModel, Contacts
 from vkc_pin.goal import compile_task
 from vkc_pin.hold import Hold, holds_of
 from vkc_pin.options import Options
-from vkc_pin.pose import target_vector
+from vkc_pin.pose import PoseRow, target_vector
 from vkc_pin.scene import Scene
 from vkc_pin.steps import Step
 from vkc_pin.task import Phase, Task
 from vkc_pin.transcription import Transcription
-from vkc_pin.waypoint import PoseRow, Structure
+from vkc_pin.waypoint import Structure
 
 __all__ = ["TrajectoryProblem", "build"]
 
@@ -94,7 +95,15 @@ class TrajectoryProblem:
                 rows.append(PoseRow(closure.joint, closure.local, tuple(int(t) for t in waypoints)))
                 targets.append(closure.target)
                 names.append(f"closure {hold.object}")
-        for phase, last in zip(self.task.phases, self.ends, strict=True):
+        for phase, first, last in zip(self.task.phases, starts, self.ends, strict=True):
+            for hold in phase.grasps:  # short of the grasp, straight back along the hand's approach
+                closure, target = self.chain.closures[hold], phase.standing.get(hold.object, self.chain.closures[hold].target)
+                joint, frame = self.chain.holder(hold)
+                x, y, z = (self.options.approach * frame.rotation[:, 2]).tolist()
+                at = max(int(first) + 1, int(last) - self.options.approach_waypoints)
+                rows.append(PoseRow(closure.joint, closure.local, (at,), shift=(joint, (x, y, z))))
+                targets.append(target)
+                names.append(f"approach {hold}")
             for goal in phase.frames:
                 rows.append(PoseRow(*self.chain.frame(goal.frame, goal.hold), (int(last),), goal.kind))
                 targets.append(goal.placement)
@@ -105,7 +114,8 @@ class TrajectoryProblem:
         o, robot = self.options, self.chain.robot.coordinates.size
         weights = np.full(self.chain.size, o.velocity_weight_object)
         weights[:robot], weights[:3] = o.velocity_weight_arm, o.velocity_weight_base
-        clamped = self._clamped()
+        # From the straight way to the grasp on: there the hand must already be where it will close.
+        clamped = tuple((column, max(grasp - o.approach_waypoints, 1), last) for column, grasp, last in self.choices)
         weights[[column for column, _, _ in clamped]] = _CHOICE_WEIGHT
         acceleration = weights * o.acceleration_weight / o.dt**2
         # The robot stands still while its gripper closes or opens.
@@ -124,8 +134,9 @@ class TrajectoryProblem:
             clamped,
         )
 
-    def _clamped(self) -> tuple[tuple[int, int, int], ...]:
-        """Return column, first and last waypoint of what a clamping hand does not let slide after a grasp."""
+    @cached_property
+    def choices(self) -> tuple[tuple[int, int, int], ...]:
+        """Column, waypoint of the grasp and last waypoint of the hold, for what is chosen when a hand clamps."""
         found = []
         for hold, names in self.chain.virtual.items():
             attachment = self.scene.objects[hold.object].object.attachments[hold.attachment]

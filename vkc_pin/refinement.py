@@ -12,7 +12,7 @@ __all__ = ["collisions_between", "merge"]
 
 SPACING = 0.02  # [m] or [rad] between the states looked at first, in the coordinate that moves most
 CLOSE, FINER = 0.015, 8  # [m] where something is as close as that, so many times more states are looked at
-KEEP = 3e-3  # [m] clearance asked for between waypoints
+KEEP = 1e-2  # [m] clearance asked for between waypoints
 
 
 def collisions_between(problem: TrajectoryProblem, z: NDArray[np.float64]) -> Contacts:
@@ -42,12 +42,10 @@ def collisions_between(problem: TrajectoryProblem, z: NDArray[np.float64]) -> Co
     segment = np.repeat(segment, FINER)
     s = (begin[:, None] + length[:, None] * (np.arange(FINER) + 0.5) / FINER).ravel()
     states, waypoints = _states(path, segment, s)
-    found = _deepest(problem.contacts.evaluate(states, waypoints, reach=KEEP), segment)
+    found = _deepest(problem.contacts.evaluate(states, waypoints, reach=KEEP + CLOSE), segment)
     # A start that is close to something leaves it as it can: only what collides on the way counts.
     found = found.select(np.flatnonzero((segment[found.waypoint] > 0) | (found.distance < 0)))
     keep = np.minimum(KEEP, found.margin)
-    closer = np.flatnonzero(found.distance < keep)
-    found, keep = found.select(closer), keep[closer]
     joints = problem.contacts.joints_of(found.pair)
     rotations, translations = problem.chain.joint_placements(states)
     ends = problem.chain.joint_placements(path)

@@ -13,6 +13,8 @@ from vkc_pin.scene import FLOOR
 
 __all__ = ["Routes"]
 
+_FOOT = 2  # the joint of the model that is the arm's first: joint 1 is the base
+_NEAR = 0.4  # [m] from the ends of a way: there the arm reaches in and out, and only the base counts
 _COARSE = 0.5  # [m]: starts closer together share their distances
 
 
@@ -38,18 +40,19 @@ class Routes:
             rotations, translations = chain.joint_placements(z[None])
             robot = range(len(chain.robot.collision.geometryObjects))
             held = [i for hold in problem.task.phases[phase].held for i in chain.held_geometries[hold]]
-            base: list[Shape] = [(shapes[i].geometry, shapes[i].placement) for i in robot if shapes[i].parentJoint == 1]
+            base: list[Shape] = []
             carried: list[Shape] = []
-            for i in [*(i for i in robot if shapes[i].parentJoint > 1), *held]:
+            for i in [*robot, *held]:
                 joint = shapes[i].parentJoint
                 carrier = pin.SE3(rotations[0, joint], translations[0, joint])
-                carried.append((shapes[i].geometry, carrier * shapes[i].placement))
+                # Where the arm stands on the base it is always: a low base does not go under a table that the arm does not.
+                (base if joint <= _FOOT else carried).append((shapes[i].geometry, carrier * shapes[i].placement))
             standing: list[Shape] = [
                 (shape.geometry, shape.placement)
                 for shape, label in zip(shapes, part.labels, strict=True)
                 if shape.parentJoint == 0 and label != FLOOR
             ]
-            self._grids[phase] = BaseGrid(base, carried, standing, problem.scene.arena, problem.options.dist_safe)
+            self._grids[phase] = BaseGrid(base, carried, standing, problem.scene.arena, problem.options.dist_safe, near=_NEAR)
         return self._grids[phase]
 
     def distances(self, phase: int, starts: NDArray[np.float64], goals: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -69,6 +72,6 @@ class Routes:
         """
         key = (phase, start.tobytes(), goal.tobytes())
         if key not in self._ways:
-            self._ways[key] = shortest_path(self.grid(phase), start, goal[None])
+            self._ways[key] = shortest_path(self.grid(phase), start.tolist(), goal[None])
         path = self._ways[key]
         return None if path is None else along(path, steps)

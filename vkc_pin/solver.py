@@ -39,8 +39,9 @@ _WARM: Mapping[str, Any] = {
     "ipopt.mu_init": 1e-3,
 }
 CLOSE_ENOUGH = 5e-4  # [m] shortfall of clearance at waypoints that ends the loop
-TOLERABLE_BETWEEN = 0.8 * KEEP  # [m] of the clearance asked for between waypoints that may be missing there
+TOLERABLE_BETWEEN = KEEP - 6e-4  # [m] of the clearance asked for between waypoints that may be missing there
 FIRST_RADIUS, RESTART_RADIUS, MIN_RADIUS, SHRINK = 0.5, 0.2, 5e-3, 0.4  # trust region, [m] and [rad]
+EARLY = 0.05  # [m] shortfall of clearance below which collisions between waypoints count
 NEARLY_FREE = 0.01  # [m] shortfall of clearance below which limits on rates count
 POSE_TOLERANCE = 1e-4  # [m] and [rad]
 RATE_TOLERANCE = 1e-4  # relative
@@ -142,6 +143,8 @@ class _Loop:
         self.z, self.at, self.shortfall = trial.z, trial.contacts, trial.shortfall
         self.objective, self.pose_error = trial.objective, trial.pose_error
         self.solution.z = trial.z
+        if not self.between and 0.0 < trial.contacts.violation() < EARLY:
+            self.free_between(trial.z)
         if trial.rate > RATE_TOLERANCE and trial.contacts.violation() < NEARLY_FREE:  # before, it only costs time
             self.problem.stretch(trial.z)
             if not self.rates and self.problem.rate_violation(trial.z) > RATE_TOLERANCE:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vkc_pin.errors import InputError, UnknownNameError
 
-__all__ = ["PhaseSpan", "Trajectory"]
+__all__ = ["PhaseSpan", "Trajectory", "join"]
 
 
 @dataclass(frozen=True)
@@ -124,6 +124,15 @@ class Trajectory:
         """Return the sum of the arm joints' absolute displacements, Σ |δq_arm| [rad]."""
         return float(np.abs(np.diff(self.positions[:, 3 : self.robot_size], axis=0)).sum())
 
+    def metrics(self) -> dict[str, float]:
+        """Return duration [s], base_effort and base_effort_l1 [m], and arm_effort [rad]."""
+        return {
+            "duration": float(self.times[-1] - self.times[0]),
+            "base_effort": self.base_effort(),
+            "base_effort_l1": self.base_effort_l1(),
+            "arm_effort": self.arm_effort(),
+        }
+
     def phase_at(self, time: float) -> PhaseSpan:
         """Return the phase at `time` [s]; at a boundary the later one."""
         index = int(np.searchsorted(self.times, time, side="right")) - 1
@@ -154,6 +163,50 @@ class Trajectory:
             return cls(tuple(data["names"]), data["times"], data["positions"], phases, int(data["robot_size"]))
         except KeyError as error:
             raise InputError("this is missing from a trajectory", field=str(error.args[0])) from None
+
+
+def join(parts: Sequence[Trajectory], *, pause: float) -> Trajectory:
+    """Return motions one after the other as one.
+
+    Args:
+        parts: Each begins where the one before it ends. A coordinate that a part does not have keeps its value there.
+        pause: How long the robot waits between two parts where the hand closes or opens [s].
+
+    Raises:
+        InputError: There is none, or one does not begin where the one before it ends.
+    """
+    if not parts:
+        raise InputError("nothing to join", field="parts", expected="at least one trajectory")
+    robot = parts[0].robot_size
+    names = list(dict.fromkeys(name for part in parts for name in part.names))
+    rows: list[NDArray[np.float64]] = []
+    times: list[float] = []
+    phases: list[PhaseSpan] = []
+    for number, part in enumerate(parts):
+        values = np.full((len(part.times), len(names)), np.nan)
+        values[:, [names.index(name) for name in part.names]] = part.positions
+        start, shift = 0.0 if not times else times[-1], 0
+        if number:
+            apart = np.abs(values[0, :robot] - rows[-1][:robot]).max()
+            if not apart <= 1e-6:
+                where = f"parts[{number}]"
+                raise InputError("a motion does not begin where the one before it ends", field=where, got=f"{apart:g} apart")
+            before, after = phases[-1], part.phases[0]
+            shift = len(rows) - 1
+            if (before.held, before.by) != (after.held, after.by):
+                rows.append(values[0])
+                times.append(start + pause)
+                start, shift = start + pause, shift + 1
+        rows += list(values[1:] if number else values)
+        times += (start + (part.times[1:] if number else part.times) - part.times[0]).tolist()
+        for k, phase in enumerate(part.phases):
+            first = phases[-1].last if phases else 0
+            phases.append(replace(phase, first=first if k == 0 else phase.first + shift, last=phase.last + shift))
+    table = np.array(rows)
+    for column in table.T:  # the last value that is known, or else the next
+        known = np.flatnonzero(~np.isnan(column))
+        column[:] = column[known[np.maximum(np.searchsorted(known, np.arange(len(column)), side="right") - 1, 0)]]
+    return Trajectory(tuple(names), np.array(times), table, tuple(phases), robot)
 
 
 def _numbers(values: Any, name: str) -> NDArray[np.float64]:

@@ -50,7 +50,7 @@ class Transcription:
         self._objective()
         self._constraints()
         self._rates()
-        self.pose_solvers = [PoseSolver(structure.model, pose.joint, pose.local, pose.kind) for pose in structure.poses]
+        self.pose_solvers = [PoseSolver(structure.model, pose) for pose in structure.poses]
         self._solvers: dict[tuple[Any, ...], tuple[ca.Function, Monitor | None]] = {}
         self.build_time = time.perf_counter() - started
 

@@ -13,31 +13,9 @@ from numpy.typing import NDArray
 
 from vkc_pin import cpin
 from vkc_pin.coordinates import Coordinates
-from vkc_pin.pose import ROW_BOUNDS, pose_rows
+from vkc_pin.pose import PoseRow, pose_rows
 
-__all__ = ["PoseRow", "Structure", "WaypointFunctions"]
-
-
-@dataclass(frozen=True)
-class PoseRow:
-    """A frame that must be at a parametric placement at some waypoints.
-
-    Attributes:
-        joint: Joint of the model that carries it.
-        local: Its placement in the joint's frame.
-        waypoints: At which waypoints, counted from 1.
-        kind: "pose", "point" or "upright"; see `pose`.
-    """
-
-    joint: int
-    local: pin.SE3
-    waypoints: tuple[int, ...]
-    kind: str = "pose"
-
-    @property
-    def rows(self) -> int:
-        """Number of constraint rows."""
-        return len(ROW_BOUNDS[self.kind][0])
+__all__ = ["Structure", "WaypointFunctions"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +47,7 @@ class Structure:
     @property
     def key(self) -> tuple[Any, ...]:
         """Equal for structures that share one program."""
-        poses = tuple((p.joint, p.local.homogeneous.round(12).tobytes(), p.waypoints, p.kind) for p in self.poses)
+        poses = tuple((p.joint, p.local.homogeneous.round(12).tobytes(), p.waypoints, p.kind, p.shift) for p in self.poses)
         weights = (self.weights_velocity.tobytes(), self.weights_acceleration.tobytes())
         others = (self.rests, self.differential, self.clamped)
         return (self.model.saveToString(), self.segments, poses, self.slots, *weights, *others)
@@ -90,10 +68,7 @@ class WaypointFunctions:
         parts = []
         for k, pose in enumerate(poses):
             row = structure.poses[pose]
-            column = placements[:, row.joint - 1]
-            rotation = ca.reshape(column[:9], 3, 3)
-            turned, moved = rotation @ row.local.rotation, rotation @ row.local.translation + column[9:]
-            parts.append(pose_rows(row.kind, turned, moved, targets[:, k]))
+            parts.append(pose_rows(row.kind, *row.placement(placements), targets[:, k]))
         pose_values = ca.vertcat(*parts) if parts else ca.SX(0, 1)
         self.pose_rows = [structure.poses[pose].rows for pose in poses]
         self.rows = slots + sum(self.pose_rows)

@@ -178,6 +178,12 @@ class World:
         """Return the joints of the model that are an object's, with its free joint."""
         return [joint for joint in self._joints[name] if joint]
 
+    def placement(self, name: str, row: NDArray[np.float64]) -> pin.SE3:
+        """Return where the base link of a free object is, of the world's coordinates, shape (n,)."""
+        numbers = row[self.placement_columns(name)].copy()
+        numbers[3:] /= np.linalg.norm(numbers[3:])
+        return pin.XYZQUATToSE3(numbers)
+
     def placement_columns(self, name: str) -> slice:
         """Return which of the coordinates are the placement of a free object."""
         first = self.coordinates.index(f"{name}.{FREE_JOINT}_x")

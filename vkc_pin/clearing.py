@@ -1,0 +1,127 @@
+"""Pushes single configurations out of collision while what must hold there goes on holding, many at once."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from vkc_pin.chain import VirtualKinematicChain
+from vkc_pin.contact import Contacts
+from vkc_pin.inverse_kinematics import PoseSolver
+from vkc_pin.problem import TrajectoryProblem
+
+__all__ = ["clear_out", "point_jacobians"]
+
+_ROUNDS = 8
+_ROWS = 6  # contacts of a configuration that are looked at in one round
+_SPARE = 5e-3  # [m] further than the margin
+_LONGEST = 0.25  # [m] and [rad], of one round's step in one coordinate
+_DAMPING = 1e-3
+
+
+def clear_out(
+    problem: TrajectoryProblem,
+    z: NDArray[np.float64],
+    waypoint: int,
+    solver: PoseSolver,
+    target: pin.SE3,
+    *,
+    lower: NDArray[np.float64],
+    upper: NDArray[np.float64],
+    weights: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return configurations that are further from collision than `z`, as far as a few damped Gauss-Newton steps get them.
+
+    Each step asks for the residuals of the pose to vanish and for the contacts that fall short of their margins to keep them,
+    linearised: with the witness points fixed in their bodies the gradient of a distance d = n·(b − a) is n·(∂b − ∂a).
+
+    Args:
+        problem: Whose contacts count.
+        z: Configurations that satisfy the pose, shape (B, n).
+        waypoint: The waypoint they are for.
+        solver: Of the pose.
+        target: Of the pose.
+        lower: Limits, shape (B, n).
+        upper: Limits, shape (B, n).
+        weights: What moving a coordinate costs, shape (n,).
+    """
+    z, done = z.copy(), np.zeros(len(z), bool)
+    free = (upper - lower > 1e-9) / weights
+    for _ in range(_ROUNDS):
+        at = np.flatnonzero(~done)
+        if not len(at):
+            break
+        reach = problem.options.dist_safe + _SPARE
+        contacts = problem.contacts.evaluate(z[at], np.full(len(at), waypoint), reach=reach, nearest=_ROWS)
+        short = np.zeros(len(at))
+        np.maximum.at(short, contacts.waypoint, contacts.margin - contacts.distance)
+        residual, pose_rows = solver.evaluate(z[at], target)
+        done[at] = (short <= 0.0) & (np.abs(residual).max(axis=1) < 1e-4)
+        rows, wanted = _contact_rows(problem, z[at], contacts)
+        jacobian = np.concatenate([pose_rows, rows], axis=1)
+        wanted = np.concatenate([-residual, wanted], axis=1)
+        scaled = jacobian * free[at][:, None, :]
+        system = scaled @ jacobian.transpose(0, 2, 1) + _DAMPING * np.eye(jacobian.shape[1])
+        step = np.einsum("bij,bi->bj", scaled, np.linalg.solve(system, wanted[..., None])[..., 0])
+        step *= np.minimum(1.0, _LONGEST / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12))
+        step[done[at]] = 0.0
+        z[at] = np.clip(z[at] + step, lower[at], upper[at])
+    return z
+
+
+def _contact_rows(
+    problem: TrajectoryProblem, z: NDArray[np.float64], contacts: Contacts
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return gradients of the nearest distances, shape (B, rows, n), and by how much they should grow, shape (B, rows) [m]."""
+    order = np.arange(len(contacts.waypoint)) - np.searchsorted(contacts.waypoint, contacts.waypoint)
+    joints = problem.contacts.joints_of(contacts.pair)
+    first = point_jacobians(problem.chain, z, contacts.waypoint, joints[:, 0], contacts.first)
+    second = point_jacobians(problem.chain, z, contacts.waypoint, joints[:, 1], contacts.second)
+    rows, wanted = np.zeros((len(z), _ROWS, z.shape[1])), np.zeros((len(z), _ROWS))
+    rows[contacts.waypoint, order] = np.einsum("ci,cij->cj", contacts.normal, second - first)
+    wanted[contacts.waypoint, order] = np.maximum(contacts.margin + _SPARE - contacts.distance, 0.0)
+    return rows, wanted
+
+
+def point_jacobians(
+    chain: VirtualKinematicChain,
+    z: NDArray[np.float64],
+    which: NDArray[np.int_],
+    joint: NDArray[np.int_],
+    point: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return how points that are fixed in joints' frames move, shape (C, 3, n).
+
+    Args:
+        chain: The chain.
+        z: Configurations, shape (B, n).
+        which: The configuration of each point, shape (C,).
+        joint: The joint that carries it, shape (C,); 0 stands still.
+        point: Where it is in the world, shape (C, 3) [m].
+    """
+    model, coordinates = chain.model, chain.coordinates
+    rotations, translations = chain.joint_placements(z)
+    supports = np.array([[k in model.supports[j] for k in range(model.njoints)] for j in range(model.njoints)])
+    subspaces = _subspaces(model)
+    jacobian = np.zeros((len(which), 3, z.shape[1]))
+    for column, owner in enumerate(coordinates.joints):
+        moved = np.flatnonzero(supports[joint, owner])
+        at = which[moved]
+        if str(model.joints[owner].shortname()) == "JointModelPlanar":  # x and y along the world's axes, then the heading
+            part = column - coordinates.joints.index(owner)
+            if part < 2:
+                jacobian[moved, part, column] = 1.0
+                continue
+            linear, angular = np.zeros((len(moved), 3)), np.tile([0.0, 0.0, 1.0], (len(moved), 1))
+        else:
+            linear, angular = rotations[at, owner] @ subspaces[owner][:3], rotations[at, owner] @ subspaces[owner][3:]
+        jacobian[moved, :, column] = linear + np.cross(angular, point[moved] - translations[at, owner])
+    return jacobian
+
+
+def _subspaces(model: pin.Model) -> dict[int, NDArray[np.float64]]:
+    """Return the motion of each joint of one degree of freedom in its own frame: linear, then angular, shape (6,)."""
+    data = model.createData()
+    pin.forwardKinematics(model, data, pin.neutral(model))
+    return {j: np.asarray(data.joints[j].S, float).ravel() for j in range(1, model.njoints) if model.joints[j].nv == 1}

@@ -1,0 +1,175 @@
+"""Steps as one problem: from seed to seed until validation accepts a motion."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vkc_pin.diagnosis import explain, impossible
+from vkc_pin.goal import compile_task
+from vkc_pin.initialization import Seed, initialize
+from vkc_pin.options import Options
+from vkc_pin.plan import Plan
+from vkc_pin.problem import TrajectoryProblem
+from vkc_pin.report import Report
+from vkc_pin.scene import Scene
+from vkc_pin.solution import Iteration, Solution
+from vkc_pin.solver import solve
+from vkc_pin.steps import Step
+from vkc_pin.trajectory import Trajectory
+from vkc_pin.unfold import as_trajectory
+from vkc_pin.validation import validate
+
+__all__ = ["TIMES", "OneProblem", "Settings"]
+
+TIMES = ("initialization", "coal", "casadi", "ipopt", "validation")
+"""What planning spends its time on."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to plan; see `planner.plan`."""
+
+    initialization: str
+    options: Options
+    callback: Callable[[Iteration], None] | None
+    time_limit: float | None
+    seed: int
+    perturbation: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Try:
+    """Where one seed led.
+
+    Attributes:
+        name: The seed's name.
+        trajectory: The motion.
+        report: What validation says of it.
+        status: "success", "rejected" or "not converged".
+    """
+
+    name: str
+    trajectory: Trajectory
+    report: Report
+    status: str
+
+    @property
+    def amount(self) -> float:
+        """By how much everything is violated, summed over all units."""
+        return sum(violation.amount for violation in self.report.violations)
+
+
+class OneProblem:
+    """Plans steps as one nonlinear program."""
+
+    def __init__(self, scene: Scene, steps: Sequence[Step], settings: Settings) -> None:
+        self.scene, self.settings = scene, settings
+        self.task = compile_task(scene, steps, settings.options)
+        self.times = dict.fromkeys(TIMES, 0.0)
+        self.rounds = self.iterations = 0
+        self.history: list[dict[str, float]] = []
+        self.blocked: list[str] = []  # phases in which there is no way for the base
+
+    def run(self) -> Plan:
+        """Try seeds until validation accepts a motion, there are no more, or time is up."""
+        began, limit = time.perf_counter(), self.settings.time_limit
+        problem = TrajectoryProblem(self.scene, self.task, self.settings.options)
+        build_time = problem.transcription.take_build_time()
+        reasons = impossible(problem)
+        if reasons:
+            best, status = self._stationary(problem), "infeasible"
+            best = dataclasses.replace(best, report=best.report.with_reasons(reasons))
+        else:
+            best, status = self._try_seeds(problem, np.inf if limit is None else began + build_time + limit)
+        build_time += problem.transcription.take_build_time()
+        return self._plan(best, status, time.perf_counter() - began - build_time, build_time)
+
+    def _try_seeds(self, problem: TrajectoryProblem, deadline: float) -> tuple[_Try, str]:
+        """Return the best try, with what is in the way of the task if it is no success, and the plan's status."""
+        best: _Try | None = None
+        notes: list[str] = []
+        status = ""
+        try:
+            for number, seed in enumerate(self._seeds(problem), start=1):
+                solution = self._solve(problem, seed, deadline)
+                found = self._judge(problem, solution, seed.name)
+                best = found if best is None or found.report.ok or found.amount < best.amount else best
+                if best.status == "success":
+                    return best, "success"
+                if solution.status in ("time limit", "interrupted"):
+                    status = solution.status
+                    break
+                if number == 1:
+                    notes = explain(problem, self.settings.seed)
+                elif notes:  # two seeds failed, and random configurations find no free one at a goal either
+                    break
+        except KeyboardInterrupt:
+            status = "interrupted"
+        best = best or self._stationary(problem)
+        if not status:
+            notes += self.blocked
+            status = "infeasible" if notes else best.status
+            best = dataclasses.replace(best, report=dataclasses.replace(best.report, notes=tuple(notes)))
+        return best, status
+
+    def _seeds(self, problem: TrajectoryProblem) -> Iterator[Seed]:
+        s = self.settings
+        seeds = initialize(
+            problem, s.initialization, s.seed, count=s.options.max_restarts, perturbation=s.perturbation, notes=self.blocked
+        )
+        while True:
+            began = time.perf_counter()
+            seed = next(seeds, None)
+            self.times["initialization"] += time.perf_counter() - began
+            if seed is None:
+                return
+            yield seed
+
+    def _solve(self, problem: TrajectoryProblem, seed: Seed, deadline: float) -> Solution:
+        solution = solve(problem, seed.z, callback=self.settings.callback, deadline=deadline)
+        self.rounds += solution.rounds
+        self.iterations += solution.iterations
+        for key, value in solution.timings.items():
+            self.times[key] += value
+        self.history += [dataclasses.asdict(row) for row in solution.history]
+        return solution
+
+    def _judge(self, problem: TrajectoryProblem, solution: Solution, name: str) -> _Try:
+        began = time.perf_counter()
+        trajectory = as_trajectory(problem, solution.z)
+        report = validate(self.scene, self.task.steps, trajectory, self.settings.options)
+        self.times["validation"] += time.perf_counter() - began
+        status = "success" if report.ok else "rejected" if solution.converged else "not converged"
+        return _Try(name, trajectory, report, status)
+
+    def _stationary(self, problem: TrajectoryProblem) -> _Try:
+        return self._judge(problem, Solution(np.tile(problem.start, (problem.segments, 1))), "none")
+
+    def _plan(self, best: _Try, status: str, planning_time: float, build_time: float) -> Plan:
+        metrics = {
+            "planning_time": planning_time,
+            "build_time": build_time,
+            **best.trajectory.metrics(),
+            "clearance": best.report.clearance,
+            "closure_error": best.report.closure_error,
+            "iterations": float(self.iterations),
+            "rounds": float(self.rounds),
+            **{f"time_{key}": value for key, value in self.times.items()},
+        }
+        return Plan(
+            scene=self.scene,
+            steps=self.task.steps,
+            options=self.settings.options,
+            trajectory=best.trajectory,
+            validation=best.report,
+            status=status,
+            metrics=metrics,
+            seed=self.settings.seed,
+            initialization=best.name,
+            history=tuple(self.history),
+        )

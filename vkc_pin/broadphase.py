@@ -43,10 +43,8 @@ class PhaseGeometry:
 
     def margin(self, pair: int, waypoint: int) -> float:
         """Return the clearance that a pair must keep at a waypoint [m]."""
-        for first, last, margin in self.eased.get(pair, ()):
-            if first <= waypoint <= last:
-                return margin
-        return float(self.margins[pair])
+        eased = (margin for first, last, margin in self.eased.get(pair, ()) if first <= waypoint <= last)
+        return float(min(eased, default=self.margins[pair]))
 
     def maybe_within(
         self, reach: float, rotations: NDArray[np.float64], translations: NDArray[np.float64]

@@ -9,6 +9,7 @@ from small_problems import door_scene, full_scene, random_configurations
 
 from vkc_pin.chain import VirtualKinematicChain, consolidate
 from vkc_pin.inverse_kinematics import PoseSolver
+from vkc_pin.pose import PoseRow
 
 GRASPS = [{}, {"door": "handle"}, {"cabinet": "ball"}]
 
@@ -23,9 +24,13 @@ def solver_and_frame(chain: VirtualKinematicChain) -> tuple[PoseSolver, int, pin
     name = chain.robot.tool_frame
     if chain.closures:
         (closure,) = chain.closures.values()
-        return PoseSolver(chain.model, closure.joint, closure.local), closure.joint, closure.local
+        return PoseSolver(chain.model, PoseRow(closure.joint, closure.local, ())), closure.joint, closure.local
     frame = chain.model.frames[chain.model.getFrameId(name)]
-    return PoseSolver(chain.model, frame.parentJoint, frame.placement), frame.parentJoint, pin.SE3(frame.placement)
+    return (
+        PoseSolver(chain.model, PoseRow(frame.parentJoint, pin.SE3(frame.placement), ())),
+        frame.parentJoint,
+        pin.SE3(frame.placement),
+    )
 
 
 def placement(chain: VirtualKinematicChain, joint: int, local: pin.SE3, z: np.ndarray) -> pin.SE3:
@@ -197,7 +202,7 @@ def tilt(placement: pin.SE3, target: pin.SE3) -> float:
 @pytest.mark.parametrize(("kind", "rows"), [("point", 3), ("upright", 5)])
 def test_residuals_and_jacobians_of_other_goals(chain: VirtualKinematicChain, kind: str, rows: int) -> None:
     _, joint, local = solver_and_frame(chain)
-    solver = PoseSolver(chain.model, joint, local, kind)
+    solver = PoseSolver(chain.model, PoseRow(joint, local, (), kind))
     z = random_configurations(chain.lower, chain.upper, 10, np.random.default_rng(7))
     target = placement(chain, joint, local, z[0])
     assert (solver.rows, solver.size) == (rows, chain.size)
@@ -218,7 +223,7 @@ def test_residuals_and_jacobians_of_other_goals(chain: VirtualKinematicChain, ki
 @pytest.mark.parametrize("kind", ["point", "upright"])
 def test_other_goals_are_reached_within_limits_at_what_orientation_they_leave(chain: VirtualKinematicChain, kind: str) -> None:
     _, joint, local = solver_and_frame(chain)
-    solver, (lower, upper) = PoseSolver(chain.model, joint, local, kind), limits(chain)
+    solver, (lower, upper) = PoseSolver(chain.model, PoseRow(joint, local, (), kind)), limits(chain)
     rng = np.random.default_rng(8)
     solved, turned = 0, 0.0
     targets = random_configurations(chain.lower, chain.upper, 8, rng, arena=1.0)
@@ -241,7 +246,7 @@ def test_what_hangs_upside_down_is_turned_upright() -> None:
     """A hand that points up is to point down: the gradient of a plain tilt vanishes there."""
     chain = consolidate(door_scene(), {})
     _, joint, local = solver_and_frame(chain)
-    solver, (lower, upper) = PoseSolver(chain.model, joint, local, "upright"), limits(chain)
+    solver, (lower, upper) = PoseSolver(chain.model, PoseRow(joint, local, (), "upright")), limits(chain)
     start = np.concatenate([[0.0, 0.0, 0.0], chain.robot.home])
     here = placement(chain, joint, local, start)
     for axis in np.eye(3)[:2]:
@@ -257,3 +262,41 @@ def test_what_hangs_upside_down_is_turned_upright() -> None:
             at = placement(chain, joint, local, row)
             assert tilt(at, target) < 3e-6
             assert np.linalg.norm(at.translation - target.translation) < 3e-6
+
+
+# --- short of a place, along a direction that another joint has -------------------------------------------------------
+
+
+def test_residuals_and_jacobians_with_a_shift(chain: VirtualKinematicChain) -> None:
+    """What is added to the frame's place is fixed in another joint's frame: a hand's approach, say."""
+    _, joint, local = solver_and_frame(chain)
+    hand, vector = chain.robot.model.njoints - 1, (0.03, -0.05, 0.08)
+    z = random_configurations(chain.lower, chain.upper, 10, np.random.default_rng(10))
+    target = placement(chain, joint, local, z[0])
+    for kind in ("pose", "point", "upright"):
+        solver = PoseSolver(chain.model, PoseRow(joint, local, (), kind, (hand, vector)))
+        plain = PoseSolver(chain.model, PoseRow(joint, local, (), kind))
+        residual, jacobian = solver.evaluate(z, target)
+        shifted = np.array([placement(chain, hand, pin.SE3.Identity(), row).rotation @ np.array(vector) for row in z])
+        np.testing.assert_allclose(residual[:, :3], plain.evaluate(z, target)[0][:, :3] + shifted, rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(residual[:, 3:], plain.evaluate(z, target)[0][:, 3:], rtol=0.0, atol=1e-9)
+        change = 1e-6 * np.eye(chain.size)
+        for row in range(10):
+            ahead, behind = solver.evaluate(z[row] + change, target)[0], solver.evaluate(z[row] - change, target)[0]
+            np.testing.assert_allclose(jacobian[row, :3], (ahead - behind).T[:3] / 2e-6, rtol=0.0, atol=1e-6)
+        np.testing.assert_allclose(jacobian[:, 3:], plain.evaluate(z, target)[1][:, 3:], rtol=0.0, atol=1e-9)
+
+
+def test_a_hand_that_is_short_of_its_goal_along_its_approach() -> None:
+    chain = consolidate(door_scene(), {})
+    _, joint, local = solver_and_frame(chain)
+    goal = np.concatenate([[0.5, -0.3, 0.4], chain.robot.home])
+    target = placement(chain, joint, local, goal)
+    vector = 0.08 * local.rotation[:, 2]
+    solver = PoseSolver(chain.model, PoseRow(joint, local, (), "pose", (joint, tuple(vector.tolist()))))
+    seeds = goal + np.random.default_rng(11).uniform(-0.3, 0.3, (40, chain.size))
+    lower, upper = limits(chain)
+    z, found = solver.solve(seeds, target, lower=lower, upper=upper, weights=np.ones(chain.size), iterations=25)
+    assert found.mean() > 0.8
+    back = target * pin.SE3(np.eye(3), np.array([0.0, 0.0, -0.08]))
+    assert np.all(errors(chain, joint, local, z[found], back) < 3e-6)

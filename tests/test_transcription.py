@@ -11,6 +11,7 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
+from carrying import room, stand, table
 from small_problems import door_scene, full_scene, random_configurations
 
 from vkc_pin import problem as problem_module
@@ -18,7 +19,7 @@ from vkc_pin.options import Options
 from vkc_pin.problem import TrajectoryProblem, build
 from vkc_pin.robot import load_robot
 from vkc_pin.scene import Scene
-from vkc_pin.steps import Actuate, GoTo, Grasp, Reach, Step
+from vkc_pin.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
 
 OPTIONS = Options(reach_waypoints=3, turn_waypoints=2, move_waypoints=3, contact_slots=2)
 QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes"}
@@ -39,12 +40,18 @@ def problem(name: str) -> TrajectoryProblem:
         return build(door_scene(), [Actuate("door", {"hinge": 1.2})], options=OPTIONS)
     if name == "differential":
         return build(differential_scene(), [Reach(pose), GoTo(0.0, 0.0, 1.0)], options=OPTIONS)
+    if name == "stick":  # chosen where to grasp, clamped from then on; a point, and an upright place
+        return build(room(table()), [Touch("stick.tip", (0.8, 0.9, 0.7)), Place("stick", (0.8, 0.5, 0.56))], options=OPTIONS)
+    if name == "fetch":  # a ball with the stick that is held at the start, then the stick itself is put away
+        scene = room(stand(), objects=("stick", "ball")).with_held({"stick": "grip"}, at={"stick": (0.02, -0.1)})
+        steps = [Grasp("ball", "pull", "stick.tip"), Place("ball", pose), Release("stick"), GoTo(0.0, 0.0)]
+        return build(scene, steps, options=OPTIONS)
     assert name == "two grasps"  # the second ends nothing: there is a pose to reach after it
     steps = [Grasp("cabinet", "ball"), Actuate("drawer", {"slide": 0.2}, attachment="handle_free"), Reach(pose)]
     return build(full_scene(), steps, options=OPTIONS)
 
 
-NAMES = ["reach", "door", "differential", "two grasps"]
+NAMES = ["reach", "door", "differential", "two grasps", "stick", "fetch"]
 
 
 @dataclass
@@ -91,10 +98,30 @@ def differences(function, x: np.ndarray, step: float = 1e-5) -> np.ndarray:  # t
     return np.array(columns).T
 
 
+def clamped(p: TrajectoryProblem) -> list[tuple[int, int, int]]:
+    """Return column, first and last waypoint of what a hand keeps as it chose it; by the definition of a firm grasp."""
+    found = []
+    for hold, names in p.chain.virtual.items():
+        firm = p.scene.objects[hold.object].object.attachments[hold.attachment].firm
+        grasps = [k for k, phase in enumerate(p.task.phases) if hold in phase.grasps]
+        for k in grasps if firm else ():
+            held = itertools.takewhile(lambda j, hold=hold: hold in p.task.phases[j].held, range(k + 1, len(p.task.phases)))
+            last = max([k, *held])
+            before = max(1, int(p.ends[k]) - OPTIONS.approach_waypoints)
+            found += [(p.chain.index(name), before, int(p.ends[last])) for name in names]
+    return found
+
+
+def clamp_rows(p: TrajectoryProblem) -> np.ndarray:
+    """Return the last rows: one for every coordinate that is clamped and every step of time."""
+    count = sum(last - first for _, first, last in clamped(p))
+    return p.transcription.rows - count + np.arange(count)
+
+
 def stretches(p: TrajectoryProblem) -> list[np.ndarray]:
     """Return the waypoints of each stretch between two rests: the start, every grasp and release, the end."""
     neighbours = zip(p.ends[:-1], p.task.phases[:-1], p.task.phases[1:], strict=True)
-    hands = [int(end) for end, a, b in neighbours if a.grasps or (a.held and not b.held)]
+    hands = [int(end) for end, a, b in neighbours if a.grasps or set(a.held) - set(b.held)]
     stops = [0, *hands, p.segments]
     return [np.arange(a, b + 1) for a, b in itertools.pairwise(stops)]
 
@@ -116,6 +143,7 @@ def test_the_objective_is_equation_1(name: str) -> None:
             for k in range(p.chain.size)
         ]
     )
+    weight[[column for column, _, _ in clamped(p)]] = 1e-3  # chosen once, and not moved
     path = np.vstack([p.start, point.z])
     expected = PENALTY * point.slack.sum()
     for stretch in stretches(p):
@@ -128,7 +156,7 @@ def test_the_objective_is_equation_1(name: str) -> None:
 
 
 def test_there_are_rests_where_a_hand_closes_or_opens() -> None:
-    assert [len(stretches(problem(name))) for name in NAMES] == [1, 2, 1, 4]
+    assert [len(stretches(problem(name))) for name in NAMES] == [1, 2, 1, 4, 2, 3]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -157,11 +185,35 @@ def test_pose_rows_are_what_is_missing_to_the_pose(name: str) -> None:
         for waypoint, which in at.items():
             pin.forwardKinematics(model, data, p.chain.coordinates.q(point.z[waypoint - 1]))
             placement = data.oMi[pose.joint] * pose.local
-            error = target.rotation.T @ placement.rotation
-            turn = pin.log3(error)
-            angle = np.linalg.norm(turn)
-            expected = np.r_[placement.translation - target.translation, np.sin(angle) * turn / angle, np.trace(error)]
-            np.testing.assert_allclose(g[which], expected, rtol=0.0, atol=1e-8)
+            shift = np.zeros(3) if pose.shift is None else data.oMi[pose.shift[0]].rotation @ np.array(pose.shift[1])
+            expected = [placement.translation + shift - target.translation]
+            if pose.kind == "pose":
+                error = target.rotation.T @ placement.rotation
+                turn = pin.log3(error)
+                angle = np.linalg.norm(turn)
+                expected += [np.sin(angle) * turn / angle, [np.trace(error)]]
+            elif pose.kind == "upright":
+                expected.append(target.rotation @ placement.rotation.T @ np.array([0.0, 0.0, 1.0]))
+            np.testing.assert_allclose(g[which], np.concatenate(expected), rtol=0.0, atol=1e-8)
+
+
+def test_there_are_goals_of_all_kinds() -> None:
+    kinds = {name: [pose.kind for pose in problem(name).transcription.structure.poses] for name in NAMES}
+    assert set(kinds["stick"]) == {"pose", "point", "upright"}
+    assert {kind for name in NAMES if name != "stick" for kind in kinds[name]} == {"pose"}
+    assert any(pose.shift for pose in problem("fetch").transcription.structure.poses)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_clamped_coordinates_keep_their_values(name: str) -> None:
+    """A row for every step of time from the way in to the end of the hold: the change of the coordinate in it."""
+    p = problem(name)
+    point = random_point(p)
+    path = p.waypoints(point.z)
+    expected = [path[t, column] - path[t - 1, column] for column, first, last in clamped(p) for t in range(first + 1, last + 1)]
+    np.testing.assert_allclose(rows(point)[clamp_rows(p)], expected, rtol=0.0, atol=1e-12)
+    assert p.transcription.structure.clamped == tuple(clamped(p))
+    assert len(expected) == {"stick": 2 * 8, "fetch": 3 * 5}.get(name, 0)
 
 
 def test_slip_rows_are_the_sideways_motion_at_the_middle_heading() -> None:
@@ -171,7 +223,7 @@ def test_slip_rows_are_the_sideways_motion_at_the_middle_heading() -> None:
     step, heading = np.diff(path[:, :2], axis=0), (path[1:, 2] + path[:-1, 2]) / 2
     expected = np.cos(heading) * step[:, 1] - np.sin(heading) * step[:, 0]
     np.testing.assert_allclose(rows(point)[p.transcription.base_rows], expected, rtol=0.0, atol=1e-12)
-    for name in ("reach", "door", "two grasps"):
+    for name in set(NAMES) - {"differential"}:
         assert problem(name).transcription.base_rows.size == 0
 
 
@@ -195,6 +247,7 @@ def test_rate_rows_are_steps_and_their_changes(name: str) -> None:
 def test_every_row_has_one_meaning(name: str) -> None:
     t = problem(name).transcription
     parts = [t.slot_rows.ravel(), t.base_rows, *(which for at in t.pose_rows for which in at.values())]
+    parts.append(clamp_rows(problem(name)))
     np.testing.assert_array_equal(np.sort(np.concatenate(parts)), np.arange(t.rows))
     assert t.size == t.segments * (t.n + 1)
 
@@ -249,9 +302,11 @@ def test_patterns_hold_everywhere(name: str) -> None:
         ahead, behind = (np.asarray(constraints(point.x + s * 1e-6 * probe, point.parameters)[0]).ravel() for s in (1.0, -1.0))
         np.testing.assert_allclose(np.asarray(jacobian @ probe).ravel(), (ahead - behind) / 2e-6, rtol=1e-5, atol=1e-5)
     assert len(sizes) == 1
-    # Waypoints hang together by rates alone: the rows of one touch no other's variables.
+    # Waypoints hang together by rates, and what is clamped, alone: all other rows of one touch no other's variables.
     if p.transcription.base_rows.size == 0:
         row, column = (np.array(part) for part in jacobian.sparsity().get_triplet())
+        alone = ~np.isin(row, clamp_rows(p))
+        row, column = row[alone], column[alone]
         owner = np.empty(p.transcription.rows, int)
         owner[p.transcription.slot_rows] = np.arange(p.segments)[:, None]
         for at in p.transcription.pose_rows:

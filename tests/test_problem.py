@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pinocchio as pin
 import pytest
+from carrying import STICK, lifted, room, stand, table
 from small_problems import SHORT, door_scene, full_scene, random_configurations
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.goal import LATCH_MARGIN
 from vkc_pin.hold import Hold
 from vkc_pin.options import Options
-from vkc_pin.unfold import as_trajectory
 from vkc_pin.problem import TrajectoryProblem, build
 from vkc_pin.robot import load_robot
-from vkc_pin.steps import Actuate, GoTo, Grasp, Reach, Step
+from vkc_pin.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
+from vkc_pin.unfold import as_trajectory
 
 POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array([0.4, 0.2, 0.9]))
 HANDLE = Hold("door", "handle")
@@ -168,18 +170,21 @@ def test_clip_and_waypoints(opened: TrajectoryProblem) -> None:
 
 def test_closure_holds_from_the_grasp_to_the_end_of_the_hold(opened: TrajectoryProblem) -> None:
     reach, _, move, _ = opened.ends.tolist()
-    assert opened.pose_names == ["closure door"]
-    (pose,) = opened.transcription.structure.poses
+    assert opened.pose_names == ["closure door", "approach door.handle"]
+    pose, _ = opened.transcription.structure.poses
     assert pose.waypoints == tuple(range(reach, move + 1))
     closure = opened.chain.closures[HANDLE]
     assert (pose.joint, pose.local) == (closure.joint, closure.local)
-    assert opened.targets == [opened.scene.objects["door"].placement]
+    assert opened.targets == [opened.scene.objects["door"].placement] * 2
 
 
 def test_every_object_is_closed_while_it_is_held_and_goals_are_met_at_the_end(two_grasps: TrajectoryProblem) -> None:
     first, second, third, fourth = two_grasps.ends.tolist()
     at = dict(zip(two_grasps.pose_names, (p.waypoints for p in two_grasps.transcription.structure.poses), strict=True))
+    way = SHORT.approach_waypoints
     assert at == {
+        "approach cabinet.ball": (first - way,),
+        "approach drawer.handle_free": (second - way,),
         "closure cabinet": (first,),
         "closure drawer": tuple(range(second, third + 1)),
         f"goal {two_grasps.scene.robot.tool_frame}": (fourth,),
@@ -188,7 +193,7 @@ def test_every_object_is_closed_while_it_is_held_and_goals_are_met_at_the_end(tw
     assert targets["closure cabinet"] == two_grasps.scene.objects["cabinet"].placement
     assert targets["closure drawer"] == two_grasps.scene.objects["drawer"].placement
     assert two_grasps.targets[-1] == POSE
-    assert two_grasps.target_matrix().shape == (3, 12)
+    assert two_grasps.target_matrix().shape == (5, 12)
     assert two_grasps.transcription.structure.rests == (first, second, third)
 
 
@@ -211,24 +216,139 @@ def test_a_frame_of_the_robot_can_reach_too() -> None:
 def test_pose_error_and_drift(opened: TrajectoryProblem) -> None:
     """The largest residual at the waypoints where a pose must hold, and half-way between those where an object is held."""
     z = random_path(opened)
-    (pose,), model = opened.transcription.structure.poses, opened.chain.model
-    target, data = opened.targets[0], opened.chain.model.createData()
+    poses, model = opened.transcription.structure.poses, opened.chain.model
+    data = opened.chain.model.createData()
+    assert len(poses) == len(opened.targets) == 2
 
-    def residual(row: np.ndarray) -> np.ndarray:
+    def residual(row: np.ndarray, number: int = 0) -> np.ndarray:
+        pose, target = poses[number], opened.targets[number]
         pin.forwardKinematics(model, data, opened.chain.coordinates.q(row))
         at = data.oMi[pose.joint] * pose.local
+        if pose.shift is not None:
+            at.translation = at.translation + data.oMi[pose.shift[0]].rotation @ np.array(pose.shift[1])
         turn = pin.log3(target.rotation.T @ at.rotation)
         angle = np.linalg.norm(turn)
         return np.abs(np.r_[at.translation - target.translation, 2 * np.sin(angle / 2) * turn / angle])
 
     path = opened.waypoints(z)
-    assert opened.pose_error(z) == pytest.approx(max(residual(path[t]).max() for t in pose.waypoints), abs=1e-8)
+    worst = max(residual(path[t], number).max() for number, pose in enumerate(poses) for t in pose.waypoints)
+    assert opened.pose_error(z) == pytest.approx(worst, abs=1e-8)
     allowed = np.repeat([SHORT.closure_position, SHORT.closure_angle], 3)
     reach, _, move, _ = opened.ends.tolist()
     worst = max((residual((path[t] + path[t + 1]) / 2) / allowed).max() for t in range(reach, move))
     assert opened.drift(z) == pytest.approx(worst, rel=1e-6)
     alone = build(door_scene(), [GoTo(0.0, 0.0)], options=SHORT)
     assert alone.pose_error(random_path(alone)) == alone.drift(random_path(alone)) == 0.0
+
+
+def tool(problem: TrajectoryProblem, row: np.ndarray) -> pin.SE3:
+    """Return where the tool is at a configuration of the chain."""
+    robot = problem.scene.robot
+    data = robot.model.createData()
+    pin.framesForwardKinematics(robot.model, data, robot.coordinates.q(row[: robot.coordinates.size]))
+    return data.oMf[robot.model.getFrameId(robot.tool_frame)].copy()
+
+
+@pytest.mark.parametrize(
+    ("step", "scene"),
+    [
+        (Actuate("door", {"hinge": 1.2}), door_scene),
+        (Grasp("cabinet", "socket"), full_scene),
+        (Grasp("stick"), lambda: room(table())),
+    ],
+    ids=["door", "socket with a standoff", "stick"],
+)
+def test_a_hand_comes_straight_to_what_it_grasps(step: Step, scene) -> None:  # type: ignore[no-untyped-def]
+    """Some waypoints before, the pose holds exactly where the tool is `approach` behind the grasp, wherever in it that is."""
+    problem = build(scene(), [step], options=SHORT)
+    number = next(k for k, name in enumerate(problem.pose_names) if name.startswith("approach "))
+    pose, solver, target = (
+        part[number] for part in (problem.transcription.structure.poses, problem.transcription.pose_solvers, problem.targets)
+    )
+    assert pose.waypoints == (REACH - SHORT.approach_waypoints,)
+    (hold,) = problem.task.holds
+    placed = problem.scene.objects[hold.object]
+    grasp = placed.object.attachments[hold.attachment]
+    rng = np.random.default_rng(0)
+    seeds = random_configurations(problem.chain.lower, problem.chain.upper, 200, rng, arena=3.0)
+    lower, upper = problem.chain.lower.copy(), problem.chain.upper.copy()
+    for name, value in problem.task.state.items():
+        lower[problem.chain.index(name)] = upper[problem.chain.index(name)] = value
+    z, found = solver.solve(seeds, target, lower=lower, upper=upper, weights=np.ones(problem.chain.size), iterations=40)
+    assert found.sum() > 10
+    for row in z[found]:
+        values = [row[problem.chain.index(f"{hold.object}.{name}")] for name in grasp.coordinates]
+        there = placed.link_placement(grasp.link) * grasp.placement * grasp.motion(values)
+        behind = there * pin.SE3(np.eye(3), np.array([0.0, 0.0, -SHORT.approach]))
+        np.testing.assert_allclose(tool(problem, row).homogeneous, behind.homogeneous, rtol=0.0, atol=1e-5)
+
+
+# --- what is carried --------------------------------------------------------------------------------------------------
+
+FETCH: list[Step] = [Grasp("ball", "pull", "stick.tip"), Place("ball", (0.8, 0.6, 0.7)), Release("stick"), GoTo(0.0, 0.0)]
+
+
+@pytest.fixture(scope="module")
+def fetching() -> TrajectoryProblem:
+    scene = room(stand(), objects=("stick", "ball")).with_held({"stick": "grip"}, at={"stick": (0.02, -0.1)})
+    return build(scene, FETCH, options=SHORT)
+
+
+def test_free_objects_are_grasped_where_they_stand_and_closed_nowhere_else() -> None:
+    aside = lifted(STICK, [0.0, 0.5, 0.0])
+    steps = [Touch("stick.tip", (0.8, 0.9, 0.7)), Place("stick", aside), GoTo(0.0, 0.0), Grasp("stick")]
+    problem = build(room(table()), steps, options=SHORT)
+    ends = problem.ends.tolist()
+    at = list(zip(problem.pose_names, problem.targets, problem.transcription.structure.poses, strict=True))
+    found = [(name, target, pose.waypoints, pose.kind) for name, target, pose in at]
+    way = SHORT.approach_waypoints
+    point = pin.SE3(np.eye(3), np.array([0.8, 0.9, 0.7]))
+    assert found == [
+        ("grasp stick.grip", STICK, (ends[0],), "pose"),
+        ("grasp stick.grip", aside, (ends[4],), "pose"),
+        ("approach stick.grip", STICK, (ends[0] - way,), "pose"),
+        ("goal stick.tip", point, (ends[1],), "point"),
+        ("goal stick.stick", aside, (ends[2],), "pose"),
+        ("approach stick.grip", aside, (ends[4] - way,), "pose"),
+    ]
+    assert problem.transcription.structure.rests == (ends[0], ends[2])
+    assert not any(problem.closed(phase) for phase in problem.task.phases)
+
+
+def test_what_is_held_at_the_start_stays_where_the_hand_has_it(fetching: TrajectoryProblem) -> None:
+    """The values at which it is clamped are the scene's, until it is let go of."""
+    problem = fetching
+    assert [str(hold) for hold in problem.at_start] == ["stick.grip"]
+    for name, value in (("stick.grip_slide", 0.02), ("stick.grip_turn", -0.1)):
+        assert problem.start[problem.chain.index(name)] == value
+        until = problem.ends[1]  # there both are let go of
+        assert np.all(column(problem, name)[:until] == value)
+        freedom = (-0.095, 0.095) if name.endswith("slide") else (-1.2, 1.2)
+        assert np.all(column(problem, name)[until:] == freedom)
+    for axis in "xyz":
+        assert np.all(column(problem, f"ball.pull_{axis}") == (-np.pi, np.pi))
+    assert problem.choices == tuple((problem.chain.index(f"ball.pull_{a}"), REACH, 2 * REACH) for a in "zyx")
+
+
+def test_a_loose_grasp_is_not_clamped() -> None:
+    problem = build(full_scene(), [Actuate("cabinet", {"swing": 0.5}, "sleeve")], options=SHORT)
+    assert problem.choices == ()
+    assert problem.transcription.structure.clamped == ()
+
+
+def test_what_is_held_through_something_is_closed_by_its_holder(fetching: TrajectoryProblem) -> None:
+    """The pose of the grasp is that of the tip, and the goal that of the ball on it."""
+    poses = dict(zip(fetching.pose_names, fetching.transcription.structure.poses, strict=True))
+    assert list(poses) == ["grasp ball.pull by stick.tip", "approach ball.pull by stick.tip", "goal ball.ball"]
+    assert poses["goal ball.ball"].kind == "upright"
+    (row,) = random_configurations(fetching.chain.lower, fetching.chain.upper, 1, np.random.default_rng(0))
+    data, model = fetching.chain.model.createData(), fetching.chain.model
+    pin.forwardKinematics(model, data, fetching.chain.coordinates.q(row))
+    pose = poses["approach ball.pull by stick.tip"]
+    assert pose.shift is not None
+    tip_joint, tip = fetching.chain.frame("tip", fetching.task.holds[0])
+    direction = (data.oMi[tip_joint] * tip).rotation[:, 2]
+    np.testing.assert_allclose(data.oMi[pose.shift[0]].rotation @ np.array(pose.shift[1]), SHORT.approach * direction, atol=1e-9)
 
 
 # --- rates ----------------------------------------------------------------------------------------------------------
@@ -276,6 +396,60 @@ def test_rate_violation_is_the_worst_excess(two_grasps: TrajectoryProblem, scale
     velocity = np.abs(trajectory.velocities()) / two_grasps.chain.velocity
     acceleration = np.abs(trajectory.accelerations()) / two_grasps.chain.acceleration
     assert two_grasps.rate_violation(z) == pytest.approx(max(velocity.max(), acceleration.max()) - 1.0, rel=1e-9)
+
+
+def runs(problem: TrajectoryProblem) -> list[slice]:
+    """Return the steps between two rests."""
+    stops = [0, *problem.transcription.structure.rests, problem.segments]
+    return [slice(a, b) for a, b in itertools.pairwise(stops)]
+
+
+def test_a_way_that_is_too_long_gets_more_time() -> None:
+    """Only where it is too long, and so much that the profile 3s² − 2s³ is within all rates; then less again."""
+    problem = build(full_scene(), [Actuate("door", {"hinge": 1.2}), GoTo(-0.5, 0.1)], options=SHORT)
+    first, *others = runs(problem)
+    z = np.tile(problem.start, (problem.segments, 1))
+    share = np.arange(1, first.stop + 1) / first.stop
+    z[first, 0] += 30.0 * share**2 * (3 - 2 * share)
+    z[first.stop :, 0] += 30.0
+    np.testing.assert_array_equal(problem.dt, np.full(problem.segments, SHORT.dt))
+    assert problem.rate_violation(z) > 1.0
+    problem.take_time_for(z)
+    assert np.ptp(problem.dt[first]) == 0.0
+    assert problem.dt[0] * first.stop > 1.5 * 30.0 / problem.chain.velocity[0]
+    for run in others:
+        np.testing.assert_array_equal(problem.dt[run], np.full(run.stop - run.start, SHORT.dt))
+    assert problem.rate_violation(z) <= 0.0
+    # The bounds are the limits over the new times, row by row, and the trajectory is played at them.
+    np.testing.assert_allclose(problem.velocity, problem.chain.velocity * problem.dt[:, None])
+    of_rows = np.concatenate([np.full(run.stop - run.start + 1, problem.dt[run.start]) for run in runs(problem)])
+    np.testing.assert_allclose(problem.acceleration, problem.chain.acceleration * of_rows[:, None] ** 2)
+    motion = as_trajectory(problem, z)
+    moving = np.abs(np.diff(motion.positions[:, 0])) > 0
+    np.testing.assert_allclose(np.diff(motion.times)[moving], problem.dt[first])
+    assert np.abs(motion.velocities()[:, 0]).max() <= problem.chain.velocity[0]
+    assert np.abs(motion.accelerations()[:, 0]).max() <= problem.chain.acceleration[0]
+    assert f"in {problem.dt.sum():g} s" in repr(problem)
+    problem.take_time_for(np.tile(problem.start, (problem.segments, 1)))
+    np.testing.assert_array_equal(problem.dt, np.full(problem.segments, SHORT.dt))
+
+
+def test_a_step_that_is_too_fast_gets_more_time_within_reason() -> None:
+    problem = build(full_scene(), [Actuate("door", {"hinge": 1.2}), GoTo(-0.5, 0.1)], options=SHORT)
+    first, second, *_ = runs(problem)
+    for jump, enough in ((0.15, True), (30.0, False)):
+        problem.take_time_for(np.tile(problem.start, (problem.segments, 1)))
+        z = np.tile(problem.start, (problem.segments, 1))
+        z[second.start + 2 :, 3] += jump
+        before = problem.dt.copy()
+        violated = problem.rate_violation(z)
+        assert violated > 0.0
+        problem.stretch(z)
+        np.testing.assert_array_equal(problem.dt[first], before[first])
+        assert np.all(problem.dt[second] > before[second])
+        assert np.ptp(problem.dt[second]) == 0.0
+        assert (problem.rate_violation(z) <= 1e-9) == enough
+        assert problem.dt[second.start] <= 2.0 * SHORT.dt  # the rest is left to the solver
 
 
 def test_standing_still_violates_nothing(opened: TrajectoryProblem) -> None:

@@ -10,7 +10,8 @@ from drives import hall
 from small_problems import SHORT, door_scene
 
 import vkc_pin as vkc
-from vkc_pin.initialization import METHODS, initialize, scatter
+from vkc_pin.initialization import METHODS, initialize
+from vkc_pin.knots import scatter
 
 OPENED = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20)
 
@@ -21,7 +22,7 @@ def problem() -> vkc.TrajectoryProblem:
 
 
 def seeds(method: str = "interpolated", *, seed: int = 0, count: int = 1) -> list[np.ndarray]:
-    return list(initialize(problem(), method, np.random.default_rng(seed), count=count))
+    return [found.z for found in initialize(problem(), method, seed, count=count)]
 
 
 def hand_off_the_handle(scene: vkc.Scene, row: np.ndarray, hinge: float, knob: float) -> float:
@@ -68,9 +69,14 @@ def test_seeds_go_from_the_start_without_a_jump() -> None:
         path = problem().waypoints(z)
         reach = int(problem().ends[0])
         np.testing.assert_array_equal(path[0], problem().start)
-        # A straight way to the grasp: every waypoint lies between its ends.
-        low, high = np.minimum(path[0], path[reach]), np.maximum(path[0], path[reach])
-        assert np.all((path[: reach + 1] >= low - 1e-9) & (path[: reach + 1] <= high + 1e-9))
+        # A straight way to where the hand is before the handle: every waypoint lies between its ends; and straight on.
+        before = reach - OPENED.approach_waypoints
+        low, high = np.minimum(path[0], path[before]), np.maximum(path[0], path[before])
+        assert np.all((path[: before + 1] >= low - 1e-9) & (path[: before + 1] <= high + 1e-9))
+        first, last = (dataclasses.replace(door_scene(), start=path[k, :9]).tool_placement() for k in (before, reach))
+        way = first.inverse() * last
+        np.testing.assert_allclose(way.translation, [0.0, 0.0, OPENED.approach], rtol=0.0, atol=1e-3)
+        np.testing.assert_allclose(way.rotation, np.eye(3), rtol=0.0, atol=1e-3)
         assert np.abs(np.diff(path, axis=0)).max() < 0.8
 
 
@@ -104,21 +110,21 @@ def test_the_stationary_seed_leaves_the_robot_where_it_is() -> None:
 def test_a_seed_for_the_base_takes_the_shorter_way_round() -> None:
     scene = hall().with_start(base=[0.0, 0.0, 3.0])
     turn = vkc.build(scene, [vkc.GoTo(1.0, 0.5, -3.0)], options=SHORT)
-    (z,) = initialize(turn, "interpolated", np.random.default_rng(0))
+    (z,) = (found.z for found in initialize(turn, "interpolated", 0))
     np.testing.assert_allclose(z[-1, :3], [1.0, 0.5, 2 * np.pi - 3.0])
     np.testing.assert_allclose(z[:, 3:], np.tile(scene.start[3:], (len(z), 1)))
 
 
 def test_a_seed_for_a_target_out_of_reach_is_still_a_seed() -> None:
     lost = vkc.build(hall(), [vkc.Reach((1.0, 0.0, 4.0, 0.0, 0.0, 0.0))], options=SHORT)
-    for z in initialize(lost, "interpolated", np.random.default_rng(0), count=2):
+    for z in (found.z for found in initialize(lost, "interpolated", 0, count=2)):
         assert np.isfinite(z).all()
         assert np.all((z >= lost.lower) & (z <= lost.upper))
 
 
 def test_a_fixed_base_stays_in_every_seed() -> None:
     fixed = vkc.build(hall(base="fixed"), [vkc.Reach((0.5, 0.4, 1.0, 0.0, np.pi / 2, 0.0))], options=SHORT)
-    for z in initialize(fixed, "interpolated", np.random.default_rng(0), count=3):
+    for z in (found.z for found in initialize(fixed, "interpolated", 0, count=3)):
         assert np.ptp(fixed.waypoints(z)[:, :3], axis=0).max() == 0.0
 
 

@@ -90,6 +90,17 @@ def test_round_trip() -> None:
     assert (again.names, again.phases, again.robot_size) == (motion.names, motion.phases, motion.robot_size)
 
 
+def test_what_is_held_through_something_is_kept_too() -> None:
+    held, by = {"stick": "grip", "ball": "pull"}, {"ball": "stick.tip"}
+    phases = (PhaseSpan("reach", 0, 2), PhaseSpan("carry", 2, 3, held, by))
+    data = json.loads(json.dumps(example(phases=phases).to_dict()))
+    assert [phase["by"] for phase in data["phases"]] == [{}, by]
+    assert Trajectory.from_dict(data).phases == phases
+    for phase in data["phases"]:  # as motions were saved before there was such a thing
+        del phase["by"]
+    assert [phase.by for phase in Trajectory.from_dict(data).phases] == [{}, {}]
+
+
 @pytest.mark.parametrize("key", ["names", "times", "positions", "phases", "robot_size"])
 def test_data_that_lacks_something(key: str) -> None:
     data = example().to_dict()

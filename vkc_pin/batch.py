@@ -33,7 +33,7 @@ class BatchFunction:
             inputs: One array per input: the first of shape (B, numel), others too, or (numel,) for the same in every row.
         """
         rows = len(inputs[0])
-        batch = -(-rows // _ROUND) * _ROUND
+        batch = max(-(-rows // _ROUND), 1) * _ROUND
         if batch not in self._buffers:
             self._allocate(batch)
         self._buffers.move_to_end(batch)

@@ -11,7 +11,7 @@ from vkc_pin.report import Violation
 
 __all__ = ["explain", "impossible"]
 
-_DRAWS = 10  # times 192 random configurations before a goal counts as blocked
+_DRAWS = 4  # times 192 random configurations before a goal counts as blocked
 
 
 def impossible(problem: TrajectoryProblem) -> list[Violation]:

@@ -165,7 +165,8 @@ def scatter(
     pose, row = search.pose_at(waypoint), waypoint - 1
     z = np.tile(problem.start, (SCATTER, 1))
     if pose is not None:
-        z, _ = search.knot(z, waypoint, "scatter")
+        z, found = search.knot(z, waypoint, "scatter")
+        z[found] = search.clear(z[found], waypoint)
         residual, _ = problem.transcription.pose_solvers[pose].evaluate(z, problem.targets[pose])
         return z, np.abs(residual).max(axis=1)
     if (problem.lower[row, :2] < problem.upper[row, :2]).any():

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vkc_pin.diagnosis import explain, impossible
 from vkc_pin.goal import compile_task
@@ -48,12 +49,14 @@ class _Try:
 
     Attributes:
         name: The seed's name.
+        z: z_1..z_N, shape (N, n).
         trajectory: The motion.
         report: What validation says of it.
         status: "success", "rejected" or "not converged".
     """
 
     name: str
+    z: NDArray[np.float64]
     trajectory: Trajectory
     report: Report
     status: str
@@ -65,7 +68,13 @@ class _Try:
 
 
 class OneProblem:
-    """Plans steps as one nonlinear program."""
+    """Plans steps as one nonlinear program.
+
+    Attributes:
+        task: What the steps ask for.
+        problem: The program, once `run` has begun.
+        z: Its best z_1..z_N, shape (N, n), once `run` has ended.
+    """
 
     def __init__(self, scene: Scene, steps: Sequence[Step], settings: Settings) -> None:
         self.scene, self.settings = scene, settings
@@ -73,29 +82,37 @@ class OneProblem:
         self.times = dict.fromkeys(TIMES, 0.0)
         self.rounds = self.iterations = 0
         self.history: list[dict[str, float]] = []
+        self.given = False  # whether the only seed was given
         self.blocked: list[str] = []  # phases in which there is no way for the base
 
-    def run(self) -> Plan:
-        """Try seeds until validation accepts a motion, there are no more, or time is up."""
+    def run(self, seed: Callable[[TrajectoryProblem], Seed] | None = None) -> Plan:
+        """Try seeds until validation accepts a motion, there are no more, or time is up.
+
+        Args:
+            seed: Makes the only seed to try; None: those of the settings' initialization.
+        """
         began, limit = time.perf_counter(), self.settings.time_limit
-        problem = TrajectoryProblem(self.scene, self.task, self.settings.options)
+        problem = self.problem = TrajectoryProblem(self.scene, self.task, self.settings.options)
         build_time = problem.transcription.take_build_time()
         reasons = impossible(problem)
         if reasons:
             best, status = self._stationary(problem), "infeasible"
             best = dataclasses.replace(best, report=best.report.with_reasons(reasons))
         else:
-            best, status = self._try_seeds(problem, np.inf if limit is None else began + build_time + limit)
+            self.given = seed is not None
+            seeds = self._seeds(problem) if seed is None else iter([seed(problem)])
+            best, status = self._try_seeds(problem, seeds, np.inf if limit is None else began + build_time + limit)
+        self.z = best.z
         build_time += problem.transcription.take_build_time()
         return self._plan(best, status, time.perf_counter() - began - build_time, build_time)
 
-    def _try_seeds(self, problem: TrajectoryProblem, deadline: float) -> tuple[_Try, str]:
+    def _try_seeds(self, problem: TrajectoryProblem, seeds: Iterator[Seed], deadline: float) -> tuple[_Try, str]:
         """Return the best try, with what is in the way of the task if it is no success, and the plan's status."""
         best: _Try | None = None
         notes: list[str] = []
         status = ""
         try:
-            for number, seed in enumerate(self._seeds(problem), start=1):
+            for number, seed in enumerate(seeds, start=1):
                 solution = self._solve(problem, seed, deadline)
                 found = self._judge(problem, solution, seed.name)
                 best = found if best is None or found.report.ok or found.amount < best.amount else best
@@ -104,7 +121,7 @@ class OneProblem:
                 if solution.status in ("time limit", "interrupted"):
                     status = solution.status
                     break
-                if number == 1:
+                if number == 1 and not self.given:
                     notes = explain(problem, self.settings.seed)
                 elif notes:  # two seeds failed, and random configurations find no free one at a goal either
                     break
@@ -145,7 +162,7 @@ class OneProblem:
         report = validate(self.scene, self.task.steps, trajectory, self.settings.options)
         self.times["validation"] += time.perf_counter() - began
         status = "success" if report.ok else "rejected" if solution.converged else "not converged"
-        return _Try(name, trajectory, report, status)
+        return _Try(name, solution.z, trajectory, report, status)
 
     def _stationary(self, problem: TrajectoryProblem) -> _Try:
         return self._judge(problem, Solution(np.tile(problem.start, (problem.segments, 1))), "none")

@@ -6,9 +6,10 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from vkc_pin.all_at_once import all_at_once
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.initialization import METHODS
-from vkc_pin.one_problem import OneProblem, Settings
+from vkc_pin.one_problem import Settings
 from vkc_pin.options import Options
 from vkc_pin.plan import Plan
 from vkc_pin.scene import Scene
@@ -66,7 +67,7 @@ def plan(
     settings = Settings(initialization, options, callback, time_limit, int(seed), float(perturbation))
     if not joint:
         return step_by_step(scene, steps, settings)
-    return OneProblem(scene, steps, settings).run()
+    return all_at_once(scene, steps, settings)
 
 
 def _is_number(value: object) -> bool:

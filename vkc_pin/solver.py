@@ -46,6 +46,8 @@ NEARLY_FREE = 0.01  # [m] shortfall of clearance below which limits on rates cou
 POSE_TOLERANCE = 1e-4  # [m] and [rad]
 RATE_TOLERANCE = 1e-4  # relative
 DRIFT = 0.4  # of what is allowed between waypoints; norms of three residuals are up to √3 larger
+BLOCK = 10  # waypoints that share a radius
+SLACK = 2e-3  # [m] of shortfall, summed over a block, that does not matter
 WORTHWHILE = 0.05  # relative decrease of the objective for which a feasible motion is improved further
 PENALTY_GROWTH, PENALTY_LIMIT = 4.0, 2000.0
 
@@ -62,7 +64,7 @@ class _Trial:
     shortfall: NDArray[np.float64]
     clear: bool
     rate: float
-    step: float
+    step: NDArray[np.float64]
     satisfied: bool
 
 
@@ -110,7 +112,7 @@ class _Loop:
                 return False
         return True
 
-    def try_step(self, radius: float) -> _Trial:
+    def try_step(self, radius: NDArray[np.float64]) -> _Trial:
         """Solve within `radius` of the current waypoints, and look at what is really there."""
         z, slack, objective, satisfied = self.run_ipopt(radius)
         contacts, clear = self.contacts(z)
@@ -123,7 +125,7 @@ class _Loop:
             shortfall=contacts.shortfall(self.problem.segments),
             clear=clear,
             rate=self.problem.rate_violation(z),
-            step=float(np.abs(z - self.z).max()),
+            step=np.abs(z - self.z).max(axis=1),
             satisfied=satisfied,
         )
 
@@ -161,22 +163,18 @@ class _Loop:
             and self.free_between(trial.z)
         )
 
-    def stuck(self, trial: _Trial, radius: float) -> bool:
-        """Return whether this penalty buys no more clearance."""
-        return radius < MIN_RADIUS or trial.step < MIN_RADIUS
-
     def raise_penalty(self) -> None:
         """Make clearance dearer."""
         self.penalty = min(self.penalty * PENALTY_GROWTH, PENALTY_LIMIT)
         self.multipliers = {}
 
-    def run_ipopt(self, radius: float) -> tuple[NDArray[np.float64], NDArray[np.float64], float, bool]:
+    def run_ipopt(self, radius: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], float, bool]:
         """Solve once with fixed planes; return waypoints, slack, objective and whether Ipopt was satisfied."""
         problem, t = self.problem, self.transcription
         begin = time.perf_counter()
         planes, offsets = problem.contacts.planes(self.z, self.at, slots=t.slots)
         self.solution.timings["coal"] += time.perf_counter() - begin
-        lower, upper = np.maximum(problem.lower, self.z - radius), np.minimum(problem.upper, self.z + radius)
+        lower, upper = np.maximum(problem.lower, self.z - radius[:, None]), np.minimum(problem.upper, self.z + radius[:, None])
         bounds = self._row_bounds()
         options = {**_IPOPT, **(_WARM if self.multipliers else {}), "ipopt.max_iter": self.options.max_iterations}
         solver = t.solver(rates=self.rates, options=options, deadline=self.deadline)
@@ -240,13 +238,13 @@ def solve(
 
 def _iterate(loop: _Loop, callback: Callable[[Iteration], None] | None, interrupt: Interrupt) -> None:
     """Run rounds until everything holds, nothing helps any more, or time is up."""
-    solution, started, radius = loop.solution, time.perf_counter(), FIRST_RADIUS
+    solution, started, region = loop.solution, time.perf_counter(), _Region(loop.problem.segments)
     feasible: NDArray[np.float64] | None = None
     for _ in range(loop.options.max_outer):
         if time.perf_counter() > loop.deadline:
             solution.status = solution.status if solution.converged else "time limit"
             break
-        trial = loop.try_step(radius)
+        trial = loop.try_step(region.radius)
         accepted, ratio = loop.judge(trial)
         solution.rounds += 1
         row = Iteration(
@@ -256,8 +254,8 @@ def _iterate(loop: _Loop, callback: Callable[[Iteration], None] | None, interrup
             clearance=trial.contacts.clearance(),
             shortfall=trial.contacts.violation(),
             pose_error=trial.pose_error,
-            step=trial.step,
-            radius=radius,
+            step=float(trial.step.max()),
+            radius=float(region.radius.max()),
             penalty=loop.penalty,
             accepted=accepted,
             time=time.perf_counter() - started,
@@ -265,23 +263,62 @@ def _iterate(loop: _Loop, callback: Callable[[Iteration], None] | None, interrup
         solution.history.append(row)
         if callback is not None:
             callback(row)
+        before, used = loop.shortfall, region.radius
         if accepted:
-            used, gain = radius, (loop.objective - trial.objective) / max(abs(loop.objective), 1e-9)
+            gain = (loop.objective - trial.objective) / max(abs(loop.objective), 1e-9)
             loop.accept(trial)
-            radius = radius * 1.5 if ratio > 0.7 else radius
             if loop.done(trial):
                 solution.converged, solution.status, feasible = True, "converged", trial.z
-                if trial.step < used or gain < WORTHWHILE:
+                if (trial.step < used).all() or gain < WORTHWHILE:
                     break
         if interrupt.pressed:
             solution.status = solution.status if solution.converged else "interrupted"
             break
-        if not accepted or ratio < 0.25:
-            radius = SHRINK * min(radius, trial.step)
-        if loop.stuck(trial, radius):
+        region.adapt(before, trial, accepted, ratio)
+        if region.stuck(trial, loop.shortfall):
             if loop.penalty >= PENALTY_LIMIT:
                 break
             loop.raise_penalty()
-            radius = RESTART_RADIUS
+            region.restart()
     if feasible is not None:  # rounds after the first feasible one only made it shorter, or failed to
         solution.z = feasible
+
+
+class _Region:
+    """How far waypoints may move in a round: the same for all of a block, so that trouble in one place does not hold up others.
+
+    Attributes:
+        radius: Of each waypoint, shape (N,) [m] and [rad].
+    """
+
+    def __init__(self, segments: int) -> None:
+        self.block = np.arange(segments) * max(1, round(segments / BLOCK)) // segments
+        self.radius = np.full(segments, FIRST_RADIUS)
+
+    def adapt(self, before: NDArray[np.float64], trial: _Trial, accepted: bool, ratio: float) -> None:
+        """Widen blocks where what was promised came true, narrow those where it did not."""
+        blocks = int(self.block[-1]) + 1
+        promised, actual, worse = np.zeros(blocks), np.zeros(blocks), np.zeros(blocks, bool)
+        np.add.at(promised, self.block, before - trial.slack)
+        np.add.at(actual, self.block, before - trial.shortfall)
+        step = np.zeros(blocks)
+        np.maximum.at(step, self.block, trial.step)
+        worse = (promised - actual > SLACK) & (actual < 0.25 * promised)
+        if not accepted and not worse.any():
+            worse[:] = True
+        good = (actual > 0.7 * promised - SLACK) & accepted & (ratio > 0.25)
+        factor = np.where(worse, 0.0, np.where(good, 1.5, 1.0))
+        radius = np.array([self.radius[self.block == b][0] for b in range(blocks)])
+        radius = np.where(worse, SHRINK * np.minimum(radius, step), radius * factor)
+        self.radius = np.maximum(radius, 1e-6)[self.block]
+
+    def stuck(self, trial: _Trial, shortfall: NDArray[np.float64]) -> bool:
+        """Return whether nothing moves any more where something is in the way."""
+        bad = shortfall > CLOSE_ENOUGH
+        if not bad.any():
+            bad[:] = True
+        return bool((np.minimum(self.radius, trial.step)[bad] < MIN_RADIUS).all())
+
+    def restart(self) -> None:
+        """Begin again, less boldly."""
+        self.radius = np.full(len(self.radius), RESTART_RADIUS)

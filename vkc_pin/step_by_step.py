@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from vkc_pin.trajectory import Trajectory, join
 from vkc_pin.validation import validate
 from vkc_pin.world import World
 
-__all__ = ["scene_after", "step_by_step"]
+__all__ = ["joined", "scene_after", "stages", "step_by_step", "summed"]
 
 
 def step_by_step(scene: Scene, steps: Sequence[Step], settings: Settings) -> Plan:
@@ -31,45 +31,55 @@ def step_by_step(scene: Scene, steps: Sequence[Step], settings: Settings) -> Pla
         settings: How to plan; the time limit is for all steps together.
     """
     compile_task(scene, steps, settings.options)  # what is wrong with the list as a whole is said before anything is planned
-    began, current = time.perf_counter(), scene
-    parts: list[Plan] = []
+    return joined(scene, steps, settings, [plan for _, plan in stages(scene, steps, settings)])
+
+
+def stages(scene: Scene, steps: Sequence[Step], settings: Settings) -> list[tuple[OneProblem, Plan]]:
+    """Plan every step that changes something from where the one before it ends, up to the first that fails."""
+    current, spent = scene, 0.0
+    parts: list[tuple[OneProblem, Plan]] = []
     for step in steps:
         if not compile_task(current, [step], settings.options, nothing=True).phases:
             continue
-        spent = sum(part.metrics["planning_time"] for part in parts)
         left = None if settings.time_limit is None else max(settings.time_limit - spent, 1e-3)
         one = OneProblem(current, [step], dataclasses.replace(settings, time_limit=left))
-        parts.append(one.run())
-        if not parts[-1].success:
+        parts.append((one, one.run()))
+        if not parts[-1][1].success:
             break
-        current = scene_after(current, one.task, parts[-1].trajectory)
+        spent += parts[-1][1].metrics["planning_time"]
+        current = scene_after(current, one.task, parts[-1][1].trajectory)
+    return parts
+
+
+def joined(scene: Scene, steps: Sequence[Step], settings: Settings, parts: Sequence[Plan]) -> Plan:
+    """Return the plans of steps, one after the other, as one plan of all `steps`."""
     trajectory = join([part.trajectory for part in parts], pause=settings.options.grasp_time)
     checked = time.perf_counter()
     report = validate(scene, steps, trajectory, settings.options)
     report = dataclasses.replace(report, notes=parts[-1].validation.notes)
-    now = time.perf_counter()
-    summed = ("build_time", "iterations", "rounds", *(f"time_{key}" for key in TIMES))
-    metrics = {key: sum(part.metrics[key] for part in parts) for key in summed}
-    metrics["time_validation"] += now - checked
-    metrics |= {
-        "planning_time": now - began - metrics["build_time"],
-        **trajectory.metrics(),
-        "clearance": report.clearance,
-        "closure_error": report.closure_error,
-    }
-    status = "success" if report.ok else "rejected" if parts[-1].success else parts[-1].status
+    spent = time.perf_counter() - checked
+    metrics = summed([part.metrics for part in parts])
+    metrics["planning_time"] += spent
+    metrics["time_validation"] += spent
+    metrics |= {**trajectory.metrics(), "clearance": report.clearance, "closure_error": report.closure_error}
     return Plan(
         scene=scene,
         steps=tuple(steps),
         options=settings.options,
         trajectory=trajectory,
         validation=report,
-        status=status,
+        status="success" if report.ok else "rejected" if parts[-1].success else parts[-1].status,
         metrics=metrics,
         seed=settings.seed,
         initialization=", ".join(part.initialization for part in parts),
         history=tuple(row for part in parts for row in part.history),
     )
+
+
+def summed(metrics: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Return what several plans took: times, iterations and rounds."""
+    keys = ("planning_time", "build_time", "iterations", "rounds", *(f"time_{key}" for key in TIMES))
+    return {key: sum(part[key] for part in metrics) for key in keys}
 
 
 def scene_after(scene: Scene, task: Task, trajectory: Trajectory) -> Scene:

@@ -1,0 +1,78 @@
+"""Several steps as one problem, from a seed in which each step was planned on its own."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from vkc_pin.initialization import Seed
+from vkc_pin.one_problem import OneProblem, Settings
+from vkc_pin.plan import Plan
+from vkc_pin.problem import TrajectoryProblem
+from vkc_pin.scene import Scene
+from vkc_pin.step_by_step import joined, stages, summed
+from vkc_pin.steps import Step
+
+__all__ = ["all_at_once"]
+
+
+def all_at_once(scene: Scene, steps: Sequence[Step], settings: Settings) -> Plan:
+    """Plan steps as one problem.
+
+    First each step from where the one before it ends: small problems, quickly solved. What comes out starts the whole
+    problem, in which every grasp and every base pose can still change in favour of what follows. Where a step fails, since
+    the ones before it led to where it cannot be done, the whole problem starts from seeds that were searched for with all
+    steps in mind.
+
+    Args:
+        scene: Robot, objects and obstacles.
+        steps: What should change in the world.
+        settings: How to plan.
+    """
+    whole = OneProblem(scene, steps, settings)
+    if len(whole.task.steps) == 1:
+        return whole.run()
+    parts = stages(scene, whole.task.steps, settings)
+    plans = [plan for _, plan in parts]
+    if len(parts) == 1 and len(whole.task.phases) == len(parts[0][0].task.phases):  # the other steps change nothing
+        return whole.run()
+    if plans[-1].status == "interrupted":
+        return joined(scene, whole.task.steps, settings, plans)
+    spent = [plan.metrics for plan in plans]
+    if plans[-1].success:
+        result = OneProblem(scene, steps, _left(settings, spent)).run(lambda problem: _seed(problem, parts))
+        if not result.success:  # what the steps came to on their own is a motion all the same
+            result = joined(scene, whole.task.steps, settings, [*plans])
+            spent = []
+        if result.success or result.status == "interrupted":
+            return dataclasses.replace(result, metrics={**result.metrics, **summed([result.metrics, *spent])})
+    result = OneProblem(scene, steps, _left(settings, spent)).run()
+    return dataclasses.replace(result, metrics={**result.metrics, **summed([result.metrics, *spent])})
+
+
+def _left(settings: Settings, spent: Sequence[dict[str, float] | object]) -> Settings:
+    """Return the settings with what is left of the time limit."""
+    if settings.time_limit is None:
+        return settings
+    used = sum(metrics["planning_time"] for metrics in spent)  # type: ignore[index]
+    return dataclasses.replace(settings, time_limit=max(settings.time_limit - used, 1e-3))
+
+
+def _seed(problem: TrajectoryProblem, parts: Sequence[tuple[OneProblem, Plan]]) -> Seed:
+    """Return the waypoints of the steps' own problems as those of the whole problem."""
+    chain = problem.chain
+    z = np.full((problem.segments, chain.size), np.nan)
+    begin = 0
+    for one, _ in parts:
+        end = begin + one.problem.segments
+        z[begin:end, [chain.index(name) for name in one.problem.chain.names]] = one.z
+        begin = end
+    for column, values in enumerate(z.T):  # what a part does not know stays as it was, or is as it will be
+        known = np.flatnonzero(~np.isnan(values))
+        if len(known):
+            values[:] = values[known[np.maximum(np.searchsorted(known, np.arange(len(values)), side="right") - 1, 0)]]
+        else:
+            values[:] = problem.start[column]
+    return Seed(", ".join(plan.initialization for _, plan in parts) + ", then all at once", z)

@@ -361,7 +361,7 @@ MISUSES: dict[str, tuple[dict[str, Any], str, str]] = {
     "None": ({"steps": None}, "steps", "a list of steps"),
     "one step alone": ({"steps": vkc.GoTo(0.0, 0.0)}, "steps", "a list of steps"),
     "no steps": ({"steps": []}, "steps", "at least one step"),
-    "not a step": ({"steps": [vkc.GoTo(0.0, 0.0), "open"]}, "steps[1]", "Reach, Grasp, Actuate or GoTo"),
+    "not a step": ({"steps": [vkc.GoTo(0.0, 0.0), "open"]}, "steps[1]", "Reach, Grasp, Actuate, GoTo, Touch, Place, Release"),
     "scene by name": ({"scene": "door"}, "scene", "a Scene"),
     "unknown object": ({"steps": [vkc.Actuate("dor", {"hinge": 1.0})]}, "steps[0].object", "dor"),
 }

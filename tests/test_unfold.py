@@ -83,6 +83,15 @@ def test_a_hand_opens_at_the_end_only_if_it_is_told_to(steps: list[Step], held: 
         assert motion.phases[-1].last - motion.phases[-1].first == 1
 
 
+def test_what_is_let_go_of_before_anything_happens() -> None:
+    """A door in the hand at the start is held in no phase. What the hand chose means nothing any more; it keeps its value."""
+    for attachment in ("handle", "handle_free"):
+        problem = build(door_scene().with_held({"door": attachment}), [GoTo(0.0, 0.0)], options=SHORT)
+        motion = unfolded(problem)[1]
+        assert [dict(phase.held) for phase in motion.phases] == [{}]
+    assert np.all(motion.column("door.handle_free") == 0.0)
+
+
 @pytest.mark.parametrize("make", [fetching, placing])
 def test_the_robot_goes_where_the_program_has_it(make) -> None:  # type: ignore[no-untyped-def]
     problem = make()

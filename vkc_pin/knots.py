@@ -166,9 +166,12 @@ def scatter(
     z = np.tile(problem.start, (SCATTER, 1))
     if pose is not None:
         z, found = search.knot(z, waypoint, "scatter")
-        z[found] = search.clear(z[found], waypoint)
-        residual, _ = problem.transcription.pose_solvers[pose].evaluate(z, problem.targets[pose])
-        return z, np.abs(residual).max(axis=1)
+        pushed = z.copy()
+        pushed[found] = search.clear(z[found], waypoint)
+        solver, target = search.solver(pose)
+        before, after = (np.abs(solver.evaluate(rows, target)[0]).max(axis=1) for rows in (z, pushed))
+        kept = after < _ROUGH  # where being pushed did not cost what must hold there
+        return np.where(kept[:, None], pushed, z), np.where(kept, after, before)
     if (problem.lower[row, :2] < problem.upper[row, :2]).any():
         return None
     z[:, 2:] += rng.normal(0.0, 1.0, z[:, 2:].shape)

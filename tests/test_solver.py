@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import time
 from functools import cache
@@ -82,11 +83,42 @@ def test_columns_that_only_grow(solution) -> None:  # type: ignore[no-untyped-de
 
 
 def test_the_trust_region_shrinks_when_a_step_is_rejected() -> None:
-    history = hard().history
+    """Few enough waypoints to share one radius, and a straight way through two walls."""
+    walls = [
+        {"name": f"wall_{k}", "type": "box", "size": [0.1, 3.0, 1.0], "position": [1.5 + 1.2 * k, (-1.0) ** k, 0.5]}
+        for k in range(2)
+    ]
+    problem = vkc.build(hall(obstacles=walls), [vkc.GoTo(4.2, 0.0, 0.0)], options=vkc.Options(reach_waypoints=14))
+    history = solve(problem, straight(problem, 4.2)).history
     rejected = [(row, after) for row, after in itertools.pairwise(history) if not row.accepted]
     assert rejected, "nothing was rejected: choose a harder problem"
     for row, after in rejected:
         assert after.radius < row.radius or after.penalty > row.penalty
+
+
+def test_trouble_in_one_place_does_not_narrow_the_trust_region_in_others() -> None:
+    """Forty waypoints in four blocks: in one nothing came of what was promised."""
+    region, before = solver._Region(40), np.full(40, 0.1)
+    slack, shortfall = np.zeros(40), np.zeros(40)
+    shortfall[10:20] = 0.1
+    trial = dataclasses.replace(blank_trial(40), slack=slack, shortfall=shortfall)
+    first = region.radius.copy()
+    region.adapt(before, trial, True, 0.9)
+    assert len(np.unique(region.block)) == 4
+    trouble = region.block == region.block[15]
+    assert np.array_equal(np.flatnonzero(trouble), np.arange(10, 20))
+    assert (region.radius[trouble] < first[trouble]).all()
+    assert (region.radius[~trouble] > first[~trouble]).all()
+    region.adapt(before, dataclasses.replace(trial, shortfall=before), False, -1.0)
+    assert (region.radius < first).all()
+    region.restart()
+    assert (region.radius == solver.RESTART_RADIUS).all()
+
+
+def blank_trial(segments: int) -> solver._Trial:
+    """Return a trial in which every coordinate went 0.3 and nothing else is said."""
+    fields = dict.fromkeys(field.name for field in dataclasses.fields(solver._Trial))
+    return solver._Trial(**{**fields, "step": np.full(segments, 0.3)})  # type: ignore[arg-type]
 
 
 def test_standing_still_where_one_is_already() -> None:

@@ -15,10 +15,12 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
+from carrying import BALL, STICK, lifted, room, stand, table, tool_at
 from drives import hall
 
 import vkc_pin as vkc
 from vkc_pin.resources import folder
+from vkc_pin.world import World
 
 ROOT = Path(__file__).resolve().parent.parent
 HINGE = 1.2
@@ -178,6 +180,63 @@ def test_through_the_door_that_was_opened() -> None:
     assert let_go.held == {}
     assert np.ptp(column(plan, "door.hinge")[let_go.first :]) == 0.0
     assert column(plan, "door.hinge")[-1] == pytest.approx(1.5, abs=1e-3)
+
+
+# --- with something in the hand ---------------------------------------------------------------------------------------
+
+
+def at_a_distance(scene: vkc.Scene) -> vkc.Scene:
+    return scene.with_start(base=[-0.8, -0.2, 0.3], arm=scene.robot.home)
+
+
+def left_at(plan: vkc.Plan, name: str) -> pin.SE3:
+    """Return where a free object is at the end."""
+    world = World(plan.scene)
+    return world.placement(name, world.positions(plan.trajectory)[-1])
+
+
+@pytest.mark.parametrize("joint", [True, False], ids=["jointly", "step by step"])
+def test_a_stick_is_put_elsewhere(joint: bool) -> None:
+    scene, aside = at_a_distance(room(table())), lifted(STICK, [0.0, 0.5, 0.0])
+    plan = vkc.plan(scene, [vkc.Grasp("stick"), vkc.Place("stick", aside), vkc.GoTo(-1.0, 0.0)], options=SEEN, joint=joint)
+    confirm(plan)
+    assert max(apart(left_at(plan, "stick"), aside)) <= 1e-3
+    held = [phase for phase in plan.trajectory.phases if phase.held]
+    assert {tuple(phase.held.items()) for phase in held} == {(("stick", "grip"),)}
+    values = [column(plan, f"stick.grip_{name}")[held[0].first] for name in ("slide", "turn")]
+    first, last = plan.trajectory.positions[held[0].first], plan.trajectory.positions[held[-1].last]
+    assert max(apart(tool(scene, first), tool_at(STICK, values=values))) <= 1e-3
+    assert max(apart(tool(scene, last), tool_at(aside, values=values))) <= 2e-3
+    assert np.hypot(*(plan.trajectory.positions[-1, :2] - [-1.0, 0.0])) <= 1e-3
+
+
+def test_a_stick_touches_and_is_let_go_of() -> None:
+    scene, point = at_a_distance(room(table())), np.array([0.8, 1.0, 0.9])
+    plan = vkc.plan(scene, [vkc.Touch("stick.tip", point), vkc.Release(), vkc.GoTo(-1.0, 0.0)], options=SEEN)
+    confirm(plan)
+    last = plan.trajectory.phases[-1]
+    assert dict(last.held) == {}
+    tip = left_at(plan, "stick").act(np.array([0.0, 0.25, 0.0]))  # it stays where it was let go of
+    np.testing.assert_allclose(tip, point, rtol=0.0, atol=1e-3)
+
+
+def test_a_ball_is_fetched_with_a_stick() -> None:
+    scene = room(stand(), stand("stand_2", aside=0.3), objects=("stick", "ball")).with_held({"stick": "grip"})
+    aside = lifted(BALL, [0.0, 0.3, 0.0])
+    steps = [vkc.Grasp("ball", "pull", "stick.tip"), vkc.Place("ball", aside), vkc.GoTo(-0.6, -0.3)]
+    plan = vkc.plan(scene.with_start(base=[-0.6, -0.3, 0.0]), steps, options=SEEN)
+    confirm(plan)
+    assert max(apart(left_at(plan, "ball"), aside)) <= 1e-3
+    assert {"ball": "stick.tip"} in [dict(phase.by) for phase in plan.trajectory.phases]
+    assert dict(plan.trajectory.phases[-1].held) == {"stick": "grip"}
+
+
+def test_what_is_put_at_a_point_stays_upright() -> None:
+    plan = vkc.plan(at_a_distance(room(table())), [vkc.Place("stick", (0.8, 0.6, 0.551))], options=SEEN)
+    confirm(plan)
+    there = left_at(plan, "stick")
+    np.testing.assert_allclose(there.translation, [0.8, 0.6, 0.551], rtol=0.0, atol=1e-3)
+    np.testing.assert_allclose(there.rotation[2], [0.0, 0.0, 1.0], rtol=0.0, atol=2e-3)
 
 
 def digest(plan: vkc.Plan) -> str:

@@ -64,8 +64,12 @@ def _seed(problem: TrajectoryProblem, parts: Sequence[tuple[OneProblem, Plan]]) 
     """Return the waypoints of the steps' own problems as those of the whole problem."""
     chain = problem.chain
     z = np.full((problem.segments, chain.size), np.nan)
-    begin = 0
+    begin = number = 0
     for one, _ in parts:
+        names = [phase.name for phase in one.task.phases]
+        if names != [phase.name for phase in problem.task.phases[number : number + len(names)]]:
+            continue  # only to let go of something the robot stands still for a while; here that has no phase of its own
+        number += len(names)
         end = begin + one.problem.segments
         z[begin:end, [chain.index(name) for name in one.problem.chain.names]] = one.z
         begin = end

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -52,11 +52,11 @@ def all_at_once(scene: Scene, steps: Sequence[Step], settings: Settings) -> Plan
     return dataclasses.replace(result, metrics={**result.metrics, **summed([result.metrics, *spent])})
 
 
-def _left(settings: Settings, spent: Sequence[dict[str, float] | object]) -> Settings:
+def _left(settings: Settings, spent: Sequence[Mapping[str, float]]) -> Settings:
     """Return the settings with what is left of the time limit."""
     if settings.time_limit is None:
         return settings
-    used = sum(metrics["planning_time"] for metrics in spent)  # type: ignore[index]
+    used = sum(metrics["planning_time"] for metrics in spent)
     return dataclasses.replace(settings, time_limit=max(settings.time_limit - used, 1e-3))
 
 

@@ -260,4 +260,3 @@ class Drawing:
     def _clip(self, movie: animation.Animation, path: str, tracks: list[animation.AnimationTrack]) -> None:
         where = self.viewer[path].path
         movie.clips[where] = animation.AnimationClip({track.name: track for track in tracks}, fps=1)
-

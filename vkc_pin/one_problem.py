@@ -121,15 +121,15 @@ class OneProblem:
                 if solution.status in ("time limit", "interrupted"):
                     status = solution.status
                     break
-                if number == 1 and not self.given:
+                if number == 1 and not self.given and not _ends_free(problem, seed):
                     notes = explain(problem, self.settings.seed)
                 elif notes:  # two seeds failed, and random configurations find no free one at a goal either
                     break
         except KeyboardInterrupt:
             status = "interrupted"
-        best = best or self._stationary(problem)
+        if best is None:
+            best, notes = self._stationary(problem), notes + self.blocked
         if not status:
-            notes += self.blocked
             status = "infeasible" if notes else best.status
             best = dataclasses.replace(best, report=dataclasses.replace(best.report, notes=tuple(notes)))
         return best, status
@@ -190,3 +190,10 @@ class OneProblem:
             initialization=best.name,
             history=tuple(self.history),
         )
+
+
+def _ends_free(problem: TrajectoryProblem, seed: Seed) -> bool:
+    """Return whether a seed's configurations at the ends of the phases are free and what they should be."""
+    ends = problem.ends - 1
+    free = problem.evaluate_contacts(seed.z, reach=problem.options.dist_safe).shortfall(problem.segments)[ends] <= 0.0
+    return bool(free.all()) and problem.pose_error(seed.z) < 1e-2

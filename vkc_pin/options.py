@@ -48,7 +48,7 @@ class Options:
     move_waypoints: int = 30
     dist_safe: float = 0.02
     grasp_clearance: float = 0.005
-    velocity_weight_base: float = 5.0
+    velocity_weight_base: float = 1.0
     velocity_weight_arm: float = 1.0
     velocity_weight_object: float = 0.5
     acceleration_weight: float = 0.3

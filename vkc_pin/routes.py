@@ -6,7 +6,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from vkc_pin.base_grid import BaseGrid, Shape
+from vkc_pin.base_body import Shape
+from vkc_pin.base_grid import BaseGrid
 from vkc_pin.base_path import BasePath, along, shortest_path
 from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.scene import FLOOR

@@ -104,9 +104,7 @@ def merge_solids(solids: list[Solid]) -> Solid:
     """Return several solids as one."""
     offsets = np.cumsum([0, *(len(s.vertices) for s in solids)])
     faces = [s.faces + np.uint32(offset) for s, offset in zip(solids, offsets[:-1], strict=True)]
-    return Solid(
-        np.concatenate([s.vertices for s in solids]), np.concatenate(faces), np.concatenate([s.normals for s in solids])
-    )
+    return Solid(np.concatenate([s.vertices for s in solids]), np.concatenate(faces), np.concatenate([s.normals for s in solids]))
 
 
 def box_solid(lower: NDArray[np.float64], upper: NDArray[np.float64], sides: tuple[int, ...] = (0, 1, 2, 3, 4, 5)) -> Solid:

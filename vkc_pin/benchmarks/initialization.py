@@ -29,8 +29,8 @@ SCENES = ("init_1", "init_2", "init_3")
 METHODS = ("stationary", "interpolated", "astar", "auto")
 STEPWISE = "step after step"
 """The method that plans the steps one after the other, initialised as by "auto"."""
-TARGET = (-1.0, 4.0, 0.205)
-"""Where the stick's tip has to be, in the world frame [m]: at the cube's top, 5 mm above it as the tip is round."""
+TARGET = (-1.0, 3.897, 0.1)
+"""Where the stick's tip has to be, in the world frame [m]: 3 mm before the middle of the cube's south face."""
 TIME_LIMIT = 20.0  # [s] of planning
 PERTURBATION = 0.05  # of the seed trajectory, in all repeats but the first
 _NAMES = {"init_1": "no obstacle", "init_2": "two small obstacles", "init_3": "one large obstacle"}

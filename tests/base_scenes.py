@@ -1,0 +1,94 @@
+"""Scenes for a mobile base, and what coal says about its poses, asked for every pair of shapes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import coal
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from vkc_pin.base_body import Shape
+from vkc_pin.meshes import convex_hull
+
+HALL = (-5.0, 5.0, -5.0, 5.0)
+MARGIN = 0.02
+BLINK = 1.1e-3  # [m] by which a motion may come closer than its margin between two questions, and rounding
+
+
+def at(x: float, y: float, z: float, yaw: float = 0.0) -> pin.SE3:
+    return pin.SE3(pin.utils.rotate("z", yaw), np.array([x, y, z], float))
+
+
+def chassis(length: float = 1.0, width: float = 0.67) -> list[Shape]:
+    return [(coal.Box(length, width, 0.4), at(0.0, 0.0, 0.2))]
+
+
+def arm() -> list[Shape]:
+    """Ten convex shapes between 0.4 and 1.1 above the floor that reach a little beyond the chassis."""
+    rng = np.random.default_rng(1)
+    shapes = []
+    for k in range(10):
+        x, y, z = rng.uniform([-0.2, -0.3, 0.5], [0.5, 0.3, 1.0])
+        turned = pin.SE3(pin.utils.rotate("y", rng.uniform(0.0, np.pi)), np.array([x, y, z]))
+        shapes.append((coal.Capsule(0.05, 0.25) if k % 2 else coal.Box(0.1, 0.1, 0.3), turned))
+    return shapes
+
+
+def wedge() -> coal.Convex:
+    """Return a convex mesh: a prism with a triangle as its base, lower at one end."""
+    return convex_hull([(0, 0, 0), (0.6, 0, 0), (0, 0.4, 0), (0, 0, 0.5), (0.6, 0, 0.2), (0, 0.4, 0.5)])
+
+
+def furniture() -> list[Shape]:
+    """A table, a table top on four legs, and a block in the way."""
+    legs = [(coal.Box(0.08, 0.08, 0.75), at(-0.5 + 1.4 * a, 3.5 + 0.7 * b, 0.375)) for a in (-1, 1) for b in (-1, 1)]
+    return [
+        (coal.Box(1.0, 2.0, 0.72), at(2.5, 1.0, 0.36)),
+        (coal.Box(3.0, 1.6, 0.05), at(-0.5, 3.5, 0.775)),
+        (coal.Box(2.0, 3.0, 2.1), at(2.0, -2.0, 1.05)),
+        *legs,
+    ]
+
+
+def clutter(seed: int, count: int, *, reach: float = 4.5) -> list[Shape]:
+    """Boxes, cylinders, spheres, and lying capsules at random."""
+    rng = np.random.default_rng(seed)
+    shapes: list[Shape] = []
+    for k in range(count):
+        x, y = rng.uniform(-reach, reach, 2)
+        height, yaw = rng.uniform(0.2, 2.0), rng.uniform(0.0, np.pi)
+        if k % 4 == 0:
+            shapes.append((coal.Box(*rng.uniform(0.1, 0.8, 2), height), at(x, y, height / 2, yaw)))
+        elif k % 4 == 1:
+            shapes.append((coal.Cylinder(rng.uniform(0.05, 0.3), height), at(x, y, height / 2)))
+        elif k % 4 == 2:
+            shapes.append((coal.Sphere(rng.uniform(0.1, 0.4)), at(x, y, rng.uniform(0.2, 1.0))))
+        else:
+            lying = pin.SE3(pin.utils.rotate("z", yaw) @ pin.utils.rotate("x", np.pi / 2 - 0.2), np.array([x, y, 0.6]))
+            shapes.append((coal.Capsule(0.06, rng.uniform(0.2, 0.8)), lying))
+    return shapes
+
+
+def distance(shapes: Sequence[Shape], standing: Sequence[Shape], pose: Sequence[float]) -> float:
+    """Return coal's smallest signed distance [m] of shapes on a base at (x, y, yaw) from what stands in the world."""
+    base = at(pose[0], pose[1], 0.0, pose[2])
+    nearest = np.inf
+    for shape, placement in shapes:
+        where = _transform(base * placement)
+        for other, there in standing:
+            found = coal.distance(shape, where, other, _transform(there), coal.DistanceRequest(), coal.DistanceResult())
+            nearest = min(nearest, found)
+    return nearest
+
+
+def between(a: Sequence[float], b: Sequence[float], *, length: float = 0.01, angle: float = 0.02) -> NDArray[np.float64]:
+    """Return poses on the straight line between two, at most so far apart [m], [rad]; shape (N, 3)."""
+    change = np.subtract(b, a)
+    count = 2 + int(max(np.hypot(change[0], change[1]) / length, abs(change[2]) / angle))
+    return np.linspace(a, b, count)
+
+
+def _transform(placement: pin.SE3) -> coal.Transform3s:
+    return coal.Transform3s(placement.rotation, placement.translation)

@@ -1,0 +1,202 @@
+"""Cells and headings at which the mobile base surely hits something, found for all of them at once, without coal.
+
+At one heading, a convex shape of the base hits a convex obstacle at the places of a convex region of the plan view. Its support
+function is the sum of theirs, taken of the parts at the same height; here it is filled row by row. What the few directions `FAN`
+leave uncertain is taken off, so that nothing free is called stuck; most of what is blocked is found, so that a search knows in
+advance where it need not look.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import coal
+import numpy as np
+from numpy.typing import NDArray
+
+from vkc_pin.base_body import FAN, Shape, outline
+
+__all__ = ["Lattice", "stuck"]
+
+_FLAT = 1e-6  # [m]: shapes, and what two have in common in height, that are no higher are left out
+_ROUNDING = 1e-5  # [m] of numbers of single precision
+_SLANT = float(np.cos(np.pi / len(FAN) * 1.2))  # of the angle between a direction and the nearest of `FAN`, at least
+
+
+class Lattice(NamedTuple):
+    """Cells and headings: centre of cell (0, 0) and size of a cell, shape (2,) [m]; cells along a side; shape (H,) [rad]."""
+
+    origin: NDArray[np.float64]
+    step: NDArray[np.float64]
+    cells: int
+    yaws: NDArray[np.float64]
+
+
+class _Solid(NamedTuple):
+    """Points whose hull a shape contains, shape (n, 3), its lowest and highest z [m], and if it is a prism."""
+
+    points: NDArray[np.float64]
+    bottom: float
+    top: float
+    prism: bool
+
+
+def stuck(
+    base: Sequence[Shape], carried: Sequence[Shape], standing: Sequence[Shape], lattice: Lattice, margin: float
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return where the base, and where what is carried, surely comes closer than `margin` [m] to an obstacle.
+
+    Args:
+        base: Shapes of the base, in its frame.
+        carried: Shapes that are carried, in its frame.
+        standing: Obstacles in the world.
+        lattice: Cells and headings.
+        margin: [m].
+
+    Returns:
+        For base and carried, shape (cells, cells, H). What rides within the outline of the base is looked at only for obstacles
+        that the base passes under.
+    """
+    obstacles, below, above = _solids(standing), _solids(base), _solids(carried)
+    pairs = [(solid, other) for solid in below for other in obstacles if _common(solid, other)]
+    low, high = (
+        reduce(np.concatenate([solid.points for solid in below] or [np.zeros((1, 3))]), axis=0) for reduce in (np.min, np.max)
+    )
+    met = {id(other) for _, other in pairs}
+    over = [
+        (solid, other)
+        for solid in above
+        for inside in [np.all((solid.points >= low) & (solid.points <= high), axis=0)[:2].all()]
+        for other in obstacles
+        if _common(solid, other) and not (inside and id(other) in met)
+    ]
+    return _fill(pairs, lattice, margin), _fill(over, lattice, margin)
+
+
+def _solids(shapes: Sequence[Shape]) -> list[_Solid]:
+    solids = []
+    for shape, placement in shapes:
+        points, _ = outline(shape, placement, outer=False)
+        if len(points) and np.ptp(points[:, 2]) > _FLAT:
+            prism = isinstance(shape, coal.Box | coal.Cylinder) and abs(placement.rotation[2, 2]) > 1.0 - 1e-9
+            solids.append(_Solid(points, float(points[:, 2].min()), float(points[:, 2].max()), prism))
+    return solids
+
+
+def _common(first: _Solid, second: _Solid) -> bool:
+    return min(first.top, second.top) - max(first.bottom, second.bottom) > _FLAT
+
+
+def _slice(solid: _Solid, low: float, high: float) -> NDArray[np.float64]:
+    """Return those points in the plan view of a solid between two heights that `FAN` touches, shape (n, 2) [m], n at most 32."""
+    points = solid.points
+    if solid.prism or (low <= solid.bottom and high >= solid.top):
+        return _touched(points[:, :2])
+    parts = [points[(points[:, 2] >= low) & (points[:, 2] <= high)][:, :2]]
+    for height in {low, high}:
+        above, below = points[points[:, 2] > height], points[points[:, 2] < height]
+        share = ((above[:, None, 2] - height) / (above[:, None, 2] - below[:, 2]))[..., None]
+        parts.append((above[:, None, :2] + share * (below[:, :2] - above[:, None, :2])).reshape(-1, 2))
+    return _touched(np.concatenate(parts))
+
+
+def _touched(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    return points[np.unique((FAN @ points.T).argmax(axis=1))]
+
+
+def _support(
+    outlines: list[NDArray[np.float64]], directions: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return support functions of point sets, and how far beyond their hulls the polygons reach that they bound.
+
+    Args:
+        outlines: M times points, shape (n, 2) [m].
+        directions: Unit vectors in turn, shape (D, K, 2).
+
+    Returns:
+        Shapes (M, D, K) and (M, D) [m].
+    """
+    size = max(len(points) for points in outlines)
+    padded = np.array([np.concatenate([points, np.repeat(points[:1], size - len(points), axis=0)]) for points in outlines])
+    along = (directions.reshape(-1, 2) @ padded.swapaxes(1, 2)).reshape(len(padded), *directions.shape[:2], size)
+    which = along.argmax(axis=-1)
+    support = np.take_along_axis(along, which[..., None], axis=-1)[..., 0]
+    touched = padded[np.arange(len(padded))[:, None, None], which]  # (M, D, K, 2)
+    after, following, beyond = (np.roll(a, -1, axis=axis) for a, axis in ((directions, 1), (support, 2), (touched, 2)))
+    # The corner between two neighbouring directions, and how far it is from the segment between the points touched.
+    area = directions[..., 0] * after[..., 1] - directions[..., 1] * after[..., 0]
+    corner = np.stack(
+        [
+            (support * after[..., 1] - following * directions[..., 1]) / area,
+            (following * directions[..., 0] - support * after[..., 0]) / area,
+        ],
+        axis=-1,
+    )
+    way, offset = beyond - touched, corner - touched
+    share = np.clip(np.sum(offset * way, axis=-1) / np.maximum(np.sum(way * way, axis=-1), 1e-12), 0.0, 1.0)
+    return support, np.linalg.norm(offset - share[..., None] * way, axis=-1).max(axis=2)
+
+
+def _fill(pairs: list[tuple[_Solid, _Solid]], lattice: Lattice, margin: float) -> NDArray[np.bool_]:
+    """Return where any of pairs of shapes surely come too close, shape (cells, cells, H)."""
+    count, cells = len(lattice.yaws), lattice.cells
+    if not pairs:
+        return np.zeros((cells, cells, count), bool)
+    moving: dict[tuple[int, float, float], int] = {}
+    standing: dict[tuple[int, float, float], int] = {}
+    shapes: tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]] = ([], [])
+    indices = []
+    for solid, other in pairs:
+        low, high = max(solid.bottom, other.bottom), min(solid.top, other.top)
+        if not other.prism:
+            low = high = (low + high) / 2
+        row = []
+        for which, known, found in ((solid, moving, shapes[0]), (other, standing, shapes[1])):
+            key = (id(which), 0.0, 0.0) if which.prism else (id(which), low, high)
+            if key not in known:
+                known[key] = len(found)
+                found.append(_slice(which, low, high))
+            row.append(known[key])
+        indices.append(row)
+    first, second = np.array(indices).T
+    cosine, sine = np.cos(lattice.yaws)[:, None], np.sin(lattice.yaws)[:, None]
+    turned = -np.stack([cosine * FAN[:, 0] + sine * FAN[:, 1], cosine * FAN[:, 1] - sine * FAN[:, 0]], axis=-1)
+    support, spare = _support(shapes[0], turned)
+    other_support, other_spare = _support(shapes[1], FAN[None])
+    allowed = _SLANT * margin - spare[first] - other_spare[second] - _ROUNDING  # (pairs, H)
+    reach = (support[first] + other_support[second] + allowed[..., None]).reshape(-1, len(FAN)).astype(np.float32)
+    return _rows(reach, np.tile(np.arange(count), len(first)), lattice)
+
+
+def _rows(reach: NDArray[np.float32], heading: NDArray[np.int_], lattice: Lattice) -> NDArray[np.bool_]:
+    """Return the cells inside any of many polygons, by heading, shape (cells, cells, H).
+
+    Args:
+        reach: How far each polygon reaches along `FAN`, shape (Q, 32) [m].
+        heading: Of each, shape (Q,).
+        lattice: Cells and headings.
+    """
+    cells, quarter = lattice.cells, len(FAN) // 4
+    (x0, y0), (dx, dy) = lattice.origin, lattice.step
+    begin = np.clip(np.floor((-reach[:, 2 * quarter] - x0) / dx) + 1, 0, cells).astype(int)
+    end = np.clip(np.ceil((reach[:, 0] - x0) / dx), 0, cells).astype(int)
+    rows = np.maximum(end - begin, 0)
+    polygon = np.repeat(np.arange(len(reach)), rows)
+    i = np.arange(len(polygon)) - np.repeat(np.cumsum(rows) - rows - begin, rows)
+    x = (x0 + dx * i).astype(np.float32)
+    bounds = []
+    for side in (0, 1):  # up to where it reaches towards y, and towards -y
+        nearest = np.full(len(polygon), np.inf, np.float32)
+        for k in range(1 + 2 * quarter * side, 2 * quarter * (side + 1)):
+            ux, uy = FAN[k].astype(np.float32)
+            np.minimum(nearest, (reach[:, k] / abs(uy))[polygon] - x * (ux / abs(uy)), out=nearest)
+        bounds.append(nearest)
+    first = np.clip(np.floor((-bounds[1] - y0) / dy) + 1, 0, cells).astype(int)
+    last = np.clip(np.ceil((bounds[0] - y0) / dy), 0, cells).astype(int)
+    some = first < last
+    line = ((heading[polygon] * cells + i) * (cells + 1))[some]
+    size = len(lattice.yaws) * cells * (cells + 1)
+    change = np.bincount(line + first[some], minlength=size) - np.bincount(line + last[some], minlength=size)
+    inside = np.cumsum(change.reshape(-1, cells, cells + 1), axis=2)[:, :, :cells] > 0
+    return np.ascontiguousarray(np.moveaxis(inside, 0, 2))

@@ -26,6 +26,7 @@ UNIT = 1e-6
 """Costs on the grid are whole numbers of this [m], so that equal ways cost exactly the same."""
 
 _ENTRY = 0.6  # [m] from the start, and from the goals, to the cells where the way over the grid begins and ends
+_CELL = 0.1  # [m]: where cells are smaller, so is the way to them
 _LEAVE = 1.0  # [m]: so far a blocked start may be left in one go, if it overlaps something
 _AWAY = 10.0  # what a metre costs on which the base leaves what it overlaps
 _TRY = np.pi / 16  # [rad] of turning, tried step by step
@@ -167,7 +168,8 @@ class Ground:
     def _ways(self, pose: NDArray[np.float64], sign: float, radius: float, haste: float) -> Ways:
         """Return the ways from a pose (`sign` 1), or to it (-1), within a radius [m], where a metre costs `haste`."""
         grid = self.grid
-        cells = grid.around(float(pose[0]), float(pose[1]), max(radius, 1.5 * float(grid.step.max())))
+        step = float(grid.step.max())
+        cells = grid.around(float(pose[0]), float(pose[1]), max(radius * min(1.0, step / _CELL), 1.5 * step))
         offset = sign * (grid.origin + cells * grid.step - pose[:2])
         length = np.hypot(*offset.T)
         ahead = np.where(length > _SAME, np.arctan2(offset[:, 1], offset[:, 0]), pose[2])

@@ -21,7 +21,7 @@ def scene(seed: int) -> tuple[list[Shape], list[Shape], Body]:
     return shapes, standing, Body(shapes, Standing(standing), MARGIN)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(SEEDS)
 def test_a_drive_is_free_if_coal_finds_room_all_along(seed: int) -> None:
     shapes, standing, body = scene(seed)
@@ -35,7 +35,7 @@ def test_a_drive_is_free_if_coal_finds_room_all_along(seed: int) -> None:
         assert nearest < MARGIN + 0.004
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(SEEDS)
 def test_a_turn_is_free_if_coal_finds_room_all_along(seed: int) -> None:
     shapes, standing, body = scene(seed)

@@ -34,7 +34,7 @@ def test_cells_and_headings(grid: BaseGrid) -> None:
 
 def test_a_cell_is_free_if_coal_finds_room(grid: BaseGrid) -> None:
     answers = []
-    for i, j, heading in states(800, 0):
+    for i, j, heading in states(400, 0):
         pose = [*grid.center(i, j), grid.yaws[heading]]
         base, over = distance(chassis(), STANDING, pose), distance(arm(), STANDING, pose)
         assert grid.free(i, j, heading, reaching=True) == (base >= MARGIN)
@@ -55,7 +55,7 @@ def test_any_pose_is_clear_if_coal_finds_room(grid: BaseGrid) -> None:
 def test_moves_between_cells_are_free_all_along(grid: BaseGrid, reaching: bool) -> None:
     shapes = chassis() if reaching else [*chassis(), *arm()]
     answers = []
-    for i, j, heading in states(150, 2):
+    for i, j, heading in states(60, 2):
         if not all(2 <= k < 98 for k in (i, j)):
             continue
         here, yaw = grid.center(i, j), grid.yaws[heading]

@@ -26,14 +26,14 @@ def test_what_is_stuck_is_blocked_and_nearly_all_that_is_blocked(name: str) -> N
     standing, rng = SCENES[name], np.random.default_rng(0)
     grid = BaseGrid(chassis(), CARRIED, standing, HALL, MARGIN)
     blocked, known = np.zeros(2), np.zeros(2)
-    for i, j, heading in rng.integers([100, 100, 16], size=(1500, 3)).tolist():
+    for i, j, heading in rng.integers([100, 100, 16], size=(800, 3)).tolist():
         pose = [*grid.center(i, j), grid.yaws[heading]]
         for body, (shapes, mask) in enumerate(((chassis(), grid.stuck), (CARRIED, grid.stuck_carrying))):
             hit = distance(shapes, standing, pose) < MARGIN
             assert hit or not mask[i, j, heading]
             blocked[body] += hit
             known[body] += mask[i, j, heading]
-    assert blocked.min() > 100
+    assert blocked.min() > 50
     assert known[0] > 0.9 * blocked[0]
     assert known[1] > 0.4 * blocked[1]  # most of the rest is over the base, where that is stuck
 

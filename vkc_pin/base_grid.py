@@ -32,6 +32,7 @@ class BaseGrid:
         yaws: The headings, ascending from 0, shape (HEADINGS,) [rad].
         lengths: Of the moves, shape (HEADINGS,) [m].
         near: Radius around the start and goals of a search in which only the base counts [m].
+        base, carried: The shapes of either, which can be asked about a drive or a turn on their own.
         stuck: Where the base surely hits something, shape (cells, cells, HEADINGS).
         stuck_carrying: Where what is carried surely does, shape (cells, cells, HEADINGS).
     """

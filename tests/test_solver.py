@@ -11,7 +11,7 @@ from drives import hall, moved, through
 from small_problems import door_scene
 
 import vkc_pin as vkc
-from vkc_pin import solver
+from vkc_pin import solver, trust_region
 from vkc_pin.initialization import initialize
 from vkc_pin.solver import Solution, solve
 
@@ -100,7 +100,7 @@ def test_the_trust_region_shrinks_when_a_step_is_rejected() -> None:
 
 def test_trouble_in_one_place_does_not_narrow_the_trust_region_in_others() -> None:
     """Forty waypoints in four blocks: in one nothing came of what was promised."""
-    region, before = solver._Region(40), np.full(40, 0.1)
+    region, before = trust_region.TrustRegion(40), np.full(40, 0.1)
     slack, shortfall = np.zeros(40), np.zeros(40)
     shortfall[10:20] = 0.1
     trial = dataclasses.replace(blank_trial(40), slack=slack, shortfall=shortfall)
@@ -114,7 +114,7 @@ def test_trouble_in_one_place_does_not_narrow_the_trust_region_in_others() -> No
     region.adapt(before, dataclasses.replace(trial, shortfall=before), False, -1.0)
     assert (region.radius < first).all()
     region.restart()
-    assert (region.radius == solver.RESTART_RADIUS).all()
+    assert (region.radius == trust_region.RESTART_RADIUS).all()
 
 
 def blank_trial(segments: int) -> solver._Trial:

@@ -1,6 +1,6 @@
 """Whole-body planning for mobile manipulators on virtual kinematic chains."""
 
-from vkc_pin.articulation import ArticulatedObject, Attachment, Latch, invert, load_object
+from vkc_pin.articulation import ArticulatedObject, Attachment, Freedom, Latch, invert, load_object
 from vkc_pin.chain import VirtualKinematicChain, consolidate
 from vkc_pin.errors import BuildError, InputError, UnknownNameError, VkcError
 from vkc_pin.options import Options
@@ -21,6 +21,7 @@ __all__ = [
     "ArticulatedObject",
     "Attachment",
     "BuildError",
+    "Freedom",
     "GoTo",
     "Grasp",
     "InputError",

@@ -71,7 +71,7 @@ class Approach:
         return np.asarray((rotations[0, joint] @ local.rotation)[:, 2])
 
     def _way(self, z: NDArray[np.float64], direction: NDArray[np.float64], lengths: Sequence[float]) -> NDArray[np.float64]:
-        """Return configurations at which the tool is `lengths` [m] along `direction` from where `z` has it, as far as there are."""
+        """Return configurations with the tool `lengths` [m] along `direction` from where `z` has it, as far as there are."""
         rotations, translations = self.chain.joint_placements(z[None])
         carrier = pin.SE3(rotations[0, self.joint], translations[0, self.joint])
         tool = carrier * self.local

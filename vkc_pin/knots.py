@@ -44,6 +44,7 @@ class Knots:
         return next((k for k, pose in enumerate(poses) if waypoint in pose.waypoints), None)
 
     def solver(self, pose: int) -> tuple[PoseSolver, pin.SE3]:
+        """Return the inverse kinematics of a pose, and its target."""
         return self.problem.transcription.pose_solvers[pose], self.problem.targets[pose]
 
     def knot(self, before: NDArray[np.float64], waypoint: int, how: str) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:

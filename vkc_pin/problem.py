@@ -9,7 +9,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import NDArray
 
 from vkc_pin.chain import VirtualKinematicChain, consolidate
@@ -18,6 +17,7 @@ from vkc_pin.goal import compile_task
 from vkc_pin.hold import Hold, holds_of
 from vkc_pin.options import Options
 from vkc_pin.pose import PoseRow, target_vector
+from vkc_pin.pose_goals import pose_goals
 from vkc_pin.scene import Scene
 from vkc_pin.steps import Step
 from vkc_pin.task import Phase, Task
@@ -66,7 +66,7 @@ class TrajectoryProblem:
         self.chain: VirtualKinematicChain = consolidate(scene, task.holds)
         self.contacts = ContactModel(scene, self.chain, task, options)
         self.ends = np.cumsum([phase.segments for phase in task.phases])
-        poses, self.targets, self.pose_names = self._poses()
+        poses, self.targets, self.pose_names = pose_goals(scene, self.chain, task, options)
         self.transcription = transcribe(self._structure(poses))
         self.start = self._start()
         self.lower, self.upper = self._bounds()
@@ -76,39 +76,6 @@ class TrajectoryProblem:
     def segments(self) -> int:
         """N, the number of waypoints after the start."""
         return int(self.ends[-1])
-
-    def _poses(self) -> tuple[list[PoseRow], list[pin.SE3], list[str]]:
-        rows, targets, names = [], [], []
-        starts = np.concatenate([[0], self.ends[:-1]])
-        for hold in self.task.holds:
-            closure, waypoints = self.chain.closures[hold], []
-            for phase, first, last in zip(self.task.phases, starts, self.ends, strict=True):
-                if hold in phase.grasps and self.scene.objects[hold.object].object.free:
-                    rows.append(PoseRow(closure.joint, closure.local, (int(last),)))
-                    targets.append(phase.standing[hold.object])
-                    names.append(f"grasp {hold}")
-                elif hold in phase.grasps:
-                    waypoints.append(last)
-                elif hold in phase.held:
-                    waypoints += range(first + 1, last + 1)
-            if waypoints and not self.scene.objects[hold.object].object.free:
-                rows.append(PoseRow(closure.joint, closure.local, tuple(int(t) for t in waypoints)))
-                targets.append(closure.target)
-                names.append(f"closure {hold.object}")
-        for phase, first, last in zip(self.task.phases, starts, self.ends, strict=True):
-            for hold in phase.grasps:  # short of the grasp, straight back along the hand's approach
-                closure, target = self.chain.closures[hold], phase.standing.get(hold.object, self.chain.closures[hold].target)
-                joint, frame = self.chain.holder(hold)
-                x, y, z = (self.options.approach * frame.rotation[:, 2]).tolist()
-                at = max(int(first) + 1, int(last) - self.options.approach_waypoints)
-                rows.append(PoseRow(closure.joint, closure.local, (at,), shift=(joint, (x, y, z))))
-                targets.append(target)
-                names.append(f"approach {hold}")
-            for goal in phase.frames:
-                rows.append(PoseRow(*self.chain.frame(goal.frame, goal.hold), (int(last),), goal.kind))
-                targets.append(goal.placement)
-                names.append(f"goal {goal}")
-        return rows, targets, names
 
     def _structure(self, poses: Sequence[PoseRow]) -> Structure:
         o, robot = self.options, self.chain.robot.coordinates.size

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.geometry import PlacedObject, clearance, placed_shapes, standing_geometry, within_limits
-from vkc_pin.hold import holds_of
+from vkc_pin.in_hand import check_holds, in_hand
 from vkc_pin.resources import find
 
 if TYPE_CHECKING:
@@ -28,7 +28,6 @@ __all__ = [
     "PlacedObject",
     "Scene",
     "StartRegion",
-    "check_holds",
     "load_scene",
     "standing_geometry",
     "start_limits",
@@ -220,16 +219,8 @@ class Scene:
 
     def with_held_objects_in_the_hand(self) -> Scene:
         """Return the scene with every free object that is held placed where the robot holds it at the start."""
-        objects = dict(self.objects)
-        for hold in holds_of(self.held, self.held_by):
-            placed = objects[hold.object]
-            if placed.object.free:
-                grasp = placed.object.attachment(hold.attachment)
-                values = self.held_at.get(hold.object) or (0.0,) * len(grasp.freedoms)
-                in_object = placed.object.link_placement(grasp.link, placed.state) * grasp.placement * grasp.motion(values)
-                through = objects[hold.by.object].link_placement(str(hold.link)) if hold.by else self.tool_placement()
-                objects[hold.object] = dataclasses.replace(placed, placement=through * in_object.inverse())
-        return dataclasses.replace(self, objects=MappingProxyType(objects))
+        objects = in_hand(self.objects, self.tool_placement, self.held, self.held_by, self.held_at)
+        return dataclasses.replace(self, objects=objects)
 
     def tool_placement(self) -> pin.SE3:
         """Return the placement of the robot's tool frame in the world frame at the start."""
@@ -305,41 +296,6 @@ def start_limits(robot: Robot) -> tuple[NDArray[np.float64], NDArray[np.float64]
     if robot.base == "fixed":
         lower[:3], upper[:3] = -np.inf, np.inf
     return lower, upper
-
-
-def check_holds(
-    objects: Mapping[str, PlacedObject],
-    held: Mapping[str, str],
-    by: Mapping[str, str],
-    at: Mapping[str, Sequence[float]],
-) -> None:
-    """Check that what is said to be held fits the objects; see `Scene.with_held`.
-
-    Raises:
-        UnknownNameError: There is no such object, attachment or link.
-        InputError: Values that do not fit the attachment's freedoms, or objects that hold each other.
-    """
-    for name, attachment in held.items():
-        if name not in objects:
-            raise UnknownNameError("object", name, objects, field="held")
-        freedoms = objects[name].object.attachment(attachment).freedoms
-        values = at.get(name, (0.0,) * len(freedoms))
-        if len(values) != len(freedoms):
-            raise InputError(
-                "wrong number of values", field=f"held.{name}.at", expected=f"{len(freedoms)}, one a freedom", got=len(values)
-            )
-        for value, freedom in zip(values, freedoms, strict=True):
-            within_limits(value, freedom.lower, freedom.upper, f"held.{name}.at")
-    for field_name, names in (("by", by), ("at", at)):
-        for name in names:
-            if name not in held:
-                raise UnknownNameError("held object", name, held, field=field_name)
-    for hold in holds_of(held, by):
-        if hold.by is not None:
-            objects[hold.by.object].link_placement(str(hold.link))
-            if not (objects[hold.object].object.free and objects[hold.by.object].object.free):
-                problem = "only a free object can be held through another, and only through a free one"
-                raise InputError(problem, field=f"held.{hold.object}.by", got=hold.frame)
 
 
 def load_scene(name_or_path: str | Path) -> Scene:

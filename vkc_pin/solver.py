@@ -16,6 +16,7 @@ from vkc_pin.pose import ROW_BOUNDS
 from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.refinement import KEEP, collisions_between, merge
 from vkc_pin.solution import Iteration, Solution
+from vkc_pin.trust_region import CLOSE_ENOUGH, TrustRegion
 
 __all__ = ["solve"]
 
@@ -38,16 +39,12 @@ _WARM: Mapping[str, Any] = {
     "ipopt.warm_start_mult_bound_push": 1e-6,
     "ipopt.mu_init": 1e-3,
 }
-CLOSE_ENOUGH = 5e-4  # [m] shortfall of clearance at waypoints that ends the loop
 TOLERABLE_BETWEEN = KEEP - 6e-4  # [m] of the clearance asked for between waypoints that may be missing there
-FIRST_RADIUS, RESTART_RADIUS, MIN_RADIUS, SHRINK = 0.5, 0.2, 5e-3, 0.4  # trust region, [m] and [rad]
 EARLY = 0.05  # [m] shortfall of clearance below which collisions between waypoints count
 NEARLY_FREE = 0.01  # [m] shortfall of clearance below which limits on rates count
 POSE_TOLERANCE = 1e-4  # [m] and [rad]
 RATE_TOLERANCE = 1e-4  # relative
 DRIFT = 0.4  # of what is allowed between waypoints; norms of three residuals are up to √3 larger
-BLOCK = 10  # waypoints that share a radius
-SLACK = 2e-3  # [m] of shortfall, summed over a block, that does not matter
 WORTHWHILE = 0.05  # relative decrease of the objective for which a feasible motion is improved further
 PENALTY_GROWTH, PENALTY_LIMIT = 4.0, 2000.0
 
@@ -238,7 +235,7 @@ def solve(
 
 def _iterate(loop: _Loop, callback: Callable[[Iteration], None] | None, interrupt: Interrupt) -> None:
     """Run rounds until everything holds, nothing helps any more, or time is up."""
-    solution, started, region = loop.solution, time.perf_counter(), _Region(loop.problem.segments)
+    solution, started, region = loop.solution, time.perf_counter(), TrustRegion(loop.problem.segments)
     feasible: NDArray[np.float64] | None = None
     for _ in range(loop.options.max_outer):
         if time.perf_counter() > loop.deadline:
@@ -282,43 +279,3 @@ def _iterate(loop: _Loop, callback: Callable[[Iteration], None] | None, interrup
             region.restart()
     if feasible is not None:  # rounds after the first feasible one only made it shorter, or failed to
         solution.z = feasible
-
-
-class _Region:
-    """How far waypoints may move in a round: the same for all of a block, so that trouble in one place does not hold up others.
-
-    Attributes:
-        radius: Of each waypoint, shape (N,) [m] and [rad].
-    """
-
-    def __init__(self, segments: int) -> None:
-        self.block = np.arange(segments) * max(1, round(segments / BLOCK)) // segments
-        self.radius = np.full(segments, FIRST_RADIUS)
-
-    def adapt(self, before: NDArray[np.float64], trial: _Trial, accepted: bool, ratio: float) -> None:
-        """Widen blocks where what was promised came true, narrow those where it did not."""
-        blocks = int(self.block[-1]) + 1
-        promised, actual, worse = np.zeros(blocks), np.zeros(blocks), np.zeros(blocks, bool)
-        np.add.at(promised, self.block, before - trial.slack)
-        np.add.at(actual, self.block, before - trial.shortfall)
-        step = np.zeros(blocks)
-        np.maximum.at(step, self.block, trial.step)
-        worse = (promised - actual > SLACK) & (actual < 0.25 * promised)
-        if not accepted and not worse.any():
-            worse[:] = True
-        good = (actual > 0.7 * promised - SLACK) & accepted & (ratio > 0.25)
-        factor = np.where(worse, 0.0, np.where(good, 1.5, 1.0))
-        radius = np.array([self.radius[self.block == b][0] for b in range(blocks)])
-        radius = np.where(worse, SHRINK * np.minimum(radius, step), radius * factor)
-        self.radius = np.maximum(radius, 1e-6)[self.block]
-
-    def stuck(self, trial: _Trial, shortfall: NDArray[np.float64]) -> bool:
-        """Return whether nothing moves any more where something is in the way."""
-        bad = shortfall > CLOSE_ENOUGH
-        if not bad.any():
-            bad[:] = True
-        return bool((np.minimum(self.radius, trial.step)[bad] < MIN_RADIUS).all())
-
-    def restart(self) -> None:
-        """Begin again, less boldly."""
-        self.radius = np.full(len(self.radius), RESTART_RADIUS)

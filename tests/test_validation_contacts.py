@@ -73,6 +73,9 @@ def test_what_a_carried_thing_rests_on_where_it_is_taken_and_left() -> None:
     assert {("stick.stick", "board"), ("stick.stick", "other"), ("stick.stick", "near")} <= resting
     assert all(found[pair] == CONTACT for pair in resting)
     assert {pair: found[pair] for pair in found if pair[0] in HANDS} == hand_on("stick.stick")
+    wide = pairs(scene, carried(scene, aside=1.0).motion(), dist_safe=0.15)  # the wrist is that close when the hand closes
+    robots = set(scene.robot.links)
+    assert {pair for pair in wide if pair[0] in robots} == set(hand_on("stick.stick"))
     tight = pairs(scene, carried(scene, aside=1.0).motion(), dist_safe=1e-3 / 2)
     assert tight == hand_on("stick.stick")  # everything is 1 mm away at least
 

@@ -151,6 +151,27 @@ def test_what_is_held_through_a_stick_follows_its_tip() -> None:
         assert_same(at, lifted(BALL, [0.0, 0.3, 0.0]))
 
 
+def test_a_ball_that_rolls_on_the_tip() -> None:
+    """About its own centre: the tip stays on it, wherever the stick's own frame is."""
+    scene, script = fetched()
+    roll, count = np.pi / 2, len(script.rows)
+    angles = [roll + 0.4 * np.sin(np.linspace(0.0, 3.0, count)), 0.3 * np.sin(np.linspace(0.0, 2.0, count))]
+    motion = script.motion(ball__pull_x=angles[0], ball__pull_y=angles[1])
+    first = motion.phases[1].first
+
+    def on_tip(x: float, y: float) -> pin.SE3:
+        return tool_at(pin.SE3.Identity(), "ball", "pull", (x, y, 0.0)).inverse()
+
+    stick = placements(scene, motion, "stick", motion.times[[first]])[0]
+    offset = (stick * TIP * on_tip(angles[0][first], angles[1][first])).inverse() * BALL
+    for phase in (1, 2, 3):
+        times = inside(motion, phase, 15)
+        balls, sticks = (placements(scene, motion, name, times) for name in ("ball", "stick"))
+        for k, (ball, stick) in enumerate(zip(balls, sticks, strict=True)):
+            x, y = (float(np.interp(times[k], motion.times, column)) for column in angles)
+            assert_same(ball, stick * TIP * on_tip(x, y) * offset)
+
+
 def test_what_is_held_at_the_start_is_where_the_hand_has_it() -> None:
     scene = room(objects=("stick",)).with_held({"stick": "grip"}, at={"stick": (-0.04, 0.5)})
     world = World(scene)

@@ -58,7 +58,7 @@ def test_a_thin_obstacle_between_waypoints(monkeypatch: pytest.MonkeyPatch) -> N
 def test_planes_are_asked_for_at_both_ends_of_the_segment() -> None:
     problem, z = straight(past_a_post())
     assert problem.evaluate_contacts(z, reach=0.02).clearance() == np.inf
-    found = collisions_between(problem, z)
+    found, _ = collisions_between(problem, z)
     labels = problem.contacts.phases[0].labels
     assert {labels[j] for j in found.pair[:, 1]} == {"post"}
     assert all(labels[i].startswith("gripper") for i in found.pair[:, 0])
@@ -70,7 +70,7 @@ def test_planes_are_asked_for_at_both_ends_of_the_segment() -> None:
 
 def test_what_is_asked_for_is_what_is_missing_in_between() -> None:
     problem, z = straight(past_a_post())
-    found = collisions_between(problem, z)
+    found, _ = collisions_between(problem, z)
     states = sub_states(problem, z, 2, 400)
     dense = problem.contacts.evaluate(states, np.full(len(states), 3), reach=KEEP + CLOSE)
     pairs = np.unique(found.pair, axis=0)
@@ -84,7 +84,7 @@ def test_what_is_asked_for_is_what_is_missing_in_between() -> None:
 def test_lifting_both_ends_lifts_what_is_between_to_first_order() -> None:
     """Moving both waypoints by ε along the normal moves the sub-state's distance by ε, up to ε²."""
     problem, z = straight(past_a_post())
-    found = collisions_between(problem, z)
+    found, _ = collisions_between(problem, z)
     index = int(np.argmax(found.margin - found.distance))
     pair, normal = found.pair[index], found.normal[index]
 
@@ -108,14 +108,14 @@ def test_a_start_that_is_close_to_something_may_leave_it() -> None:
     assert 0.0 < scene.start_clearance() < KEEP
     problem = build(scene, [vkc.GoTo(-1.0, 0.0, 0.0)], options=FEW)
     away = through(scene, scene.start, moved(scene.start, x=-1.0), steps=FEW.reach_waypoints).positions[1:]
-    assert len(collisions_between(problem, away).waypoint) == 0
+    assert len(collisions_between(problem, away)[0].waypoint) == 0
     into = through(scene, scene.start, moved(scene.start, x=1.0), steps=FEW.reach_waypoints).positions[1:]
-    assert 0 in collisions_between(problem, into).waypoint
+    assert 0 in collisions_between(problem, into)[0].waypoint
 
 
 def test_merged_contacts_are_in_order() -> None:
     problem, z = straight(past_a_post())
-    found = collisions_between(problem, z)
+    found, _ = collisions_between(problem, z)
     near = problem.evaluate_contacts(z, reach=0.3)
     both = merge(near, found)
     assert len(both.waypoint) == len(near.waypoint) + len(found.waypoint)
@@ -129,4 +129,4 @@ def test_merged_contacts_are_in_order() -> None:
 
 def test_standing_still_has_nothing_in_between() -> None:
     problem, _ = straight(hall().with_start(arm=ARM))
-    assert len(collisions_between(problem, np.tile(problem.start, (problem.segments, 1))).waypoint) == 0
+    assert len(collisions_between(problem, np.tile(problem.start, (problem.segments, 1)))[0].waypoint) == 0

@@ -13,10 +13,11 @@ __all__ = ["collisions_between", "merge"]
 SPACING = 0.02  # [m] or [rad] between the states looked at first, in the coordinate that moves most
 CLOSE, FINER = 0.015, 8  # [m] where something is as close as that, so many times more states are looked at
 KEEP = 1e-2  # [m] clearance asked for between waypoints
+ENOUGH = 6e-4  # [m] clearance there that will do
 
 
-def collisions_between(problem: TrajectoryProblem, z: NDArray[np.float64]) -> Contacts:
-    """Return contacts at waypoints that stand for collisions inside the segments around them.
+def collisions_between(problem: TrajectoryProblem, z: NDArray[np.float64]) -> tuple[Contacts, bool]:
+    """Return contacts at waypoints that stand for closeness inside the segments around them, and whether all is far enough.
 
     At a sub-state (1 − s)·z_t + s·z_{t+1} with distance d < KEEP (or than the pair's margin, where that is less), the witness
     points, fixed in their bodies, are carried to both waypoints. There n·(b − a) has some value v; asking for v + KEEP − d at
@@ -27,7 +28,8 @@ def collisions_between(problem: TrajectoryProblem, z: NDArray[np.float64]) -> Co
         z: z_1..z_N, shape (N, n).
 
     Returns:
-        Contacts at z_1..z_N, whose margin exceeds their distance by what is missing in between.
+        Contacts at z_1..z_N, whose margin exceeds their distance by what is missing in between (or falls below it by what
+        is to spare: they guard against what is close already), and whether no sub-state is closer than `ENOUGH`.
     """
     path = problem.waypoints(z)
     counts = np.maximum(np.ceil(np.abs(np.diff(path, axis=0)).max(axis=1) / SPACING).astype(int), 1)
@@ -38,7 +40,7 @@ def collisions_between(problem: TrajectoryProblem, z: NDArray[np.float64]) -> Co
     rows = np.unique(near.waypoint)
     segment, begin, length = segment[rows], piece[rows] / counts[segment[rows]], 1 / counts[segment[rows]]
     if not len(rows):
-        return _empty()
+        return _empty(), True
     segment = np.repeat(segment, FINER)
     s = (begin[:, None] + length[:, None] * (np.arange(FINER) + 0.5) / FINER).ravel()
     states, waypoints = _states(path, segment, s)
@@ -61,7 +63,7 @@ def collisions_between(problem: TrajectoryProblem, z: NDArray[np.float64]) -> Co
         inside = waypoint > 0  # the start cannot be moved
         part = Contacts(waypoint - 1, found.pair, value, value + keep - found.distance, found.normal, points[0], points[1])
         parts.append(part.select(np.flatnonzero(inside)))
-    return merge(*parts)
+    return merge(*parts), bool(np.all(found.distance >= np.minimum(ENOUGH, keep)))
 
 
 def _states(

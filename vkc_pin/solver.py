@@ -14,7 +14,7 @@ from vkc_pin.contact import Contacts
 from vkc_pin.monitor import Interrupt, interruptible
 from vkc_pin.pose import ROW_BOUNDS
 from vkc_pin.problem import TrajectoryProblem
-from vkc_pin.refinement import KEEP, collisions_between, merge
+from vkc_pin.refinement import collisions_between, merge
 from vkc_pin.solution import Iteration, Solution
 from vkc_pin.trust_region import CLOSE_ENOUGH, TrustRegion
 
@@ -39,7 +39,6 @@ _WARM: Mapping[str, Any] = {
     "ipopt.warm_start_mult_bound_push": 1e-6,
     "ipopt.mu_init": 1e-3,
 }
-TOLERABLE_BETWEEN = KEEP - 6e-4  # [m] of the clearance asked for between waypoints that may be missing there
 EARLY = 0.05  # [m] shortfall of clearance below which collisions between waypoints count
 NEARLY_FREE = 0.01  # [m] shortfall of clearance below which limits on rates count
 POSE_TOLERANCE = 1e-4  # [m] and [rad]
@@ -60,6 +59,7 @@ class _Trial:
     contacts: Contacts
     shortfall: NDArray[np.float64]
     clear: bool
+    between: bool
     rate: float
     step: NDArray[np.float64]
     satisfied: bool
@@ -90,24 +90,23 @@ class _Loop:
         found = self.problem.evaluate_contacts(z, reach=self.options.contact_reach, nearest=self.options.contact_slots)
         clear = found.violation() < CLOSE_ENOUGH
         if self.between:
-            collisions = collisions_between(self.problem, z)
-            clear = clear and collisions.violation() < TOLERABLE_BETWEEN
-            found = merge(found, collisions)
+            collisions, free = collisions_between(self.problem, z)
+            found, clear = merge(found, collisions), clear and free
         self.solution.timings["coal"] += time.perf_counter() - begin
         return found, clear
 
-    def free_between(self, z: NDArray[np.float64]) -> bool:
+    def free_between(self, trial: _Trial) -> bool:
         """Return whether nothing collides between waypoints; if something does, look there from now on."""
-        if not self.between:
-            begin = time.perf_counter()
-            found = collisions_between(self.problem, z)
-            self.solution.timings["coal"] += time.perf_counter() - begin
-            if found.violation() >= TOLERABLE_BETWEEN:
-                self.between = True
-                self.at = merge(self.at, found)
-                self.shortfall = self.at.shortfall(self.problem.segments)
-                return False
-        return True
+        if trial.between:
+            return trial.clear
+        begin = time.perf_counter()
+        found, free = collisions_between(self.problem, trial.z)
+        self.solution.timings["coal"] += time.perf_counter() - begin
+        if not free and not self.between:
+            self.between = True
+            self.at = merge(self.at, found)
+            self.shortfall = self.at.shortfall(self.problem.segments)
+        return free
 
     def try_step(self, radius: NDArray[np.float64]) -> _Trial:
         """Solve within `radius` of the current waypoints, and look at what is really there."""
@@ -121,6 +120,7 @@ class _Loop:
             contacts=contacts,
             shortfall=contacts.shortfall(self.problem.segments),
             clear=clear,
+            between=self.between,
             rate=self.problem.rate_violation(z),
             step=np.abs(z - self.z).max(axis=1),
             satisfied=satisfied,
@@ -143,7 +143,7 @@ class _Loop:
         self.objective, self.pose_error = trial.objective, trial.pose_error
         self.solution.z = trial.z
         if not self.between and 0.0 < trial.contacts.violation() < EARLY:
-            self.free_between(trial.z)
+            self.free_between(trial)
         if trial.rate > RATE_TOLERANCE and trial.contacts.violation() < NEARLY_FREE:  # before, it only costs time
             self.problem.stretch(trial.z)
             if not self.rates and self.problem.rate_violation(trial.z) > RATE_TOLERANCE:
@@ -157,7 +157,7 @@ class _Loop:
             and trial.pose_error < POSE_TOLERANCE
             and self.problem.rate_violation(trial.z) <= RATE_TOLERANCE
             and self.problem.drift(trial.z) < DRIFT
-            and self.free_between(trial.z)
+            and self.free_between(trial)
         )
 
     def raise_penalty(self) -> None:

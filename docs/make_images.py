@@ -1,4 +1,7 @@
-"""Makes the pictures in docs/images: plans the door, or loads a saved plan of it, and looks at it. Needs Chromium."""
+"""Makes the pictures in docs/images: plans the door and the use of a stick, looks at both, and at scenes. Needs Chromium.
+
+Usage: make_images.py [DOOR [STICK]]: saved plans (.npz) to show instead of planning them.
+"""
 
 from __future__ import annotations
 
@@ -6,31 +9,60 @@ import sys
 import tempfile
 from pathlib import Path
 
+import numpy as np
+
+import vkc_pin as vkc
+from vkc_pin import drawing, visualization
+from vkc_pin.viewpoint import Viewpoint
+
 ROOT = Path(__file__).parent.parent
 IMAGES = ROOT / "docs" / "images"
-MOMENT = 14.0  # [s] of the motion: the door is half open
+WIDE, SMALL = (1200, 640), (640, 400)  # [pixels]
+HALF_OPEN = 14.0  # [s] of the motion at the door
+UNDER_THE_TABLE = (-0.4, 2.4, 0.4), (-4.2, -0.6, 2.0)  # what to look at, and from where [m]
+WHOLE_ROOM = (0.5, 0.3, 0.0), (-8.6, -5.4, 5.4)
+
+sys.path.insert(0, str(ROOT / "tests"))
+from browser import screenshot  # noqa: E402
+
+
+def look(target: tuple[float, ...], position: tuple[float, ...]) -> None:
+    """Take this camera instead of one that is chosen for the motion as a whole."""
+    drawing.choose_viewpoint = lambda *_: Viewpoint(np.array(target), np.array(position))  # type: ignore[assignment]
+
+
+def picture(shown: vkc.Plan | vkc.Scene, name: str, size: tuple[int, int], time: float | None = None) -> None:
+    """Write the picture of a plan at `time` [s], or of a scene."""
+    with tempfile.TemporaryDirectory() as folder:
+        screenshot(visualization.to_html(shown, Path(folder) / "page.html"), IMAGES / f"{name}.png", time=time, size=size)
+
+
+def plots(plan: vkc.Plan, prefix: str, *names: str) -> None:
+    """Write some of a plan's plots."""
+    with tempfile.TemporaryDirectory() as folder:
+        plan.plot(folder)
+        for name in names:
+            (IMAGES / f"{prefix}_{name}.png").write_bytes((Path(folder) / f"{name}.png").read_bytes())
 
 
 def main() -> int:
     """Write the pictures; return 1 if there is no motion to show."""
-    sys.path.insert(0, str(ROOT / "tests"))
-    from browser import screenshot
-
-    import vkc_pin as vkc
-
-    if len(sys.argv) > 1:
-        plan = vkc.Plan.load(sys.argv[1])
-    else:
-        plan = vkc.plan(vkc.load_scene("door"), [vkc.Actuate("door", {"hinge": 1.2})])
-    sys.stdout.write(plan.report() + "\n")
-    if not plan.success:
-        return 1
-    with tempfile.TemporaryDirectory() as folder:
-        page = plan.to_html(Path(folder) / "door.html")
-        screenshot(page, IMAGES / "door.png", time=min(MOMENT, float(plan.trajectory.times[-1])), size=(1200, 640))
-        plan.plot(folder)
-        for name in ("joints", "clearance", "top_view"):
-            (IMAGES / f"door_{name}.png").write_bytes((Path(folder) / f"{name}.png").read_bytes())
+    saved = [vkc.Plan.load(name) for name in sys.argv[1:]]
+    use = [vkc.Grasp("stick"), vkc.Touch("stick.tip", (-1, 3.897, 0.1))]
+    door = saved[0] if saved else vkc.plan(vkc.load_scene("door"), [vkc.Actuate("door", {"hinge": 1.2})])
+    stick = saved[1] if len(saved) > 1 else vkc.plan(vkc.load_scene("init_3"), use, initialization="astar")
+    for plan in (door, stick):
+        sys.stdout.write(plan.report() + "\n")
+        if not plan.success:
+            return 1
+    picture(door, "door", WIDE, HALF_OPEN)
+    plots(door, "door", "joints", "clearance", "top_view")
+    plots(stick, "stick", "top_view")
+    look(*UNDER_THE_TABLE)
+    picture(stick, "stick", WIDE, float(stick.trajectory.times[-1]))
+    look(*WHOLE_ROOM)
+    for name in ("init_1", "init_2", "init_3"):
+        picture(vkc.load_scene(name), name, SMALL)
     return 0
 
 

@@ -42,10 +42,10 @@ def test_a_thin_obstacle_between_waypoints(monkeypatch: pytest.MonkeyPatch) -> N
     assert plan.trajectory.arm_effort() + plan.trajectory.base_effort() > WIDTH + 0.02  # it went round the post
 
     problem, _ = straight(scene)
-    nothing = collisions_between(problem, np.tile(problem.start, (problem.segments, 1)))
-    assert nothing.violation() == 0.0
+    nothing, free = collisions_between(problem, np.tile(problem.start, (problem.segments, 1)))
+    assert free and nothing.violation() == 0.0
     nothing = nothing.select(np.zeros(0, int))
-    monkeypatch.setattr("vkc_pin.solver.collisions_between", lambda problem, z: nothing)
+    monkeypatch.setattr("vkc_pin.solver.collisions_between", lambda problem, z: (nothing, True))
     blind = vkc.plan(scene, steps, options=FEW, initialization="interpolated")
     assert not blind.success
     assert blind.status == "rejected"  # the solver was content, validation was not

@@ -394,6 +394,22 @@ def test_a_touch_on_the_way_is_no_touch() -> None:
     assert {v.subject for v in report.violations if v.constraint == "goal"} == {"stick.tip"}
 
 
+def test_a_tip_may_touch_a_ball() -> None:
+    """Which could be carried away, but stands there."""
+    beside = pin.SE3(STICK.rotation, BALL.translation - np.array([0.0, 0.285, 0.0]))
+    there = reaching(tool_at(beside), above(STICK))
+    start = moved_base(there, y=-0.1)
+    scene = room(stand(), objects=("stick", "ball")).with_held({"stick": "grip"}).with_start(base=start[:3], arm=start[3:])
+    motion = Script(scene).go(there).motion()
+    side = BALL.translation - np.array([0.0, 0.035, 0.0])
+    report = validate(scene, [vkc.Touch("stick.tip", side)], motion)
+    assert report.ok, "\n".join(report.lines())
+    assert names(validate(scene, [vkc.GoTo(0.0, 0.0)], motion)) & {
+        ("clearance", "stick.tip – ball.ball"),
+        ("penetration", "stick.tip – ball.ball"),
+    }
+
+
 def test_touches_in_the_wrong_order() -> None:
     scene = room().with_held({"stick": "grip"})
     one, two = moved_base(scene.start, y=0.3), moved_base(scene.start, y=0.3, x=-0.2)

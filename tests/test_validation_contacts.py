@@ -128,5 +128,25 @@ def test_a_frame_and_what_is_at_its_target() -> None:
             found = pairs(scene, still(scene), [Touch("stick.tip", target)])
             assert found == ({("stick.tip", "wall"): CONTACT} if near else {})
     assert pairs(scene, still(scene), [Touch("forearm_link", (0.8, 0.9, 0.75))]) == {("forearm_link", "wall"): CONTACT}
+    door = door_scene()
+    lever = door.objects["door"].link_placement("lever").act(np.array([-0.1, 0.06, 0.0]))
+    assert ("forearm_link", "door.lever") in pairs(door, still(door), [Touch("forearm_link", lever)])
     corner = pairs(scene, still(scene), [Touch("stick.tip", (0.8, 1.0, TOP + 0.01))], dist_safe=0.7)
     assert corner == {("stick.tip", "wall"): CONTACT, ("stick.tip", "table"): CONTACT, ("stick.tip", FLOOR): CONTACT}
+
+
+def test_what_can_be_carried_itself_may_be_touched_where_it_is_then() -> None:
+    """A ball that is put somewhere, and touched there; and it does not touch itself."""
+    scene = room(table(), objects=("stick", "ball"))
+    side = BALL.translation - np.array([0.0, 0.035, 0.0])
+    touch = [Touch("stick.tip", side)]
+    assert pairs(scene, still(scene), touch) == {("stick.tip", "ball.ball"): CONTACT}
+    assert pairs(scene, still(scene), [Touch("ball.ball", side)]) == {}
+    moved = with_object(scene, "ball", lifted(BALL, [0.0, 0.5, 0.0]))
+    assert pairs(moved, still(moved), touch) == {}
+    tool = scene.tool_placement()
+    held = with_object(scene, "ball", tool)
+    script = Script(held).take("ball", "grip", (0.0, 0.0, 0.0)).go(moved_base(held.start, y=0.5))
+    assert ("stick.tip", "ball.ball") not in pairs(held, script.motion(), [Touch("stick.tip", tool.translation)])
+    there = [Touch("stick.tip", tool.translation + np.array([0.0, 0.5, 0.0]))]
+    assert ("stick.tip", "ball.ball") in pairs(held, script.motion(), there)

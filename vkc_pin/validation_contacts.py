@@ -27,7 +27,7 @@ def may_touch(
 
     These pairs need no clearance: the robot's touch links and the link that is grasped; what is held through something and
     the link that holds it; a free object that is carried, and what is within `dist_safe` of it where it is taken or left;
-    the link that a `Touch` brings somewhere, and what is within `dist_safe` of the target.
+    the link that a `Touch` brings somewhere, and what is within `dist_safe` of the target at the end of some phase.
 
     Args:
         scene: Where it happens.
@@ -66,17 +66,20 @@ def may_touch(
                 if shape_distance(shapes[i].geometry, geometry.oMg[i], shapes[j].geometry, geometry.oMg[j]) < dist_safe:
                     allowed.setdefault((min(i, j), max(i, j)), CONTACT)
 
-    for step in steps:
-        if not isinstance(step, Touch):
-            continue
-        target = step.target.translation if isinstance(step.target, pin.SE3) else np.array(step.target)
-        point, where = coal.Sphere(1e-4), pin.SE3(np.eye(3), target)
-        near = {
-            label
-            for label, shape in zip(labels, shapes, strict=True)
-            if shape.parentJoint == 0 and shape_distance(point, where, shape.geometry, shape.placement) < dist_safe
-        }
-        allow({step.frame}, near, CONTACT)
+    touches = [step for step in steps if isinstance(step, Touch)]
+    ends = [phase.last for phase in trajectory.phases] if touches else []
+    for row in world.positions(trajectory)[ends]:
+        pin.updateGeometryPlacements(world.model, data, world.collision, geometry, world.coordinates.q(row))
+        for step in touches:
+            target = step.target.translation if isinstance(step.target, pin.SE3) else np.array(step.target)
+            point, where = coal.Sphere(1e-4), pin.SE3(np.eye(3), target)
+            near = {
+                labels[j]
+                for j in range(robots, len(labels))
+                if labels[j].partition(".")[0] != step.frame.partition(".")[0]
+                and shape_distance(point, where, shapes[j].geometry, geometry.oMg[j]) < dist_safe
+            }
+            allow({step.frame}, near, CONTACT)
     return allowed
 
 

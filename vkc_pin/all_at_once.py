@@ -15,7 +15,7 @@ from vkc_pin.scene import Scene
 from vkc_pin.step_by_step import joined, stages, summed
 from vkc_pin.steps import Step
 
-__all__ = ["all_at_once"]
+__all__ = ["all_at_once", "seed_of"]
 
 
 def all_at_once(scene: Scene, steps: Sequence[Step], settings: Settings) -> Plan:
@@ -38,14 +38,16 @@ def all_at_once(scene: Scene, steps: Sequence[Step], settings: Settings) -> Plan
     plans = [plan for _, plan in parts]
     if len(parts) == 1 and len(whole.task.phases) == len(parts[0][0].task.phases):  # the other steps change nothing
         return whole.run()
-    if plans[-1].status == "interrupted":
+    # A stationary seed knows nothing of the steps: for all of them it is no better than for the one that failed.
+    hopeless = settings.initialization == "stationary" and not plans[-1].success
+    if plans[-1].status == "interrupted" or hopeless:
         return joined(scene, whole.task.steps, settings, plans)
     spent = [plan.metrics for plan in plans]
     if plans[-1].success:
-        result = OneProblem(scene, steps, _left(settings, spent)).run(lambda problem: _seed(problem, parts))
+        result = OneProblem(scene, steps, _left(settings, spent)).run(lambda problem: seed_of(problem, parts))
         if not result.success:  # what the steps came to on their own is a motion all the same
-            result = joined(scene, whole.task.steps, settings, [*plans])
-            spent = []
+            spent = [result.metrics]
+            result = joined(scene, whole.task.steps, settings, plans)
         if result.success or result.status == "interrupted":
             return dataclasses.replace(result, metrics={**result.metrics, **summed([result.metrics, *spent])})
     result = OneProblem(scene, steps, _left(settings, spent)).run()
@@ -60,7 +62,7 @@ def _left(settings: Settings, spent: Sequence[Mapping[str, float]]) -> Settings:
     return dataclasses.replace(settings, time_limit=max(settings.time_limit - used, 1e-3))
 
 
-def _seed(problem: TrajectoryProblem, parts: Sequence[tuple[OneProblem, Plan]]) -> Seed:
+def seed_of(problem: TrajectoryProblem, parts: Sequence[tuple[OneProblem, Plan]]) -> Seed:
     """Return the waypoints of the steps' own problems as those of the whole problem."""
     chain = problem.chain
     z = np.full((problem.segments, chain.size), np.nan)

@@ -13,11 +13,11 @@ from vkc_pin.problem import TrajectoryProblem
 
 __all__ = ["clear_out", "point_jacobians"]
 
-_ROUNDS = 8
+_ROUNDS = 10
 _ROWS = 6  # contacts of a configuration that are looked at in one round
-_SPARE = 5e-3  # [m] further than the margin
+_SPARE = 1e-2  # [m] further than the margin
 _LONGEST = 0.25  # [m] and [rad], of one round's step in one coordinate
-_DAMPING = 1e-3
+_DAMPING = 3e-4
 
 
 def clear_out(

@@ -52,8 +52,10 @@ def test_python_runs(code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 
 def test_readme_is_brief() -> None:
-    (code,) = blocks(ROOT / "README.md", "python")
-    assert len([line for line in code.splitlines() if line.strip()]) <= 10
+    found = blocks(ROOT / "README.md", "python")
+    assert len(found) >= 2
+    for code in found:
+        assert len([line for line in code.splitlines() if line.strip()]) <= 10
 
 
 def test_yaml_examples_fit_their_schemas(tmp_path: Path) -> None:
@@ -193,13 +195,36 @@ def test_nothing_upstream_imports_anything_downstream() -> None:
     assert wrong == []
 
 
+def test_ways_of_the_base_know_neither_chain_nor_program() -> None:
+    own = {module for module in imports() if module.startswith("base_")}
+    assert len(own) >= 5
+    assert [(m, sorted(i)) for m, i in imports(lazy=True).items() if m in own and i - own - {"errors"}] == []
+
+
 def test_validation_does_not_know_the_optimiser() -> None:
-    graph = imports(lazy=True)
-    optimiser = {"cpin", "chain", "contact", "problem", "transcription", "waypoint", "pose", "solver", "planner"}
-    for module in ("validation", "validation_samples", "validation_pairs", "validation_goals", "world", "motion", "clearance"):
+    graph, (_, _, base, program, solver, answer) = imports(lazy=True), tables()
+    assert {"base_search"} <= set(base)
+    assert {"cpin", "chain", "contact", "pose", "problem", "easing"} <= set(program)
+    assert {"initialization", "refinement", "solver"} <= set(solver)
+    optimiser = {*base, *program, *solver, "planner", "one_problem", "step_by_step", "all_at_once", "unfold"} - {"steps"}
+    checking = [module for module in answer if module.startswith("validation")]
+    assert len(checking) >= 5
+    for module in (*checking, "world", "motion", "clearance"):
         seen, todo = set[str](), [module]
         while todo:
             new = graph[todo.pop()] - seen
             seen |= new
             todo += new
         assert not seen & optimiser, module
+
+
+def test_few_modules_import_casadi() -> None:
+    named = read("docs/architecture.md").split("- Only `cpin`")[1].split("import CasADi")[0]
+    found = set()
+    for file in (ROOT / "vkc_pin").rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            modules = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            modules += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            if any(module.split(".")[0] == "casadi" for module in modules):
+                found.add(file.relative_to(ROOT / "vkc_pin").with_suffix("").parts[0])
+    assert found | {"cpin"} == {"cpin", *re.findall(r"`(\w+)`", named)}

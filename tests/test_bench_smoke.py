@@ -1,0 +1,110 @@
+"""The experiment from the command line, for real, on two starts."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vkc_pin.benchmarks.initialization import TARGET
+from vkc_pin.cli import main
+from vkc_pin.scene import load_scene
+
+FIELDS = {
+    *("key", "scene", "method", "number", "repeat", "perturbation", "start", "seed", "success", "status", "planning_time"),
+    *("base_effort", "base_effort_l1", "arm_effort", "clearance", "closure_error", "iterations", "rounds", "waypoints"),
+    *("initialization", "build_time", "failed_constraint", "violations"),
+    *(f"time_{part}" for part in ("initialization", "coal", "casadi", "ipopt", "validation")),
+}
+
+
+def check(trial: dict[str, Any], method: str, number: int) -> None:
+    """A record must agree with itself."""
+    assert set(trial) == FIELDS
+    assert trial["key"] == f"init_1/{number:04d}/000/{method}"
+    assert (trial["scene"], trial["method"], trial["number"], trial["repeat"]) == ("init_1", method, number, 0)
+    assert trial["success"] is True, (trial["status"], trial["violations"])
+    assert (trial["status"], trial["failed_constraint"], trial["violations"]) == ("success", None, [])
+    assert 0.0 <= trial["clearance"] < 0.02  # the stick is near the table and the cube
+    assert 0.0 <= trial["closure_error"] <= 1e-3
+    assert trial["base_effort"] <= trial["base_effort_l1"] <= np.sqrt(2.0) * trial["base_effort"]
+    assert trial["arm_effort"] > 0.5
+    start, stick = np.array(trial["start"]), load_scene("init_1").objects["stick"].placement.translation
+    # From the start to within reach of the stick, and from there to within reach of the cube; the stick makes the arm longer.
+    reach = 1.4
+    farther = np.linalg.norm(start[:2] - stick[:2]) - reach + np.linalg.norm(stick[:2] - TARGET[:2]) - 2 * reach - 0.5
+    assert farther > 2.0
+    assert trial["base_effort"] > farther
+    parts = [trial[name] for name in trial if name.startswith("time_")]
+    assert all(part >= 0.0 for part in parts)
+    assert 0.0 < sum(parts) <= trial["planning_time"] < 60.0
+    assert trial["waypoints"] == 82  # two times 40 segments, the start, and a pause for the gripper
+    assert trial["iterations"] >= trial["rounds"] >= 1
+
+
+@pytest.mark.slow
+def test_initialization(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "tmp"
+    command = ["bench", "initialization", "--starts", "2", "--scenes", "init_1", "--methods", "astar", "--jobs", "1", "--quiet"]
+    assert main([*command, "--out", str(out)]) == 0
+    said = capsys.readouterr()
+    assert {path.name for path in out.iterdir()} == {"results.json", "results.csv", "table.md", "success.png", "trials.jsonl"}
+
+    result = json.loads((out / "results.json").read_text(encoding="utf-8"))
+    assert (result["meta"]["scenes"], result["meta"]["methods"], result["meta"]["starts"]) == (["init_1"], ["astar"], 2)
+    assert sum(session["trials"] for session in result["meta"]["sessions"]) == len(result["trials"]) == 2
+    for number, trial in enumerate(result["trials"]):
+        check(trial, "astar", number)
+        assert trial["initialization"].startswith("astar")
+    assert result["trials"][0]["start"] != result["trials"][1]["start"]
+
+    with (out / "results.csv").open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [row["key"] for row in rows] == [trial["key"] for trial in result["trials"]]
+    for row, trial in zip(rows, result["trials"], strict=True):
+        assert set(row) == FIELDS
+        assert (row["success"], row["status"], row["failed_constraint"]) == ("true", "success", "")
+        for name in ("planning_time", "base_effort", "arm_effort", "start"):
+            assert json.loads(row[name]) == trial[name]
+
+    table = (out / "table.md").read_text(encoding="utf-8")
+    assert table in said.out
+    (line,) = [line for line in table.splitlines() if line.startswith("| init_1")]
+    cells = [cell.strip() for cell in line.strip("|").split("|")]
+    assert cells[:3] == ["init_1: no obstacle", "astar", "2 of 2"]
+    medians = (np.median([trial[name] for trial in result["trials"]]) for name in ("planning_time", "base_effort", "arm_effort"))
+    assert [cells[3], cells[5], cells[6]] == [f"{value:.2f}" for value in medians]
+    assert cells[7] == "none"
+    assert "step after step" not in table  # that is compared with "auto" only
+    picture = (out / "success.png").read_bytes()
+    assert picture.startswith(b"\x89PNG\r\n\x1a\n")
+    assert len(picture) > 5000
+
+    # The same command again has nothing left to do.
+    before = {name: (out / name).read_bytes() for name in ("trials.jsonl", "results.json", "results.csv", "table.md")}
+    assert main([*command, "--out", str(out)]) == 0
+    assert {name: (out / name).read_bytes() for name in before} == before
+    # Another experiment in this folder is refused.
+    assert main([*command, "--seed", "1", "--out", str(out)]) == 2
+    assert "seed" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_auto_is_compared_with_step_after_step(tmp_path: Path) -> None:
+    command = ["bench", "initialization", "--starts", "1", "--scenes", "init_1", "--methods", "auto", "--jobs", "1", "--quiet"]
+    assert main([*command, "--out", str(tmp_path)]) == 0
+    trials = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))["trials"]
+    assert [trial["method"] for trial in trials] == ["auto", "step after step"]
+    for trial in trials:
+        check(trial, trial["method"], 0)
+    assert trials[0]["start"] == trials[1]["start"]
+    compared = (tmp_path / "table.md").read_text(encoding="utf-8").split("## One problem against step after step")[1]
+    for name, field in (("base [m]", "base_effort"), ("arm [rad]", "arm_effort")):
+        (line,) = [line for line in compared.splitlines() if line.startswith(f"| init_1: no obstacle | {name} |")]
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        assert [cell.split(" ")[0] for cell in cells[2:4]] == [f"{trial[field]:.2f}" for trial in trials]
+        assert cells[4] == f"{int(trials[0][field] < trials[1][field] - 1e-6)} of 1"

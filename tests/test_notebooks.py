@@ -1,0 +1,105 @@
+"""Every notebook runs from top to bottom, and its cells show what they should."""
+
+from __future__ import annotations
+
+import base64
+import re
+import time
+from pathlib import Path
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+NOTEBOOKS = sorted((Path(__file__).resolve().parents[1] / "notebooks").glob("*.ipynb"))
+Cells = dict[str, nbformat.NotebookNode]
+
+
+def load(path: Path) -> nbformat.NotebookNode:
+    return nbformat.read(path, as_version=4)
+
+
+def executed(name: str, folder: Path) -> Cells:
+    """Run a notebook in a folder of its own; return its cells by their ids."""
+    (path,) = (path for path in NOTEBOOKS if path.stem == name)
+    notebook = load(path)
+    NotebookClient(notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(folder)}}).execute()
+    return {cell.id: cell for cell in notebook.cells}
+
+
+def text(cell: nbformat.NotebookNode) -> str:
+    """Return what a cell printed."""
+    return "".join(output.text for output in cell.outputs if output.output_type == "stream" and output.name == "stdout")
+
+
+def result(cell: nbformat.NotebookNode) -> nbformat.NotebookNode:
+    """Return the data of a cell's value, by MIME type."""
+    (found,) = (output.data for output in cell.outputs if output.output_type == "execute_result")
+    return found
+
+
+def size(cell: nbformat.NotebookNode) -> tuple[int, int]:
+    """Return width and height of the PNG that a cell shows [pixels]."""
+    data = base64.b64decode(result(cell)["image/png"])
+    assert data.startswith(b"\x89PNG\r\n\x1a\n")
+    return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
+
+
+def table(markdown: str) -> list[dict[str, str]]:
+    """Return the rows of a table in Markdown."""
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in markdown.splitlines()]
+    return [dict(zip(rows[0], row, strict=True)) for row in rows[2:]]
+
+
+def test_every_notebook_is_tested() -> None:
+    tested = set(re.findall(r'executed\("(\w+)"', Path(__file__).read_text(encoding="utf-8")))
+    assert NOTEBOOKS
+    assert {path.stem for path in NOTEBOOKS} == tested
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebooks_are_kept_without_outputs(path: Path) -> None:
+    notebook = load(path)
+    nbformat.validate(notebook)
+    assert notebook.metadata.kernelspec.name == "python3"
+    assert set(notebook.metadata) == {"kernelspec", "language_info"}
+    for cell in notebook.cells:
+        assert not cell.metadata, cell.id
+        if cell.cell_type == "code":
+            assert (cell.outputs, cell.execution_count) == ([], None), cell.id
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_initialization(tmp_path: Path) -> None:
+    began = time.perf_counter()
+    cells = executed("05_initialization", tmp_path)
+    assert time.perf_counter() - began < 150.0  # less than a minute on a machine that does nothing else
+
+    report = text(cells["plan"])
+    assert report.startswith("init_3: success — reach stick.grip, touch with stick.tip")
+    assert "every constraint holds" in report
+    view = result(cells["show"])["text/html"]
+    assert "iframe" in view
+    assert "init_3" in view
+    assert len(view) > 100_000  # the whole film, so that it stays in a saved notebook
+    assert min(size(cells["top-view"])) > 300
+
+    grasp = re.findall(r"(grip_\w+): ([+-][\d.]+) within \[([-\d.]+), ([-\d.]+)\], moves by (\S+)", text(cells["grip"]))
+    assert [name for name, *_ in grasp] == ["grip_slide", "grip_turn"]
+    for _, value, lower, upper, moved in grasp:
+        assert float(lower) - 1e-3 <= float(value) <= float(upper) + 1e-3
+        assert float(moved) < 1e-5
+
+    good, number = map(int, re.findall(r"\d+", result(cells["run"])["text/plain"]))
+    rows = table(result(cells["table"])["text/markdown"])
+    asked = [(scene, method) for scene in ("init_1", "init_2", "init_3", "all") for method in ("interpolated", "astar")]
+    assert [(row["scene"], row["method"]) for row in rows] == asked
+    counts = {(row["scene"], row["method"]): tuple(map(int, row["success"].split(" of "))) for row in rows}
+    assert all(counts[scene, method][1] == (6 if scene == "all" else 2) for scene, method in asked)
+    assert (good, number) == tuple(sum(counts["all", method][k] for method in ("interpolated", "astar")) for k in (0, 1))
+    assert counts["all", "astar"][0] == 6  # the way around works from everywhere
+    assert min(size(cells["chart"])) > 300
+
+    written = {path.name for path in (tmp_path / "few_starts").iterdir()}
+    assert written == {"results.csv", "results.json", "success.png", "table.md", "trials.jsonl"}

@@ -387,3 +387,15 @@ def test_every_phase_says_where_everything_is() -> None:
     for before, after in zip(task.phases[:-1], task.phases[1:], strict=True):
         assert set(after.held) == ({*before.held, *before.grasps} - set(after.leaves))
         assert set(after.lifted) == {hold for hold in before.grasps if hold in after.held and hold.object in ("stick", "ball")}
+
+
+def test_a_door_is_not_held_through_a_stick() -> None:
+    with pytest.raises(InputError, match="stands fixed") as caught:
+        phases(Grasp("stick"), Grasp("door", by="stick.tip"))
+    assert caught.value.field == "steps[1].by"
+
+
+def test_an_object_that_is_not_there_is_missed_by_its_name() -> None:
+    with pytest.raises(InputError, match="stick") as caught:
+        phases(Touch("stik.tip", POINT))
+    assert caught.value.field == "steps[0].frame"

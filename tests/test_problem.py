@@ -17,6 +17,7 @@ from vkc_pin.hold import Hold
 from vkc_pin.options import Options
 from vkc_pin.problem import TrajectoryProblem, build
 from vkc_pin.robot import load_robot
+from vkc_pin.scene import load_scene
 from vkc_pin.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
 from vkc_pin.unfold import as_trajectory
 
@@ -524,3 +525,16 @@ def test_scene_steps_and_options_are_left_as_they_were() -> None:
 def test_steps_that_cannot_be_are_refused(steps: list[Step], error: type[Exception], match: str) -> None:
     with pytest.raises(error, match=match):
         build(door_scene(), steps, options=SHORT)
+
+
+@pytest.mark.parametrize("waypoints", [1, 3, 10])
+def test_a_grasp_is_chosen_within_its_own_phase(waypoints: int) -> None:
+    """What an earlier grasp chose does not bind a later one, however short the phases are."""
+    scene, few = load_scene("init_1"), Options(reach_waypoints=waypoints)
+    aside = Place("stick", pin.SE3(np.eye(3), np.array([2.5, 0.5, 0.771])))
+    problem = build(scene, [aside, Grasp("stick")], options=few)
+    clamped = problem.transcription.structure.clamped
+    spans = sorted({(first, last) for _, first, last in clamped})
+    assert len(spans) == 2
+    assert spans[0][1] < spans[1][0]
+    assert all(name.startswith("approach") == (waypoints > 1) for name in problem.pose_names if "approach" in name)

@@ -319,6 +319,26 @@ def test_placed_and_taken_away_again() -> None:
     assert ("goal", "stick.stick") in names(validate(hall(), wrong, motion))
 
 
+def test_placed_before_its_turn() -> None:
+    """First the drive, then the stick was asked for; it is done the other way round."""
+    script = carried_over(hall())
+    motion = script.go(moved_base(hall().start, y=1.0)).motion()
+    assert validate(hall(), [PLACED, vkc.GoTo(0.0, 1.0)], motion).ok
+    back = carried_over(hall()).motion()
+    (x, y) = back.positions[-1, :2]
+    assert names(validate(hall(), [vkc.GoTo(float(x), float(y)), PLACED], back)) == {("order", "stick")}
+
+
+def test_left_behind() -> None:
+    """What was taken must still be in the hand at the next step's end, unless it was to be let go of."""
+    motion = carried_over(hall()).motion()
+    goto = vkc.GoTo(*map(float, motion.positions[-1, :2]))
+    assert validate(hall(), [vkc.Grasp("stick"), vkc.Release(), goto], motion).ok
+    found = only(validate(hall(), [vkc.Grasp("stick"), goto], motion))
+    assert (found.constraint, found.subject) == ("goal", "stick")
+    assert "not in the hand" in found.detail
+
+
 # --- touching ---------------------------------------------------------------------------------------------------------
 
 

@@ -64,9 +64,10 @@ def eased_pairs(
         if not goal.touches:
             continue
         point, where = coal.Sphere(1e-4), pin.SE3(np.eye(3), goal.placement.translation)
-        label = str(goal)
+        joint, _ = chain.frame(goal.frame, goal.hold)
         for k, (i, j, margin) in enumerate(pairs):
-            if labels[i] == label and shapes[j].parentJoint == 0:
+            touching = labels[i] == str(goal) if goal.hold else shapes[i].parentJoint == joint
+            if touching and shapes[j].parentJoint == 0:
                 distance = shape_distance(point, where, shapes[j].geometry, shapes[j].placement)
                 if distance < margin:
                     eased.setdefault(k, []).append((begin, end, SHARE * max(distance, 0.0)))

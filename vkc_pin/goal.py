@@ -114,6 +114,8 @@ class _Compiler:
             if self.held:
                 kind = "the robot has one hand, and it holds"
                 raise InputError(f"{kind} {self.held[0]}", field=f"{where}.object", expected="Place or Release before", got=name)
+        if not placed.object.free and through is not None:
+            raise InputError(f"'{name}' stands fixed in the world", field=f"{where}.by", expected="the hand itself", got=repr(by))
         if not placed.object.free:
             other = next((h for h in self.holds if h.object == name and h != hold), None)
             if other is not None:
@@ -220,6 +222,8 @@ class _Compiler:
                 raise InputError(problem, field=f"{where}.frame", expected="a link of a free object, or a frame of the robot")
             _check_link(placed, link, f"{where}.frame")
             hold = self._hold_of(owner) or self.grasp(owner, None, where)
+        elif dot and step.frame not in [f.name for f in self.scene.robot.model.frames]:
+            raise UnknownNameError("object", owner, self.scene.objects, field=f"{where}.frame")
         else:
             link = self._robot_frame(step.frame, f"{where}.frame")
         self._let_go_of_fixed()
@@ -268,7 +272,6 @@ class _Compiler:
         self.held = tuple(h for h in self.held if h != hold)
         if self.scene.objects[hold.object].object.free:
             self.standing[hold.object] = where
-            self.left.pop(hold.object, None)
 
     def _robot_frame(self, name: str | None, where: str) -> str:
         frame = name or self.scene.robot.tool_frame

@@ -80,9 +80,10 @@ class Knots:
             return z
         lower, upper = self._limits(z, waypoint)
         solver, target = self.solver(pose)
-        limits = {"lower": lower, "upper": upper, "weights": self.weights}
-        pushed = clear_out(self.problem, z, waypoint, solver, target, **limits)
-        return solver.solve(pushed, target, **limits, iterations=3, tolerance=_ROUGH)[0]
+        weights = self.weights
+        pushed = clear_out(self.problem, z, waypoint, solver, target, lower=lower, upper=upper, weights=weights)
+        exact, _ = solver.solve(pushed, target, lower=lower, upper=upper, weights=weights, iterations=3, tolerance=_ROUGH)
+        return exact
 
     def _limits(self, before: NDArray[np.float64], waypoint: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the limits of what comes from `before`, shape (B, n), at a waypoint: lower and upper, shape (B, n)."""

@@ -49,6 +49,8 @@ def pose_goals(
             joint, frame = chain.holder(hold)
             x, y, z = (options.approach * frame.rotation[:, 2]).tolist()
             at = max(int(first) + 1, int(last) - options.approach_waypoints)
+            if at == last:  # no room for it
+                continue
             rows.append(PoseRow(closure.joint, closure.local, (at,), shift=(joint, (x, y, z))))
             targets.append(target)
             names.append(f"approach {hold}")

@@ -82,7 +82,11 @@ class TrajectoryProblem:
         weights = np.full(self.chain.size, o.velocity_weight_object)
         weights[:robot], weights[:3] = o.velocity_weight_arm, o.velocity_weight_base
         # From the straight way to the grasp on: there the hand must already be where it will close.
-        clamped = tuple((column, max(grasp - o.approach_waypoints, 1), last) for column, grasp, last in self.choices)
+        starts = np.concatenate([[0], self.ends[:-1]])
+        begin = {int(end): int(start) for start, end in zip(starts, self.ends, strict=True)}
+        clamped = tuple(
+            (column, max(grasp - o.approach_waypoints, begin[grasp] + 1), last) for column, grasp, last in self.choices
+        )
         weights[[column for column, _, _ in clamped]] = _CHOICE_WEIGHT
         acceleration = weights * o.acceleration_weight / o.dt**2
         # The robot stands still while its gripper closes or opens.

@@ -150,6 +150,8 @@ class Touch:
     target: Any
 
     def __post_init__(self) -> None:
+        if not isinstance(self.frame, str):
+            raise InputError("not a frame", field="Touch.frame", expected="<object>.<link>, e.g. stick.tip", got=repr(self.frame))
         object.__setattr__(self, "target", as_target(self.target, name="Touch.target"))
 
 

@@ -79,8 +79,17 @@ def may_touch(
                 if labels[j].partition(".")[0] != step.frame.partition(".")[0]
                 and shape_distance(point, where, shapes[j].geometry, geometry.oMg[j]) < dist_safe
             }
-            allow({step.frame}, near, CONTACT)
+            allow(_links_of(scene, step.frame), near, CONTACT)
     return allowed
+
+
+def _links_of(scene: Scene, frame: str) -> set[str]:
+    """Return the labels of the links that a `Touch` brings somewhere: those that its frame is fixed to."""
+    if frame.partition(".")[0] in scene.objects:
+        return {frame}
+    robot = scene.robot
+    joint = robot.model.frames[robot.model.getFrameId(frame)].parentJoint
+    return {robot.link_of(i) for i, shape in enumerate(robot.collision.geometryObjects) if shape.parentJoint == joint}
 
 
 def _taken_and_left(scene: Scene, world: World, trajectory: Trajectory) -> list[tuple[str, NDArray[np.float64]]]:

@@ -69,12 +69,17 @@ def check_steps(samples: Samples, steps: Sequence[Step]) -> None:
 def check_goals(samples: Samples, steps: Sequence[Step], options: Options) -> list[Violation]:
     """Check that every step is done, in their order: "goal" and "order".
 
-    There must be a phase for each step at whose end the step's goal holds, the last step's at the end of the motion; and
-    in the phases that lead from one to the next, no object may move but the one that the step actuates.
+    There must be a phase for each step at whose end the step's goal holds, with everything in the hand that the steps have
+    put there, the last step's at the end of the motion; and in the phases that lead from one to the next, no object may move
+    but the one that the step actuates, and no free object of a step be carried when it is not to be in the hand.
     """
     phases = samples.trajectory.phases
     ends = [0, *(phase.last for phase in phases)]  # a step may be done before anything begins
-    misses = [[_misses(samples, step, k, options) for k in range(len(ends))] for step in steps]
+    hands = _in_hand(samples, steps)
+    misses = [
+        [_misses(samples, step, k, options) + _dropped(samples, steps, hands, number, k) for k in range(len(ends))]
+        for number, step in enumerate(steps)
+    ]
     found, reached = [], 0
     for number in range(len(steps)):
         candidates = [len(ends) - 1] if number == len(steps) - 1 else range(reached, len(ends))
@@ -85,14 +90,47 @@ def check_goals(samples: Samples, steps: Sequence[Step], options: Options) -> li
             found += [Violation("goal", m.subject, ends[best], time, m.amount, m.unit, m.detail) for m in misses[number][best]]
         else:
             reached = fit
-    return found or _check_order(samples, steps, [[not missing for missing in row] for row in misses])
+    return found or _check_order(samples, steps, hands, [[not missing for missing in row] for row in misses])
 
 
-def _check_order(samples: Samples, steps: Sequence[Step], holds: list[list[bool]]) -> list[Violation]:
-    """Check that no object moves before its step's turn; `holds[i][k]` says whether step i holds at the start of phase k."""
+def _in_hand(samples: Samples, steps: Sequence[Step]) -> list[set[str]]:
+    """Return which free objects the steps want in the hand before the first and after each of them."""
+    objects = samples.scene.objects
+    held = {name: samples.scene.held_by.get(name, "") for name in samples.scene.held if objects[name].object.free}
+    hands = [set(held)]
+    for step in steps:
+        owner = step.frame.partition(".")[0] if isinstance(step, Touch) else getattr(step, "object", None)
+        if isinstance(step, Grasp | Touch) and owner is not None and owner in objects and objects[owner].object.free:
+            held.setdefault(owner, (step.by or "") if isinstance(step, Grasp) else "")
+        if isinstance(step, Place | Release):
+            gone = set(held) if owner is None else {owner}
+            while more := {name for name, by in held.items() if by.partition(".")[0] in gone} - gone:
+                gone |= more
+            held = {name: by for name, by in held.items() if name not in gone}
+        hands.append(set(held))
+    return hands
+
+
+def _dropped(samples: Samples, steps: Sequence[Step], hands: list[set[str]], number: int, end: int) -> list[Miss]:
+    """Return what should be in the hand when a step is done, after `end` phases, and is not."""
     phases = samples.trajectory.phases
-    moved = [_moved(samples, k) for k in range(len(phases))]
-    own = [{step.object} if isinstance(step, Actuate) else set() for step in steps]
+    near = {owner for phase in phases[max(end - 1, 0) : end + 1] for owner in phase.held}
+    near |= set() if end else set(samples.scene.held)
+    wanted = set(hands[number + 1])
+    step = steps[number]
+    if isinstance(step, Grasp) and number == len(steps) - 1:
+        wanted.discard(step.object)  # taken hold of, and nothing more
+    return [Miss(name, 1.0, "holds", "is not in the hand") for name in sorted(wanted - near)]
+
+
+def _check_order(samples: Samples, steps: Sequence[Step], hands: list[set[str]], holds: list[list[bool]]) -> list[Violation]:
+    """Check that nothing moves before its step's turn; `holds[i][k]` says whether step i holds at the start of phase k."""
+    phases = samples.trajectory.phases
+    named = set().union(*hands, *({step.object} for step in steps if isinstance(step, Place)))
+    moved = [_moved(samples, k) | _carried(samples, k, named) for k in range(len(phases))]
+    own = [
+        hands[i] | hands[i + 1] | ({step.object} if isinstance(step, Actuate | Place) else set()) for i, step in enumerate(steps)
+    ]
     turns = {0}  # which step may be the one that is being done
     for k in range(len(phases) + 1):
         for turn in range(len(steps) - 1):
@@ -119,6 +157,18 @@ def _check_order(samples: Samples, steps: Sequence[Step], holds: list[list[bool]
 
 def _kind(step: Step) -> str:
     return type(step).__name__
+
+
+def _carried(samples: Samples, number: int, named: set[str]) -> dict[str, tuple[float, str]]:
+    """Return those of some free objects that are in the hand in a phase, and how far they go."""
+    phase, world = samples.trajectory.phases[number], samples.world
+    rows = samples.z[samples.rows(phase)]
+    carried = {}
+    for owner in phase.held:
+        if owner in named:
+            way = np.diff(rows[:, world.placement_columns(owner)][:, :3], axis=0)
+            carried[owner] = (float(np.linalg.norm(way, axis=1).sum()), "m")
+    return carried
 
 
 def _moved(samples: Samples, number: int) -> dict[str, tuple[float, str]]:

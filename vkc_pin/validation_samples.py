@@ -78,6 +78,8 @@ class Samples:
         owner, _, link = frame.partition(".")
         if owner not in self.scene.objects:
             raise UnknownNameError("object", owner, self.scene.objects, field=field)
+        if not self.scene.objects[owner].object.free:
+            raise InputError("it stands fixed in the world", field=field, expected="a link of a free object", got=frame)
         links = [f.name for f in self.scene.objects[owner].object.model.frames if f.type == pin.FrameType.BODY]
         if link not in links:
             raise UnknownNameError(f"link of '{owner}'", link, links, field=field)

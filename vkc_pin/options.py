@@ -16,9 +16,9 @@ class Options:
     """How to plan. Every field is checked when the object is made.
 
     Attributes:
-        dt: Time between two waypoints [s].
+        dt: Least time between two waypoints [s]; motions that are too long for it take more.
         grasp_time: How long the robot stands still at a grasp or release, for the gripper to close or open [s].
-        reach_waypoints: Segments of a phase in which nothing is held.
+        reach_waypoints: Segments of a phase that drives or reaches, with or without something in the hand.
         turn_waypoints: Segments of a phase in which a latch is released.
         move_waypoints: Segments of a phase in which a held object is moved.
         dist_safe: Clearance to keep at the waypoints [m].

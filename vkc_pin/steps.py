@@ -69,6 +69,9 @@ def as_target(target: Any, *, name: str) -> pin.SE3 | tuple[float, float, float]
         point = np.asarray(target, float) if not isinstance(target, pin.SE3) else None
     except (TypeError, ValueError):
         point = None
+    if point is not None and point.ndim == 1 and point.shape not in ((3,), (6,)):
+        expected = "a point (x, y, z), or a pose: a pinocchio.SE3, a 4 x 4 matrix or (x, y, z, roll, pitch, yaw)"
+        raise InputError("not a pose or a point", field=name, expected=expected, got=repr(target))
     if point is None or point.shape != (3,):
         return as_placement(target, name=name)
     if not np.all(np.isfinite(point)):

@@ -324,6 +324,7 @@ def test_a_real_stop_leaves_what_was_done_and_no_process(tmp_path: Path, jobs: i
     process = subprocess.Popen(
         [sys.executable, "-c", SCRIPT, str(tmp_path), str(jobs)],
         start_new_session=True,  # a group of its own, as of a command in a terminal
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a shell's background job ignores it, and hands that on
         stderr=subprocess.PIPE,
         text=True,
         env={**os.environ, "PYTHONPATH": path},

@@ -41,7 +41,8 @@ def plan(
         options: How to plan; `Options()` if left out.
         callback: Called after every round of the solver with an `Iteration`, whose fields are named columns.
         time_limit: Seconds of planning after which the best iterate is returned, with status "time limit".
-        seed: Of the random numbers. The same seed gives the same trajectory on the same machine.
+        seed: Of the random numbers. The same calls in a new process give the same trajectory on the same machine; what was
+            planned before in a process can change the last digits.
         joint: Plan all steps as one problem; otherwise each from where the one before it ends, for comparison.
         perturbation: Standard deviation of smooth noise on the seeds, [m] and [rad], to see how much hangs on them.
 

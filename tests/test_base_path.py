@@ -44,7 +44,7 @@ def check(
         way = b[:2] - a[:2]
         length = np.hypot(*way)
         if length > 1e-9:  # a drive: straight ahead or back
-            assert a[2] == b[2]
+            assert abs(a[2] - b[2]) < 1e-9  # the path takes headings that are closer for one
             ahead = way @ (np.cos(a[2]), np.sin(a[2]))
             if abs(ahead) == pytest.approx(length, abs=1e-9):
                 cost += length * (1.0 if ahead > 0.0 else BACKWARDS)
@@ -71,6 +71,7 @@ def find(
 
 @settings(max_examples=15, deadline=None)
 @given(st.integers(0, 2**32 - 1))
+@example(280)  # a drive whose ends differ in heading by a rounding error
 @example(955485)  # a move from near the start to near a goal, which in between is near neither
 def test_nothing_is_hit_all_along_a_path(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -43,15 +43,18 @@ def all_at_once(scene: Scene, steps: Sequence[Step], settings: Settings) -> Plan
     if plans[-1].status == "interrupted" or hopeless:
         return joined(scene, whole.task.steps, settings, plans)
     spent = [plan.metrics for plan in plans]
-    if plans[-1].success:
+    result = plans[-1]
+    if result.success:
         result = OneProblem(scene, steps, _left(settings, spent)).run(lambda problem: seed_of(problem, parts))
+        spent.append(result.metrics)
         if not result.success:  # what the steps came to on their own is a motion all the same
-            spent = [result.metrics]
-            result = joined(scene, whole.task.steps, settings, plans)
-        if result.success or result.status == "interrupted":
-            return dataclasses.replace(result, metrics={**result.metrics, **summed([result.metrics, *spent])})
-    result = OneProblem(scene, steps, _left(settings, spent)).run()
-    return dataclasses.replace(result, metrics={**result.metrics, **summed([result.metrics, *spent])})
+            apart = joined(scene, whole.task.steps, settings, plans)
+            spent = [apart.metrics, spent[-1]]
+            result = apart if apart.success else result
+    if not result.success and result.status != "interrupted":
+        result = OneProblem(scene, steps, _left(settings, spent)).run()
+        spent.append(result.metrics)
+    return dataclasses.replace(result, metrics={**result.metrics, **summed(spent)})
 
 
 def _left(settings: Settings, spent: Sequence[Mapping[str, float]]) -> Settings:

@@ -82,7 +82,6 @@ class OneProblem:
         self.times = dict.fromkeys(TIMES, 0.0)
         self.rounds = self.iterations = 0
         self.history: list[dict[str, float]] = []
-        self.given = False  # whether the only seed was given
         self.blocked: list[str] = []  # phases in which there is no way for the base
 
     def run(self, seed: Callable[[TrajectoryProblem], Seed] | None = None) -> Plan:
@@ -99,14 +98,16 @@ class OneProblem:
             best, status = self._stationary(problem), "infeasible"
             best = dataclasses.replace(best, report=best.report.with_reasons(reasons))
         else:
-            self.given = seed is not None
             seeds = self._seeds(problem) if seed is None else iter([seed(problem)])
-            best, status = self._try_seeds(problem, seeds, np.inf if limit is None else began + build_time + limit)
+            deadline = np.inf if limit is None else began + build_time + limit
+            best, status = self._try_seeds(problem, seeds, deadline, searched=seed is None)
         self.z = best.z
         build_time += problem.transcription.take_build_time()
         return self._plan(best, status, time.perf_counter() - began - build_time, build_time)
 
-    def _try_seeds(self, problem: TrajectoryProblem, seeds: Iterator[Seed], deadline: float) -> tuple[_Try, str]:
+    def _try_seeds(
+        self, problem: TrajectoryProblem, seeds: Iterator[Seed], deadline: float, *, searched: bool
+    ) -> tuple[_Try, str]:
         """Return the best try, with what is in the way of the task if it is no success, and the plan's status."""
         best: _Try | None = None
         notes: list[str] = []
@@ -121,7 +122,7 @@ class OneProblem:
                 if solution.status in ("time limit", "interrupted"):
                     status = solution.status
                     break
-                if number == 1 and not self.given and not _ends_free(problem, seed):
+                if number == 1 and searched and not _ends_free(problem, seed):
                     notes = explain(problem, self.settings.seed)
                 elif notes:  # two seeds failed, and random configurations find no free one at a goal either
                     break

@@ -38,6 +38,7 @@ def transcribe(structure: Structure) -> Transcription:
     key = structure.key
     if key in _transcriptions:
         _transcriptions.move_to_end(key)
+        _transcriptions[key].take_build_time()  # that was somebody else's
     else:
         _transcriptions[key] = Transcription(structure)
         while len(_transcriptions) > _KEPT:

@@ -14,6 +14,7 @@ from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.scene import Scene
 from vkc_pin.step_by_step import joined, stages, summed
 from vkc_pin.steps import Step
+from vkc_pin.trajectory import filled
 
 __all__ = ["all_at_once", "seed_of"]
 
@@ -78,10 +79,6 @@ def seed_of(problem: TrajectoryProblem, parts: Sequence[tuple[OneProblem, Plan]]
         end = begin + one.problem.segments
         z[begin:end, [chain.index(name) for name in one.problem.chain.names]] = one.z
         begin = end
-    for column, values in enumerate(z.T):  # what a part does not know stays as it was, or is as it will be
-        known = np.flatnonzero(~np.isnan(values))
-        if len(known):
-            values[:] = values[known[np.maximum(np.searchsorted(known, np.arange(len(values)), side="right") - 1, 0)]]
-        else:
-            values[:] = problem.start[column]
+    z = filled(z)
+    z = np.where(np.isnan(z), problem.start, z)  # no part moves it
     return Seed(", ".join(plan.initialization for _, plan in parts) + ", then all at once", z)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vkc_pin.errors import InputError, UnknownNameError
 
-__all__ = ["PhaseSpan", "Trajectory", "join"]
+__all__ = ["PhaseSpan", "Trajectory", "filled", "join"]
 
 
 @dataclass(frozen=True)
@@ -202,11 +202,20 @@ def join(parts: Sequence[Trajectory], *, pause: float) -> Trajectory:
         for k, phase in enumerate(part.phases):
             first = phases[-1].last if phases else 0
             phases.append(replace(phase, first=first if k == 0 else phase.first + shift, last=phase.last + shift))
-    table = np.array(rows)
-    for column in table.T:  # the last value that is known, or else the next
+    return Trajectory(tuple(names), np.array(times), filled(np.array(rows)), tuple(phases), robot)
+
+
+def filled(table: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return waypoints, shape (T, n), with what is not known (NaN) as it was last, or else as it will be next.
+
+    A coordinate that is known nowhere stays so.
+    """
+    table = table.copy()
+    for column in table.T:
         known = np.flatnonzero(~np.isnan(column))
-        column[:] = column[known[np.maximum(np.searchsorted(known, np.arange(len(column)), side="right") - 1, 0)]]
-    return Trajectory(tuple(names), np.array(times), table, tuple(phases), robot)
+        if len(known):
+            column[:] = column[known[np.maximum(np.searchsorted(known, np.arange(len(column)), side="right") - 1, 0)]]
+    return table
 
 
 def _numbers(values: Any, name: str) -> NDArray[np.float64]:

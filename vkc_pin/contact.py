@@ -22,7 +22,7 @@ from vkc_pin.broadphase import PhaseGeometry
 from vkc_pin.chain import VirtualKinematicChain
 from vkc_pin.easing import eased_pairs
 from vkc_pin.errors import InputError
-from vkc_pin.geometry import bounding_box
+from vkc_pin.geometry import bounding_box, link_name, own_name
 from vkc_pin.hold import Hold
 from vkc_pin.options import Options
 from vkc_pin.scene import FLOOR, Scene, standing_geometry
@@ -101,7 +101,7 @@ class ContactModel:
         robots = range(len(robot.collision.geometryObjects))
         labels = [robot.link_of(i) for i in robots]
         for hold, indices in chain.held_geometries.items():
-            labels += [f"{hold.object}.{_link(geometry.geometryObjects[i])}" for i in indices]
+            labels += [f"{hold.object}.{link_name(own_name(geometry.geometryObjects[i].name))}" for i in indices]
         pairs = [(pair.first, pair.second, margin) for pair in robot.collision.collisionPairs]
         moving = list(robots)
         for hold in phase.held:
@@ -120,11 +120,11 @@ class ContactModel:
                 placed = dataclasses.replace(placed, placement=phase.standing.get(name, placed.placement))
             standing = standing_geometry(placed.with_state(state))
             if name in mine:  # its frame stands on, the rest is in the hand
-                held_shapes = {geometry.geometryObjects[i].name.rpartition(".")[2] for i in mine[name]}
+                held_shapes = {own_name(geometry.geometryObjects[i].name) for i in mine[name]}
                 standing = [shape for shape in standing if shape.name not in held_shapes]
             near = {self._grasped(h): self._touching(h) for h in (*phase.leaves, *phase.grasps) if h.object == name}
             for j in graft_geometry(geometry, standing, joints=[0], placement=pin.SE3.Identity(), prefix=f"{name}."):
-                labels.append(f"{name}.{_link(geometry.geometryObjects[j])}")
+                labels.append(link_name(geometry.geometryObjects[j].name))
                 close = near.get(labels[j], ())
                 own = mine.get(name, ())
                 pairs += [(i, j, self.options.grasp_clearance if labels[i] in close else margin) for i in moving if i not in own]
@@ -268,8 +268,3 @@ def _accurate(data: pin.GeometryData, pairs: int) -> pin.GeometryData:
         data.distanceRequests[k] = coal.DistanceRequest()
         data.distanceRequests[k].gjk_tolerance = 1e-8
     return data
-
-
-def _link(geometry: pin.GeometryObject) -> str:
-    """Return the link's name: Pinocchio calls its geometries `<link>_<number>`."""
-    return str(geometry.name).split(".")[-1].rpartition("_")[0]

@@ -21,6 +21,8 @@ __all__ = [
     "bounding_box",
     "clearance",
     "copy_shape",
+    "link_name",
+    "own_name",
     "placed_shapes",
     "shape_distance",
     "standing_geometry",
@@ -104,6 +106,16 @@ def copy_shape(shape: pin.GeometryObject, name: str, placement: pin.SE3) -> pin.
     copy = pin.GeometryObject(shape)
     copy.name, copy.parentJoint, copy.parentFrame, copy.placement = name, 0, 0, clean(placement)
     return copy
+
+
+def link_name(shape_name: str) -> str:
+    """Return the name of the link that a shape belongs to: Pinocchio calls its shapes `<link>_<number>`."""
+    return shape_name.rpartition("_")[0]
+
+
+def own_name(shape_name: str) -> str:
+    """Return the name in its object of a shape that is called `<object>.<own name>`."""
+    return shape_name.partition(".")[2]
 
 
 def placed_shapes(shapes: Iterable[pin.GeometryObject]) -> list[tuple[coal.CollisionGeometry, pin.SE3]]:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from vkc_pin.coordinates import Coordinates
 from vkc_pin.documents import Document
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.geometry import link_name
 from vkc_pin.robot_files import RobotFile, find_robot, read_urdf
 from vkc_pin.robot_geometry import collision_geometry, visual_geometry
 from vkc_pin.robot_model import default_tool_frame, full_model, planned_model, rest_positions, within_limits
@@ -80,17 +81,17 @@ class Robot:
 
     def link_of(self, geometry: int) -> str:
         """Return the name of the link that shape number `geometry` of `collision` belongs to."""
-        return _link(self.collision.geometryObjects[geometry].name)
+        return link_name(self.collision.geometryObjects[geometry].name)
 
     @property
     def links(self) -> tuple[str, ...]:
         """The links that have collision geometry, each once."""
-        return tuple(dict.fromkeys(_link(shape.name) for shape in self.collision.geometryObjects))
+        return tuple(dict.fromkeys(link_name(shape.name) for shape in self.collision.geometryObjects))
 
     @property
     def base_links(self) -> tuple[str, ...]:
         """The links with collision geometry that drive along with the base: they stand on the floor."""
-        return tuple(dict.fromkeys(_link(shape.name) for shape in self.collision.geometryObjects if shape.parentJoint == 1))
+        return tuple(dict.fromkeys(link_name(shape.name) for shape in self.collision.geometryObjects if shape.parentJoint == 1))
 
     def rest(self) -> NDArray[np.float64]:
         """Return the coordinates, shape (n,), of the arm at home and the base at the origin."""
@@ -264,7 +265,3 @@ def _limits(
     if base == "fixed":
         lower[:3] = upper[:3] = 0.0
     return coordinates, lower, upper, coordinates.velocity.copy(), acceleration
-
-
-def _link(shape_name: str) -> str:
-    return shape_name.rpartition("_")[0]

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vkc_pin.assembly import graft, graft_geometry
 from vkc_pin.coordinates import Coordinates
-from vkc_pin.geometry import PlacedObject
+from vkc_pin.geometry import PlacedObject, link_name
 from vkc_pin.hold import holds_of
 from vkc_pin.scene import Scene
 from vkc_pin.trajectory import PhaseSpan, Trajectory
@@ -47,11 +47,8 @@ class World:
         self.collision = self._geometry(
             robot.collision, {name: placed.object.collision for name, placed in scene.objects.items()}, scene.obstacles
         )
-        self.collision_labels = [
-            *(_link(shape) for shape in robot.collision.geometryObjects),
-            *(f"{n}.{_link(shape)}" for n, placed in scene.objects.items() for shape in placed.object.collision.geometryObjects),
-            *scene.obstacle_labels,
-        ]
+        moving = list(self.collision.geometryObjects)[: -len(scene.obstacle_labels) or None]
+        self.collision_labels = [*(link_name(shape.name) for shape in moving), *scene.obstacle_labels]
         self.coordinates = Coordinates(self.model)
         states = [
             np.concatenate([as_numbers(placed.placement) if placed.object.free else [], placed.state])
@@ -81,7 +78,7 @@ class World:
         moving = len(shapes) - len(self.scene.obstacle_visual.geometryObjects)
         labels = []
         for shape in shapes[:moving]:
-            label = _link(shape)
+            label = link_name(shape.name)
             while label not in links and "_" in label:  # a mesh of several parts is `<link>_<number>_<part>`
                 label = label.rpartition("_")[0]
             labels.append(label)
@@ -193,8 +190,3 @@ class World:
 def as_numbers(placement: pin.SE3) -> NDArray[np.float64]:
     """Return a placement as a free joint's seven coordinates."""
     return np.asarray(pin.SE3ToXYZQUAT(placement), float)
-
-
-def _link(shape: pin.GeometryObject) -> str:
-    """Return the link's name: Pinocchio calls its geometries `<link>_<number>`."""
-    return str(shape.name).rpartition("_")[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import coal
@@ -9,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.chain import VirtualKinematicChain
-from vkc_pin.geometry import shape_distance
+from vkc_pin.geometry import own_name, shape_distance, standing_geometry
 from vkc_pin.scene import Scene
 from vkc_pin.task import Phase
 
@@ -49,13 +50,13 @@ def eased_pairs(
     moments = [(h, p, first, first + NEAR) for h, p in phase.lifted.items()]
     moments += [(h, p, last - NEAR, last) for h, p in phase.lowered.items()]
     for hold, placement, begin, end in moments:
-        held, placed = set(chain.held_geometries[hold]), scene.objects[hold.object]
-        model, data = placed.object.model, placed.object.model.createData()
-        pin.forwardKinematics(model, data, placed.object.coordinates.q(placed.state))
-        own = {s.name: placement * data.oMi[s.parentJoint] * s.placement for s in placed.object.collision.geometryObjects}
+        placed = dataclasses.replace(scene.objects[hold.object], placement=placement)
+        rests = {shape.name: shape.placement for shape in standing_geometry(placed)}
+        held = set(chain.held_geometries[hold])
         for k, (i, j, margin) in enumerate(pairs):
             if i in held and shapes[j].parentJoint == 0:
-                distance = shape_distance(shapes[i].geometry, own[_own_name(shapes[i])], shapes[j].geometry, shapes[j].placement)
+                where = rests[own_name(shapes[i].name)]
+                distance = shape_distance(shapes[i].geometry, where, shapes[j].geometry, shapes[j].placement)
                 if distance < margin:
                     eased.setdefault(k, []).append((begin, end, SHARE * max(distance, 0.0)))
     touches = [(goal, last - NEAR, last) for goal in phase.frames]
@@ -72,8 +73,3 @@ def eased_pairs(
                 if distance < margin:
                     eased.setdefault(k, []).append((begin, end, SHARE * max(distance, 0.0)))
     return eased
-
-
-def _own_name(shape: pin.GeometryObject) -> str:
-    """Return a held shape's name in its object."""
-    return str(shape.name).rpartition(".")[2]

@@ -9,11 +9,10 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from vkc_pin.hold import Hold
 from vkc_pin.inverse_kinematics import PoseSolver
+from vkc_pin.knots import Knots
 from vkc_pin.pose import PoseRow
-from vkc_pin.problem import TrajectoryProblem
-from vkc_pin.task import FrameGoal, Phase
+from vkc_pin.task import Phase
 
 __all__ = ["Approach"]
 
@@ -29,44 +28,37 @@ class Approach:
     the frame's z axis for what a frame touches.
     """
 
-    def __init__(self, problem: TrajectoryProblem) -> None:
-        self.problem, self.chain = problem, problem.chain
+    def __init__(self, knots: Knots) -> None:
+        self.knots, self.problem, self.chain = knots, knots.problem, knots.chain
         joint, local = self.chain.frame(self.chain.robot.tool_frame)
         self.joint, self.local = joint, local
         self.solver = _tool_solver(self.chain.model.saveToString(), joint, local.homogeneous.tobytes())
-        self.weights = np.ones(self.chain.size)
-        self.weights[:3] = 3.0
 
     def before(self, z: NDArray[np.float64], phase: Phase) -> NDArray[np.float64]:
         """Return configurations on the way to `z`, shape (n,), the end of a phase: shape (K, n), the last is the nearest."""
         if phase.grasps:
-            return self._way(z, -self._axis(z, phase.grasps[0]), [self.problem.options.approach])
+            return self._way(z, -self._ahead(z, self.chain.holder(phase.grasps[0])), [self.problem.options.approach])
         if phase.lowered:
             return self._way(z, np.array([0.0, 0.0, 1.0]), [LIFT])
         for goal in phase.frames:
             if goal.touches:
-                return self._way(z, -self._goal_axis(z, goal), _REACH)[::-1]
+                return self._way(z, -self._ahead(z, self.chain.frame(goal.frame, goal.hold)), _REACH)[::-1]
         return np.empty((0, len(z)))
 
     def after(self, z: NDArray[np.float64], phase: Phase, before: Phase | None) -> NDArray[np.float64]:
         """Return configurations on the way from `z`, shape (n,), the start of a phase: shape (K, n), the first is the nearest."""
         if phase.leaves:
-            return self._way(z, -self._axis(z, phase.leaves[0]), [self.problem.options.approach])
+            return self._way(z, -self._ahead(z, self.chain.holder(phase.leaves[0])), [self.problem.options.approach])
         if phase.lifted:
             return self._way(z, np.array([0.0, 0.0, 1.0]), [LIFT])
         for goal in before.frames if before else ():
             if goal.touches:
-                return self._way(z, -self._goal_axis(z, goal), _REACH)
+                return self._way(z, -self._ahead(z, self.chain.frame(goal.frame, goal.hold)), _REACH)
         return np.empty((0, len(z)))
 
-    def _axis(self, z: NDArray[np.float64], hold: Hold) -> NDArray[np.float64]:
-        """Return the direction, in the world, in which what holds something approaches it, at `z`."""
-        return self._z_axis(z, *self.chain.holder(hold))
-
-    def _goal_axis(self, z: NDArray[np.float64], goal: FrameGoal) -> NDArray[np.float64]:
-        return self._z_axis(z, *self.chain.frame(goal.frame, goal.hold))
-
-    def _z_axis(self, z: NDArray[np.float64], joint: int, local: pin.SE3) -> NDArray[np.float64]:
+    def _ahead(self, z: NDArray[np.float64], frame: tuple[int, pin.SE3]) -> NDArray[np.float64]:
+        """Return the direction of a frame's z axis in the world, at `z`: in it a hand nears what it grasps."""
+        joint, local = frame
         rotations, _ = self.chain.joint_placements(z[None])
         return np.asarray((rotations[0, joint] @ local.rotation)[:, 2])
 
@@ -75,16 +67,14 @@ class Approach:
         rotations, translations = self.chain.joint_placements(z[None])
         carrier = pin.SE3(rotations[0, self.joint], translations[0, self.joint])
         tool = carrier * self.local
-        robot = self.chain.robot.coordinates.size
-        lower, upper = z.copy(), z.copy()
-        lower[:robot], upper[:robot] = self.chain.lower[:robot], self.chain.upper[:robot]
-        for column, name in enumerate(self.chain.names[:3]):
+        lower, upper = z.copy(), z.copy()  # only the robot moves
+        for column, name in enumerate(self.chain.names[: self.knots.robot]):
             lower[column], upper[column] = self.problem.limits(name)
-        found: list[NDArray[np.float64]] = []
+        weights, found = self.knots.weights, list[NDArray[np.float64]]()
         for length in lengths:
             target = pin.SE3(tool.rotation, tool.translation + length * direction)
             start = (found[-1] if found else z)[None]
-            near, ok = self.solver.solve(start, target, lower=lower, upper=upper, weights=self.weights, tolerance=_TOLERANCE)
+            near, ok = self.solver.solve(start, target, lower=lower, upper=upper, weights=weights, tolerance=_TOLERANCE)
             if not ok[0]:
                 break
             found.append(near[0])

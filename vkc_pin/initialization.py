@@ -111,7 +111,7 @@ class _Seeds:
         self.knots = Knots(problem, np.random.default_rng(seed))
         self.routes = Routes(problem) if method == "astar" and problem.chain.robot.base != "fixed" else None
         self.beam = Beam(self.knots, self.routes)
-        self.approach = Approach(problem)
+        self.approach = Approach(self.knots)
 
     def seeds(self, count: int) -> Iterator[Seed]:
         """Yield seeds through the cheapest paths of knots: of one quick search if that is any good, then of thorough ones."""

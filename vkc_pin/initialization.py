@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,19 +77,14 @@ def initialize(
 
 def _in_turn(straight: Iterator[Seed], around: Iterator[Seed]) -> Iterator[Seed]:
     """Yield from both in turn, first what goes straight, unless that is hopeless."""
-    while True:
-        first = next(straight, None)
-        second = next(around, None) if first is None or first.shortfall > _HOPELESS else None
-        if first is None and second is None:
-            return
-        if second is not None:
-            yield second
-        if first is not None:
-            yield first
-        if second is None:
-            second = next(around, None)
-            if second is not None:
-                yield second
+    for seed in straight:
+        if seed.shortfall > _HOPELESS:
+            yield from islice(around, 1)
+            yield seed
+        else:
+            yield seed
+            yield from islice(around, 1)
+    yield from around
 
 
 def _perturbed(

@@ -156,24 +156,21 @@ class _Seeds:
             inside = [k for k, waypoint in enumerate(at) if begin <= waypoint <= end]
             s = np.concatenate([[0.0], smooth(end - begin)])
             through, when = knots[inside], [at[k] - begin for k in inside]
+            way = None
             if not problem.closed(phase):
                 through, when, leave, arrive = self._ways(through, phase, previous, end - begin)
                 if self.routes is not None:
                     steps = when[arrive] - when[leave]
                     way = self.routes.way(number, through[leave, :3], through[arrive, :3], steps)
                     if way is None:
-                        line = (
-                            f"{phase.name}: found no way for the base from {_place(through[leave])} to {_place(through[arrive])}"
-                        )
-                        if not any(note.startswith(f"{phase.name}: found no way") for note in self.notes):
-                            self.notes.append(line)
+                        self._note_no_way(phase, through[leave], through[arrive])
                         return None
                     turned = way[-1, 2] - through[arrive, 2]  # by whole turns: what follows goes on from there
                     through[arrive:, 2] += turned
                     knots[inside[-1] :, 2] += turned
             for column in range(size):
                 z[begin:end, column] = np.interp(s[1:], s[when], through[:, column])
-            if not problem.closed(phase) and self.routes is not None:
+            if way is not None:
                 z[begin + when[leave] : begin + when[arrive], :3] = way
             begin, previous = int(end), phase
         driven = self.knots.driven
@@ -186,6 +183,12 @@ class _Seeds:
                 solver, target = self.knots.solver(pose)
                 z[rows], _ = solver.solve(z[rows], target, lower=lower, upper=upper, weights=self.knots.weights, iterations=6)
         return problem.clip(z)
+
+    def _note_no_way(self, phase: Phase, first: NDArray[np.float64], last: NDArray[np.float64]) -> None:
+        """Note, once a phase, that the base finds no way between two configurations, shape (n,)."""
+        problem = f"{phase.name}: found no way for the base"
+        if not any(note.startswith(problem) for note in self.notes):
+            self.notes.append(f"{problem} from ({first[0]:.2f}, {first[1]:.2f}) to ({last[0]:.2f}, {last[1]:.2f})")
 
     def _ways(
         self, ends: NDArray[np.float64], phase: Phase, previous: Phase | None, segments: int
@@ -201,7 +204,3 @@ class _Seeds:
         when = [0, *(spacing * (1 + k) for k in range(len(first)))]
         when += [*(segments - spacing * (len(last) - k) for k in range(len(last))), segments]
         return np.vstack([ends[:1], first, last, ends[1:]]), when, len(first), len(first) + 1
-
-
-def _place(z: NDArray[np.float64]) -> str:
-    return f"({z[0]:.2f}, {z[1]:.2f})"

@@ -139,7 +139,7 @@ def test_invert_refuses_unknown_links_and_wrong_states() -> None:
 def test_door() -> None:
     door = load_object("door")
     assert door.coordinates.names == ("hinge", "knob")
-    assert door.base_link == "frame"
+    assert (door.base_link, door.links) == ("frame", ("frame", "panel", "lever"))
     assert not door.free
     np.testing.assert_array_equal(door.lower, [-1.57, 0.0])
     np.testing.assert_array_equal(door.upper, [1.57, 0.8])

@@ -100,6 +100,11 @@ class ArticulatedObject:
     def __repr__(self) -> str:
         return f"<ArticulatedObject {self.name}: joints {', '.join(self.coordinates.names) or 'none'}>"
 
+    @property
+    def links(self) -> tuple[str, ...]:
+        """The names of its links."""
+        return tuple(str(frame.name) for frame in self.model.frames if frame.type == pin.FrameType.BODY)
+
     def attachment(self, name: str | None = None) -> Attachment:
         """Return the attachment `name`, or the default one. Raises `UnknownNameError` if there is none."""
         if name is None:
@@ -153,11 +158,9 @@ def load_object(name_or_path: str | Path) -> ArticulatedObject:
 
 
 def _body_frame(obj: ArticulatedObject, link: str) -> int:
-    for index, frame in enumerate(obj.model.frames):
-        if frame.type == pin.FrameType.BODY and frame.name == link:
-            return index
-    links = [frame.name for frame in obj.model.frames if frame.type == pin.FrameType.BODY]
-    raise UnknownNameError(f"link of {obj.name}", link, links)
+    if link not in obj.links:
+        raise UnknownNameError(f"link of {obj.name}", link, obj.links)
+    return int(obj.model.getFrameId(link, pin.FrameType.BODY))
 
 
 def invert(obj: ArticulatedObject, link: str, state: ArrayLike) -> InvertedTree:

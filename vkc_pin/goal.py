@@ -304,9 +304,8 @@ class _Compiler:
 
 
 def _check_link(placed: PlacedObject, link: str, where: str) -> None:
-    links = [frame.name for frame in placed.object.model.frames if frame.type == pin.FrameType.BODY]
-    if link not in links:
-        raise UnknownNameError(f"link of '{placed.name}'", link, links, field=where)
+    if link not in placed.object.links:
+        raise UnknownNameError(f"link of '{placed.name}'", link, placed.object.links, field=where)
 
 
 def compile_task(scene: Scene, steps: Sequence[Step], options: Options, *, nothing: bool = False) -> Task:

@@ -78,11 +78,11 @@ class Samples:
         owner, _, link = frame.partition(".")
         if owner not in self.scene.objects:
             raise UnknownNameError("object", owner, self.scene.objects, field=field)
-        if not self.scene.objects[owner].object.free:
+        item = self.scene.objects[owner].object
+        if not item.free:
             raise InputError("it stands fixed in the world", field=field, expected="a link of a free object", got=frame)
-        links = [f.name for f in self.scene.objects[owner].object.model.frames if f.type == pin.FrameType.BODY]
-        if link not in links:
-            raise UnknownNameError(f"link of '{owner}'", link, links, field=field)
+        if link not in item.links:
+            raise UnknownNameError(f"link of '{owner}'", link, item.links, field=field)
 
     def _sample(self) -> tuple[NDArray[np.float64], NDArray[np.int_]]:
         """Return the times to look at, and where among them the waypoints are."""

@@ -319,7 +319,7 @@ def test_free_objects_are_grasped_where_they_stand_and_closed_nowhere_else() -> 
 def test_what_is_held_at_the_start_stays_where_the_hand_has_it(fetching: TrajectoryProblem) -> None:
     """The values at which it is clamped are the scene's, until it is let go of."""
     problem = fetching
-    assert [str(hold) for hold in problem.at_start] == ["stick.grip"]
+    assert [str(hold) for hold in problem.scene.holds] == ["stick.grip"]
     for name, value in (("stick.grip_slide", 0.02), ("stick.grip_turn", -0.1)):
         assert problem.start[problem.chain.index(name)] == value
         until = problem.ends[1]  # there both are let go of

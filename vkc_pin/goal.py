@@ -11,7 +11,7 @@ import pinocchio as pin
 
 from vkc_pin.articulation import Attachment
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.hold import Hold, holds_of
+from vkc_pin.hold import Hold
 from vkc_pin.options import Options
 from vkc_pin.scene import PlacedObject, Scene
 from vkc_pin.steps import STEPS, Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
@@ -54,7 +54,7 @@ class _Compiler:
     def __init__(self, scene: Scene, options: Options) -> None:
         self.scene, self.options = scene, options
         self.phases: list[Phase] = []
-        self.held: tuple[Hold, ...] = holds_of(scene.held, scene.held_by)
+        self.held: tuple[Hold, ...] = scene.holds
         self.holds: list[Hold] = list(self.held)
         self.initial: dict[str, float] = {}
         self.state: dict[str, float] = {}
@@ -72,7 +72,7 @@ class _Compiler:
 
     def _append(self, name: str, segments: int, **details: Any) -> None:
         last = self.phases[-1] if self.phases else None
-        before = (*last.held, *last.grasps) if last else holds_of(self.scene.held, self.scene.held_by)
+        before = (*last.held, *last.grasps) if last else self.scene.holds
         leaves = tuple(hold for hold in before if hold not in self.held)
         lifted = {hold: last.standing[hold.object] for hold in last.grasps if hold.object in last.standing} if last else {}
         phase = Phase(

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from vkc_pin.chain import VirtualKinematicChain, consolidate
 from vkc_pin.contact import ContactModel, Contacts
 from vkc_pin.goal import compile_task
-from vkc_pin.hold import Hold, holds_of
 from vkc_pin.options import Options
 from vkc_pin.pose import PoseRow, target_vector
 from vkc_pin.pose_goals import pose_goals
@@ -126,16 +125,11 @@ class TrajectoryProblem:
         start[: len(self.scene.start)] = self.scene.start
         for name, value in self.task.state.items():
             start[self.chain.index(name)] = value
-        for hold in self.at_start:
+        for hold in self.scene.holds:
             names = self.scene.objects[hold.object].object.attachment(hold.attachment).coordinates
             for name, value in zip(names, self.scene.held_at.get(hold.object, ()), strict=False):
                 start[self.chain.index(f"{hold.object}.{name}")] = value
         return start
-
-    @property
-    def at_start(self) -> tuple[Hold, ...]:
-        """What is held at the start."""
-        return holds_of(self.scene.held, self.scene.held_by)
 
     def _bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         lower, upper = np.tile(self.chain.lower, (self.segments, 1)), np.tile(self.chain.upper, (self.segments, 1))
@@ -158,7 +152,7 @@ class TrajectoryProblem:
                         turn = (goal - self.start[2] + np.pi) % (2 * np.pi) - np.pi  # to the nearest of the equal headings
                         lower[end - 1, column] = upper[end - 1, column] = self.start[2] + turn if column == 2 else goal
             begin = end
-        for hold in self.at_start:  # until it is let go of, what is clamped stays where it is
+        for hold in self.scene.holds:  # until it is let go of, what is clamped stays where it is
             if self.scene.objects[hold.object].object.attachments[hold.attachment].firm:
                 held = [hold in phase.held for phase in self.task.phases]
                 until = int(self.ends[(held.index(False) if False in held else len(held)) - 1]) if held[0] else 0

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.geometry import PlacedObject, clearance, placed_shapes, standing_geometry, within_limits
+from vkc_pin.hold import Hold, holds_of
 from vkc_pin.in_hand import check_holds, in_hand
 from vkc_pin.resources import find
 
@@ -97,6 +98,11 @@ class Scene:
             f"<Scene {self.name}: {self.robot.name}, objects {', '.join(self.objects) or 'none'}, "
             f"{len(self.obstacle_names)} obstacles>"
         )
+
+    @property
+    def holds(self) -> tuple[Hold, ...]:
+        """What the robot holds at the start, each after the hold it depends on."""
+        return holds_of(self.held, self.held_by)
 
     @staticmethod
     def from_document(document: Mapping[str, Any], folder: str | Path = ".") -> Scene:

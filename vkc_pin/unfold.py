@@ -43,7 +43,7 @@ def _settle_choices(problem: TrajectoryProblem, waypoints: NDArray[np.float64]) 
     starts = [0, *problem.ends[:-1]]
     for hold, names in problem.chain.virtual.items():
         active = np.zeros(len(waypoints), bool)
-        active[0] = hold in problem.at_start
+        active[0] = hold in problem.scene.holds
         for phase, first, last in zip(problem.task.phases, starts, problem.ends, strict=True):
             active[first : last + 1] |= hold in phase.held
             active[last] |= hold in phase.grasps

@@ -11,7 +11,7 @@ from vkc_pin.contact import Contacts
 from vkc_pin.inverse_kinematics import PoseSolver
 from vkc_pin.problem import TrajectoryProblem
 
-__all__ = ["clear_out", "point_jacobians"]
+__all__ = ["clear_out", "distance_gradients", "point_jacobians"]
 
 _ROUNDS = 10
 _ROWS = 6  # contacts of a configuration that are looked at in one round
@@ -75,13 +75,18 @@ def _contact_rows(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return gradients of the nearest distances, shape (B, rows, n), and by how much they should grow, shape (B, rows) [m]."""
     order = np.arange(len(contacts.waypoint)) - np.searchsorted(contacts.waypoint, contacts.waypoint)
+    rows, wanted = np.zeros((len(z), _ROWS, z.shape[1])), np.zeros((len(z), _ROWS))
+    rows[contacts.waypoint, order] = distance_gradients(problem, z, contacts)
+    wanted[contacts.waypoint, order] = np.maximum(contacts.margin + _SPARE - contacts.distance, 0.0)
+    return rows, wanted
+
+
+def distance_gradients(problem: TrajectoryProblem, z: NDArray[np.float64], contacts: Contacts) -> NDArray[np.float64]:
+    """Return the gradients of the distances of contacts at configurations `z`, shape (B, n): n·(∂b − ∂a), shape (C, n)."""
     joints = problem.contacts.joints_of(contacts.pair)
     first = point_jacobians(problem.chain, z, contacts.waypoint, joints[:, 0], contacts.first)
     second = point_jacobians(problem.chain, z, contacts.waypoint, joints[:, 1], contacts.second)
-    rows, wanted = np.zeros((len(z), _ROWS, z.shape[1])), np.zeros((len(z), _ROWS))
-    rows[contacts.waypoint, order] = np.einsum("ci,cij->cj", contacts.normal, second - first)
-    wanted[contacts.waypoint, order] = np.maximum(contacts.margin + _SPARE - contacts.distance, 0.0)
-    return rows, wanted
+    return np.asarray(np.einsum("ci,cij->cj", contacts.normal, second - first))
 
 
 def point_jacobians(

@@ -1,0 +1,88 @@
+"""Inverse kinematics of the arm alone: base and object stand where they were planned to, and the hand must close the chain.
+
+By the differential inverse kinematics of Pink (https://github.com/stephane-caron/pink), with joint limits.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from vkc_pin.knots import Knots
+from vkc_pin.problem import TrajectoryProblem
+
+__all__ = ["QP", "ArmKinematics"]
+
+QP = "daqp"
+"""The solver of quadratic programs, by its name in `qpsolvers`."""
+_ITERATIONS = 30
+_TOLERANCE = 1e-6  # [m] and [rad]
+_LONGEST = 0.5  # [rad] or [m] of one step in one coordinate
+_FRAME = "what closes the chain"
+
+
+class ArmKinematics:
+    """Solves for the arm at waypoints of a problem at which something is held that stands fixed in the world.
+
+    Attributes:
+        columns: The coordinates that it decides: the arm's joints, and the freedoms of its grasps.
+    """
+
+    def __init__(self, problem: TrajectoryProblem, knots: Knots) -> None:
+        self.problem, self.knots = problem, knots
+        chain = problem.chain
+        virtual = [chain.index(name) for names in chain.virtual.values() for name in names]
+        self.columns = np.array([*range(3, knots.robot), *virtual], int)
+        self._models: dict[int, pin.Model] = {}
+
+    def solve(self, z: NDArray[np.float64], waypoint: int) -> tuple[NDArray[np.float64], bool]:
+        """Return the configuration that iterations from `z`, shape (n,), lead to, and whether it closes the chain there."""
+        import pink
+
+        pose = self.knots.pose_at(waypoint)
+        if pose is None:
+            return z, True
+        model, chain = self._model(pose), self.problem.chain
+        task = pink.tasks.FrameTask(_FRAME, position_cost=1.0, orientation_cost=1.0, lm_damping=1e-3)
+        task.set_target(self.problem.targets[pose])
+        box = _Box(self.columns, chain.lower, chain.upper, z.copy())
+        configuration = pink.Configuration(model, model.createData(), chain.coordinates.q(box.z))
+        for _ in range(_ITERATIONS):
+            if np.abs(task.compute_error(configuration)).max() < _TOLERANCE:
+                return box.z, True
+            try:
+                step = pink.solve_ik(configuration, [task], 1.0, QP, damping=1e-9, limits=[box], safety_break=False)
+            except pink.exceptions.NoSolutionFound:
+                break
+            box.z = box.z + step
+            configuration.update(chain.coordinates.q(box.z))
+        return box.z, False
+
+    def _model(self, pose: int) -> pin.Model:
+        """Return the chain's model with a frame for what must be at the target of a pose."""
+        if pose not in self._models:
+            row, model = self.problem.transcription.structure.poses[pose], pin.Model(self.problem.chain.model)
+            model.addFrame(pin.Frame(_FRAME, row.joint, row.local, pin.FrameType.OP_FRAME))
+            self._models[pose] = model
+        return self._models[pose]
+
+
+class _Box:
+    """A limit in Pink's sense: joint limits, no long steps, and everything but `columns` stays where it is."""
+
+    def __init__(
+        self, columns: NDArray[np.int_], lower: NDArray[np.float64], upper: NDArray[np.float64], z: NDArray[np.float64]
+    ) -> None:
+        self.columns, self.lower, self.upper, self.z = columns, lower, upper, z
+        self._rows = np.vstack([np.eye(len(z)), -np.eye(len(z))])
+
+    def compute_qp_inequalities(self, configuration: Any, dt: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return G and h of G·δz ≤ h, shapes (2n, n) and (2n,)."""
+        most, least = np.zeros(len(self.z)), np.zeros(len(self.z))
+        at = self.columns
+        most[at] = np.clip(self.upper[at] - self.z[at], 0.0, _LONGEST)
+        least[at] = np.clip(self.lower[at] - self.z[at], -_LONGEST, 0.0)
+        return self._rows, np.concatenate([most, -least])

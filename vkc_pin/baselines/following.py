@@ -1,0 +1,101 @@
+"""The arm follows: waypoint by waypoint, while the base runs along its path and the object's joints to their goals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vkc_pin.baselines.arm_kinematics import ArmKinematics
+from vkc_pin.baselines.refining import refined
+from vkc_pin.knots import Knots
+from vkc_pin.problem import TrajectoryProblem
+
+__all__ = ["Followed", "follow"]
+
+SEEDS = 16
+"""From so many random arms inverse kinematics is tried where it leads to nothing from the waypoint before."""
+_SPREAD = 1.0  # [rad], of half of them about the waypoint before; the others are anywhere within the limits
+
+
+@dataclass(frozen=True, eq=False)
+class Followed:
+    """Where following led.
+
+    Attributes:
+        z: z_1..z_N, shape (N, n); if it failed, all stands still from there on, in what was nearest to working.
+        share: Share of the waypoints up to which it worked.
+        cause: "", "no inverse kinematics", or "collision" if all there is is not free.
+    """
+
+    z: NDArray[np.float64]
+    share: float
+    cause: str
+
+
+def follow(problem: TrajectoryProblem, base: NDArray[np.float64], rng: np.random.Generator, *, refine: bool) -> Followed:
+    """Find the arm for every waypoint from the one before.
+
+    Args:
+        problem: Moves joints of what is held, and nothing else.
+        base: x, y, yaw [m, rad] at its waypoints, shape (N, 3).
+        rng: Draws seeds.
+        refine: Move arm and object at each waypoint out of collision (B2), instead of taking the object where the time law has
+            it and the arm as inverse kinematics finds it (B1).
+    """
+    knots = Knots(problem, rng)
+    z = knots.objects.copy()
+    z[:, :3] = base
+    arm = _Arm(problem, knots, refine=refine)
+    before = problem.start
+    for row in range(len(z)):
+        z[row, arm.kinematics.columns] = before[arm.kinematics.columns]
+        found, cause = arm.at(z[row], row + 1)
+        z[row] = found
+        if cause:
+            z[row:] = found
+            return Followed(z, row / len(z), cause)
+        before = z[row]
+    return Followed(z, 1.0, "")
+
+
+class _Arm:
+    """Looks for what the arm does at single waypoints."""
+
+    def __init__(self, problem: TrajectoryProblem, knots: Knots, *, refine: bool) -> None:
+        self.problem, self.knots, self.refine = problem, knots, refine
+        self.kinematics = ArmKinematics(problem, knots)
+
+    def at(self, z: NDArray[np.float64], waypoint: int) -> tuple[NDArray[np.float64], str]:
+        """Return the free configuration nearest to `z`, shape (n,), or the nearest that is not, and what is wrong with it."""
+        first, cause = self._candidate(z, waypoint)
+        if not cause:
+            return first, ""
+        found = [self._candidate(seed, waypoint) for seed in self._seeds(z)]
+        found.append((first, cause))
+        for kind in ("", "collision", "no inverse kinematics"):
+            alike = [other for other, wrong in found if wrong == kind]
+            if alike:
+                return min(alike, key=lambda other: float(np.abs(other - z).sum())), kind
+        return first, cause
+
+    def _candidate(self, z: NDArray[np.float64], waypoint: int) -> tuple[NDArray[np.float64], str]:
+        """Return what inverse kinematics, and refinement, lead to from `z`, and what is wrong with it."""
+        found, closed = self.kinematics.solve(z, waypoint)
+        if self.refine and (not closed or self.knots.depth(found[None], waypoint)[0] > 0.0):
+            found, closed = refined(self.problem, self.knots, found, z, waypoint, self.kinematics.columns)
+        if not closed:
+            return found, "no inverse kinematics"
+        return found, "collision" if self.knots.depth(found[None], waypoint)[0] > 0.0 else ""
+
+    def _seeds(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return `z` with other arms, shape (SEEDS, n)."""
+        columns, chain, rng = self.kinematics.columns, self.problem.chain, self.knots.rng
+        lower, upper = np.maximum(chain.lower[columns], -np.pi), np.minimum(chain.upper[columns], np.pi)
+        arms = rng.uniform(np.minimum(lower, upper), upper, (SEEDS, len(columns)))
+        near = z[columns] + rng.normal(0.0, _SPREAD, (SEEDS // 2, len(columns)))
+        arms[: SEEDS // 2] = np.clip(near, chain.lower[columns], chain.upper[columns])
+        seeds = np.tile(z, (SEEDS, 1))
+        seeds[:, columns] = arms
+        return seeds

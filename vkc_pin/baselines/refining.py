@@ -1,0 +1,80 @@
+"""Moves arm and object out of collision at one waypoint, the base stays: a sequence of quadratic programs."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vkc_pin.baselines.arm_kinematics import QP
+from vkc_pin.clearing import distance_gradients
+from vkc_pin.knots import Knots
+from vkc_pin.problem import TrajectoryProblem
+
+__all__ = ["refined"]
+
+_ROUNDS = 12
+_REACH = 0.05  # [m] beyond the clearance: contacts that are looked at
+_LONGEST = 0.2  # [m] and [rad] of one round in one coordinate
+_OBJECT = 10.0  # what moving the object's joints away from their time law costs, beside the arm's away from where it was
+_SLACK = 1e3  # what a metre of clearance costs that there is no room for
+_REGULAR = 1e-6  # makes the program strictly convex in the slack
+_TOLERANCE = 1e-5  # [m] and [rad]
+
+
+def refined(
+    problem: TrajectoryProblem,
+    knots: Knots,
+    z: NDArray[np.float64],
+    wanted: NDArray[np.float64],
+    waypoint: int,
+    columns: NDArray[np.int_],
+) -> tuple[NDArray[np.float64], bool]:
+    """Return the configuration near `wanted` that rounds from `z` lead to, and whether the chain is closed there.
+
+    Each round minimises Σ w (z − z*)² + slack over the arm, the freedoms of its grasps and the object's joints, so that the
+    linearised closure holds and the linearised distances of close pairs keep their margins.
+
+    Args:
+        problem: The problem.
+        knots: Of it.
+        z: Where to begin, shape (n,).
+        wanted: z*: the arm at the waypoint before, the object where its time law has it, shape (n,).
+        waypoint: The waypoint.
+        columns: The coordinates of arm and grasps.
+    """
+    import qpsolvers
+
+    pose = knots.pose_at(waypoint)
+    if pose is None:
+        return z, True
+    solver, target = knots.solver(pose)
+    lower, upper = problem.lower[waypoint - 1], problem.upper[waypoint - 1]
+    free = np.concatenate([columns, knots.driven])
+    weights = np.where(np.isin(free, columns), 1.0, _OBJECT)
+    for _ in range(_ROUNDS):
+        residual, jacobian = (part[0] for part in solver.evaluate(z[None], target))
+        reach = problem.options.dist_safe + _REACH
+        contacts = problem.contacts.evaluate(z[None], np.array([waypoint]), reach=reach, nearest=None)
+        if np.abs(residual).max() < _TOLERANCE and contacts.violation() <= 0.0:
+            return z, True
+        gradients = distance_gradients(problem, z[None], contacts)[:, free]
+        room = contacts.distance - contacts.margin
+        bounds = [np.clip(limit[free] - z[free], -_LONGEST, _LONGEST) for limit in (lower, upper)]
+        # The step of the free coordinates, then one slack for all pairs.
+        step = qpsolvers.solve_qp(
+            np.diag([*weights, _REGULAR]),
+            np.append(weights * (z - wanted)[free], _SLACK),
+            np.column_stack([-gradients, -np.ones(len(room))]),
+            room,
+            np.column_stack([jacobian[:, free], np.zeros(len(residual))]),
+            -residual,
+            np.append(bounds[0], 0.0),
+            np.append(bounds[1], np.inf),
+            solver=QP,
+        )
+        if step is None:
+            break
+        z = z.copy()
+        z[free] += step[:-1]
+    residual, _ = solver.evaluate(z[None], target)
+    return z, bool(np.abs(residual).max() < _TOLERANCE)

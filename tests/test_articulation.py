@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import tempfile
 from pathlib import Path
@@ -245,6 +246,8 @@ GRASPS = [
 def test_an_attachment_moves_as_its_joint_does(joint: str, fields: str, suffixes: tuple[str, ...], standoff: float) -> None:
     entry = ", ".join(part for part in (f"name: grip, link: panel, joint: {joint}, standoff: {standoff}", fields) if part)
     grip = load_text(URDF, f"urdf: thing.urdf\nattachments: [{{{entry}}}]").attachment()
+    placement = pin.SE3(pin.rpy.rpyToMatrix(0.3, -0.2, 1.0), np.array([0.1, 0.2, -0.3]))
+    grip = dataclasses.replace(grip, placement=placement)
     assert (grip.joint, grip.standoff) == (joint, standoff)
     assert grip.coordinates == tuple(f"grip{suffix}" for suffix in suffixes)
     stated = {"_turn": (-1.2, 1.1)} if joint == "cylindrical" else {}
@@ -260,6 +263,7 @@ def test_an_attachment_moves_as_its_joint_does(joint: str, fields: str, suffixes
     moved = grip.motion(v)
     np.testing.assert_allclose(moved.rotation, turn.as_matrix(), atol=1e-12)
     np.testing.assert_allclose(moved.translation, centre + turn.apply([0.0, 0.0, -standoff]), atol=1e-12)
+    np.testing.assert_allclose(grip.tool(v).homogeneous, placement.homogeneous @ moved.homogeneous, atol=1e-12)
     with pytest.raises(InputError, match="one a freedom"):
         grip.motion([*v, 0.0])
 

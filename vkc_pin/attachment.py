@@ -89,3 +89,7 @@ class Attachment:
         for freedom, value in zip(self.freedoms, given, strict=True):
             placement = placement * freedom.motion(float(value))
         return placement * self.offset
+
+    def tool(self, values: ArrayLike = ()) -> pin.SE3:
+        """Return the tool frame in the frame of `link`, placement · J(v) · offset, at the values v; see `motion`."""
+        return self.placement * self.motion(values)

@@ -72,7 +72,7 @@ def in_hand(
         if one.object.free:
             grasp = one.object.attachment(hold.attachment)
             values = at.get(hold.object) or (0.0,) * len(grasp.freedoms)
-            in_object = one.object.link_placement(grasp.link, one.state) * grasp.placement * grasp.motion(values)
+            in_object = one.object.link_placement(grasp.link, one.state) * grasp.tool(values)
             holder = placed[hold.by.object].link_placement(str(hold.link)) if hold.by else tool()
             placed[hold.object] = dataclasses.replace(one, placement=holder * in_object.inverse())
     return MappingProxyType(placed)

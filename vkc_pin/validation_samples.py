@@ -169,6 +169,6 @@ class Samples:
                 values[:, column] = positions[:, self.trajectory.names.index(coordinate)]
         errors = np.empty((len(rows), 2))
         for k, (tool, link) in enumerate(zip(tools, links, strict=True)):
-            offset = (link * attachment.placement * attachment.motion(values[k])).actInv(tool)
+            offset = (link * attachment.tool(values[k])).actInv(tool)
             errors[k] = np.linalg.norm(offset.translation), np.linalg.norm(pin.log3(offset.rotation))
         return errors

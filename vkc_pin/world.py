@@ -159,12 +159,12 @@ class World:
                 link = carrier.object.link_placement(str(hold.link), carrier.state)
                 holders = [placement * link for placement in found[hold.by.object]]
             attachment = placed.object.attachment(hold.attachment)
-            in_object = placed.object.link_placement(attachment.link, placed.state) * attachment.placement
+            grasped = placed.object.link_placement(attachment.link, placed.state)
             names = [f"{hold.object}.{name}" for name in attachment.coordinates]
             freedom = values[:, [trajectory.names.index(name) for name in names]]
-            still = attachment.motion(freedom[0]) if not np.ptp(freedom, axis=0).any() else None
+            still = attachment.tool(freedom[0]) if not np.ptp(freedom, axis=0).any() else None
             ideal = [
-                holder * (in_object * (still if still is not None else attachment.motion(row))).inverse()
+                holder * (grasped * (still if still is not None else attachment.tool(row))).inverse()
                 for holder, row in zip(holders, freedom, strict=True)
             ]
             offset = ideal[0].inverse() * where[hold.object]  # the hand may close a hair beside the attachment

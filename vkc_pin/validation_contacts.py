@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import coal
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from vkc_pin.geometry import shape_distance
 from vkc_pin.scene import Scene
@@ -56,8 +55,9 @@ def may_touch(
 
     robots = len(scene.robot.collision.geometryObjects)
     data, geometry = world.model.createData(), world.collision.createData()
-    for owner, row in _taken_and_left(scene, world, trajectory):
-        pin.updateGeometryPlacements(world.model, data, world.collision, geometry, world.coordinates.q(row))
+    rows = world.positions(trajectory)
+    for owner, waypoint in _taken_and_left(scene, trajectory):
+        pin.updateGeometryPlacements(world.model, data, world.collision, geometry, world.coordinates.q(rows[waypoint]))
         mine = [i for i, label in enumerate(labels) if label.partition(".")[0] == owner]
         for i in mine:
             for j in range(len(labels)):
@@ -67,8 +67,7 @@ def may_touch(
                     allowed.setdefault((min(i, j), max(i, j)), CONTACT)
 
     touches = [step for step in steps if isinstance(step, Touch)]
-    ends = [phase.last for phase in trajectory.phases] if touches else []
-    for row in world.positions(trajectory)[ends]:
+    for row in rows[[phase.last for phase in trajectory.phases]] if touches else ():
         pin.updateGeometryPlacements(world.model, data, world.collision, geometry, world.coordinates.q(row))
         for step in touches:
             target = step.target.translation if isinstance(step.target, pin.SE3) else np.array(step.target)
@@ -92,9 +91,9 @@ def _links_of(scene: Scene, frame: str) -> set[str]:
     return {robot.link_of(i) for i, shape in enumerate(robot.collision.geometryObjects) if shape.parentJoint == joint}
 
 
-def _taken_and_left(scene: Scene, world: World, trajectory: Trajectory) -> list[tuple[str, NDArray[np.float64]]]:
-    """Return every free object that is carried, with the world's configurations in which it is taken or left."""
-    found, phases, rows = [], trajectory.phases, world.positions(trajectory)
+def _taken_and_left(scene: Scene, trajectory: Trajectory) -> list[tuple[str, int]]:
+    """Return every free object that is carried, with the waypoints at which it is taken or left."""
+    found, phases = [], trajectory.phases
     for number, phase in enumerate(phases):
         for owner in phase.held:
             if not scene.objects[owner].object.free:
@@ -102,7 +101,7 @@ def _taken_and_left(scene: Scene, world: World, trajectory: Trajectory) -> list[
             before = phases[number - 1].held if number else scene.held
             after = phases[number + 1].held if number + 1 < len(phases) else phase.held
             if owner not in before:
-                found.append((owner, rows[phase.first]))
+                found.append((owner, phase.first))
             if owner not in after:
-                found.append((owner, rows[phase.last]))
+                found.append((owner, phase.last))
     return found

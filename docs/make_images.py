@@ -21,6 +21,8 @@ WIDE, SMALL = (1200, 640), (640, 400)  # [pixels]
 HALF_OPEN = 14.0  # [s] of the motion at the door
 UNDER_THE_TABLE = (-0.4, 2.4, 0.4), (-4.2, -0.6, 2.0)  # what to look at, and from where [m]
 WHOLE_ROOM = (0.5, 0.3, 0.0), (-8.6, -5.4, 5.4)
+CORRIDOR = (1.6, 0.0, 0.3), (-7.4, -1.4, 7.2)
+AISLE = (2.35, 2.5, 0.2), (-2.9, -3.0, 6.2)
 
 sys.path.insert(0, str(ROOT / "tests"))
 from browser import screenshot  # noqa: E402
@@ -62,6 +64,9 @@ def main() -> int:
     picture(stick, "stick", WIDE, float(stick.trajectory.times[-1]))
     look(*WHOLE_ROOM)
     for name in ("init_1", "init_2", "init_3"):
+        picture(vkc.load_scene(name), name, SMALL)
+    for name, camera in (("corridor_door", CORRIDOR), ("aisle_drawer", AISLE)):
+        look(*camera)
         picture(vkc.load_scene(name), name, SMALL)
     return 0
 

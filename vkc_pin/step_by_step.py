@@ -90,29 +90,29 @@ def scene_after(scene: Scene, task: Task, trajectory: Trajectory) -> Scene:
         task: What the motion brings about.
         trajectory: The motion.
     """
-    world, names = World(scene), trajectory.names
-    last = dict(zip(names, trajectory.positions[-1].tolist(), strict=True))
+    last = dict(zip(trajectory.names, trajectory.positions[-1].tolist(), strict=True))
+
+    def end(coordinate: str, lower: float, upper: float) -> float:
+        return float(np.clip(last[coordinate], lower, upper))
+
     robot = np.clip(trajectory.positions[-1, : trajectory.robot_size], scene.robot.lower, scene.robot.upper)
     robot[:2] = np.clip(robot[:2], scene.arena[::2], scene.arena[1::2])
     after = scene.with_held({}).with_start(base=robot[:3], arm=robot[3:])
+    world = World(scene)
     (row,) = world.positions(trajectory, trajectory.times[-1:])
     for name, placed in scene.objects.items():
-        if placed.object.free:
+        thing = placed.object
+        if thing.free:
             after = after.with_placement(name, world.placement(name, row))
-        joints = [joint for joint in placed.object.coordinates.names if f"{name}.{joint}" in last]
-        limits = {joint: placed.object.coordinates.index(joint) for joint in joints}
-        state = {
-            joint: float(np.clip(last[f"{name}.{joint}"], placed.object.lower[i], placed.object.upper[i]))
-            for joint, i in limits.items()
-        }
-        after = after.with_state(name, state) if state else after
+        joints = zip(thing.coordinates.names, thing.lower, thing.upper, strict=True)
+        state = {joint: end(f"{name}.{joint}", low, high) for joint, low, high in joints if f"{name}.{joint}" in last}
+        if state:
+            after = after.with_state(name, state)
+    at: dict[str, list[float]] = {}
+    for hold in task.after:
+        attachment = scene.objects[hold.object].object.attachment(hold.attachment)
+        if attachment.freedoms:
+            freedoms = zip(attachment.coordinates, attachment.freedoms, strict=True)
+            at[hold.object] = [end(f"{hold.object}.{name}", freedom.lower, freedom.upper) for name, freedom in freedoms]
     held, by = as_mappings(task.after)
-    at = {}
-    for name, attachment in held.items():
-        freedoms = zip(
-            after.objects[name].object.attachment(attachment).coordinates,
-            after.objects[name].object.attachment(attachment).freedoms,
-            strict=True,
-        )
-        at[name] = [float(np.clip(last[f"{name}.{c}"], freedom.lower, freedom.upper)) for c, freedom in freedoms]
-    return after.with_held(held, by=by, at={name: values for name, values in at.items() if values})
+    return after.with_held(held, by=by, at=at)

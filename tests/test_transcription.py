@@ -14,12 +14,13 @@ import pytest
 from carrying import room, stand, table
 from small_problems import door_scene, full_scene, random_configurations
 
-from vkc_pin import problem as problem_module
+from vkc_pin import transcription as module
 from vkc_pin.options import Options
 from vkc_pin.problem import TrajectoryProblem, build
 from vkc_pin.robot import load_robot
 from vkc_pin.scene import Scene
 from vkc_pin.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
+from vkc_pin.waypoint import Structure
 
 OPTIONS = Options(reach_waypoints=3, turn_waypoints=2, move_waypoints=3, contact_slots=2)
 QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes"}
@@ -377,19 +378,31 @@ def test_a_base_that_cannot_slip_has_another_structure() -> None:
 
 
 def test_only_the_programs_used_last_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    built = []
-    monkeypatch.setattr(problem_module, "Transcription", lambda structure: built.append(structure) or object())
-    monkeypatch.setattr(problem_module, "_transcriptions", type(problem_module._transcriptions)())
     structure = problem("reach").transcription.structure
-    limit = problem_module._KEPT
+    built: list[Structure] = []
+    times: list[float] = []
+
+    class Built:
+        def __init__(self, structure: Structure) -> None:
+            built.append(structure)
+
+        def take_build_time(self) -> float:
+            times.append(1.0)
+            return 1.0
+
+    monkeypatch.setattr(module, "Transcription", Built)
+    monkeypatch.setattr(module, "_transcriptions", type(module._transcriptions)())
+    limit = module._KEPT
     structures = [dataclasses.replace(structure, slots=10 + k) for k in range(limit + 1)]
-    kept = [problem_module.transcribe(s) for s in structures[:limit]]
-    assert problem_module.transcribe(structures[0]) is kept[0]  # used again: the second is now the oldest
-    problem_module.transcribe(structures[limit])
-    assert len(problem_module._transcriptions) == limit
-    assert problem_module.transcribe(structures[0]) is kept[0]
+    kept = [module.transcribe(s) for s in structures[:limit]]
+    assert times == []  # who has a program built is to count the time
+    assert module.transcribe(structures[0]) is kept[0]  # used again: the second is now the oldest
+    assert times == [1.0]  # whoever uses it again is not
+    module.transcribe(structures[limit])
+    assert len(module._transcriptions) == limit
+    assert module.transcribe(structures[0]) is kept[0]
     assert len(built) == limit + 1
-    problem_module.transcribe(structures[1])
+    module.transcribe(structures[1])
     assert len(built) == limit + 2
 
 

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections import OrderedDict
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +18,7 @@ from vkc_pin.pose_goals import pose_goals
 from vkc_pin.scene import Scene
 from vkc_pin.steps import Step
 from vkc_pin.task import Phase, Task
-from vkc_pin.transcription import Transcription
+from vkc_pin.transcription import transcribe
 from vkc_pin.waypoint import Structure
 
 __all__ = ["TrajectoryProblem", "build"]
@@ -28,21 +26,6 @@ __all__ = ["TrajectoryProblem", "build"]
 _CHOICE_WEIGHT = 1e-3  # of coordinates that are chosen when grasping and do not move: only keeps the problem regular
 _PATIENCE = 1.5  # how much more time a motion may take before limits on its rates become rows of the program
 _SPARE = 1.15  # how much longer a motion may take than the profile 3s² − 2s³ along its seed
-_KEPT = 8  # programs kept for reuse; each holds some tens of MB
-_transcriptions: OrderedDict[tuple[Any, ...], Transcription] = OrderedDict()
-
-
-def transcribe(structure: Structure) -> Transcription:
-    """Return the program of `structure`, built if it is not there already."""
-    key = structure.key
-    if key in _transcriptions:
-        _transcriptions.move_to_end(key)
-        _transcriptions[key].take_build_time()  # that was somebody else's
-    else:
-        _transcriptions[key] = Transcription(structure)
-        while len(_transcriptions) > _KEPT:
-            _transcriptions.popitem(last=False)
-    return _transcriptions[key]
 
 
 class TrajectoryProblem:

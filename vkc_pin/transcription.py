@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import itertools
 import time
+from collections import OrderedDict
 from typing import Any
 
 import casadi as ca
@@ -21,7 +22,10 @@ from vkc_pin.inverse_kinematics import PoseSolver
 from vkc_pin.monitor import Monitor
 from vkc_pin.waypoint import Structure, WaypointFunctions
 
-__all__ = ["Transcription"]
+__all__ = ["Transcription", "transcribe"]
+
+_KEPT = 8  # programs kept for reuse; each holds some tens of MB
+_transcriptions: OrderedDict[tuple[Any, ...], Transcription] = OrderedDict()
 
 
 class Transcription:
@@ -251,3 +255,16 @@ def _assemble(parts: list[ca.MX], at: list[NDArray[np.int_]], rows: int, columns
     pointers = np.concatenate([[0], np.cumsum(np.bincount(column, minlength=columns))])
     pattern = ca.Sparsity(rows, columns, pointers.tolist(), row.tolist())
     return ca.MX(pattern, ca.vertcat(*parts)[order.tolist()])
+
+
+def transcribe(structure: Structure) -> Transcription:
+    """Return the program of `structure`, built if it is not there already."""
+    key = structure.key
+    if key in _transcriptions:
+        _transcriptions.move_to_end(key)
+        _transcriptions[key].take_build_time()  # that was somebody else's
+    else:
+        _transcriptions[key] = Transcription(structure)
+        while len(_transcriptions) > _KEPT:
+            _transcriptions.popitem(last=False)
+    return _transcriptions[key]

@@ -12,8 +12,9 @@ import pytest
 from small_problems import CABINET_STATE, door_scene, full_scene
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.goal import LATCH_MARGIN, compile_task, path_joints
+from vkc_pin.goal import LATCH_MARGIN, compile_task
 from vkc_pin.hold import Hold
+from vkc_pin.lookup import path_joints
 from vkc_pin.options import Options
 from vkc_pin.scene import Scene
 from vkc_pin.steps import Actuate, GoTo, Grasp, Reach, Step

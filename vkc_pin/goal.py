@@ -9,45 +9,17 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.articulation import Attachment
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.hold import Hold
+from vkc_pin.lookup import attachment_of, check_link, joint_limits, path_joints, placed_object, robot_frame
 from vkc_pin.options import Options
 from vkc_pin.scene import PlacedObject, Scene
 from vkc_pin.steps import STEPS, Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
 from vkc_pin.task import FrameGoal, Phase, Task
 
-__all__ = ["compile_task", "path_joints"]
+__all__ = ["compile_task"]
 
 LATCH_MARGIN = 0.02  # [rad] or [m] past the threshold at which a latch lets go
-
-
-def _placed(scene: Scene, name: str, field_name: str) -> PlacedObject:
-    if name not in scene.objects:
-        raise UnknownNameError("object", name, scene.objects, field=field_name)
-    return scene.objects[name]
-
-
-def _attachment(placed: PlacedObject, name: str | None, field_name: str) -> Attachment:
-    attachments = placed.object.attachments
-    if name is None:
-        if not attachments:
-            raise InputError(f"object '{placed.name}' has no attachment, so it cannot be grasped", field=field_name)
-        return next(iter(attachments.values()))
-    if name not in attachments:
-        raise UnknownNameError(f"attachment of '{placed.name}'", name, attachments, field=field_name)
-    return attachments[name]
-
-
-def path_joints(placed: PlacedObject, attachment: Attachment) -> list[str]:
-    """Return the names of the object's joints between its base and the attachment's link, base first."""
-    model = placed.object.model
-    joint = model.frames[model.getFrameId(attachment.link, pin.FrameType.BODY)].parentJoint
-    names: list[str] = []
-    while joint:
-        names.insert(0, str(model.names[joint]))
-        joint = model.parents[joint]
-    return names
 
 
 class _Compiler:
@@ -88,7 +60,7 @@ class _Compiler:
         )
         self.phases.append(phase)
         for coordinate, value in phase.values.items():  # a goal beyond a limit is approached as far as it goes
-            lower, upper = self._limits(self.scene.objects[coordinate.split(".", 1)[0]], coordinate)
+            lower, upper = joint_limits(self.scene.objects[coordinate.split(".", 1)[0]], coordinate)
             self.state[coordinate] = min(max(value, lower), upper)
 
     def _hold_of(self, name: str) -> Hold | None:
@@ -100,9 +72,9 @@ class _Compiler:
 
     def grasp(self, name: str, attachment_name: str | None, where: str, by: str | None = None) -> Hold:
         """Add the phase that takes hold of an object, unless it is held; return the hold."""
-        placed = _placed(self.scene, name, f"{where}.object")
+        placed = placed_object(self.scene, name, f"{where}.object")
         earlier = next((hold.attachment for hold in self.holds if hold.object == name and hold.frame == by), None)
-        attachment = _attachment(placed, attachment_name or earlier, f"{where}.attachment")
+        attachment = attachment_of(placed, attachment_name or earlier, f"{where}.attachment")
         through = self._through(by, name, f"{where}.by") if by is not None else None
         hold = Hold(name, attachment.name, *(through or (None, None)))
         if hold in self.held:
@@ -144,17 +116,17 @@ class _Compiler:
         owner, dot, link = str(frame).partition(".")
         if not dot:
             raise InputError("not a link of an object", field=where, expected="<object>.<link>, e.g. stick.tip", got=repr(frame))
-        placed = _placed(self.scene, owner, where)
+        placed = placed_object(self.scene, owner, where)
         hold = self._hold_of(owner)
         if hold is None or not placed.object.free:
             held = ", ".join(str(h) for h in self.held if self.scene.objects[h.object].object.free) or "nothing"
             problem = f"'{name}' cannot be grasped through '{owner}', which the robot does not carry"
             raise InputError(problem, field=where, expected=f"a link of what it carries ({held})", got=repr(frame))
-        _check_link(placed, link, where)
+        check_link(placed, link, where)
         return hold, link
 
     def actuate(self, step: Actuate, where: str) -> None:
-        placed = _placed(self.scene, step.object, f"{where}.object")
+        placed = placed_object(self.scene, step.object, f"{where}.object")
         names = placed.object.coordinates.names
         for joint in step.joints:
             if joint not in names:
@@ -175,7 +147,7 @@ class _Compiler:
                     expected=f"one of {', '.join(path)}" if path else "an attachment that moves with it",
                 )
         values = {f"{step.object}.{joint}": value for joint, value in step.joints.items()}
-        ranges = {coordinate: self._limits(placed, coordinate) for coordinate in values}
+        ranges = {coordinate: joint_limits(placed, coordinate) for coordinate in values}
         after: dict[str, float] = {}  # what must wait until the latch is left behind
         for latch in placed.object.latches:
             held, release = f"{step.object}.{latch.joint}", f"{step.object}.{latch.released_by}"
@@ -192,7 +164,7 @@ class _Compiler:
                     field=f"{where}.attachment",
                     expected=f"an attachment that moves '{latch.released_by}'",
                 )
-            lower, upper = self._limits(placed, release)
+            lower, upper = joint_limits(placed, release)
             turned = min(latch.threshold + LATCH_MARGIN, upper)
             if self.state[release] < turned:
                 self._append(
@@ -204,12 +176,8 @@ class _Compiler:
             values[release] = turned if release in after else values.get(release, turned)
         self._append(f"move {', '.join(values)}", self.options.move_waypoints, ranges=ranges, values=values)
         if after:
-            limits = {release: self._limits(placed, release) for release in after}
+            limits = {release: joint_limits(placed, release) for release in after}
             self._append(f"turn {', '.join(after)}", self.options.turn_waypoints, ranges=limits, values=after)
-
-    def _limits(self, placed: PlacedObject, coordinate: str) -> tuple[float, float]:
-        index = placed.object.coordinates.names.index(coordinate.split(".", 1)[1])
-        return float(placed.object.lower[index]), float(placed.object.upper[index])
 
     def touch(self, step: Touch, where: str) -> None:
         """Add the phase that brings a frame to its target, carrying on what is carried."""
@@ -220,12 +188,12 @@ class _Compiler:
             if not placed.object.free:
                 problem = f"'{owner}' stands fixed in the world and cannot be carried anywhere"
                 raise InputError(problem, field=f"{where}.frame", expected="a link of a free object, or a frame of the robot")
-            _check_link(placed, link, f"{where}.frame")
+            check_link(placed, link, f"{where}.frame")
             hold = self._hold_of(owner) or self.grasp(owner, None, where)
         elif dot and step.frame not in [f.name for f in self.scene.robot.model.frames]:
             raise UnknownNameError("object", owner, self.scene.objects, field=f"{where}.frame")
         else:
-            link = self._robot_frame(step.frame, f"{where}.frame")
+            link = robot_frame(self.scene, step.frame, f"{where}.frame")
         self._let_go_of_fixed()
         point = not isinstance(step.target, pin.SE3)
         target = pin.SE3(np.eye(3), np.array(step.target)) if point else step.target
@@ -234,7 +202,7 @@ class _Compiler:
 
     def place(self, step: Place, where: str) -> None:
         """Add the phases that bring an object to its place and leave it there."""
-        placed = _placed(self.scene, step.object, f"{where}.object")
+        placed = placed_object(self.scene, step.object, f"{where}.object")
         if not placed.object.free:
             raise InputError(f"'{step.object}' stands fixed in the world", field=f"{where}.object", expected="a free object")
         hold = self._hold_of(step.object) or self.grasp(step.object, step.attachment, where)
@@ -273,13 +241,6 @@ class _Compiler:
         if self.scene.objects[hold.object].object.free:
             self.standing[hold.object] = where
 
-    def _robot_frame(self, name: str | None, where: str) -> str:
-        frame = name or self.scene.robot.tool_frame
-        frames = [f.name for f in self.scene.robot.model.frames]
-        if frame not in frames:
-            raise UnknownNameError("frame of the robot", frame, frames, field=where)
-        return frame
-
     def add(self, step: Step, where: str) -> None:
         if isinstance(step, Grasp):
             self.grasp(step.object, step.attachment, where, step.by)
@@ -292,7 +253,7 @@ class _Compiler:
         elif isinstance(step, Release):
             self.release(step, where)
         elif isinstance(step, Reach):
-            frame = self._robot_frame(step.frame, f"{where}.frame")
+            frame = robot_frame(self.scene, step.frame, f"{where}.frame")
             self._let_go_of_fixed()
             self._append(f"reach with {frame}", self.options.reach_waypoints, frames=(FrameGoal(frame, step.pose),))
         elif isinstance(step, GoTo):
@@ -301,11 +262,6 @@ class _Compiler:
         else:
             expected = ", ".join(kind.__name__ for kind in STEPS)
             raise InputError("not a step", field=where, expected=expected, got=repr(step))
-
-
-def _check_link(placed: PlacedObject, link: str, where: str) -> None:
-    if link not in placed.object.links:
-        raise UnknownNameError(f"link of '{placed.name}'", link, placed.object.links, field=where)
 
 
 def compile_task(scene: Scene, steps: Sequence[Step], options: Options, *, nothing: bool = False) -> Task:

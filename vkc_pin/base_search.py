@@ -14,23 +14,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vkc_pin.base_grid import HEADINGS
+from vkc_pin.base_task import AHEAD, BACK, BEGIN, DIRECT, END, LEFT, RIGHT, Step, Task
 from vkc_pin.base_ways import BACKWARDS, TURNING, UNIT, Drive, Ground, wrapped
 
 __all__ = ["cheapest"]
 
-# How a step is taken; the first four lead from node to node.
-_AHEAD, _BACK, _LEFT, _RIGHT, _BEGIN, _END, _DIRECT = range(7)
-_OPPOSITE = [_BACK, _AHEAD, _RIGHT, _LEFT]
-_KINDS = (_AHEAD, _BACK, _LEFT, _RIGHT)
+_OPPOSITE = [BACK, AHEAD, RIGHT, LEFT]
+_KINDS = (AHEAD, BACK, LEFT, RIGHT)
 
-_Step = tuple[int, int, int]  # how, goal, number of the way
-_Entry = tuple[float, float, int, int, int, _Step]  # cost in all, cost up to the node, tie-break, node, the next one, step
+_Entry = tuple[float, float, int, int, int, Step]  # cost in all, cost up to the node, tie-break, node, the next one, step
 
 # By how much [m] ways may be longer than what is known to be needed, and the number of cells to look at, one try after the other.
 _WIDER = ((1.0, 1000), (1.0, 2000), (3.0, 4000), (np.inf, 0))
 _CURVES = 0.13  # by what share ways are longer, mostly, because of turns on the way
 _PATIENCE = 8e-3  # share of all nodes that are looked at, after a surprise, before the heuristic is found again
-_ALIKE = 0.1  # [rad] between ways of which one is blocked, and the other then may well be
 
 
 def cheapest(ground: Ground, extra: NDArray[np.float64]) -> tuple[float, int, list[Drive], float] | None:
@@ -43,7 +40,7 @@ def cheapest(ground: Ground, extra: NDArray[np.float64]) -> tuple[float, int, li
     Returns:
         The cost [m], the goal, the drives up to it, with continuous yaws, and the yaw at the goal.
     """
-    task = _Task(ground, extra)
+    task = Task(ground, extra)
     if not task.ends:
         return None
     # What the way costs at least up to every cell, and from it on.
@@ -63,54 +60,10 @@ def cheapest(ground: Ground, extra: NDArray[np.float64]) -> tuple[float, int, li
     return None if found is None else (cost, *found)
 
 
-class _Task:
-    """Where the way begins and may end, and what has been learned.
-
-    Attributes:
-        starts, ends: Ways from the start, and to each goal.
-        closed: Steps from the start, or to a goal, that are not free.
-        shut: Moves that are not free, as cell, heading, kind.
-    """
-
-    def __init__(self, ground: Ground, extra: NDArray[np.float64]) -> None:
-        self.ground, self.extra = ground, extra
-        self.starts = ground.starts()
-        self.ends = {g: ground.ends(g) for g, goal in enumerate(ground.goals) if ground.clear(goal)}
-        self.closed: set[_Step] = set()
-        self.shut: set[tuple[int, int, int]] = set()
-        self._turned: set[int] = set()  # goals at which it is known how far the base can turn
-
-    def free(self, step: _Step, yaw: float) -> bool:
-        """Return whether a step from the start or to a goal is free; `yaw` is that in the cell [rad]."""
-        ground, (kind, goal, way) = self.ground, step
-        if kind == _BEGIN:
-            return ground.swept(float(ground.start[2]), *ground.begin(self.starts, way), ground.leaving)
-        if kind == _END:
-            return ground.swept(yaw, *ground.end(self.ends[goal], way, goal, yaw))
-        direct = ground.direct(goal, way)
-        return direct is not None and ground.swept(float(ground.start[2]), *direct, ground.leaving)
-
-    def close(self, step: _Step) -> None:
-        """Note that a step from the start or to a goal is not free, and look at those that are like it."""
-        self.closed.add(step)
-        kind, goal, way = step
-        if kind == _DIRECT:
-            return
-        ground, ways = self.ground, self.starts if kind == _BEGIN else self.ends[goal]
-        if kind == _END and goal not in self._turned:
-            self._turned.add(goal)
-            turnable = ground.turnable(ground.goals[goal], ways)
-            self.closed |= {(_END, goal, k) for k in np.flatnonzero(~turnable).tolist()}
-        alike = np.flatnonzero(np.abs(wrapped(ways.yaw - ways.yaw[way])) < _ALIKE).tolist()
-        for other in [(kind, goal, k) for k in alike]:
-            if other not in self.closed and not self.free(other, float(ground.grid.yaws[ways.heading[other[2]]])):
-                self.closed.add(other)
-
-
 class _Round:
     """A* over some of the cells, from the goals back to the start: dead ends are mostly around goals, and small."""
 
-    def __init__(self, task: _Task, before: NDArray[np.float64], after: NDArray[np.float64], bound: float) -> None:
+    def __init__(self, task: Task, before: NDArray[np.float64], after: NDArray[np.float64], bound: float) -> None:
         """Look at the cells over which a way may cost less than `bound` [m], given what it costs at least up to and from it."""
         self.task, self.ground, self.bound = task, task.ground, bound / UNIT
         grid = self.ground.grid
@@ -155,7 +108,7 @@ class _Round:
         starts, closed = self.task.starts, self.task.closed
         self.begin.clear()
         for k, (node, cost) in enumerate(zip(self.node[starts.cell, starts.heading].tolist(), starts.cost.tolist(), strict=True)):
-            if node != self.nowhere and (_BEGIN, 0, k) not in closed:
+            if node != self.nowhere and (BEGIN, 0, k) not in closed:
                 self.begin.setdefault(node, []).append((cost, k))
         edges, first = 4 * self.start, np.array(list(self.begin), np.int32)
         weights = np.broadcast_to(self.costs, (len(self.cell), HEADINGS, 4)).reshape(-1)
@@ -179,7 +132,7 @@ class _Round:
         """
         queue, leads, surprised, count = self._endings(), dict[int, _Entry](), -1, 0
         # By the heading at their end: turning right from it costs what turning left to it does.
-        moves = self.costs[:, [_AHEAD, _BACK, _RIGHT, _LEFT]].tolist()
+        moves = self.costs[:, [AHEAD, BACK, RIGHT, LEFT]].tolist()
         while queue:
             entry = heapq.heappop(queue)
             total, passed, _, node, _, step = entry
@@ -208,7 +161,7 @@ class _Round:
                     heapq.heappush(queue, (spent + cost + before, before, -count, source, node, (kind, 0, 0)))
             for cost, way in self.begin.get(node, ()):
                 count += 1
-                heapq.heappush(queue, (spent + cost, 0.0, -count, self.start, node, (_BEGIN, 0, way)))
+                heapq.heappush(queue, (spent + cost, 0.0, -count, self.start, node, (BEGIN, 0, way)))
         return self.bound * UNIT, None
 
     def _endings(self) -> list[_Entry]:
@@ -218,7 +171,7 @@ class _Round:
             nodes, extra = self.node[ways.cell, ways.heading], round(task.extra[goal] / UNIT)
             passed = self.passed[nodes]
             queue += [
-                (cost + extra + before, before, len(queue) + k, node, -1, (_END, goal, k))
+                (cost + extra + before, before, len(queue) + k, node, -1, (END, goal, k))
                 for k, (node, cost, before) in enumerate(zip(nodes.tolist(), ways.cost.tolist(), passed.tolist(), strict=True))
                 if before < np.inf
             ]
@@ -228,7 +181,7 @@ class _Round:
                     drive, last = direct
                     turned = abs(drive.yaw - self.ground.start[2]) + abs(last - drive.yaw)
                     cost = float(np.rint((drive.cost * self.ground.haste + TURNING * turned) / UNIT)) + extra
-                    queue.append((cost, 0.0, len(queue), self.start, -1, (_DIRECT, goal, how)))
+                    queue.append((cost, 0.0, len(queue), self.start, -1, (DIRECT, goal, how)))
         heapq.heapify(queue)
         return queue
 
@@ -239,11 +192,11 @@ class _Round:
         if kind not in _KINDS:
             return self.task.free(step, float(grid.yaws[node % HEADINGS]))
         # Backwards, and to the right, the same move is taken from its other end.
-        first, second = (node, after) if kind in (_AHEAD, _LEFT) else (after, node)
+        first, second = (node, after) if kind in (AHEAD, LEFT) else (after, node)
         index, heading = divmod(first, HEADINGS)
         i, j = divmod(self.cell[index], grid.cells)
         near, other = self.near[index], second // HEADINGS
-        if kind in (_LEFT, _RIGHT):
+        if kind in (LEFT, RIGHT):
             return grid.left(i, j, heading, reaching=near >= 0)
         if near == self.near[other]:
             return grid.forward(i, j, heading, reaching=near >= 0)
@@ -255,8 +208,8 @@ class _Round:
         _, _, _, node, _, step = entry
         if step[0] not in _KINDS:
             self.task.close(step)
-            if step[0] == _BEGIN:
-                self.begin = {n: [w for w in ways if (_BEGIN, 0, w[1]) not in self.task.closed] for n, ways in self.begin.items()}
+            if step[0] == BEGIN:
+                self.begin = {n: [w for w in ways if (BEGIN, 0, w[1]) not in self.task.closed] for n, ways in self.begin.items()}
             return
         index, heading = divmod(node, HEADINGS)
         self.task.shut.add((self.cell[index], heading, step[0]))
@@ -300,14 +253,14 @@ class _Round:
         yaw, node, before = float(ground.start[2]), self.start, -1
         while True:
             _, _, _, _, after, (kind, goal, way) = leads[node]
-            if kind in (_LEFT, _RIGHT):
+            if kind in (LEFT, RIGHT):
                 yaw += float(wrapped(yaws[after % HEADINGS] - yaws[node % HEADINGS]))
-            elif kind in (_AHEAD, _BACK):
+            elif kind in (AHEAD, BACK):
                 ends = [ground.center(self.cell[n // HEADINGS]) for n in (node, after)]
                 drives.append(Drive(drives.pop().a if kind == before else ends[0], ends[1], yaw))
             else:
-                direct = ground.direct(goal, way) if kind == _DIRECT else None
-                step = ground.begin(task.starts, way) if kind == _BEGIN else direct or ground.end(task.ends[goal], way, goal, yaw)
+                direct = ground.direct(goal, way) if kind == DIRECT else None
+                step = ground.begin(task.starts, way) if kind == BEGIN else direct or ground.end(task.ends[goal], way, goal, yaw)
                 drives.append(step[0])
                 yaw = step[1]
             if after < 0:

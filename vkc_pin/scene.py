@@ -19,6 +19,7 @@ from vkc_pin.geometry import PlacedObject, clearance, placed_shapes, standing_ge
 from vkc_pin.hold import Hold, holds_of
 from vkc_pin.in_hand import check_holds, in_hand
 from vkc_pin.resources import find
+from vkc_pin.starts import START_CLEARANCE, StartRegion, sampled_start, start_limits
 
 if TYPE_CHECKING:
     from vkc_pin.robot import Robot
@@ -31,23 +32,10 @@ __all__ = [
     "StartRegion",
     "load_scene",
     "standing_geometry",
-    "start_limits",
 ]
 
 FLOOR = "floor"
 """Name of the floor among a scene's obstacles."""
-START_CLEARANCE = 0.03
-"""Random starts keep the robot at least this far from everything but the floor [m]."""
-_TRIES = 2000
-
-
-@dataclass(frozen=True)
-class StartRegion:
-    """Where random starts are drawn from: intervals of the base's x and y [m] and heading [rad] (None: any)."""
-
-    x: tuple[float, float]
-    y: tuple[float, float]
-    yaw: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,22 +258,7 @@ class Scene:
             InputError: The scene has no start region, the robot holds something that stands fixed in the world, or no
                 free place was found.
         """
-        region = self.start_region
-        if region is None:
-            raise InputError("the scene has no start region", file=self.file, field="start_region", expected="x and y intervals")
-        for name in self.held:
-            if not self.objects[name].object.free:
-                raise InputError(
-                    "the robot cannot start elsewhere while it holds this", file=self.file, field=f"start.held.{name}"
-                )
-        low, high = region.yaw or (-np.pi, np.pi)
-        for _ in range(_TRIES):
-            base = rng.uniform([region.x[0], region.y[0], low], [region.x[1], region.y[1], high])
-            scene = self.with_start(base=base)
-            if scene.start_clearance(reach=START_CLEARANCE) >= START_CLEARANCE:
-                return scene
-        problem = f"no free place for the robot in {_TRIES} tries"
-        raise InputError(problem, file=self.file, field="start_region", expected=f"a clearance of {START_CLEARANCE} m somewhere")
+        return sampled_start(self, rng)
 
 
 def _write_placement(document: dict[str, Any], name: str, placement: pin.SE3) -> None:
@@ -294,14 +267,6 @@ def _write_placement(document: dict[str, Any], name: str, placement: pin.SE3) ->
     entry.pop("yaw", None)
     entry["position"] = np.asarray(placement.translation).tolist()
     entry["rpy"] = np.asarray(pin.rpy.matrixToRpy(placement.rotation)).tolist()
-
-
-def start_limits(robot: Robot) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the limits of a start, shape (n,), [m] and [rad]: the robot's; a base that cannot move may stand anywhere."""
-    lower, upper = robot.lower.copy(), robot.upper.copy()
-    if robot.base == "fixed":
-        lower[:3], upper[:3] = -np.inf, np.inf
-    return lower, upper
 
 
 def load_scene(name_or_path: str | Path) -> Scene:

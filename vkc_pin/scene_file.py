@@ -19,7 +19,8 @@ from vkc_pin.documents import Document, check
 from vkc_pin.geometry import PlacedObject, copy_shape, within_limits
 from vkc_pin.hold import holds_of
 from vkc_pin.in_hand import check_holds
-from vkc_pin.scene import FLOOR, Scene, StartRegion, start_limits
+from vkc_pin.scene import FLOOR, Scene
+from vkc_pin.starts import StartRegion, start_limits
 from vkc_pin.urdf import load_urdf
 
 if TYPE_CHECKING:

@@ -54,8 +54,7 @@ def clear_out(
             break
         reach = problem.options.dist_safe + _SPARE
         contacts = problem.contacts.evaluate(z[at], np.full(len(at), waypoint), reach=reach, nearest=_ROWS)
-        short = np.zeros(len(at))
-        np.maximum.at(short, contacts.waypoint, contacts.margin - contacts.distance)
+        short = contacts.shortfall(len(at))
         residual, pose_rows = solver.evaluate(z[at], target)
         done[at] = (short <= 0.0) & (np.abs(residual).max(axis=1) < 1e-4)
         rows, wanted = _contact_rows(problem, z[at], contacts)

@@ -1,12 +1,17 @@
 from __future__ import annotations
 
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 import pinocchio as pin
 import pytest
 from small_problems import door_scene
 
 import vkc_pin as vkc
-from vkc_pin.clearing import point_jacobians
+from vkc_pin import clearing
+from vkc_pin.clearing import clear_out, point_jacobians
 from vkc_pin.knots import Knots
 
 
@@ -65,3 +70,85 @@ def test_what_is_free_stays_where_it_is() -> None:
     free = z[found][knots.depth(z[found], problem.segments) <= 0.0]
     assert len(free) > 3
     np.testing.assert_allclose(knots.clear(free, problem.segments), free, atol=0.05)
+
+
+@dataclass
+class Scattered:
+    """Random configurations that touch the cube under the table, most of them in collision.
+
+    Attributes:
+        problem, knots: Where they come from.
+        z: Shape (B, n).
+    """
+
+    problem: vkc.TrajectoryProblem
+    knots: Knots
+    z: np.ndarray
+
+    def cleared(self, **changes: Any) -> np.ndarray:
+        """Return what they are cleared to, with other arguments than usual."""
+        solver, target = self.knots.solver(0)
+        lower, upper = (np.tile(limits[-1], (len(self.z), 1)) for limits in (self.problem.lower, self.problem.upper))
+        fields = {"lower": lower, "upper": upper, "weights": self.knots.weights, **changes}
+        return clear_out(self.problem, self.z, self.problem.segments, solver, target, **fields)
+
+    def free(self) -> np.ndarray:
+        """Return which of them need not be moved, shape (B,)."""
+        solver, target = self.knots.solver(0)
+        residual, _ = solver.evaluate(self.z, target)
+        return (self.knots.depth(self.z, self.problem.segments) <= 0.0) & (np.abs(residual).max(axis=1) < 1e-4)
+
+
+@pytest.fixture(scope="module")
+def scattered() -> Scattered:
+    scene = vkc.load_scene("init_1").with_held({"stick": "grip"}).with_start(base=[1.2, 1.0, 1.0])
+    problem, knots = drawn([vkc.Touch("stick.tip", (-1.0, 3.897, 0.1))], scene)
+    z, found = knots.knot(np.tile(problem.start, (96, 1)), problem.segments, "scatter")
+    return Scattered(problem, knots, z[found])
+
+
+@pytest.fixture(scope="module")
+def cleared(scattered: Scattered) -> Scattered:
+    return dataclasses.replace(scattered, z=scattered.knots.clear(scattered.z, scattered.problem.segments))
+
+
+def test_what_is_free_is_not_touched(cleared: Scattered) -> None:
+    free, given = cleared.free(), cleared.z.copy()
+    assert np.count_nonzero(free) > 5
+    pushed = cleared.cleared()
+    np.testing.assert_array_equal(pushed[free], given[free])
+    assert np.abs(pushed - given)[~free].max() > 1e-3
+    np.testing.assert_array_equal(cleared.z, given)  # what comes out is a copy
+
+
+def test_limits_hold(scattered: Scattered) -> None:
+    z = scattered.z
+    pushed = scattered.cleared(lower=z - 0.02, upper=z + 0.03)
+    assert np.all((pushed >= z - 0.02) & (pushed <= z + 0.03))
+    assert np.any(pushed == z - 0.02)
+    assert np.any(pushed == z + 0.03)
+    upper = z + 0.5
+    upper[:, 3:5] = z[:, 3:5]
+    lower = z - 0.5
+    lower[:, 3:5] = z[:, 3:5]
+    pushed = scattered.cleared(lower=lower, upper=upper)
+    np.testing.assert_array_equal(pushed[:, 3:5], z[:, 3:5])
+    assert np.abs(pushed - z).max() > 0.1
+
+
+def test_a_round_goes_no_further_than_the_linearisation_is_worth(
+    scattered: Scattered, cleared: Scattered, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(clearing, "_ROUNDS", 1)
+    far, near = (np.abs(some.cleared() - some.z).max(axis=1) for some in (scattered, cleared))
+    assert far.max() == pytest.approx(clearing._LONGEST)
+    assert np.any((near > 0.0) & (near < 0.5 * clearing._LONGEST))  # short steps stay as they are
+
+
+def test_what_weighs_more_moves_less(scattered: Scattered, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clearing, "_ROUNDS", 1)
+    even = np.ones(scattered.problem.chain.size)
+    heavy = even.copy()
+    heavy[:3] = 100.0
+    moved = [np.abs(scattered.cleared(weights=weights) - scattered.z)[:, :3].sum() for weights in (even, heavy)]
+    assert moved[1] < 0.5 * moved[0]

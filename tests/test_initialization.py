@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from functools import cache
 
 import numpy as np
@@ -10,7 +11,7 @@ from drives import hall
 from small_problems import SHORT, door_scene
 
 import vkc_pin as vkc
-from vkc_pin.initialization import METHODS, initialize
+from vkc_pin.initialization import METHODS, Seed, _in_turn, initialize
 from vkc_pin.knots import scatter
 
 OPENED = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20)
@@ -151,3 +152,29 @@ def test_nothing_to_scatter() -> None:
     assert np.all(residual == 0.0)
     middle = int(free.ends[-1]) - 1  # on the way, nothing is asked for
     assert scatter(free, middle, np.random.default_rng(0)) is None
+
+
+@pytest.mark.parametrize(
+    ("straight", "around", "expected"),
+    [
+        ([0.0, 0.0], 2, "s0 S0 a0 A0 s1 S1 a1 A1"),  # each is looked for (s) when the one before it has been taken (S)
+        ([np.nan], 1, "s0 S0 a0 A0"),  # nobody looked
+        ([9.0, 0.0], 2, "s0 a0 A0 S0 s1 S1 a1 A1"),  # what is hopeless comes second
+        ([9.0], 0, "s0 S0"),
+        ([0.0, 0.0, 0.0], 1, "s0 S0 a0 A0 s1 S1 s2 S2"),
+        ([0.0], 3, "s0 S0 a0 A0 a1 A1 a2 A2"),
+        ([], 2, "a0 A0 a1 A1"),
+        ([], 0, ""),
+    ],
+)
+def test_straight_and_around_take_turns(straight: list[float], around: int, expected: str) -> None:
+    said: list[str] = []
+
+    def looked_for(kind: str, shortfalls: list[float]) -> Iterator[Seed]:
+        for number, shortfall in enumerate(shortfalls):
+            said.append(f"{kind}{number}")
+            yield Seed(f"{kind}{number}", np.zeros((1, 1)), shortfall)
+
+    for seed in _in_turn(looked_for("s", straight), looked_for("a", [0.0] * around)):
+        said.append(seed.name.upper())
+    assert said == expected.split()

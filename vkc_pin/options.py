@@ -23,7 +23,8 @@ class Options:
         move_waypoints: Segments of a phase in which a held object is moved.
         dist_safe: Clearance to keep at the waypoints [m].
         grasp_clearance: Clearance of the gripper's touch links to the link that is grasped, before the grasp [m].
-        velocity_weight_base: W_vel of eq. 1 for the base coordinates.
+        velocity_weight_base: W_vel of eq. 1 for the base's place.
+        velocity_weight_heading: W_vel for its heading.
         velocity_weight_arm: W_vel for the arm joints.
         velocity_weight_object: W_vel for the object's and the virtual joints.
         acceleration_weight: W_acc of eq. 1, as a multiple of W_vel [s²].
@@ -48,7 +49,8 @@ class Options:
     move_waypoints: int = 30
     dist_safe: float = 0.02
     grasp_clearance: float = 0.005
-    velocity_weight_base: float = 1.0
+    velocity_weight_base: float = 5.0
+    velocity_weight_heading: float = 0.3
     velocity_weight_arm: float = 1.0
     velocity_weight_object: float = 0.5
     acceleration_weight: float = 0.3

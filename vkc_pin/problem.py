@@ -63,7 +63,8 @@ class TrajectoryProblem:
     def _structure(self, poses: Sequence[PoseRow]) -> Structure:
         o, robot = self.options, self.chain.robot.coordinates.size
         weights = np.full(self.chain.size, o.velocity_weight_object)
-        weights[:robot], weights[:3] = o.velocity_weight_arm, o.velocity_weight_base
+        weights[:robot], weights[:2] = o.velocity_weight_arm, o.velocity_weight_base
+        weights[2] = o.velocity_weight_heading
         # From the straight way to the grasp on: there the hand must already be where it will close.
         starts = np.concatenate([[0], self.ends[:-1]])
         begin = {int(end): int(start) for start, end in zip(starts, self.ends, strict=True)}

@@ -16,14 +16,16 @@ from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.routes import Routes
 from vkc_pin.task import Phase
 
-__all__ = ["METHODS", "Seed", "initialize"]
+__all__ = ["HOPELESS", "METHODS", "Seed", "initialize"]
 
 METHODS = ("auto", "interpolated", "astar", "stationary")
 _TOLERABLE = 60.0  # what the solver may be left to push apart: a graze or two
 _LOOKED, _FREE = 8, 0.05  # paths whose seeds are compared; shortfalls [m], summed over waypoints, that nobody looks further for
-_HOPELESS = 2.0  # such shortfalls of the straight seed, and the way around comes first
+HOPELESS = 2.0
+"""Shortfalls of a seed, summed over its waypoints [m], with which others come first."""
 _WAVES = 6  # half waves of a perturbation over the whole motion
 _DIFFERENT = 0.1  # [m] and [rad] by which the base must differ somewhere between two seeds
+_ELSEWHERE, _DEARER = 0.5, 1.4  # by so much in a second seed of one search, which may cost so much more than the cheapest
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +80,7 @@ def initialize(
 def _in_turn(straight: Iterator[Seed], around: Iterator[Seed]) -> Iterator[Seed]:
     """Yield from both in turn, first what goes straight, unless that is hopeless."""
     for seed in straight:
-        if seed.shortfall > _HOPELESS:
+        if seed.shortfall > HOPELESS:
             yield from islice(around, 1)
             yield seed
         else:
@@ -117,14 +119,16 @@ class _Seeds:
             if attempt == 0 and found.trouble[np.argmin(found.cost)] > _TOLERABLE:
                 continue
             order = np.argsort(found.cost, kind="stable")
-            new = [k for k in order if all(np.abs(found.paths[k] - other)[:, :3].max() > _DIFFERENT for other in given)]
-            best = self._best(found.paths, new[:_LOOKED], found.at)
-            if best is not None:
-                index, z, short = best
-                given.append(found.paths[index])
-                yield Seed(self.method if len(given) == 1 else f"{self.method} {len(given)}", z, short)
-            if len(given) == count:
-                return
+            for apart, dearer in ((_DIFFERENT, np.inf), (_ELSEWHERE, _DEARER)):
+                near = order[found.cost[order] <= dearer * found.cost[order[0]]]
+                new = [k for k in near if all(np.abs(found.paths[k] - other)[:, :3].max() > apart for other in given)]
+                best = self._best(found.paths, new[:_LOOKED], found.at)
+                if best is not None:
+                    index, z, short = best
+                    given.append(found.paths[index])
+                    yield Seed(self.method if len(given) == 1 else f"{self.method} {len(given)}", z, short)
+                if len(given) == count:
+                    return
 
     def _best(
         self, paths: NDArray[np.float64], candidates: list[int], at: list[int]

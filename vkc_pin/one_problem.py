@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from vkc_pin.diagnosis import explain, impossible
 from vkc_pin.goal import compile_task
-from vkc_pin.initialization import Seed, initialize
+from vkc_pin.initialization import HOPELESS, Seed, initialize
 from vkc_pin.options import Options
 from vkc_pin.plan import Plan
 from vkc_pin.problem import TrajectoryProblem
@@ -29,6 +30,7 @@ __all__ = ["TIMES", "OneProblem", "Settings"]
 
 TIMES = ("initialization", "coal", "casadi", "ipopt", "validation")
 """What planning spends its time on."""
+_RACING = 3  # seeds of which the one to begin with is chosen
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,7 @@ class OneProblem:
         self.rounds = self.iterations = 0
         self.history: list[dict[str, float]] = []
         self.blocked: list[str] = []  # phases in which there is no way for the base
+        self._leading: Seed | None = None
 
     def run(self, seed: Callable[[TrajectoryProblem], Seed] | None = None) -> Plan:
         """Try seeds until validation accepts a motion, there are no more, or time is up.
@@ -98,8 +101,8 @@ class OneProblem:
             best, status = self._stationary(problem), "infeasible"
             best = dataclasses.replace(best, report=best.report.with_reasons(reasons))
         else:
-            seeds = self._seeds(problem) if seed is None else iter([seed(problem)])
             deadline = np.inf if limit is None else began + build_time + limit
+            seeds = self._raced(problem, deadline) if seed is None else iter([seed(problem)])
             best, status = self._try_seeds(problem, seeds, deadline, searched=seed is None)
         self.z = best.z
         build_time += problem.transcription.take_build_time()
@@ -128,6 +131,8 @@ class OneProblem:
                     break
         except KeyboardInterrupt:
             status = "interrupted"
+        if best is None and self._leading is not None:
+            best = self._judge(problem, Solution(self._leading.z), self._leading.name)
         if best is None:
             best, notes = self._stationary(problem), notes + self.blocked
         if not status:
@@ -148,8 +153,25 @@ class OneProblem:
                 return
             yield seed
 
-    def _solve(self, problem: TrajectoryProblem, seed: Seed, deadline: float) -> Solution:
-        solution = solve(problem, seed.z, callback=self.settings.callback, deadline=deadline)
+    def _raced(self, problem: TrajectoryProblem, deadline: float) -> Iterator[Seed]:
+        """Yield seeds; where a grasp is chosen with what follows in mind, first those that look best after one round."""
+        seeds = self._seeds(problem)
+        if any(phase.grasps for phase in problem.task.phases[:-1]):
+            scored: list[tuple[float, int, Seed]] = []
+            for number, seed in enumerate(itertools.islice(seeds, _RACING)):
+                if seed.shortfall > HOPELESS:  # a round would not tell
+                    scored.append((np.inf, number, seed))
+                    continue
+                solution = self._solve(problem, seed, deadline, rounds=1)
+                scored.append((problem.objective(solution.z), number, dataclasses.replace(seed, z=solution.z)))
+                self._leading = min(scored)[-1]
+                if solution.status == "interrupted":
+                    raise KeyboardInterrupt
+            yield from (seed for _, _, seed in sorted(scored))
+        yield from seeds
+
+    def _solve(self, problem: TrajectoryProblem, seed: Seed, deadline: float, *, rounds: int | None = None) -> Solution:
+        solution = solve(problem, seed.z, callback=self.settings.callback, deadline=deadline, rounds=rounds)
         self.rounds += solution.rounds
         self.iterations += solution.iterations
         for key, value in solution.timings.items():

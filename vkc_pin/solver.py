@@ -215,6 +215,7 @@ def solve(
     *,
     callback: Callable[[Iteration], None] | None = None,
     deadline: float = np.inf,
+    rounds: int | None = None,
 ) -> Solution:
     """Return the trajectory that the witness-plane loop reaches from `seed`.
 
@@ -223,21 +224,22 @@ def solve(
         seed: z_1..z_N, shape (N, n).
         callback: Called after every round.
         deadline: Value of `time.perf_counter()` at which to stop with the best iterate.
+        rounds: At most so many rounds; None: `Options.max_outer`.
     """
     loop = _Loop(problem, seed, deadline)
     solution = loop.solution
     with interruptible() as interrupt:
-        _iterate(loop, callback, interrupt)
+        _iterate(loop, callback, interrupt, loop.options.max_outer if rounds is None else rounds)
     if interrupt.pressed:  # whichever way the loop ended, nothing else is to be tried
         solution.status = "interrupted"
     return solution
 
 
-def _iterate(loop: _Loop, callback: Callable[[Iteration], None] | None, interrupt: Interrupt) -> None:
+def _iterate(loop: _Loop, callback: Callable[[Iteration], None] | None, interrupt: Interrupt, rounds: int) -> None:
     """Run rounds until everything holds, nothing helps any more, or time is up."""
     solution, started, region = loop.solution, time.perf_counter(), TrustRegion(loop.problem.segments)
     feasible: NDArray[np.float64] | None = None
-    for _ in range(loop.options.max_outer):
+    for _ in range(rounds):
         if time.perf_counter() > loop.deadline:
             solution.status = solution.status if solution.converged else "time limit"
             break

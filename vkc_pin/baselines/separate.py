@@ -18,6 +18,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +35,7 @@ from vkc_pin.options import Options
 from vkc_pin.plan import Plan
 from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.scene import Scene
-from vkc_pin.solver import solve
+from vkc_pin.solver import RATE_TOLERANCE, solve
 from vkc_pin.step_by_step import scene_after
 from vkc_pin.steps import Actuate, GoTo, Grasp, Step
 from vkc_pin.trajectory import Trajectory, join
@@ -46,7 +47,10 @@ __all__ = ["METHODS", "RETRIES", "plan_separately"]
 METHODS = ("B1", "B2")
 RETRIES = 5
 """How often all is tried."""
-_POSES = 10  # base poses that are tried in turn, if there is no way to the nearest
+FINER = 2
+"""How many times more waypoints than elsewhere objects are moved in: an arm that only follows needs smaller steps, and time."""
+_STANDS, _ENDS = 4, 10  # base poses that are tried in turn, the nearest first, at the handle and at the end
+_ROUNDS = 8  # of the solver: what takes more is mostly in vain
 
 
 class _FailedError(Exception):
@@ -55,6 +59,7 @@ class _FailedError(Exception):
     def __init__(self, cause: str, trajectory: Trajectory | None = None) -> None:
         super().__init__(cause)
         self.trajectory = trajectory
+        self.parts: list[Trajectory] = []  # what was done before
 
 
 def plan_separately(
@@ -80,8 +85,8 @@ def plan_separately(
 
     Returns:
         The plan of the first try that validation accepts, else the one that came furthest. Its status is then the cause:
-        "no base pose", "no base path", "arm does not reach", "no inverse kinematics", "collision", or "rejected" by
-        validation. Planning time is that of all tries.
+        "no base pose", "no base path", "arm does not reach", "no inverse kinematics", "collision", "too fast", "closure", or
+        "rejected" by validation. Planning time is that of all tries.
 
     Raises:
         InputError: Steps that cannot be done or are of another kind, or an argument is wrong.
@@ -169,9 +174,21 @@ class _Attempt:
 
     def _actuate(self, step: Actuate) -> None:
         """Move joints of an object: drive to its handle, reach for it, move it."""
-        grasp = self._problem([Grasp(step.object, step.attachment)])
-        goal = self._drive(self._poses(grasp))
-        self._reach(step, goal)
+        steps = [Grasp(step.object, step.attachment)]
+        poses = self._free(self._poses(self._problem(steps)))
+        begun, failure = (self.scene, len(self.parts)), _FailedError("no base pose")
+        for pose in poses[:_STANDS]:
+            try:
+                self._drive(pose)
+                self._reach(steps, pose)
+                break
+            except _FailedError as error:
+                failure = error if failure.trajectory is None else failure  # the first that came anywhere
+                failure.parts = failure.parts or self.parts[begun[1] :]
+                self.scene, self.parts = begun[0], self.parts[: begun[1]]
+        else:
+            self.parts += failure.parts
+            raise failure
         self._move(step)
 
     def _poses(self, problem: TrajectoryProblem) -> NDArray[np.float64]:
@@ -183,55 +200,53 @@ class _Attempt:
             raise _FailedError("no base pose")
         return poses
 
-    def _drive(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Drive to the nearest of some base poses that there is a way to, the arm as it is; return that configuration."""
+    def _free(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return those whose base may stand there while the arm is still as it is."""
         stay = self._problem([GoTo(*self.scene.start[:3].tolist())])
         ends = np.tile(stay.start, (len(poses), 1))
         ends[:, :3] = poses[:, :3]
-        free = Knots(stay, self.rng).depth(ends, stay.segments) <= 0.0
-        if not free.any():
-            raise _FailedError("no base pose")
-        cause, last = "no base path", None
-        for pose in poses[free][:_POSES]:
-            problem = self._problem([GoTo(*pose[:3].tolist())])
-            robot = problem.chain.robot.coordinates.size
-            problem.lower[:, 3:robot] = problem.upper[:, 3:robot] = problem.start[3:robot]
-            z, solved = self._solve(problem, initialize(problem, "astar", self._seed(), count=2))
-            if solved:
-                self._take(problem, z)
-                return pose
-            last = as_trajectory(problem, z) if last is None and z is not None else last
-        raise _FailedError(cause, last)
+        return np.asarray(poses[Knots(stay, self.rng).depth(ends, stay.segments) <= 0.0])
 
-    def _reach(self, step: Actuate, goal: NDArray[np.float64]) -> None:
+    def _drive(self, pose: NDArray[np.float64]) -> None:
+        """Drive to where the base has to stand, the arm as it is."""
+        problem = self._problem([GoTo(*pose[:3].tolist())])
+        arm = slice(3, problem.chain.robot.coordinates.size)
+        problem.lower[:, arm] = problem.upper[:, arm] = problem.start[arm]
+        self._take(problem, self._solve(problem, initialize(problem, "astar", self._seed()), "no base path"))
+
+    def _reach(self, steps: Sequence[Step], pose: NDArray[np.float64]) -> None:
         """Take hold of the object, the base stands."""
-        problem = self._problem([Grasp(step.object, step.attachment)])
+        problem = self._problem(steps)
         problem.lower[:, :3] = problem.upper[:, :3] = problem.start[:3]
-        seeds = initialize(problem, "interpolated", self._seed(), count=2)
-        straight = problem.start + smooth(problem.segments)[:, None] * (np.append(problem.start[:3], goal[3:]) - problem.start)
-        z, solved = self._solve(problem, itertools.chain([Seed("straight", straight)], seeds))
-        if not solved:
-            raise _FailedError("arm does not reach", as_trajectory(problem, z))
-        self._take(problem, z)
+        last = np.append(problem.start[:3], pose[3:])
+        straight = problem.start + smooth(problem.segments)[:, None] * (last - problem.start)
+        seeds = initialize(problem, "interpolated", self._seed())
+        self._take(problem, self._solve(problem, itertools.chain([Seed("straight", straight)], seeds), "arm does not reach"))
 
     def _move(self, step: Actuate) -> None:
-        """Move the object's joints: the base along its way, the arm follows."""
-        problem = self._problem([step])
-        began = time.perf_counter()
-        ways, base = BaseWays(problem), None
-        for pose in self._poses(problem)[:_POSES]:
+        """Move the object's joints: the base goes to the nearest pose to which the arm can follow."""
+        finer = replace(self.options, move_waypoints=FINER * self.options.move_waypoints)
+        problem = self._problem([step], finer)
+        ways = BaseWays(problem)
+        failure, share = _FailedError("no base path"), -1.0
+        for pose in self._poses(problem)[:_ENDS]:
             base = self._path(problem, ways, pose[:3])
-            if base is not None:
-                break
-        self.times["initialization"] += time.perf_counter() - began
-        if base is None:
-            raise _FailedError("no base path")
-        followed = follow(problem, base, self.rng, refine=self.method == "B2")
-        problem.take_time_for(followed.z)
-        problem.stretch(followed.z)
-        if followed.cause:
-            raise _FailedError(followed.cause, as_trajectory(problem, followed.z))
-        self._take(problem, followed.z)
+            if base is None:
+                continue
+            followed = follow(problem, base, self.rng, refine=self.method == "B2")
+            problem.take_time_for(followed.z)
+            problem.stretch(followed.z)
+            cause = followed.cause
+            if not cause and problem.rate_violation(followed.z) > RATE_TOLERANCE:
+                cause = "too fast"
+            if not cause and problem.drift(followed.z) > 1.0:
+                cause = "closure"
+            if not cause:
+                self._take(problem, followed.z)
+                return
+            if followed.share > share:
+                failure, share = _FailedError(cause, as_trajectory(problem, followed.z)), followed.share
+        raise failure
 
     def _path(self, problem: TrajectoryProblem, ways: BaseWays, goal: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Return the base at every waypoint, shape (N, 3): it stands while a latch is released; None: there is no way."""
@@ -247,25 +262,26 @@ class _Attempt:
             begin += phase.segments
         return np.concatenate(base)
 
-    def _problem(self, steps: Sequence[Step]) -> TrajectoryProblem:
+    def _problem(self, steps: Sequence[Step], options: Options | None = None) -> TrajectoryProblem:
         """Return the problem of steps from where the motion has come to."""
-        problem = TrajectoryProblem(self.scene, compile_task(self.scene, steps, self.options), self.options)
+        options = options or self.options
+        problem = TrajectoryProblem(self.scene, compile_task(self.scene, steps, options), options)
         self.build_time += problem.transcription.take_build_time()
         return problem
 
-    def _solve(self, problem: TrajectoryProblem, seeds: Iterator[Seed]) -> tuple[NDArray[np.float64] | None, bool]:
-        """Return the first solution from a seed, or the first that is none, and whether it is one."""
-        first = None
+    def _solve(self, problem: TrajectoryProblem, seeds: Iterator[Seed], cause: str) -> NDArray[np.float64]:
+        """Return the first solution from a seed; raise the error of `cause`, with the first motion that is none, otherwise."""
+        first: Trajectory | None = None
         for seed in seeds:
-            solution = solve(problem, seed.z)
+            solution = solve(problem, seed.z, rounds=_ROUNDS)
             self.build_time += problem.transcription.take_build_time()
             self.iterations += solution.iterations
             for key, value in solution.timings.items():
                 self.times[key] += value
             if solution.converged:
-                return solution.z, True
-            first = solution.z if first is None else first
-        return first, False
+                return solution.z
+            first = first or as_trajectory(problem, solution.z)
+        raise _FailedError(cause, first)
 
     def _take(self, problem: TrajectoryProblem, z: NDArray[np.float64]) -> None:
         """Append a motion, and go on from where it ends."""

@@ -80,9 +80,9 @@ def test_comparison_against_numbers_by_hand() -> None:
     ]
 
 
-def test_pairs_are_of_one_start_and_repeat() -> None:
+def test_common_successes_are_of_one_start_and_repeat() -> None:
     again = {**RECORDS[0], "repeat": 1}
-    found = tables.pairs([again, *RECORDS], "auto", "slow")
+    found = tables.common([again, *RECORDS], ["auto", "slow"])
     assert [(one["number"], one["repeat"], other["number"], other["repeat"]) for one, other in found] == [
         (0, 0, 0, 0),
         (2, 0, 2, 0),

@@ -127,26 +127,37 @@ def _bench_initialization(arguments: argparse.Namespace) -> int:
     return _experiment(
         arguments,
         initialization.run,
-        initialization.report,
+        starts=arguments.starts,
         repeats=arguments.repeats,
         scenes=arguments.scenes or initialization.SCENES,
         methods=arguments.methods or initialization.METHODS,
     )
 
 
-def _experiment(
-    arguments: argparse.Namespace, run: Callable[..., dict[str, Any]], report: Callable[[dict[str, Any]], str], **settings: Any
-) -> int:
-    """Run an experiment on the options that all of them have, and `settings`; print its report, or how to go on."""
-    common = {"starts": arguments.starts, "seed": arguments.seed, "jobs": arguments.jobs, "out": arguments.out}
+def _bench_baselines(arguments: argparse.Namespace) -> int:
+    from vkc_pin.benchmarks import baselines
+
+    return _experiment(
+        arguments,
+        baselines.run,
+        trials=arguments.trials,
+        tasks=arguments.tasks or tuple(baselines.TASKS),
+        methods=arguments.methods or baselines.METHODS,
+        save_failures=arguments.save_failures,
+    )
+
+
+def _experiment(arguments: argparse.Namespace, run: Callable[..., Any], **settings: Any) -> int:
+    """Run an experiment on the options that all of them have, and `settings`; print its table, or how to go on."""
+    common = {"seed": arguments.seed, "jobs": arguments.jobs, "out": arguments.out}
     try:
-        result = run(**common, **settings, progress=not arguments.quiet)
+        run(**common, **settings, progress=not arguments.quiet)
     except KeyboardInterrupt as stop:
         again = shlex.join(["vkc-pin", *arguments.given])
         sys.stderr.write(f"\nvkc-pin: stopped{f'; {stop}' if str(stop) else ''}. The same command goes on from there:\n{again}\n")
         return EXIT_INTERRUPTED
-    sys.stdout.write(report(result))
-    sys.stdout.write(f"\nresults.json, results.csv, table.md and success.png are in {arguments.out}\n")
+    sys.stdout.write((Path(arguments.out) / "table.md").read_text(encoding="utf-8"))
+    sys.stdout.write(f"\nThis table (table.md), its pictures, results.json and results.csv are in {arguments.out}\n")
     return EXIT_OK
 
 
@@ -214,7 +225,7 @@ def _parser() -> argparse.ArgumentParser:
         "Compare ways of initialising the trajectory in three scenes, from the same random starts, and plan step after step too."
     )
     initialization = benches.add_parser("initialization", help="ways of initialising, at a task with a tool", description=about)
-    _add_experiment_options(initialization)
+    _add_experiment_options(initialization, "--starts")
     initialization.add_argument(
         "--repeats", type=_positive, default=1, metavar="R", help="trials per start and method (default 1)"
     )
@@ -222,6 +233,13 @@ def _parser() -> argparse.ArgumentParser:
     some = "some of stationary interpolated astar auto (default: all)"
     initialization.add_argument("--methods", nargs="+", metavar="METHOD", help=some)
     initialization.set_defaults(run=_bench_initialization)
+    about = "Compare planning base and arm together with planning them apart, at a door and a drawer, from random starts."
+    baselines = benches.add_parser("baselines", help="base and arm together or apart, at a door and a drawer", description=about)
+    _add_experiment_options(baselines, "--trials")
+    baselines.add_argument("--tasks", nargs="+", metavar="TASK", help="some of door drawer (default: both)")
+    baselines.add_argument("--methods", nargs="+", metavar="METHOD", help="some of B1 B2 VKC (default: all)")
+    baselines.add_argument("--save-failures", action="store_true", help="save the plans of failures, to be viewed")
+    baselines.set_defaults(run=_bench_baselines)
 
     about = "Sample which links of a robot can never collide."
     srdf = commands.add_parser("srdf", help="regenerate allowed collisions", description=about)
@@ -233,13 +251,13 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add_experiment_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--starts", type=_positive, default=50, metavar="N", help="random starts per scene (default 50)")
+def _add_experiment_options(parser: argparse.ArgumentParser, number: str) -> None:
+    parser.add_argument(number, type=_positive, default=50, metavar="N", help="random starts per scene (default 50)")
     parser.add_argument("--seed", type=_natural, default=0, metavar="S", help="of the starts and of planning (default 0)")
     parser.add_argument(
         "--jobs", type=_positive, default=os.cpu_count() or 1, metavar="J", help="processes (default: one per core)"
     )
-    about = "folder for results, table and chart; trials that it has already are not run again"
+    about = "folder for results, table and charts; trials that it has already are not run again"
     parser.add_argument("--out", required=True, metavar="DIR", help=about)
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
 

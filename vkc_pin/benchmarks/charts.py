@@ -8,15 +8,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vkc_pin.benchmarks.tables import wilson
-from vkc_pin.plotting import _COLOURS, _figure, _save, _style
+from vkc_pin.benchmarks.tables import common, quartiles, wilson
+from vkc_pin.plan import Plan
+from vkc_pin.plotting import _COLOURS, _figure, _save, _shade_phases, _style
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["success_chart"]
+__all__ = ["criteria_chart", "motions_chart", "success_chart"]
 
 _WIDTH = 0.8  # of a group of bars; the distance between groups is 1
+_BASE = ("x [m/s]", "y [m/s]", "yaw [rad/s]")
 
 
 def success_chart(
@@ -52,11 +55,8 @@ def success_chart(
                 own = [bool(r["success"]) for r in records if r["scene"] == scene and r["method"] == method]
                 if not own:
                     continue
-                rate, (low, high) = 100.0 * sum(own) / len(own), (100.0 * end for end in wilson(sum(own), len(own)))
-                axes.bar(place, rate, 0.9 * width, color=colour)
-                error = np.clip([[rate - low], [high - rate]], 0.0, None)
-                axes.errorbar(place, rate, error, color="0.25", linewidth=0.9, capsize=2.5)
-                axes.annotate(f"{rate:.0f}", (place, high), (0, 2), textcoords="offset points", ha="center", fontsize=7.5)
+                low, rate, high = _rate(own)
+                _bar(axes, place, (low, rate, high), colour, f"{rate:.0f}", width=0.9 * width)
             axes.bar(0.0, 0.0, color=colour, label=method)
         axes.set_xticks(range(len(scenes)), [f"{name}\n{_number(records, scene, methods)}" for scene, name in scenes.items()])
         axes.set_xlim(-0.5, len(scenes) - 0.5)
@@ -71,6 +71,111 @@ def success_chart(
         if path is not None:
             _save(figure, Path(path))
     return figure
+
+
+def criteria_chart(
+    records: Sequence[Mapping[str, Any]], path: str | Path | None, methods: Sequence[str], *, title: str = ""
+) -> Figure:
+    """Draw a task's success rate, base effort, arm effort and planning time as bars, side by side.
+
+    Rates have Wilson's intervals of 95 % confidence. The other bars are medians with quartiles: times over all trials, efforts
+    over the trials in which all methods succeed, or over each method's own successes if there are no such trials.
+
+    Args:
+        records: Records of one task as `record.trial` makes them.
+        path: The file to write, .png, .svg or .pdf; None writes nothing.
+        methods: One bar each, in this order.
+        title: Written above.
+
+    Returns:
+        The figure.
+    """
+    both = common(records, methods)
+    where = f"the\n{len(both)} trial{'s' * (len(both) != 1)} where all succeed" if both else "own successes;\nnowhere all succeed"
+    shared = f"median and quartiles over {where}"
+    panels = (
+        ("success", "success [%]", "all trials,\n95 % confidence (Wilson)", ".0f"),
+        ("base_effort", "base effort [m]", shared, ".2f"),
+        ("arm_effort", "arm effort [rad]", shared, ".2f"),
+        ("planning_time", "planning time [s]", "median and quartiles\nover all trials", ".2f"),
+    )
+    with _style():
+        figure = _figure(11.0, 3.4)
+        for axes, (field, name, about, form) in zip(figure.subplots(1, len(panels)), panels, strict=True):
+            for k, method in enumerate(methods):
+                own = [record for record in records if record["method"] == method]
+                if field in ("base_effort", "arm_effort"):
+                    own = [row[k] for row in both] or [record for record in own if record["success"]]
+                values = [float(record[field]) for record in own if record.get(field) is not None]
+                if values:
+                    interval = _rate([value > 0.0 for value in values]) if field == "success" else quartiles(values)
+                    _bar(axes, k, interval, _COLOURS[k % len(_COLOURS)], f"{interval[1]:{form}}", width=0.7)
+            axes.set_xticks(range(len(methods)), methods)
+            axes.set_xlim(-0.6, len(methods) - 0.4)
+            axes.tick_params(axis="x", length=0.0)
+            axes.grid(visible=False, axis="x")
+            axes.set_axisbelow(True)
+            axes.set_ylim(0.0, 110.0 if field == "success" else 1.12 * axes.get_ylim()[1])
+            axes.set_title(name, fontsize=9.5)
+            axes.set_xlabel(about, fontsize=7.5, color="0.35")
+        figure.suptitle(title, fontsize=10.5)
+        if path is not None:
+            _save(figure, Path(path))
+    return figure
+
+
+def motions_chart(plans: Mapping[str, Plan], path: str | Path | None, *, title: str = "") -> Figure:
+    """Draw motions over time, side by side: positions and velocities of the arm's joints, velocity of the base.
+
+    Args:
+        plans: Name → plan, one column each.
+        path: The file to write, .png, .svg or .pdf; None writes nothing.
+        title: Written above.
+
+    Returns:
+        The figure.
+    """
+    with _style():
+        figure = _figure(1.2 + 4.0 * len(plans), 7.0)
+        columns: Any = figure.subplots(3, len(plans), sharex=True, sharey="row", squeeze=False).T
+        for (position, velocity, base), (name, plan) in zip(columns, plans.items(), strict=True):
+            motion = plan.trajectory
+            rates = motion.velocities()
+            for k, joint in enumerate(range(3, motion.robot_size)):
+                colour, label = _COLOURS[k % len(_COLOURS)], motion.names[joint].removesuffix("_joint")
+                position.plot(motion.times, motion.positions[:, joint], color=colour, label=label)
+                velocity.stairs(rates[:, joint], motion.times, baseline=None, color=colour, linewidth=1.2)
+            for k, label in enumerate(_BASE):
+                base.stairs(rates[:, k], motion.times, baseline=None, color=_COLOURS[k], linewidth=1.2, label=label)
+            for axes in (position, velocity, base):
+                _shade_phases(axes, plan)
+                axes.margins(x=0.0)
+            outcome = "" if plan.success else f", FAILED: {plan.status}"
+            position.set_title(f"{name}{outcome} ({motion.times[-1] - motion.times[0]:.1f} s)", fontsize=9.5)
+            base.set_xlabel("time [s]")
+        for axes, label in zip(columns[0], ("arm positions [rad]", "arm velocities [rad/s]", "base velocity"), strict=True):
+            axes.set_ylabel(label)
+        for axes in columns[-1][[0, 2]]:
+            axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7.5)
+        figure.suptitle(title, fontsize=10.5)
+        if path is not None:
+            _save(figure, Path(path))
+    return figure
+
+
+def _rate(good: Sequence[bool]) -> tuple[float, float, float]:
+    """Return a success rate between the ends of Wilson's interval: low, rate, high [%]."""
+    low, high = wilson(sum(good), len(good))
+    return 100.0 * low, 100.0 * sum(good) / len(good), 100.0 * high
+
+
+def _bar(axes: Axes, place: float, interval: tuple[float, float, float], colour: str, text: str, *, width: float) -> None:
+    """Draw a bar with an error bar: an interval is its lower end, the bar's height, and its upper end."""
+    low, height, high = interval
+    axes.bar(place, height, width, color=colour)
+    error = np.clip([[height - low], [high - height]], 0.0, None)
+    axes.errorbar(place, height, error, color="0.25", linewidth=0.9, capsize=2.5)
+    axes.annotate(text, (place, high), (0, 2), textcoords="offset points", ha="center", fontsize=7.5)
 
 
 def _number(records: Sequence[Mapping[str, Any]], scene: str, methods: Sequence[str]) -> str:

@@ -15,12 +15,15 @@ from vkc_pin.benchmarks.record import distribution
 
 __all__ = [
     "EFFORTS",
+    "common",
     "comparison_table",
+    "decimal",
     "failures",
     "foot",
+    "lower",
     "markdown",
+    "mean_and_deviation",
     "methods_table",
-    "pairs",
     "quartiles",
     "to_csv",
     "wilson",
@@ -29,7 +32,7 @@ __all__ = [
 Record = Mapping[str, Any]
 EFFORTS = {"base_effort": "base [m]", "base_effort_l1": "base |dx|+|dy| [m]", "arm_effort": "arm [rad]"}
 """What motions are compared by: field → name."""
-_LEAST = 1e-6  # [m] and [rad] by which an effort must be less to be called lower
+_LEAST = 1e-6  # in any unit, by which a value must be less to be called lower
 
 
 def to_csv(records: Sequence[Record]) -> str:
@@ -68,6 +71,17 @@ def quartiles(values: Sequence[float]) -> tuple[float, float, float]:
     return float(first), float(median), float(third)
 
 
+def decimal(value: float) -> str:
+    """Return a number with two decimals, and a dash for what is none."""
+    return f"{value:.2f}" if np.isfinite(value) else "–"
+
+
+def mean_and_deviation(values: Sequence[float]) -> tuple[float, float]:
+    """Return the mean and the standard deviation of a sample (n − 1); NaN where there are too few values."""
+    mean = float(np.mean(values)) if len(values) else float("nan")
+    return mean, float(np.std(values, ddof=1)) if len(values) > 1 else float("nan")
+
+
 def failures(records: Iterable[Record]) -> str:
     """Return the kinds of failures with their numbers, most frequent first: status, and the kind of constraint violated first."""
     kinds: Counter[str] = Counter()
@@ -96,21 +110,27 @@ def methods_table(records: Sequence[Record], scenes: Mapping[str, str], methods:
                 continue
             good = [record for record in own if record["success"]]
             time, late = distribution([record for record in own if record.get("planning_time") is not None], "planning_time")
-            efforts = (_number(distribution(good, field)[0]) for field in ("base_effort", "arm_effort"))
+            efforts = (decimal(distribution(good, field)[0]) for field in ("base_effort", "arm_effort"))
             rows.append(
-                [name, method, f"{len(good)} of {len(own)}", _number(time), _number(late), *efforts, failures(own) or "none"]
+                [name, method, f"{len(good)} of {len(own)}", decimal(time), decimal(late), *efforts, failures(own) or "none"]
             )
     head = ["scene", "method", "success", "time, median [s]", "95th percentile [s]", "base [m]", "arm [rad]", "failures"]
     return markdown(head, rows, text=2)
 
 
-def pairs(records: Iterable[Record], first: str, second: str) -> list[tuple[Record, Record]]:
-    """Return the records of two methods at the same scene, start and repeat, where both have a success."""
-    found: dict[str, dict[tuple[Any, ...], Record]] = {first: {}, second: {}}
+def common(records: Iterable[Record], methods: Sequence[str]) -> list[tuple[Record, ...]]:
+    """Return the records of several methods at the same scene, start and repeat, where all of them have a success."""
+    found: dict[str, dict[tuple[Any, ...], Record]] = {method: {} for method in methods}
     for record in records:
         if record["success"] and record["method"] in found:
-            found[record["method"]][(record["scene"], record["number"], record["repeat"])] = record
-    return [(record, found[second][place]) for place, record in found[first].items() if place in found[second]]
+            found[record["method"]][(record["scene"], record["number"], record.get("repeat", 0))] = record
+    places = [place for place in found[methods[0]] if all(place in found[method] for method in methods)]
+    return [tuple(found[method][place] for method in methods) for place in places]
+
+
+def lower(pairs: Sequence[tuple[Record, ...]], field: str) -> int:
+    """Return in how many of the pairs the first record's value is lower than the second's, by more than rounding."""
+    return sum(float(one[field]) < float(other[field]) - _LEAST for one, other in pairs)
 
 
 def comparison_table(
@@ -126,11 +146,10 @@ def comparison_table(
     """
     rows = []
     for name, chosen in _groups(records, scenes):
-        both = pairs(chosen, *methods)
+        both = common(chosen, methods)
         for field, shown in EFFORTS.items():
             one, other = ([float(pair[k][field]) for pair in both] for k in (0, 1))
-            lower = sum(a < b - _LEAST for a, b in zip(one, other, strict=True))
-            rows.append([name, shown, _spread(one), _spread(other), f"{lower} of {len(both)}"])
+            rows.append([name, shown, _spread(one), _spread(other), f"{lower(both, field)} of {len(both)}"])
     head = ["scene", "effort", *(f"{name}: median (quartiles)" for name in names), f"lower with {names[0]}"]
     return markdown(head, rows, text=2)
 
@@ -156,10 +175,6 @@ def _groups(records: Sequence[Record], scenes: Mapping[str, str]) -> list[tuple[
     """Return name and records of every scene, and of all of them if there are several."""
     groups = [(name, [record for record in records if record["scene"] == scene]) for scene, name in scenes.items()]
     return [*groups, ("all", list(records))] if len(groups) > 1 else groups
-
-
-def _number(value: float) -> str:
-    return f"{value:.2f}" if np.isfinite(value) else "–"
 
 
 def _spread(values: Sequence[float]) -> str:

@@ -1,0 +1,178 @@
+"""The tables of the experiment that compares planning base and arm together with planning them apart."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from vkc_pin.benchmarks.tables import (
+    EFFORTS,
+    common,
+    decimal,
+    failures,
+    foot,
+    lower,
+    markdown,
+    mean_and_deviation,
+    wilson,
+)
+
+__all__ = ["CRITERIA", "report"]
+
+CRITERIA = {
+    **EFFORTS,
+    "peak_velocity": "peak arm velocity [rad/s]",
+    "peak_acceleration": "peak arm acceleration [rad/s²]",
+    "duration": "duration [s]",
+}
+"""What motions are compared by: field → name."""
+_OWN = "VKC"
+
+Record = Mapping[str, Any]
+
+
+def report(
+    result: Mapping[str, Any],
+    tasks: Mapping[str, str],
+    *,
+    saved: Mapping[str, str] | None = None,
+    shown: Mapping[str, int] | None = None,
+) -> str:
+    """Return the tables of a result in Markdown, with versions and machine at the foot.
+
+    Args:
+        result: {"meta": ..., "trials": [...]}, as from `baselines.run`.
+        tasks: Task → what is done in it.
+        saved: Key → file, for the failures whose plans are saved.
+        shown: Task → the trial whose motions <task>_joints.png shows.
+    """
+    about, records = result["meta"], result["trials"]
+    methods = about["methods"]
+    pictures = [
+        f"![Criteria: {tasks[task]}]({task}.png)"
+        + (f"\n\n![Motions of trial {shown[task]}: {tasks[task]}]({task}_joints.png)" if shown and task in shown else "")
+        for task in tasks
+    ]
+    parts = [
+        "# Base and arm together, or one after the other",
+        f"{' and '.join(f'`{task}`: {name}' for task, name in tasks.items())}. {about['starts']} random "
+        f"start{'s' * (about['starts'] != 1)} per task, the same for all methods; seed {about['seed']}. At most "
+        f"{about['time_limit']:g} s of planning per trial, after which the baselines begin no further try of {about['retries']}. "
+        "Success is the word of the independent validation. Standard deviations are those of samples (n − 1).",
+        "## Success",
+        _success(records, tasks, methods),
+        "## Planning time",
+        "Without imports and symbolic build. The last column is the median over that of VKC.",
+        _times(records, tasks, methods),
+        "## Efforts, peaks and durations where all methods succeed",
+        "Mean ± standard deviation; median. Trials in which all methods succeed: " + _numbers(records, tasks, methods) + ".",
+        _criteria(records, tasks, methods, shared=True),
+        *_pairwise(records, tasks, methods),
+        "## Efforts, peaks and durations over each method's own successes",
+        "Mean ± standard deviation; median. The methods have succeeded in different trials, so harder ones count for some only.",
+        _criteria(records, tasks, methods, shared=False),
+        *pictures,
+    ]
+    if saved:
+        parts += ["## Failures", "`vkc-pin view FILE` shows them, links that come too close in red.", _failed(records, saved)]
+    return "\n\n".join([*parts, foot(about)]) + "\n"
+
+
+def _success(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str]) -> str:
+    rows = []
+    for task, method in _cases(tasks, methods):
+        own = _of(records, task, method)
+        good = sum(bool(record["success"]) for record in own)
+        low, high = (f"{100.0 * end:.0f}" for end in wilson(good, len(own)))
+        rate = f"{100.0 * good / len(own):.0f}" if own else "–"
+        rows.append([task, method, f"{good} of {len(own)}", rate, f"{low}–{high}", failures(own) or "none"])
+    head = ["task", "method", "success", "[%]", "95 % interval (Wilson)", "failures: cause (violated first)"]
+    return markdown(head, rows, text=2)
+
+
+def _times(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str]) -> str:
+    rows = []
+    for name, good in (("all trials", False), ("successes", True)):
+        for task, method in _cases(tasks, methods):
+            times, own = (_values(_of(records, task, which, good=good), "planning_time") for which in (method, _OWN))
+            late = float(np.percentile(times, 95)) if times else float("nan")
+            median, reference = (float(np.median(values)) if values else float("nan") for values in (times, own))
+            cells = (median, late, *mean_and_deviation(times), median / reference)
+            rows.append([name, task, method, str(len(times)), *map(decimal, cells)])
+    head = ["over", "task", "method", "n", "median [s]", "95th percentile [s]", "mean [s]", "deviation [s]", f"to {_OWN}"]
+    return markdown(head, rows, text=3)
+
+
+def _numbers(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str]) -> str:
+    """Return in how many trials of every task all methods succeed."""
+    numbers = []
+    for task in tasks:
+        own = [record for record in records if record["scene"] == task]
+        numbers.append(f"{len(common(own, methods))} of {len({record['number'] for record in own})} ({task})")
+    return ", ".join(numbers)
+
+
+def _criteria(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str], *, shared: bool) -> str:
+    """Return all criteria of all methods, over the trials that they share or over each method's own successes."""
+    rows = []
+    for task in tasks:
+        own = [record for record in records if record["scene"] == task]
+        good = {method: _of(own, task, method, good=True) for method in methods}
+        if shared:
+            both = common(own, methods)
+            good = {method: [row[k] for row in both] for k, method in enumerate(methods)}
+        if not shared:
+            rows.append([task, "n", *(str(len(good[method])) for method in methods)])
+        for field, name in CRITERIA.items():
+            rows.append([task, name, *(_spread(_values(good[method], field)) for method in methods)])
+    return markdown(["task", "criterion", *methods], rows, text=2)
+
+
+def _pairwise(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str]) -> list[str]:
+    """Return a section on VKC against every other method, if it is one of several."""
+    others = [method for method in methods if method != _OWN]
+    if _OWN not in methods or not others:
+        return []
+    rows = []
+    for other in others:
+        for task in tasks:
+            both = common([record for record in records if record["scene"] == task], (_OWN, other))
+            for field, name in {**CRITERIA, "planning_time": "planning time [s]"}.items():
+                one, two = (_values([row[k] for row in both], field) for k in (0, 1))
+                medians = (decimal(float(np.median(values))) if values else "–" for values in (one, two))
+                rows.append([task, name, other, *medians, f"{lower(both, field)} of {len(both)}"])
+    head = ["task", "criterion", "other", f"{_OWN}, median", "other, median", f"lower with {_OWN}"]
+    text = f"Over the trials in which {_OWN} and the other method succeed, whatever the third does."
+    return [f"## {_OWN} against each baseline", text, markdown(head, rows, text=3)]
+
+
+def _failed(records: Sequence[Record], saved: Mapping[str, str]) -> str:
+    rows = []
+    for record in records:
+        if record["key"] in saved:
+            violated = record["violations"][0] if record["violations"] else "–"
+            cells = [record["scene"], record["number"], record["method"], record["status"], violated, f"`{saved[record['key']]}`"]
+            rows.append([str(cell) for cell in cells])
+    return markdown(["task", "trial", "method", "cause", "violated first", "file"], rows, text=6)
+
+
+def _cases(tasks: Mapping[str, str], methods: Sequence[str]) -> list[tuple[str, str]]:
+    return [(task, method) for task in tasks for method in methods]
+
+
+def _of(records: Sequence[Record], task: str, method: str, *, good: bool = False) -> list[Record]:
+    """Return the records of a task and method, or its successes."""
+    own = (record for record in records if (record["scene"], record["method"]) == (task, method))
+    return [record for record in own if record["success"] or not good]
+
+
+def _values(records: Sequence[Record], field: str) -> list[float]:
+    """Return the values of a field; trials that ended with an error have none."""
+    return [float(record[field]) for record in records if record.get(field) is not None]
+
+
+def _spread(values: Sequence[float]) -> str:
+    mean, deviation = mean_and_deviation(values)
+    return f"{decimal(mean)} ± {decimal(deviation)}; {decimal(float(np.median(values)))}" if values else "–"

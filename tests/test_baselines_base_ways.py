@@ -1,0 +1,120 @@
+"""Ways of the bare base: straight, around what stands there, or none."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from base_scenes import BLINK, MARGIN, between, distance
+from drawers import SHORT, changed, drawer_scene, open_scene
+from small_problems import door_scene
+
+import vkc_pin as vkc
+from vkc_pin.baselines.base_ways import BaseWays
+from vkc_pin.geometry import placed_shapes, standing_geometry
+from vkc_pin.scene import FLOOR
+
+START, BESIDE = np.array([-1.5, 1.5, 0.0]), np.array([0.5, 1.0, 0.8])
+AISLE = np.array([1.0, -1.4, 0.0])  # behind the post
+POST: dict[str, Any] = {"name": "post", "type": "box", "size": [0.2, 0.2, 1.0], "position": [-0.3, -0.1, 0.5]}
+
+
+def ways(scene: vkc.Scene, name: str = "drawer", **joints: float) -> BaseWays:
+    return BaseWays(vkc.build(scene, [vkc.Actuate(name, joints or {"slide": 0.3})], options=SHORT))
+
+
+def room_of(scene: vkc.Scene, poses: np.ndarray, *, without: Sequence[str] = ("drawer",)) -> float:
+    """Return the least distance of the base from obstacles and objects on straight lines between poses [m], asked of coal."""
+    base = [(s.geometry, s.placement) for s in scene.robot.collision.geometryObjects if s.parentJoint == 1]
+    labels = zip(scene.obstacle_labels, scene.obstacles.geometryObjects, strict=True)
+    still = [shape for label, shape in labels if label != FLOOR]
+    for name, placed in scene.objects.items():
+        still += standing_geometry(placed) if name not in without else []
+    rows = np.vstack([between(a, b, length=0.05, angle=0.1) for a, b in itertools.pairwise(poses)])
+    return min(distance(base, placed_shapes(still), row.tolist()) for row in rows)
+
+
+def test_straight_where_that_is_free() -> None:
+    way = ways(open_scene(POST)).way(START, BESIDE, 10)
+    assert way is not None
+    u = np.arange(1, 11) / 10
+    for column in range(3):  # from rest to rest
+        expected = START[column] + (3 * u**2 - 2 * u**3) * (BESIDE[column] - START[column])
+        np.testing.assert_allclose(way[:, column], expected, atol=1e-12)
+
+
+def test_around_what_stands_there() -> None:
+    scene = open_scene(POST)
+    assert room_of(scene, np.array([START, AISLE])) < 0.0
+    way = ways(scene).way(START, AISLE, 80)
+    assert way is not None
+    assert way.shape == (80, 3)
+    np.testing.assert_array_equal(way[-1, :2], AISLE[:2])
+    assert np.cos(way[-1, 2] - AISLE[2]) == pytest.approx(1.0)
+    # It keeps its margin, but for the corners that are cut between two waypoints.
+    assert room_of(scene, np.vstack([START, way])) >= MARGIN - BLINK - 0.01
+    steps = np.linalg.norm(np.diff(np.vstack([START, way])[:, :2], axis=0), axis=1)
+    assert steps.sum() < 1.3 * np.hypot(*(AISLE - START)[:2])
+    assert steps.max() < 0.15
+    assert max(steps[0], steps[-1]) < 0.01, "slow at both ends"
+
+
+@pytest.mark.parametrize(
+    "walls",
+    [
+        [([0.1, 4.6, 1.0], [0.0, 0.0, 0.5])],  # from side to side
+        [([2.4, 0.1, 1.0], [-1.4, 0.6, 0.5]), ([0.1, 4.0, 1.0], [-0.2, 1.5, 0.5])],  # round the start
+    ],
+    ids=["a wall across", "walled in"],
+)
+def test_no_way(walls: list[tuple[list[float], list[float]]]) -> None:
+    boxes = [{"name": f"wall_{k}", "type": "box", "size": size, "position": at} for k, (size, at) in enumerate(walls)]
+    scene = open_scene(*boxes)
+    assert room_of(scene, np.array([START, START])) > MARGIN
+    assert room_of(scene, np.array([AISLE, AISLE])) > MARGIN
+    assert ways(scene).way(START, AISLE, 10) is None
+
+
+def test_a_blocked_end_is_not_reached() -> None:
+    scene = open_scene(POST)
+    assert ways(scene).way(START, np.array([-0.3, -0.1, 0.0]), 10) is None
+
+
+def test_a_differential_base_does_not_go_sideways() -> None:
+    way = ways(open_scene(base="differential")).way(START, BESIDE, 400)
+    assert way is not None
+    steps = np.diff(np.vstack([START, way]), axis=0)
+    heading = np.vstack([START, way])[:-1, 2] + steps[:, 2] / 2
+    sideways = np.abs(np.cos(heading) * steps[:, 1] - np.sin(heading) * steps[:, 0])
+    assert sideways.max() < 5e-3, "it turns where it stands, but for the step in which it begins to"
+    assert np.median(sideways) < 1e-9
+
+
+def test_other_objects_are_in_the_way_as_they_stand() -> None:
+    """A door that the hand does not hold, shut or open; the drawer is what it holds."""
+    scene = drawer_scene()
+    door = {"name": "door", "type": "door", "position": [0.0, 0.44, 0.0]}
+    both = changed(open_scene(), objects=[*scene.document["objects"], door])
+    before, after = np.array([-0.9, -0.05, 0.0]), np.array([0.8, -0.05, 0.0])
+    for hinge, straight in ((0.0, False), (1.5, True)):
+        here = both.with_state("door", {"hinge": hinge})
+        assert (room_of(here, np.array([before, after])) > MARGIN) == straight
+        way = ways(here).way(before, after, 80)
+        assert way is not None
+        assert (np.ptp(way[:, 1]) < 1e-9) == straight
+        assert room_of(here, np.vstack([before, way])) >= MARGIN - BLINK - 0.01
+
+
+def test_the_door_that_it_opens_is_not_in_its_way() -> None:
+    """But the walls beside it are."""
+    scene = door_scene()
+    before, after = np.array([1.8, -0.05, 0.0]), np.array([3.3, -0.05, 0.0])
+    assert room_of(scene, np.array([before, after]), without=()) < 0.0
+    found = ways(scene, "door", hinge=1.2)
+    way = found.way(before, after, 10)
+    assert way is not None
+    np.testing.assert_allclose(way[:, 1:], np.tile(before[1:], (10, 1)), atol=1e-12)
+    assert not found.grid.clear(2.55, -0.5, 0.0)

@@ -1,13 +1,17 @@
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from fake_plan import fake_plan
+from matplotlib.patches import StepPatch
 
-from vkc_pin.benchmarks.charts import success_chart
+from vkc_pin.benchmarks.charts import criteria_chart, motions_chart, success_chart
 from vkc_pin.benchmarks.tables import wilson
+from vkc_pin.report import Report
 
 SCENES = {"a": "easy", "b": "hard"}
 RATES = {("a", "one"): (4, 4), ("a", "two"): (3, 4), ("b", "one"): (1, 4), ("b", "two"): (0, 4)}
@@ -58,3 +62,80 @@ def test_a_method_without_trials_has_no_bar() -> None:
     figure = success_chart(RECORDS[:4], None, SCENES, ["one", "two"])
     assert [text.get_text() for text in figure.axes[0].texts] == ["100"]
     assert [label.get_text() for label in figure.axes[0].get_xticklabels()] == ["easy\n4 trials each", "hard\nno trials"]
+
+
+def record(method: str, number: int, success: bool, base: float, time: float | None) -> dict[str, Any]:
+    efforts = {"base_effort": base, "arm_effort": 10.0 * base, "planning_time": time}
+    return {"scene": "a", "method": method, "number": number, "success": success, **efforts}
+
+
+TRIALS = [
+    *(record("one", number, True, base, time) for number, base, time in ((0, 3.0, 1.0), (1, 4.0, 2.0), (2, 9.0, 6.0))),
+    *(record("two", number, good, base, time) for number, good, base, time in ((0, True, 5.0, 3.0), (1, True, 6.0, 4.0))),
+    record("two", 2, False, 99.0, None),  # an error
+]
+
+
+def bars_of(axes: Any) -> list[tuple[str, float]]:
+    names = [label.get_text() for label in axes.get_xticklabels()]
+    return [(names[round(bar.get_x() + bar.get_width() / 2.0)], bar.get_height()) for bar in axes.patches]
+
+
+def test_criteria_against_numbers_by_hand() -> None:
+    figure = criteria_chart(TRIALS, None, ["one", "two"], title="All")
+    success, base, arm, time = figure.axes
+    assert bars_of(success) == [("one", 100.0), ("two", pytest.approx(200.0 / 3.0))]
+    assert bars_of(base) == [("one", 3.5), ("two", 5.5)]  # only where both succeed
+    assert bars_of(arm) == [("one", 35.0), ("two", 55.0)]
+    assert bars_of(time) == [("one", 2.0), ("two", 3.5)]  # of all that have one
+    ends = [[line.get_segments()[0][:, 1].tolist() for line in axes.collections] for axes in figure.axes]
+    assert ends[0] == [pytest.approx([100.0 * end for end in wilson(good, 3)]) for good in (3, 2)]
+    assert ends[1:] == [[[3.25, 3.75], [5.25, 5.75]], [[32.5, 37.5], [52.5, 57.5]], [[1.5, 4.0], [3.25, 3.75]]]
+    assert [text.get_text() for text in success.texts + base.texts] == ["100", "67", "3.50", "5.50"]
+    about = [axes.get_xlabel().replace("\n", " ") for axes in figure.axes]
+    assert "Wilson" in about[0]
+    assert about[1] == about[2] == "median and quartiles over the 2 trials where all succeed"
+    assert about[3] == "median and quartiles over all trials"
+    colours = [[bar.get_facecolor() for bar in axes.patches] for axes in figure.axes]
+    assert all(pair == colours[0] for pair in colours)
+    assert colours[0][0] != colours[0][1]
+
+
+def test_criteria_without_common_successes() -> None:
+    trials = [*TRIALS[:2], *(r | {"number": r["number"] + 5} for r in TRIALS[3:]), record("three", 0, False, 99.0, 20.0)]
+    _, base, _, time = criteria_chart(trials, None, ["one", "two", "three"]).axes
+    assert bars_of(base) == [("one", 3.5), ("two", 5.5)]
+    assert "own successes" in base.get_xlabel()
+    assert bars_of(time)[2] == ("three", 20.0)
+
+
+def test_motions_are_those_of_the_plans(tmp_path: Path) -> None:
+    from matplotlib.image import imread
+
+    plan = fake_plan()
+    slow = dataclasses.replace(
+        plan,
+        status="success",
+        validation=Report(),
+        trajectory=dataclasses.replace(plan.trajectory, times=2.0 * plan.trajectory.times),
+    )
+    path = tmp_path / "new" / "motions.png"
+    figure = motions_chart({"first": plan, "second": slow}, path, title="Both")
+    rows = np.array(figure.axes).reshape(3, 2)
+    assert rows[0, 0].get_title() == "first, FAILED: rejected (6.0 s)"
+    assert rows[0, 1].get_title() == "second (12.0 s)"
+    for column, shown in enumerate((plan, slow)):
+        motion, (position, velocity, base) = shown.trajectory, rows[:, column]
+        np.testing.assert_array_equal([line.get_ydata() for line in position.lines], motion.positions[:, 3:9].T)
+        assert all((line.get_xdata() == motion.times).all() for line in position.lines)
+        for axes, columns in ((velocity, slice(3, 9)), (base, slice(0, 3))):
+            steps = [patch for patch in axes.patches if isinstance(patch, StepPatch)]
+            np.testing.assert_allclose([step.get_data().values for step in steps], motion.velocities()[:, columns].T)
+            assert all((step.get_data().edges == motion.times).all() for step in steps)
+    for row in rows:
+        assert row[0].get_ylim() == row[1].get_ylim()
+    assert {axes.get_xlim() for axes in rows.ravel()} == {(0.0, 12.0)}
+    assert [text.get_text() for text in rows[0, 1].get_legend().get_texts()][:2] == ["shoulder_pan", "shoulder_lift"]
+    assert [text.get_text() for text in rows[2, 1].get_legend().get_texts()] == ["x [m/s]", "y [m/s]", "yaw [rad/s]"]
+    image = imread(path)[..., :3]
+    assert float((np.ptp(image, axis=2) > 0.2).mean()) > 0.005  # coloured lines

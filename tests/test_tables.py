@@ -90,6 +90,25 @@ def test_common_successes_are_of_one_start_and_repeat() -> None:
     assert all((one["method"], other["method"]) == ("auto", "slow") for one, other in found)
 
 
+def test_common_successes_of_three() -> None:
+    third = record("a", "third", 2, 1.0, 1.0, 1.0)
+    del third["repeat"]  # an experiment without repeats
+    found = tables.common([*RECORDS, third, record("a", "third", 1, 1.0, 1.0, 1.0)], ["third", "slow", "auto"])
+    assert [[(r["method"], r["number"]) for r in row] for row in found] == [[("third", 2), ("slow", 2), ("auto", 2)]]
+
+
+def test_lower() -> None:
+    pairs = [({"x": a}, {"x": b}) for a, b in ((1.0, 2.0), (2.0, 1.0), (3.0, 3.0), (3.0, 3.0 + 1e-8), (3.0, 3.0 + 1e-4))]
+    assert tables.lower(pairs, "x") == 2
+
+
+def test_mean_and_deviation() -> None:
+    assert tables.mean_and_deviation([2.0, 4.0, 9.0]) == pytest.approx((5.0, np.sqrt(13.0)))  # 9 + 1 + 16, by 2
+    one, none = tables.mean_and_deviation([2.0]), tables.mean_and_deviation([])
+    assert one[0] == 2.0
+    assert np.isnan([one[1], *none]).all()
+
+
 @pytest.mark.parametrize(
     ("good", "number", "low", "high"),
     # Published values of the interval: 81 of 263 (Newcombe 1998), 15 of 148, 0 of 20, 1 of 29.

@@ -1,4 +1,4 @@
-"""The experiment from the command line, for real, on two starts."""
+"""The experiments from the command line, for real, on two starts."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ import pytest
 
 from vkc_pin.benchmarks.initialization import TARGET
 from vkc_pin.cli import main
+from vkc_pin.plan import Plan
 from vkc_pin.scene import load_scene
+from vkc_pin.validation import validate
 
 FIELDS = {
     *("key", "scene", "method", "number", "repeat", "perturbation", "start", "seed", "success", "status", "planning_time"),
@@ -108,3 +110,50 @@ def test_auto_is_compared_with_step_after_step(tmp_path: Path) -> None:
         cells = [cell.strip() for cell in line.strip("|").split("|")]
         assert [cell.split(" ")[0] for cell in cells[2:4]] == [f"{trial[field]:.2f}" for trial in trials]
         assert cells[4] == f"{int(trials[0][field] < trials[1][field] - 1e-6)} of 1"
+
+
+@pytest.mark.slow
+def test_baselines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["bench", "baselines", "--trials", "2", "--tasks", "drawer", "--methods", "B1", "VKC", "--jobs", "1", "--quiet"]
+    command += ["--save-failures", "--out", str(tmp_path)]
+    assert main(command) == 0
+    table = (tmp_path / "table.md").read_text(encoding="utf-8")
+    assert table in capsys.readouterr().out
+    trials = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))["trials"]
+    assert [t["key"] for t in trials] == [f"drawer/{n:04d}/{method}" for n in (0, 1) for method in ("B1", "VKC")]
+    for t in trials:
+        own = {"peak_velocity", "peak_acceleration", "duration"} | ({"time_following"} if t["method"] == "B1" else set())
+        assert set(t) == FIELDS - {"repeat", "perturbation"} | own
+        assert t["success"] == (t["status"] == "success") == (not t["violations"])
+        assert t["success"] or t["method"] == "B1", t["violations"]
+        assert (t["scene"], t["seed"]) == ("drawer", t["number"])
+        assert 0.0 < sum(t[name] for name in t if name.startswith("time_")) <= t["planning_time"] < 40.0
+        assert (tmp_path / f"failures/drawer_{t['number']:04d}_{t['method']}.npz").is_file() == (not t["success"])
+        assert f"| drawer | {t['method']} | {sum(o['success'] for o in trials if o['method'] == t['method'])} of 2 |" in table
+        if not t["success"]:
+            continue
+        assert t["base_effort"] <= t["base_effort_l1"] <= np.sqrt(2.0) * t["base_effort"]
+        # From the start to within reach of the drawer, which is at x = 4, y = 2.5.
+        assert t["base_effort"] > np.linalg.norm(np.array(t["start"][:2]) - [4.0, 2.5]) - 1.9
+        assert 0.0 < t["peak_velocity"] <= np.pi
+        assert 0.0 < t["peak_acceleration"] <= 1.4 + 1e-3  # the limit
+        assert t["peak_velocity"] * 6 * t["duration"] > t["arm_effort"] > 1.0
+    assert trials[0]["start"] == trials[1]["start"] != trials[2]["start"] == trials[3]["start"]
+
+    # The motions in the picture are those of the trial.
+    both = [n for n in (0, 1) if all(t["success"] for t in trials if t["number"] == n)]
+    shown = {path.name: Plan.load(path) for path in (tmp_path / "shown").iterdir()} if both else {}
+    assert set(shown) == ({f"drawer_{both[0]:04d}_{method}.npz" for method in ("B1", "VKC")} if both else set())
+    for t in trials:
+        plan = shown.get(f"drawer_{t['number']:04d}_{t['method']}.npz")
+        if plan is not None:
+            assert validate(plan.scene, plan.steps, plan.trajectory, plan.options).ok
+            assert plan.trajectory.column("drawer.slide")[-1] == pytest.approx(0.6, abs=5e-3)
+            for name, value in plan.trajectory.metrics().items():
+                assert t[name] == pytest.approx(value, rel=1e-3), name
+    for name in ("drawer.png", "drawer_joints.png")[: 1 + bool(both)]:
+        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
+
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.suffix in (".json", ".jsonl", ".csv", ".md")}
+    assert main(command) == 0  # nothing is left to do
+    assert {name: (tmp_path / name).read_bytes() for name in before} == before

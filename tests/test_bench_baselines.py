@@ -311,9 +311,11 @@ def test_view_shows_a_failure_with_the_offending_links_in_red(
     ("good", "expected"),
     [
         ({"B1": {1, 2}, "B2": {2, 3}, "VKC": {0, 1, 2, 3}}, 2),
-        ({"B1": {1}, "B2": {0}, "VKC": {0, 1}}, 1),
+        ({"B1": {1}, "B2": {0}, "VKC": {0, 1}}, 0),
         ({"B1": set(), "B2": {1}, "VKC": {0, 1}}, 1),
-        ({"B1": {0}, "B2": {0}, "VKC": set()}, None),
+        ({"B1": {0, 1}, "B2": {0, 1}, "VKC": {2}}, 2),
+        ({"B1": {0, 1}, "B2": {1}, "VKC": set()}, 1),
+        ({"B1": set(), "B2": set(), "VKC": set()}, None),
     ],
 )
 def test_the_trial_that_is_shown(good: dict[str, set[int]], expected: int | None) -> None:

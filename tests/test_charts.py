@@ -11,6 +11,7 @@ from matplotlib.patches import StepPatch
 
 from vkc_pin.benchmarks.charts import criteria_chart, motions_chart, success_chart
 from vkc_pin.benchmarks.tables import wilson
+from vkc_pin.plan import Plan
 from vkc_pin.report import Report
 
 SCENES = {"a": "easy", "b": "hard"}
@@ -109,6 +110,16 @@ def test_criteria_without_common_successes() -> None:
     assert bars_of(time)[2] == ("three", 20.0)
 
 
+def fastest(plan: Plan) -> float:
+    return float(np.abs(plan.trajectory.velocities()[:, 3:9]).max())
+
+
+def test_motions_that_succeed_are_all_in_the_picture() -> None:
+    plan = dataclasses.replace(fake_plan(), status="success", validation=Report())
+    axes = motions_chart({"one": plan, "two": plan}, None).axes[2]
+    assert axes.get_ylim()[1] > fastest(plan)
+
+
 def test_motions_are_those_of_the_plans(tmp_path: Path) -> None:
     from matplotlib.image import imread
 
@@ -134,6 +145,7 @@ def test_motions_are_those_of_the_plans(tmp_path: Path) -> None:
             assert all((step.get_data().edges == motion.times).all() for step in steps)
     for row in rows:
         assert row[0].get_ylim() == row[1].get_ylim()
+    assert rows[1, 0].get_ylim() == pytest.approx((-2.0 * fastest(slow), 2.0 * fastest(slow)))  # not scaled to the failure
     assert {axes.get_xlim() for axes in rows.ravel()} == {(0.0, 12.0)}
     assert [text.get_text() for text in rows[0, 1].get_legend().get_texts()][:2] == ["shoulder_pan", "shoulder_lift"]
     assert [text.get_text() for text in rows[2, 1].get_legend().get_texts()] == ["x [m/s]", "y [m/s]", "yaw [rad/s]"]

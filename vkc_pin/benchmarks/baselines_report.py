@@ -59,7 +59,7 @@ def report(
         "# Base and arm together, or one after the other",
         f"{' and '.join(f'`{task}`: {name}' for task, name in tasks.items())}. {about['starts']} random "
         f"start{'s' * (about['starts'] != 1)} per task, the same for all methods; seed {about['seed']}. At most "
-        f"{about['time_limit']:g} s of planning per trial, after which the baselines begin no further try of {about['retries']}. "
+        f"{about['time_limit']:g} s of planning per trial, in which the baselines try up to {about['retries']} times. "
         "Success is the word of the independent validation. Standard deviations are those of samples (n − 1).",
         "## Success",
         _success(records, tasks, methods),

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["criteria_chart", "motions_chart", "success_chart"]
 
 _WIDTH = 0.8  # of a group of bars; the distance between groups is 1
+_ROOM = 2.0  # a scale that is not made for all motions reaches so many times farther than the others
 _BASE = ("x [m/s]", "y [m/s]", "yaw [rad/s]")
 
 
@@ -127,6 +128,8 @@ def criteria_chart(
 def motions_chart(plans: Mapping[str, Plan], path: str | Path | None, *, title: str = "") -> Figure:
     """Draw motions over time, side by side: positions and velocities of the arm's joints, velocity of the base.
 
+    Velocities are scaled to the motions that succeed, if any does; failed ones may leave the frame.
+
     Args:
         plans: Name → plan, one column each.
         path: The file to write, .png, .svg or .pdf; None writes nothing.
@@ -153,6 +156,11 @@ def motions_chart(plans: Mapping[str, Plan], path: str | Path | None, *, title: 
             outcome = "" if plan.success else f", FAILED: {plan.status}"
             position.set_title(f"{name}{outcome} ({motion.times[-1] - motion.times[0]:.1f} s)", fontsize=9.5)
             base.set_xlabel("time [s]")
+        good = [plan.trajectory for plan in plans.values() if plan.success]
+        for row, part in ((1, lambda motion: slice(3, motion.robot_size)), (2, lambda motion: slice(0, 3))):
+            if good and len(good) < len(plans):
+                largest = max(float(np.abs(motion.velocities()[:, part(motion)]).max()) for motion in good)
+                columns[0][row].set_ylim(-_ROOM * largest, _ROOM * largest)
         for axes, label in zip(columns[0], ("arm positions [rad]", "arm velocities [rad/s]", "base velocity"), strict=True):
             axes.set_ylabel(label)
         for axes in columns[-1][[0, 2]]:

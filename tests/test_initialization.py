@@ -178,3 +178,14 @@ def test_straight_and_around_take_turns(straight: list[float], around: int, expe
     for seed in _in_turn(looked_for("s", straight), looked_for("a", [0.0] * around)):
         said.append(seed.name.upper())
     assert said == expected.split()
+
+
+def test_the_base_turns_on_the_way_and_not_in_the_last_step() -> None:
+    scene, rng = vkc.load_scene("aisle_drawer"), np.random.default_rng(1)
+    for _ in range(12):  # on some of these ways headings wind by a whole turn
+        problem = vkc.build(scene.sample_start(rng), [vkc.GoTo(2.9, 2.0, float(rng.uniform(-3.0, 3.0)))])
+        (seed,) = initialize(problem, "astar", 0)
+        turns = np.diff(problem.waypoints(seed.z)[:, 2])
+        assert abs(turns[-1]) < 0.2
+        assert np.abs(turns).max() < 1.0
+        assert abs(seed.z[-1, 2] - problem.start[2]) <= np.pi + 1e-9

@@ -170,6 +170,9 @@ class _Seeds:
                         self._note_no_way(phase, through[leave], through[arrive])
                         return None
                     turned = way[-1, 2] - through[arrive, 2]  # by whole turns: what follows goes on from there
+                    if problem.lower[end - 1, 2] == problem.upper[end - 1, 2]:  # unless the goal says how far to turn
+                        way[:, 2] -= turned * np.arange(1, steps + 1) / steps
+                        turned = 0.0
                     through[arrive:, 2] += turned
                     knots[inside[-1] :, 2] += turned
             for column in range(size):

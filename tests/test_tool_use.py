@@ -17,14 +17,14 @@ from vkc_pin.world import World
 
 
 @cache
-def start() -> vkc.Scene:
-    return vkc.load_scene("init_1").sample_start(np.random.default_rng(5))
+def start(seed: int = 5) -> vkc.Scene:
+    return vkc.load_scene("init_1").sample_start(np.random.default_rng(seed))
 
 
 @cache
-def plan(attachment: str = "grip") -> vkc.Plan:
+def plan(attachment: str = "grip", seed: int = 5) -> vkc.Plan:
     steps = [vkc.Grasp("stick", attachment), vkc.Touch("stick.tip", TARGET)]
-    return vkc.plan(start(), steps, initialization="astar")
+    return vkc.plan(start(seed), steps, initialization="astar")
 
 
 def tip(scene: vkc.Scene, row: np.ndarray, trajectory: vkc.Trajectory) -> np.ndarray:
@@ -48,14 +48,17 @@ def test_the_tip_reaches_its_target_to_a_millimetre() -> None:
 
 
 def test_grasping_anywhere_costs_less_than_at_one_place() -> None:
-    anywhere, fixed = plan(), plan("end")
-    assert anywhere.success, anywhere.report()
-    assert fixed.success, fixed.report()
-    slide = anywhere.trajectory.column("stick.grip_slide")
-    turn = anywhere.trajectory.column("stick.grip_turn")
-    assert abs(slide[-1]) > 5e-3 or abs(turn[-1]) > 5e-2  # it makes use of it
-    effort = [p.trajectory.base_effort() + p.trajectory.arm_effort() for p in (anywhere, fixed)]
-    assert effort[0] < effort[1]
+    efforts = []
+    for seed in range(5, 10):
+        anywhere, fixed = plan(seed=seed), plan("end", seed)
+        assert anywhere.success, anywhere.report()
+        assert fixed.success, fixed.report()
+        slide = anywhere.trajectory.column("stick.grip_slide")
+        turn = anywhere.trajectory.column("stick.grip_turn")
+        assert abs(slide[-1]) > 5e-3 or abs(turn[-1]) > 5e-2  # it makes use of it
+        efforts.append([p.trajectory.base_effort() + p.trajectory.arm_effort() for p in (anywhere, fixed)])
+    some, one = np.median(efforts, axis=0)  # of single starts either may end in a local minimum
+    assert some < 0.97 * one
 
 
 def test_one_problem_costs_less_than_step_after_step() -> None:

@@ -137,7 +137,9 @@ def test_the_objective_is_equation_1(name: str) -> None:
     weight = np.array(
         [
             o.velocity_weight_base
-            if k < 3
+            if k < 2
+            else o.velocity_weight_heading
+            if k == 2
             else o.velocity_weight_arm
             if k < p.chain.robot.coordinates.size
             else o.velocity_weight_object

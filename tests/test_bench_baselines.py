@@ -151,6 +151,7 @@ def test_going_on_after_ctrl_c_gives_the_same(tmp_path: Path, result: dict[str, 
     with pytest.raises(KeyboardInterrupt, match="4 of 9 trials are done"):
         run(tmp_path, solve=first, save_failures=True)
     assert not (tmp_path / "table.md").exists()
+    assert files(tmp_path / "failures") == {"door_0000_B1.npz", "door_0001_B1.npz", "door_0000_B2.npz"}  # not what was stopped
     assert run(tmp_path, solve=second, save_failures=True)["trials"] == result["trials"]
     assert sorted(first.asked + second.asked[:5]) == [t["key"] for t in result["trials"]]
     assert [key.split("/")[1] for key in second.asked[5:]] == ["0002"] * 3  # planned again to be shown
@@ -283,6 +284,15 @@ def test_failures_are_saved_later_too(tmp_path: Path, out: Path) -> None:
     assert later.asked == ["door/0000/B1", "door/0001/B1", "door/0000/B2"]
     assert files(tmp_path / "failures") == files(out / "failures")
     assert "failures/door_0001_B1.npz" in (tmp_path / "table.md").read_text(encoding="utf-8")
+
+
+def test_what_succeeds_when_planned_again_is_no_failure_to_look_at(tmp_path: Path) -> None:
+    run(tmp_path)
+    run(tmp_path, solve=lambda scene, spec: solve(scene, {**spec, "number": 2}), save_failures=True)
+    assert files(tmp_path / "failures") == set()
+    text = (tmp_path / "table.md").read_text(encoding="utf-8")
+    assert "## Failures" not in text
+    assert "| door | B1 | 1 of 3 |" in text  # the trials count as they were
 
 
 def test_view_shows_a_failure_with_the_offending_links_in_red(

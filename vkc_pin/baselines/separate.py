@@ -62,9 +62,9 @@ def plan_separately(
 
     Returns:
         The plan of the first try that validation accepts, else the one that came furthest. Its status is then the cause:
-        "no base pose", "no base path", "arm does not reach", "no inverse kinematics", "collision", "too fast", "closure", or
-        "rejected" by validation; "time limit" if that was up before anything had failed; "interrupted" by Ctrl-C. Planning time is that of all tries,
-        `rounds` is their number.
+        "no base pose", "no base path", "arm does not reach", "no inverse kinematics", "collision", "too fast", "closure",
+        "rejected" by validation, "time limit" if that was up before anything had failed, "interrupted" by Ctrl-C. Planning
+        time is that of all tries; `rounds` is their number.
 
     Raises:
         InputError: Steps that cannot be done or are of another kind, or an argument is wrong.

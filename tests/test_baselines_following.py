@@ -59,6 +59,24 @@ def test_it_follows_to_the_end(change: Sequence[float], refine: bool) -> None:
     assert np.abs(np.diff(problem.waypoints(found.z)[:, 3:9], axis=0)).max() < 0.6, "from the waypoint before"
 
 
+def test_every_arm_is_looked_for_from_the_one_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = pulling()
+    way, given = base(problem, -0.25, 0.0, 0.0), []
+    at = module._Arm.at
+
+    def seen(self: module._Arm, z: np.ndarray, waypoint: int) -> tuple[np.ndarray, str]:
+        given.append((z.copy(), waypoint))
+        return at(self, z, waypoint)
+
+    monkeypatch.setattr(module._Arm, "at", seen)
+    found = followed(problem, way)
+    assert [waypoint for _, waypoint in given] == [1, 2, 3, 4, 5, 6, 7, 8]
+    rows = np.array([z for z, _ in given])
+    np.testing.assert_array_equal(rows[:, 3:9], problem.waypoints(found.z)[:-1, 3:9])
+    np.testing.assert_array_equal(rows[:, :3], way)
+    np.testing.assert_allclose(rows[:, 9], GOAL * smooth(8))
+
+
 def test_the_same_numbers_give_the_same_motion() -> None:
     problem = pulling(0.92)  # where random arms are needed
     way = base(problem)

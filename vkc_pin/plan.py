@@ -74,7 +74,8 @@ class Plan:
         options: How it was planned.
         trajectory: The motion; if planning failed, the best there was.
         validation: What the independent check says of it.
-        status: "success", or why not: "infeasible", "not converged", "time limit", "interrupted", "rejected".
+        status: "success", or why not: "infeasible", "not converged", "time limit", "interrupted", "rejected"; plans of the
+            baselines name the stage that failed.
         metrics: planning_time [s], build_time [s], base_effort [m], base_effort_l1 [m], arm_effort [rad], clearance [m],
             closure_error [m], duration [s], iterations, rounds, and the split time_coal, time_casadi, time_ipopt,
             time_initialization, time_validation [s].

@@ -118,3 +118,12 @@ def test_the_door_that_it_opens_is_not_in_its_way() -> None:
     assert way is not None
     np.testing.assert_allclose(way[:, 1:], np.tile(before[1:], (10, 1)), atol=1e-12)
     assert not found.grid.clear(2.55, -0.5, 0.0)
+
+
+def test_what_stands_still_of_the_thing_it_holds_is_in_its_way() -> None:
+    """The drawer's case does not move with the drawer."""
+    scene = changed(open_scene(), objects=[{**drawer_scene().document["objects"][0], "position": [-0.4, 0.0, 0.0]}])
+    before, after = np.array([-0.1, -1.7, np.pi / 2]), np.array([-0.1, 1.7, np.pi / 2])
+    way = ways(scene).way(before, after, 80)
+    assert way is not None
+    assert room_of(scene, np.vstack([before, way]), without=()) >= MARGIN - 0.02

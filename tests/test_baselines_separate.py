@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drawers import drawer_scene, handle, off, open_scene, with_boxes
+from drawers import changed, drawer_scene, handle, holding, off, open_scene, with_boxes
 from small_problems import door_scene
 
 import vkc_pin as vkc
@@ -436,3 +436,63 @@ def test_misuse_raises(case: tuple[dict[str, Any], str, str]) -> None:
         plan_separately(drawer_scene(), call.pop("steps"), **call)
     assert caught.value.field == field
     assert text in str(caught.value)
+
+
+def test_one_thing_after_another() -> None:
+    second = {"name": "second", "type": "drawer", "position": [1.93, -1.4, 0.0]}
+    scene = changed(open_scene(), objects=[*drawer_scene().document["objects"], second])
+    plan = plan_separately(scene, [PULL, vkc.Actuate("second", {"slide": 0.2})], options=OPTIONS)
+    assert plan.success, plan.report()
+    names = [phase.name for phase in plan.trajectory.phases]
+    first = ["go to", "reach drawer.handle", "move drawer.slide"]
+    assert names == [*first, "go to", "reach second.handle", "move second.slide"]
+
+
+def test_the_same_thing_twice() -> None:
+    """It is in the hand already."""
+    plan = plan_separately(open_scene(), [vkc.Actuate("drawer", {"slide": 0.15}), PULL], options=OPTIONS)
+    assert plan.success, plan.report()
+    names = [phase.name for phase in plan.trajectory.phases]
+    assert names == ["go to", "reach drawer.handle", "move drawer.slide", "move drawer.slide"]
+
+
+def test_what_is_held_at_the_start() -> None:
+    plan = plan_separately(holding(open_scene()), [PULL], options=OPTIONS)
+    assert plan.success, plan.report()
+    assert [phase.name for phase in plan.trajectory.phases] == ["move drawer.slide"]
+
+
+def test_walled_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    """There are places at the handle, but no way to them."""
+    limited(monkeypatch, stands=3)
+    plan = failed(with_boxes(open_scene(), wall=([0.1, 4.6, 2.4], [0.15, 0.0, 1.2])))
+    assert plan.status == "no base path"
+    assert [phase.name for phase in plan.trajectory.phases] == ["go to"]
+
+
+def test_a_time_limit_ends_planning_inside_a_try(monkeypatch: pytest.MonkeyPatch) -> None:
+    limited(monkeypatch, stands=4)
+    plan = failed(open_scene(), time_limit=1e-6, retries=5)
+    assert plan.status == "time limit"
+    assert plan.metrics["rounds"] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "field"),
+    [
+        ({"seed": -1}, "seed"),
+        ({"seed": 0.5}, "seed"),
+        ({"time_limit": "5"}, "time_limit"),
+        ({"time_limit": -1.0}, "time_limit"),
+        ({"time_limit": float("nan")}, "time_limit"),
+        ({"options": {"dt": 0.1}}, "options"),
+        ({"scene": "drawer"}, "scene"),
+        ({"retries": True}, "retries"),
+    ],
+    ids=str,
+)
+def test_arguments_are_checked_as_those_of_plan(arguments: dict[str, Any], field: str) -> None:
+    call = {"scene": drawer_scene(), **arguments}
+    with pytest.raises(vkc.InputError) as caught:
+        plan_separately(call.pop("scene"), [PULL], **{"retries": 1, **call})
+    assert caught.value.field == field

@@ -208,14 +208,14 @@ def test_of_failures_the_least_violated_is_returned(monkeypatch: pytest.MonkeyPa
 
 
 def test_time_is_up_during_the_race(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The solver returns at once from then on; what looks best is returned."""
+    """The solver returns at once from then on; what looked best before is returned."""
     late: dict[str, Answer] = {"b": (1.0, "time limit"), "c": (3.0, "time limit")}
     race = Race(monkeypatch, [2.0, 3.0, 4.0], after=late, finally_=dict.fromkeys("abc", (1.0, "time limit")))
     plan = race.run(time_limit=10.0)
     assert plan.status == "time limit"
     assert not plan.success
-    assert plan.initialization == "b"
-    assert race.events[-1] == "b*", "no other seed is begun"
+    assert plan.initialization == "a"
+    assert race.events[-1] == "a*", "no other seed is begun"
     assert plan.validation.violations
 
 
@@ -303,3 +303,31 @@ def test_turning_costs_what_the_heading_weighs() -> None:
 
 def test_standing_still_costs_nothing() -> None:
     assert flat() == pytest.approx(0.0, abs=1e-9)
+
+
+def test_no_seed_is_looked_for_when_time_is_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And what the solver has not touched does not lead."""
+    after = {"a": (2.0, "not converged"), "b": (1.0, "time limit")}
+    race = Race(monkeypatch, [3.0, 1.0, 4.0], after=after, finally_=dict.fromkeys("abc", (2.0, "time limit")))
+    plan = race.run(time_limit=10.0)
+    assert "c" not in race.events
+    assert (plan.status, plan.initialization) == ("time limit", "a")
+
+
+def test_the_leader_keeps_its_own_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """How long a motion takes follows from its seed; the last seed's is not the leader's."""
+    race = Race(monkeypatch, [2.0, 40.0, 40.0], after={"a": (2.0, "not converged"), "b": (40.0, "interrupted")})
+    solve = race.solve
+
+    def timed(problem: vkc.TrajectoryProblem, z: np.ndarray, **keywords: Any) -> Any:
+        problem.take_time_for(z)  # as the solver does
+        return solve(problem, z, **keywords)
+
+    from vkc_pin import one_problem
+
+    monkeypatch.setattr(one_problem, "solve", timed)
+    plan = race.run()
+    assert plan.initialization == "a"
+    alone = vkc.build(drawer_scene(), PULL, options=SHORT)
+    alone.take_time_for(race.z(alone, "a", 2.0))
+    assert plan.metrics["duration"] == pytest.approx(float(alone.dt.sum()) + SHORT.grasp_time, rel=1e-6)

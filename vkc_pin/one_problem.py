@@ -132,6 +132,7 @@ class OneProblem:
         except KeyboardInterrupt:
             status = "interrupted"
         if best is None and self._leading is not None:
+            problem.take_time_for(self._leading.z)
             best = self._judge(problem, Solution(self._leading.z), self._leading.name)
         if best is None:
             best, notes = self._stationary(problem), notes + self.blocked
@@ -163,6 +164,8 @@ class OneProblem:
                     scored.append((np.inf, number, seed))
                     continue
                 solution = self._solve(problem, seed, deadline, rounds=1)
+                if solution.status == "time limit" and self._leading is not None:
+                    break
                 scored.append((problem.objective(solution.z), number, dataclasses.replace(seed, z=solution.z)))
                 self._leading = min(scored)[-1]
                 if solution.status == "interrupted":

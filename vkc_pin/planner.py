@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import TypeGuard
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from vkc_pin.solution import Iteration
 from vkc_pin.step_by_step import step_by_step
 from vkc_pin.steps import Step
 
-__all__ = ["plan"]
+__all__ = ["check_arguments", "plan"]
 
 
 def plan(
@@ -54,15 +55,9 @@ def plan(
         InputError: The steps name something that is not there or cannot be done, or an argument is wrong.
     """
     options = Options() if options is None else options
-    for field, value, kind in (("scene", scene, Scene), ("options", options, Options)):
-        if not isinstance(value, kind):
-            raise InputError("wrong kind of argument", field=field, expected=f"a {kind.__name__}", got=repr(value))
+    check_arguments(scene, options, time_limit, seed)
     if initialization not in METHODS:
         raise UnknownNameError("initialization", str(initialization), METHODS, field="initialization")
-    if time_limit is not None and not (_is_number(time_limit) and 0 < time_limit < np.inf):
-        raise InputError("out of range", field="time_limit", expected="seconds, more than 0", got=repr(time_limit))
-    if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:
-        raise InputError("out of range", field="seed", expected="a whole number of at least 0", got=repr(seed))
     if not (_is_number(perturbation) and 0 <= perturbation < np.inf):
         raise InputError("out of range", field="perturbation", expected="a number of at least 0", got=repr(perturbation))
     settings = Settings(initialization, options, callback, time_limit, int(seed), float(perturbation))
@@ -71,5 +66,16 @@ def plan(
     return all_at_once(scene, steps, settings)
 
 
-def _is_number(value: object) -> bool:
+def check_arguments(scene: object, options: object, time_limit: object, seed: object) -> None:
+    """Raise an InputError that says what is wrong if one of these is not what planning needs; see `plan`."""
+    for field, value, kind in (("scene", scene, Scene), ("options", options, Options)):
+        if not isinstance(value, kind):
+            raise InputError("wrong kind of argument", field=field, expected=f"a {kind.__name__}", got=repr(value))
+    if time_limit is not None and not (_is_number(time_limit) and 0 < time_limit < np.inf):
+        raise InputError("out of range", field="time_limit", expected="seconds, more than 0", got=repr(time_limit))
+    if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:
+        raise InputError("out of range", field="seed", expected="a whole number of at least 0", got=repr(seed))
+
+
+def _is_number(value: object) -> TypeGuard[float]:
     return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)

@@ -57,7 +57,7 @@ class ArmKinematics:
                 step = pink.solve_ik(configuration, [task], 1.0, QP, damping=1e-9, limits=[box], safety_break=False)
             except pink.exceptions.NoSolutionFound:
                 break
-            box.z = box.z + step
+            box.take(step)
             configuration.update(chain.coordinates.q(box.z))
         return box.z, False
 
@@ -78,6 +78,12 @@ class _Box:
     ) -> None:
         self.columns, self.lower, self.upper, self.z = columns, lower, upper, z
         self._rows = np.vstack([np.eye(len(z)), -np.eye(len(z))])
+
+    def take(self, step: NDArray[np.float64]) -> None:
+        """Go a step, shape (n,), without what the solver of quadratic programs leaves as rounding errors."""
+        at, z = self.columns, self.z.copy()
+        z[at] = np.clip(z[at] + step[at], self.lower[at], self.upper[at])
+        self.z = z
 
     def compute_qp_inequalities(self, configuration: Any, dt: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return G and h of G·δz ≤ h, shapes (2n, n) and (2n,)."""

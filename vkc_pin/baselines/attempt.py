@@ -96,10 +96,17 @@ class Attempt:
         return join(self.parts, pause=self.options.grasp_time), np.inf, ""
 
     def _actuate(self, step: Actuate) -> None:
-        """Move joints of an object: drive to its handle, reach for it, move it."""
-        steps = [Grasp(step.object, step.attachment)]
+        """Move joints of an object: drive to its handle and reach for it, unless it is held, and move it."""
+        held = self.scene.held.get(step.object)
+        if held is None or step.attachment not in (None, held):
+            self.scene = self.scene.with_held({})
+            self._take_hold([Grasp(step.object, step.attachment)])
+        self._move(step)
+
+    def _take_hold(self, steps: Sequence[Step]) -> None:
+        """Drive to the nearest base pose from which the arm reaches what is to be grasped, and reach for it."""
         poses = self._free(self._poses(self._problem(steps)))
-        scene, before, failure = self.scene, self.parts, _FailedError("no base pose")
+        scene, before, failure = self.scene, self.parts, _FailedError("no base pose", share=-1.0)
         for pose in poses[:_STANDS]:
             self.scene, self.parts = scene, list(before)
             try:
@@ -112,7 +119,6 @@ class Attempt:
         else:
             self.parts = before
             raise failure
-        self._move(step)
 
     def _poses(self, problem: TrajectoryProblem) -> NDArray[np.float64]:
         """Return configurations for the end of a problem, the nearest first."""
@@ -214,6 +220,8 @@ class Attempt:
                 return solution.z
             if solution.status == "interrupted":
                 raise KeyboardInterrupt
+            if solution.status == "time limit":
+                raise _FailedError("time limit", as_trajectory(problem, solution.z))
             if not failure.parts:
                 failure = _FailedError(cause, as_trajectory(problem, solution.z))
         raise failure

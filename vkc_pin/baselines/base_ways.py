@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from vkc_pin.base_body import Shape
 from vkc_pin.base_grid import BaseGrid
 from vkc_pin.base_path import along, shortest_path
-from vkc_pin.geometry import placed_shapes, standing_geometry
 from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.scene import FLOOR
 
@@ -18,25 +17,25 @@ _STEPS = 25  # places of a straight way that are looked at
 
 
 class BaseWays:
-    """Ways of the bare base between places, with all in the scene but what a problem's holds move.
+    """Ways of the bare base between places, around all that stands while an object is moved.
 
     Attributes:
         grid: Where the base fits.
     """
 
     def __init__(self, problem: TrajectoryProblem) -> None:
-        scene, robot = problem.scene, problem.chain.robot
+        robot = problem.chain.robot
         self.omni = robot.base == "omni"
         base: list[Shape] = [
             (shape.geometry, shape.placement) for shape in robot.collision.geometryObjects if shape.parentJoint == 1
         ]
-        held = {hold.object for hold in problem.task.holds}
-        still = [
-            shape for shape, label in zip(scene.obstacles.geometryObjects, scene.obstacle_labels, strict=True) if label != FLOOR
+        part = problem.contacts.phases[-1]
+        standing: list[Shape] = [
+            (shape.geometry, shape.placement)
+            for shape, label in zip(part.geometry.geometryObjects, part.labels, strict=True)
+            if shape.parentJoint == 0 and label != FLOOR
         ]
-        for name, placed in scene.objects.items():
-            still += standing_geometry(placed) if name not in held else []
-        self.grid = BaseGrid(base, [], placed_shapes(still), scene.arena, problem.options.dist_safe)
+        self.grid = BaseGrid(base, [], standing, problem.scene.arena, problem.options.dist_safe)
 
     def way(self, start: NDArray[np.float64], goal: NDArray[np.float64], steps: int) -> NDArray[np.float64] | None:
         """Return poses after the start, slow at both ends, the last at the goal, shape (steps, 3); None: there is no way.

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vkc_pin.baselines.arm_kinematics import ArmKinematics
-from vkc_pin.baselines.refining import refined
+from vkc_pin.baselines.refining import CLEAR, refined
 from vkc_pin.knots import Knots
 from vkc_pin.problem import TrajectoryProblem
 
@@ -16,6 +16,7 @@ __all__ = ["Followed", "follow"]
 
 SEEDS = 16
 """From so many random arms inverse kinematics is tried where it leads to nothing from the waypoint before."""
+_KINDS = ("", "collision", "no inverse kinematics")  # what may be wrong with a configuration, the best first
 _SPREAD = 1.0  # [rad], of half of them about the waypoint before; the others are anywhere within the limits
 
 
@@ -74,20 +75,20 @@ class _Arm:
             return first, ""
         found = [self._candidate(seed, waypoint) for seed in self._seeds(z)]
         found.append((first, cause))
-        for kind in ("", "collision", "no inverse kinematics"):
-            alike = [other for other, wrong in found if wrong == kind]
-            if alike:
-                return min(alike, key=lambda other: float(np.abs(other - z).sum())), kind
-        return first, cause
+        # The best kind, and of these the nearest.
+        return min(found, key=lambda one: (_KINDS.index(one[1]), float(np.abs(one[0] - z).sum())))
 
     def _candidate(self, z: NDArray[np.float64], waypoint: int) -> tuple[NDArray[np.float64], str]:
         """Return what inverse kinematics, and refinement, lead to from `z`, and what is wrong with it."""
         found, closed = self.kinematics.solve(z, waypoint)
-        if self.refine and (not closed or self.knots.depth(found[None], waypoint)[0] > 0.0):
+        if self.refine and not (closed and self._free(found, waypoint)):
             found, closed = refined(self.problem, self.knots, found, z, waypoint, self.kinematics.columns)
         if not closed:
             return found, "no inverse kinematics"
-        return found, "collision" if self.knots.depth(found[None], waypoint)[0] > 0.0 else ""
+        return found, "" if self._free(found, waypoint) else "collision"
+
+    def _free(self, z: NDArray[np.float64], waypoint: int) -> bool:
+        return bool(self.knots.depth(z[None], waypoint)[0] <= CLEAR)
 
     def _seeds(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return `z` with other arms, shape (SEEDS, n)."""

@@ -10,7 +10,10 @@ from vkc_pin.clearing import distance_gradients
 from vkc_pin.knots import Knots
 from vkc_pin.problem import TrajectoryProblem
 
-__all__ = ["refined"]
+__all__ = ["CLEAR", "refined"]
+
+CLEAR = 1e-5
+"""By so much [m] a configuration may fall short of its clearances: the programs end at them."""
 
 _ROUNDS = 12
 _REACH = 0.05  # [m] beyond the clearance: contacts that are looked at
@@ -55,7 +58,7 @@ def refined(
         residual, jacobian = (part[0] for part in solver.evaluate(z[None], target))
         reach = problem.options.dist_safe + _REACH
         contacts = problem.contacts.evaluate(z[None], np.array([waypoint]), reach=reach, nearest=None)
-        if np.abs(residual).max() < _TOLERANCE and contacts.violation() <= 0.0:
+        if np.abs(residual).max() < _TOLERANCE and contacts.violation() <= CLEAR:
             return z, True
         gradients = distance_gradients(problem, z[None], contacts)[:, free]
         room = contacts.distance - contacts.margin

@@ -26,6 +26,7 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.goal import compile_task
 from vkc_pin.options import Options
 from vkc_pin.plan import Plan
+from vkc_pin.planner import check_arguments
 from vkc_pin.report import Report
 from vkc_pin.scene import Scene
 from vkc_pin.steps import Actuate, Step
@@ -70,9 +71,10 @@ def plan_separately(
         InputError: Steps that cannot be done or are of another kind, or an argument is wrong.
     """
     options = Options() if options is None else options
+    check_arguments(scene, options, time_limit, seed)
     if method not in METHODS:
         raise UnknownNameError("method", str(method), METHODS, field="method")
-    if not isinstance(retries, int) or retries < 1:
+    if not isinstance(retries, int) or isinstance(retries, bool) or retries < 1:
         raise InputError("out of range", field="retries", expected="a whole number of at least 1", got=repr(retries))
     task = compile_task(scene, steps, options)
     actions = []
@@ -84,7 +86,7 @@ def plan_separately(
     best: tuple[float, str, int, Trajectory, Report] | None = None
     for number in range(retries):
         deadline = np.inf if time_limit is None else began + built + time_limit
-        attempt = Attempt(scene, options, refine=method == "B2", seed=[seed, number], deadline=deadline)
+        attempt = Attempt(scene, options, refine=method == "B2", seed=[int(seed), number], deadline=deadline)
         trajectory, came, cause = attempt.run(actions)
         checked = time.perf_counter()
         report = validate(scene, task.steps, trajectory, options)
@@ -114,6 +116,6 @@ def plan_separately(
             "closure_error": report.closure_error,
             "rounds": float(number + 1),
         },
-        seed=seed,
+        seed=int(seed),
         initialization=f"{method}, try {tried + 1}",
     )

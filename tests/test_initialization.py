@@ -189,3 +189,11 @@ def test_the_base_turns_on_the_way_and_not_in_the_last_step() -> None:
         assert abs(turns[-1]) < 0.2
         assert np.abs(turns).max() < 1.0
         assert abs(seed.z[-1, 2] - problem.start[2]) <= np.pi + 1e-9
+
+
+def test_what_costs_nothing_has_a_seed() -> None:
+    scene = vkc.load_scene("drawer")
+    problem = vkc.build(scene, [vkc.GoTo(*scene.start[:3].tolist())])
+    with np.errstate(all="raise"):
+        (seed,) = initialize(problem, "interpolated", 0)
+    assert np.abs(seed.z - problem.start).max() < 1e-9

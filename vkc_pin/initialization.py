@@ -119,9 +119,9 @@ class _Seeds:
             if attempt == 0 and found.trouble[np.argmin(found.cost)] > _TOLERABLE:
                 continue
             order = np.argsort(found.cost, kind="stable")
-            for apart, dearer in ((_DIFFERENT, np.inf), (_ELSEWHERE, _DEARER)):
-                near = order[found.cost[order] <= dearer * found.cost[order[0]]]
-                new = [k for k in near if all(np.abs(found.paths[k] - other)[:, :3].max() > apart for other in given)]
+            cheap = order[found.cost[order] <= _DEARER * found.cost[order[0]]]
+            for apart, some in ((_DIFFERENT, order), (_ELSEWHERE, cheap)):
+                new = [k for k in some if all(np.abs(found.paths[k] - other)[:, :3].max() > apart for other in given)]
                 best = self._best(found.paths, new[:_LOOKED], found.at)
                 if best is not None:
                     index, z, short = best

@@ -125,6 +125,14 @@ def test_attachments_are_where_hands_can_be(name: str) -> None:
         assert not others or clearance(hand, parts(placed, *others)) > DIST_SAFE, attachment.name
 
 
+def test_hand_on_the_dishwashers_door_can_stay_level_until_it_is_open() -> None:
+    grasp = thing("dishwasher").attachment("door_handle")
+    for angle in np.linspace(0.0, np.pi / 2, 5):
+        tool = at_origin("dishwasher", door=float(angle)).link_placement("door") * grasp.placement * grasp.motion([-angle])
+        np.testing.assert_allclose(tool.rotation[:, 2], [1.0, 0.0, 0.0], atol=1e-9)
+        assert lowest(moved_hand(tool)) > DIST_SAFE, "it clears the floor"
+
+
 @pytest.mark.parametrize("name", ATTACHMENTS)
 def test_object_turned_round_is_the_same_object(name: str) -> None:
     obj, rng = thing(name), np.random.default_rng(0)
@@ -337,12 +345,8 @@ def test_the_arm_reaches_it_without_touching_anything(name: str, attachment: str
     others = world(here, without={name})
     rest = [link for link in placed.object.links if link != grasp.link]
     others += parts(placed, *rest) if rest else []
-    here_about = placed.placement.translation
-    others = [
-        (shape, where)
-        for shape, where in others
-        if clearance([(coal.Sphere(1.8), pin.SE3(np.eye(3), here_about))], [(shape, where)]) < 0
-    ]
+    ball = [(coal.Sphere(1.8), pin.SE3(np.eye(3), placed.placement.translation))]
+    others = [part for part in others if clearance(ball, [part]) < 0.0]
     data, shapes = robot.model.createData(), robot.collision.createData()
     frame, rng = tool_frame(robot), np.random.default_rng(0)
     for turn in turns(grasp.freedoms):
@@ -380,6 +384,12 @@ def bounds(shapes: Iterable[tuple[coal.CollisionGeometry, pin.SE3]]) -> np.ndarr
         lows.append(where.translation - reach)
         highs.append(where.translation + reach)
     return np.array([np.min(lows, axis=0), np.max(highs, axis=0)])
+
+
+def lowest(shapes: Shapes) -> float:
+    """How far shapes are above the floor [m]."""
+    plate = (coal.Box(20.0, 20.0, 0.1), pin.SE3(np.eye(3), np.array([0.0, 0.0, -0.05])))
+    return clearance(shapes, [plate])
 
 
 def robot_shapes(robot: Robot, z: np.ndarray) -> list[tuple[str, coal.CollisionGeometry, pin.SE3]]:

@@ -23,6 +23,9 @@ UNDER_THE_TABLE = (-0.4, 2.4, 0.4), (-4.2, -0.6, 2.0)  # what to look at, and fr
 WHOLE_ROOM = (0.5, 0.3, 0.0), (-8.6, -5.4, 5.4)
 CORRIDOR = (1.6, 0.0, 0.3), (-7.4, -1.4, 7.2)
 AISLE = (2.35, 2.5, 0.2), (-2.9, -3.0, 6.2)
+HOME = (0.1, -0.3, 0.0), (-1.5, -8.5, 9.0)
+KITCHEN = (-2.1, 2.4, 0.7), (0.1, -1.0, 2.9)
+OPENED = {"door": ("hinge", 1.0), "drawer": ("slide", 0.22), "dishwasher": ("rack", 0.5), "refrigerator": ("hinge", 1.4)}
 
 sys.path.insert(0, str(ROOT / "tests"))
 from browser import screenshot  # noqa: E402
@@ -47,6 +50,17 @@ def plots(plan: vkc.Plan, prefix: str, *names: str) -> None:
             (IMAGES / f"{prefix}_{name}.png").write_bytes((Path(folder) / f"{name}.png").read_bytes())
 
 
+def home_pictures() -> None:
+    """Write the pictures of the home, as it is and with its doors open."""
+    home = vkc.load_scene("household")
+    look(*HOME)
+    picture(home, "household", WIDE)
+    for name, (joint, value) in OPENED.items():
+        home = home.with_state(name, {joint: value})
+    look(*KITCHEN)
+    picture(home, "household_kitchen", SMALL)
+
+
 def main() -> int:
     """Write the pictures; return 1 if there is no motion to show."""
     saved = [vkc.Plan.load(name) for name in sys.argv[1:]]
@@ -68,6 +82,7 @@ def main() -> int:
     for name, camera in (("corridor_door", CORRIDOR), ("aisle_drawer", AISLE)):
         look(*camera)
         picture(vkc.load_scene(name), name, SMALL)
+    home_pictures()
     return 0
 
 

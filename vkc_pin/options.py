@@ -52,7 +52,7 @@ class Options:
     velocity_weight_base: float = 5.0
     velocity_weight_heading: float = 0.3
     velocity_weight_arm: float = 1.0
-    velocity_weight_object: float = 0.5
+    velocity_weight_object: float = 0.1
     acceleration_weight: float = 0.3
     approach: float = 0.08
     approach_waypoints: int = 4

@@ -103,3 +103,26 @@ def test_initialization(tmp_path: Path) -> None:
 
     written = {path.name for path in (tmp_path / "few_starts").iterdir()}
     assert written == {"results.csv", "results.json", "success.png", "table.md", "trials.jsonl"}
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_baselines(tmp_path: Path) -> None:
+    began = time.perf_counter()
+    cells = executed("06_baselines", tmp_path)
+    assert time.perf_counter() - began < 240.0  # about a minute on a machine that does nothing else
+
+    assert text(cells["vkc"]).startswith("aisle_drawer: success — reach drawer.handle, move drawer.slide")
+    assert "every constraint holds" in text(cells["vkc"])
+    assert text(cells["b1"]).startswith("aisle_drawer: ")
+    assert "iframe" in result(cells["show"])["text/html"]
+    efforts = dict(re.findall(r"(VKC|B1) +base [\d.]+ m, arm ([\d.]+) rad", text(cells["efforts"])))
+    assert float(efforts["VKC"]) < float(efforts["B1"])
+    assert min(size(cells["joints"])) > 300
+
+    lines = re.findall(r"^(\d) (\w+) ([a-z ]+) base ([\d.]+) m", text(cells["run"]), re.MULTILINE)
+    assert sorted((number, method) for number, method, *_ in lines) == [("0", "B1"), ("0", "VKC"), ("1", "B1"), ("1", "VKC")]
+    assert [status for _, method, status, _ in lines if method == "VKC"] == ["success", "success"]
+    assert min(size(cells["chart"])) > 300
+    written = {path.name for path in (tmp_path / "few_starts").iterdir()}
+    assert {"results.csv", "results.json", "table.md", "trials.jsonl", "door.png"} <= written

@@ -283,10 +283,10 @@ def test_a_weight_weighs_what_it_says(field: str, columns: list[int]) -> None:
     usual, other = (vkc.build(drawer_scene(), PULL, options=each).transcription.structure for each in options)
     for name in ("weights_velocity", "weights_acceleration"):
         weights, changed = getattr(usual, name), getattr(other, name)
-        factors = np.ones(len(weights))
+        factors = np.ones(weights.shape[-1])
         factors[columns] = 7.0 / getattr(SHORT, field)
         np.testing.assert_allclose(changed, weights * factors, rtol=1e-12)
-    np.testing.assert_array_equal(other.weights_velocity[columns], 7.0)
+    np.testing.assert_array_equal(other.weights_velocity[..., columns], 7.0)
 
 
 def test_turning_costs_what_the_heading_weighs() -> None:

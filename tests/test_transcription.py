@@ -152,7 +152,9 @@ def test_the_objective_is_equation_1(name: str) -> None:
     for stretch in stretches(p):
         step = np.diff(path[stretch], axis=0)
         bend = np.diff(np.vstack([np.zeros(p.chain.size), step, np.zeros(p.chain.size)]), axis=0) / o.dt
-        expected += np.sum(weight * step**2) + o.acceleration_weight * np.sum(weight * bend**2)
+        holding = np.array([p.closed(p.task.phases[p.contacts.phase_of(int(t))]) for t in stretch[1:]])
+        heavier = np.where(holding[:, None] & (np.arange(p.chain.size) < 2), o.velocity_weight_holding, 1.0)
+        expected += np.sum(heavier * weight * step**2) + o.acceleration_weight * np.sum(weight * bend**2)
     value, _ = functions(p, rates=False)[0](point.x, point.parameters)
     assert float(value) == pytest.approx(expected, rel=1e-10)
     assert p.objective(point.z) == pytest.approx(expected - PENALTY * point.slack.sum(), rel=1e-10)

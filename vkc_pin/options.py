@@ -25,6 +25,8 @@ class Options:
         grasp_clearance: Clearance of the gripper's touch links to the link that is grasped, before the grasp [m].
         velocity_weight_base: W_vel of eq. 1 for the base's place.
         velocity_weight_heading: W_vel for its heading.
+        velocity_weight_holding: How many times more its place weighs while something is held that stands fixed in the world: the
+            base goes slowly then, and squares make slow motion cheap.
         velocity_weight_arm: W_vel for the arm joints.
         velocity_weight_object: W_vel for the object's and the virtual joints.
         acceleration_weight: W_acc of eq. 1, as a multiple of W_vel [s²].
@@ -51,6 +53,7 @@ class Options:
     grasp_clearance: float = 0.005
     velocity_weight_base: float = 5.0
     velocity_weight_heading: float = 0.3
+    velocity_weight_holding: float = 15.0
     velocity_weight_arm: float = 1.0
     velocity_weight_object: float = 0.1
     acceleration_weight: float = 0.3

@@ -73,6 +73,10 @@ class TrajectoryProblem:
         )
         weights[[column for column, _, _ in clamped]] = _CHOICE_WEIGHT
         acceleration = weights * o.acceleration_weight / o.dt**2
+        velocity = np.tile(weights, (self.segments, 1))
+        for phase, first, last in zip(self.task.phases, starts, self.ends, strict=True):
+            if self.closed(phase):
+                velocity[first:last, :2] *= o.velocity_weight_holding
         # The robot stands still while its gripper closes or opens.
         phases = zip(self.ends[:-1], self.task.phases[:-1], self.task.phases[1:], strict=True)
         rests = [int(end) for end, phase, after in phases if phase.grasps or after.leaves]
@@ -82,7 +86,7 @@ class TrajectoryProblem:
             self.segments,
             tuple(poses),
             o.contact_slots,
-            weights,
+            velocity,
             acceleration,
             tuple(rests),
             differential,
@@ -222,7 +226,7 @@ class TrajectoryProblem:
         """Return f of eq. 1 at z_1..z_N, shape (N, n)."""
         structure = self.transcription.structure
         first, second = self.rates(z)
-        return float(np.sum(first**2 @ structure.weights_velocity) + np.sum(second**2 @ structure.weights_acceleration))
+        return float(np.sum(first**2 * structure.weights_velocity) + np.sum(second**2 @ structure.weights_acceleration))
 
     def pose_error(self, z: NDArray[np.float64]) -> float:
         """Return the largest residual of closure, goals and rolling, [m] or [rad], at z_1..z_N, shape (N, n)."""

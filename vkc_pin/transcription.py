@@ -101,9 +101,9 @@ class Transcription:
         second, start_second = steps @ first, steps @ start_first
         self.first, self.second, self.start_first, self.start_second = first, second, start_first, start_second
         hessian, linear = np.zeros((N, n + 1, N, n + 1)), np.zeros((N, n + 1, n))
-        for i, (v, a) in enumerate(zip(self.structure.weights_velocity, self.structure.weights_acceleration, strict=True)):
-            hessian[:, i, :, i] = 2 * (v * first.T @ first + a * second.T @ second)
-            linear[:, i, i] = 2 * (v * first.T @ start_first + a * second.T @ start_second)
+        for i, (v, a) in enumerate(zip(self.structure.weights_velocity.T, self.structure.weights_acceleration, strict=True)):
+            hessian[:, i, :, i] = 2 * (first.T @ (v[:, None] * first) + a * second.T @ second)
+            linear[:, i, i] = 2 * (first.T @ (v * start_first) + a * second.T @ start_second)
         self.objective_hessian = ca.sparsify(ca.DM(hessian.reshape(self.size, self.size)))
         linear_matrix = ca.sparsify(ca.DM(linear.reshape(self.size, n)))
         slack = np.zeros((N, n + 1))
@@ -116,7 +116,7 @@ class Transcription:
 
     def _start_weight(self) -> ca.DM:
         v, a = self.structure.weights_velocity, self.structure.weights_acceleration
-        return ca.DM(v * (self.start_first @ self.start_first) + a * (self.start_second @ self.start_second))
+        return ca.DM(self.start_first**2 @ v + a * (self.start_second @ self.start_second))
 
     def _constraints(self) -> None:
         n, N, K = self.n, self.segments, self.slots

@@ -27,7 +27,8 @@ class Structure:
         segments: N, the number of waypoints after the start.
         poses: Frames that must be somewhere.
         slots: K, witness planes per waypoint.
-        weights_velocity, weights_acceleration: Of eq. 1, per coordinate, on the squared differences; shape (n,).
+        weights_velocity: Of eq. 1, on the squared differences, shape (N, n).
+        weights_acceleration: The same for second differences, per coordinate, shape (n,).
         rests: Waypoints inside the motion at which it comes to rest, as it does at start and end.
         differential: Whether the base must not slip sideways.
         clamped: (column, first, last): coordinates that keep their value from waypoint `first` to `last`, as a hand does

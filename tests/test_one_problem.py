@@ -286,7 +286,7 @@ def test_a_weight_weighs_what_it_says(field: str, columns: list[int]) -> None:
         factors = np.ones(weights.shape[-1])
         factors[columns] = 7.0 / getattr(SHORT, field)
         np.testing.assert_allclose(changed, weights * factors, rtol=1e-12)
-    np.testing.assert_array_equal(other.weights_velocity[..., columns], 7.0)
+    np.testing.assert_array_equal(other.weights_velocity[0, columns], 7.0)
 
 
 def test_turning_costs_what_the_heading_weighs() -> None:

@@ -53,7 +53,7 @@ class Options:
     grasp_clearance: float = 0.005
     velocity_weight_base: float = 5.0
     velocity_weight_heading: float = 0.3
-    velocity_weight_holding: float = 15.0
+    velocity_weight_holding: float = 40.0
     velocity_weight_arm: float = 1.0
     velocity_weight_object: float = 0.1
     acceleration_weight: float = 0.3

@@ -12,6 +12,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.articulation import ArticulatedObject, Attachment, Freedom, load_object
+from vkc_pin.broadphase import PhaseGeometry
 from vkc_pin.geometry import PlacedObject
 from vkc_pin.options import Options
 from vkc_pin.scene import Scene, load_scene
@@ -102,3 +103,13 @@ def random_configurations(
     low, high = np.maximum(lower, -np.pi), np.minimum(upper, np.pi)
     low[:2], high[:2] = -arena, arena
     return rng.uniform(low, high, (count, len(low)))
+
+
+def all_pairs(part: PhaseGeometry) -> pin.GeometryModel:
+    """Return the geometry of a phase as Pinocchio's own, with every pair, to ask for all distances without culling."""
+    geometry = pin.GeometryModel()
+    for shape in part.shapes:
+        geometry.addGeometryObject(shape)
+    for first, second in part.pairs.tolist():
+        geometry.addCollisionPair(pin.CollisionPair(first, second))
+    return geometry

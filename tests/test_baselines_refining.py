@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from drawers import SHORT, drawer_scene, handle, holding, off, spare, with_boxes
+from small_problems import all_pairs
 
 import vkc_pin as vkc
 from vkc_pin.baselines import refining as module
@@ -155,7 +156,7 @@ def test_gradients_are_those_of_coals_distances(held: bool) -> None:
         z = base_poses(problem, waypoint, problem.start, rng)[:6]
     z[:, :9] += rng.normal(0.0, 0.05, (len(z), 9))
     contacts = problem.contacts.evaluate(z, np.full(len(z), waypoint), reach=0.12)
-    chain, geometry = problem.chain, problem.contacts.phases[problem.contacts.phase_of(waypoint)].geometry
+    chain, geometry = problem.chain, all_pairs(problem.contacts.phases[problem.contacts.phase_of(waypoint)])
     data, shapes = chain.model.createData(), pin.GeometryData(geometry)
     request = coal.DistanceRequest()
     request.gjk_tolerance = 1e-8

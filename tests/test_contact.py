@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 import pytest
-from small_problems import SHORT, cabinet, door_scene, full_scene, random_configurations
+from small_problems import SHORT, all_pairs, cabinet, door_scene, full_scene, random_configurations
 
 from vkc_pin.contact import Contacts
 from vkc_pin.errors import InputError
@@ -83,10 +83,9 @@ def test_pairs_of_every_phase_are_counted() -> None:
     assert min(n) > 3
     assert [len(part.pairs) for part in problem.contacts.phases] == [standing, held, held, standing]
     for part in problem.contacts.phases:
-        assert len(part.geometry.collisionPairs) == len(part.pairs) == len(part.margins)
+        assert len(part.pairs) == len(part.margins)
         assert len({frozenset(pair) for pair in part.pairs.tolist()}) == len(part.pairs)
-        assert [(pair.first, pair.second) for pair in part.geometry.collisionPairs] == [tuple(p) for p in part.pairs.tolist()]
-        assert len(part.labels) == len(part.geometry.geometryObjects)
+        assert len(part.labels) == len(part.shapes) == len(part.joint)
 
 
 def test_labels_name_links_and_obstacles() -> None:
@@ -162,7 +161,7 @@ def test_objects_stand_where_the_phases_before_left_them() -> None:
         part, moved = problem.contacts.phases[phase], placed.with_state(state)
         for index, label in enumerate(part.labels):
             if label.startswith("door.") and part.joint[index] == 0:
-                shape = part.geometry.geometryObjects[index]
+                shape = part.shapes[index]
                 original = next(s for s in placed.object.collision.geometryObjects if f"door.{s.name}" == shape.name)
                 frame = placed.object.model.frames[original.parentFrame]
                 expected = moved.link_placement(frame.name) * frame.placement.inverse() * original.placement
@@ -225,7 +224,7 @@ def test_a_scene_in_which_nothing_can_collide_is_refused() -> None:
 def all_distances(problem: TrajectoryProblem, phase: int, z: np.ndarray) -> np.ndarray:
     """Return the signed distance of every pair at every configuration, shape (W, P), all asked of coal afresh."""
     part = problem.contacts.phases[phase]
-    geometry, model = part.geometry, problem.chain.model
+    geometry, model = all_pairs(part), problem.chain.model
     data, placed = model.createData(), pin.GeometryData(geometry)
     for k in range(len(geometry.collisionPairs)):
         placed.distanceRequests[k].gjk_tolerance = 1e-8
@@ -382,15 +381,16 @@ def test_planes_have_value_and_gradient_of_the_signed_distance(phase: int) -> No
     contacts = problem.contacts.evaluate(z, np.full(len(z), problem.ends[phase]), reach=0.25, nearest=slots)
     planes, offsets = problem.contacts.planes(z, contacts, slots=slots)
     number = {tuple(pair): k for k, pair in enumerate(part.pairs.tolist())}
-    data, placed = chain.model.createData(), pin.GeometryData(part.geometry)
+    geometry = all_pairs(part)
+    data, placed = chain.model.createData(), pin.GeometryData(geometry)
     for k in range(len(part.pairs)):
         placed.distanceRequests[k].gjk_tolerance = 1e-8
 
     def distances(row: np.ndarray, which: list[int]) -> np.ndarray:
-        pin.updateGeometryPlacements(chain.model, data, part.geometry, placed, chain.coordinates.q(row))
-        return np.array([pin.computeDistance(part.geometry, placed, k).min_distance for k in which])
+        pin.updateGeometryPlacements(chain.model, data, geometry, placed, chain.coordinates.q(row))
+        return np.array([pin.computeDistance(geometry, placed, k).min_distance for k in which])
 
-    kinds = [type(shape.geometry).__name__ for shape in part.geometry.geometryObjects]
+    kinds = [type(shape.geometry).__name__ for shape in part.shapes]
     errors: dict[tuple[str, str], list[float]] = {(a, b): [] for a in ("flat", "round") for b in ("apart", "deep")}
     sorts = collections.Counter()
     robots = len(problem.scene.robot.collision.geometryObjects)

@@ -93,7 +93,7 @@ def test_a_tip_comes_closer_to_what_it_will_hold_and_holds_it() -> None:
 def test_a_placed_thing_stands_where_it_was_put(phase: int) -> None:
     part = placing().contacts.phases[phase]
     for name, where in (("stick", (STICK, None, ASIDE)[phase]), ("ball", BALL)):
-        shapes = {shape.name: shape for shape in part.geometry.geometryObjects if shape.parentJoint == 0}
+        shapes = {shape.name: shape for shape in part.shapes if shape.parentJoint == 0}
         own = standing_geometry(scene().objects[name])
         standing = [shape for shape in own if f"{name}.{shape.name}" in shapes]
         assert len(standing) == (0 if where is None else len(own))
@@ -126,11 +126,11 @@ def test_what_is_let_go_of_somewhere_stands_there(seed: int) -> None:
         there = standing_geometry(dataclasses.replace(scene().objects[name], placement=where))
         for number in later:
             part = problem.contacts.phases[number]
-            index = {str(shape.name): i for i, shape in enumerate(part.geometry.geometryObjects) if part.joint[i] == 0}
+            index = {str(shape.name): i for i, shape in enumerate(part.shapes) if part.joint[i] == 0}
             for shape in there:
                 i = index[f"{name}.{shape.name}"]
                 expected = shape.placement.homogeneous
-                np.testing.assert_allclose(part.geometry.geometryObjects[i].placement.homogeneous, expected, rtol=0.0, atol=1e-9)
+                np.testing.assert_allclose(part.shapes[i].placement.homogeneous, expected, rtol=0.0, atol=1e-9)
                 np.testing.assert_allclose(part.rotation[i], expected[:3, :3], rtol=0.0, atol=1e-9)
                 np.testing.assert_allclose(part.translation[i], expected[:3, 3], rtol=0.0, atol=1e-9)
 

@@ -73,9 +73,7 @@ def test_the_margin_is_half_the_distance_of_that_shape() -> None:
     p = problem(room(table(gap=GAP), wall), Place("stick", ASIDE))
     part, first = p.contacts.phases[1], int(p.contacts.first_waypoint[1])
     eased = {
-        (part.geometry.geometryObjects[i].name, part.labels[j]): [*part.eased[k]]
-        for k, (i, j) in enumerate(part.pairs.tolist())
-        if k in part.eased
+        (part.shapes[i].name, part.labels[j]): [*part.eased[k]] for k, (i, j) in enumerate(part.pairs.tolist()) if k in part.eased
     }
     assert set(eased) >= {("stick.stick_1", "table"), ("stick.stick_2", "table"), ("stick.tip_1", "wall")}
     assert not {name for name, label in eased if label == "table"} - {"stick.stick_1", "stick.stick_2"}

@@ -82,7 +82,7 @@ def test_a_goal_beyond_a_limit_is_approached_as_far_as_it_goes() -> None:
     part = problem.contacts.phases[3]
     assert part.joint[panel] == 0
     expected = door_scene().objects["door"].with_state({"hinge": 1.57}).link_placement("panel")
-    np.testing.assert_allclose(part.geometry.geometryObjects[panel].placement.rotation, expected.rotation, atol=1e-9)
+    np.testing.assert_allclose(part.shapes[panel].placement.rotation, expected.rotation, atol=1e-9)
 
 
 def test_the_robot_keeps_its_limits_and_stays_in_the_arena(opened: TrajectoryProblem) -> None:

@@ -8,22 +8,22 @@ signed distance's at the linearisation point. It is linear in the placements of 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Any
 
-import coal
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from vkc_pin.assembly import graft_geometry
 from vkc_pin.broadphase import PhaseGeometry
 from vkc_pin.chain import VirtualKinematicChain
 from vkc_pin.easing import eased_pairs
 from vkc_pin.errors import InputError
 from vkc_pin.geometry import bounding_box, link_name, own_name
 from vkc_pin.hold import Hold
+from vkc_pin.narrowphase import Distances
 from vkc_pin.options import Options
 from vkc_pin.scene import FLOOR, Scene, standing_geometry
 from vkc_pin.task import Task
@@ -88,7 +88,11 @@ class ContactModel:
         self.data = chain.model.createData()
         self.task = task
         self.first_waypoint = np.concatenate([[0], np.cumsum([phase.segments for phase in task.phases])])
+        self._placed = pin.GeometryData(chain.collision)
+        self._obstacles = tuple(scene.obstacles.geometryObjects)
+        self._boxes = _boxes([*chain.collision.geometryObjects]), _boxes(self._obstacles)
         self.phases = [self._phase(number) for number in range(len(task.phases))]
+        self._distances = [Distances(part.shapes, part.pairs) for part in self.phases]
         # Beyond the chain's own geometries everything stands in the world.
         own = [shape.parentJoint for shape in chain.collision.geometryObjects]
         self._joints = np.array(own + [0] * (max(len(part.labels) for part in self.phases) - len(own)))
@@ -96,12 +100,11 @@ class ContactModel:
     def _phase(self, number: int) -> PhaseGeometry:
         phase, before = self.task.phases[number], self.task.phases[number - 1] if number else None
         scene, chain, robot, margin = self.scene, self.chain, self.scene.robot, self.options.dist_safe
-        geometry = chain.collision.copy()
-        geometry.removeAllCollisionPairs()
-        robots = range(len(robot.collision.geometryObjects))
+        shapes = list(chain.collision.geometryObjects)
+        robots, own = range(len(robot.collision.geometryObjects)), len(shapes)
         labels = [robot.link_of(i) for i in robots]
         for hold, indices in chain.held_geometries.items():
-            labels += [f"{hold.object}.{link_name(own_name(geometry.geometryObjects[i].name))}" for i in indices]
+            labels += [f"{hold.object}.{link_name(own_name(shapes[i].name))}" for i in indices]
         pairs = [(pair.first, pair.second, margin) for pair in robot.collision.collisionPairs]
         moving = list(robots)
         for hold in phase.held:
@@ -111,7 +114,7 @@ class ContactModel:
             pairs += [(i, j, margin) for i in moving for j in held if not (labels[i] in touching and labels[j] == grasped)]
             moving += held
         mine = {hold.object: chain.held_geometries[hold] for hold in phase.held}
-        left: dict[str, list[int]] = {}
+        left: dict[str, tuple[int, ...]] = {}
         for name, placed in scene.objects.items():
             state = {c.removeprefix(f"{name}."): v for c, v in phase.before.items() if c.startswith(f"{name}.")}
             if placed.object.free:
@@ -120,47 +123,57 @@ class ContactModel:
                 placed = dataclasses.replace(placed, placement=phase.standing.get(name, placed.placement))
             standing = standing_geometry(placed.with_state(state))
             if name in mine:  # its frame stands on, the rest is in the hand
-                held_shapes = {own_name(geometry.geometryObjects[i].name) for i in mine[name]}
+                held_shapes = {own_name(shapes[i].name) for i in mine[name]}
                 standing = [shape for shape in standing if shape.name not in held_shapes]
             near = {self._grasped(h): self._touching(h) for h in (*phase.leaves, *phase.grasps) if h.object == name}
-            for j in graft_geometry(geometry, standing, joints=[0], placement=pin.SE3.Identity(), prefix=f"{name}."):
-                labels.append(link_name(geometry.geometryObjects[j].name))
-                close = near.get(labels[j], ())
-                own = mine.get(name, ())
-                pairs += [(i, j, self.options.grasp_clearance if labels[i] in close else margin) for i in moving if i not in own]
-                if name in phase.left:
-                    left.setdefault(name, []).append(j)
+            if name in phase.left:
+                left[name] = tuple(range(len(shapes), len(shapes) + len(standing)))
+            for shape in standing:
+                label = f"{name}.{link_name(shape.name)}"
+                close = near.get(label, ())
+                pairs += [
+                    (i, len(shapes), self.options.grasp_clearance if labels[i] in close else margin)
+                    for i in moving
+                    if i not in mine.get(name, ())
+                ]
+                shape.name = f"{name}.{shape.name}"
+                shapes.append(shape)
+                labels.append(label)
         carried = {i for hold in phase.held if scene.objects[hold.object].object.free for i in mine[hold.object]}
-        for obstacle, label in zip(scene.obstacles.geometryObjects, scene.obstacle_labels, strict=True):
-            (j,) = graft_geometry(geometry, [obstacle], joints=[0], placement=pin.SE3.Identity())
-            labels.append(label)
-            # Wheels stand on the floor, and doors hang above it as their makers hung them.
-            arm = [i for i in robots if geometry.geometryObjects[i].parentJoint > 1]
-            pairs += [(i, j, margin) for i in (moving if label != FLOOR else [*arm, *sorted(carried)])]
-        if not pairs:
+        above = [i for i in moving if i in carried or (i in robots and shapes[i].parentJoint > 1)]
+        table = np.concatenate([np.array(pairs).reshape(-1, 3), self._with_obstacles(len(shapes), moving, above)])
+        if not len(table):
             raise InputError(
                 "no pair of geometries can collide", field=phase.name, expected="collision geometry in robot or scene"
             )
-        for one, other, _ in pairs:
-            geometry.addCollisionPair(pin.CollisionPair(one, other))
-        if len(geometry.collisionPairs) != len(pairs):
-            raise InputError("collision pairs were lost", field=phase.name, expected=len(pairs), got=len(geometry.collisionPairs))
-        shapes = geometry.geometryObjects
-        boxes = [bounding_box(shape) for shape in shapes]
-        return PhaseGeometry(
-            geometry,
-            _accurate(pin.GeometryData(geometry), len(pairs)),
-            tuple(labels),
-            pairs=np.array([p[:2] for p in pairs]),
-            margins=np.array([p[2] for p in pairs]),
+        boxes = zip(self._boxes[0], _boxes(shapes[own:]), self._boxes[1], strict=True)
+        center, half, rotation, translation = (np.concatenate(parts) for parts in boxes)
+        shapes += self._obstacles
+        part = PhaseGeometry(
+            tuple(shapes),
+            (*labels, *scene.obstacle_labels),
+            pairs=table[:, :2].astype(int),
+            margins=table[:, 2],
             joint=np.array([shape.parentJoint for shape in shapes]),
-            center=np.array([center for center, _ in boxes]),
-            half=np.array([half for _, half in boxes]),
-            rotation=np.array([shape.placement.rotation for shape in shapes]),
-            translation=np.array([shape.placement.translation for shape in shapes]),
-            eased=eased_pairs(scene, chain, phase, geometry, labels, pairs, int(self.first_waypoint[number]), before),
-            left={name: tuple(indices) for name, indices in left.items()},
+            center=center,
+            half=half,
+            rotation=rotation,
+            translation=translation,
+            left=left,
         )
+        return dataclasses.replace(part, eased=eased_pairs(scene, chain, phase, part, int(self.first_waypoint[number]), before))
+
+    def _with_obstacles(self, first: int, moving: Sequence[int], above: Sequence[int]) -> NDArray[np.float64]:
+        """Return the pairs of what moves with the obstacles, the first of which is geometry `first`, and their margins.
+
+        Of `moving`, only those that are `above` the floor can hit it: wheels stand on it, and doors hang above it as their
+        makers hung them.
+        """
+        ones, others = np.array(moving, int), np.arange(len(self._obstacles))
+        floor = np.array([label == FLOOR for label in self.scene.obstacle_labels], bool)
+        pairs = np.column_stack([np.tile(ones, len(others)), np.repeat(others, len(ones))])
+        pairs = pairs[~floor[pairs[:, 1]] | np.isin(pairs[:, 0], above)]
+        return np.column_stack([pairs[:, 0], first + pairs[:, 1], np.full(len(pairs), self.options.dist_safe)])
 
     def _grasped(self, hold: Hold) -> str:
         """Return the label of the link that a hold takes hold of."""
@@ -179,8 +192,8 @@ class ContactModel:
                 carrier = pin.SE3(rotations[0, closure.joint], translations[0, closure.joint])
                 placed = dataclasses.replace(self.scene.objects[name], placement=carrier * closure.local)
                 for index, shape in zip(part.left[name], standing_geometry(placed), strict=True):
-                    part.geometry.geometryObjects[index].placement = shape.placement
-                    part.rotation[index], part.translation[index] = shape.placement.rotation, shape.placement.translation
+                    part.place(index, shape.placement)
+                    self._distances[number].forget(index)
 
     def phase_of(self, waypoint: int) -> int:
         """Return the phase whose geometry holds at `waypoint`: at a boundary the earlier, before the grasp."""
@@ -206,18 +219,20 @@ class ContactModel:
             part, inside = self.phases[number], np.flatnonzero(phase_of == number)
             at, pairs = part.maybe_within(reach, rotations[inside], translations[inside])
             edges = np.searchsorted(at, np.arange(len(inside) + 1))
+            asked = self._distances[number]
             for row, begin, end in zip(inside, edges[:-1], edges[1:], strict=True):
-                pin.updateGeometryPlacements(self.chain.model, self.data, part.geometry, part.data, q[row])
+                if begin == end:
+                    continue
+                pin.updateGeometryPlacements(self.chain.model, self.data, self.chain.collision, self._placed, q[row])
+                asked.at(self._placed.oMg)
                 found = []
                 for k in pairs[begin:end].tolist():
-                    distance = pin.computeDistance(part.geometry, part.data, k).min_distance
-                    if distance < reach:
+                    result = asked.of(k)
+                    if result.min_distance < reach:
                         margin = part.margin(k, int(waypoints[row]))
-                        found.append((distance - margin, distance, k, margin))
-                found.sort()
-                for _, distance, k, margin in found[:nearest]:
-                    result = part.data.distanceResults[k]
-                    # `normal` is a view of memory that the next distance of this pair overwrites.
+                        found.append((result.min_distance - margin, result.min_distance, k, margin, result))
+                found.sort(key=itemgetter(0, 1, 2))
+                for _, distance, k, margin, result in found[:nearest]:
                     vectors.append((result.normal.copy(), result.getNearestPoint1(), result.getNearestPoint2()))
                     rows.append((float(row), *part.pairs[k].tolist(), distance, margin))
         table = np.array(rows, float).reshape(len(rows), 5)
@@ -258,13 +273,12 @@ class ContactModel:
         return coefficients.reshape(len(z), slots, 12 * joints), offsets
 
 
-def _accurate(data: pin.GeometryData, pairs: int) -> pin.GeometryData:
-    """Return `data` with tight distances: at coal's own 1e-6 the planes' gradients are off by up to 5e-3; this takes no longer.
-
-    Penetration keeps its tolerance: below 1e-6 it fails for cylinders. A request of our own starts afresh every time, while
-    Pinocchio's starts from the last result, so that a distance would depend, in its last digits, on what was asked before.
-    """
-    for k in range(pairs):
-        data.distanceRequests[k] = coal.DistanceRequest()
-        data.distanceRequests[k].gjk_tolerance = 1e-8
-    return data
+def _boxes(shapes: Sequence[pin.GeometryObject]) -> tuple[NDArray[np.float64], ...]:
+    """Return centres and half extents of bounding boxes, and placements as rotations and translations; see `PhaseGeometry`."""
+    boxes = [bounding_box(shape) for shape in shapes]
+    return (
+        np.array([center for center, _ in boxes]).reshape(-1, 3),
+        np.array([half for _, half in boxes]).reshape(-1, 3),
+        np.array([shape.placement.rotation for shape in shapes]).reshape(-1, 3, 3),
+        np.array([shape.placement.translation for shape in shapes]).reshape(-1, 3),
+    )

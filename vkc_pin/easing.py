@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 
 import coal
 import numpy as np
 import pinocchio as pin
 
+from vkc_pin.broadphase import PhaseGeometry
 from vkc_pin.chain import VirtualKinematicChain
-from vkc_pin.geometry import own_name, shape_distance, standing_geometry
+from vkc_pin.geometry import own_name, shape_distance, standing_geometry, world_box
 from vkc_pin.scene import Scene
 from vkc_pin.task import Phase
 
@@ -24,9 +24,7 @@ def eased_pairs(
     scene: Scene,
     chain: VirtualKinematicChain,
     phase: Phase,
-    geometry: pin.GeometryModel,
-    labels: Sequence[str],
-    pairs: Sequence[tuple[int, int, float]],
+    part: PhaseGeometry,
     first: int,
     before: Phase | None,
 ) -> dict[int, list[tuple[int, int, float]]]:
@@ -38,27 +36,30 @@ def eased_pairs(
     Args:
         scene: Where it happens.
         chain: The chain.
-        phase: The phase that `pairs` belong to.
-        geometry: Its geometry; what stands has parent joint 0.
-        labels: Of each geometry.
-        pairs: (first geometry, second geometry, margin [m]).
+        phase: The phase.
+        part: Its geometry and pairs.
         first: The waypoint at which the phase begins.
         before: The phase before it.
     """
-    shapes, last = geometry.geometryObjects, first + phase.segments
+    shapes, last = part.shapes, first + phase.segments
     eased: dict[int, list[tuple[int, int, float]]] = {}
+
+    def ease(moving: int, shape: coal.CollisionGeometry, where: pin.SE3, begin: int, end: int) -> None:
+        """Ease the pairs of a geometry that moves with what stands next to a shape."""
+        beside = part.within(float(part.margins.max()), *world_box(shape, where))
+        for k in part.pairs_of(moving, beside).tolist():
+            other = shapes[int(part.pairs[k, 1])]
+            distance = shape_distance(shape, where, other.geometry, other.placement)
+            if distance < part.margins[k]:
+                eased.setdefault(k, []).append((begin, end, SHARE * max(distance, 0.0)))
+
     moments = [(h, p, first, first + NEAR) for h, p in phase.lifted.items()]
     moments += [(h, p, last - NEAR, last) for h, p in phase.lowered.items()]
     for hold, placement, begin, end in moments:
         placed = dataclasses.replace(scene.objects[hold.object], placement=placement)
         rests = {shape.name: shape.placement for shape in standing_geometry(placed)}
-        held = set(chain.held_geometries[hold])
-        for k, (i, j, margin) in enumerate(pairs):
-            if i in held and shapes[j].parentJoint == 0:
-                where = rests[own_name(shapes[i].name)]
-                distance = shape_distance(shapes[i].geometry, where, shapes[j].geometry, shapes[j].placement)
-                if distance < margin:
-                    eased.setdefault(k, []).append((begin, end, SHARE * max(distance, 0.0)))
+        for i in chain.held_geometries[hold]:
+            ease(i, shapes[i].geometry, rests[own_name(shapes[i].name)], begin, end)
     touches = [(goal, last - NEAR, last) for goal in phase.frames]
     touches += [(goal, first, first + NEAR) for goal in (before.frames if before else ())]
     for goal, begin, end in touches:
@@ -66,10 +67,7 @@ def eased_pairs(
             continue
         point, where = coal.Sphere(1e-4), pin.SE3(np.eye(3), goal.placement.translation)
         joint, _ = chain.frame(goal.frame, goal.hold)
-        for k, (i, j, margin) in enumerate(pairs):
-            touching = labels[i] == str(goal) if goal.hold else shapes[i].parentJoint == joint
-            if touching and shapes[j].parentJoint == 0:
-                distance = shape_distance(point, where, shapes[j].geometry, shapes[j].placement)
-                if distance < margin:
-                    eased.setdefault(k, []).append((begin, end, SHARE * max(distance, 0.0)))
+        for i in range(len(chain.collision.geometryObjects)):
+            if part.labels[i] == str(goal) if goal.hold else shapes[i].parentJoint == joint:
+                ease(i, point, where, begin, end)
     return eased

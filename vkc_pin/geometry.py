@@ -27,6 +27,7 @@ __all__ = [
     "shape_distance",
     "standing_geometry",
     "within_limits",
+    "world_box",
 ]
 
 LIMIT_SLACK = 1e-6
@@ -163,6 +164,15 @@ def bounding_box(shape: pin.GeometryObject) -> tuple[NDArray[np.float64], NDArra
     shape.geometry.computeLocalAABB()
     box = shape.geometry.aabb_local
     return np.asarray(box.center(), float), np.array([box.width(), box.height(), box.depth()]) / 2
+
+
+def world_box(shape: coal.CollisionGeometry, placement: pin.SE3) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the lower and upper corner, shape (3,) each [m], of a box along the world's axes around a shape."""
+    shape.computeLocalAABB()
+    box = shape.aabb_local
+    centre = placement.act(np.asarray(box.center(), float))
+    extent = np.abs(placement.rotation) @ np.array([box.width(), box.height(), box.depth()]) / 2
+    return centre - extent, centre + extent
 
 
 def _ball(shape: coal.CollisionGeometry, placement: pin.SE3) -> tuple[NDArray[np.float64], float]:

@@ -32,7 +32,7 @@ class Routes:
         """Return where the base fits in a phase: alone near the ends of a way, elsewhere with the arm at home and its load."""
         if phase not in self._grids:
             problem, part = self.problem, self.problem.contacts.phases[phase]
-            chain, shapes = problem.chain, part.geometry.geometryObjects
+            chain, shapes = problem.chain, part.shapes
             z = problem.start.copy()
             z[:3], z[3 : chain.robot.coordinates.size] = 0.0, chain.robot.home
             for names in chain.virtual.values():

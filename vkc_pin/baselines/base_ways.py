@@ -32,7 +32,7 @@ class BaseWays:
         part = problem.contacts.phases[-1]
         standing: list[Shape] = [
             (shape.geometry, shape.placement)
-            for shape, label in zip(part.geometry.geometryObjects, part.labels, strict=True)
+            for shape, label in zip(part.shapes, part.labels, strict=True)
             if shape.parentJoint == 0 and label != FLOOR
         ]
         self.grid = BaseGrid(base, [], standing, problem.scene.arena, problem.options.dist_safe)

@@ -44,12 +44,15 @@ def wander(scene: Scene, seed: int, *, size: float) -> Trajectory:
 
 
 def brute_force(table: PairTable, z: np.ndarray) -> np.ndarray:
-    """Return the distance of every pair at every configuration, shape (S, P)."""
-    model, data, shapes = table.world.model, table.world.model.createData(), pin.GeometryData(table.geometry)
+    """Return the distance of every pair at every configuration, shape (S, P), by Pinocchio and coal without culling."""
+    geometry = table.world.collision.copy()
+    for first, second in table.pairs.tolist():
+        geometry.addCollisionPair(pin.CollisionPair(first, second))
+    model, data, shapes = table.world.model, table.world.model.createData(), pin.GeometryData(geometry)
     out = np.empty((len(z), len(table.pairs)))
     for row, q in enumerate(table.world.coordinates.q(z)):
-        pin.updateGeometryPlacements(model, data, table.geometry, shapes, q)
-        pin.computeDistances(table.geometry, shapes)
+        pin.updateGeometryPlacements(model, data, geometry, shapes, q)
+        pin.computeDistances(geometry, shapes)
         out[row] = [result.min_distance for result in shapes.distanceResults]
     return out
 
@@ -111,14 +114,14 @@ def test_no_point_moves_further_than_the_bound(seed: int, size: float) -> None:
     z[:, 11:] += rng.uniform(0.0, 2.0, z.shape[1] - 11)
     z[1:, 11:] += size * rng.uniform(-1.0, 1.0, (len(z) - 1, z.shape[1] - 11))
     bounds = table._motion_bounds(z, np.arange(len(z)))
-    data, shapes = world.model.createData(), pin.GeometryData(table.geometry)
-    corners = [np.array(box_corners(shape)) for shape in table.geometry.geometryObjects]
+    data, shapes = world.model.createData(), pin.GeometryData(world.collision)
+    corners = [np.array(box_corners(shape)) for shape in world.shapes]
     for t in range(len(z) - 1):
         path = np.zeros(len(corners))
         before: list[np.ndarray] = []
         for share in np.linspace(0.0, 1.0, 60):  # the way of each corner of the bounding boxes, not only its ends
             q = world.coordinates.q((1 - share) * z[t] + share * z[t + 1])
-            pin.updateGeometryPlacements(world.model, data, table.geometry, shapes, q)
+            pin.updateGeometryPlacements(world.model, data, world.collision, shapes, q)
             now = [points @ where.rotation.T + where.translation for points, where in zip(corners, shapes.oMg, strict=True)]
             if before:
                 path += [np.linalg.norm(a - b, axis=1).max() for a, b in zip(now, before, strict=True)]
@@ -176,7 +179,7 @@ def test_which_pairs_count(door: Scene) -> None:
     leaves = [shape for shape in things if shape.parentJoint > 0]
     bodies = len(robot.geometryObjects)
     expected = len(robot.collisionPairs) + bodies * (len(things) + len(walls)) + len(arm) + len(leaves) * len(walls)
-    assert len(table.pairs) == len(table.geometry.collisionPairs) == expected
+    assert len(table.pairs) == expected
     assert len({frozenset(pair) for pair in table.pairs.tolist()}) == expected
     touching = {pair_names(table, k) for k in np.flatnonzero(table.margins == 0.0)}
     assert touching == {(link, "door.lever") for link in door.robot.touch_links}
@@ -243,8 +246,8 @@ def test_no_point_of_what_is_carried_moves_further_than_the_bound(seed: int, siz
     table_of_pairs = PairTable(scene, samples.world, motion, 0.02)
     bounds = table_of_pairs._motion_bounds(samples.z, samples.waypoint_rows)
     world = samples.world
-    data, shapes = world.model.createData(), pin.GeometryData(table_of_pairs.geometry)
-    corners = [np.array(box_corners(shape)) for shape in table_of_pairs.geometry.geometryObjects]
+    data, shapes = world.model.createData(), pin.GeometryData(world.collision)
+    corners = [np.array(box_corners(shape)) for shape in world.shapes]
     carried = [i for i, label in enumerate(world.collision_labels) if label.partition(".")[0] in ("stick", "ball")]
     assert len(carried) == 6
     travelled = 0.0
@@ -254,7 +257,7 @@ def test_no_point_of_what_is_carried_moves_further_than_the_bound(seed: int, siz
         for row in np.linspace(first, last, 4 * (last - first) + 1):  # the way of each corner, between the samples too
             low, share = int(row), row - int(row)
             z = samples.z[low] if not share else (1 - share) * samples.z[low] + share * samples.z[low + 1]
-            pin.updateGeometryPlacements(world.model, data, table_of_pairs.geometry, shapes, world.coordinates.q(z))
+            pin.updateGeometryPlacements(world.model, data, world.collision, shapes, world.coordinates.q(z))
             now = [points @ where.rotation.T + where.translation for points, where in zip(corners, shapes.oMg, strict=True)]
             if before:
                 path += [np.linalg.norm(a - b, axis=1).max() for a, b in zip(now, before, strict=True)]

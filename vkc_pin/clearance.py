@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from vkc_pin.scene import Scene
@@ -58,20 +57,18 @@ def clearance_curves(
     touching = may_touch(scene, world, trajectory, (), dist_safe)
     table = PairTable(scene, world, trajectory, dist_safe, touching=touching)
     moments = np.atleast_1d(np.asarray(times, float))
-    model, data, shapes = world.model, world.model.createData(), pin.GeometryData(table.geometry)
-    distances = np.empty((len(moments), len(table.pairs)))
-    for k, q in enumerate(world.coordinates.q(world.positions(trajectory, moments))):
-        pin.updateGeometryPlacements(model, data, table.geometry, shapes, q)
-        pin.computeDistances(table.geometry, shapes)
-        distances[k] = [result.min_distance for result in shapes.distanceResults]
     kinds = np.array([_kind(table, pair, margin) for pair, margin in zip(table.pairs, table.margins, strict=True)])
+    groups = {kind: table.pairs[kinds == kind] for kind in _KINDS if (kinds == kind).any()}
+    nearest: dict[str, list[tuple[int, float]]] = {kind: [] for kind in groups}
+    for q in world.coordinates.q(world.positions(trajectory, moments)):
+        placed = table.solids.at(q)
+        for kind, pairs in groups.items():
+            nearest[kind].append(placed.nearest(pairs))
     curves = []
-    for kind in dict.fromkeys(_KINDS):
-        members = np.flatnonzero(kinds == kind)
-        if len(members):
-            nearest = members[np.argmin(distances[:, members], axis=1)]
-            names = tuple((world.collision_labels[i], world.collision_labels[j]) for i, j in table.pairs[nearest])
-            curves.append(ClearanceCurve(kind, moments, distances[np.arange(len(moments)), nearest], names))
+    for kind, found in nearest.items():
+        closest = groups[kind][[k for k, _ in found]]
+        names = tuple((world.collision_labels[i], world.collision_labels[j]) for i, j in closest)
+        curves.append(ClearanceCurve(kind, moments, np.array([distance for _, distance in found]), names))
     return curves
 
 

@@ -35,7 +35,7 @@ def draw_top_view(figure: FigureBase, world: World, trajectory: Trajectory) -> N
     from matplotlib.colors import LinearSegmentedColormap
 
     axes = figure.subplots()
-    for i, shape in enumerate(world.collision.geometryObjects):
+    for i, shape in enumerate(world.shapes):
         if shape.parentJoint or world.collision_labels[i] == FLOOR:
             continue
         points = _corners(world, i, np.eye(4))
@@ -48,7 +48,7 @@ def draw_top_view(figure: FigureBase, world: World, trajectory: Trajectory) -> N
     motion = sample_motion(world, trajectory, times)
     shades = LinearSegmentedColormap.from_list("time", [_START, _END])(np.linspace(0.0, 1.0, len(times)))
     robot, moving = [], []
-    for i, shape in enumerate(world.collision.geometryObjects):
+    for i, shape in enumerate(world.shapes):
         if shape.parentJoint == 1:
             robot.append(i)
         elif shape.parentJoint and "." in world.collision_labels[i]:
@@ -63,7 +63,7 @@ def draw_top_view(figure: FigureBase, world: World, trajectory: Trajectory) -> N
             tail, nose = (motion.world[k, 1] @ np.array([[0.0, 0.0, 0.0, 1.0], [0.45, 0.0, 0.0, 1.0]]).T)[:2].T
             axes.annotate("", nose, tail, arrowprops={"arrowstyle": "->", "color": colour, "linewidth": 1.6}, zorder=4)
         for i in moving:
-            joint = world.collision.geometryObjects[i].parentJoint
+            joint = world.shapes[i].parentJoint
             corners = _corners(world, i, motion.world[k, joint])
             axes.add_patch(_polygon(outline(corners), facecolor=(*colour[:3], 0.35 if ends else 0.1), **drawn))
     fine = sample_motion(world, trajectory, np.linspace(trajectory.times[0], trajectory.times[-1], 400))
@@ -96,7 +96,7 @@ def _moments(trajectory: Trajectory) -> NDArray[np.float64]:
 
 def _corners(world: World, index: int, joint: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the vertices of a collision shape, shape (n, 3) [m], with its joint placed at `joint`, shape (4, 4)."""
-    shape = world.collision.geometryObjects[index]
+    shape = world.shapes[index]
     vertices, _ = triangles(shape.geometry)
     placed = pin.SE3(joint) * shape.placement
     return np.asarray(vertices @ np.asarray(placed.rotation).T + placed.translation)

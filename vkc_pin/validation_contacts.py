@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import coal
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.geometry import shape_distance
 from vkc_pin.scene import Scene
 from vkc_pin.steps import Grasp, Step, Touch
 from vkc_pin.trajectory import Trajectory
+from vkc_pin.validation_distances import Solids
 from vkc_pin.world import World
 
 __all__ = ["may_touch"]
@@ -35,7 +34,7 @@ def may_touch(
         steps: What was asked for.
         dist_safe: [m].
     """
-    labels, shapes = world.collision_labels, world.collision.geometryObjects
+    labels = world.collision_labels
     allowed: dict[tuple[int, int], float] = {}
 
     def allow(first: set[str], second: set[str], overlap: float) -> None:
@@ -54,31 +53,24 @@ def may_touch(
         allow({by} if by else hands, {grasped}, CONTACT if by else 0.0)
 
     robots = len(scene.robot.collision.geometryObjects)
-    data, geometry = world.model.createData(), world.collision.createData()
-    rows = world.positions(trajectory)
+    rows, solids = world.positions(trajectory), Solids(world)
     for owner, waypoint in _taken_and_left(scene, trajectory):
-        pin.updateGeometryPlacements(world.model, data, world.collision, geometry, world.coordinates.q(rows[waypoint]))
+        placed = solids.at(world.coordinates.q(rows[waypoint]))
         mine = [i for i, label in enumerate(labels) if label.partition(".")[0] == owner]
-        for i in mine:
-            for j in range(len(labels)):
-                if j in mine or j < robots:
-                    continue
-                if shape_distance(shapes[i].geometry, geometry.oMg[i], shapes[j].geometry, geometry.oMg[j]) < dist_safe:
-                    allowed.setdefault((min(i, j), max(i, j)), CONTACT)
+        others = [j for j in range(robots, len(labels)) if j not in mine]
+        pairs = np.array([(min(i, j), max(i, j)) for i in mine for j in others], int).reshape(-1, 2)
+        for i, j in pairs[placed.bounds(pairs) < dist_safe].tolist():
+            if placed.distance(i, j) < dist_safe:
+                allowed.setdefault((i, j), CONTACT)
 
     touches = [step for step in steps if isinstance(step, Touch)]
     for row in rows[[phase.last for phase in trajectory.phases]] if touches else ():
-        pin.updateGeometryPlacements(world.model, data, world.collision, geometry, world.coordinates.q(row))
+        placed = solids.at(world.coordinates.q(row))
         for step in touches:
             target = step.target.translation if isinstance(step.target, pin.SE3) else np.array(step.target)
-            point, where = coal.Sphere(1e-4), pin.SE3(np.eye(3), target)
-            near = {
-                labels[j]
-                for j in range(robots, len(labels))
-                if labels[j].partition(".")[0] != step.frame.partition(".")[0]
-                and shape_distance(point, where, shapes[j].geometry, geometry.oMg[j]) < dist_safe
-            }
-            allow(_links_of(scene, step.frame), near, CONTACT)
+            owner = step.frame.partition(".")[0]
+            close = [int(j) for j in placed.around(target, dist_safe) if j >= robots and labels[j].partition(".")[0] != owner]
+            allow(_links_of(scene, step.frame), {labels[j] for j in close}, CONTACT)
     return allowed
 
 

@@ -6,17 +6,17 @@ by at most what their relative motion is long.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import NDArray
 
 from vkc_pin.errors import InputError
-from vkc_pin.geometry import bounding_box
 from vkc_pin.scene import FLOOR, Scene
 from vkc_pin.trajectory import Trajectory
+from vkc_pin.validation_distances import Placed, Solids
 from vkc_pin.world import World
 
 __all__ = ["Hit", "PairTable"]
@@ -43,18 +43,19 @@ class PairTable:
     """All pairs of a motion.
 
     Attributes:
-        pairs: Geometry indices in `world.collision`, shape (P, 2).
+        pairs: Indices of `world.shapes`, shape (P, 2).
         margins: Clearance each must keep at waypoints [m], shape (P,); 0 where a gripper closes on what it grasps.
         contact: Overlap that counts as contact [m], shape (P,).
         together: Whether one holds the other in some phase, so that they move as one, shape (P,): `closure` sees to that.
+        solids: The shapes, to ask for distances.
 
     Args:
         scene: Where it happens.
         world: The scene as one plain tree.
         trajectory: The motion.
         dist_safe: Clearance to keep at the waypoints [m].
-        touching: Which pairs of geometries of `world.collision` (smaller index first) need no clearance, and the overlap
-            of each that counts as contact [m].
+        touching: Which pairs of `world.shapes` (smaller index first) need no clearance, and the overlap of each that counts
+            as contact [m].
     """
 
     def __init__(
@@ -78,45 +79,67 @@ class PairTable:
                 self.moved[joint] = True
         robots = len(scene.robot.collision.geometryObjects)
         self._robot_pairs = {frozenset((p.first, p.second)) for p in scene.robot.collision.collisionPairs}
-        shapes, labels = world.collision.geometryObjects, world.collision_labels
-        self.group = ["robot" if i < robots else self._owner(labels[i]) for i in range(len(shapes))]
-        pairs, margins, contact = [], [], []
-        for j in range(len(shapes)):
-            for i in range(j):
-                if self._counts(i, j):
-                    pairs.append((i, j))
-                    margins.append(0.0 if (i, j) in touching else dist_safe)
-                    contact.append(touching.get((i, j), 0.0))
-        holders = {(link, owner) for phase in trajectory.phases for owner, link in phase.by.items()}
-        names = [((labels[i], self.group[j]), (labels[j], self.group[i])) for i, j in pairs]
-        by_hand = [margin == 0.0 and overlap == 0.0 for margin, overlap in zip(margins, contact, strict=True)]
-        self.together = np.array(by_hand) | np.array([bool(holders.intersection(both)) for both in names], bool)
-        if not pairs:
+        labels, self.solids = world.collision_labels, Solids(world)
+        bodies = range(self.solids.bodies)
+        self.group = ["robot" if i < robots else self._owner(label) for i, label in enumerate(labels)]
+        self.pairs = np.concatenate(
+            [
+                np.array([(i, j) for j in bodies for i in range(j) if self._counts(i, j)], int).reshape(-1, 2),
+                self._with_obstacles(),
+            ]
+        )
+        if not len(self.pairs):
             raise InputError("no pair of geometries can collide", field="scene", expected="collision geometry")
-        self.pairs, self.margins, self.contact = np.array(pairs), np.array(margins), np.array(contact)
-        self.geometry = world.collision.copy()
-        self.geometry.removeAllCollisionPairs()
-        for first, second in pairs:
-            self.geometry.addCollisionPair(pin.CollisionPair(first, second))
-        if len(self.geometry.collisionPairs) != len(pairs):
-            raise InputError("collision pairs were lost", expected=len(pairs), got=len(self.geometry.collisionPairs))
+        self.margins, self.contact = np.full(len(self.pairs), float(dist_safe)), np.zeros(len(self.pairs))
+        self.together = np.zeros(len(self.pairs), bool)
+        for pair, overlap in touching.items():
+            which = (self.pairs == pair).all(axis=1)
+            self.margins[which], self.contact[which], self.together[which] = 0.0, overlap, overlap == 0.0
+        for owner, link in {item for phase in trajectory.phases for item in phase.by.items()}:
+            ones, others = np.array(self.group) == owner, np.array(labels) == link
+            first, second = self.pairs.T
+            self.together |= (ones[first] & others[second]) | (others[first] & ones[second])
+        self._sort()
 
     def _owner(self, label: str) -> str:
         owner = label.partition(".")[0]
         return owner if owner in self.scene.objects and "." in label else ""
 
     def _counts(self, i: int, j: int) -> bool:
-        """Return whether geometries i < j (robot first, then objects, then obstacles) can collide at all."""
-        shapes, a, b = self.world.collision.geometryObjects, self.group[i], self.group[j]
+        """Return whether two bodies i < j (robot first, then objects) can collide at all."""
+        shapes, a, b = self.world.shapes, self.group[i], self.group[j]
         if a == "robot" and b == "robot":
             return frozenset((i, j)) in self._robot_pairs
-        if self.world.collision_labels[j] == FLOOR:  # wheels stand on it, objects hang as their makers hung them
-            return (a == "robot" and shapes[i].parentJoint > 1) or a in self.carried
         if a == "robot":
             return True
-        if a == b:  # an object with itself, or two obstacles
+        if a == b:  # an object with itself
             return False
         return self.moved[shapes[i].parentJoint] or self.moved[shapes[j].parentJoint]
+
+    def _with_obstacles(self) -> NDArray[np.int_]:
+        """Return the pairs of what moves with the obstacles, shape (n, 2), by obstacle."""
+        bodies, labels = range(self.solids.bodies), self.world.collision_labels
+        joints = [self.world.shapes[i].parentJoint for i in bodies]
+        moving = [i for i in bodies if self.group[i] == "robot" or self.moved[joints[i]]]
+        # Wheels stand on the floor, objects hang as their makers hung them.
+        above = [i for i in moving if self.group[i] in self.carried or (self.group[i] == "robot" and joints[i] > 1)]
+        obstacles = range(self.solids.bodies, len(labels))
+        found = [np.zeros((0, 2), int)]
+        for floor, ones in ((False, moving), (True, above)):
+            others = [j for j in obstacles if (labels[j] == FLOOR) == floor]
+            found.append(np.column_stack([np.tile(np.array(ones, int), len(others)), np.repeat(others, len(ones))]))
+        return np.concatenate(found).astype(int)
+
+    def _sort(self) -> None:
+        """Part the pairs of two things that move from those of which one stands still all along the motion."""
+        moves = np.array([self.group[i] == "robot" or self.moved[shape.parentJoint] for i, shape in enumerate(self.world.shapes)])
+        both = moves[self.pairs].all(axis=1)
+        self._both, mixed = np.flatnonzero(both), np.flatnonzero(~both)
+        pairs = self.pairs[mixed]
+        pairs = np.where(moves[pairs[:, :1]], pairs, pairs[:, ::-1])  # what moves comes first
+        self._moving, self._still = (np.unique(column) for column in pairs.T)
+        self._number = np.full((len(self._moving), len(self._still)), -1)
+        self._number[np.searchsorted(self._moving, pairs[:, 0]), np.searchsorted(self._still, pairs[:, 1])] = mixed
 
     def sweep(self, z: NDArray[np.float64], waypoints: NDArray[np.int_]) -> Iterator[Hit]:
         """Yield what is close along the motion, and at least the closest pair of every waypoint.
@@ -125,33 +148,29 @@ class PairTable:
             z: Sampled configurations of the world, shape (S, n), evenly spaced between waypoints.
             waypoints: Rows of `z` that are waypoints, shape (T,).
         """
-        model, data = self.world.model, self.world.model.createData()
-        shapes = pin.GeometryData(self.geometry)
-        at = np.empty((len(waypoints), len(self.pairs)))
-        for t, q in enumerate(self.world.coordinates.q(z[waypoints])):
-            pin.updateGeometryPlacements(model, data, self.geometry, shapes, q)
-            pin.computeDistances(self.geometry, shapes)
-            at[t] = [result.min_distance for result in shapes.distanceResults]
-        for t, row in enumerate(waypoints.tolist()):
-            for k in {int(np.argmin(at[t])), *np.flatnonzero(at[t] < self.margins).tolist()}:
-                yield self._hit(row, k, at[t, k], at_waypoint=True)
+        configuration, smallest = self.world.coordinates.q, np.inf
+        placed = [self.solids.at(q) for q in configuration(z[waypoints])]
+        for row, here in zip(waypoints.tolist(), placed, strict=True):
+            near, at = self._nearest(here)
+            smallest = min(smallest, float(at.min()))
+            for c in {int(np.argmin(at)), *np.flatnonzero(at < self.margins[near]).tolist()}:
+                yield self._hit(row, near[c], at[c], at_waypoint=True)
+        smallest = max(1e-3, smallest)  # what cannot come closer than that changes nothing
         bounds = self._motion_bounds(z, waypoints)
-        motion = bounds[:, self.pairs[:, 0]] + bounds[:, self.pairs[:, 1]]
-        # d(s) ≥ (d_t + d_{t+1} − relative motion) / 2 for every state in between.
-        floor = (at[1:] + at[:-1] - motion) / 2
-        smallest = max(1e-3, float(at.min()))  # what cannot come closer than that changes nothing
-        for t in np.flatnonzero((floor < smallest).any(axis=1)).tolist():
-            active = np.flatnonzero(floor[t] < smallest)
+        for t, (here, there) in enumerate(itertools.pairwise(placed)):
+            active = self._active(here, there, bounds[t], smallest)
+            if not len(active):
+                continue
             first, last = int(waypoints[t]), int(waypoints[t + 1])
             rows = np.empty((last - first + 1, len(active)))
-            rows[0], rows[-1] = at[t, active], at[t + 1, active]
+            rows[0], rows[-1] = here.distances(self.pairs[active]), there.distances(self.pairs[active])
             for row in range(first + 1, last):
-                rows[row - first] = self._distances(self.world.coordinates.q(z[row]), active, data, shapes)
+                rows[row - first] = self.solids.at(configuration(z[row])).distances(self.pairs[active])
                 closest = int(np.argmin(rows[row - first]))
                 for c in {closest, *np.flatnonzero(rows[row - first] < 0).tolist()}:
                     yield self._hit(row, active[c], rows[row - first, c])
             # Between two samples that are free it is looked at again and again, until nothing deeper than 1 mm can hide.
-            step = motion[t, active] / (last - first)
+            step = bounds[t, self.pairs[active]].sum(axis=1) / (last - first)
             overlap = self.contact[active]
             free = (np.minimum(rows[1:], rows[:-1]) >= -overlap) & (rows[1:] + rows[:-1] < step)
             for r, c in np.argwhere(free & ~self.together[active]):
@@ -161,19 +180,54 @@ class PairTable:
                     if (width := (high - low) * step[c]) <= 2 * RESOLUTION or before + after >= width:
                         continue
                     middle = (low + high) / 2
-                    state = self.world.coordinates.q((1 - middle) * z[first + r] + middle * z[first + r + 1])
-                    (between,) = self._distances(state, active[c : c + 1], data, shapes)
+                    state = self.solids.at(configuration((1 - middle) * z[first + r] + middle * z[first + r + 1]))
+                    between = state.distance(*self.pairs[active[c]].tolist())
                     yield self._hit(first + r, active[c], between)
                     if between < -overlap[c]:
                         break
                     stack += [(low, middle, before, between), (middle, high, between, after)]
 
-    def _distances(
-        self, q: NDArray[np.float64], pairs: NDArray[np.int_], data: pin.Data, shapes: pin.GeometryData
-    ) -> NDArray[np.float64]:
-        """Return the distances of some pairs at one configuration [m]."""
-        pin.updateGeometryPlacements(self.world.model, data, self.geometry, shapes, q)
-        return np.array([pin.computeDistance(self.geometry, shapes, int(k)).min_distance for k in pairs])
+    def _close(self, placed: Placed, reach: NDArray[np.float64]) -> NDArray[np.int_]:
+        """Return all pairs but those of which one stands still and the other is at least `reach` from it; shape (G,) [m]."""
+        lower, upper = placed.corners
+        low, high = lower[self._moving] - reach[self._moving, None], upper[self._moving] + reach[self._moving, None]
+        near = np.ones(self._number.shape, bool)
+        for axis in range(3):
+            near &= low[:, axis, None] < upper[self._still, axis]
+            near &= high[:, axis, None] > lower[self._still, axis]
+        found = self._number[near]
+        return np.sort(np.concatenate([self._both, found[found >= 0]]))
+
+    def _nearest(self, placed: Placed) -> tuple[NDArray[np.int_], NDArray[np.float64]]:
+        """Return pairs, the closest and all that fall short of their margins among them, and their distances [m]."""
+        reach = max(float(self.margins.max()), RESOLUTION)
+        while True:
+            near = self._close(placed, np.full(len(self.group), reach))
+            near = near[placed.bounds(self.pairs[near]) < reach]
+            distances = placed.distances(self.pairs[near])
+            if not distances.min(initial=np.inf) > reach:  # all others are further apart
+                return near, distances
+            reach *= 2.0
+
+    def _active(self, here: Placed, there: Placed, bounds: NDArray[np.float64], smallest: float) -> NDArray[np.int_]:
+        """Return the pairs that may come closer than `smallest` between two waypoints [m].
+
+        d(s) ≥ (d_t + d_{t+1} − relative motion) / 2 for every state in between. So one of both distances, of which boxes give
+        lower bounds, is less than `smallest` and half the relative motion.
+
+        Args:
+            here: The world at the one.
+            there: The world at the other.
+            bounds: How far any point of each geometry moves, shape (G,) [m].
+            smallest: [m].
+        """
+        reach = smallest + bounds / 2
+        some = np.union1d(self._close(here, reach), self._close(there, reach))
+        for known in (Placed.bounds, Placed.distances):
+            pairs = self.pairs[some]
+            floor = (known(here, pairs) + known(there, pairs) - bounds[pairs].sum(axis=1)) / 2
+            some = some[floor < smallest]
+        return some
 
     def _hit(self, row: int, k: int, distance: float, *, at_waypoint: bool = False) -> Hit:
         first, second = self.pairs[k]
@@ -197,9 +251,9 @@ class PairTable:
         for index, joint in enumerate(coordinates.joints):
             of_joint.setdefault(joint, []).append(index)
         prismatic = {j: model.joints[j].shortname().startswith("JointModelP") and j > 1 for j in of_joint}
-        bounds = np.zeros((len(steps), len(self.geometry.geometryObjects)))
-        for g, shape in enumerate(self.geometry.geometryObjects):
-            center, half = bounding_box(shape)
+        bounds = np.zeros((len(steps), len(self.world.shapes)))
+        for g, shape in enumerate(self.world.shapes[: self.solids.bodies]):
+            center, half = self.solids.center[g], self.solids.half[g]
             reach = float(np.linalg.norm(half)) + float(np.linalg.norm(shape.placement.act(center)))
             joint = shape.parentJoint
             while joint:

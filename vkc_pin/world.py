@@ -33,7 +33,9 @@ class World:
         model: Robot (joint 1 is the planar base), then every object's own tree; joints of objects are `<object>.<joint>`,
             the free joint of one that can be carried `<object>.placement`, frames `<object>.<link>`.
         coordinates: Its minimal coordinates, n of them: the robot's, then the objects'.
-        collision, visual: Geometry; what stands still has parent joint 0.
+        bodies: Collision geometry of robot and objects.
+        shapes: These shapes, then those of the obstacles, which stand in the world (parent joint 0).
+        collision, visual: All geometry in one, put together when first asked for; what stands still has parent joint 0.
         collision_labels, visual_labels: For each geometry, the link or obstacle it belongs to, e.g. "forearm_link",
             "door.panel", "sofa".
         start: The scene's start and the objects' placements and states, shape (n,).
@@ -44,11 +46,10 @@ class World:
         self.scene = scene
         self.model = pin.Model(robot.model)
         self._joints = {name: self._plant(placed) for name, placed in scene.objects.items()}
-        self.collision = self._geometry(
-            robot.collision, {name: placed.object.collision for name, placed in scene.objects.items()}, scene.obstacles
-        )
-        moving = list(self.collision.geometryObjects)[: -len(scene.obstacle_labels) or None]
-        self.collision_labels = [*(link_name(shape.name) for shape in moving), *scene.obstacle_labels]
+        objects = {name: placed.object.collision for name, placed in scene.objects.items()}
+        self.bodies = self._geometry(robot.collision, objects)
+        self.shapes = (*self.bodies.geometryObjects, *scene.obstacles.geometryObjects)
+        self.collision_labels = [*(link_name(shape.name) for shape in self.bodies.geometryObjects), *scene.obstacle_labels]
         self.coordinates = Coordinates(self.model)
         states = [
             np.concatenate([as_numbers(placed.placement) if placed.object.free else [], placed.state])
@@ -65,10 +66,19 @@ class World:
         return graft(self.model, placed.object.model, parent=parent, placement=placement, prefix=prefix)
 
     @cached_property
+    def collision(self) -> pin.GeometryModel:
+        """What collides, as one; with many obstacles that takes a while, as Pinocchio's models take quadratic time to grow."""
+        geometry = self.bodies.copy()
+        graft_geometry(geometry, self.scene.obstacles.geometryObjects, joints=[0], placement=pin.SE3.Identity())
+        return geometry
+
+    @cached_property
     def visual(self) -> pin.GeometryModel:
         """What to draw; put together when first asked for, since meshes for display are large."""
         objects = {name: placed.object.visual for name, placed in self.scene.objects.items()}
-        return self._geometry(self.scene.robot.visual, objects, self.scene.obstacle_visual)
+        geometry = self._geometry(self.scene.robot.visual, objects)
+        graft_geometry(geometry, self.scene.obstacle_visual.geometryObjects, joints=[0], placement=pin.SE3.Identity())
+        return geometry
 
     @cached_property
     def visual_labels(self) -> list[str]:
@@ -84,17 +94,14 @@ class World:
             labels.append(label)
         return labels + [shape.name for shape in shapes[moving:]]
 
-    def _geometry(
-        self, robot: pin.GeometryModel, objects: Mapping[str, pin.GeometryModel], obstacles: pin.GeometryModel
-    ) -> pin.GeometryModel:
-        """Return the shapes of robot, objects and obstacles, in this order."""
+    def _geometry(self, robot: pin.GeometryModel, objects: Mapping[str, pin.GeometryModel]) -> pin.GeometryModel:
+        """Return the shapes of robot and objects, in this order."""
         geometry, here = pin.GeometryModel(), pin.SE3.Identity()
         graft_geometry(geometry, robot.geometryObjects, joints=list(range(self.scene.robot.model.njoints)), placement=here)
         for name, source in objects.items():
             placed = self.scene.objects[name]
             where = here if placed.object.free else placed.placement
             graft_geometry(geometry, source.geometryObjects, joints=self._joints[name], placement=where, prefix=f"{name}.")
-        graft_geometry(geometry, obstacles.geometryObjects, joints=[0], placement=here)
         return geometry
 
     def positions(self, trajectory: Trajectory, times: ArrayLike | None = None) -> NDArray[np.float64]:

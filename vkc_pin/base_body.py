@@ -29,6 +29,7 @@ _ANGLES = np.concatenate([_QUADRANT + quarter * np.pi / 2 for quarter in range(4
 FAN = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
 """Unit vectors along which distances are bounded, in turn, eight to a quadrant from the x axis on, shape (32, 2)."""
 
+_AXES = slice(0, len(FAN), len(FAN) // 4)  # of `FAN`, those along the axes of the world
 _RIM = 2 * np.pi * np.arange(16) / 16  # corners that stand for a circle
 _STEP, _ARC = 0.25, 0.13  # [m], [rad]: longer motions are halved before coal is asked
 _LONG_ARC = 0.5  # [rad] that one row of bounds may sweep
@@ -43,6 +44,7 @@ class Standing:
     Attributes:
         shapes: Convex shapes and where they are.
         support: Their support functions along `FAN`, shape (S, 32) [m].
+        extent: Of these, along the axes of the world alone, shape (S, 4) [m].
         height: Their lowest and highest z, shape (S, 2) [m].
     """
 
@@ -53,6 +55,7 @@ class Standing:
             points, radius = outline(shape, placement, outer=True)
             self.support[s] = (points[:, :2] @ FAN.T).max(axis=0) + radius
             self.height[s] = points[:, 2].min() - radius, points[:, 2].max() + radius
+        self.extent = self.support[:, _AXES].copy()
 
 
 class Body:
@@ -80,6 +83,8 @@ class Body:
         self._tables: dict[tuple[float, float], NDArray[np.float64]] = {}
         self._ask: dict[int, coal.ComputeDistance] = {}
         self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
+        order = np.argsort(self.standing, kind="stable")
+        self._of_standing = np.split(order, np.searchsorted(self.standing[order], np.arange(1, len(world.shapes))))
         self._margins = np.full(len(world.shapes), margin)
 
     def driven(
@@ -89,7 +94,8 @@ class Body:
         if not len(self.moving):
             return True
         margins = self._margins if margins is None else margins
-        return self._drive(a, b, yaw, self._table(yaw, yaw), self._close(np.minimum(FAN @ a, FAN @ b)), margins)
+        rows = self._close(np.minimum(FAN @ a, FAN @ b))
+        return not len(rows) or self._drive(a, b, yaw, self._extents(yaw, yaw, rows), rows, margins)
 
     def turned(self, at: NDArray[np.float64], start: float, end: float, margins: NDArray[np.float64] | None = None) -> bool:
         """Return whether the margins are kept while turning; see `BaseGrid.turned`."""
@@ -112,23 +118,29 @@ class Body:
 
     def _close(self, along: NDArray[np.float64]) -> NDArray[np.int_]:
         """Return the pairs that may meet where the base's origin is at least `along` in the directions `FAN`, shape (32,) [m]."""
-        near = (along - self.world.support).max(axis=1) < self.span
-        return np.flatnonzero(near[self.standing])
+        world = self.world
+        near = np.flatnonzero((along[_AXES] - world.extent).max(axis=1) < self.span)
+        near = near[(along - world.support[near]).max(axis=1) < self.span[near]]
+        return np.sort(np.concatenate([self._of_standing[s] for s in near.tolist()])) if len(near) else near
+
+    def _extents(self, start: float, end: float, rows: NDArray[np.int_]) -> NDArray[np.float64]:
+        """Return by how much pairs extend against the directions `FAN` while the base turns, at most: shape (n, 32) [m]."""
+        moving = self.moving[rows]
+        extents = self._table(start, end)[moving] + self.world.support[self.standing[rows]]
+        return extents if start == end else extents + (self.reach * (1.0 - np.cos((end - start) / 4)))[moving, None]
 
     def _table(self, start: float, end: float) -> NDArray[np.float64]:
-        """Return by how much each pair extends against the directions `FAN` while the base turns, at most: shape (P, 32) [m]."""
+        """Return by how much each shape extends against `FAN` at both yaws and half-way, at most: shape (M, 32) [m]."""
         key = (start, end)
         if key not in self._tables:
             if start == end:
                 cosine, sine = np.cos(start), np.sin(start)
                 turned = FAN @ np.array([[-cosine, sine], [-sine, -cosine]])  # against u, in the base's frame
-                support = np.maximum.reduceat(self._points @ turned.T, self._first, axis=0) + self._radius
-                table = support[self.moving] + self.world.support[self.standing]
+                table = np.maximum.reduceat(self._points @ turned.T, self._first, axis=0) + self._radius
             else:
                 middle = (start + end) / 2
                 table = np.maximum(self._table(start, start), self._table(end, end))
                 table = np.maximum(table, self._table(middle, middle))
-                table += (self.reach * (1.0 - np.cos((end - start) / 4)))[self.moving, None]
             if len(self._tables) >= _KEPT:
                 self._tables.clear()
             self._tables[key] = table
@@ -139,18 +151,18 @@ class Body:
         a: NDArray[np.float64],
         b: NDArray[np.float64],
         yaw: float,
-        table: NDArray[np.float64],
+        extents: NDArray[np.float64],
         rows: NDArray[np.int_],
         margins: NDArray[np.float64],
     ) -> bool:
-        gaps = (np.minimum(FAN @ a, FAN @ b) - table[rows]).max(axis=1, initial=-np.inf)
-        rows = rows[gaps < margins[self.standing[rows]]]
+        near = (np.minimum(FAN @ a, FAN @ b) - extents).max(axis=1) < margins[self.standing[rows]]
+        rows, extents = rows[near], extents[near]
         if not len(rows):
             return True
         length = float(np.hypot(*(b - a)))
         if length > _STEP:
             middle = (a + b) / 2
-            return self._drive(a, middle, yaw, table, rows, margins) and self._drive(middle, b, yaw, table, rows, margins)
+            return self._drive(a, middle, yaw, extents, rows, margins) and self._drive(middle, b, yaw, extents, rows, margins)
         direction = (b - a) / max(length, 1e-12)
 
         def closing(row: int, at: float) -> tuple[float, float]:
@@ -168,7 +180,7 @@ class Body:
         rows: NDArray[np.int_],
         margins: NDArray[np.float64],
     ) -> bool:
-        gaps = (along - self._table(start, end)[rows]).max(axis=1)
+        gaps = (along - self._extents(start, end, rows)).max(axis=1)
         rows = rows[gaps < margins[self.standing[rows]]]
         if not len(rows):
             return True

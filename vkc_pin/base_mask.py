@@ -21,6 +21,7 @@ __all__ = ["Lattice", "stuck"]
 
 _FLAT = 1e-6  # [m]: shapes, and what two have in common in height, that are no higher are left out
 _ROUNDING = 1e-5  # [m] of numbers of single precision
+_AT_ONCE = 16  # outlines
 _SLANT = float(np.cos(np.pi / len(FAN) * 1.2))  # of the angle between a direction and the nearest of `FAN`, at least
 
 
@@ -102,7 +103,7 @@ def _slice(solid: _Solid, low: float, high: float) -> NDArray[np.float64]:
 
 
 def _touched(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    return points[np.unique((FAN @ points.T).argmax(axis=1))]
+    return points[np.flatnonzero(np.bincount((FAN @ points.T).argmax(axis=1)))]
 
 
 def _support(
@@ -117,6 +118,17 @@ def _support(
     Returns:
         Shapes (M, D, K) and (M, D) [m].
     """
+    order = np.argsort([len(points) for points in outlines], kind="stable")
+    support, spare = np.empty((len(outlines), *directions.shape[:2])), np.empty((len(outlines), len(directions)))
+    for first in range(0, len(order), _AT_ONCE):  # few at once stay in the processor's cache
+        some = order[first : first + _AT_ONCE]
+        support[some], spare[some] = _support_of([outlines[k] for k in some.tolist()], directions)
+    return support, spare
+
+
+def _support_of(
+    outlines: list[NDArray[np.float64]], directions: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     size = max(len(points) for points in outlines)
     padded = np.array([np.concatenate([points, np.repeat(points[:1], size - len(points), axis=0)]) for points in outlines])
     along = (directions.reshape(-1, 2) @ padded.swapaxes(1, 2)).reshape(len(padded), *directions.shape[:2], size)

@@ -249,7 +249,7 @@ def sampled(phase: int) -> tuple[np.ndarray, np.ndarray]:
 def test_culling_never_drops_a_pair_within_reach(phase: int, reach: float) -> None:
     problem = door_problem()
     z, distances = sampled(phase)
-    at, which = problem.contacts.phases[phase].maybe_within(reach, *problem.chain.joint_placements(z))
+    at, which, bounds = problem.contacts.phases[phase].maybe_within(reach, *problem.chain.joint_placements(z))
     kept = np.zeros(distances.shape, bool)
     kept[at, which] = True
     near = distances < reach
@@ -257,6 +257,8 @@ def test_culling_never_drops_a_pair_within_reach(phase: int, reach: float) -> No
     assert not np.any(near & ~kept)
     assert kept.mean() < 0.75  # it does cull
     assert np.all(np.diff(at) >= 0)
+    assert np.all(bounds < reach)
+    assert np.all(bounds <= distances[at, which] + 1e-5)  # also of what overlaps
 
 
 @pytest.mark.parametrize("phase", [0, 2])

@@ -32,7 +32,7 @@ def margins(p: TrajectoryProblem, phase: int) -> dict[tuple[str, str], np.ndarra
     waypoints = range(first, first + p.task.phases[phase].segments + 1)
     found: dict[tuple[str, str], np.ndarray] = {}
     for k, pair in enumerate(part.pairs.tolist()):
-        row = np.array([part.margin(k, waypoint) for waypoint in waypoints])
+        row = part.margins_at(np.full(len(waypoints), k), np.array(waypoints))
         assert k in part.eased or (row == part.margins[k]).all()
         if k in part.eased:
             key = (part.labels[pair[0]], part.labels[pair[1]])

@@ -31,7 +31,7 @@ class PhaseGeometry:
         joint: Parent joint per geometry, shape (G,).
         center, half: Bounding box per geometry, in the geometry's own frame: centre and half extents, shape (G, 3) [m].
         rotation, translation: Placement of each geometry in its joint's frame, shapes (G, 3, 3) and (G, 3).
-        eased: Pair → (first waypoint, last waypoint, margin) [m]: between these it may come closer than `margins` says.
+        eased: Pair → (first waypoint, last waypoint, margin) [m]: between these it may come closer than `margins` says, so close.
         left: Object → its geometries, for what the motion leaves behind at a place that it chooses.
     """
 
@@ -47,10 +47,15 @@ class PhaseGeometry:
     eased: Mapping[int, Sequence[tuple[int, int, float]]] = field(default_factory=dict)
     left: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
-    def margin(self, pair: int, waypoint: int) -> float:
-        """Return the clearance that a pair must keep at a waypoint [m]."""
-        eased = (margin for first, last, margin in self.eased.get(pair, ()) if first <= waypoint <= last)
-        return float(min(eased, default=self.margins[pair]))
+    def margins_at(self, pairs: NDArray[np.int_], waypoints: NDArray[np.int_]) -> NDArray[np.float64]:
+        """Return the clearances that pairs must keep at waypoints, both of shape (n,), shape (n,) [m]."""
+        margins = self.margins[pairs]
+        for pair, moments in self.eased.items():
+            (which,) = np.nonzero(pairs == pair)
+            for first, last, margin in moments:
+                inside = which[(first <= waypoints[which]) & (waypoints[which] <= last)]
+                margins[inside] = np.minimum(margins[inside], margin)
+        return margins
 
     def place(self, geometry: int, placement: pin.SE3) -> None:
         """Let a geometry that stands stand elsewhere in the world."""
@@ -70,10 +75,11 @@ class PhaseGeometry:
 
     def maybe_within(
         self, reach: float, rotations: NDArray[np.float64], translations: NDArray[np.float64]
-    ) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+    ) -> tuple[NDArray[np.int_], NDArray[np.int_], NDArray[np.float64]]:
         """Return (configuration, pair) of all pairs that bounding volumes cannot prove to be `reach` [m] apart, in this order.
 
-        First balls (against boxes where they stand in the world), then what the face normals of both boxes separate.
+        First balls (against boxes where they stand in the world), then what the face normals of both boxes separate. The third
+        array has lower bounds of the signed distances [m].
 
         Args:
             reach: [m].
@@ -94,9 +100,10 @@ class PhaseGeometry:
                 w, k = self._standing_within(reach, centers[rows], extents[rows, ..., 0], local)
                 found.append((w + first, k))
         w, k = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        w, k = self._unseparated(reach, w, k, rotations, centers, local)
-        order = np.lexsort((k, w))
-        return w[order], k[order]
+        gaps = self._gaps(w, k, rotations, centers, local)
+        near = np.flatnonzero(gaps < reach)
+        near = near[np.lexsort((k[near], w[near]))]
+        return w[near], k[near], gaps[near]
 
     def _moving_within(self, reach: float, centers: NDArray[np.float64]) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
         """Return (configuration, pair) of what moves and whose balls are within `reach` of each other."""
@@ -117,15 +124,16 @@ class PhaseGeometry:
             extents: Half extents of its boxes along the world's axes, shape (W, M, 3) [m].
             local: Centres of all boxes in their joints' frames, shape (G, 3) [m].
         """
-        lower, upper = centers - extents - reach, centers + extents + reach
+        lower = np.stack([(centers - extents)[:, group].min(axis=1) for group in self._groups], axis=1) - reach
+        upper = np.stack([(centers + extents)[:, group].max(axis=1) for group in self._groups], axis=1) + reach
         lows, highs = self._boxes
-        near = np.ones((len(centers), len(self._groups), len(lows)), bool)
+        some = ((lower.min(axis=(0, 1)) < highs) & (upper.max(axis=(0, 1)) > lows)).all(axis=1).nonzero()[0]
+        near = np.ones((*lower.shape[:2], len(some)), bool)
         for axis in range(3):
-            low = np.stack([lower[:, group, axis].min(axis=1) for group in self._groups], axis=1)
-            high = np.stack([upper[:, group, axis].max(axis=1) for group in self._groups], axis=1)
-            near &= low[..., None] < highs[:, axis]
-            near &= high[..., None] > lows[:, axis]
+            near &= lower[..., axis, None] < highs[some, axis]
+            near &= upper[..., axis, None] > lows[some, axis]
         w, group, standing = np.nonzero(near)
+        standing = some[standing]
         sizes = np.array([len(members) for members in self._groups])
         entry = np.repeat(np.arange(len(w)), sizes[group])
         place = np.arange(len(entry)) - np.repeat(np.cumsum(sizes[group]) - sizes[group], sizes[group])
@@ -139,16 +147,18 @@ class PhaseGeometry:
         near_ball = np.sqrt(np.einsum("ni,ni->n", outside, outside)) - np.linalg.norm(self.half[a], axis=1) < reach
         return w[near_ball], k[near_ball]
 
-    def _unseparated(
+    def _gaps(
         self,
-        reach: float,
         w: NDArray[np.int_],
         k: NDArray[np.int_],
         rotations: NDArray[np.float64],
         centers: NDArray[np.float64],
         local: NDArray[np.float64],
-    ) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
-        """Return those of (configuration, pair) whose boxes no face normal of either separates by `reach`."""
+    ) -> NDArray[np.float64]:
+        """Return by how much the face normals of either box separate pairs at configurations [m].
+
+        That is a lower bound of their signed distance also where it is negative: moved apart by as much, they are separate.
+        """
         a, b = self.pairs[k].T
         stands = self.joint[b] == 0
         second = np.where(stands[:, None], local[b], centers[w, np.where(stands, 0, b)])
@@ -158,8 +168,7 @@ class PhaseGeometry:
         mixed = np.abs(turn_a.swapaxes(1, 2) @ turn_b)
         gap_a = np.abs(between @ turn_a)[:, 0] - self.half[a] - (mixed @ self.half[b][..., None])[..., 0]
         gap_b = np.abs(between @ turn_b)[:, 0] - self.half[b] - (self.half[a][:, None] @ mixed)[:, 0]
-        near = np.maximum(gap_a.max(axis=1), gap_b.max(axis=1)) < reach
-        return w[near], k[near]
+        return np.asarray(np.maximum(gap_a.max(axis=1), gap_b.max(axis=1)))
 
     # -- what does not change -------------------------------------------------------------------------------------------------
 

@@ -8,11 +8,12 @@ signed distance's at the linearisation point. It is linear in the placements of 
 from __future__ import annotations
 
 import dataclasses
+from bisect import insort
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from operator import itemgetter
 from typing import Any
 
+import coal
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
@@ -29,6 +30,8 @@ from vkc_pin.scene import FLOOR, Scene, standing_geometry
 from vkc_pin.task import Task
 
 __all__ = ["ContactModel", "Contacts"]
+
+_ROUNDING = 1e-6  # [m] of coal
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,21 +220,25 @@ class ContactModel:
         phase_of = np.array([self.phase_of(int(w)) for w in waypoints])
         for number in np.unique(phase_of):
             part, inside = self.phases[number], np.flatnonzero(phase_of == number)
-            at, pairs = part.maybe_within(reach, rotations[inside], translations[inside])
-            edges = np.searchsorted(at, np.arange(len(inside) + 1))
-            asked = self._distances[number]
-            for row, begin, end in zip(inside, edges[:-1], edges[1:], strict=True):
+            at, pairs, bounds = part.maybe_within(reach, rotations[inside], translations[inside])
+            margins = part.margins_at(pairs, waypoints[inside][at])
+            order = np.lexsort((pairs, bounds - margins, at))
+            at, pairs, margins, bounds = at[order], pairs[order], margins[order], bounds[order]
+            edges = np.searchsorted(at, np.arange(len(inside) + 1)).tolist()
+            for row, begin, end in zip(inside.tolist(), edges[:-1], edges[1:], strict=True):
                 if begin == end:
                     continue
                 pin.updateGeometryPlacements(self.chain.model, self.data, self.chain.collision, self._placed, q[row])
-                asked.at(self._placed.oMg)
-                found = []
-                for k in pairs[begin:end].tolist():
+                asked = self._distances[number].at(self._placed.oMg)
+                found: list[tuple[float, float, int, float, coal.DistanceResult]] = []
+                candidates = (values[begin:end].tolist() for values in (pairs, margins, bounds))
+                for k, margin, bound in zip(*candidates, strict=True):
+                    if nearest is not None and len(found) >= nearest and bound - margin > found[nearest - 1][0] + _ROUNDING:
+                        break  # neither this one nor any after it is among the nearest
                     result = asked.of(k)
-                    if result.min_distance < reach:
-                        margin = part.margin(k, int(waypoints[row]))
-                        found.append((result.min_distance - margin, result.min_distance, k, margin, result))
-                found.sort(key=itemgetter(0, 1, 2))
+                    distance = result.min_distance
+                    if distance < reach:
+                        insort(found, (distance - margin, distance, k, margin, result))
                 for _, distance, k, margin, result in found[:nearest]:
                     vectors.append((result.normal.copy(), result.getNearestPoint1(), result.getNearestPoint2()))
                     rows.append((float(row), *part.pairs[k].tolist(), distance, margin))

@@ -16,8 +16,8 @@ class Distances:
     """Distances between some of many pairs, at one configuration after the other.
 
     They are tight: at coal's own 1e-6 the gradients of planes are off by up to 5e-3; this takes no longer. Penetration keeps
-    its tolerance: below 1e-6 it fails for cylinders. Every question starts afresh, while Pinocchio's start from the last
-    answer, so that a distance would depend, in its last digits, on what was asked before.
+    its tolerance: below 1e-6 it fails for cylinders. And they start afresh every time: what coal (`coal.ComputeDistance`) and
+    Pinocchio keep from a pair's last distance would let the next depend, in its last digits, on what was asked before.
 
     Args:
         shapes: First those that move, then those that stand in the world (parent joint 0).
@@ -26,17 +26,17 @@ class Distances:
 
     def __init__(self, shapes: Sequence[pin.GeometryObject], pairs: NDArray[np.int_]) -> None:
         self._shapes, self._pairs = shapes, pairs
-        self._asking: dict[int, tuple[coal.ComputeDistance, int, int]] = {}
         self._standing: dict[int, coal.Transform3s] = {}
         self._where: dict[int, coal.Transform3s] = {}
         self._placements: Sequence[pin.SE3] = ()
         self._request = coal.DistanceRequest()
         self._request.gjk_tolerance = 1e-8
 
-    def at(self, placements: Sequence[pin.SE3]) -> None:
-        """Go on to another configuration; `placements` are those of the shapes that move, in the world."""
+    def at(self, placements: Sequence[pin.SE3]) -> Distances:
+        """Go on to another configuration, and return this; `placements` are those of the shapes that move, in the world."""
         self._placements = placements
         self._where.clear()
+        return self
 
     def forget(self, shape: int) -> None:
         """Take note that a shape that stands has been placed elsewhere."""
@@ -44,16 +44,9 @@ class Distances:
 
     def of(self, pair: int) -> coal.DistanceResult:
         """Return distance, witness points and normal of a pair at the configuration."""
-        if pair not in self._asking:
-            first, second = self._pairs[pair].tolist()
-            self._asking[pair] = (
-                coal.ComputeDistance(self._shapes[first].geometry, self._shapes[second].geometry),
-                first,
-                second,
-            )
-        ask, first, second = self._asking[pair]
-        result = coal.DistanceResult()
-        ask(self._transform(first), self._transform(second), self._request, result)
+        first, second = self._pairs[pair].tolist()
+        one, other, result = self._shapes[first].geometry, self._shapes[second].geometry, coal.DistanceResult()
+        coal.distance(one, self._transform(first), other, self._transform(second), self._request, result)
         return result
 
     def _transform(self, shape: int) -> coal.Transform3s:

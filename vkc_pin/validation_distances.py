@@ -40,8 +40,7 @@ class Solids:
         self.data = world.model.createData()
         obstacles = self.shapes[self.bodies :]
         self._transforms: dict[int, coal.Transform3s] = {}
-        self._asking: dict[tuple[int, int], coal.ComputeDistance] = {}
-        self._request = coal.DistanceRequest()
+        self.request = coal.DistanceRequest()
         self._corners = self.corners([shape.placement for shape in obstacles], slice(self.bodies, None))
 
     def at(self, q: NDArray[np.float64]) -> Placed:
@@ -91,10 +90,9 @@ class Placed:
         """Return coal's signed distance of two shapes [m]."""
         key = (first, second)
         if key not in self._known:
-            asking, result = self._solids._asking, coal.DistanceResult()
-            if key not in asking:
-                asking[key] = coal.ComputeDistance(self._solids.shapes[first].geometry, self._solids.shapes[second].geometry)
-            asking[key](self._transform(first), self._transform(second), self._solids._request, result)
+            one, other = (self._solids.shapes[i].geometry for i in key)
+            result = coal.DistanceResult()  # nothing is kept from one distance to the next, which would change its last digits
+            coal.distance(one, self._transform(first), other, self._transform(second), self._solids.request, result)
             self._known[key] = float(result.min_distance)
         return self._known[key]
 
@@ -119,7 +117,7 @@ class Placed:
         lower, upper = self.corners
         near = np.flatnonzero(((lower - point < reach + POINT) & (point - upper < reach + POINT)).all(axis=1)).tolist()
         ball, there = coal.Sphere(POINT), coal.Transform3s(np.eye(3), point)
-        request = self._solids._request
+        request = self._solids.request
         return [
             i
             for i in near

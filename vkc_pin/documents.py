@@ -108,7 +108,7 @@ def read_yaml(file: str | Path) -> Document:
         raise InputError(
             "cannot read the file", file=path, expected="an existing YAML file", got=getattr(error, "strerror", None) or error
         ) from error
-    loader = yaml.SafeLoader(text)
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)(text)  # the first is ten times as fast, and not everywhere
     lines: dict[tuple[Key, ...], int] = {}
     try:
         node = loader.get_single_node()

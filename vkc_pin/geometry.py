@@ -137,17 +137,19 @@ def clearance(
         second: The other group.
         reach: Distances above this do not matter [m]: the result is then some number ≥ `reach`.
     """
-    nearest, request = reach, coal.DistanceRequest()
-    around = [(shape, placement, *_ball(shape, placement)) for shape, placement in second]
+    nearest, request, others = reach, coal.DistanceRequest(), list(second)
+    boxes = np.array([world_box(shape, placement) for shape, placement in others]).reshape(-1, 2, 3)
     for shape, placement in first:
-        centre, radius = _ball(shape, placement)
+        low, high = world_box(shape, placement)
+        # Moved apart by as much as their boxes overlap, shapes are separate: a bound also where it is negative.
+        gaps = np.maximum(boxes[:, 0] - high, low - boxes[:, 1]).max(axis=1)
         transform = coal.Transform3s(placement.rotation, placement.translation)
-        for other, other_placement, other_centre, other_radius in around:
-            if np.linalg.norm(centre - other_centre) - radius - other_radius >= nearest:
-                continue
-            other_transform = coal.Transform3s(other_placement.rotation, other_placement.translation)
-            distance = coal.distance(shape, transform, other, other_transform, request, coal.DistanceResult())
-            nearest = min(nearest, distance)
+        for k in np.argsort(gaps, kind="stable").tolist():
+            if gaps[k] >= nearest:
+                break
+            other, where = others[k]
+            there = coal.Transform3s(where.rotation, where.translation)
+            nearest = min(nearest, coal.distance(shape, transform, other, there, request, coal.DistanceResult()))
     return float(nearest)
 
 
@@ -173,10 +175,3 @@ def world_box(shape: coal.CollisionGeometry, placement: pin.SE3) -> tuple[NDArra
     centre = placement.act(np.asarray(box.center(), float))
     extent = np.abs(placement.rotation) @ np.array([box.width(), box.height(), box.depth()]) / 2
     return centre - extent, centre + extent
-
-
-def _ball(shape: coal.CollisionGeometry, placement: pin.SE3) -> tuple[NDArray[np.float64], float]:
-    """Return a ball around a shape: its centre in the world frame, shape (3,), and its radius [m]."""
-    if shape.aabb_radius < 0.0:
-        shape.computeLocalAABB()
-    return placement.act(np.array(shape.aabb_center)), float(shape.aabb_radius)

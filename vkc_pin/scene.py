@@ -133,7 +133,7 @@ class Scene:
         for value, low, high, name in zip(start[:2], self.arena[::2], self.arena[1::2], names[:2], strict=True):
             if not low <= value <= high:
                 raise InputError("outside the arena", field=f"base.{name}", expected=f"{low:g} to {high:g}", got=f"{value:g}")
-        document = copy.deepcopy(self.document)
+        document = self._document_with_own("start")
         document["start"]["base"] = start[:3].tolist()
         if arm is not None:
             document["start"]["arm"] = start[3:].tolist()
@@ -150,7 +150,7 @@ class Scene:
         if name not in self.objects:
             raise UnknownNameError("object", name, self.objects)
         placed = self.objects[name].with_state(values)
-        document = copy.deepcopy(self.document)
+        document = self._document_with_own("objects")
         (entry,) = (item for item in document["objects"] if item["name"] == name)
         state = zip(placed.object.coordinates.names, placed.state.tolist(), strict=True)
         entry["state"] = dict(state)
@@ -165,7 +165,7 @@ class Scene:
         """
         if name not in self.objects:
             raise UnknownNameError("object", name, self.objects)
-        document = copy.deepcopy(self.document)
+        document = self._document_with_own("objects")
         _write_placement(document, name, placement)
         placed = dataclasses.replace(self.objects[name], placement=pin.SE3(placement))
         changed = dataclasses.replace(self, objects=MappingProxyType({**self.objects, name: placed}), document=document)
@@ -192,7 +192,7 @@ class Scene:
         by = {} if by is None else by
         values = {name: tuple(float(value) for value in row) for name, row in ({} if at is None else at).items()}
         check_holds(self.objects, held, by, values)
-        document = copy.deepcopy(self.document)
+        document = self._document_with_own("start", "objects")
         document["start"]["held"] = {
             name: {"attachment": attachment}
             | ({"by": by[name]} if name in by else {})
@@ -210,6 +210,10 @@ class Scene:
             document=document,
         )
         return changed.with_held_objects_in_the_hand()
+
+    def _document_with_own(self, *parts: str) -> dict[str, Any]:
+        """Return the document with copies of some of its parts, which may be changed; the others it shares."""
+        return {**self.document, **{part: copy.deepcopy(self.document[part]) for part in parts if part in self.document}}
 
     def with_held_objects_in_the_hand(self) -> Scene:
         """Return the scene with every free object that is held placed where the robot holds it at the start."""

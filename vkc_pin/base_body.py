@@ -31,6 +31,7 @@ FAN = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
 
 _AXES = slice(0, len(FAN), len(FAN) // 4)  # of `FAN`, those along the axes of the world
 _RIM = 2 * np.pi * np.arange(16) / 16  # corners that stand for a circle
+_CORNERS = np.array(list(itertools.product((False, True), repeat=3)))  # of a box, whether they are its upper ends
 _STEP, _ARC = 0.25, 0.13  # [m], [rad]: longer motions are halved before coal is asked
 _LONG_ARC = 0.5  # [rad] that one row of bounds may sweep
 _BLINK = 2e-3  # [m] that a motion goes on at least before the next question: half of it is how far it may come too close
@@ -255,7 +256,7 @@ def outline(shape: coal.CollisionGeometry, placement: pin.SE3, *, outer: bool) -
     elif isinstance(shape, coal.Box) or outer:
         shape.computeLocalAABB()
         box = shape.aabb_local
-        points = np.array(list(itertools.product(*zip(box.min_, box.max_, strict=True))))
+        points = np.where(_CORNERS, box.max_, box.min_)
     else:
         points = np.empty((0, 3))
     return points @ placement.rotation.T + placement.translation, radius

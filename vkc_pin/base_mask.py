@@ -60,19 +60,13 @@ def stuck(
         that the base passes under.
     """
     obstacles, below, above = _solids(standing), _solids(base), _solids(carried)
-    pairs = [(solid, other) for solid in below for other in obstacles if _common(solid, other)]
+    pairs, over = _meeting(below, obstacles), _meeting(above, obstacles)
     low, high = (
         reduce(np.concatenate([solid.points for solid in below] or [np.zeros((1, 3))]), axis=0) for reduce in (np.min, np.max)
     )
-    met = {id(other) for _, other in pairs}
-    over = [
-        (solid, other)
-        for solid in above
-        for inside in [np.all((solid.points >= low) & (solid.points <= high), axis=0)[:2].all()]
-        for other in obstacles
-        if _common(solid, other) and not (inside and id(other) in met)
-    ]
-    return _fill(pairs, lattice, margin), _fill(over, lattice, margin)
+    inside = [np.all((solid.points >= low) & (solid.points <= high), axis=0)[:2].all() for solid in above]
+    hidden = np.array(inside, bool)[over[:, 0]] & np.isin(over[:, 1], pairs[:, 1])
+    return _fill(below, obstacles, pairs, lattice, margin), _fill(above, obstacles, over[~hidden], lattice, margin)
 
 
 def _solids(shapes: Sequence[Shape]) -> list[_Solid]:
@@ -85,8 +79,11 @@ def _solids(shapes: Sequence[Shape]) -> list[_Solid]:
     return solids
 
 
-def _common(first: _Solid, second: _Solid) -> bool:
-    return min(first.top, second.top) - max(first.bottom, second.bottom) > _FLAT
+def _meeting(first: Sequence[_Solid], second: Sequence[_Solid]) -> NDArray[np.int_]:
+    """Return which solids share heights with which, in the order of the first, shape (P, 2)."""
+    one, other = (np.array([(solid.bottom, solid.top) for solid in solids]).reshape(-1, 2) for solids in (first, second))
+    common = np.minimum(one[:, None, 1], other[:, 1]) - np.maximum(one[:, None, 0], other[:, 0])
+    return np.argwhere(common > _FLAT)
 
 
 def _slice(solid: _Solid, low: float, high: float) -> NDArray[np.float64]:
@@ -131,9 +128,12 @@ def _support_of(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     size = max(len(points) for points in outlines)
     padded = np.array([np.concatenate([points, np.repeat(points[:1], size - len(points), axis=0)]) for points in outlines])
-    along = (directions.reshape(-1, 2) @ padded.swapaxes(1, 2)).reshape(len(padded), *directions.shape[:2], size)
-    which = along.argmax(axis=-1)
-    support = np.take_along_axis(along, which[..., None], axis=-1)[..., 0]
+    along = (directions.reshape(-1, 2) @ padded.swapaxes(1, 2)).swapaxes(1, 2).reshape(len(padded), size, *directions.shape[:2])
+    support, which = along[:, 0].copy(), np.zeros((len(padded), *directions.shape[:2]), int)
+    for point in range(1, size):  # faster than argmax, since there are many more directions than points
+        further = along[:, point] > support
+        which[further] = point
+        np.maximum(support, along[:, point], out=support)
     touched = padded[np.arange(len(padded))[:, None, None], which]  # (M, D, K, 2)
     after, following, beyond = (np.roll(a, -1, axis=axis) for a, axis in ((directions, 1), (support, 2), (touched, 2)))
     # The corner between two neighbouring directions, and how far it is from the segment between the points touched.
@@ -150,35 +150,35 @@ def _support_of(
     return support, np.linalg.norm(offset - share[..., None] * way, axis=-1).max(axis=2)
 
 
-def _fill(pairs: list[tuple[_Solid, _Solid]], lattice: Lattice, margin: float) -> NDArray[np.bool_]:
-    """Return where any of pairs of shapes surely come too close, shape (cells, cells, H)."""
+def _fill(
+    first: Sequence[_Solid], second: Sequence[_Solid], pairs: NDArray[np.int_], lattice: Lattice, margin: float
+) -> NDArray[np.bool_]:
+    """Return where any of pairs of solids, shape (P, 2), surely come too close, shape (cells, cells, H)."""
     count, cells = len(lattice.yaws), lattice.cells
-    if not pairs:
+    if not len(pairs):
         return np.zeros((cells, cells, count), bool)
-    moving: dict[tuple[int, float, float], int] = {}
-    standing: dict[tuple[int, float, float], int] = {}
-    shapes: tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]] = ([], [])
-    indices = []
-    for solid, other in pairs:
+    known: tuple[dict[tuple[int, float, float], int], ...] = ({}, {})
+    shapes: tuple[list[NDArray[np.float64]], ...] = ([], [])
+    indices: tuple[list[int], ...] = ([], [])
+    for i, j in zip(*pairs.T.tolist(), strict=True):
+        solid, other = first[i], second[j]
         low, high = max(solid.bottom, other.bottom), min(solid.top, other.top)
         if not other.prism:
             low = high = (low + high) / 2
-        row = []
-        for which, known, found in ((solid, moving, shapes[0]), (other, standing, shapes[1])):
+        for side, which in enumerate((solid, other)):
             key = (id(which), 0.0, 0.0) if which.prism else (id(which), low, high)
-            if key not in known:
-                known[key] = len(found)
-                found.append(_slice(which, low, high))
-            row.append(known[key])
-        indices.append(row)
-    first, second = np.array(indices).T
+            if key not in known[side]:
+                known[side][key] = len(shapes[side])
+                shapes[side].append(_slice(which, low, high))
+            indices[side].append(known[side][key])
+    moving, standing = np.array(indices)
     cosine, sine = np.cos(lattice.yaws)[:, None], np.sin(lattice.yaws)[:, None]
     turned = -np.stack([cosine * FAN[:, 0] + sine * FAN[:, 1], cosine * FAN[:, 1] - sine * FAN[:, 0]], axis=-1)
     support, spare = _support(shapes[0], turned)
     other_support, other_spare = _support(shapes[1], FAN[None])
-    allowed = _SLANT * margin - spare[first] - other_spare[second] - _ROUNDING  # (pairs, H)
-    reach = (support[first] + other_support[second] + allowed[..., None]).reshape(-1, len(FAN)).astype(np.float32)
-    return _rows(reach, np.tile(np.arange(count), len(first)), lattice)
+    allowed = _SLANT * margin - spare[moving] - other_spare[standing] - _ROUNDING  # (pairs, H)
+    reach = (support[moving] + other_support[standing] + allowed[..., None]).reshape(-1, len(FAN)).astype(np.float32)
+    return _rows(reach, np.tile(np.arange(count), len(moving)), lattice)
 
 
 def _rows(reach: NDArray[np.float32], heading: NDArray[np.int_], lattice: Lattice) -> NDArray[np.bool_]:

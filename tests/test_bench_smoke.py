@@ -157,3 +157,24 @@ def test_baselines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.suffix in (".json", ".jsonl", ".csv", ".md")}
     assert main(command) == 0  # nothing is left to do
     assert {name: (tmp_path / name).read_bytes() for name in before} == before
+
+
+@pytest.mark.slow
+def test_scale(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["bench", "scale", "--starts", "2", "--obstacles", "10", "40", "--jobs", "1", "--quiet", "--out", str(tmp_path)]
+    assert main(command) == 0
+    table = (tmp_path / "table.md").read_text(encoding="utf-8")
+    assert table in capsys.readouterr().out
+    trials = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))["trials"]
+    assert [t["key"] for t in trials] == [f"{n:04d}/{count:06d}" for n in (0, 1) for count in (10, 40)]
+    for t in trials:
+        assert set(t) == FIELDS - {"repeat", "perturbation"} | {"obstacles"}
+        assert t["success"] == (t["status"] == "success") == (not t["violations"])
+        assert t["success"], t["violations"]
+        assert t["base_effort"] > 1.5 - t["start"][0]  # from the start to within reach of the door, which is at x = 2.5
+        assert 0.0 < sum(t[name] for name in t if name.startswith("time_")) <= t["planning_time"] < 60.0
+    assert trials[0]["start"] == trials[1]["start"] != trials[2]["start"] == trials[3]["start"]
+    for count in (10, 40):
+        median = np.median([t["planning_time"] for t in trials if t["obstacles"] == count])
+        assert f"| {count} | 2 of 2 | {median:.2f} |" in table
+    assert (tmp_path / "scale.png").read_bytes().startswith(b"\x89PNG\r\n\x1a\n")

@@ -9,8 +9,8 @@ import pytest
 from fake_plan import fake_plan
 from matplotlib.patches import StepPatch
 
-from vkc_pin.benchmarks.charts import criteria_chart, motions_chart, success_chart
-from vkc_pin.benchmarks.tables import wilson
+from vkc_pin.benchmarks.charts import criteria_chart, motions_chart, scale_chart, success_chart
+from vkc_pin.benchmarks.tables import TIMES, wilson
 from vkc_pin.plan import Plan
 from vkc_pin.report import Report
 
@@ -153,3 +153,26 @@ def test_motions_are_those_of_the_plans(tmp_path: Path) -> None:
     assert [text.get_text() for text in rows[2, 1].get_legend().get_texts()] == ["x [m/s]", "y [m/s]", "yaw [rad/s]"]
     image = imread(path)[..., :3]
     assert float((np.ptp(image, axis=2) > 0.2).mean()) > 0.005  # coloured lines
+
+
+def test_time_against_the_number_of_obstacles(tmp_path: Path) -> None:
+    times = {10: (1.0, 1.2, 1.1), 300: (2.0, 1.6, 1.8), 30: (1.3, 1.4, 1.5)}
+    share = dict(zip(TIMES, (0.3, 0.1, 0.2, 0.15, 0.05), strict=True))
+    records: list[dict[str, Any]] = [
+        {"obstacles": count, "planning_time": time, **{field: part * time for field, part in share.items()}}
+        for count, own in times.items()
+        for time in own
+    ]
+    figure = scale_chart([*records, {"obstacles": 10, "status": "error"}], tmp_path / "scale.png", title="Many")
+    (axes,) = figure.axes
+    np.testing.assert_allclose(axes.lines[0].get_xydata(), [[10.0, 1.1], [30.0, 1.4], [300.0, 1.8]])
+    tops = [area.get_paths()[0].vertices[:, 1].max() for area in axes.collections[: len(TIMES) + 1]]
+    np.testing.assert_allclose(tops, 1.8 * np.array([*np.cumsum(list(share.values())), 1.0]))
+    (bars,) = [part for part in axes.collections if len(part.get_paths()) == 3 and part not in axes.collections[: len(TIMES) + 1]]
+    np.testing.assert_allclose([bar[:, 1] for bar in bars.get_segments()], [[1.05, 1.15], [1.35, 1.45], [1.7, 1.9]])
+    assert [text.get_text() for text in axes.texts] == ["1.10", "1.40", "1.80"]
+    assert [text.get_text() for text in axes.get_xticklabels()] == ["10", "30", "300"]
+    names = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert names == [*TIMES.values(), "setting up", "planning time"]
+    assert (tmp_path / "scale.png").stat().st_size > 10_000
+    assert scale_chart([], None).axes

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import coal
@@ -18,7 +17,6 @@ from hypothesis import strategies as st
 from small_problems import SHORT, all_pairs, random_configurations
 from test_validation_pairs import brute_force, pair_names, wander
 
-from vkc_pin.benchmarks import scale
 from vkc_pin.benchmarks.scale import crowded
 from vkc_pin.clearance import clearance_curves
 from vkc_pin.geometry import clearance, shape_distance, standing_geometry
@@ -67,16 +65,6 @@ class Counter:
 # --- what it costs --------------------------------------------------------------------------------------------------
 
 
-def test_obstacles_are_the_same_and_more() -> None:
-    few, some, many = (crowded(count) for count in (10, 30, 300))
-    assert [len(scene.obstacle_names) for scene in (few, some, many)] == [10, 30, 300]
-    assert some.obstacle_names[:10] == few.obstacle_names
-    assert many.document["obstacles"][:30] == some.document["obstacles"]
-    assert many.start_clearance() == some.start_clearance()
-    assert crowded(30, seed=1).document["obstacles"] != some.document["obstacles"]
-    assert {label for label in few.obstacle_labels if "wall" in label} >= {"wall_west", "wall_above_door", "hall_wall"}
-
-
 @pytest.fixture(scope="module")
 def plans() -> dict[int, tuple[Plan, int]]:
     """Return the plans of opening the door among 30 and 1000 obstacles, and how many distances each took."""
@@ -118,19 +106,6 @@ def test_pictures_of_clearance_ask_for_few(plans: dict[int, tuple[Plan, int]]) -
         asked.append(counter.asked / len(times))
     assert [curve.name for curve in found[0]] == [curve.name for curve in found[1]]
     assert max(asked) < 200  # at every moment, of 26,000 pairs
-
-
-def test_the_benchmark(tmp_path: Path) -> None:
-    result = scale.run(counts=(10, 40), repeats=1, progress=False)
-    assert [(t["obstacles"], t["number"], t["scene"]) for t in result["trials"]] == [(10, 0, "door_10"), (40, 0, "door_40")]
-    assert all(trial["success"] for trial in result["trials"])
-    head, *lines = scale.table(result).splitlines()
-    assert [line.split()[:2] for line in lines] == [["10", "1/1"], ["40", "1/1"]]
-    assert len(head.split()) == len(lines[0].split()) + 1  # "time [s]"
-    figure = scale.draw(result, tmp_path / "scale.png")
-    (axes,) = figure.axes
-    np.testing.assert_allclose(axes.lines[0].get_ydata(), [trial["planning_time"] for trial in result["trials"]])
-    assert (tmp_path / "scale.png").stat().st_size > 10_000
 
 
 # --- contacts -------------------------------------------------------------------------------------------------------

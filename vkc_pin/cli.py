@@ -147,6 +147,12 @@ def _bench_baselines(arguments: argparse.Namespace) -> int:
     )
 
 
+def _bench_scale(arguments: argparse.Namespace) -> int:
+    from vkc_pin.benchmarks import scale
+
+    return _experiment(arguments, scale.run, starts=arguments.starts, counts=arguments.obstacles or scale.COUNTS)
+
+
 def _experiment(arguments: argparse.Namespace, run: Callable[..., Any], **settings: Any) -> int:
     """Run an experiment on the options that all of them have, and `settings`; print its table, or how to go on."""
     common = {"seed": arguments.seed, "jobs": arguments.jobs, "out": arguments.out}
@@ -240,6 +246,12 @@ def _parser() -> argparse.ArgumentParser:
     baselines.add_argument("--methods", nargs="+", metavar="METHOD", help="some of B1 B2 VKC (default: all)")
     baselines.add_argument("--save-failures", action="store_true", help="save the plans of failures, to be viewed")
     baselines.set_defaults(run=_bench_baselines)
+    about = "Measure planning time against the number of obstacles, at the door from random starts."
+    scale = benches.add_parser("scale", help="planning time against the number of obstacles", description=about)
+    _add_experiment_options(scale, "--starts", jobs=1)
+    numbers = "numbers of obstacles (default: 10 30 100 300 1000)"
+    scale.add_argument("--obstacles", nargs="+", type=_positive, metavar="N", help=numbers)
+    scale.set_defaults(run=_bench_scale)
 
     about = "Sample which links of a robot can never collide."
     srdf = commands.add_parser("srdf", help="regenerate allowed collisions", description=about)
@@ -251,12 +263,12 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add_experiment_options(parser: argparse.ArgumentParser, number: str) -> None:
+def _add_experiment_options(parser: argparse.ArgumentParser, number: str, *, jobs: int | None = None) -> None:
+    """Add what all experiments have; `jobs` is the default number of processes, None one per core."""
     parser.add_argument(number, type=_positive, default=50, metavar="N", help="random starts per scene (default 50)")
     parser.add_argument("--seed", type=_natural, default=0, metavar="S", help="of the starts and of planning (default 0)")
-    parser.add_argument(
-        "--jobs", type=_positive, default=os.cpu_count() or 1, metavar="J", help="processes (default: one per core)"
-    )
+    processes = f"processes (default: {'one per core' if jobs is None else jobs})"
+    parser.add_argument("--jobs", type=_positive, default=jobs or os.cpu_count() or 1, metavar="J", help=processes)
     about = "folder for results, table and charts; trials that it has already are not run again"
     parser.add_argument("--out", required=True, metavar="DIR", help=about)
     parser.add_argument("--quiet", action="store_true", help="no progress bar")

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from vkc_pin.benchmarks.tables import common, quartiles, wilson
+from vkc_pin.benchmarks.tables import TIMES, common, quartiles, wilson
 from vkc_pin.plan import Plan
 from vkc_pin.plotting import _COLOURS, _figure, _save, _shade_phases, _style
 
@@ -20,13 +21,6 @@ __all__ = ["criteria_chart", "motions_chart", "scale_chart", "success_chart"]
 
 _WIDTH = 0.8  # of a group of bars; the distance between groups is 1
 _ROOM = 2.0  # a scale that is not made for all motions reaches so many times farther than the others
-_PARTS = {
-    "initialization": "seeds",
-    "coal": "distances",
-    "casadi": "functions",
-    "ipopt": "Ipopt",
-    "validation": "validation",
-}
 _BASE = ("x [m/s]", "y [m/s]", "yaw [rad/s]")
 
 
@@ -179,40 +173,41 @@ def motions_chart(plans: Mapping[str, Plan], path: str | Path | None, *, title: 
 
 
 def scale_chart(records: Sequence[Mapping[str, Any]], path: str | Path | None, *, title: str = "") -> Figure:
-    """Draw planning time against the number of obstacles, and what it is spent on; medians, and of the whole the quartiles.
+    """Draw planning time against the number of obstacles, and what it is spent on: medians, and quartiles of the whole.
 
     Args:
-        records: Records as `record.trial` makes them, with `obstacles`.
+        records: Records as `record.trial` makes them, with `obstacles`; those without a planning time are left out.
         path: The file to write, .png, .svg or .pdf; None writes nothing.
         title: Written above.
 
     Returns:
         The figure.
     """
+    records = [record for record in records if record.get("planning_time") is not None]
     counts = sorted({int(record["obstacles"]) for record in records})
     rows = [[record for record in records if record["obstacles"] == count] for count in counts]
-    whole = np.array([quartiles([float(record["planning_time"]) for record in own]) for own in rows])
-    parts = {
-        name: np.array([np.median([float(record[f"time_{key}"]) for record in own]) for own in rows])
-        for key, name in _PARTS.items()
-    }
+
+    def spread(field: str) -> NDArray[np.float64]:
+        return np.array([quartiles([float(record[field]) for record in own]) for own in rows]).reshape(-1, 3)
+
+    low, middle, high = spread("planning_time").T
+    parts = {name: spread(field)[:, 1] for field, name in TIMES.items()}
+    parts["setting up"] = np.maximum(middle - sum(parts.values()), 0.0)
     with _style():
         figure = _figure(6.4, 4.0)
         axes = figure.subplots()
-        rest = np.maximum(whole[:, 1] - sum(parts.values()), 0.0)
-        axes.stackplot(
-            counts, *parts.values(), rest, labels=[*parts, "the rest"], colors=[*_COLOURS[: len(parts)], "0.7"], alpha=0.55
-        )
-        error = np.stack([whole[:, 1] - whole[:, 0], whole[:, 2] - whole[:, 1]])
-        axes.errorbar(counts, whole[:, 1], error, color="0.15", marker="o", markersize=4.0, capsize=2.5, label="planning time")
-        for count, (_, middle, high) in zip(counts, whole, strict=True):
-            axes.annotate(f"{middle:.2f}", (count, high), (0, 5), textcoords="offset points", ha="center", fontsize=8)
+        colours = [*_COLOURS[: len(TIMES)], "0.7"]
+        axes.stackplot(counts, *parts.values(), labels=[*parts], colors=colours, alpha=0.55)
+        error = [middle - low, high - middle]
+        axes.errorbar(counts, middle, error, color="0.15", marker="o", markersize=4.0, capsize=2.5, label="planning time")
+        for count, height, value in zip(counts, high, middle, strict=True):
+            axes.annotate(f"{value:.2f}", (count, height), (0, 5), textcoords="offset points", ha="center", fontsize=8)
         axes.set_xscale("log")
         axes.set_xticks(counts, [str(count) for count in counts])
         axes.minorticks_off()
-        axes.set_ylim(0.0, 1.25 * float(whole.max()))
+        axes.set_ylim(0.0, 1.15 * float(high.max(initial=0.0)) or 1.0)
         axes.set_xlabel("obstacles")
-        axes.set_ylabel("planning time [s]")
+        axes.set_ylabel("planning time, median and quartiles [s]")
         axes.set_title(title, fontsize=10)
         figure.legend(loc="outside right upper")
         if path is not None:

@@ -2,28 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
+from vkc_pin.benchmarks import experiment
 from vkc_pin.benchmarks.charts import scale_chart
-from vkc_pin.benchmarks.record import distribution, meta, peak_memory, trial
+from vkc_pin.benchmarks.record import distribution, trial
+from vkc_pin.benchmarks.tables import TIMES, decimal, foot, markdown, quartiles
+from vkc_pin.errors import InputError
+from vkc_pin.plan import Plan, write_atomically
 from vkc_pin.planner import plan
 from vkc_pin.scene import Scene, load_scene
 from vkc_pin.steps import Actuate
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-__all__ = ["COUNTS", "crowded", "draw", "run", "table"]
+__all__ = ["COUNTS", "crowded", "report", "run", "specify"]
 
 COUNTS = (10, 30, 100, 300, 1000)
+FEW = 30
+"""The number of obstacles to whose planning times the others are compared."""
+TIME_LIMIT = 60.0  # [s] of planning
 _GOAL = {"hinge": 1.2}
 _WEST, _EAST, _SOUTH, _NORTH, _HALL, _CEILING = -2.5, 2.5, -2.0, 2.0, 5.1, 2.4  # [m]: faces of the walls
-_PARTS = ("initialization", "coal", "casadi", "ipopt", "validation")
 
 
 def crowded(count: int, *, seed: int = 0) -> Scene:
@@ -61,40 +64,106 @@ def _thing(rng: np.random.Generator, number: int) -> dict[str, Any]:
     return {"name": f"thing_{number}", "type": "box", "size": list(map(float, size)), "position": list(map(float, position))}
 
 
-def run(*, counts: Sequence[int] = COUNTS, repeats: int = 5, seed: int = 0, progress: bool = True) -> dict[str, Any]:
-    """Plan the whole task at the door (drive up, grasp, turn the knob, push) among different numbers of obstacles.
+def specify(*, starts: int, seed: int, counts: Sequence[int]) -> list[dict[str, Any]]:
+    """Return the trials: from every start all numbers of obstacles, one after the other, so that they meet the same machine.
+
+    A start is free among as many obstacles as there are in any trial.
+    """
+    rng, scene = np.random.default_rng(seed), _crowded(max(*COUNTS, *counts))
+    bases = [scene.sample_start(rng).start[:3].tolist() for _ in range(starts)]
+    return [
+        {"key": f"{number:04d}/{count:06d}", "obstacles": count, "number": number, "base": base, "seed": seed}
+        for number, base in enumerate(bases)
+        for count in counts
+    ]
+
+
+def run(
+    *,
+    starts: int,
+    seed: int,
+    out: str | Path,
+    jobs: int = 1,
+    counts: Sequence[int] = COUNTS,
+    progress: bool = True,
+) -> dict[str, Any]:
+    """Run the experiment, or what is left of it, and write results.json, results.csv, table.md and scale.png to `out`.
+
+    It is the whole task at the door: drive up, grasp, turn the knob, push.
 
     Args:
+        starts: Number of random starts, the same for every number of obstacles.
+        seed: Of the starts and of planning.
+        out: The folder; if it has trials of the same settings already, they are not run again.
+        jobs: Number of processes. Several get in each other's way, and times are what this is about.
         counts: Numbers of obstacles.
-        repeats: How often each is planned; the numbers take turns, so that a busy moment does not hit one of them alone.
-        seed: Of where things are, and of planning.
         progress: Whether to show a progress bar.
 
     Returns:
-        {"meta": ..., "trials": [...]}, one object a plan, with the number of `obstacles`.
+        {"meta": ..., "trials": [...]}, each trial with its number of `obstacles`; see `experiment.run`.
+
+    Raises:
+        InputError: A number of obstacles is less than 1, or `out` has trials of other settings.
+        KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
     """
-    scenes = {count: crowded(count, seed=seed) for count in counts}
-    plan(next(iter(scenes.values())), [Actuate("door", _GOAL)], seed=seed)  # pays for what is built once
-    records = []
-    for number in tqdm(range(repeats), desc="scale", unit="round", disable=not progress):
-        for count, scene in scenes.items():
-            result = plan(scene, [Actuate("door", _GOAL)], seed=seed)
-            records.append(trial(result, method="VKC", seed=seed, obstacles=count, number=number))
-    about = meta(benchmark="scale", seed=seed, repeats=repeats, counts=list(counts), peak_memory_mb=peak_memory())
-    return {"meta": about, "trials": records}
+    counts = sorted(set(counts))
+    if not counts or counts[0] < 1:
+        raise InputError("out of range", field="counts", expected="numbers of at least 1", got=counts)
+    trials = specify(starts=starts, seed=seed, counts=counts)
+    settings = {"benchmark": "scale", "seed": seed, "starts": starts, "counts": counts, "time_limit": TIME_LIMIT}
+    result = experiment.run(trials, _record, out, settings=settings, jobs=jobs, progress=progress)
+    write_atomically(Path(out) / "table.md", report(result).encode())
+    scale_chart(result["trials"], Path(out) / "scale.png", title="Opening the door among more and more obstacles")
+    return result
 
 
-def table(result: dict[str, Any]) -> str:
-    """Return medians of planning time and its parts as text, a line for each number of obstacles."""
-    lines = [f"{'obstacles':>9}{'success':>9}{'time [s]':>10}" + "".join(f"{part:>16}" for part in _PARTS)]
-    for count in result["meta"]["counts"]:
-        rows = [record for record in result["trials"] if record["obstacles"] == count]
-        success = f"{sum(record['success'] for record in rows)}/{len(rows)}"
-        medians = "".join(f"{distribution(rows, f'time_{part}')[0]:>16.3f}" for part in _PARTS)
-        lines.append(f"{count:>9}{success:>9}{distribution(rows, 'planning_time')[0]:>10.3f}{medians}")
-    return "\n".join(lines)
+def report(result: Mapping[str, Any]) -> str:
+    """Return the table of a result in Markdown, with versions and machine at the foot."""
+    about = result["meta"]
+    timed = [record for record in result["trials"] if record.get("planning_time") is not None]  # all but errors
+    few = {record["number"]: record["planning_time"] for record in timed if record["obstacles"] == FEW}
+    rows = []
+    for count in about["counts"]:
+        everyone = [record for record in result["trials"] if record["obstacles"] == count]
+        own = [record for record in timed if record["obstacles"] == count]
+        ratios = [record["planning_time"] / few[record["number"]] for record in own if record["number"] in few]
+        numbers = (*distribution(own, "planning_time"), quartiles(ratios)[1], *(distribution(own, part)[0] for part in TIMES))
+        success = f"{sum(record['success'] for record in everyone)} of {len(everyone)}"
+        iterations = f"{distribution(own, 'iterations')[0]:.0f}" if own else "–"
+        rows.append([str(count), success, *map(decimal, numbers), iterations])
+    head = ["obstacles", "success", "time, median [s]", "95th percentile [s]", f"times that of {FEW}"]
+    head += [f"{name} [s]" for name in TIMES.values()] + ["Ipopt iterations"]
+    parts = [
+        "# Planning time against the number of obstacles",
+        f"{about['starts']} random starts, the same for every number of obstacles; seed {about['seed']}. Success is the word of "
+        f"the independent validation. Times are those of all trials; “times that of {FEW}” is the median, over starts, of the "
+        f"ratio to the time among {FEW} obstacles. What follows are medians of parts of the time; the rest is setting up the "
+        "problem.",
+        markdown(head, rows),
+        "![Planning time](scale.png)",
+    ]
+    return "\n\n".join([*parts, foot(about)]) + "\n"
 
 
-def draw(result: dict[str, Any], path: str | Path | None = None) -> Figure:
-    """Draw what `run` returns; see `charts.scale_chart`."""
-    return scale_chart(result["trials"], path, title="Opening the door among more and more obstacles")
+def _record(spec: dict[str, Any]) -> dict[str, Any]:
+    """Run one trial and return its record."""
+    _warm(spec["seed"])
+    scene = _crowded(spec["obstacles"]).with_start(base=spec["base"])
+    return trial(_solve(scene, spec["seed"]), method="VKC", seed=spec["seed"], obstacles=spec["obstacles"], number=spec["number"])
+
+
+def _solve(scene: Scene, seed: int) -> Plan:
+    return plan(scene, [Actuate("door", _GOAL)], time_limit=TIME_LIMIT, seed=seed)
+
+
+@functools.cache
+def _warm(seed: int) -> None:
+    """Plan once in this process, which pays for what is loaded and built only once."""
+    if _solve(_crowded(COUNTS[0]), seed).status == "interrupted":
+        raise KeyboardInterrupt
+
+
+@functools.cache
+def _crowded(count: int) -> Scene:
+    """Return a scene, made once per process."""
+    return crowded(count)

@@ -15,6 +15,7 @@ from vkc_pin.benchmarks.record import distribution
 
 __all__ = [
     "EFFORTS",
+    "TIMES",
     "common",
     "comparison_table",
     "decimal",
@@ -32,6 +33,14 @@ __all__ = [
 Record = Mapping[str, Any]
 EFFORTS = {"base_effort": "base [m]", "base_effort_l1": "base |dx|+|dy| [m]", "arm_effort": "arm [rad]"}
 """What motions are compared by: field → name."""
+TIMES = {
+    "time_initialization": "seeds",
+    "time_coal": "coal",
+    "time_casadi": "CasADi",
+    "time_ipopt": "Ipopt",
+    "time_validation": "validation",
+}
+"""What planning time is spent on: field → name. The rest is setting up the problem."""
 _LEAST = 1e-6  # in any unit, by which a value must be less to be called lower
 
 

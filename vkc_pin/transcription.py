@@ -100,12 +100,13 @@ class Transcription:
         steps = np.vstack(runs)
         second, start_second = steps @ first, steps @ start_first
         self.first, self.second, self.start_first, self.start_second = first, second, start_first, start_second
-        hessian, linear = np.zeros((N, n + 1, N, n + 1)), np.zeros((N, n + 1, n))
+        hessian, linear = ca.DM(self.size, self.size), ca.DM(self.size, n)
         for i, (v, a) in enumerate(zip(self.structure.weights_velocity.T, self.structure.weights_acceleration, strict=True)):
-            hessian[:, i, :, i] = 2 * (first.T @ (v[:, None] * first) + a * second.T @ second)
-            linear[:, i, i] = 2 * (first.T @ (v * start_first) + a * second.T @ start_second)
-        self.objective_hessian = ca.sparsify(ca.DM(hessian.reshape(self.size, self.size)))
-        linear_matrix = ca.sparsify(ca.DM(linear.reshape(self.size, n)))
+            curvature = first.T @ (v[:, None] * first) + a * second.T @ second
+            slope = first.T @ (v * start_first) + a * second.T @ start_second
+            hessian += ca.kron(_sparse(2 * curvature), _unit(n + 1, n + 1, i))
+            linear += ca.kron(_sparse(2 * slope[:, None]), _unit(n + 1, n, i))
+        self.objective_hessian, linear_matrix = hessian, linear
         slack = np.zeros((N, n + 1))
         slack[:, n] = 1.0
         gradient = linear_matrix @ self.start + self.penalty * ca.DM(slack.ravel())
@@ -185,10 +186,10 @@ class Transcription:
         pairs = [(c, t) for c, first, last in self.structure.clamped for t in range(first + 1, last + 1)]
         if not pairs:
             return
-        matrix = np.zeros((len(pairs), self.segments, self.n + 1))
+        difference = ca.DM(len(pairs), self.size)
         for row, (column, waypoint) in enumerate(pairs):
-            matrix[row, waypoint - 1, column], matrix[row, waypoint - 2, column] = 1.0, -1.0
-        difference = ca.sparsify(ca.DM(matrix.reshape(len(pairs), self.size)))
+            difference[row, (waypoint - 1) * (self.n + 1) + column] = 1.0
+            difference[row, (waypoint - 2) * (self.n + 1) + column] = -1.0
         self.g = ca.vertcat(self.g, difference @ self.x)
         self.jacobian = ca.vertcat(self.jacobian, difference)
         both = ca.MX.sym("lam_g", self.rows + len(pairs))
@@ -197,11 +198,10 @@ class Transcription:
 
     def _rates(self) -> None:
         n = self.n
-        select = np.eye(n + 1)[:n]  # leaves the slack out
-        matrix = np.vstack([np.kron(self.first, select), np.kron(self.second, select)])
-        identity = np.eye(n)
-        start = np.vstack([np.kron(self.start_first[:, None], identity), np.kron(self.start_second[:, None], identity)])
-        self.rate_matrix, self.rate_start = ca.sparsify(ca.DM(matrix)), ca.sparsify(ca.DM(start))
+        select, identity = ca.horzcat(ca.DM.eye(n), ca.DM(n, 1)), ca.DM.eye(n)  # leaves the slack out
+        self.rate_matrix = ca.vertcat(*(ca.kron(_sparse(part), select) for part in (self.first, self.second)))
+        starts = (self.start_first[:, None], self.start_second[:, None])
+        self.rate_start = ca.vertcat(*(ca.kron(_sparse(part), identity) for part in starts))
 
     def solver(self, *, rates: bool, options: dict[str, Any], deadline: float = np.inf) -> ca.Function:
         """Return Ipopt on this program.
@@ -245,6 +245,16 @@ class Transcription:
         monitor = Monitor(self.size, g.numel(), self.parameters.numel()) if timed else None
         callback = {"iteration_callback": monitor} if timed else {}
         return ca.nlpsol("trajectory", "ipopt", program, {**quiet, **functions, **callback, **options}), monitor
+
+
+def _sparse(matrix: NDArray[np.float64]) -> ca.DM:
+    """Return a small matrix without its zeros."""
+    return ca.sparsify(ca.DM(matrix))
+
+
+def _unit(rows: int, columns: int, index: int) -> ca.DM:
+    """Return a matrix whose only entry is a 1 at (index, index)."""
+    return ca.DM.triplet([index], [index], ca.DM(1.0), rows, columns)
 
 
 def _assemble(parts: list[ca.MX], at: list[NDArray[np.int_]], rows: int, columns: int) -> ca.MX:

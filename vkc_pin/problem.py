@@ -249,17 +249,18 @@ class TrajectoryProblem:
         return float(np.abs(np.cos(heading) * step[:, 1] - np.sin(heading) * step[:, 0]).max())
 
     def drift(self, z: NDArray[np.float64]) -> float:
-        """Return the largest closure residual half-way between waypoints, relative to what `Options` allow."""
+        """Return how far grasps drift half-way between waypoints at most, relative to what `Options` allow."""
         path, worst = self.waypoints(z), 0.0
         between = (path[1:] + path[:-1]) / 2
-        allowed = np.repeat([self.options.closure_position, self.options.closure_angle], 3)
+        allowed = np.array([self.options.closure_position, self.options.closure_angle])
         for pose, solver, target in zip(
             self.transcription.structure.poses, self.transcription.pose_solvers, self.targets, strict=True
         ):
             held = np.array([t - 1 for t in pose.waypoints if t - 1 in pose.waypoints], int)
             if len(held):
                 residual, _ = solver.evaluate(between[held], target)
-                worst = max(worst, float((np.abs(residual) / allowed).max()))
+                amounts = np.linalg.norm(residual.reshape(len(held), 2, 3), axis=2)
+                worst = max(worst, float((amounts / allowed).max()))
         return worst
 
     def rate_violation(self, z: NDArray[np.float64]) -> float:

@@ -43,7 +43,7 @@ EARLY = 0.05  # [m] shortfall of clearance below which collisions between waypoi
 NEARLY_FREE = 0.01  # [m] shortfall of clearance below which limits on rates count
 POSE_TOLERANCE = 1e-4  # [m] and [rad]
 RATE_TOLERANCE = 1e-4  # relative
-DRIFT = 0.4  # of what is allowed between waypoints; norms of three residuals are up to √3 larger
+DRIFT = 0.9  # of what a grasp may drift between waypoints
 WORTHWHILE = 0.05  # relative decrease of the objective for which a feasible motion is improved further
 PENALTY_GROWTH, PENALTY_LIMIT = 4.0, 2000.0
 

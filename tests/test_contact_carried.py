@@ -76,9 +76,9 @@ def test_a_hand_comes_closer_to_what_it_will_take_or_has_let_go_of() -> None:
             assert found == {CLOSE if first in hand and second == "stick.stick" else MARGIN}
 
 
-def test_a_tip_comes_closer_to_what_it_will_hold_and_holds_it() -> None:
+def test_a_tip_touches_what_it_will_hold_and_holds_it() -> None:
     before, held = margins(fetching(), 1), margins(fetching(), 2)
-    assert before["stick.tip", "ball.ball"] == {CLOSE}
+    assert before["stick.tip", "ball.ball"] == {0.0}
     assert before["stick.stick", "ball.ball"] == {MARGIN}
     assert before[scene().robot.touch_links[0], "ball.ball"] == {MARGIN}  # the hand is not what takes it
     assert ("stick.tip", "ball.ball") not in held
@@ -86,7 +86,7 @@ def test_a_tip_comes_closer_to_what_it_will_hold_and_holds_it() -> None:
     robots = set(scene().robot.links)
     assert partners(fetching(), 2, "ball.ball") == robots | {"stick.stick", "table", "stand", FLOOR}
     after = margins(fetching(), 3)
-    assert after["stick.tip", "ball.ball"] == {CLOSE}
+    assert after["stick.tip", "ball.ball"] == {0.0}
 
 
 @pytest.mark.parametrize("phase", [0, 1, 2])

@@ -128,16 +128,18 @@ class ContactModel:
             if name in mine:  # its frame stands on, the rest is in the hand
                 held_shapes = {own_name(shapes[i].name) for i in mine[name]}
                 standing = [shape for shape in standing if shape.name not in held_shapes]
-            near = {self._grasped(h): self._touching(h) for h in (*phase.leaves, *phase.grasps) if h.object == name}
+            near = {  # what is held through something touches it; a hand's fingers are on both sides
+                self._grasped(hold): (self._touching(hold), 0.0 if hold.by else self.options.grasp_clearance)
+                for hold in (*phase.leaves, *phase.grasps)
+                if hold.object == name
+            }
             if name in phase.left:
                 left[name] = tuple(range(len(shapes), len(shapes) + len(standing)))
             for shape in standing:
                 label = f"{name}.{link_name(shape.name)}"
-                close = near.get(label, ())
+                close, least = near.get(label, ((), margin))
                 pairs += [
-                    (i, len(shapes), self.options.grasp_clearance if labels[i] in close else margin)
-                    for i in moving
-                    if i not in mine.get(name, ())
+                    (i, len(shapes), least if labels[i] in close else margin) for i in moving if i not in mine.get(name, ())
                 ]
                 shape.name = f"{name}.{shape.name}"
                 shapes.append(shape)

@@ -9,9 +9,9 @@ import pinocchio as pin
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.all_at_once import seed_of
 from vkc_pin.benchmarks.initialization import TARGET
 from vkc_pin.one_problem import OneProblem, Settings
+from vkc_pin.pieces import seed_of
 from vkc_pin.step_by_step import scene_after, stages
 from vkc_pin.world import World
 
@@ -67,10 +67,11 @@ def test_one_problem_costs_less_than_step_after_step() -> None:
     steps = [vkc.Grasp("stick"), vkc.Touch("stick.tip", TARGET)]
     parts = stages(start(), steps, settings)
     assert [part.success for _, part in parts] == [True, True]
+    pieces = [one.piece() for one, _ in parts]
     one = OneProblem(start(), steps, settings)
-    whole = one.run(lambda problem: seed_of(problem, parts))
+    whole = one.run(lambda problem: seed_of(problem, pieces))
     assert whole.success, whole.report()
-    before = one.problem.objective(seed_of(one.problem, parts).z)
+    before = one.problem.objective(seed_of(one.problem, pieces).z)
     assert one.problem.objective(one.z) < 0.97 * before
     assert whole.initialization == "astar, astar, then all at once"
     assert np.abs(one.z[39, :3] - parts[0][0].z[39, :3]).max() > 1e-3  # the grasp has moved in favour of what follows

@@ -2,6 +2,7 @@
 
 from vkc_pin.articulation import ArticulatedObject, Attachment, Freedom, Latch, invert, load_object
 from vkc_pin.chain import VirtualKinematicChain, consolidate
+from vkc_pin.chore import plan_chore
 from vkc_pin.errors import BuildError, InputError, UnknownNameError, VkcError
 from vkc_pin.options import Options
 from vkc_pin.plan import Plan
@@ -52,5 +53,6 @@ __all__ = [
     "load_robot",
     "load_scene",
     "plan",
+    "plan_chore",
     "validate",
 ]

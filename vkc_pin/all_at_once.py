@@ -5,18 +5,14 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-
-from vkc_pin.initialization import Seed
 from vkc_pin.one_problem import OneProblem, Settings
+from vkc_pin.pieces import seed_of
 from vkc_pin.plan import Plan
-from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.scene import Scene
 from vkc_pin.step_by_step import joined, stages, summed
 from vkc_pin.steps import Step
-from vkc_pin.trajectory import filled
 
-__all__ = ["all_at_once", "seed_of"]
+__all__ = ["all_at_once"]
 
 
 def all_at_once(scene: Scene, steps: Sequence[Step], settings: Settings) -> Plan:
@@ -46,7 +42,8 @@ def all_at_once(scene: Scene, steps: Sequence[Step], settings: Settings) -> Plan
     spent = [plan.metrics for plan in plans]
     result = plans[-1]
     if result.success:
-        result = OneProblem(scene, steps, _left(settings, spent)).run(lambda problem: seed_of(problem, parts))
+        pieces = [one.piece() for one, _ in parts]
+        result = OneProblem(scene, steps, _left(settings, spent)).run(lambda problem: seed_of(problem, pieces))
         spent.append(result.metrics)
         if not result.success:  # what the steps came to on their own is a motion all the same
             apart = joined(scene, whole.task.steps, settings, plans)
@@ -64,21 +61,3 @@ def _left(settings: Settings, spent: Sequence[Mapping[str, float]]) -> Settings:
         return settings
     used = sum(metrics["planning_time"] for metrics in spent)
     return dataclasses.replace(settings, time_limit=max(settings.time_limit - used, 1e-3))
-
-
-def seed_of(problem: TrajectoryProblem, parts: Sequence[tuple[OneProblem, Plan]]) -> Seed:
-    """Return the waypoints of the steps' own problems as those of the whole problem."""
-    chain = problem.chain
-    z = np.full((problem.segments, chain.size), np.nan)
-    begin = number = 0
-    for one, _ in parts:
-        names = [phase.name for phase in one.task.phases]
-        if names != [phase.name for phase in problem.task.phases[number : number + len(names)]]:
-            continue  # only to let go of something the robot stands still for a while; here that has no phase of its own
-        number += len(names)
-        end = begin + one.problem.segments
-        z[begin:end, [chain.index(name) for name in one.problem.chain.names]] = one.z
-        begin = end
-    z = filled(z)
-    z = np.where(np.isnan(z), problem.start, z)  # no part moves it
-    return Seed(", ".join(plan.initialization for _, plan in parts) + ", then all at once", z)

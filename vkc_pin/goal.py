@@ -14,10 +14,10 @@ from vkc_pin.hold import Hold
 from vkc_pin.lookup import attachment_of, check_link, joint_limits, path_joints, placed_object, robot_frame
 from vkc_pin.options import Options
 from vkc_pin.scene import PlacedObject, Scene
-from vkc_pin.steps import STEPS, Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
+from vkc_pin.steps import STEPS, Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch, as_list
 from vkc_pin.task import FrameGoal, Phase, Task
 
-__all__ = ["compile_task"]
+__all__ = ["compile_task", "nothing_to_do"]
 
 LATCH_MARGIN = 0.02  # [rad] or [m] past the threshold at which a latch lets go
 
@@ -209,7 +209,9 @@ class _Compiler:
         if step.attachment is not None and hold.attachment != step.attachment:
             raise InputError("it is held elsewhere", field=f"{where}.attachment", expected=hold.attachment, got=step.attachment)
         upright = not isinstance(step.pose, pin.SE3)
-        pose = pin.SE3(placed.placement.rotation, np.array(step.pose)) if upright else step.pose
+        # As it stands; what is in the hand from the start stands with its z axis up.
+        stands = np.eye(3) if step.object in self.scene.held else placed.placement.rotation
+        pose = pin.SE3(stands, np.array(step.pose)) if upright else step.pose
         goal = FrameGoal(placed.object.base_link, pose, "upright" if upright else "pose", hold)
         self._append(f"place {step.object}", self.options.reach_waypoints, frames=(goal,), lowered={hold: pose})
         self._release(hold, pose)
@@ -264,7 +266,7 @@ class _Compiler:
             raise InputError("not a step", field=where, expected=expected, got=repr(step))
 
 
-def compile_task(scene: Scene, steps: Sequence[Step], options: Options, *, nothing: bool = False) -> Task:
+def compile_task(scene: Scene, steps: Sequence[Step], options: Options, *, nothing: bool = False, first: int = 0) -> Task:
     """Return the phases that bring about `steps`, beginning at the scene's start.
 
     Args:
@@ -272,25 +274,24 @@ def compile_task(scene: Scene, steps: Sequence[Step], options: Options, *, nothi
         steps: What should change.
         options: How many waypoints phases have.
         nothing: Whether steps that change nothing are fine; there are no phases then.
+        first: The number of the first of `steps` in the user's list, for messages.
 
     Raises:
         InputError: No steps, an unknown object, joint, attachment or frame, a joint that cannot be moved that way, or a
             hand that is asked to hold a second thing.
     """
-    if isinstance(steps, STEPS):
-        raise InputError("one step alone", field="steps", expected="a list of steps", got=repr(steps))
-    try:
-        steps = tuple(steps)
-    except TypeError:
-        raise InputError("not steps", field="steps", expected="a list of steps", got=repr(steps)) from None
-    if not steps:
-        raise InputError("there is nothing to do", field="steps", expected="at least one step", got="an empty list")
+    steps = as_list(steps)
     compiler = _Compiler(scene, options)
-    for index, step in enumerate(steps):
+    for index, step in enumerate(steps, start=first):
         compiler.add(step, f"steps[{index}]")
     if not compiler.phases and not nothing:
-        expected, got = "a step that changes something", "only what holds already"
-        raise InputError("there is nothing to do", field="steps", expected=expected, got=got)
+        raise nothing_to_do()
     # Objects that are grasped later stand as they are at the start until then.
     phases = tuple(replace(phase, before={**compiler.initial, **phase.before}) for phase in compiler.phases)
     return Task(steps, phases, tuple(compiler.holds), compiler.initial, compiler.held)
+
+
+def nothing_to_do() -> InputError:
+    """Return the error for steps that change nothing."""
+    expected, got = "a step that changes something", "only what holds already"
+    return InputError("there is nothing to do", field="steps", expected=expected, got=got)

@@ -15,6 +15,7 @@ from vkc_pin.diagnosis import explain, impossible
 from vkc_pin.goal import compile_task
 from vkc_pin.initialization import HOPELESS, Seed, initialize
 from vkc_pin.options import Options
+from vkc_pin.pieces import Piece
 from vkc_pin.plan import Plan
 from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.report import Report
@@ -76,6 +77,7 @@ class OneProblem:
         task: What the steps ask for.
         problem: The program, once `run` has begun.
         z: Its best z_1..z_N, shape (N, n), once `run` has ended.
+        initialization: The name of the seed that led there.
     """
 
     def __init__(self, scene: Scene, steps: Sequence[Step], settings: Settings) -> None:
@@ -104,9 +106,14 @@ class OneProblem:
             deadline = np.inf if limit is None else began + build_time + limit
             seeds = self._raced(problem, deadline) if seed is None else iter([seed(problem)])
             best, status = self._try_seeds(problem, seeds, deadline, searched=seed is None)
-        self.z = best.z
+        self.z, self.initialization = best.z, best.name
         build_time += problem.transcription.take_build_time()
         return self._plan(best, status, time.perf_counter() - began - build_time, build_time)
+
+    def piece(self) -> Piece:
+        """Return the best waypoints, once `run` has ended, for problems of more phases to start from."""
+        phases = tuple(phase.name for phase in self.task.phases)
+        return Piece(phases, self.problem.chain.names, self.z, self.initialization)
 
     def _try_seeds(
         self, problem: TrajectoryProblem, seeds: Iterator[Seed], deadline: float, *, searched: bool

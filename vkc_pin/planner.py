@@ -18,7 +18,7 @@ from vkc_pin.solution import Iteration
 from vkc_pin.step_by_step import step_by_step
 from vkc_pin.steps import Step
 
-__all__ = ["check_arguments", "plan"]
+__all__ = ["check_arguments", "plan", "settings_for"]
 
 
 def plan(
@@ -54,16 +54,33 @@ def plan(
     Raises:
         InputError: The steps name something that is not there or cannot be done, or an argument is wrong.
     """
+    settings = settings_for(scene, initialization, options, callback, time_limit, seed, perturbation)
+    if not joint:
+        return step_by_step(scene, steps, settings)
+    return all_at_once(scene, steps, settings)
+
+
+def settings_for(
+    scene: object,
+    initialization: str,
+    options: Options | None,
+    callback: Callable[[Iteration], None] | None,
+    time_limit: float | None,
+    seed: int,
+    perturbation: float = 0.0,
+) -> Settings:
+    """Return arguments of `plan` as settings.
+
+    Raises:
+        InputError: One of them is wrong.
+    """
     options = Options() if options is None else options
     check_arguments(scene, options, time_limit, seed)
     if initialization not in METHODS:
         raise UnknownNameError("initialization", str(initialization), METHODS, field="initialization")
     if not (_is_number(perturbation) and 0 <= perturbation < np.inf):
         raise InputError("out of range", field="perturbation", expected="a number of at least 0", got=repr(perturbation))
-    settings = Settings(initialization, options, callback, time_limit, int(seed), float(perturbation))
-    if not joint:
-        return step_by_step(scene, steps, settings)
-    return all_at_once(scene, steps, settings)
+    return Settings(initialization, options, callback, time_limit, int(seed), float(perturbation))
 
 
 def check_arguments(scene: object, options: object, time_limit: object, seed: object) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from typing import Any
 
@@ -21,6 +21,7 @@ __all__ = [
     "Release",
     "Step",
     "Touch",
+    "as_list",
     "as_placement",
     "as_target",
     "step_from_dict",
@@ -219,6 +220,23 @@ Step = Reach | Grasp | Actuate | GoTo | Touch | Place | Release
 STEPS = (Reach, Grasp, Actuate, GoTo, Touch, Place, Release)
 """All kinds of steps."""
 _KINDS: dict[str, Any] = {kind.__name__: kind for kind in STEPS}
+
+
+def as_list(steps: Sequence[Step]) -> tuple[Step, ...]:
+    """Return steps as a tuple.
+
+    Raises:
+        InputError: They are no list, or an empty one.
+    """
+    if isinstance(steps, STEPS):
+        raise InputError("one step alone", field="steps", expected="a list of steps", got=repr(steps))
+    try:
+        steps = tuple(steps)
+    except TypeError:
+        raise InputError("not steps", field="steps", expected="a list of steps", got=repr(steps)) from None
+    if not steps:
+        raise InputError("there is nothing to do", field="steps", expected="at least one step", got="an empty list")
+    return steps
 
 
 def step_to_dict(step: Step) -> dict[str, Any]:

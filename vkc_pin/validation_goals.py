@@ -237,7 +237,9 @@ def _target(samples: Samples, step: Reach | Touch | Place) -> tuple[str, pin.SE3
         return frame, goal, ""
     if isinstance(step, Touch):
         return frame, pin.SE3(np.eye(3), np.array(goal)), "all"
-    return frame, pin.SE3(samples.scene.objects[step.object].placement.rotation, np.array(goal)), "heading"
+    placed = samples.scene.objects[step.object]
+    stands = np.eye(3) if step.object in samples.scene.held else placed.placement.rotation
+    return frame, pin.SE3(stands, np.array(goal)), "heading"
 
 
 def _turn(placement: pin.SE3, target: pin.SE3, free: str) -> float:

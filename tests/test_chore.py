@@ -1,0 +1,270 @@
+"""Chores: what is an action, what is foreseen, how the window slides, and chores planned for real."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import vkc_pin as vkc
+from vkc_pin import chore
+from vkc_pin.actions import actions_of
+from vkc_pin.benchmarks.initialization import TARGET
+from vkc_pin.chore import _Chore, _cut
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.one_problem import OneProblem
+from vkc_pin.world import World
+
+A, G, P = vkc.Actuate, vkc.Grasp, vkc.Place
+TABLE = (-3.0, 1.3, 1.051)  # on the bar table
+OPEN, SHUT = A("refrigerator", {"hinge": 1.57}), A("refrigerator", {"hinge": 0.0})
+CUP = (G("cold_cup"), P("cold_cup", TABLE))
+
+
+@cache
+def home() -> vkc.Scene:
+    return vkc.load_scene("household")
+
+
+@cache
+def fridge() -> vkc.Plan:
+    """Take the cup out of the refrigerator, and shut it again."""
+    return vkc.plan_chore(home(), [OPEN, *CUP, SHUT])
+
+
+# --- actions ----------------------------------------------------------------------------------------------------------
+
+
+def test_what_is_done_with_one_thing_is_one_action() -> None:
+    steps = [
+        G("refrigerator"),
+        OPEN,
+        G("cold_cup"),
+        P("cold_cup", TABLE),
+        SHUT,
+        G("broom"),
+        G("litter", "pull", by="broom.bristles"),
+        P("litter", (1.1, -2.9, 0.036)),
+        vkc.Release(),
+        vkc.GoTo(0, 0),
+    ]
+    assert actions_of(steps) == [
+        tuple(steps[0:2]),
+        tuple(steps[2:4]),
+        (SHUT,),
+        (steps[5],),
+        tuple(steps[6:9]),
+        (steps[9],),
+    ]
+
+
+def test_no_step_is_lost() -> None:
+    steps = [vkc.Release(), vkc.Release(), G("cup"), vkc.GoTo(1, 0), G("door"), OPEN, OPEN, vkc.Release()]
+    actions = actions_of(steps)
+    assert [step for action in actions for step in action] == steps
+    assert len(actions) == 6  # a grasp of one thing is no part of what is done with another
+
+
+# --- what is foreseen -------------------------------------------------------------------------------------------------
+
+
+def test_one_hand_cannot_open_a_door_with_a_cup_in_it() -> None:
+    steps = [OPEN, G("cold_cup"), A("door", {"hinge": 1.52}), P("cold_cup", (1.75, 3.5, 0.741))]
+    with pytest.raises(InputError, match=r"steps\[2\].object: the robot has one hand, and it holds cold_cup.side") as caught:
+        vkc.plan_chore(home(), steps)
+    assert caught.value.expected == "Place or Release before"
+
+
+@pytest.mark.parametrize(
+    ("wrong", "kind", "field", "says"),
+    [
+        (A("fridge", {"hinge": 1.0}), UnknownNameError, "steps[3].object", "refrigerator"),
+        (A("refrigerator", {"door": 1.0}), UnknownNameError, "steps[3].joints", "hinge"),
+        (G("cup", "handle"), UnknownNameError, "steps[3].attachment", "side"),
+        (P("door", (0, 0, 0)), InputError, "steps[3].object", "stands fixed"),
+        (vkc.Release(), InputError, "steps[3]", "the hand is empty"),
+        (G("litter", by="broom.bristles"), InputError, "steps[3].by", "does not carry"),
+        ("tidy up", InputError, "steps[3]", "not a step"),
+    ],
+)
+def test_what_cannot_be_done_is_said_at_once(wrong: vkc.Grasp, kind: type, field: str, says: str) -> None:
+    with pytest.raises(kind) as caught:
+        vkc.plan_chore(home(), [OPEN, G("cold_cup"), P("cold_cup", TABLE), wrong, SHUT])
+    assert caught.value.field == field
+    assert says in str(caught.value)
+
+
+@pytest.mark.parametrize("steps", [[], OPEN, 3])
+def test_steps_are_a_list(steps: object) -> None:
+    with pytest.raises(InputError) as caught:
+        vkc.plan_chore(home(), steps)
+    assert caught.value.field == "steps"
+
+
+@pytest.mark.parametrize("window", [0, -1, 1.5, True, "2"])
+def test_window_is_a_number_ofactions_of(window: object) -> None:
+    with pytest.raises(InputError, match="window: out of range"):
+        vkc.plan_chore(home(), [OPEN], window=window)
+
+
+@pytest.mark.parametrize(("field", "value"), [("initialization", "magic"), ("time_limit", 0), ("seed", -1), ("options", {})])
+def test_other_arguments_are_those_of_plan(field: str, value: object) -> None:
+    with pytest.raises(InputError) as caught:
+        vkc.plan_chore(home(), [OPEN], **{field: value})
+    assert caught.value.field == field
+
+
+def test_only_what_holds_already_is_nothing_to_do() -> None:
+    with pytest.raises(InputError, match="nothing to do"):
+        vkc.plan_chore(home().with_held({"cup": "side"}), [G("cup")])
+
+
+# --- how the window slides --------------------------------------------------------------------------------------------
+
+
+class Problems:
+    """Notes the problems that a chore solves, and lets some of them fail, as if no motion had been found."""
+
+    def __init__(self, patch: pytest.MonkeyPatch, fails: Callable[[tuple[vkc.Step, ...]], bool]) -> None:
+        self.asked: list[tuple[tuple[vkc.Step, ...], bool]] = []
+        solved = _Chore._solved
+
+        def solve(chore: _Chore, one: OneProblem, seed: object = None) -> vkc.Plan:
+            plan = solved(chore, one, seed)
+            self.asked.append((one.task.steps, seed is not None))
+            if not fails(one.task.steps):
+                return plan
+            trajectory = _cut(plan.trajectory, plan.trajectory.names, 0, 1)
+            return dataclasses.replace(plan, status="not converged", trajectory=trajectory)
+
+        patch.setattr(_Chore, "_solved", solve)
+
+
+def test_each_action_is_planned_once_alone_and_with_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    problems = Problems(monkeypatch, lambda steps: False)
+    plan = vkc.plan_chore(home(), [OPEN, *CUP, SHUT])
+    assert plan.success, plan.report()
+    assert problems.asked == [
+        ((OPEN,), False),
+        (CUP, False),
+        ((OPEN, *CUP), True),
+        ((SHUT,), False),
+        ((*CUP, SHUT), True),
+    ]
+
+
+def test_where_the_next_cannot_be_done_both_are_planned_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    problems = Problems(monkeypatch, lambda steps: steps == (SHUT,))
+    plan = vkc.plan_chore(home(), [OPEN, SHUT])
+    assert plan.success, plan.report()
+    assert [steps for steps, _ in problems.asked] == [(OPEN,), (SHUT,), (SHUT,), (OPEN, SHUT)]
+    assert not problems.asked[-1][1]  # from seeds of its own
+
+
+def test_a_decision_that_leads_nowhere_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a window of one nothing is foreseen: only a step back helps."""
+    problems = Problems(monkeypatch, lambda steps: steps == (SHUT,))
+    plan = vkc.plan_chore(home(), [OPEN, SHUT], window=1)
+    assert plan.success, plan.report()
+    alone = [steps for steps, _ in problems.asked]
+    assert alone[0] == (OPEN,)
+    assert (OPEN, SHUT) in alone
+    assert len(plan.trajectory.phases) == 3  # reach, open, and shut without letting go
+
+
+def test_what_fails_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(chore, "_TRIES", 1)
+    monkeypatch.setattr(chore, "_BACK", 0)
+    Problems(monkeypatch, lambda steps: CUP[0] in steps)
+    plan = vkc.plan_chore(home(), [vkc.GoTo(0.5, -0.5), OPEN, *CUP], window=1, options=vkc.Options(max_outer=1))
+    assert not plan.success
+    assert plan.status == "not converged"
+    assert plan.validation.notes[0].startswith("steps[2], Grasp(object='cold_cup'")
+    assert [phase.name for phase in plan.trajectory.phases][:2] == ["go to", "reach refrigerator.handle"]
+    assert len(plan.steps) == 4
+
+
+def test_time_is_for_all_steps_together() -> None:
+    plan = vkc.plan_chore(home(), [OPEN, *CUP], time_limit=0.05)
+    assert (plan.status, plan.success) == ("time limit", False)
+    assert "steps[1]" in plan.validation.notes[0], "the refrigerator is open before time is up: its seed is good enough"
+    assert plan.trajectory.phases[1].name == "move refrigerator.hinge"
+
+
+def test_ctrl_c_leaves_what_is_done() -> None:
+    seen: list[vkc.Iteration] = []
+
+    def stop(row: vkc.Iteration) -> None:
+        seen.append(row)
+        if len(seen) > 1 and row.round == 1 and row.objective != seen[0].objective:
+            raise KeyboardInterrupt
+
+    plan = vkc.plan_chore(home(), [vkc.GoTo(0.5, -0.5), OPEN], callback=stop)
+    assert (plan.status, plan.success) == ("interrupted", False)
+    assert plan.trajectory.phases[0].name == "go to"
+    assert plan.trajectory.positions[plan.trajectory.phases[0].last, :2] == pytest.approx([0.5, -0.5], abs=1e-3)
+
+
+def test_the_robot_does_not_stop_between_ways() -> None:
+    """It rests where its hand closes or opens; a motion that goes on from one step to the next is not cut there."""
+    plan = vkc.plan_chore(home(), [vkc.GoTo(1.0, -0.9), vkc.GoTo(0.4, -0.7), vkc.GoTo(0.2, -0.2)])
+    assert plan.success, plan.report()
+    speed = np.linalg.norm(plan.trajectory.velocities()[:, :2], axis=1)
+    first = plan.trajectory.phases[0].last
+    assert speed[first - 1 : first + 1].min() > 0.1 * speed.max()
+
+
+# --- chores, for real -------------------------------------------------------------------------------------------------
+
+
+def test_a_chore_of_four_steps() -> None:
+    plan = fridge()
+    assert plan.success, plan.report()
+    assert plan.steps == (OPEN, *CUP, SHUT)
+    assert [phase.name.partition(" ")[0] for phase in plan.trajectory.phases] == [
+        "reach",
+        "move",
+        "reach",
+        "place",
+        "reach",
+        "move",
+    ]
+    world = World(home())
+    rows = world.positions(plan.trajectory)
+    hinge = rows[:, world.coordinates.index("refrigerator.hinge")]
+    ends = [phase.last for phase in plan.trajectory.phases]
+    assert hinge[ends] == pytest.approx([0, 1.57, 1.57, 1.57, 1.57, 0], abs=1e-3)
+    cup = world.placement("cold_cup", rows[-1])
+    assert cup.translation == pytest.approx(TABLE, abs=1e-3)
+    assert cup.rotation[:, 2] == pytest.approx([0, 0, 1], abs=5e-3)
+    assert vkc.validate(home(), plan.steps, plan.trajectory).ok
+
+
+def test_metrics_are_those_of_the_whole_chore() -> None:
+    plan = fridge()
+    assert plan.metrics["base_effort"] == pytest.approx(plan.trajectory.base_effort())
+    parts = sum(plan.metrics[f"time_{part}"] for part in ("initialization", "coal", "casadi", "ipopt", "validation"))
+    assert parts <= plan.metrics["planning_time"] + plan.metrics["build_time"]
+    assert parts > 0.5 * plan.metrics["planning_time"]
+    assert plan.metrics["rounds"] == len(plan.history)
+
+
+def test_it_can_be_saved_and_shown(tmp_path: Path) -> None:
+    plan = fridge()
+    plan.save(tmp_path / "chore.npz")
+    assert vkc.Plan.load(tmp_path / "chore.npz").success
+
+
+def test_with_the_next_in_mind_less_is_moved() -> None:
+    """Where the stick is taken depends on where its tip has to go."""
+    scene = vkc.load_scene("init_1").sample_start(np.random.default_rng(5))
+    steps = [G("stick"), vkc.Touch("stick.tip", TARGET)]
+    blind, seeing = (vkc.plan_chore(scene, steps, window=window) for window in (1, 2))
+    assert blind.success, blind.report()
+    assert seeing.success, seeing.report()
+    efforts = [plan.trajectory.base_effort() + plan.trajectory.arm_effort() for plan in (blind, seeing)]
+    assert efforts[1] < efforts[0]

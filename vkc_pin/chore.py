@@ -1,0 +1,268 @@
+"""Chores: long lists of steps, planned in a window that slides along them."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vkc_pin.actions import actions_of, foresee
+from vkc_pin.chain import consolidate
+from vkc_pin.errors import InputError
+from vkc_pin.goal import compile_task
+from vkc_pin.initialization import Seed
+from vkc_pin.one_problem import OneProblem, Settings
+from vkc_pin.options import Options
+from vkc_pin.pieces import Piece, seed_of
+from vkc_pin.plan import Plan
+from vkc_pin.planner import settings_for
+from vkc_pin.problem import TrajectoryProblem
+from vkc_pin.scene import Scene
+from vkc_pin.solution import Iteration
+from vkc_pin.step_by_step import joined, scene_after, summed
+from vkc_pin.steps import Step
+from vkc_pin.task import Task
+from vkc_pin.trajectory import Trajectory
+
+__all__ = ["plan_chore"]
+
+_SINGLE = 2  # searches, from different random numbers, for a motion of one more action
+_TRIES = 4  # searches, from different random numbers, for a motion of what is in the window
+_ROUNDS = 10  # of the solver from one seed: what takes more has mostly run into a dead end, and other seeds are at hand
+_BACK = 3  # how often, in all, what has been decided is given up since what follows cannot be done
+_STOPPED = ("interrupted", "time limit")
+_FINAL = (*_STOPPED, "infeasible")
+
+
+def plan_chore(
+    scene: Scene,
+    steps: Sequence[Step],
+    *,
+    window: int = 2,
+    initialization: str = "auto",
+    options: Options | None = None,
+    callback: Callable[[Iteration], None] | None = None,
+    time_limit: float | None = None,
+    seed: int = 0,
+) -> Plan:
+    """Plan many steps over several objects, each with the next ones in mind.
+
+    What is done with one object, from taking hold of it on, is an action. Every `window` actions that follow one another are
+    planned as one problem; the motion of the first of them is kept, and the window moves on by one, from the state in which
+    that motion leaves robot and world. So no grasp and no place of the base is chosen from which the next action cannot be
+    done. Should it come to that all the same, the last decision is given up, and planned anew with one more action in mind.
+
+    Args:
+        scene: Robot, objects and obstacles.
+        steps: What should change in the world, in this order.
+        window: How many actions are planned together, at least 1.
+        initialization: As for `planner.plan`.
+        options: As for `planner.plan`.
+        callback: As for `planner.plan`.
+        time_limit: Seconds of planning for all steps together.
+        seed: Of the random numbers.
+
+    Returns:
+        One plan of all steps, checked as a whole. If a step fails: of those before it, with the best motion there is of
+        that one, and a note that names it.
+
+    Raises:
+        InputError: A step names something that is not there, or cannot be done at its place in the list; the error names it.
+    """
+    settings = settings_for(scene, initialization, options, callback, time_limit, seed)
+    if not isinstance(window, int) or isinstance(window, bool) or window < 1:
+        raise InputError("out of range", field="window", expected="a whole number of at least 1", got=repr(window))
+    foresee(scene, steps, settings.options)
+    return _Chore(scene, tuple(steps), window, settings).run()
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """One action's part of a motion.
+
+    Attributes:
+        plan: The motion of the action alone, from the scene in which it begins; None if nothing is to be done.
+        piece: Its waypoints.
+        after: The scene in which it ends.
+        rests: Whether the robot stands still at its end.
+    """
+
+    plan: Plan | None
+    piece: Piece
+    after: Scene
+    rests: bool
+
+
+class _Chore:
+    """A list of steps that is being planned.
+
+    Attributes:
+        actions: The steps of each action.
+        kept: What is decided: parts of the first actions.
+        ahead: Parts of the actions after those, from which the next problem starts.
+        spent, history: What every problem took, and every round of the solver.
+    """
+
+    def __init__(self, scene: Scene, steps: tuple[Step, ...], window: int, settings: Settings) -> None:
+        self.scene, self.steps, self.window, self.settings = scene, steps, window, settings
+        self.actions = actions_of(steps)
+        self.kept: list[_Part] = []
+        self.ahead: list[_Part] = []
+        self.spent: list[Mapping[str, float]] = []
+        self.history: list[Mapping[str, float]] = []
+        self.began = time.perf_counter()
+
+    def run(self) -> Plan:
+        """Plan action after action, until all is done or one fails."""
+        window, back, failed = self.window, _BACK, None
+        while len(self.kept) < len(self.actions):
+            failed = self._plan_window(window)
+            if failed is None:
+                window = self.window
+            elif self.kept and back and failed.status not in _FINAL:
+                self.kept.pop()
+                while self.kept and not self.kept[-1].rests:
+                    self.kept.pop()
+                self.ahead, window, back = [], window + 1, back - 1
+            else:
+                self.kept += self.ahead
+                break
+        return self._joined(failed)
+
+    @property
+    def _now(self) -> Scene:
+        return self.kept[-1].after if self.kept else self.scene
+
+    def _plan_window(self, window: int) -> Plan | None:
+        """Decide on the next action with those after it in mind.
+
+        If that is not possible, return the plan of the first action that could not be planned, from where those ahead end.
+        """
+        first = len(self.kept)
+        last = self._last(first, window)
+        self.ahead = self.ahead[: last - first]
+        alone = None
+        while alone is None and first + len(self.ahead) < last:
+            alone = self._look_ahead()
+        if alone is None and sum(part.plan is not None for part in self.ahead) > 1:
+            pieces = [part.piece for part in self.ahead]
+            one = OneProblem(self._now, self._steps(first, last), self._left())
+            plan = self._solved(one, lambda problem: seed_of(problem, pieces))
+            if plan.success:
+                self.ahead = self._parts(one, plan, first, last)
+        for attempt in range(1, 1 + _TRIES):
+            if alone is None or alone.status in _STOPPED:
+                break
+            one = OneProblem(self._now, self._steps(first, last), self._left(attempt))
+            together = self._solved(one)
+            alone = None if together.success else dataclasses.replace(alone, status=together.status)
+            if together.success:
+                self.ahead = self._parts(one, together, first, last)
+        if alone is None:
+            self.kept.append(self.ahead.pop(0))
+            while not self.kept[-1].rests:
+                self.kept.append(self.ahead.pop(0))
+        return alone
+
+    def _last(self, first: int, window: int) -> int:
+        """Return the end of a window: as wide as it may be, but without what can be said only once the rest is planned."""
+        last = first + 1
+        while last < min(first + window, len(self.actions)):
+            try:
+                self._task(self._now, first, last + 1)
+            except InputError:
+                break
+            last += 1
+        return last
+
+    def _look_ahead(self) -> Plan | None:
+        """Plan one more action alone, from where those planned ahead end; return the plan if it fails."""
+        number, scene = len(self.kept) + len(self.ahead), self.ahead[-1].after if self.ahead else self._now
+        if not self._task(scene, number, number + 1).phases:
+            self.ahead.append(_Part(None, Piece((), (), np.empty((0, 0)), ""), scene, rests=True))
+            return None
+        for attempt in range(_SINGLE):
+            one = OneProblem(scene, self._steps(number, number + 1), self._left(attempt))
+            plan = self._solved(one)
+            if plan.success:
+                self.ahead += self._parts(one, plan, number, number + 1)
+                return None
+            if plan.status in _STOPPED:
+                break
+        return plan
+
+    def _solved(self, one: OneProblem, seed: Callable[[TrajectoryProblem], Seed] | None = None) -> Plan:
+        plan = one.run(seed)
+        self.spent.append(plan.metrics)
+        self.history += plan.history
+        return plan
+
+    def _parts(self, one: OneProblem, plan: Plan, first: int, last: int) -> list[_Part]:
+        """Return the parts of a solved problem's motion in which the actions from `first` to before `last` are done."""
+        scene, begin, parts = one.scene, 0, []
+        ahead = dict(enumerate(self.ahead, start=len(self.kept)))
+        for number in range(first, last):
+            task = self._task(one.scene, first, number + 1)
+            end = len(task.phases)
+            at = [0, *one.problem.ends.tolist()]
+            names = consolidate(one.scene, task.holds).names
+            part, piece, rests = None, Piece((), (), np.empty((0, 0)), ""), True
+            if end > begin:
+                trajectory = _cut(plan.trajectory, names, begin, end if end < len(one.task.phases) else None)
+                steps = self._steps(number, number + 1)
+                seed = ahead[number].piece.seed if number in ahead else one.initialization  # where it came from at first
+                part = dataclasses.replace(plan, scene=scene, steps=steps, trajectory=trajectory, initialization=seed)
+                phases = tuple(phase.name for phase in task.phases[begin:])
+                piece = Piece(phases, one.problem.chain.names, one.z[at[begin] : at[end]], seed)
+                rests = end == len(one.task.phases) or at[end] in one.problem.transcription.structure.rests
+                scene = scene_after(scene, task, trajectory)
+            parts.append(_Part(part, piece, scene, rests))
+            begin = end
+        return parts
+
+    def _steps(self, first: int, last: int) -> tuple[Step, ...]:
+        return tuple(step for action in self.actions[first:last] for step in action)
+
+    def _task(self, scene: Scene, first: int, last: int) -> Task:
+        return compile_task(scene, self._steps(first, last), self.settings.options, nothing=True)
+
+    def _left(self, attempt: int = 0) -> Settings:
+        """Return the settings with what is left of the time limit, and other random numbers for each attempt.
+
+        There are few seeds to an attempt: where an action cannot be done from where the last one ends, all others fail as well,
+        slowly, and to plan the two together is the way out.
+        """
+        limit = self.settings.time_limit
+        if limit is not None:
+            limit = max(limit - sum(metrics["planning_time"] for metrics in self.spent), 1e-3)
+        given = self.settings.options
+        options = dataclasses.replace(given, max_restarts=1, max_outer=min(given.max_outer, _ROUNDS))
+        return dataclasses.replace(self.settings, options=options, seed=self.settings.seed + attempt, time_limit=limit)
+
+    def _joined(self, failed: Plan | None) -> Plan:
+        """Return one plan of all that is decided, and of what failed."""
+        parts = [part.plan for part in self.kept if part.plan is not None]
+        parts = parts if failed is None else [*parts, failed]
+        plan = joined(self.scene, self.steps, self.settings, parts)
+        metrics = {**plan.metrics, **summed(self.spent)}
+        metrics["planning_time"] = time.perf_counter() - self.began - metrics["build_time"]
+        metrics["time_validation"] += plan.metrics["time_validation"] - sum(part.metrics["time_validation"] for part in parts)
+        report = plan.validation
+        if failed is not None:
+            number = len(self._steps(0, len(self.kept)))
+            note = f"steps[{number}], {self.steps[number]}, could not be planned: {failed.status}"
+            report = dataclasses.replace(report, notes=(note, *report.notes))
+        return dataclasses.replace(plan, metrics=metrics, validation=report, history=tuple(self.history))
+
+
+def _cut(trajectory: Trajectory, names: Sequence[str], begin: int, end: int | None) -> Trajectory:
+    """Return the phases from `begin` to before `end` of a trajectory, of some of its coordinates."""
+    phases = trajectory.phases[begin:end]
+    first, last = phases[0].first, phases[-1].last
+    columns = [trajectory.names.index(name) for name in names]
+    spans = tuple(dataclasses.replace(phase, first=phase.first - first, last=phase.last - first) for phase in phases)
+    rows = slice(first, last + 1)
+    return Trajectory(tuple(names), trajectory.times[rows], trajectory.positions[rows][:, columns], spans, trajectory.robot_size)

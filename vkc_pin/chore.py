@@ -161,6 +161,8 @@ class _Chore:
             alone = None if together.success else dataclasses.replace(alone, status=together.status)
             if together.success:
                 self.ahead = self._parts(one, together, first, last)
+            elif together.status in _FINAL:
+                break
         if alone is None:
             self.kept.append(self.ahead.pop(0))
             while not self.kept[-1].rests:
@@ -190,7 +192,7 @@ class _Chore:
             if plan.success:
                 self.ahead += self._parts(one, plan, number, number + 1)
                 return None
-            if plan.status in _STOPPED:
+            if plan.status in _FINAL:
                 break
         return plan
 

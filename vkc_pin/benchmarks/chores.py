@@ -1,0 +1,183 @@
+"""Two chores of many steps: eighteen in a home, ten in an arena, each planned in one call from random starts."""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vkc_pin.benchmarks import experiment
+from vkc_pin.benchmarks.record import distribution, trial
+from vkc_pin.benchmarks.tables import decimal, failures, foot, markdown
+from vkc_pin.chore import plan_chore
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.plan import Plan, write_atomically
+from vkc_pin.scene import Scene, load_scene
+from vkc_pin.steps import Actuate, Grasp, Place, Step
+
+__all__ = ["CHORES", "fetch", "home", "plan_trial", "report", "run"]
+
+TIME_LIMIT = 300.0  # [s] of planning
+WINDOW = 2
+
+BAR_TABLE = (-3.0, 1.3, 1.051)  # [m], where the cup stands in between
+DESK = (1.75, 3.5, 0.741)
+CLEAR = (1.1, -2.9, 0.036)  # floor before the television
+BIN = (3.0, -3.6, 0.16)  # within its walls; from there things fall
+BEFORE_TABLE = (-0.9, 2.2, 0.036)  # floor before the low table
+SHELF = (-4.61, -1.0, 0.846)
+
+Solve = Callable[[Scene, Mapping[str, Any]], Plan]
+
+
+def home(scene: Scene) -> list[Step]:
+    """Return the eighteen steps of the scene `household`: a cup to the desk in the other room, and litter to the bin."""
+    return [
+        Grasp("refrigerator"),
+        Actuate("refrigerator", {"hinge": 1.57}),
+        Grasp("cold_cup"),
+        Place("cold_cup", BAR_TABLE),
+        Grasp("refrigerator"),
+        Actuate("refrigerator", {"hinge": 0.0}),
+        Grasp("door"),
+        Actuate("door", {"hinge": 1.52}),
+        Grasp("cold_cup"),
+        Place("cold_cup", DESK),
+        Grasp("door"),
+        Actuate("door", {"hinge": 0.0}),
+        Grasp("broom"),
+        Grasp("litter", "pull", by="broom.bristles"),
+        Place("litter", CLEAR),
+        Place("broom", scene.objects["broom"].placement.translation),
+        Grasp("litter", "grip"),
+        Place("litter", BIN),
+    ]
+
+
+def fetch(scene: Scene) -> list[Step]:
+    """Return the ten steps of the scene `fetch`: a ball from under a table, with a stick, into a cabinet."""
+    return [
+        Grasp("stick"),
+        Grasp("ball", "pull", by="stick.tip"),
+        Place("ball", BEFORE_TABLE),
+        Place("stick", scene.objects["stick"].placement.translation),
+        Grasp("cabinet"),
+        Actuate("cabinet", {"hinge": 1.57}),
+        Grasp("ball", "grip"),
+        Place("ball", SHELF),
+        Grasp("cabinet"),
+        Actuate("cabinet", {"hinge": 0.0}),
+    ]
+
+
+CHORES: dict[str, tuple[str, Callable[[Scene], list[Step]]]] = {"home": ("household", home), "fetch": ("fetch", fetch)}
+"""Name → scene, and what makes the steps in it."""
+
+
+def plan_trial(scene: Scene, spec: Mapping[str, Any]) -> Plan:
+    """Plan the chore of one trial."""
+    _, steps = CHORES[spec["chore"]]
+    return plan_chore(scene, steps(scene), window=WINDOW, time_limit=TIME_LIMIT, seed=spec["seed"])
+
+
+def run(
+    *,
+    trials: int,
+    seed: int,
+    out: str | Path,
+    jobs: int = 1,
+    chores: Sequence[str] = tuple(CHORES),
+    progress: bool = True,
+    solve: Solve = plan_trial,
+) -> dict[str, Any]:
+    """Run the benchmark, or what is left of it, and write results.json, results.csv and table.md to `out`.
+
+    Args:
+        trials: Number of random starts per chore; the first is the scene's own start.
+        seed: Of the starts and of planning.
+        out: The folder; if it has trials of the same settings already, they are not run again.
+        jobs: Number of processes.
+        chores: Some of `CHORES`.
+        progress: Whether to show a progress bar.
+        solve: What plans a trial.
+
+    Returns:
+        {"meta": ..., "trials": [...]}; see `experiment.run`.
+
+    Raises:
+        UnknownNameError: There is no such chore.
+        InputError: No chores, or `out` has trials of other settings.
+        KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
+    """
+    chores = tuple(dict.fromkeys(chores))
+    for name in chores:
+        if name not in CHORES:
+            raise UnknownNameError("chore", name, CHORES, field="chores")
+    if not chores:
+        raise InputError("nothing to plan", field="chores", expected="at least one")
+    specs = []
+    for chore in chores:
+        scene = load_scene(CHORES[chore][0])
+        rng = np.random.default_rng([seed, list(CHORES).index(chore)])
+        for number in range(trials):
+            base = (scene.sample_start(rng) if number else scene).start[:3].tolist()
+            specs.append({"key": f"{chore}/{number:04d}", "chore": chore, "number": number, "base": base, "seed": seed})
+    settings = {"benchmark": "chores", "seed": seed, "starts": trials, "chores": chores}
+    settings |= {"window": WINDOW, "time_limit": TIME_LIMIT, "steps": {name: _steps(name) for name in chores}}
+    result = experiment.run(specs, functools.partial(_record, solve=solve), out, settings=settings, jobs=jobs, progress=progress)
+    write_atomically(Path(out) / "table.md", report(result).encode())
+    return result
+
+
+def report(result: Mapping[str, Any]) -> str:
+    """Return the table of a result in Markdown, with versions and machine at the foot."""
+    about, rows = result["meta"], []
+    for chore in about["chores"]:
+        own = [record for record in result["trials"] if record["scene"] == chore]
+        good = [record for record in own if record["success"]]
+        timed = [record for record in own if record.get("wall_time") is not None]
+        planning, late = distribution(timed, "planning_time")
+        wall, _ = distribution(timed, "wall_time")
+        efforts = (decimal(distribution(good, field)[0]) for field in ("base_effort", "arm_effort", "duration"))
+        number = str(len(about["steps"][chore]))
+        rows.append(
+            [chore, number, f"{len(good)} of {len(own)}", decimal(wall), decimal(planning), decimal(late), *efforts]
+            + [failures(own) or "none"]
+        )
+    head = ["chore", "steps", "success", "in all, median [s]", "planning, median [s]", "95th percentile [s]"]
+    head += ["base [m]", "arm [rad]", "duration [s]", "failures"]
+    every = [
+        [record["scene"], str(record["number"]), record["status"]]
+        + [decimal(record.get(field) or float("nan")) for field in ("wall_time", "planning_time", "base_effort", "arm_effort")]
+        for record in result["trials"]
+    ]
+    parts = [
+        "# Chores",
+        f"Each chore in one call, from {about['starts']} starts, the first of them the scene's own; seed {about['seed']}, a window "
+        f"of {about['window']} actions. Success is the word of the independent validation of the whole motion. The time in all is "
+        "that of planning and of building symbolic programs; efforts and durations are medians of successes.",
+        markdown(head, rows),
+        "## Every trial",
+        markdown(["chore", "start", "status", "in all [s]", "planning [s]", "base [m]", "arm [rad]"], every, text=3),
+        foot(about),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _steps(chore: str) -> list[str]:
+    scene, steps = CHORES[chore]
+    return [str(step) for step in steps(load_scene(scene))]
+
+
+def _record(spec: dict[str, Any], solve: Solve) -> dict[str, Any]:
+    """Run one trial and return its record."""
+    scene = load_scene(CHORES[spec["chore"]][0]).with_start(base=spec["base"])
+    began = time.perf_counter()
+    plan = solve(scene, spec)
+    spent = time.perf_counter() - began
+    own = {"number": spec["number"], "wall_time": spent, "duration": plan.trajectory.metrics()["duration"]}
+    return {**trial(plan, method="VKC", seed=spec["seed"], **own), "scene": spec["chore"]}

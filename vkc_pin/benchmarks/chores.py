@@ -144,10 +144,8 @@ def report(result: Mapping[str, Any]) -> str:
         wall, _ = distribution(timed, "wall_time")
         efforts = (decimal(distribution(good, field)[0]) for field in ("base_effort", "arm_effort", "duration"))
         number = str(len(about["steps"][chore]))
-        rows.append(
-            [chore, number, f"{len(good)} of {len(own)}", decimal(wall), decimal(planning), decimal(late), *efforts]
-            + [failures(own) or "none"]
-        )
+        times = (decimal(value) for value in (wall, planning, late))
+        rows.append([chore, number, f"{len(good)} of {len(own)}", *times, *efforts, failures(own) or "none"])
     head = ["chore", "steps", "success", "in all, median [s]", "planning, median [s]", "95th percentile [s]"]
     head += ["base [m]", "arm [rad]", "duration [s]", "failures"]
     every = [
@@ -157,9 +155,9 @@ def report(result: Mapping[str, Any]) -> str:
     ]
     parts = [
         "# Chores",
-        f"Each chore in one call, from {about['starts']} starts, the first of them the scene's own; seed {about['seed']}, a window "
-        f"of {about['window']} actions. Success is the word of the independent validation of the whole motion. The time in all is "
-        "that of planning and of building symbolic programs; efforts and durations are medians of successes.",
+        f"Each chore in one call, from {about['starts']} starts, the first of them the scene's own; seed {about['seed']}, a "
+        f"window of {about['window']} actions. Success is the word of the independent validation of the whole motion. The time "
+        "in all is that of planning and of building symbolic programs; efforts and durations are medians of successes.",
         markdown(head, rows),
         "## Every trial",
         markdown(["chore", "start", "status", "in all [s]", "planning [s]", "base [m]", "arm [rad]"], every, text=3),

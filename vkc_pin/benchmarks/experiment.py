@@ -32,7 +32,7 @@ Function = Callable[[dict[str, Any]], Mapping[str, Any] | Sequence[Mapping[str, 
 """What runs one trial: takes its specification, returns its record, or several."""
 
 # What shows results has no part in them: a table may be written anew after a change there.
-_NO_PART = ("cli.py", "benchmarks/")
+_NO_PART = ("cli.py", "cli_bench.py", "benchmarks/")
 _DESCRIPTIONS = (".yaml", ".urdf", ".srdf")
 
 

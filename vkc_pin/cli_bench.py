@@ -59,7 +59,7 @@ def add_bench(commands: Any) -> None:
 
 
 def _add_experiment_options(parser: argparse.ArgumentParser, number: str, *, default: int = 50, jobs: int | None = None) -> None:
-    """Add what all experiments have; `default` starts, and `jobs` processes, None one per core, unless other numbers are given."""
+    """Add what all experiments have, by default `default` starts and `jobs` processes, or one per core."""
     about = f"random starts per scene (default {default})"
     parser.add_argument(number, type=positive, default=default, metavar="N", help=about)
     parser.add_argument("--seed", type=natural, default=0, metavar="S", help="of the starts and of planning (default 0)")

@@ -166,7 +166,7 @@ class Place:
     Attributes:
         object: Its name in the scene.
         pose: Of its base link in the world frame: a pose (see `as_placement`), or a point (x, y, z) [m], where it then
-            stands as upright as it does before the plan, at any heading.
+            stands as upright as it does before the plan, at any heading; with its z axis up if it is in the hand then.
         attachment: Where to grasp it if it is not held yet; None is the object's first attachment.
     """
 

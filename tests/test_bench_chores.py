@@ -1,0 +1,76 @@
+"""The benchmark of chores, with a planner that pretends, and one real trial from the command line."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import vkc_pin as vkc
+from vkc_pin.actions import actions_of, foresee
+from vkc_pin.benchmarks import chores
+from vkc_pin.cli import main
+from vkc_pin.errors import InputError, UnknownNameError
+
+
+@pytest.mark.parametrize(("name", "number", "actions"), [("home", 18, 10), ("fetch", 10, 6)])
+def test_chores_have_the_papers_steps(name: str, number: int, actions: int) -> None:
+    scene, steps = chores.CHORES[name]
+    loaded = vkc.load_scene(scene)
+    listed = steps(loaded)
+    assert len(listed) == number
+    assert len(actions_of(listed)) == actions
+    foresee(loaded, listed, vkc.Options())  # none of them is impossible at its place
+
+
+def test_one_step_less_is_noticed() -> None:
+    """Without putting the broom back the hand is not free for the litter."""
+    scene = vkc.load_scene("household")
+    steps = chores.home(scene)
+    del steps[15]
+    with pytest.raises(InputError, match=r"steps\[15\]"):
+        foresee(scene, steps, vkc.Options())
+
+
+def stay(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
+    """Return a plan whose success hangs on the number of the trial."""
+    plan = vkc.plan(scene, [vkc.GoTo(*scene.start[:2])], seed=spec["seed"])
+    status = "success" if spec["number"] else "not converged"
+    return dataclasses.replace(plan, status=status, metrics={**plan.metrics, "planning_time": 1.0 + spec["number"]})
+
+
+def test_every_trial_is_on_record(tmp_path: Path) -> None:
+    result = chores.run(trials=3, seed=4, out=tmp_path, chores=("fetch",), progress=False, solve=stay)
+    assert [trial["number"] for trial in result["trials"]] == [0, 1, 2]
+    assert [trial["success"] for trial in result["trials"]] == [False, True, True]
+    assert len(result["meta"]["steps"]["fetch"]) == 10
+    starts = np.array([trial["start"] for trial in result["trials"]])
+    np.testing.assert_allclose(starts[0], vkc.load_scene("fetch").start, atol=1e-9)
+    assert len(np.unique(starts[:, :2], axis=0)) == 3
+    table = (tmp_path / "table.md").read_text(encoding="utf-8")
+    assert "| fetch | 10 | 2 of 3 |" in table
+    assert "not converged 1" in table
+    assert table.count("| fetch | ") == 4
+    assert json.loads((tmp_path / "results.json").read_text(encoding="utf-8")) == result
+
+
+def test_unknown_chores_are_named(tmp_path: Path) -> None:
+    with pytest.raises(UnknownNameError, match="did you mean 'fetch'"):
+        chores.run(trials=1, seed=0, out=tmp_path, chores=("fetsh",))
+    with pytest.raises(InputError, match="chores: nothing to plan"):
+        chores.run(trials=1, seed=0, out=tmp_path, chores=())
+
+
+@pytest.mark.slow
+def test_ten_steps_in_one_call(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "chores", "--trials", "1", "--chores", "fetch", "--out", str(tmp_path / "out"), "--quiet"]) == 0
+    (trial,) = json.loads((tmp_path / "out" / "results.json").read_text(encoding="utf-8"))["trials"]
+    assert trial["success"], trial["violations"]
+    assert trial["planning_time"] < trial["wall_time"]
+    assert trial["base_effort"] > 10.0  # from table to table to cabinet
+    assert "| fetch | 10 | 1 of 1 |" in capsys.readouterr().out

@@ -67,8 +67,9 @@ def test_what_is_returned_and_what_it_took(
             limits.append(self.settings.time_limit)
             return queue.pop(0)
 
+    part = SimpleNamespace(task=SimpleNamespace(phases=(1,)), piece=lambda: None)
     monkeypatch.setattr(module, "OneProblem", One)
-    monkeypatch.setattr(module, "stages", lambda *_: [(SimpleNamespace(task=SimpleNamespace(phases=(1,))), p) for p in plans])
+    monkeypatch.setattr(module, "stages", lambda *_: [(part, p) for p in plans])
     monkeypatch.setattr(
         module, "joined", lambda *_: fake(joined or "never", 0.5 + sum(p.metrics["planning_time"] for p in plans))
     )

@@ -7,8 +7,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from vkc_pin.actions import actions_of, foresee
 from vkc_pin.chain import consolidate
 from vkc_pin.errors import InputError
@@ -33,6 +31,8 @@ _SINGLE = 2  # searches, from different random numbers, for a motion of one more
 _TRIES = 4  # searches, from different random numbers, for a motion of what is in the window
 _ROUNDS = 10  # of the solver from one seed: what takes more has mostly run into a dead end, and other seeds are at hand
 _BACK = 3  # how often, in all, what has been decided is given up since what follows cannot be done
+_FINER = 1.6  # times as many waypoints on the way to a goal in every search but the first
+_NOTHING = Piece((), (), (), "")
 _STOPPED = ("interrupted", "time limit")
 _FINAL = (*_STOPPED, "infeasible")
 
@@ -88,12 +88,14 @@ class _Part:
         piece: Its waypoints.
         after: The scene in which it ends.
         rests: Whether the robot stands still at its end.
+        fine: Whether it has more waypoints than usual.
     """
 
     plan: Plan | None
     piece: Piece
     after: Scene
-    rests: bool
+    rests: bool = True
+    fine: bool = False
 
 
 class _Chore:
@@ -149,14 +151,15 @@ class _Chore:
             alone = self._look_ahead()
         if alone is None and sum(part.plan is not None for part in self.ahead) > 1:
             pieces = [part.piece for part in self.ahead]
-            one = OneProblem(self._now, self._steps(first, last), self._left())
+            fine = any(part.fine for part in self.ahead)
+            one = OneProblem(self._now, self._steps(first, last), self._left(fine=fine))
             plan = self._solved(one, lambda problem: seed_of(problem, pieces))
             if plan.success:
                 self.ahead = self._parts(one, plan, first, last)
         for attempt in range(1, 1 + _TRIES):
             if alone is None or alone.status in _STOPPED:
                 break
-            one = OneProblem(self._now, self._steps(first, last), self._left(attempt))
+            one = OneProblem(self._now, self._steps(first, last), self._left(attempt, fine=True))
             together = self._solved(one)
             alone = None if together.success else dataclasses.replace(alone, status=together.status)
             if together.success:
@@ -184,10 +187,10 @@ class _Chore:
         """Plan one more action alone, from where those planned ahead end; return the plan if it fails."""
         number, scene = len(self.kept) + len(self.ahead), self.ahead[-1].after if self.ahead else self._now
         if not self._task(scene, number, number + 1).phases:
-            self.ahead.append(_Part(None, Piece((), (), np.empty((0, 0)), ""), scene, rests=True))
+            self.ahead.append(_Part(None, _NOTHING, scene))
             return None
         for attempt in range(_SINGLE):
-            one = OneProblem(scene, self._steps(number, number + 1), self._left(attempt))
+            one = OneProblem(scene, self._steps(number, number + 1), self._left(attempt, fine=attempt > 0))
             plan = self._solved(one)
             if plan.success:
                 self.ahead += self._parts(one, plan, number, number + 1)
@@ -204,24 +207,24 @@ class _Chore:
 
     def _parts(self, one: OneProblem, plan: Plan, first: int, last: int) -> list[_Part]:
         """Return the parts of a solved problem's motion in which the actions from `first` to before `last` are done."""
-        scene, begin, parts = one.scene, 0, []
+        scene, begin, parts, whole = one.scene, 0, [], one.piece()
+        fine = one.settings.options.reach_waypoints > self.settings.options.reach_waypoints
         ahead = dict(enumerate(self.ahead, start=len(self.kept)))
         for number in range(first, last):
             task = self._task(one.scene, first, number + 1)
             end = len(task.phases)
-            at = [0, *one.problem.ends.tolist()]
             names = consolidate(one.scene, task.holds).names
-            part, piece, rests = None, Piece((), (), np.empty((0, 0)), ""), True
+            part, piece, rests = None, _NOTHING, True
             if end > begin:
                 trajectory = _cut(plan.trajectory, names, begin, end if end < len(one.task.phases) else None)
                 steps = self._steps(number, number + 1)
                 seed = ahead[number].piece.seed if number in ahead else one.initialization  # where it came from at first
                 part = dataclasses.replace(plan, scene=scene, steps=steps, trajectory=trajectory, initialization=seed)
-                phases = tuple(phase.name for phase in task.phases[begin:])
-                piece = Piece(phases, one.problem.chain.names, one.z[at[begin] : at[end]], seed)
-                rests = end == len(one.task.phases) or at[end] in one.problem.transcription.structure.rests
+                piece = Piece(whole.phases[begin:end], whole.names, whole.waypoints[begin:end], seed)
+                ends = one.problem.ends
+                rests = end == len(ends) or ends[end - 1] in one.problem.transcription.structure.rests
                 scene = scene_after(scene, task, trajectory)
-            parts.append(_Part(part, piece, scene, rests))
+            parts.append(_Part(part, piece, scene, rests, fine))
             begin = end
         return parts
 
@@ -231,17 +234,23 @@ class _Chore:
     def _task(self, scene: Scene, first: int, last: int) -> Task:
         return compile_task(scene, self._steps(first, last), self.settings.options, nothing=True)
 
-    def _left(self, attempt: int = 0) -> Settings:
-        """Return the settings with what is left of the time limit, and other random numbers for each attempt.
+    def _left(self, attempt: int = 0, fine: bool = False) -> Settings:
+        """Return the settings with what is left of the time limit.
 
         There are few seeds to an attempt: where an action cannot be done from where the last one ends, all others fail as well,
         slowly, and to plan the two together is the way out.
+
+        Args:
+            attempt: Other random numbers for each.
+            fine: More waypoints, for ways that are long and narrow.
         """
         limit = self.settings.time_limit
         if limit is not None:
             limit = max(limit - sum(metrics["planning_time"] for metrics in self.spent), 1e-3)
         given = self.settings.options
         options = dataclasses.replace(given, max_restarts=1, max_outer=min(given.max_outer, _ROUNDS))
+        if fine:
+            options = dataclasses.replace(options, reach_waypoints=round(_FINER * given.reach_waypoints))
         return dataclasses.replace(self.settings, options=options, seed=self.settings.seed + attempt, time_limit=limit)
 
     def _joined(self, failed: Plan | None) -> Plan:

@@ -113,7 +113,9 @@ class OneProblem:
     def piece(self) -> Piece:
         """Return the best waypoints, once `run` has ended, for problems of more phases to start from."""
         phases = tuple(phase.name for phase in self.task.phases)
-        return Piece(phases, self.problem.chain.names, self.z, self.initialization)
+        path, ends = self.problem.waypoints(self.z), [0, *self.problem.ends.tolist()]
+        waypoints = tuple(path[first : last + 1] for first, last in itertools.pairwise(ends))
+        return Piece(phases, self.problem.chain.names, waypoints, self.initialization)
 
     def _try_seeds(
         self, problem: TrajectoryProblem, seeds: Iterator[Seed], deadline: float, *, searched: bool

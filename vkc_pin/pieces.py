@@ -22,30 +22,40 @@ class Piece:
     Attributes:
         phases: The phases' names.
         names: Of the n coordinates.
-        z: Their waypoints after the first, shape (N, n).
+        waypoints: Their waypoints, for each phase, from its first, which is the last of the phase before, to its last.
         seed: The name of the seed that led to them.
     """
 
     phases: tuple[str, ...]
     names: tuple[str, ...]
-    z: NDArray[np.float64]
+    waypoints: tuple[NDArray[np.float64], ...]
     seed: str
 
 
 def seed_of(problem: TrajectoryProblem, pieces: Sequence[Piece]) -> Seed:
-    """Return the waypoints of `pieces`, one after the other, as those of the whole problem."""
+    """Return the waypoints of `pieces`, one after the other, as those of the whole problem, however many these are."""
     chain = problem.chain
     z = np.full((problem.segments, chain.size), np.nan)
     begin = number = 0
     for piece in pieces:
         count = len(piece.phases)
-        if piece.phases != tuple(phase.name for phase in problem.task.phases[number : number + count]):
+        phases = problem.task.phases[number : number + count]
+        if piece.phases != tuple(phase.name for phase in phases):
             continue  # only to let go of something the robot stands still for a while; here that has no phase of its own
         number += count
-        end = begin + len(piece.z)
         known = [k for k, name in enumerate(piece.names) if name in chain.names]  # the rest belongs to what is held no more
-        z[begin:end, [chain.index(piece.names[k]) for k in known]] = piece.z[:, known]
-        begin = end
+        columns = [chain.index(piece.names[k]) for k in known]
+        for phase, waypoints in zip(phases, piece.waypoints, strict=True):
+            z[begin : begin + phase.segments, columns] = _resampled(waypoints[:, known], phase.segments)
+            begin += phase.segments
     z = filled(z)
     z = np.where(np.isnan(z), problem.start, z)  # no piece moves it
     return Seed(", ".join(piece.seed for piece in pieces) + ", then all at once", z)
+
+
+def _resampled(waypoints: NDArray[np.float64], segments: int) -> NDArray[np.float64]:
+    """Return `segments` waypoints after the first along those given, shape (K, n)."""
+    if len(waypoints) == segments + 1:
+        return waypoints[1:]
+    at = np.linspace(0.0, len(waypoints) - 1, segments + 1)[1:]
+    return np.stack([np.interp(at, np.arange(len(waypoints)), column) for column in waypoints.T], axis=1)

@@ -17,6 +17,7 @@ from vkc_pin import validation_pairs
 from vkc_pin.scene import FLOOR, Scene
 from vkc_pin.trajectory import PhaseSpan, Trajectory
 from vkc_pin.validation_contacts import may_touch
+from vkc_pin.validation_motion import ways
 from vkc_pin.validation_pairs import Hit, PairTable
 from vkc_pin.validation_samples import Samples
 from vkc_pin.world import World
@@ -113,7 +114,7 @@ def test_no_point_moves_further_than_the_bound(seed: int, size: float) -> None:
     z = world.positions(motion)
     z[:, 11:] += rng.uniform(0.0, 2.0, z.shape[1] - 11)
     z[1:, 11:] += size * rng.uniform(-1.0, 1.0, (len(z) - 1, z.shape[1] - 11))
-    bounds = table._motion_bounds(z, np.arange(len(z)))
+    bounds = np.diff(ways(table.solids, z), axis=0)
     data, shapes = world.model.createData(), pin.GeometryData(world.collision)
     corners = [np.array(box_corners(shape)) for shape in world.shapes]
     for t in range(len(z) - 1):
@@ -223,10 +224,10 @@ def test_a_side_branch_that_nothing_moves_hits_nothing_that_stands() -> None:
 # --- what is carried --------------------------------------------------------------------------------------------------
 
 
-def whirl(seed: int, *, size: float) -> tuple[Scene, Trajectory]:
+def whirl(seed: int, *, size: float, scene: Scene | None = None) -> tuple[Scene, Trajectory]:
     """Return a random motion with a stick in the hand and a ball on its tip, five waypoints, in two phases."""
     rng = np.random.default_rng(seed)
-    scene = room(table(), objects=("stick", "ball"))
+    scene = room(table(), objects=("stick", "ball")) if scene is None else scene
     scene = scene.with_held({"stick": "grip", "ball": "pull"}, by={"ball": "stick.tip"})
     script = Script(scene)
     for phase in range(2):
@@ -244,7 +245,7 @@ def test_no_point_of_what_is_carried_moves_further_than_the_bound(seed: int, siz
     scene, motion = whirl(seed, size=size)
     samples = Samples(scene, motion)
     table_of_pairs = PairTable(scene, samples.world, motion, 0.02)
-    bounds = table_of_pairs._motion_bounds(samples.z, samples.waypoint_rows)
+    bounds = np.diff(ways(table_of_pairs.solids, samples.z)[samples.waypoint_rows], axis=0)
     world = samples.world
     data, shapes = world.model.createData(), pin.GeometryData(world.collision)
     corners = [np.array(box_corners(shape)) for shape in world.shapes]

@@ -1,7 +1,7 @@
 """The independent check of a motion, continuous in time.
 
 It knows nothing of the optimiser: numeric Pinocchio on the plain tree of robot and objects side by side (`world`), coal
-on every pair, at most 5 mm and 0.01 rad apart along the whole motion, closer where something could slip through.
+on every pair that could come close, at most 5 mm and 0.01 rad apart there, closer where something could slip through.
 """
 
 from __future__ import annotations

@@ -5,6 +5,7 @@ Nothing of it is the planner's, so that what its culling overlooked would be fou
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 
 import coal
@@ -17,7 +18,6 @@ from vkc_pin.world import World
 
 __all__ = ["Placed", "Solids"]
 
-
 POINT = 1e-4  # [m], radius of a point
 
 
@@ -25,58 +25,82 @@ class Solids:
     """The collision shapes of a world.
 
     Attributes:
-        world: The world.
-        shapes: Its shapes, G of them.
+        world: The world, with G shapes.
         bodies: How many of these, the first, belong to the robot or an object; the others are obstacles.
         center, half: Of a box around each in its own frame, centre and half extents, shape (G, 3) [m].
     """
 
     def __init__(self, world: World) -> None:
-        self.world, self.shapes = world, world.shapes
-        self.bodies = len(world.bodies.geometryObjects)
-        boxes = [bounding_box(shape) for shape in self.shapes]
+        self.world, self.bodies = world, len(world.bodies.geometryObjects)
+        boxes = [bounding_box(shape) for shape in world.shapes]
         self.center = np.array([center for center, _ in boxes]).reshape(-1, 3)
         self.half = np.array([half for _, half in boxes]).reshape(-1, 3)
-        self.data = world.model.createData()
-        obstacles = self.shapes[self.bodies :]
-        self._transforms: dict[int, coal.Transform3s] = {}
-        self.request = coal.DistanceRequest()
-        self._corners = self.corners([shape.placement for shape in obstacles], slice(self.bodies, None))
+        obstacles = slice(self.bodies, None)
+        self._obstacle_corners = self._corners([shape.placement for shape in world.shapes[obstacles]], obstacles)
+        self._obstacle_transforms: dict[int, coal.Transform3s] = {}
+        self._geometries = [shape.geometry for shape in world.shapes]
+        self._data = world.model.createData()
+        self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
 
     def at(self, q: NDArray[np.float64]) -> Placed:
         """Return the shapes as they are placed at Pinocchio's configuration `q` of the world."""
-        return Placed(self, q)
+        placed = pin.GeometryData(self.world.bodies)
+        pin.updateGeometryPlacements(self.world.model, self._data, self.world.bodies, placed, q)
+        return Placed(self, placed)
 
-    def corners(self, placements: list[pin.SE3], which: slice) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the corners of boxes along the world's axes around shapes at `placements`, lower and upper, shape (n, 3) [m]."""
-        rotation = np.array([placement.rotation for placement in placements]).reshape(-1, 3, 3)
-        translation = np.array([placement.translation for placement in placements]).reshape(-1, 3)
+    def corners(self, where: Sequence[pin.SE3]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return lower and upper corners of boxes along the world's axes around all shapes, shape (G, 3) each [m].
+
+        Args:
+            where: Placements of the shapes of robot and objects in the world.
+        """
+        bodies = self._corners(where, slice(self.bodies))
+        lower, upper = (np.concatenate(parts) for parts in zip(bodies, self._obstacle_corners, strict=True))
+        return lower, upper
+
+    def _corners(self, where: Sequence[pin.SE3], which: slice) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        rotation = np.array([placement.rotation for placement in where]).reshape(-1, 3, 3)
+        translation = np.array([placement.translation for placement in where]).reshape(-1, 3)
         middle = (rotation @ self.center[which, :, None])[..., 0] + translation
         extent = (np.abs(rotation) @ self.half[which, :, None])[..., 0]
         return middle - extent, middle + extent
+
+    def obstacle_transform(self, shape: int) -> coal.Transform3s:
+        """Return where an obstacle is, for coal."""
+        known = self._obstacle_transforms.get(shape)
+        if known is None:
+            known = self._obstacle_transforms[shape] = _transform(self.world.shapes[shape].placement)
+        return known
+
+    def distance(
+        self, first: int | coal.CollisionGeometry, here: coal.Transform3s, second: int, there: coal.Transform3s
+    ) -> float:
+        """Return coal's signed distance of two shapes, or of anything else and a shape [m].
+
+        Nothing is kept from one distance to the next, which would change its last digits.
+        """
+        self._result.clear()
+        one = self._geometries[first] if isinstance(first, int) else first
+        return float(coal.distance(one, here, self._geometries[second], there, self._request, self._result))
 
 
 class Placed:
     """The shapes at one configuration.
 
-    Attributes:
-        where: Placement of each shape of robot and objects in the world.
+    Args:
+        solids: The shapes.
+        placed: Where those of robot and objects are in the world.
     """
 
-    def __init__(self, solids: Solids, q: NDArray[np.float64]) -> None:
-        self._solids = solids
-        world, self._shapes = solids.world, pin.GeometryData(solids.world.bodies)
-        pin.updateGeometryPlacements(world.model, solids.data, world.bodies, self._shapes, q)
-        self.where = self._shapes.oMg
+    def __init__(self, solids: Solids, placed: pin.GeometryData) -> None:
+        self._solids, self._where = solids, placed.oMg
         self._transforms: dict[int, coal.Transform3s] = {}
         self._known: dict[tuple[int, int], float] = {}
 
     @cached_property
     def corners(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Lower and upper corners of boxes along the world's axes around all shapes, shape (G, 3) each [m]."""
-        bodies = self._solids.corners(list(self.where), slice(self._solids.bodies))
-        lower, upper = (np.concatenate(parts) for parts in zip(bodies, self._solids._corners, strict=True))
-        return lower, upper
+        return self._solids.corners(list(self._where))
 
     def bounds(self, pairs: NDArray[np.int_]) -> NDArray[np.float64]:
         """Return lower bounds of the distances of pairs, shape (n, 2), shape (n,) [m]; -inf where the boxes overlap."""
@@ -89,12 +113,11 @@ class Placed:
     def distance(self, first: int, second: int) -> float:
         """Return coal's signed distance of two shapes [m]."""
         key = (first, second)
-        if key not in self._known:
-            one, other = (self._solids.shapes[i].geometry for i in key)
-            result = coal.DistanceResult()  # nothing is kept from one distance to the next, which would change its last digits
-            coal.distance(one, self._transform(first), other, self._transform(second), self._solids.request, result)
-            self._known[key] = float(result.min_distance)
-        return self._known[key]
+        known = self._known.get(key)
+        if known is None:
+            here, there = self._transform(first), self._transform(second)
+            known = self._known[key] = self._solids.distance(first, here, second, there)
+        return known
 
     def distances(self, pairs: NDArray[np.int_]) -> NDArray[np.float64]:
         """Return coal's signed distances of pairs, shape (n, 2), shape (n,) [m]."""
@@ -116,19 +139,17 @@ class Placed:
         """Return the shapes that are closer than `reach` [m] to a point, shape (3,) [m]; a point has a size here, 0.1 mm."""
         lower, upper = self.corners
         near = np.flatnonzero(((lower - point < reach + POINT) & (point - upper < reach + POINT)).all(axis=1)).tolist()
-        ball, there = coal.Sphere(POINT), coal.Transform3s(np.eye(3), point)
-        request = self._solids.request
-        return [
-            i
-            for i in near
-            if coal.distance(ball, there, self._solids.shapes[i].geometry, self._transform(i), request, coal.DistanceResult())
-            < reach
-        ]
+        ball, here = coal.Sphere(POINT), coal.Transform3s(np.eye(3), point)
+        return [i for i in near if self._solids.distance(ball, here, i, self._transform(i)) < reach]
 
     def _transform(self, shape: int) -> coal.Transform3s:
-        moves = shape < self._solids.bodies
-        known = self._transforms if moves else self._solids._transforms
-        if shape not in known:
-            where = self.where[shape] if moves else self._solids.shapes[shape].placement
-            known[shape] = coal.Transform3s(where.rotation, where.translation)
-        return known[shape]
+        if shape >= self._solids.bodies:
+            return self._solids.obstacle_transform(shape)
+        known = self._transforms.get(shape)
+        if known is None:
+            known = self._transforms[shape] = _transform(self._where[shape])
+        return known
+
+
+def _transform(placement: pin.SE3) -> coal.Transform3s:
+    return coal.Transform3s(placement.rotation, placement.translation)

@@ -17,6 +17,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.scene import FLOOR, Scene
 from vkc_pin.trajectory import Trajectory
 from vkc_pin.validation_distances import Placed, Solids
+from vkc_pin.validation_motion import ways
 from vkc_pin.world import World
 
 __all__ = ["Hit", "PairTable"]
@@ -155,37 +156,83 @@ class PairTable:
             smallest = min(smallest, float(at.min()))
             for c in {int(np.argmin(at)), *np.flatnonzero(at < self.margins[near]).tolist()}:
                 yield self._hit(row, near[c], at[c], at_waypoint=True)
-        smallest = max(1e-3, smallest)  # what cannot come closer than that changes nothing
-        bounds = self._motion_bounds(z, waypoints)
-        for t, (here, there) in enumerate(itertools.pairwise(placed)):
-            active = self._active(here, there, bounds[t], smallest)
-            if not len(active):
+        smallest = max(RESOLUTION, smallest)  # what cannot come closer than that changes nothing
+        travelled = ways(self.solids, z)
+        for (first, here), (last, there) in itertools.pairwise(zip(waypoints.tolist(), placed, strict=True)):
+            pairs = self._active(here, there, travelled[last] - travelled[first], smallest)
+            ends = here.distances(self.pairs[pairs]), there.distances(self.pairs[pairs])
+            yield from self._between(z, (first, last), pairs, ends, travelled, smallest)
+
+    def _between(
+        self,
+        z: NDArray[np.float64],
+        rows: tuple[int, int],
+        pairs: NDArray[np.int_],
+        ends: tuple[NDArray[np.float64], NDArray[np.float64]],
+        travelled: NDArray[np.float64],
+        smallest: float,
+    ) -> Iterator[Hit]:
+        """Yield what comes closer than `smallest` at samples between two others, halves of which are left out where nothing can.
+
+        d(s) ≥ (d_t + d_{t+1} − relative motion) / 2 for every state in between.
+
+        Args:
+            z: Sampled configurations of the world, shape (S, n).
+            rows: The two samples.
+            pairs: What may come so close, shape (n,).
+            ends: Their distances at both [m].
+            travelled: See `ways`.
+            smallest: [m].
+        """
+        todo = [(rows, pairs, ends)]
+        while todo:
+            (low, high), pairs, (before, after) = todo.pop()
+            way = (travelled[high] - travelled[low])[self.pairs[pairs]].sum(axis=1)
+            some = before + after - way < 2 * smallest
+            pairs, before, after, way = pairs[some], before[some], after[some], way[some]
+            if not len(pairs):
                 continue
-            first, last = int(waypoints[t]), int(waypoints[t + 1])
-            rows = np.empty((last - first + 1, len(active)))
-            rows[0], rows[-1] = here.distances(self.pairs[active]), there.distances(self.pairs[active])
-            for row in range(first + 1, last):
-                rows[row - first] = self.solids.at(configuration(z[row])).distances(self.pairs[active])
-                closest = int(np.argmin(rows[row - first]))
-                for c in {closest, *np.flatnonzero(rows[row - first] < 0).tolist()}:
-                    yield self._hit(row, active[c], rows[row - first, c])
-            # Between two samples that are free it is looked at again and again, until nothing deeper than 1 mm can hide.
-            step = bounds[t, self.pairs[active]].sum(axis=1) / (last - first)
-            overlap = self.contact[active]
-            free = (np.minimum(rows[1:], rows[:-1]) >= -overlap) & (rows[1:] + rows[:-1] < step)
-            for r, c in np.argwhere(free & ~self.together[active]):
-                stack = [(0.0, 1.0, rows[r, c], rows[r + 1, c])]
-                while stack:
-                    low, high, before, after = stack.pop()
-                    if (width := (high - low) * step[c]) <= 2 * RESOLUTION or before + after >= width:
-                        continue
-                    middle = (low + high) / 2
-                    state = self.solids.at(configuration((1 - middle) * z[first + r] + middle * z[first + r + 1]))
-                    between = state.distance(*self.pairs[active[c]].tolist())
-                    yield self._hit(first + r, active[c], between)
-                    if between < -overlap[c]:
-                        break
-                    stack += [(low, middle, before, between), (middle, high, between, after)]
+            if high - low == 1:
+                yield from self._slipping(z, low, pairs, (before, after), way)
+                continue
+            middle = (low + high) // 2
+            distances = self.solids.at(self.world.coordinates.q(z[middle])).distances(self.pairs[pairs])
+            for c in {int(np.argmin(distances)), *np.flatnonzero(distances < 0).tolist()}:
+                yield self._hit(middle, pairs[c], distances[c])
+            todo += [((low, middle), pairs, (before, distances)), ((middle, high), pairs, (distances, after))]
+
+    def _slipping(
+        self,
+        z: NDArray[np.float64],
+        row: int,
+        pairs: NDArray[np.int_],
+        ends: tuple[NDArray[np.float64], NDArray[np.float64]],
+        way: NDArray[np.float64],
+    ) -> Iterator[Hit]:
+        """Yield what overlaps between a sample and the next, at both of which it is free: nothing deeper than 1 mm can hide.
+
+        Args:
+            z: Sampled configurations of the world, shape (S, n).
+            row: The first of the two samples.
+            pairs: The pairs, shape (n,).
+            ends: Their distances at both [m].
+            way: How far any two points of a pair can move relative to each other in between [m].
+        """
+        overlap = self.contact[pairs]
+        free = (np.minimum(*ends) >= -overlap) & (ends[0] + ends[1] < way) & ~self.together[pairs]
+        for c in np.flatnonzero(free).tolist():
+            stack = [(0.0, 1.0, ends[0][c], ends[1][c])]
+            while stack:
+                low, high, before, after = stack.pop()
+                if (width := (high - low) * way[c]) <= 2 * RESOLUTION or before + after >= width:
+                    continue
+                middle = (low + high) / 2
+                state = self.solids.at(self.world.coordinates.q((1 - middle) * z[row] + middle * z[row + 1]))
+                between = state.distance(*self.pairs[pairs[c]].tolist())
+                yield self._hit(row, pairs[c], between)
+                if between < -overlap[c]:
+                    break
+                stack += [(low, middle, before, between), (middle, high, between, after)]
 
     def _close(self, placed: Placed, reach: NDArray[np.float64]) -> NDArray[np.int_]:
         """Return all pairs but those of which one stands still and the other is at least `reach` from it; shape (G,) [m]."""
@@ -209,25 +256,22 @@ class PairTable:
                 return near, distances
             reach *= 2.0
 
-    def _active(self, here: Placed, there: Placed, bounds: NDArray[np.float64], smallest: float) -> NDArray[np.int_]:
-        """Return the pairs that may come closer than `smallest` between two waypoints [m].
+    def _active(self, here: Placed, there: Placed, moved: NDArray[np.float64], smallest: float) -> NDArray[np.int_]:
+        """Return all pairs but those that boxes prove to stay `smallest` apart between two waypoints [m].
 
-        d(s) ≥ (d_t + d_{t+1} − relative motion) / 2 for every state in between. So one of both distances, of which boxes give
-        lower bounds, is less than `smallest` and half the relative motion.
+        Where d(s) of `_between` is less, one of both distances is less than `smallest` and half the relative motion.
 
         Args:
             here: The world at the one.
             there: The world at the other.
-            bounds: How far any point of each geometry moves, shape (G,) [m].
+            moved: How far any point of each geometry moves in between, shape (G,) [m].
             smallest: [m].
         """
-        reach = smallest + bounds / 2
+        reach = smallest + moved / 2
         some = np.union1d(self._close(here, reach), self._close(there, reach))
-        for known in (Placed.bounds, Placed.distances):
-            pairs = self.pairs[some]
-            floor = (known(here, pairs) + known(there, pairs) - bounds[pairs].sum(axis=1)) / 2
-            some = some[floor < smallest]
-        return some
+        pairs = self.pairs[some]
+        floor = (here.bounds(pairs) + there.bounds(pairs) - moved[pairs].sum(axis=1)) / 2
+        return some[floor < smallest]
 
     def _hit(self, row: int, k: int, distance: float, *, at_waypoint: bool = False) -> Hit:
         first, second = self.pairs[k]
@@ -235,46 +279,3 @@ class PairTable:
         return Hit(
             int(row), labels[first], labels[second], float(distance), float(self.margins[k]), float(self.contact[k]), at_waypoint
         )
-
-    def _motion_bounds(self, samples: NDArray[np.float64], waypoints: NDArray[np.int_]) -> NDArray[np.float64]:
-        """Return how far any point of each geometry can move between waypoints, shape (T − 1, G) [m].
-
-        A joint's rotation moves a point by at most the angle times its distance from the axis, and that is at most the
-        sum of the offsets of all joints between, and of the geometry itself; a prismatic joint adds its travel. The way of
-        a free joint is the sum over the samples in between.
-        """
-        model, coordinates, z = self.world.model, self.world.coordinates, samples[waypoints]
-        steps = np.abs(np.diff(z, axis=0))
-        spans = np.linalg.norm(np.diff(z[:, :2], axis=0), axis=1)
-        offset = [float(np.linalg.norm(placement.translation)) for placement in model.jointPlacements]
-        of_joint: dict[int, list[int]] = {}
-        for index, joint in enumerate(coordinates.joints):
-            of_joint.setdefault(joint, []).append(index)
-        prismatic = {j: model.joints[j].shortname().startswith("JointModelP") and j > 1 for j in of_joint}
-        bounds = np.zeros((len(steps), len(self.world.shapes)))
-        for g, shape in enumerate(self.world.shapes[: self.solids.bodies]):
-            center, half = self.solids.center[g], self.solids.half[g]
-            reach = float(np.linalg.norm(half)) + float(np.linalg.norm(shape.placement.act(center)))
-            joint = shape.parentJoint
-            while joint:
-                columns = of_joint[joint]
-                if len(columns) == 7:  # the free joint of what can be carried
-                    bounds[:, g] += self._free_motion(samples[:, columns], waypoints, reach)
-                elif len(columns) == 3:  # the planar base
-                    bounds[:, g] += spans + steps[:, columns[2]] * reach
-                elif prismatic[joint]:
-                    bounds[:, g] += steps[:, columns[0]]
-                    reach += float(np.abs(z[:, columns[0]]).max())
-                else:
-                    bounds[:, g] += steps[:, columns[0]] * reach
-                reach += offset[joint]
-                joint = model.parents[joint]
-        return bounds
-
-    def _free_motion(self, samples: NDArray[np.float64], waypoints: NDArray[np.int_], reach: float) -> NDArray[np.float64]:
-        """Return how far a point at `reach` [m] from a free joint moves between waypoints, shape (T − 1,) [m]."""
-        turns = samples[:, 3:] / np.linalg.norm(samples[:, 3:], axis=1, keepdims=True)
-        half = np.arccos(np.clip(np.abs(np.einsum("kc,kc->k", turns[1:], turns[:-1])), 0.0, 1.0))
-        way = np.linalg.norm(np.diff(samples[:, :3], axis=0), axis=1) + 2.0 * half * reach
-        total = np.concatenate([[0.0], np.cumsum(way)])
-        return np.diff(total[waypoints])

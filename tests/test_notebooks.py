@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import itertools
 import re
 import time
 from pathlib import Path
@@ -126,3 +127,26 @@ def test_baselines(tmp_path: Path) -> None:
     assert min(size(cells["chart"])) > 300
     written = {path.name for path in (tmp_path / "few_starts").iterdir()}
     assert {"results.csv", "results.json", "table.md", "trials.jsonl", "door.png"} <= written
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_chores(tmp_path: Path) -> None:
+    began = time.perf_counter()
+    cells = executed("07_chores", tmp_path)
+    assert time.perf_counter() - began < 240.0  # about a minute on a machine that does nothing else
+
+    report = text(cells["plan"])
+    assert report.startswith("household: success — reach refrigerator.handle, move refrigerator.hinge, reach cold_cup.")
+    assert "every constraint holds" in report
+    assert "iframe" in result(cells["show"])["text/html"]
+    rows = re.findall(r"^ *([\d.]+) s to +([\d.]+) s  (\w+) .* holding (.*)$", text(cells["timetable"]), re.MULTILINE)
+    assert [(what, holding) for _, _, what, holding in rows if holding != "nothing"] == [
+        ("move", "refrigerator"),
+        ("place", "cold_cup"),
+        ("move", "refrigerator"),
+    ]
+    assert all(one[1] == other[0] for one, other in itertools.pairwise(rows))
+    assert text(cells["error"]).startswith("steps[1].object: the robot has one hand, and it holds cup.side")
+    assert "fetch: success — reach stick.grip, reach ball.pull by stick.tip, place ball" in text(cells["ten"])
+    assert (tmp_path / "fetch.html").stat().st_size > 100_000

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vkc_pin.benchmarks.tables import TIMES, common, quartiles, wilson
 from vkc_pin.plan import Plan
@@ -187,12 +186,12 @@ def scale_chart(records: Sequence[Mapping[str, Any]], path: str | Path | None, *
     counts = sorted({int(record["obstacles"]) for record in records})
     rows = [[record for record in records if record["obstacles"] == count] for count in counts]
 
-    def spread(field: str) -> NDArray[np.float64]:
-        return np.array([quartiles([float(record[field]) for record in own]) for own in rows]).reshape(-1, 3)
+    def medians(*fields: str) -> list[float]:
+        """Return, for each number of obstacles, the median of the first field less the others."""
+        return [float(np.median([record[fields[0]] - sum(record[f] for f in fields[1:]) for record in own])) for own in rows]
 
-    low, middle, high = spread("planning_time").T
-    parts = {name: spread(field)[:, 1] for field, name in TIMES.items()}
-    parts["setting up"] = np.maximum(middle - sum(parts.values()), 0.0)
+    low, middle, high = np.array([quartiles([record["planning_time"] for record in own]) for own in rows]).reshape(-1, 3).T
+    parts = {name: medians(field) for field, name in TIMES.items()} | {"setting up": medians("planning_time", *TIMES)}
     with _style():
         figure = _figure(6.4, 4.0)
         axes = figure.subplots()

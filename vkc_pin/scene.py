@@ -60,7 +60,7 @@ class Scene:
         held: Object → attachment of what the robot holds at the start.
         held_by: Object → "<object>.<link>", for what it holds through another thing that it holds.
         held_at: Object → values of its attachment's freedoms, [m] and [rad]; zero where nothing is said.
-        document: The scene as plain data, from which `from_document` builds it again.
+        document: The scene as plain data, from which `from_document` builds it again; not to be changed, as scenes share parts.
     """
 
     name: str

@@ -27,11 +27,11 @@ from vkc_pin.trajectory import Trajectory
 
 __all__ = ["plan_chore"]
 
-_SINGLE = 2  # searches, from different random numbers, for a motion of one more action
+_SINGLE = 3  # searches, from different random numbers, for a motion of one more action
 _TRIES = 4  # searches, from different random numbers, for a motion of what is in the window
 _ROUNDS = 10  # of the solver from one seed: what takes more has mostly run into a dead end, and other seeds are at hand
 _BACK = 3  # how often, in all, what has been decided is given up since what follows cannot be done
-_FINER = 1.6  # times as many waypoints on the way to a goal in every search but the first
+_FINER = 1.6  # times as many waypoints in every search but the first
 _NOTHING = Piece((), (), (), "")
 _STOPPED = ("interrupted", "time limit")
 _FINAL = (*_STOPPED, "infeasible")
@@ -242,7 +242,7 @@ class _Chore:
 
         Args:
             attempt: Other random numbers for each.
-            fine: More waypoints, for ways that are long and narrow.
+            fine: More waypoints, for ways that are long and narrow, and arcs along which hands would drift between few.
         """
         limit = self.settings.time_limit
         if limit is not None:
@@ -250,7 +250,8 @@ class _Chore:
         given = self.settings.options
         options = dataclasses.replace(given, max_restarts=1, max_outer=min(given.max_outer, _ROUNDS))
         if fine:
-            options = dataclasses.replace(options, reach_waypoints=round(_FINER * given.reach_waypoints))
+            more = {name: round(_FINER * getattr(given, name)) for name in ("reach_waypoints", "move_waypoints")}
+            options = dataclasses.replace(options, **more)
         return dataclasses.replace(self.settings, options=options, seed=self.settings.seed + attempt, time_limit=limit)
 
     def _joined(self, failed: Plan | None) -> Plan:

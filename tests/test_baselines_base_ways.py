@@ -1,4 +1,4 @@
-"""Ways of the bare base: straight, around what stands there, or none."""
+"""Ways of the base, bare or with the arm as it is: straight, around what stands there, or none."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 from base_scenes import BLINK, MARGIN, between, distance
+from carrying import room
 from drawers import SHORT, changed, drawer_scene, open_scene
 from small_problems import door_scene
 
 import vkc_pin as vkc
-from vkc_pin.baselines.base_ways import BaseWays
+from vkc_pin.baselines.base_ways import BaseWays, headings
 from vkc_pin.geometry import placed_shapes, standing_geometry
 from vkc_pin.scene import FLOOR
 
@@ -127,3 +128,78 @@ def test_what_stands_still_of_the_thing_it_holds_is_in_its_way() -> None:
     way = ways(scene).way(before, after, 80)
     assert way is not None
     assert room_of(scene, np.vstack([before, way]), without=()) >= MARGIN - 0.02
+
+
+# --- with the arm as it is ---------------------------------------------------------------------------------------------
+
+
+SHELF: dict[str, Any] = {"name": "shelf", "type": "box", "size": [0.3, 1.0, 0.1], "position": [-0.4, 0.65, 1.0]}  # over the base
+ASIDE = np.array([-1.5, -1.57, 0.0, 0.0, 0.0, 0.0])  # the arm stretched out upwards
+
+
+def to(scene: vkc.Scene, x: float, y: float, yaw: float | None = None) -> vkc.TrajectoryProblem:
+    return vkc.build(scene.with_start(base=START), [vkc.GoTo(x, y, yaw)], options=SHORT)
+
+
+def test_the_arm_counts_if_it_is_to() -> None:
+    problem = to(open_scene(SHELF).with_start(arm=ASIDE), 0.5, 0.6)
+    goal = np.array([0.5, 0.6, 0.0])
+    bare = BaseWays(problem).way(START, goal, 80)
+    assert bare is not None
+    np.testing.assert_allclose(np.diff(bare[:, 0]) * 0.9 / 2.0, -np.diff(bare[:, 1]), atol=1e-9)  # straight below the shelf
+    whole = BaseWays(problem, whole=True)
+    assert not all(whole.grid.clear(*pose) for pose in bare)
+    way = whole.way(START, goal, 80)
+    assert way is not None
+    np.testing.assert_array_equal(way[-1, :2], goal[:2])
+    z = np.tile(problem.start, (len(way), 1))
+    z[:, :3] = way
+    contacts = problem.contacts.evaluate(z, np.ones(len(z), int), reach=MARGIN)
+    assert contacts.violation() < 0.01 + BLINK, "but for the corners that are cut between two waypoints"
+
+
+def test_what_is_held_counts_with_the_arm() -> None:
+    scene = room(objects=["stick"])
+    held = scene.with_held({"stick": "grip"})
+    shapes = [len(BaseWays(to(one, 1.0, 1.0), whole=True).grid.base.shapes) for one in (scene, held)]
+    assert shapes[1] == shapes[0] + len(scene.objects["stick"].object.collision.geometryObjects)
+
+
+def test_of_several_goals_the_first_that_is_straight_ahead_or_else_the_nearest() -> None:
+    found = ways(open_scene(POST))
+    blocked, free = AISLE, np.array([0.5, 1.0, 0.5])
+    way = found.way(START, np.array([blocked, free]), 10)
+    assert way is not None
+    np.testing.assert_array_equal(way[-1], free)
+    near, far = np.array([-0.3, -0.7, 0.0]), np.array([1.0, -1.4, 0.0])
+    start = np.array([-0.3, 0.9, -np.pi / 2])
+    for goals in ([far, near], [near, far]):
+        way = found.way(start, np.array(goals), 10)
+        assert way is not None
+        np.testing.assert_array_equal(way[-1, :2], near[:2])
+
+
+def test_the_seed_has_the_arm_at_rest() -> None:
+    problem = to(open_scene(POST), *AISLE[:2].tolist())
+    goals = headings(vkc.GoTo(*AISLE[:2].tolist()), 0.0)
+    (seed,) = BaseWays(problem, whole=True).seeds(problem, goals)
+    assert seed.z.shape == (problem.segments, problem.chain.size)
+    np.testing.assert_array_equal(seed.z[:, 3:], np.tile(problem.start[3:], (problem.segments, 1)))
+    np.testing.assert_allclose(seed.z[-1, :2], AISLE[:2], atol=1e-12)
+    wall: dict[str, Any] = {"name": "wall", "type": "box", "size": [0.1, 4.6, 1.0], "position": [0.0, 0.0, 0.5]}
+    problem = to(open_scene(wall), *AISLE[:2].tolist())
+    assert list(BaseWays(problem, whole=True).seeds(problem, goals)) == []
+
+
+@pytest.mark.parametrize("yaw", [-3.0, 0.4, 7.0])
+def test_headings(yaw: float) -> None:
+    some = headings(vkc.GoTo(1.0, 2.0), yaw)
+    assert some.shape == (16, 3)
+    np.testing.assert_array_equal(some[:, :2], np.tile([1.0, 2.0], (16, 1)))
+    turns = np.abs(some[:, 2] - yaw)
+    assert turns[0] < 1e-9
+    assert np.all(np.diff(turns) > -1e-9)
+    assert turns[-1] == pytest.approx(np.pi)
+    (one,) = headings(vkc.GoTo(1.0, 2.0, 1.0), yaw)
+    assert np.cos(one[2] - 1.0) == pytest.approx(1.0)
+    assert abs(one[2] - yaw) <= np.pi, "the nearest of equal headings"

@@ -271,7 +271,7 @@ def test_where_the_arm_does_not_reach_the_next_place_is_tried(monkeypatch: pytes
     def second_time(self: attempt.Attempt, steps: Any, pose: np.ndarray) -> None:
         bases.append(self.scene.start[:3])
         if len(bases) < 2:
-            raise attempt._FailedError("arm does not reach")
+            raise attempt.FailedError("arm does not reach")
         reach(self, steps, pose)
 
     monkeypatch.setattr(attempt.Attempt, "_reach", second_time)
@@ -302,7 +302,7 @@ def test_of_several_places_the_one_that_came_furthest_counts(
         problem = self._problem(steps)
         z = problem.start + np.arange(1, problem.segments + 1)[:, None] * np.eye(problem.chain.size)[0] * 1e-3
         if not works:
-            raise attempt._FailedError(cause, as_trajectory(problem, z))
+            raise attempt.FailedError(cause, as_trajectory(problem, z))
         self._take(problem, z)
 
     def driven(self: attempt.Attempt, pose: np.ndarray) -> None:
@@ -414,8 +414,8 @@ MISUSES: dict[str, tuple[dict[str, Any], str, str]] = {
     "method in small letters": ({"method": "b2"}, "method", "did you mean 'B2'"),
     "no tries": ({"retries": 0}, "retries", "at least 1"),
     "half a try": ({"retries": 1.5}, "retries", "1.5"),
-    "another step": ({"steps": [PULL, vkc.GoTo(0.0, 0.0)]}, "steps[1]", "expected Actuate"),
-    "a grasp": ({"steps": [vkc.Grasp("drawer")]}, "steps[0]", "expected Actuate"),
+    "another step": ({"steps": [PULL, vkc.Release()]}, "steps[1]", "expected Actuate, Place or GoTo"),
+    "a grasp": ({"steps": [vkc.Grasp("drawer")]}, "steps[0]", "expected Actuate, Place or GoTo"),
     "no steps": ({"steps": []}, "steps", "at least one step"),
     "one step alone": ({"steps": PULL}, "steps", "a list of steps"),
     "unknown object": ({"steps": [vkc.Actuate("drawr", {"slide": 0.3})]}, "steps[0].object", "did you mean 'drawer'"),

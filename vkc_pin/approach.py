@@ -18,6 +18,7 @@ __all__ = ["Approach"]
 
 LIFT = 0.1  # [m] to lift or lower what is carried
 _REACH = (0.1, 0.2, 0.3, 0.4, 0.5)  # [m] from what is touched, on the way to it
+_SHARES = (0.25, 0.5, 0.75, 1.0)  # of a way, from each to the next
 _TOLERANCE = 1e-4  # [m] and [rad]
 
 
@@ -56,20 +57,36 @@ class Approach:
                 return self._way(z, -self._ahead(z, self.chain.frame(goal.frame, goal.hold)), _REACH)
         return np.empty((0, len(z)))
 
+    def away(self, z: NDArray[np.float64], phase: Phase) -> NDArray[np.float64]:
+        """Return configurations on the way from `z`, shape (n,), the base where it is: shape (K, n), the last is the farthest.
+
+        The hand goes back from what a phase lets go of at its start, or up with what is carried in it.
+        """
+        if phase.leaves:
+            direction, length = -self._ahead(z, self.chain.holder(phase.leaves[0])), self.problem.options.approach
+        elif phase.held:
+            direction, length = np.array([0.0, 0.0, 1.0]), LIFT
+        else:
+            return np.empty((0, len(z)))
+        return self._way(z, direction, [share * length for share in _SHARES], drives=False)
+
     def _ahead(self, z: NDArray[np.float64], frame: tuple[int, pin.SE3]) -> NDArray[np.float64]:
         """Return the direction of a frame's z axis in the world, at `z`: in it a hand nears what it grasps."""
         joint, local = frame
         rotations, _ = self.chain.joint_placements(z[None])
         return np.asarray((rotations[0, joint] @ local.rotation)[:, 2])
 
-    def _way(self, z: NDArray[np.float64], direction: NDArray[np.float64], lengths: Sequence[float]) -> NDArray[np.float64]:
+    def _way(
+        self, z: NDArray[np.float64], direction: NDArray[np.float64], lengths: Sequence[float], *, drives: bool = True
+    ) -> NDArray[np.float64]:
         """Return configurations with the tool `lengths` [m] along `direction` from where `z` has it, as far as there are."""
         rotations, translations = self.chain.joint_placements(z[None])
         carrier = pin.SE3(rotations[0, self.joint], translations[0, self.joint])
         tool = carrier * self.local
         lower, upper = z.copy(), z.copy()  # only the robot moves
         for column, name in enumerate(self.chain.names[: self.knots.robot]):
-            lower[column], upper[column] = self.problem.limits(name)
+            if drives or column > 2:
+                lower[column], upper[column] = self.problem.limits(name)
         weights, found = self.knots.weights, list[NDArray[np.float64]]()
         for length in lengths:
             target = pin.SE3(tool.rotation, tool.translation + length * direction)

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vkc_pin.approach import Approach
 from vkc_pin.baselines.base_poses import base_poses
-from vkc_pin.baselines.base_ways import BaseWays
+from vkc_pin.baselines.base_ways import BaseWays, headings
+from vkc_pin.baselines.failure import FailedError
 from vkc_pin.baselines.following import follow
+from vkc_pin.baselines.postures import at_home, postures, through
 from vkc_pin.goal import compile_task
 from vkc_pin.initialization import Seed, initialize
 from vkc_pin.knots import Knots, smooth
@@ -22,36 +25,19 @@ from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.scene import Scene
 from vkc_pin.solver import RATE_TOLERANCE, solve
 from vkc_pin.step_by_step import scene_after
-from vkc_pin.steps import Actuate, GoTo, Grasp, Step
+from vkc_pin.steps import Actuate, GoTo, Grasp, Place, Step
 from vkc_pin.trajectory import Trajectory, join
 from vkc_pin.unfold import as_trajectory
 
-__all__ = ["FINER", "Attempt"]
+__all__ = ["FINER", "Attempt", "Doable"]
+
+Doable = Actuate | Place | GoTo
+"""The steps that the baselines know."""
 
 FINER = 2
 """How many times more waypoints than elsewhere objects are moved in: an arm that only follows needs smaller steps, and time."""
 _STANDS, _ENDS = 4, 10  # base poses that are tried in turn, the nearest first, at the handle and at the end
 _ROUNDS = 8  # of the solver: what takes more is mostly in vain
-
-
-class _FailedError(Exception):
-    """A stage failed.
-
-    Attributes:
-        cause: Why; what becomes the plan's status.
-        parts: What was done before, and as much as there is of the stage.
-        share: How much of the stage works.
-    """
-
-    def __init__(self, cause: str, last: Trajectory | None = None, share: float = 0.0) -> None:
-        super().__init__(cause)
-        self.cause, self.share = cause, share
-        self.parts = [] if last is None else [last]
-
-    @property
-    def came(self) -> float:
-        """How many stages it came through."""
-        return len(self.parts) + self.share
 
 
 class Attempt:
@@ -72,25 +58,31 @@ class Attempt:
             seed: Of the random numbers.
             deadline: Value of `time.perf_counter()` after which no stage is begun.
         """
-        self.scene, self.options, self.refine, self.deadline = scene, options, refine, deadline
+        self.first = self.scene = scene
+        self.options, self.refine, self.deadline = options, refine, deadline
         self.rng = np.random.default_rng(seed)
         self.parts: list[Trajectory] = []
         self.times = dict.fromkeys([*TIMES, "following"], 0.0)
         self.build_time, self.iterations = 0.0, 0
 
-    def run(self, steps: Sequence[Actuate]) -> tuple[Trajectory, float, str]:
+    def run(self, steps: Sequence[Doable]) -> tuple[Trajectory, float, str]:
         """Return the motion, how many stages it came through (infinite: all), and why no further."""
         try:
             try:
                 for step in steps:
-                    self._actuate(step)
+                    if isinstance(step, Actuate):
+                        self._actuate(step)
+                    elif isinstance(step, Place):
+                        self._place(step)
+                    else:
+                        self._go(step)
             except KeyboardInterrupt:
-                raise _FailedError("interrupted") from None
-        except _FailedError as error:
+                raise FailedError("interrupted") from None
+        except FailedError as error:
             came = len(self.parts) + error.came
             parts = [*self.parts, *error.parts]
             if not parts:
-                problem = self._problem([GoTo(*self.scene.start[:3].tolist())])
+                problem = self._problem([self._here()])
                 parts = [as_trajectory(problem, np.tile(problem.start, (problem.segments, 1)))]
             return join(parts, pause=self.options.grasp_time), came, error.cause
         return join(self.parts, pause=self.options.grasp_time), np.inf, ""
@@ -99,26 +91,63 @@ class Attempt:
         """Move joints of an object: drive to its handle and reach for it, unless it is held, and move it."""
         held = self.scene.held.get(step.object)
         if held is None or step.attachment not in (None, held):
-            self.scene = self.scene.with_held({})
             self._take_hold([Grasp(step.object, step.attachment)])
         self._move(step)
 
+    def _place(self, step: Place) -> None:
+        """Put an object down: take it, unless it is held, carry it to where the arm can put it down, and do so."""
+        if step.object not in self.scene.held:
+            self._take_hold([Grasp(step.object, step.attachment)])
+        poses = self._poses(self._problem([step]))
+        self._drive_and_reach([step], poses, _ENDS)
+
+    def _go(self, step: GoTo) -> None:
+        """Drive somewhere, at whichever heading is best if none is asked for."""
+        goals = headings(step, float(self.scene.start[2]))
+        self._withdrawn(lambda: self._drive(goals), FailedError("no base path"))
+
     def _take_hold(self, steps: Sequence[Step]) -> None:
         """Drive to the nearest base pose from which the arm reaches what is to be grasped, and reach for it."""
-        poses = self._free(self._poses(self._problem(steps)))
-        scene, before, failure = self.scene, self.parts, _FailedError("no base pose", share=-1.0)
-        for pose in poses[:_STANDS]:
-            self.scene, self.parts = scene, list(before)
+        poses = self._poses(self._problem(steps, scene=self.scene.with_held({})))
+        self._drive_and_reach(steps, poses, _STANDS)
+
+    def _drive_and_reach(self, steps: Sequence[Step], poses: NDArray[np.float64], most: int) -> None:
+        """Drive to the first base poses of `poses`, shape (K, n), from where the arm then does its part; at most `most`."""
+
+        def at(pose: NDArray[np.float64]) -> None:
+            self._drive(pose[None, :3])
+            self._reach(steps, pose)
+
+        def somewhere() -> None:
+            self._first(self._free(poses)[:most], at, FailedError("no base pose", share=-1.0))
+
+        self._withdrawn(somewhere, FailedError("no base pose", share=-1.0))
+
+    def _withdrawn(self, stage: Callable[[], None], failure: FailedError) -> None:
+        """Bring the arm to how it can be held while the base drives, with as little motion as will do, and go on with a stage."""
+
+        def held(way: NDArray[np.float64]) -> None:
+            self._withdraw(way)
+            stage()
+
+        self._first(postures(self._problem([self._here()])), held, failure)
+
+    def _first(
+        self, choices: Iterable[NDArray[np.float64]], stage: Callable[[NDArray[np.float64]], None], failure: FailedError
+    ) -> None:
+        """Do a stage with the first choice with which it works; if there is none, raise the failure that came furthest."""
+        scene, before = self.scene, self.parts
+        for choice in choices:
+            self._in_time(failure)
+            self.parts = list(before)
             try:
-                self._drive(pose)
-                self._reach(steps, pose)
-                break
-            except _FailedError as error:
+                stage(choice)
+                return
+            except FailedError as error:
                 error.parts = [*self.parts[len(before) :], *error.parts]
                 failure = max(failure, error, key=lambda one: one.came)
-        else:
-            self.parts = before
-            raise failure
+                self.scene, self.parts = scene, before
+        raise failure
 
     def _poses(self, problem: TrajectoryProblem) -> NDArray[np.float64]:
         """Return configurations for the end of a problem, the nearest first."""
@@ -126,36 +155,54 @@ class Attempt:
         poses = base_poses(problem, problem.segments, problem.start, self.rng)
         self.times["initialization"] += time.perf_counter() - began
         if not len(poses):
-            raise _FailedError("no base pose")
+            raise FailedError("no base pose")
         return poses
 
     def _free(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return those whose base may stand there while the arm is still as it is."""
-        stay = self._problem([GoTo(*self.scene.start[:3].tolist())])
+        stay = self._problem([self._here()])
         ends = np.tile(stay.start, (len(poses), 1))
         ends[:, :3] = poses[:, :3]
         return np.asarray(poses[Knots(stay, self.rng).depth(ends, stay.segments) <= 0.0])
 
-    def _drive(self, pose: NDArray[np.float64]) -> None:
-        """Drive to where the base has to stand, the arm as it is."""
-        problem = self._problem([GoTo(*pose[:3].tolist())])
+    def _withdraw(self, way: NDArray[np.float64]) -> None:
+        """Move the arm along configurations, shape (K, n), to the last of them, the base stands; nothing to do if K = 0."""
+        if not len(way):
+            return
+        problem = self._problem([self._here()])
+        arm = slice(3, problem.chain.robot.coordinates.size)
+        problem.lower[:, :3] = problem.upper[:, :3] = problem.start[:3]
+        problem.lower[-1, arm] = problem.upper[-1, arm] = way[-1, arm]
+        seeds = [Seed("straight", through(problem, way[k:])) for k in (0, -1)[: len(way)]]  # by that way, and directly
+        self._take(problem, self._solve(problem, iter(seeds), "arm does not reach"))
+
+    def _drive(self, goals: NDArray[np.float64]) -> None:
+        """Drive to where the base has to stand, or to one of several headings there, shape (G, 3), the arm as it is."""
+        x, y, yaw = goals[0].tolist()
+        problem = self._problem([GoTo(x, y, yaw if len(goals) == 1 else None)])
         arm = slice(3, problem.chain.robot.coordinates.size)
         problem.lower[:, arm] = problem.upper[:, arm] = problem.start[arm]
-        self._take(problem, self._solve(problem, initialize(problem, "astar", self._seed()), "no base path"))
+        bare = at_home(problem) and not self.scene.held and len(goals) == 1
+        seeds = initialize(problem, "astar", self._seed()) if bare else BaseWays(problem, whole=True).seeds(problem, goals)
+        self._take(problem, self._solve(problem, seeds, "no base path"))
 
     def _reach(self, steps: Sequence[Step], pose: NDArray[np.float64]) -> None:
-        """Take hold of the object, the base stands."""
+        """Take hold of the object, or put it down, the base stands."""
         problem = self._problem(steps)
         problem.lower[:, :3] = problem.upper[:, :3] = problem.start[:3]
         last = np.append(problem.start[:3], pose[3:])
-        straight = problem.start + smooth(problem.segments)[:, None] * (last - problem.start)
-        seeds = initialize(problem, "interpolated", self._seed())
-        self._take(problem, self._solve(problem, itertools.chain([Seed("straight", straight)], seeds), "arm does not reach"))
+        seeds = [Seed("straight", problem.start + smooth(problem.segments)[:, None] * (last - problem.start))]
+        phase = problem.task.phases[-1]
+        if phase.lowered:  # from above
+            above = Approach(Knots(problem, self.rng)).away(last, phase)[::-1]
+            seeds = [Seed("from above", through(problem, np.vstack([above, last])))] * (len(above) > 0) + seeds
+        more = initialize(problem, "interpolated", self._seed())
+        self._take(problem, self._solve(problem, itertools.chain(seeds, more), "arm does not reach"))
 
     def _move(self, step: Actuate) -> None:
         """Move the object's joints: the base goes to the nearest pose to which the arm can follow."""
         problem = self._problem([step], replace(self.options, move_waypoints=FINER * self.options.move_waypoints))
-        ways, failure = BaseWays(problem), _FailedError("no base path")
+        ways, failure = BaseWays(problem), FailedError("no base path")
         for pose in self._poses(problem)[:_ENDS]:
             base = self._path(problem, ways, pose[:3])
             if base is None:
@@ -175,10 +222,10 @@ class Attempt:
                 self._take(problem, followed.z)
                 return
             if not failure.parts or followed.share > failure.share:
-                failure = _FailedError(cause, as_trajectory(problem, followed.z), followed.share)
+                failure = FailedError(cause, as_trajectory(problem, followed.z), followed.share)
         raise failure
 
-    def _in_time(self, failure: _FailedError) -> None:
+    def _in_time(self, failure: FailedError) -> None:
         """Raise the error of what has failed so far if time is up."""
         if time.perf_counter() > self.deadline:
             failure.cause = failure.cause if failure.parts else "time limit"
@@ -199,16 +246,24 @@ class Attempt:
             now = way[-1]
         return np.concatenate(base)
 
-    def _problem(self, steps: Sequence[Step], options: Options | None = None) -> TrajectoryProblem:
-        """Return the problem of steps from where the motion has come to."""
-        options = options or self.options
-        problem = TrajectoryProblem(self.scene, compile_task(self.scene, steps, options), options)
+    def _here(self) -> GoTo:
+        """Return the step of the base to where it is."""
+        return GoTo(*self.scene.start[:3].tolist())
+
+    def _problem(self, steps: Sequence[Step], options: Options | None = None, scene: Scene | None = None) -> TrajectoryProblem:
+        """Return the problem of steps from where the motion has come to, or from another scene."""
+        options, scene = options or self.options, scene or self.scene
+        # What is to stand upright somewhere stands as it did at the very start, however the hand has turned it since.
+        held = {name: scene.objects[name] for name in scene.held}
+        stood = {name: replace(now, placement=self.first.objects[name].placement) for name, now in held.items()}
+        task = compile_task(replace(scene, objects={**scene.objects, **stood}), steps, options)
+        problem = TrajectoryProblem(scene, task, options)
         self.build_time += problem.transcription.take_build_time()
         return problem
 
     def _solve(self, problem: TrajectoryProblem, seeds: Iterator[Seed], cause: str) -> NDArray[np.float64]:
         """Return the first solution from a seed."""
-        failure = _FailedError(cause)
+        failure = FailedError(cause)
         for seed in seeds:
             self._in_time(failure)
             solution = solve(problem, seed.z, rounds=_ROUNDS, deadline=self.deadline)
@@ -221,9 +276,9 @@ class Attempt:
             if solution.status == "interrupted":
                 raise KeyboardInterrupt
             if solution.status == "time limit":
-                raise _FailedError("time limit", as_trajectory(problem, solution.z))
+                raise FailedError("time limit", as_trajectory(problem, solution.z))
             if not failure.parts:
-                failure = _FailedError(cause, as_trajectory(problem, solution.z))
+                failure = FailedError(cause, as_trajectory(problem, solution.z))
         raise failure
 
     def _take(self, problem: TrajectoryProblem, z: NDArray[np.float64]) -> None:

@@ -1,52 +1,88 @@
-"""The base's way while an object is moved: straight if that is free, else the shortest by A*, the arm left out of it."""
+"""The base's ways: straight if that is free, else the shortest by A*; of the bare base, or with the arm as it is."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
+import pinocchio as pin
 from numpy.typing import NDArray
 
 from vkc_pin.base_body import Shape
-from vkc_pin.base_grid import BaseGrid
+from vkc_pin.base_grid import HEADINGS, BaseGrid
 from vkc_pin.base_path import along, shortest_path
+from vkc_pin.initialization import Seed
 from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.scene import FLOOR
+from vkc_pin.steps import GoTo
 
-__all__ = ["BaseWays"]
+__all__ = ["BaseWays", "headings"]
 
-_STEPS = 25  # places of a straight way that are looked at
+_STEPS, _STEP = 25, 0.08  # places of a straight way that are looked at: at least so many, and at most so far apart [m]
 
 
 class BaseWays:
-    """Ways of the bare base between places, around all that stands while an object is moved.
+    """Ways of the base between places, around all that stands in the last phase of a problem.
 
     Attributes:
         grid: Where the base fits.
     """
 
-    def __init__(self, problem: TrajectoryProblem) -> None:
-        robot = problem.chain.robot
-        self.omni = robot.base == "omni"
-        base: list[Shape] = [
-            (shape.geometry, shape.placement) for shape in robot.collision.geometryObjects if shape.parentJoint == 1
-        ]
-        part = problem.contacts.phases[-1]
+    def __init__(self, problem: TrajectoryProblem, *, whole: bool = False) -> None:
+        """Look at the floor.
+
+        Args:
+            problem: Whose ways they are.
+            whole: The arm counts as well, as it is at the start, with what it holds; otherwise the bare base alone.
+        """
+        chain, part = problem.chain, problem.contacts.phases[-1]
+        self.omni = chain.robot.base == "omni"
+        shapes, robot = part.shapes, range(len(chain.robot.collision.geometryObjects))
+        own = [i for i in robot if shapes[i].parentJoint == 1]
+        if whole:
+            own = [*robot, *(i for hold in problem.task.phases[-1].held for i in chain.held_geometries[hold])]
+        z = problem.start.copy()
+        z[:3] = 0.0
+        rotations, translations = chain.joint_placements(z[None])
+        carriers = [pin.SE3(*placement) for placement in zip(rotations[0], translations[0], strict=True)]
+        base: list[Shape] = [(shapes[i].geometry, carriers[shapes[i].parentJoint] * shapes[i].placement) for i in own]
         standing: list[Shape] = [
             (shape.geometry, shape.placement)
-            for shape, label in zip(part.shapes, part.labels, strict=True)
+            for shape, label in zip(shapes, part.labels, strict=True)
             if shape.parentJoint == 0 and label != FLOOR
         ]
         self.grid = BaseGrid(base, [], standing, problem.scene.arena, problem.options.dist_safe)
 
-    def way(self, start: NDArray[np.float64], goal: NDArray[np.float64], steps: int) -> NDArray[np.float64] | None:
-        """Return poses after the start, slow at both ends, the last at the goal, shape (steps, 3); None: there is no way.
+    def way(self, start: NDArray[np.float64], goals: NDArray[np.float64], steps: int) -> NDArray[np.float64] | None:
+        """Return poses after the start, slow at both ends, the last at a goal, shape (steps, 3); None: there is no way.
 
         Args:
             start: x, y, yaw [m, rad].
-            goal: The same.
+            goals: The same, shape (3,), or several of them, shape (G, 3): the first that can be reached straight, else the one
+                to which the way is the shortest.
             steps: How many poses.
         """
         u = np.arange(1, steps + 1)[:, None] / steps
-        if self.omni and all(self.grid.clear(*pose) for pose in np.linspace(start, goal, _STEPS)):
-            return np.asarray(start + u * u * (3.0 - 2.0 * u) * (goal - start))
-        path = shortest_path(self.grid, start.tolist(), goal[None])
+        goals = np.atleast_2d(goals)
+        for goal in goals if self.omni else ():
+            places = max(_STEPS, int(np.ceil(np.hypot(*(goal - start)[:2]) / _STEP)))
+            if all(self.grid.clear(*pose) for pose in np.linspace(start, goal, places)):
+                return np.asarray(start + u * u * (3.0 - 2.0 * u) * (goal - start))
+        path = shortest_path(self.grid, start.tolist(), goals)
         return None if path is None else along(path, steps)
+
+    def seeds(self, problem: TrajectoryProblem, goals: NDArray[np.float64]) -> Iterator[Seed]:
+        """Yield the way from a problem's start to one of `goals`, shape (G, 3), the arm at rest, if there is one."""
+        way = self.way(problem.start[:3], goals, problem.segments)
+        if way is not None:
+            z = np.tile(problem.start, (problem.segments, 1))
+            z[:, :3] = way
+            yield Seed("astar", problem.clip(z))
+
+
+def headings(step: GoTo, yaw: float) -> NDArray[np.float64]:
+    """Return the poses in which a step may end, shape (G, 3): one, or one per heading, those nearest to `yaw` [rad] first."""
+    turns = np.linspace(0.0, 2.0 * np.pi, HEADINGS, endpoint=False) if step.yaw is None else np.array([step.yaw - yaw])
+    turns = (turns + np.pi) % (2.0 * np.pi) - np.pi
+    turns = turns[np.argsort(np.abs(turns), kind="stable")]
+    return np.column_stack([np.tile([step.x, step.y], (len(turns), 1)), yaw + turns])

@@ -9,6 +9,16 @@ After section IV-C of Jiao et al. (IROS 2021) and its authors' code. For a step 
 5. The object's joints run to their goals, the base along its path, and the arm follows (`following`): B1 by inverse
    kinematics, B2 moving arm and object out of collision at each waypoint.
 
+To put something down (`Place`), it is taken as in 1 to 3, and then:
+
+4. Base poses from which the arm puts it down, the nearest first.
+5. The base stands, the arm lifts it, or goes home with it if the base gets nowhere otherwise (`postures`).
+6. The base drives there, the arm as it is: A*, then optimisation.
+7. The base stands, the arm puts it down: optimisation.
+
+To drive somewhere (`GoTo`), the arm stays as it is if that will do, goes back from the handle it let go of, or else home, and the
+base drives as in 6. Neither has anything to follow, so B1 and B2 are the same there.
+
 Where a stage fails, the next nearest base poses are tried, then all again with other random numbers. Scene, limits, steps of
 time, clearances and validation are those of `planner.plan`, and so is the solver of the optimisations.
 """
@@ -21,7 +31,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vkc_pin.baselines.attempt import Attempt
+from vkc_pin.baselines.attempt import Attempt, Doable
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.goal import compile_task
 from vkc_pin.options import Options
@@ -29,7 +39,7 @@ from vkc_pin.plan import Plan
 from vkc_pin.planner import check_arguments
 from vkc_pin.report import Report
 from vkc_pin.scene import Scene
-from vkc_pin.steps import Actuate, Step
+from vkc_pin.steps import Step
 from vkc_pin.trajectory import Trajectory
 from vkc_pin.validation import validate
 
@@ -54,7 +64,7 @@ def plan_separately(
 
     Args:
         scene: Robot, objects and obstacles.
-        steps: What should change: `Actuate`, any number.
+        steps: What should change: `Actuate`, `Place` and `GoTo`, any number.
         method: "B1" or "B2".
         options: As for `planner.plan`.
         seed: Of the random numbers.
@@ -77,10 +87,11 @@ def plan_separately(
     if not isinstance(retries, int) or isinstance(retries, bool) or retries < 1:
         raise InputError("out of range", field="retries", expected="a whole number of at least 1", got=repr(retries))
     task = compile_task(scene, steps, options)
-    actions = []
+    actions: list[Doable] = []
     for number, step in enumerate(task.steps):
-        if not isinstance(step, Actuate):
-            raise InputError("the baselines know no such step", field=f"steps[{number}]", expected="Actuate", got=repr(step))
+        if not isinstance(step, Doable):
+            expected = "Actuate, Place or GoTo"
+            raise InputError("the baselines know no such step", field=f"steps[{number}]", expected=expected, got=repr(step))
         actions.append(step)
     began, spent, built = time.perf_counter(), Counter[str](), 0.0
     best: tuple[float, str, int, Trajectory, Report] | None = None

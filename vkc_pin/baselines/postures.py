@@ -1,0 +1,49 @@
+"""How the arm is held while the base drives alone: as it is, a little way off from what it took or let go of, or at home."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vkc_pin.approach import Approach
+from vkc_pin.knots import Knots, smooth
+from vkc_pin.problem import TrajectoryProblem
+
+__all__ = ["at_home", "postures", "through"]
+
+_SAME = 1e-6  # [rad]
+
+
+def postures(problem: TrajectoryProblem) -> list[NDArray[np.float64]]:
+    """Return configurations, shape (n,), in which the base may drive away from where it is, and the ones that lead to them.
+
+    Each is a way for the arm while the base stands, shape (K, n), and ends in what the base then drives in: nothing to do (K =
+    0), back from what it lets go of, or up with what it carries, and from there to home. Those that are not free are left out.
+
+    Args:
+        problem: Lets go of what stands fixed in the world and carries the rest along.
+    """
+    knots, robot = Knots(problem, np.random.default_rng(0)), problem.chain.robot  # nothing is drawn
+    away = Approach(knots).away(problem.start, problem.task.phases[0])
+    home = (away[-1] if len(away) else problem.start).copy()
+    home[3 : robot.coordinates.size] = robot.home
+    ways = [np.empty((0, problem.chain.size))]
+    ways += [away] if len(away) else []
+    ways += [] if at_home(problem) else [np.vstack([away, home])]
+    ends = np.array([way[-1] if len(way) else problem.start for way in ways])
+    free = knots.depth(ends, problem.segments) <= 0.0
+    return [way for way, is_free in zip(ways, free, strict=True) if is_free]
+
+
+def at_home(problem: TrajectoryProblem) -> bool:
+    """Return whether the arm is at home at the start."""
+    robot = problem.chain.robot
+    return bool(np.abs(problem.start[3 : robot.coordinates.size] - robot.home).max() < _SAME)
+
+
+def through(problem: TrajectoryProblem, way: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return waypoints from a problem's start through configurations, shape (K, n), to the last of them, shape (N, n)."""
+    knots = np.vstack([problem.start, way])
+    lengths = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(knots, axis=0)).max(axis=1))])
+    at = lengths[-1] * smooth(problem.segments)
+    return problem.clip(np.column_stack([np.interp(at, lengths, column) for column in knots.T]))

@@ -13,9 +13,10 @@ from test_tables import cells
 from test_visualization import clips, commands_of
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks import baselines, experiment
-from vkc_pin.benchmarks.baselines import METHODS, TASKS, peaks
-from vkc_pin.benchmarks.baselines_report import report
+from vkc_pin.benchmarks import baselines, comparison, experiment
+from vkc_pin.benchmarks.baselines import METHODS, TASKS
+from vkc_pin.benchmarks.comparison import peaks, shown
+from vkc_pin.benchmarks.comparison_report import report
 from vkc_pin.cli import main
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.report import Report, Violation
@@ -119,20 +120,20 @@ def test_starts_are_drawn_from_seed_and_task_and_the_same_for_all_methods(result
     for k, (task, scene) in enumerate((("door", "corridor_door"), ("drawer", "aisle_drawer"))):
         rng, loaded = np.random.default_rng([5, k]), vkc.load_scene(scene)
         drawn[task] = [loaded.sample_start(rng).start[:3].tolist() for _ in range(2)]
-    specs = baselines.specify(trials=2, seed=5, tasks=["door", "drawer"], methods=["B1", "VKC"])
+    specs = baselines.COMPARISON.specify(trials=2, seed=5, tasks=["door", "drawer"], methods=["B1", "VKC"])
     assert [(s["scene"], s["method"], s["number"]) for s in specs] == [
         (task, method, number) for task in ("door", "drawer") for method in ("B1", "VKC") for number in (0, 1)
     ]
     assert all(s["base"] == drawn[s["scene"]][s["number"]] for s in specs)
-    (alone,) = baselines.specify(trials=1, seed=5, tasks=["drawer"], methods=["B2"])
+    (alone,) = baselines.COMPARISON.specify(trials=1, seed=5, tasks=["drawer"], methods=["B2"])
     assert (alone["base"], alone["seed"], alone["key"]) == (drawn["drawer"][0], 5, "drawer/0000/B2")
     np.testing.assert_allclose(result["trials"][0]["start"][:3], drawn["door"][0], atol=1e-8)
 
 
 def test_the_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[tuple[Any, ...]] = []
-    monkeypatch.setattr(baselines, "plan", lambda scene, steps, **how: asked.append((scene, steps, how)))
-    monkeypatch.setattr(baselines.baselines, "plan_separately", lambda scene, steps, **how: asked.append((scene, steps, how)))
+    for name in ("plan", "plan_separately"):
+        monkeypatch.setattr(comparison, name, lambda scene, steps, **how: asked.append((scene, list(steps), how)))
     for task in TASKS:
         for method in METHODS:
             baselines.plan_trial("scene", {"scene": task, "method": method, "seed": 8})  # type: ignore[arg-type]
@@ -247,7 +248,8 @@ def test_tables_against_numbers_by_hand(out: Path, result: dict[str, Any]) -> No
 def test_errors_have_no_times_and_no_efforts(result: dict[str, Any]) -> None:
     error = {"success": False, "status": "error", "failed_constraint": "error", "violations": ["ValueError: no"]}
     odd = {"key": "door/0003/B1", "scene": "door", "method": "B1", "number": 3, **error}
-    text = report({**result, "trials": [*result["trials"], odd]}, {"door": "open it"})
+    text = report({**result, "trials": [*result["trials"], odd]}, {"door": "open it"}, title="Odd")
+    assert text.startswith("# Odd\n\n`door`: open it. 3 random starts")
     assert "| door | B1 | 1 of 4 | 25 |" in text
     assert "error 1" in text
     assert "| all trials | door | B1 | 3 | 2.00 |" in text
@@ -330,7 +332,7 @@ def test_view_shows_a_failure_with_the_offending_links_in_red(
 )
 def test_the_trial_that_is_shown(good: dict[str, set[int]], expected: int | None) -> None:
     records = [{"scene": "door", "method": m, "number": n, "success": n in good[m]} for n in range(4) for m in METHODS]
-    assert baselines._shown(records, METHODS) == expected
+    assert shown(records, METHODS) == expected
 
 
 def test_what_is_shown_is_kept(out: Path) -> None:

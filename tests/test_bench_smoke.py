@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from vkc_pin.benchmarks import comparison
 from vkc_pin.benchmarks.initialization import TARGET
 from vkc_pin.cli import main
 from vkc_pin.plan import Plan
 from vkc_pin.scene import load_scene
 from vkc_pin.validation import validate
+from vkc_pin.world import World
 
 FIELDS = {
     *("key", "scene", "method", "number", "repeat", "perturbation", "start", "seed", "success", "status", "planning_time"),
@@ -178,3 +180,35 @@ def test_scale(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         median = np.median([t["planning_time"] for t in trials if t["obstacles"] == count])
         assert f"| {count} | 2 of 2 | {median:.2f} |" in table
     assert (tmp_path / "scale.png").read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
+
+
+@pytest.mark.slow
+def test_household(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(comparison, "TIME_LIMIT", 30.0)
+    command = ["bench", "household", "--trials", "1", "--tasks", "cup", "cabinet", "--methods", "B1", "VKC", "--jobs", "1"]
+    assert main([*command, "--quiet", "--out", str(tmp_path)]) == 0
+    table = (tmp_path / "table.md").read_text(encoding="utf-8")
+    assert table in capsys.readouterr().out
+    trials = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))["trials"]
+    assert [t["key"] for t in trials] == [f"{task}/0000/{method}" for task in ("cabinet", "cup") for method in ("B1", "VKC")]
+    for t in trials:
+        assert t["success"] == (t["status"] == "success") == (not t["violations"])
+        assert t["success"] or t["method"] == "B1", t["violations"]
+        assert ("placed" in t) == (t["scene"] == "cup")
+        assert (tmp_path / f"shown/{t['scene']}_0000_{t['method']}.npz").is_file()
+        if not t["success"]:
+            continue
+        found = Plan.load(tmp_path / f"shown/{t['scene']}_0000_{t['method']}.npz")
+        assert validate(found.scene, found.steps, found.trajectory, found.options).ok
+        if t["scene"] == "cup":
+            world = World(found.scene)
+            at, *_, end = (world.placement("cup", row) for row in world.positions(found.trajectory))
+            np.testing.assert_allclose(at.translation, t["placed"]["cup"][:3], atol=1e-6)
+            np.testing.assert_allclose(end.translation, [-0.6, -1.6, 0.751], atol=2e-3)
+            assert end.rotation[2, 2] > np.cos(2e-3)
+        else:
+            assert found.trajectory.column("cabinet.hinge")[-1] == pytest.approx(0.4, abs=5e-3)
+        assert t["base_effort"] > 1.0
+    for name in ("success", "base_effort", "arm_effort", "planning_time", "cup_joints", "cabinet_joints"):
+        assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
+        assert f"]({name}.png)" in table

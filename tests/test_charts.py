@@ -9,7 +9,7 @@ import pytest
 from fake_plan import fake_plan
 from matplotlib.patches import StepPatch
 
-from vkc_pin.benchmarks.charts import criteria_chart, motions_chart, scale_chart, success_chart
+from vkc_pin.benchmarks.charts import criteria_chart, means_chart, motions_chart, scale_chart, success_chart
 from vkc_pin.benchmarks.tables import TIMES, wilson
 from vkc_pin.plan import Plan
 from vkc_pin.report import Report
@@ -108,6 +108,42 @@ def test_criteria_without_common_successes() -> None:
     assert bars_of(base) == [("one", 3.5), ("two", 5.5)]
     assert "own successes" in base.get_xlabel()
     assert bars_of(time)[2] == ("three", 20.0)
+
+
+def grouped(axes: Any) -> dict[str, list[float]]:
+    """Return the heights of a chart's bars, group by group, method after method."""
+    names = [label.get_text() for label in axes.get_xticklabels()]
+    found: dict[str, list[float]] = {name: [] for name in names}
+    for bar in axes.patches:
+        if bar.get_width() < 0.5:  # not what the legend needs
+            found[names[round(bar.get_x() + bar.get_width() / 2.0)]].append(bar.get_height())
+    return found
+
+
+def test_means_against_numbers_by_hand() -> None:
+    lonely = [{**record("one", 0, True, 7.0, 5.0), "scene": "b"}, {**record("two", 0, False, 1.0, 7.0), "scene": "b"}]
+    records, scenes = [*TRIALS, *lonely], {"a": "easy", "b": "hard"}
+    figure = means_chart(records, None, scenes, ["one", "two"], field="base_effort", label="base effort [m]", shared=True)
+    (axes,) = figure.axes
+    assert grouped(axes) == {"easy\n2 trials": [3.5, 5.5], "hard\nown successes": [7.0]}  # 9 and 99 are not shared
+    ends = [line.get_segments()[0][:, 1].tolist() for line in axes.collections]
+    spread = np.sqrt(0.5)  # of 3 and 4, and of 5 and 6; a single value has none
+    assert ends == [pytest.approx([3.5 - spread, 3.5 + spread]), [7.0, 7.0], pytest.approx([5.5 - spread, 5.5 + spread])]
+    assert [text.get_text() for text in axes.texts] == ["3.5", "7", "5.5"]
+    assert axes.get_ylabel() == "base effort [m]"
+    assert axes.get_title() == "Base effort: mean and standard deviation over trials in which all methods succeed"
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["one", "two"]
+    assert axes.get_ylim()[1] > 7.0
+
+
+def test_means_over_all_trials(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "time.png"
+    how: dict[str, Any] = {"field": "planning_time", "label": "planning time [s]", "shared": False}
+    figure = means_chart(TRIALS, path, {"a": "easy", "c": "none"}, ["one", "two"], **how)
+    (axes,) = figure.axes
+    assert grouped(axes) == {"easy\n3 trials each": [3.0, 3.5], "none\nno trials": []}  # an error has no time
+    assert "over all trials" in axes.get_title()
+    assert path.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
 
 
 def fastest(plan: Plan) -> float:

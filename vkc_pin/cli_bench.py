@@ -40,11 +40,13 @@ def add_bench(commands: Any) -> None:
     initialization.set_defaults(run=_bench_initialization)
     about = "Compare planning base and arm together with planning them apart, at a door and a drawer, from random starts."
     baselines = benches.add_parser("baselines", help="base and arm together or apart, at a door and a drawer", description=about)
-    _add_experiment_options(baselines, "--trials")
-    baselines.add_argument("--tasks", nargs="+", metavar="TASK", help="some of door drawer (default: both)")
-    baselines.add_argument("--methods", nargs="+", metavar="METHOD", help="some of B1 B2 VKC (default: all)")
-    baselines.add_argument("--save-failures", action="store_true", help="save the plans of failures, to be viewed")
+    _add_comparison_options(baselines, "door drawer (default: both)")
     baselines.set_defaults(run=_bench_baselines)
+    about = "Compare planning base and arm together with planning them apart, at six tasks in a home, from random starts."
+    household = benches.add_parser("household", help="base and arm together or apart, at six tasks in a home", description=about)
+    some = "cup door drawer dishwasher refrigerator cabinet (default: all)"
+    _add_comparison_options(household, some, trials=20)
+    household.set_defaults(run=_bench_household)
     about = "Plan two chores, of eighteen and of ten steps, each in one call, from random starts."
     chores = benches.add_parser("chores", help="chores of many steps, in a home and in an arena", description=about)
     _add_experiment_options(chores, "--trials", default=5, jobs=1)
@@ -58,9 +60,16 @@ def add_bench(commands: Any) -> None:
     scale.set_defaults(run=_bench_scale)
 
 
+def _add_comparison_options(parser: argparse.ArgumentParser, tasks: str, *, trials: int = 50) -> None:
+    _add_experiment_options(parser, "--trials", default=trials)
+    parser.add_argument("--tasks", nargs="+", metavar="TASK", help=f"some of {tasks}")
+    parser.add_argument("--methods", nargs="+", metavar="METHOD", help="some of B1 B2 VKC (default: all)")
+    parser.add_argument("--save-failures", action="store_true", help="save the plans of failures, to be viewed")
+
+
 def _add_experiment_options(parser: argparse.ArgumentParser, number: str, *, default: int = 50, jobs: int | None = None) -> None:
     """Add what all experiments have, by default `default` starts and `jobs` processes, or one per core."""
-    about = f"random starts per scene (default {default})"
+    about = f"random starts per {'task' if number == '--trials' else 'scene'} (default {default})"
     parser.add_argument(number, type=positive, default=default, metavar="N", help=about)
     parser.add_argument("--seed", type=natural, default=0, metavar="S", help="of the starts and of planning (default 0)")
     processes = f"processes (default: {'one per core' if jobs is None else jobs})"
@@ -99,12 +108,23 @@ def _bench_initialization(arguments: argparse.Namespace) -> int:
 def _bench_baselines(arguments: argparse.Namespace) -> int:
     from vkc_pin.benchmarks import baselines
 
+    return _comparison(arguments, baselines)
+
+
+def _bench_household(arguments: argparse.Namespace) -> int:
+    from vkc_pin.benchmarks import household
+
+    return _comparison(arguments, household)
+
+
+def _comparison(arguments: argparse.Namespace, experiment: Any) -> int:
+    """Run an experiment that compares methods at tasks."""
     return _experiment(
         arguments,
-        baselines.run,
+        experiment.run,
         trials=arguments.trials,
-        tasks=arguments.tasks or tuple(baselines.TASKS),
-        methods=arguments.methods or baselines.METHODS,
+        tasks=arguments.tasks or tuple(experiment.TASKS),
+        methods=arguments.methods or experiment.METHODS,
         save_failures=arguments.save_failures,
     )
 

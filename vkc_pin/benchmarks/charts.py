@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vkc_pin.benchmarks.tables import TIMES, common, quartiles, wilson
+from vkc_pin.benchmarks.tables import TIMES, common, mean_and_deviation, quartiles, wilson
 from vkc_pin.plan import Plan
 from vkc_pin.plotting import _COLOURS, _figure, _save, _shade_phases, _style
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["criteria_chart", "motions_chart", "scale_chart", "success_chart"]
+__all__ = ["criteria_chart", "means_chart", "motions_chart", "scale_chart", "success_chart"]
 
 _WIDTH = 0.8  # of a group of bars; the distance between groups is 1
 _ROOM = 2.0  # a scale that is not made for all motions reaches so many times farther than the others
@@ -45,32 +45,73 @@ def success_chart(
     Returns:
         The figure.
     """
-    with _style():
-        figure = _figure(max(6.0, 1.0 + 0.5 * len(scenes) * (len(methods) + 1)), 3.8)
-        axes = figure.subplots()
-        width = _WIDTH / len(methods)
+
+    def bar(scene: str, method: str) -> tuple[float, float, float] | None:
+        own = [bool(r["success"]) for r in records if r["scene"] == scene and r["method"] == method]
+        return _rate(own) if own else None
+
+    names = {scene: f"{name}\n{_number(records, scene, methods)}" for scene, name in scenes.items()}
+    figure = _grouped(names, methods, bar, label="successful trials [%]", form=".0f", title=title)
+    (axes,) = figure.axes
+    axes.set_ylim(0.0, 108.0)
+    axes.set_yticks(range(0, 101, 20))
+    if path is not None:
+        _save(figure, Path(path))
+    return figure
+
+
+def means_chart(
+    records: Sequence[Mapping[str, Any]],
+    path: str | Path | None,
+    scenes: Mapping[str, str],
+    methods: Sequence[str],
+    *,
+    field: str,
+    label: str,
+    shared: bool,
+) -> Figure:
+    """Draw the means of a field as bars, grouped by scene, with standard deviations (n − 1).
+
+    Args:
+        records: Records as `record.trial` makes them.
+        path: The file to write, .png, .svg or .pdf; None writes nothing.
+        scenes: Scene → name to show, one group each.
+        methods: One bar of each group, in this order.
+        field: The field.
+        label: Its name and unit.
+        shared: Over the trials in which all methods succeed, or over each method's own successes where there are none;
+            otherwise over all trials.
+
+    Returns:
+        The figure.
+    """
+    values: dict[tuple[str, str], list[float]] = {}
+    names = {}
+    for scene, name in scenes.items():
+        own = [record for record in records if record["scene"] == scene]
+        both = common(own, methods) if shared else []
         for k, method in enumerate(methods):
-            places = np.arange(len(scenes)) + (k - (len(methods) - 1) / 2.0) * width
-            colour = _COLOURS[k % len(_COLOURS)]
-            for place, scene in zip(places, scenes, strict=True):
-                own = [bool(r["success"]) for r in records if r["scene"] == scene and r["method"] == method]
-                if not own:
-                    continue
-                low, rate, high = _rate(own)
-                _bar(axes, place, (low, rate, high), colour, f"{rate:.0f}", width=0.9 * width)
-            axes.bar(0.0, 0.0, color=colour, label=method)
-        axes.set_xticks(range(len(scenes)), [f"{name}\n{_number(records, scene, methods)}" for scene, name in scenes.items()])
-        axes.set_xlim(-0.5, len(scenes) - 0.5)
-        axes.tick_params(axis="x", length=0.0)
-        axes.grid(visible=False, axis="x")
-        axes.set_axisbelow(True)
-        axes.set_ylim(0.0, 108.0)
-        axes.set_yticks(range(0, 101, 20))
-        axes.set_ylabel("successful trials [%]")
-        axes.set_title(title, fontsize=10)
-        figure.legend(loc="outside lower center", ncols=len(methods))
-        if path is not None:
-            _save(figure, Path(path))
+            mine = [record for record in own if record["method"] == method]
+            if shared:
+                mine = [row[k] for row in both] or [record for record in mine if record["success"]]
+            values[scene, method] = [float(record[field]) for record in mine if record.get(field) is not None]
+        trials = f"{len(both)} trial{'s' * (len(both) != 1)}" if both else "own successes"
+        names[scene] = f"{name}\n{trials if shared else _number(own, scene, methods)}"
+
+    def bar(scene: str, method: str) -> tuple[float, float, float] | None:
+        if not values[scene, method]:
+            return None
+        mean, deviation = mean_and_deviation(values[scene, method])
+        spread = deviation if np.isfinite(deviation) else 0.0
+        return mean - spread, mean, mean + spread
+
+    over = "trials in which all methods succeed" if shared else "all trials"
+    title = f"{label.partition(' [')[0].capitalize()}: mean and standard deviation over {over}"
+    figure = _grouped(names, methods, bar, label=label, form=".3g", title=title)
+    (axes,) = figure.axes
+    axes.set_ylim(0.0, 1.06 * axes.get_ylim()[1])
+    if path is not None:
+        _save(figure, Path(path))
     return figure
 
 
@@ -211,6 +252,39 @@ def scale_chart(records: Sequence[Mapping[str, Any]], path: str | Path | None, *
         figure.legend(loc="outside right upper")
         if path is not None:
             _save(figure, Path(path))
+    return figure
+
+
+def _grouped(
+    scenes: Mapping[str, str],
+    methods: Sequence[str],
+    bar: Callable[[str, str], tuple[float, float, float] | None],
+    *,
+    label: str,
+    form: str,
+    title: str,
+) -> Figure:
+    """Draw bars grouped by scene, one for each method: `bar` returns lower end, height and upper end, or None for no bar."""
+    with _style():
+        figure = _figure(max(6.0, 1.0 + 0.5 * len(scenes) * (len(methods) + 1)), 3.8)
+        axes = figure.subplots()
+        width = _WIDTH / len(methods)
+        for k, method in enumerate(methods):
+            places = np.arange(len(scenes)) + (k - (len(methods) - 1) / 2.0) * width
+            colour = _COLOURS[k % len(_COLOURS)]
+            for place, scene in zip(places, scenes, strict=True):
+                interval = bar(scene, method)
+                if interval is not None:
+                    _bar(axes, place, interval, colour, f"{interval[1]:{form}}", width=0.9 * width)
+            axes.bar(0.0, 0.0, color=colour, label=method)
+        axes.set_xticks(range(len(scenes)), list(scenes.values()))
+        axes.set_xlim(-0.5, len(scenes) - 0.5)
+        axes.tick_params(axis="x", length=0.0)
+        axes.grid(visible=False, axis="x")
+        axes.set_axisbelow(True)
+        axes.set_ylabel(label)
+        axes.set_title(title, fontsize=10)
+        figure.legend(loc="outside lower center", ncols=len(methods))
     return figure
 
 

@@ -1,4 +1,4 @@
-"""The tables of the experiment that compares planning base and arm together with planning them apart."""
+"""The tables of the experiments that compare planning base and arm together with planning them apart."""
 
 from __future__ import annotations
 
@@ -37,27 +37,25 @@ def report(
     result: Mapping[str, Any],
     tasks: Mapping[str, str],
     *,
+    title: str,
     saved: Mapping[str, str] | None = None,
-    shown: Mapping[str, int] | None = None,
+    pictures: Sequence[str] = (),
 ) -> str:
     """Return the tables of a result in Markdown, with versions and machine at the foot.
 
     Args:
-        result: {"meta": ..., "trials": [...]}, as from `baselines.run`.
+        result: {"meta": ..., "trials": [...]}, as from `Comparison.run`.
         tasks: Task → what is done in it.
+        title: The first line.
         saved: Key → file, for the failures whose plans are saved.
-        shown: Task → the trial whose motions <task>_joints.png shows.
+        pictures: What is shown below the tables, in Markdown.
     """
     about, records = result["meta"], result["trials"]
     methods = about["methods"]
-    pictures = [
-        f"![Criteria: {tasks[task]}]({task}.png)"
-        + (f"\n\n![Motions of trial {shown[task]}: {tasks[task]}]({task}_joints.png)" if shown and task in shown else "")
-        for task in tasks
-    ]
+    *first, last = (f"`{task}`: {name}" for task, name in tasks.items())
     parts = [
-        "# Base and arm together, or one after the other",
-        f"{' and '.join(f'`{task}`: {name}' for task, name in tasks.items())}. {about['starts']} random "
+        f"# {title}",
+        f"{', '.join(first)}{' and ' * bool(first)}{last}. {about['starts']} random "
         f"start{'s' * (about['starts'] != 1)} per task, the same for all methods; seed {about['seed']}. At most "
         f"{about['time_limit']:g} s of planning per trial, in which the baselines try up to {about['retries']} times. "
         "Success is the word of the independent validation. Standard deviations are those of samples (n − 1).",
@@ -82,8 +80,10 @@ def report(
 
 def _success(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str]) -> str:
     rows = []
-    for task, method in _cases(tasks, methods):
-        own = _of(records, task, method)
+    cases = [(task, method, _of(records, task, method)) for task, method in _cases(tasks, methods)]
+    if len(tasks) > 1:
+        cases += [("all", method, [record for record in records if record["method"] == method]) for method in methods]
+    for task, method, own in cases:
         good = sum(bool(record["success"]) for record in own)
         low, high = (f"{100.0 * end:.0f}" for end in wilson(good, len(own)))
         rate = f"{100.0 * good / len(own):.0f}" if own else "–"

@@ -1,0 +1,292 @@
+"""Base and arm planned together (VKC) compared with planners of base and arm apart (B1, B2), at tasks from random starts.
+
+The same starts, scenes, limits and validation for all methods.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from vkc_pin.baselines import METHODS as APART
+from vkc_pin.baselines import RETRIES, plan_separately
+from vkc_pin.benchmarks import experiment
+from vkc_pin.benchmarks.charts import motions_chart
+from vkc_pin.benchmarks.comparison_report import report
+from vkc_pin.benchmarks.record import trial
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.plan import Plan, write_atomically
+from vkc_pin.planner import plan
+from vkc_pin.scene import Scene, load_scene
+from vkc_pin.steps import Actuate, GoTo, Place, Step, as_placement
+from vkc_pin.trajectory import Trajectory
+
+__all__ = ["METHODS", "TIME_LIMIT", "Comparison", "Solve", "Task", "peaks"]
+
+METHODS = (*APART, "VKC")
+TIME_LIMIT = 20.0  # [s] of planning
+
+Solve = Callable[[Scene, Mapping[str, Any]], Plan]
+"""What plans a trial: takes its scene and its specification."""
+Draw = Callable[[Sequence[Mapping[str, Any]], Path, Mapping[str, str], Sequence[str]], list[str]]
+"""What draws an experiment's charts: takes records, folder, task → what is done in it, methods; returns them in Markdown."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is to be done.
+
+    Attributes:
+        scene: The scene's name.
+        steps: What should change in it.
+        name: To show.
+        scatter: Draws where objects stand: returns object → (x, y, z, roll, pitch, yaw) [m, rad] of its base link in the world;
+            None leaves all as in the scene.
+    """
+
+    scene: str
+    steps: tuple[Step, ...]
+    name: str
+    scatter: Callable[[Scene, np.random.Generator], dict[str, list[float]]] | None = None
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """An experiment that compares `METHODS`.
+
+    Attributes:
+        benchmark: Its name on the command line.
+        title: Of its tables.
+        tasks: Name → task.
+        draw: What draws its charts.
+    """
+
+    benchmark: str
+    title: str
+    tasks: Mapping[str, Task]
+    draw: Draw
+
+    def plan_trial(self, scene: Scene, spec: Mapping[str, Any]) -> Plan:
+        """Plan the task of one trial: `scene` (the task's name), `method` and `seed` say how."""
+        steps = self.tasks[spec["scene"]].steps
+        if spec["method"] == "VKC":
+            return plan(scene, steps, time_limit=TIME_LIMIT, seed=spec["seed"])
+        return plan_separately(scene, steps, method=spec["method"], time_limit=TIME_LIMIT, seed=spec["seed"])
+
+    def specify(self, *, trials: int, seed: int, tasks: Sequence[str], methods: Sequence[str]) -> list[dict[str, Any]]:
+        """Return the trials: every task, method and start, in this order, in which a process can keep what it has built.
+
+        A task's starts, and where its objects stand, depend on the seed and the task alone; start i is planned from with the
+        random seed `seed` + i.
+        """
+        specs = []
+        for name in tasks:
+            task = self.tasks[name]
+            rng, scene = np.random.default_rng([seed, list(self.tasks).index(name)]), load_scene(task.scene)
+            starts: list[dict[str, Any]] = []
+            for _ in range(trials):
+                more = {"placed": task.scatter(scene, rng)} if task.scatter else {}
+                starts.append({"base": placed(scene, more).sample_start(rng).start[:3].tolist(), **more})
+            for method in methods:
+                for number, start in enumerate(starts):
+                    key = f"{name}/{number:04d}/{method}"
+                    specs.append({"key": key, "scene": name, "method": method, "number": number, **start, "seed": seed + number})
+        return specs
+
+    def run(
+        self,
+        *,
+        trials: int,
+        seed: int,
+        out: str | Path,
+        solve: Solve,
+        jobs: int = 1,
+        tasks: Sequence[str] | None = None,
+        methods: Sequence[str] = METHODS,
+        save_failures: bool = False,
+        progress: bool = True,
+    ) -> dict[str, Any]:
+        """Run the experiment, or what is left of it, and write its results, table and pictures to `out`.
+
+        They are results.json, results.csv and table.md; the experiment's charts; for every task <task>_joints.png (the motions of
+        one trial over time); the plans of that trial in shown/, and those of failures in failures/ if asked for.
+
+        Args:
+            trials: Number of random starts per task, at least 1.
+            seed: Of the starts and of planning.
+            out: The folder; if it has trials of the same settings already, they are not run again.
+            solve: What plans a trial.
+            jobs: Number of processes.
+            tasks: Some of the tasks; None: all.
+            methods: Some of `METHODS`.
+            save_failures: Save the plan of every failure; those that ran before without this are planned once more.
+            progress: Whether to show progress bars.
+
+        Returns:
+            {"meta": ..., "trials": [...]}; see `experiment.run`. A trial's `scene` is its task's name.
+
+        Raises:
+            UnknownNameError: There is no such task or method.
+            InputError: No trials, tasks or methods, or `out` has trials of other settings.
+            KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
+        """
+        tasks = _chosen("task", list(self.tasks) if tasks is None else tasks, list(self.tasks))
+        methods = _chosen("method", methods, METHODS)
+        if trials < 1:
+            raise InputError("out of range", field="trials", expected="at least 1", got=trials)
+        specs, out = self.specify(trials=trials, seed=seed, tasks=tasks, methods=methods), Path(out)
+        settings = {
+            "benchmark": self.benchmark,
+            "seed": seed,
+            "starts": trials,
+            "tasks": tasks,
+            "methods": methods,
+            "scenes": {name: self.tasks[name].scene for name in tasks},
+            "goals": {name: goals(self.tasks[name].steps) for name in tasks},
+            "time_limit": TIME_LIMIT,
+            "retries": RETRIES,
+        }
+        trials_of = _Trials(self.tasks, out, solve)
+        function = functools.partial(trials_of.record, save_failures=save_failures)
+        result = experiment.run(specs, function, out, settings=settings, jobs=jobs, progress=progress)
+        saved = trials_of.saved(result["trials"], specs, again=save_failures, progress=progress)
+        names = {name: self.tasks[name].name for name in tasks}
+        pictures = self.draw(result["trials"], out, names, methods) + trials_of.motions(result["trials"], specs)
+        text = report(result, names, title=self.title, saved=saved, pictures=pictures)
+        write_atomically(out / "table.md", text.encode())
+        return result
+
+
+def placed(scene: Scene, spec: Mapping[str, Any]) -> Scene:
+    """Return a scene with its objects where the specification of a trial has them."""
+    for name, pose in spec.get("placed", {}).items():
+        scene = scene.with_placement(name, as_placement(pose))
+    return scene
+
+
+def goals(steps: Sequence[Step]) -> dict[str, Any]:
+    """Return what steps ask for as plain data: "<object>.<joint>" → value, object → place, "base" → place."""
+    found: dict[str, Any] = {}
+    for step in steps:
+        if isinstance(step, Actuate):
+            found |= {f"{step.object}.{joint}": value for joint, value in step.joints.items()}
+        elif isinstance(step, Place):
+            found[step.object] = np.asarray(step.pose, float).tolist()
+        elif isinstance(step, GoTo):
+            found["base"] = [step.x, step.y] if step.yaw is None else [step.x, step.y, step.yaw]
+    return found
+
+
+def peaks(trajectory: Trajectory) -> dict[str, float]:
+    """Return the largest velocity [rad/s] and acceleration [rad/s²] of an arm joint: peak_velocity, peak_acceleration."""
+    arm = slice(3, trajectory.robot_size)
+    rates = {"peak_velocity": trajectory.velocities(), "peak_acceleration": trajectory.accelerations()}
+    return {name: float(np.abs(rate[:, arm]).max(initial=0.0)) for name, rate in rates.items()}
+
+
+@dataclass(frozen=True)
+class _Trials:
+    """Runs single trials, and keeps their plans in a folder.
+
+    Attributes:
+        tasks: Name → task.
+        out: The folder.
+        solve: What plans a trial.
+    """
+
+    tasks: Mapping[str, Task]
+    out: Path
+    solve: Solve
+
+    def record(self, spec: dict[str, Any], *, save_failures: bool) -> dict[str, Any]:
+        """Run one trial and return its record; a failure's plan is saved if asked for."""
+        _ready()
+        found = self._plan(spec)
+        if save_failures and not found.success and found.status != "interrupted":
+            found.save(self._file(spec, "failures"))
+        own = {"scene": spec["scene"], "number": spec["number"], "duration": found.metrics["duration"], **peaks(found.trajectory)}
+        own |= {"placed": spec["placed"]} if "placed" in spec else {}
+        return trial(found, method=spec["method"], seed=spec["seed"], **own)
+
+    def saved(
+        self, records: Sequence[Mapping[str, Any]], specs: Sequence[Mapping[str, Any]], *, again: bool, progress: bool
+    ) -> dict[str, str]:
+        """Return key → file of the failures whose plans are saved; with `again`, those that are not are planned again."""
+        failed = {record["key"] for record in records if not record["success"] and record["status"] != "error"}
+        files = {spec["key"]: self._file(spec, "failures") for spec in specs if spec["key"] in failed}
+        lost = [spec for spec in specs if spec["key"] in failed and not files[spec["key"]].is_file()] if again else []
+        for spec in tqdm(lost, desc="failures", unit="plan", disable=not (progress and lost)):
+            found = self._uninterrupted(spec)
+            if not found.success:
+                found.save(files[spec["key"]])
+        return {key: path.relative_to(self.out).as_posix() for key, path in files.items() if path.is_file()}
+
+    def motions(self, records: Sequence[Mapping[str, Any]], specs: Sequence[Mapping[str, Any]]) -> list[str]:
+        """Draw the motions of one trial of every task in which a method succeeds in any; return the pictures in Markdown."""
+        methods, pictures = tuple(dict.fromkeys(spec["method"] for spec in specs)), []
+        for task in dict.fromkeys(spec["scene"] for spec in specs):
+            number, name = shown([record for record in records if record["scene"] == task], methods), self.tasks[task].name
+            if number is not None:
+                plans = {s["method"]: self._kept(s) for s in specs if (s["scene"], s["number"]) == (task, number)}
+                motions_chart(plans, self.out / f"{task}_joints.png", title=f"{name.capitalize()}, trial {number}")
+                pictures.append(f"![Motions of trial {number}: {name}]({task}_joints.png)")
+        return pictures
+
+    def _kept(self, spec: Mapping[str, Any]) -> Plan:
+        """Return the plan of a trial that is shown: from its file, or else planned again and saved there."""
+        path = self._file(spec, "shown")
+        if path.is_file():
+            return Plan.load(path)
+        found = self._uninterrupted(spec)
+        found.save(path)
+        return found
+
+    def _uninterrupted(self, spec: Mapping[str, Any]) -> Plan:
+        found = self._plan(spec)
+        if found.status == "interrupted":
+            raise KeyboardInterrupt("all trials are done, but not all of their plans are saved")
+        return found
+
+    def _plan(self, spec: Mapping[str, Any]) -> Plan:
+        scene = placed(_scene(self.tasks[spec["scene"]].scene), spec)
+        return self.solve(scene.with_start(base=spec["base"]), spec)
+
+    def _file(self, spec: Mapping[str, Any], folder: str) -> Path:
+        return self.out / folder / f"{spec['scene']}_{spec['number']:04d}_{spec['method']}.npz"
+
+
+def shown(records: Sequence[Mapping[str, Any]], methods: Sequence[str]) -> int | None:
+    """Return the first trial in which all methods succeed, or else VKC and most others, or else most; None: none ever does."""
+    good: dict[int, set[str]] = {}
+    for record in records:
+        if record["success"]:
+            good.setdefault(int(record["number"]), set()).add(str(record["method"]))
+    return max(sorted(good), key=lambda k: (len(good[k]) == len(methods), "VKC" in good[k], len(good[k])), default=None)
+
+
+def _chosen(kind: str, names: Sequence[str], choices: Sequence[str]) -> tuple[str, ...]:
+    """Return names without repetition, in the order of the choices; raise an error if one is none of them."""
+    for name in names:
+        if name not in choices:
+            raise UnknownNameError(kind, name, choices, field=f"{kind}s")
+    if not names:
+        raise InputError("nothing to compare", field=f"{kind}s", expected="at least one")
+    return tuple(choice for choice in choices if choice in names)
+
+
+@functools.cache
+def _scene(name: str) -> Scene:
+    """Return a scene, loaded once per process."""
+    return load_scene(name)
+
+
+@functools.cache
+def _ready() -> None:
+    """Import what planners import when they are first called, which is no part of planning."""
+    import pink  # noqa: F401

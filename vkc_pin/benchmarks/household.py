@@ -1,0 +1,87 @@
+"""The third experiment: six tasks of a day in a home; B1, B2 and VKC."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vkc_pin.benchmarks.charts import means_chart, success_chart
+from vkc_pin.benchmarks.comparison import METHODS, Comparison, Solve, Task
+from vkc_pin.plan import Plan
+from vkc_pin.scene import Scene
+from vkc_pin.steps import Actuate, GoTo, Place
+
+__all__ = ["METHODS", "TABLE_TOP", "TASKS", "on_the_coffee_table", "plan_trial", "run"]
+
+TABLE_TOP = ((2.5, 3.0), (-1.9, -0.9))
+"""The coffee table's plate in the scene `household`: x and y, lowest and highest [m]."""
+_EDGE = 0.05  # [m] from the cup's axis, whose radius is 0.035, to the plate's edges, at least
+
+
+def on_the_coffee_table(scene: Scene, rng: np.random.Generator) -> dict[str, list[float]]:
+    """Return the cup somewhere on the coffee table, as high as it stands in the scene, at any heading."""
+    x, y = (float(rng.uniform(low + _EDGE, high - _EDGE)) for low, high in TABLE_TOP)
+    height, yaw = float(scene.objects["cup"].placement.translation[2]), float(rng.uniform(-np.pi, np.pi))
+    return {"cup": [x, y, height, 0.0, 0.0, yaw]}
+
+
+TASKS = {
+    "cup": Task(
+        "household", (Place("cup", (-0.6, -1.6, 0.751)),), "carry a cup to the dining table", scatter=on_the_coffee_table
+    ),
+    "door": Task("household", (Actuate("door", {"hinge": 1.52}), GoTo(1.6, 2.5)), "push a narrow door open and drive through"),
+    "drawer": Task("household", (Actuate("drawer", {"slide": 0.22}),), "pull a low drawer open in a corner"),
+    "dishwasher": Task("household", (Actuate("dishwasher", {"rack": 0.5}),), "pull a dishwasher's rack out"),
+    "refrigerator": Task("household", (Actuate("refrigerator", {"hinge": 1.57}),), "pull a refrigerator open"),
+    "cabinet": Task("household", (Actuate("cabinet", {"hinge": 0.4}),), "pull a cabinet open behind a chair"),
+}
+
+
+def _draw(records: Sequence[Mapping[str, Any]], out: Path, tasks: Mapping[str, str], methods: Sequence[str]) -> list[str]:
+    """Draw success, efforts and planning time, one chart each over all tasks."""
+    shown = {task: task for task in tasks}
+    success_chart(records, out / "success.png", shown, methods, title="Success")
+    for field, label, shared in (
+        ("base_effort", "base effort [m]", True),
+        ("arm_effort", "arm effort [rad]", True),
+        ("planning_time", "planning time [s]", False),
+    ):
+        means_chart(records, out / f"{field}.png", shown, methods, field=field, label=label, shared=shared)
+    about = {
+        "success": "Success, with Wilson's intervals of 95 % confidence",
+        "base_effort": "Base effort: means and standard deviations",
+        "arm_effort": "Arm effort: means and standard deviations",
+        "planning_time": "Planning time: means and standard deviations",
+    }
+    return [f"![{text}]({name}.png)" for name, text in about.items()]
+
+
+COMPARISON = Comparison("household", "Six tasks in a home", TASKS, _draw)
+
+
+def plan_trial(scene: Scene, spec: Mapping[str, Any]) -> Plan:
+    """Plan the task of one trial; see `Comparison.plan_trial`."""
+    return COMPARISON.plan_trial(scene, spec)
+
+
+def run(
+    *,
+    trials: int,
+    seed: int,
+    out: str | Path,
+    jobs: int = 1,
+    tasks: Sequence[str] = tuple(TASKS),
+    methods: Sequence[str] = METHODS,
+    save_failures: bool = False,
+    progress: bool = True,
+    solve: Solve = plan_trial,
+) -> dict[str, Any]:
+    """Run the experiment, or what is left of it, and write its results to `out`; see `Comparison.run`.
+
+    The charts are success.png, base_effort.png, arm_effort.png and planning_time.png, each with all tasks and methods.
+    """
+    how: dict[str, Any] = {"jobs": jobs, "tasks": tasks, "methods": methods, "save_failures": save_failures}
+    return COMPARISON.run(trials=trials, seed=seed, out=out, solve=solve, progress=progress, **how)

@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 from base_scenes import BLINK, MARGIN, between, distance
-from carrying import room
+from carrying import box, room
 from drawers import SHORT, changed, drawer_scene, open_scene
+from drives import hall
 from small_problems import door_scene
 
 import vkc_pin as vkc
+from vkc_pin.base_path import shortest_path
 from vkc_pin.baselines.base_ways import BaseWays, headings
 from vkc_pin.geometry import placed_shapes, standing_geometry
 from vkc_pin.scene import FLOOR
@@ -189,6 +191,20 @@ def test_the_seed_has_the_arm_at_rest() -> None:
     wall: dict[str, Any] = {"name": "wall", "type": "box", "size": [0.1, 4.6, 1.0], "position": [0.0, 0.0, 0.5]}
     problem = to(open_scene(wall), *AISLE[:2].tolist())
     assert list(BaseWays(problem, whole=True).seeds(problem, goals)) == []
+
+
+def test_through_a_gate_that_is_hardly_wider_than_the_base() -> None:
+    """0.73 m wide for 0.67 m: there is no way on a grid whose cells are larger than what is left."""
+    walls = [box(str(side), [0.2, 6.0, 1.5], [0.0, 0.09 + 3.365 * side, 0.75]) for side in (1, -1)]
+    narrow = hall(obstacles=walls).with_start(arm=np.array([1.57, -2.2, 2.5, -1.9, -1.57, 0.0]))  # the arm drawn in
+    found, goal = BaseWays(to(narrow, 1.5, 0.5, 0.0), whole=True), np.array([1.5, 0.5, 0.0])
+    assert shortest_path(found.grid, START.tolist(), goal[None]) is None
+    way = found.way(START, goal, 80)
+    assert way is not None
+    np.testing.assert_array_equal(way[-1, :2], goal[:2])
+    through = way[np.abs(way[:, 0]) < 0.3]
+    assert len(through)
+    assert np.abs(through[:, 1] - 0.09).max() < 0.04
 
 
 @pytest.mark.parametrize("yaw", [-3.0, 0.4, 7.0])

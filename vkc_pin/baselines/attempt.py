@@ -27,6 +27,7 @@ from vkc_pin.solver import RATE_TOLERANCE, solve
 from vkc_pin.step_by_step import scene_after
 from vkc_pin.steps import Actuate, GoTo, Grasp, Place, Step
 from vkc_pin.trajectory import Trajectory, join
+from vkc_pin.trust_region import CLOSE_ENOUGH
 from vkc_pin.unfold import as_trajectory
 
 __all__ = ["FINER", "Attempt", "Doable"]
@@ -161,9 +162,10 @@ class Attempt:
     def _free(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return those whose base may stand there while the arm is still as it is."""
         stay = self._problem([self._here()])
-        ends = np.tile(stay.start, (len(poses), 1))
-        ends[:, :3] = poses[:, :3]
-        return np.asarray(poses[Knots(stay, self.rng).depth(ends, stay.segments) <= 0.0])
+        ends = np.tile(stay.start, (len(poses) + 1, 1))
+        ends[:-1, :3] = poses[:, :3]
+        depth = Knots(stay, self.rng).depth(ends, stay.segments)
+        return np.asarray(poses[depth[:-1] <= min(depth[-1], CLOSE_ENOUGH)])  # the arm may be as close to the robot as it is
 
     def _withdraw(self, way: NDArray[np.float64]) -> None:
         """Move the arm along configurations, shape (K, n), to the last of them, the base stands; nothing to do if K = 0."""

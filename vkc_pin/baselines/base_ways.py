@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
@@ -19,6 +20,7 @@ from vkc_pin.steps import GoTo
 __all__ = ["BaseWays", "headings"]
 
 _STEPS, _STEP = 25, 0.08  # places of a straight way that are looked at: at least so many, and at most so far apart [m]
+_FINEST = 250  # cells along a side of a grid
 
 
 class BaseWays:
@@ -51,7 +53,16 @@ class BaseWays:
             for shape, label in zip(shapes, part.labels, strict=True)
             if shape.parentJoint == 0 and label != FLOOR
         ]
-        self.grid = BaseGrid(base, [], standing, problem.scene.arena, problem.options.dist_safe)
+        arena, margin = problem.scene.arena, problem.options.dist_safe
+        self.grid = BaseGrid(base, [], standing, arena, margin)
+        # So fine that a passage with room for the margins has a cell in its middle. If an optimisation follows, it restores them.
+        cells = int(np.clip(np.ceil(max(arena[1] - arena[0], arena[3] - arena[2]) / (2.0 * margin)), self.grid.cells, _FINEST))
+        self._finer = lambda: BaseGrid(base, [], standing, arena, 0.0 if whole else margin, cells=cells)
+
+    @cached_property
+    def finer(self) -> BaseGrid:
+        """A grid of smaller cells, for narrow passages."""
+        return self._finer()
 
     def way(self, start: NDArray[np.float64], goals: NDArray[np.float64], steps: int) -> NDArray[np.float64] | None:
         """Return poses after the start, slow at both ends, the last at a goal, shape (steps, 3); None: there is no way.
@@ -69,6 +80,8 @@ class BaseWays:
             if all(self.grid.clear(*pose) for pose in np.linspace(start, goal, places)):
                 return np.asarray(start + u * u * (3.0 - 2.0 * u) * (goal - start))
         path = shortest_path(self.grid, start.tolist(), goals)
+        if path is None:
+            path = shortest_path(self.finer, start.tolist(), goals)
         return None if path is None else along(path, steps)
 
     def seeds(self, problem: TrajectoryProblem, goals: NDArray[np.float64]) -> Iterator[Seed]:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from vkc_pin.approach import Approach
 from vkc_pin.knots import Knots, smooth
 from vkc_pin.problem import TrajectoryProblem
+from vkc_pin.trust_region import CLOSE_ENOUGH
 
 __all__ = ["at_home", "postures", "through"]
 
@@ -31,7 +32,7 @@ def postures(problem: TrajectoryProblem) -> list[NDArray[np.float64]]:
     ways += [away] if len(away) else []
     ways += [] if at_home(problem) else [np.vstack([away, home])]
     ends = np.array([way[-1] if len(way) else problem.start for way in ways])
-    free = knots.depth(ends, problem.segments) <= 0.0
+    free = knots.depth(ends, problem.segments) <= CLOSE_ENOUGH
     return [way for way, is_free in zip(ways, free, strict=True) if is_free]
 
 

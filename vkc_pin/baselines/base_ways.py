@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
-from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
@@ -57,9 +57,9 @@ class BaseWays:
         self.grid = BaseGrid(base, [], standing, arena, margin)
         # So fine that a passage with room for the margins has a cell in its middle. If an optimisation follows, it restores them.
         cells = int(np.clip(np.ceil(max(arena[1] - arena[0], arena[3] - arena[2]) / (2.0 * margin)), self.grid.cells, _FINEST))
-        self._finer = lambda: BaseGrid(base, [], standing, arena, 0.0 if whole else margin, cells=cells)
+        self._finer = functools.partial(BaseGrid, base, [], standing, arena, 0.0 if whole else margin, cells=cells)
 
-    @cached_property
+    @functools.cached_property
     def finer(self) -> BaseGrid:
         """A grid of smaller cells, for narrow passages."""
         return self._finer()

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.benchmarks import experiment
-from vkc_pin.benchmarks.charts import scale_chart
 from vkc_pin.benchmarks.record import distribution, trial
+from vkc_pin.benchmarks.scale_chart import scale_chart
 from vkc_pin.benchmarks.tables import TIMES, decimal, foot, markdown, quartiles
 from vkc_pin.errors import InputError
 from vkc_pin.plan import Plan, write_atomically

@@ -1,0 +1,95 @@
+"""The arm that is drawn in: narrower than at home, free, and the same every time."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import vkc_pin as vkc
+from vkc_pin import compact
+from vkc_pin.compact import compact_arm
+
+TASKS = {  # scene and steps, in the last phase of which something is carried
+    "nothing": ("household", [vkc.GoTo(1.0, 0.5)]),
+    "cup": ("household", [vkc.Grasp("cup"), vkc.GoTo(1.0, 0.5)]),
+    "stick": ("init_1", [vkc.Grasp("stick"), vkc.GoTo(0.0, 0.0)]),
+}
+
+
+@cache
+def problem(load: str) -> vkc.TrajectoryProblem:
+    name, steps = TASKS[load]
+    return vkc.build(vkc.load_scene(name), steps)
+
+
+def resting(load: str) -> np.ndarray:
+    chain = problem(load).chain
+    z = np.clip(np.zeros(chain.size), chain.lower, chain.upper)
+    z[3 : chain.robot.coordinates.size] = chain.robot.home
+    return z
+
+
+def with_arm(load: str, arm: np.ndarray) -> np.ndarray:
+    z = resting(load)
+    z[3 : 3 + len(arm)] = arm
+    return z
+
+
+def reach(load: str, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and highest x, y, z of what the base carries, by coal's boxes in numeric Pinocchio."""
+    chain = problem(load).chain
+    data, placed = chain.model.createData(), pin.GeometryData(chain.collision)
+    pin.updateGeometryPlacements(chain.model, data, chain.collision, placed, chain.coordinates.q(z))
+    lows, highs = [], []
+    for shape, where in zip(chain.collision.geometryObjects, placed.oMg, strict=True):
+        if shape.parentJoint > 1:
+            points = np.asarray(shape.geometry.points()) if hasattr(shape.geometry, "points") else None
+            if points is None:
+                shape.geometry.computeLocalAABB()
+                box = shape.geometry.aabb_local
+                points = np.array(np.meshgrid(*zip(box.min_, box.max_, strict=True))).reshape(3, -1).T
+            points = points @ where.rotation.T + where.translation
+            lows.append(points.min(axis=0))
+            highs.append(points.max(axis=0))
+    return np.min(lows, axis=0), np.max(highs, axis=0)
+
+
+@pytest.mark.parametrize("load", TASKS)
+def test_it_is_much_narrower_than_at_home(load: str) -> None:
+    p = problem(load)
+    arm = compact_arm(p, len(p.task.phases) - 1, resting(load))
+    low, high = reach(load, with_arm(load, arm))
+    low_home, high_home = reach(load, resting(load))
+    assert max(high[1], -low[1]) < 0.7 * max(high_home[1], -low_home[1])
+    assert low[2] > 0.1, "it is above the floor"
+    assert low[0] > -0.7, "and does not hang far over the base's ends"
+    assert high[0] < 0.7
+
+
+@pytest.mark.parametrize("load", TASKS)
+def test_it_keeps_within_limits_and_away_from_itself(load: str) -> None:
+    p = problem(load)
+    chain, robot = p.chain, p.chain.robot
+    z = with_arm(load, compact_arm(p, len(p.task.phases) - 1, resting(load)))
+    assert np.all((z >= chain.lower) & (z <= chain.upper))
+    data, shapes = robot.model.createData(), robot.collision.createData()
+    q = robot.coordinates.q(z[: robot.coordinates.size])
+    pin.computeDistances(robot.model, data, robot.collision, shapes, q)
+    assert min(result.min_distance for result in shapes.distanceResults) > p.options.dist_safe - 1e-4
+    # What is carried, too: of the pairs that move in the last phase none comes too close where nothing stands.
+    z[:2] = 50.0
+    last = np.array([p.segments])
+    assert p.contacts.evaluate(z[None], last, reach=p.options.dist_safe).violation() == 0.0
+
+
+def test_it_is_the_same_every_time() -> None:
+    p = problem("stick")
+    np.testing.assert_array_equal(compact_arm(p, 1, resting("stick")), compact_arm(p, 1, resting("stick")))
+
+
+def test_where_nothing_is_free_the_arm_stays_at_home(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compact._Body, "free", lambda _, z: np.zeros(len(z), bool))
+    np.testing.assert_array_equal(compact_arm(problem("nothing"), 0, resting("nothing")), problem("nothing").chain.robot.home)

@@ -1,0 +1,93 @@
+"""The arm drawn in over the base with what it carries, for passages that are too narrow for the robot as it is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from vkc_pin.base_body import outline
+from vkc_pin.problem import TrajectoryProblem
+
+__all__ = ["compact_arm"]
+
+_DRAWN, _ROUNDS = 256, 8  # configurations looked at in a round
+_KEPT = 8  # free ones from which the next round begins
+_SPREAD, _SHRINKS = 0.5, 0.7  # [m] and [rad] around these at first, and how that changes from round to round
+_OVERHANG, _HEIGHT, _TURN = 0.3, 0.2, 0.01  # metres of width that one before or behind the base, one up, or a radian is worth
+_LOW = 0.1  # [m] over the floor, at least
+_AWAY = 100.0  # [m] from the arena, where nothing stands
+
+
+def compact_arm(problem: TrajectoryProblem, phase: int, resting: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the arm, shape (m,) [m] and [rad], with which the robot is narrow: the best that a random search finds.
+
+    What counts is how far the arm, and what is carried, reach to either side of the base's x axis; next, how far they reach
+    beyond the base before and behind, how high, and how far the joints are from home. The robot is free of collisions with itself
+    and with what it carries. The search is the same every time.
+
+    Args:
+        problem: Whose robot it is.
+        phase: In which it carries what it carries.
+        resting: Where robot and load rest, shape (n,): what is not the arm stays so; where the base is does not matter.
+    """
+    chain, rng = problem.chain, np.random.default_rng(0)
+    arm, home = slice(3, chain.robot.coordinates.size), chain.robot.home
+    turns = np.array([problem.unit(name) == "rad" for name in chain.names[arm]])
+    lower = np.where(turns, np.maximum(chain.lower[arm], home - np.pi), chain.lower[arm])
+    upper = np.where(turns, np.minimum(chain.upper[arm], home + np.pi), chain.upper[arm])
+    body = _Body(problem, phase)
+    z = np.tile(resting, (_DRAWN, 1))
+    z[0, arm] = home
+    z[1:, arm] = rng.uniform(lower, upper, (_DRAWN - 1, len(home)))
+    best, spread = z[:1], _SPREAD
+    for _ in range(_ROUNDS):
+        z = z[np.argsort(body.price(z) + _TURN * np.abs(z[:, arm] - home).max(axis=1), kind="stable")]
+        best = z[body.free(z)][:_KEPT]
+        if not len(best):
+            return home.copy()
+        z = best[np.arange(_DRAWN) % len(best)]
+        off = spread * rng.uniform(0.0, 1.0, (_DRAWN, 1)) * rng.normal(size=(_DRAWN, len(home)))
+        off[: len(best)] = 0.0
+        z[:, arm] = np.clip(z[:, arm] + off, lower, upper)
+        spread *= _SHRINKS
+    return best[0, arm].copy()
+
+
+class _Body:
+    """What the base carries in a phase of a problem, and the base's own outline."""
+
+    def __init__(self, problem: TrajectoryProblem, phase: int) -> None:
+        self.problem, self.chain = problem, problem.chain
+        self.waypoint = int(problem.contacts.first_waypoint[phase]) + 1
+        shapes = problem.contacts.phases[phase].shapes
+        moving = [*range(len(self.chain.robot.collision.geometryObjects))]
+        moving += [i for hold in problem.task.phases[phase].held for i in self.chain.held_geometries[hold]]
+        points: dict[bool, list[NDArray[np.float64]]] = {True: [np.zeros((1, 3))], False: []}
+        joints = []
+        for i in moving:
+            corners, radius = outline(shapes[i].geometry, shapes[i].placement, outer=True)
+            corners = np.concatenate([corners - radius, corners + radius]) if radius else corners
+            points[shapes[i].parentJoint == 1].append(corners)
+            joints += [shapes[i].parentJoint] * len(corners) if shapes[i].parentJoint > 1 else []
+        base = np.concatenate(points[True])
+        self.front, self.back = base[:, 0].max(), base[:, 0].min()
+        self.points, self.joints = np.concatenate(points[False]), np.array(joints)
+
+    def price(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how far what is carried reaches, weighted as in `compact_arm`, shape (B,) [m]."""
+        rotations, translations = self.chain.joint_placements(z)
+        base = pin.SE3(rotations[0, 1], translations[0, 1])
+        at = np.einsum("bpij,pj->bpi", rotations[:, self.joints], self.points) + translations[:, self.joints]
+        at = (at - base.translation) @ base.rotation
+        (back, right, bottom), (front, left, top) = at.min(axis=1).T, at.max(axis=1).T
+        beyond = np.maximum(front - self.front, 0.0) + np.maximum(self.back - back, 0.0)
+        return np.asarray(np.maximum(left, -right) + _OVERHANG * beyond + _HEIGHT * top + 10.0 * np.maximum(_LOW - bottom, 0.0))
+
+    def free(self, z: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return at which configurations the robot keeps its clearances from itself and what it carries, shape (B,)."""
+        z = z.copy()
+        z[:, 0] = self.problem.scene.arena[1] + _AWAY
+        at = np.full(len(z), self.waypoint)
+        margin = self.problem.options.dist_safe
+        return self.problem.contacts.evaluate(z, at, reach=margin, nearest=1).shortfall(len(z)) <= 0.0

@@ -31,7 +31,7 @@ def all_at_once(scene: Scene, steps: Sequence[Step], settings: Settings) -> Plan
     whole = OneProblem(scene, steps, settings)
     if len(whole.task.steps) == 1:
         return whole.run()
-    parts = stages(scene, whole.task.steps, settings)
+    parts = stages(scene, whole.task.steps, settings, brief=True)
     plans = [plan for _, plan in parts]
     if len(parts) == 1 and len(whole.task.phases) == len(parts[0][0].task.phases):  # the other steps change nothing
         return whole.run()

@@ -27,10 +27,14 @@ class Approach:
 
     A way is the tool's: back along its approach for what it grasps or lets go of, up for what is lifted or put down, back along
     the frame's z axis for what a frame touches.
+
+    Attributes:
+        stands: Whether the base stands still meanwhile, as long as the arm alone can do it: in narrow places it has no room.
     """
 
     def __init__(self, knots: Knots) -> None:
         self.knots, self.problem, self.chain = knots, knots.problem, knots.chain
+        self.stands = False
         joint, local = self.chain.frame(self.chain.robot.tool_frame)
         self.joint, self.local = joint, local
         self.solver = _tool_solver(self.chain.model.saveToString(), joint, local.homogeneous.tobytes())
@@ -87,12 +91,16 @@ class Approach:
         for column, name in enumerate(self.chain.names[: self.knots.robot]):
             if drives or column > 2:
                 lower[column], upper[column] = self.problem.limits(name)
+        standing = np.concatenate([z[:3], lower[3:]]), np.concatenate([z[:3], upper[3:]])
         weights, found = self.knots.weights, list[NDArray[np.float64]]()
         for length in lengths:
             target = pin.SE3(tool.rotation, tool.translation + length * direction)
             start = (found[-1] if found else z)[None]
-            near, ok = self.solver.solve(start, target, lower=lower, upper=upper, weights=weights, tolerance=_TOLERANCE)
-            if not ok[0]:
+            for low, high in (standing, (lower, upper)) if self.stands else ((lower, upper),):
+                near, ok = self.solver.solve(start, target, lower=low, upper=high, weights=weights, tolerance=_TOLERANCE)
+                if ok[0]:
+                    break
+            else:
                 break
             found.append(near[0])
         return np.array(found).reshape(len(found), len(z))

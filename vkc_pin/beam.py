@@ -19,6 +19,8 @@ _APPROACH = 6  # configurations looked at on the way to a grasp
 _EASY = 0.5  # share of the beam that must go on freely for a knot to be easy
 _COLLISION, _DEPTH = 10.0, 300.0  # what a collision costs, and a metre of its depth, beside radians of motion
 _NOT_FOUND = 1e3
+_TOLERABLE = 60.0  # what the solver may be left to push apart: a graze or two
+_JUMP = 0.5  # [m] of the base from knot to knot while something fixed is held: through something, no doubt
 
 
 class Found(NamedTuple):
@@ -43,39 +45,93 @@ class Beam:
     Args:
         knots: Where configurations come from.
         routes: The ways that the base would drive; None: as if it drove straight.
+
+    Attributes:
+        careful: Whether grasps count as free only if the straight way to them is free, too, and ways of the base are those with
+            the arm drawn in: for narrow places.
     """
 
     def __init__(self, knots: Knots, routes: Routes | None = None) -> None:
         self.knots, self.problem, self.routes = knots, knots.problem, routes
-        self.width = _BEAM
+        self.width, self.backwards, self.careful = _BEAM, False, False
+        self.approaches = {
+            int(end): max(int(end) - self.problem.options.approach_waypoints, int(end) - phase.segments + 1)
+            for phase, end in zip(self.problem.task.phases, self.problem.ends, strict=True)
+            if phase.grasps
+        }
 
-    def search(self, *, thorough: bool) -> Found:
-        """Go from knot to knot, keeping the cheapest paths."""
-        self.width = _BEAM if thorough else _QUICK_BEAM
+    def search(self, *, thorough: bool, backwards: bool = False) -> Found:
+        """Go from knot to knot, keeping the cheapest paths.
+
+        Args:
+            thorough: Keep more, and shake the arms at every knot at which something fixed is held.
+            backwards: Where something fixed is held, begin where it is let go of, and go back to where it is grasped: a way may
+                be wide at its end only, and hardly anything that is free at its beginning leads there.
+        """
+        self.width, self.backwards = _BEAM if thorough else _QUICK_BEAM, backwards
         problem = self.problem
-        paths = problem.start[None, None, :]
-        cost, trouble = np.zeros(1), np.zeros(1)
-        at, begin = [0], 0
-        for number, (phase, end) in enumerate(zip(problem.task.phases, problem.ends, strict=True)):
-            closed = problem.closed(phase)
-            pieces = max(1, round((end - begin) / _SPACING)) if closed else 1
-            for knot in np.linspace(begin, end, pieces + 1).round().astype(int)[1:].tolist():
-                parents, z, bad = self._continue(paths, cost, knot, number, thorough=thorough)
-                total = cost[parents] + self._way(paths[parents, -1], z, number) + bad
-                best = np.argsort(total, kind="stable")[: self.width]
-                paths = np.concatenate([paths[parents[best]], z[best, None]], axis=1)
-                cost, trouble = total[best], (trouble[parents] + bad)[best]
-                at.append(knot)
-            if not closed and self.routes is None:
-                cost = cost + self._approach(paths[:, -2], paths[:, -1], begin, end)
-            begin = end
-        return Found(paths, cost, trouble, at)
+        found = Found(problem.start[None, None, :], np.zeros(1), np.zeros(1), [0])
+        closed = [problem.closed(phase) for phase in problem.task.phases]
+        number = begin = 0
+        while number < len(closed):
+            last = number
+            while backwards and not closed[number] and closed[last + 1 : last + 2] == [True]:
+                last += 1
+            knots, before = self._knots(number, last), found.paths.shape[1]
+            if last > number:
+                found = self._go_back(found, knots, number, thorough=thorough)
+            else:
+                for knot in knots:
+                    found = self._go_on(found, knot, number, thorough=thorough)
+            if not closed[number] and self.routes is None:
+                ends = found.paths[:, before - 1], found.paths[:, before]
+                found = found._replace(cost=found.cost + self._approach(*ends, begin, int(problem.ends[number])))
+            number, begin = last + 1, int(problem.ends[last])
+        return found
+
+    def tolerable(self, found: Found) -> bool:
+        """Return whether the cheapest path hits little and, if ways of the base count, never jumps while something is held."""
+        best = int(np.argmin(found.cost))
+        held = [self.problem.closed(self.problem.task.phases[self.problem.contacts.phase_of(knot)]) for knot in found.at[1:]]
+        jumps = np.abs(np.diff(found.paths[best, :, :2], axis=0)).max(axis=1) > _JUMP
+        return bool(found.trouble[best] <= _TOLERABLE and (self.routes is None or not np.any(jumps & held)))
+
+    def _knots(self, first: int, last: int) -> list[int]:
+        """Return the waypoints of the knots of some phases."""
+        problem, knots = self.problem, list[int]()
+        for number in range(first, last + 1):
+            begin, end = int(problem.ends[number - 1]) if number else 0, int(problem.ends[number])
+            pieces = max(1, round((end - begin) / _SPACING)) if problem.closed(problem.task.phases[number]) else 1
+            knots += np.linspace(begin, end, pieces + 1).round().astype(int)[1:].tolist()
+        return knots
+
+    def _go_on(self, found: Found, knot: int, phase: int, *, thorough: bool) -> Found:
+        """Return the cheapest paths to the next knot, to which something of a phase leads."""
+        parents, z, bad = self._continue(found.paths, found.cost, knot, phase, thorough=thorough)
+        total = found.cost[parents] + self._way(found.paths[parents, -1], z, phase) + bad
+        best = np.argsort(total, kind="stable")[: self.width]
+        paths = np.concatenate([found.paths[parents[best]], z[best, None]], axis=1)
+        return Found(paths, total[best], (found.trouble[parents] + bad)[best], [*found.at, knot])
+
+    def _go_back(self, found: Found, knots: list[int], phase: int, *, thorough: bool) -> Found:
+        """Return the cheapest paths through knots, of which all but the first are while something fixed is held after a phase."""
+        known = found.paths.shape[1]
+        found = self._go_on(found, knots[-1], phase, thorough=thorough)
+        for knot in knots[-2::-1]:
+            found = self._go_on(found, knot, phase + 1, thorough=thorough)
+        paths = np.concatenate([found.paths[:, :known], found.paths[:, : known - 1 : -1]], axis=1)
+        start, grasp, end = paths[:, known - 1], paths[:, known], paths[:, -1]
+        cost = found.cost + self._way(start, grasp, phase) - self._way(start, end, phase)
+        return Found(paths, cost, found.trouble, [*found.at[:known], *knots])
 
     def _way(self, first: NDArray[np.float64], last: NDArray[np.float64], phase: int) -> NDArray[np.float64]:
         """Return what it costs to go from `first` to `last`, both (B, n), in a phase, shape (B,)."""
         way = np.abs(last - first) * self.knots.weights
         if self.routes is not None and not self.problem.closed(self.problem.task.phases[phase]):
-            way[:, 0], way[:, 1] = self.knots.weights[0] * self.routes.distances(phase, first[:, :3], last[:, :3]), 0.0
+            way[:, 0], way[:, 1] = (
+                self.knots.weights[0] * self.routes.distances(phase, first[:, :3], last[:, :3], drawn_in=self.careful),
+                0.0,
+            )
             np.minimum(way, _NOT_FOUND, out=way)  # where there is no way, others come first
         return np.asarray(way.sum(axis=1))
 
@@ -94,13 +150,7 @@ class Beam:
                 if sum(np.count_nonzero(bad == 0) for _, _, bad in draws) >= _ENOUGH:
                     break
             parents, z, bad = (np.concatenate(parts) for parts in zip(*draws, strict=True))
-            if np.count_nonzero(bad == 0) < _ENOUGH:  # push the best of the others out of what they are in
-                price = cost[parents] + self._way(paths[parents, -1], z, phase) + bad
-                best = np.argsort(price, kind="stable")[: 2 * self.width]
-                pushed = knots.clear(z[best], waypoint)
-                parents, z = np.concatenate([parents, parents[best]]), np.concatenate([z, pushed])
-                bad = np.concatenate([bad, self._bad(pushed, np.ones(len(pushed), bool), waypoint)])
-            return parents, z, bad
+            return self._pushed(paths, cost, parents, z, bad, waypoint, phase)
         parents = np.arange(len(paths))
         z, found = knots.knot(paths[:, -1], waypoint, "track")
         if not thorough:
@@ -110,7 +160,28 @@ class Beam:
         more = np.arange(self.width * _CHILDREN - len(paths)) % len(paths)
         shaken, also = knots.knot(paths[more, -1], waypoint, "shake")
         parents, z, found = np.concatenate([parents, more]), np.concatenate([z, shaken]), np.concatenate([found, also])
-        return self._cheapest(cost[parents] + self._way(paths[parents, -1], z, phase), parents, z, found, waypoint)
+        price = cost[parents] + self._way(paths[parents, -1], z, phase)
+        parents, z, bad = self._cheapest(price, parents, z, found, waypoint)
+        return self._pushed(paths, cost, parents, z, bad, waypoint, phase) if self.backwards else (parents, z, bad)
+
+    def _pushed(
+        self,
+        paths: NDArray[np.float64],
+        cost: NDArray[np.float64],
+        parents: NDArray[np.int_],
+        z: NDArray[np.float64],
+        bad: NDArray[np.float64],
+        waypoint: int,
+        phase: int,
+    ) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64]]:
+        """Return continuations and, if few of them are free, the best of them pushed out of what they are in."""
+        if np.count_nonzero(bad == 0) >= _ENOUGH:
+            return parents, z, bad
+        price = cost[parents] + self._way(paths[parents, -1], z, phase) + bad
+        best = np.argsort(price, kind="stable")[: 2 * self.width]
+        pushed = self.knots.clear(z[best], waypoint)
+        more = self._bad(pushed, np.ones(len(pushed), bool), waypoint)
+        return np.concatenate([parents, parents[best]]), np.concatenate([z, pushed]), np.concatenate([bad, more])
 
     def _cheapest(
         self,
@@ -135,6 +206,12 @@ class Beam:
         if found.any():
             depth = self.knots.depth(z[found], waypoint)
             bad[found] = np.where(depth > 0, _COLLISION + _DEPTH * depth, 0.0)
+            if self.careful and waypoint in self.approaches and (depth <= 0).any():
+                free = np.flatnonzero(found)[depth <= 0]
+                at = self.approaches[waypoint]
+                near, reached = self.knots.knot(z[free], at, "track")
+                depth = self.knots.depth(near, at)
+                bad[free] += np.where(depth > 0, _COLLISION + _DEPTH * depth, 0.0) + _NOT_FOUND * ~reached
         return bad
 
     def _approach(self, first: NDArray[np.float64], last: NDArray[np.float64], begin: int, end: int) -> NDArray[np.float64]:

@@ -10,17 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vkc_pin.approach import Approach
-from vkc_pin.beam import Beam
-from vkc_pin.knots import Knots, follow_objects, smooth
+from vkc_pin.beam import Beam, Found
+from vkc_pin.joining import Around, Joiner, Trees
+from vkc_pin.knots import Knots, follow_objects
 from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.routes import Routes
-from vkc_pin.task import Phase
 
 __all__ = ["HOPELESS", "METHODS", "Seed", "initialize"]
 
-METHODS = ("auto", "interpolated", "astar", "stationary")
-_TOLERABLE = 60.0  # what the solver may be left to push apart: a graze or two
+METHODS = ("auto", "interpolated", "astar", "rrt", "stationary")
 _LOOKED, _FREE = 8, 0.05  # paths whose seeds are compared; shortfalls [m], summed over waypoints, that nobody looks further for
+_GROWN, _POOR = 4, 0.5  # paths along which trees grow; shortfalls with which they are asked
 HOPELESS = 2.0
 """Shortfalls of a seed, summed over its waypoints [m], with which others come first."""
 _WAVES = 6  # half waves of a perturbation over the whole motion
@@ -59,7 +59,8 @@ def initialize(
         method: "stationary": the robot stays at its start, only the objects' joints go to their goals. "interpolated":
             straight to a configuration at each goal, found by inverse kinematics from random seeds; where something fixed is
             held, the seed follows its motion. "astar": to such configurations, the base along the shortest way around what
-            stands there, heading along it. "auto": these two in turn, beginning with what is cheaper.
+            stands there, heading along it. "rrt": to such configurations, base and arm together along what two random trees find.
+            "auto": these three in turn, the last first where the others hit things.
         seed: Of the random numbers.
         count: How many different seeds to return.
         perturbation: Standard deviation of what is added to the robot's coordinates, smoothly over time, [m] and [rad].
@@ -69,24 +70,37 @@ def initialize(
     if method == "stationary":
         seeds = iter([Seed(method, follow_objects(problem, np.tile(problem.start, (problem.segments, 1))))])
     elif method == "auto":
-        seeds = _in_turn(*(_Seeds(problem, part, seed, said).seeds(count) for part in ("interpolated", "astar")))
+        routes = Routes(problem)
+        seeds = _in_turn(*(_Seeds(problem, part, seed, said, routes).seeds(count) for part in METHODS[1:4]))
     else:
-        seeds = _Seeds(problem, method, seed, said).seeds(count)
+        seeds = _Seeds(problem, method, seed, said, Routes(problem)).seeds(count)
     rng = np.random.default_rng([seed, 1])
     for item in seeds:
         yield replace(item, z=_perturbed(problem, item.z, perturbation, rng)) if perturbation else item
 
 
-def _in_turn(straight: Iterator[Seed], around: Iterator[Seed]) -> Iterator[Seed]:
-    """Yield from both in turn, first what goes straight, unless that is hopeless."""
+def _in_turn(straight: Iterator[Seed], around: Iterator[Seed], trees: Iterator[Seed]) -> Iterator[Seed]:
+    """Yield from all in turn, first what goes straight, unless that is hopeless.
+
+    Where what goes straight hits things, and so does what goes around, or does not get there, base and arm are looked for
+    together; that comes first then.
+    """
     for seed in straight:
-        if seed.shortfall > HOPELESS:
-            yield from islice(around, 1)
+        other = next(around, None) if seed.shortfall > _POOR else None
+        if seed.shortfall > _POOR and (other is None or other.shortfall > _POOR):
+            poor = sorted([seed] if other is None else [seed, other], key=lambda one: one.shortfall)
+            yield from islice(trees, 1)
+            yield poor[0]
+            yield from islice(trees, 1)
+            yield from poor[1:]
+        elif other is not None and seed.shortfall > HOPELESS:
+            yield other
             yield seed
         else:
             yield seed
-            yield from islice(around, 1)
+            yield from islice(around, 1) if other is None else [other]
     yield from around
+    yield from trees
 
 
 def _perturbed(
@@ -104,110 +118,75 @@ def _perturbed(
 class _Seeds:
     """Joins the knots of the cheapest paths."""
 
-    def __init__(self, problem: TrajectoryProblem, method: str, seed: int, notes: list[str]) -> None:
+    def __init__(self, problem: TrajectoryProblem, method: str, seed: int, notes: list[str], routes: Routes) -> None:
         self.problem, self.method, self.notes = problem, method, notes
         self.knots = Knots(problem, np.random.default_rng(seed))
-        self.routes = Routes(problem) if method == "astar" and problem.chain.robot.base != "fixed" else None
-        self.beam = Beam(self.knots, self.routes)
-        self.approach = Approach(self.knots)
+        drives = problem.chain.robot.base != "fixed"
+        self.beam = Beam(self.knots, routes if drives and method != "interpolated" else None)
+        approach = Approach(self.knots)
+        if method == "rrt":
+            approach.stands = self.beam.careful = True
+            self.joiner = Joiner(self.knots, approach, Trees(self.knots, routes))
+        else:
+            self.joiner = Joiner(self.knots, approach, Around(routes) if drives and method == "astar" else None)
 
     def seeds(self, count: int) -> Iterator[Seed]:
         """Yield seeds through the cheapest paths of knots: of one quick search if that is any good, then of thorough ones."""
         given: list[NDArray[np.float64]] = []
         for attempt in range(count + 1):
-            found = self.beam.search(thorough=attempt > 0)
-            if attempt == 0 and found.trouble[np.argmin(found.cost)] > _TOLERABLE:
+            found = self._search(attempt)
+            if found is None:
                 continue
             order = np.argsort(found.cost, kind="stable")
             cheap = order[found.cost[order] <= _DEARER * found.cost[order[0]]]
             for apart, some in ((_DIFFERENT, order), (_ELSEWHERE, cheap)):
-                new = [k for k in some if all(np.abs(found.paths[k] - other)[:, :3].max() > apart for other in given)]
-                best = self._best(found.paths, new[:_LOOKED], found.at)
-                if best is not None:
-                    index, z, short = best
-                    given.append(found.paths[index])
-                    yield Seed(self.method if len(given) == 1 else f"{self.method} {len(given)}", z, short)
+                new = [k for k in some if all(_distance(found.paths[k], other) > apart for other in given)]
+                best = self._best(found.paths, new, found.at)
+                if best is None:  # nor elsewhere: that is some of the same
+                    break
+                index, z, short = best
+                given.append(found.paths[index])
+                yield Seed(self.method if len(given) == 1 else f"{self.method} {len(given)}", z, short)
                 if len(given) == count:
                     return
+
+    def _search(self, attempt: int) -> Found | None:
+        """Return what a search finds: a quick one, then thorough ones, with trees also backwards; None if it is no good."""
+        found = self.beam.search(thorough=attempt > 0, backwards=self.method == "rrt" and attempt % 2 == 1)
+        return None if (attempt == 0 or self.method == "rrt") and not self.beam.tolerable(found) else found
 
     def _best(
         self, paths: NDArray[np.float64], candidates: list[int], at: list[int]
     ) -> tuple[int, NDArray[np.float64], float] | None:
         """Return the path, of the cheapest, whose seed has the least l1 merit, that seed and its shortfall.
 
-        The first that is free will do. None if there is no way for the base in any of them.
+        The first that is free will do, with trees the first that is nearly so. None if there is no way in any of them.
         """
-        best, least = None, np.inf
-        for index in candidates:
-            z = self._join(paths[index], at)
+        best, least, tries = None, np.inf, _LOOKED
+        if self.method == "rrt":
+            candidates, tries = self._apart(paths, candidates), _GROWN
+        for index in candidates[:tries]:
+            z = self.joiner.join(paths[index], at)
+            self.notes += [line for line in self.joiner.blocked if line not in self.notes]
             if z is None:
                 continue
             short = float(self.problem.evaluate_contacts(z, reach=self.problem.options.dist_safe).shortfall(len(z)).sum())
             merit = self.problem.objective(z) + self.problem.options.penalty * short
             if merit < least:
                 best, least = (index, z, short), merit
-            if short < _FREE:
+            if short < (_POOR if self.method == "rrt" else _FREE):
                 break
         return best
 
-    def _join(self, knots: NDArray[np.float64], at: list[int]) -> NDArray[np.float64] | None:
-        """Return waypoints through `knots`, shape (K, n), at waypoints `at`; where something fixed is held, closed."""
-        problem, size = self.problem, self.problem.chain.size
-        z = np.empty((problem.segments, size))
-        knots = knots.copy()
-        begin, previous = 0, None
-        for number, (phase, end) in enumerate(zip(problem.task.phases, problem.ends, strict=True)):
-            inside = [k for k, waypoint in enumerate(at) if begin <= waypoint <= end]
-            s = np.concatenate([[0.0], smooth(end - begin)])
-            through, when = knots[inside], [at[k] - begin for k in inside]
-            way = None
-            if not problem.closed(phase):
-                through, when, leave, arrive = self._ways(through, phase, previous, end - begin)
-                if self.routes is not None:
-                    steps = when[arrive] - when[leave]
-                    way = self.routes.way(number, through[leave, :3], through[arrive, :3], steps)
-                    if way is None:
-                        self._note_no_way(phase, through[leave], through[arrive])
-                        return None
-                    turned = way[-1, 2] - through[arrive, 2]  # by whole turns: what follows goes on from there
-                    if problem.lower[end - 1, 2] == problem.upper[end - 1, 2]:  # unless the goal says how far to turn
-                        way[:, 2] -= turned * np.arange(1, steps + 1) / steps
-                        turned = 0.0
-                    through[arrive:, 2] += turned
-                    knots[inside[-1] :, 2] += turned
-            for column in range(size):
-                z[begin:end, column] = np.interp(s[1:], s[when], through[:, column])
-            if way is not None:
-                z[begin + when[leave] : begin + when[arrive], :3] = way
-            begin, previous = int(end), phase
-        driven = self.knots.driven
-        z[:, driven] = self.knots.objects[:, driven]
-        for pose, row in enumerate(problem.transcription.structure.poses):
-            if len(row.waypoints) > 1:
-                rows = np.array(row.waypoints) - 1
-                lower, upper = problem.lower[rows].copy(), problem.upper[rows].copy()
-                lower[:, driven] = upper[:, driven] = self.knots.objects[np.ix_(rows, driven)]
-                solver, target = self.knots.solver(pose)
-                z[rows], _ = solver.solve(z[rows], target, lower=lower, upper=upper, weights=self.knots.weights, iterations=6)
-        return problem.clip(z)
+    def _apart(self, paths: NDArray[np.float64], candidates: list[int]) -> list[int]:
+        """Return candidates of which no two are alike: where no way is found to one, there is hardly one to the other."""
+        kept: list[int] = []
+        for index in candidates:
+            if all(_distance(paths[index], paths[other]) > _DIFFERENT for other in kept):
+                kept.append(index)
+        return kept
 
-    def _note_no_way(self, phase: Phase, first: NDArray[np.float64], last: NDArray[np.float64]) -> None:
-        """Note, once a phase, that the base finds no way between two configurations, shape (n,)."""
-        problem = f"{phase.name}: found no way for the base"
-        if not any(note.startswith(problem) for note in self.notes):
-            self.notes.append(f"{problem} from ({first[0]:.2f}, {first[1]:.2f}) to ({last[0]:.2f}, {last[1]:.2f})")
 
-    def _ways(
-        self, ends: NDArray[np.float64], phase: Phase, previous: Phase | None, segments: int
-    ) -> tuple[NDArray[np.float64], list[int], int, int]:
-        """Return configurations to go through from start to end of a phase, `ends`, shape (2, n), and when, counted from 0.
-
-        The last two numbers say between which of them it is neither a straight way out nor one in.
-        """
-        first = self.approach.after(ends[0], phase, previous)
-        last = self.approach.before(ends[1], phase)
-        steps = self.problem.options.approach_waypoints
-        spacing = max(1, min(steps, segments // (2 * max(len(first) + len(last), 1))))
-        when = [0, *(spacing * (1 + k) for k in range(len(first)))]
-        when += [*(segments - spacing * (len(last) - k) for k in range(len(last))), segments]
-        return np.vstack([ends[:1], first, last, ends[1:]]), when, len(first), len(first) + 1
+def _distance(path: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    """Return by how much the base differs somewhere between two paths, both (K, n) [m] or [rad]."""
+    return float(np.abs(path - other)[:, :3].max())

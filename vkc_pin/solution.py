@@ -49,6 +49,7 @@ class Solution:
         z: z_1..z_N, shape (N, n), the best iterate.
         converged: Whether the loop ended by its own criteria.
         status: "converged", "not converged", "time limit" or "interrupted".
+        merit: The ℓ1 merit where the loop ended: objective and weighted shortfalls of clearances.
         rounds, iterations: Of the outer loop and of Ipopt.
         timings: Seconds in "coal", "casadi" (evaluating functions) and "ipopt" (all the rest of it).
         history: One `Iteration` per round.
@@ -57,6 +58,7 @@ class Solution:
     z: NDArray[np.float64]
     converged: bool = False
     status: str = "not converged"
+    merit: float = float("nan")
     rounds: int = 0
     iterations: int = 0
     timings: dict[str, float] = field(default_factory=lambda: {"coal": 0.0, "casadi": 0.0, "ipopt": 0.0})

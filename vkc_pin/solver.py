@@ -230,6 +230,7 @@ def solve(
     solution = loop.solution
     with interruptible() as interrupt:
         _iterate(loop, callback, interrupt, loop.options.max_outer if rounds is None else rounds)
+    solution.merit = loop.objective + loop.options.penalty * float(loop.shortfall.sum())
     if interrupt.pressed:  # whichever way the loop ended, nothing else is to be tried
         solution.status = "interrupted"
     return solution

@@ -21,6 +21,8 @@ from vkc_pin.world import World
 
 __all__ = ["joined", "scene_after", "stages", "step_by_step", "summed"]
 
+_ROUNDS = 10  # of the solver from one seed: what takes more has mostly run into a dead end
+
 
 def step_by_step(scene: Scene, steps: Sequence[Step], settings: Settings) -> Plan:
     """Plan every step from where the one before it ends, and join the motions; it ends at the first step that fails.
@@ -34,15 +36,24 @@ def step_by_step(scene: Scene, steps: Sequence[Step], settings: Settings) -> Pla
     return joined(scene, steps, settings, [plan for _, plan in stages(scene, steps, settings)])
 
 
-def stages(scene: Scene, steps: Sequence[Step], settings: Settings) -> list[tuple[OneProblem, Plan]]:
-    """Plan every step that changes something from where the one before it ends, up to the first that fails."""
+def stages(scene: Scene, steps: Sequence[Step], settings: Settings, *, brief: bool = False) -> list[tuple[OneProblem, Plan]]:
+    """Plan every step that changes something from where the one before it ends, up to the first that fails.
+
+    Args:
+        scene: Robot, objects and obstacles.
+        steps: What should change in the world.
+        settings: How to plan; the time limit is for all steps together.
+        brief: Whether to give up soon on all but the first: where the next cannot be done from where a step led, all seeds fail.
+    """
+    options = dataclasses.replace(settings.options, max_restarts=1, max_outer=min(settings.options.max_outer, _ROUNDS))
     current, spent = scene, 0.0
     parts: list[tuple[OneProblem, Plan]] = []
     for step in steps:
         if not compile_task(current, [step], settings.options, nothing=True).phases:
             continue
         left = None if settings.time_limit is None else max(settings.time_limit - spent, 1e-3)
-        one = OneProblem(current, [step], dataclasses.replace(settings, time_limit=left))
+        chosen = options if brief and parts else settings.options
+        one = OneProblem(current, [step], dataclasses.replace(settings, options=chosen, time_limit=left))
         parts.append((one, one.run()))
         if not parts[-1][1].success:
             break

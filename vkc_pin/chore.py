@@ -29,7 +29,7 @@ __all__ = ["plan_chore"]
 
 _SINGLE = 3  # searches, from different random numbers, for a motion of one more action
 _TRIES = 4  # searches, from different random numbers, for a motion of what is in the window
-_ROUNDS = 10  # of the solver from one seed: what takes more has mostly run into a dead end, and other seeds are at hand
+_ROUNDS = 16  # of the solver from one seed: what takes more has mostly run into a dead end, and other seeds are at hand
 _BACK = 3  # how often, in all, what has been decided is given up since what follows cannot be done
 _FINER = 1.6  # times as many waypoints in every search but the first
 _NOTHING = Piece((), (), (), "")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import NDArray
 
 from vkc_pin.base_body import outline
@@ -12,7 +11,7 @@ from vkc_pin.problem import TrajectoryProblem
 __all__ = ["compact_arm"]
 
 _DRAWN, _ROUNDS = 256, 8  # configurations looked at in a round
-_KEPT = 8  # free ones from which the next round begins
+_KEPT, _LOOKED = 8, 32  # free ones from which the next round begins; how many are looked at in one go for them
 _SPREAD, _SHRINKS = 0.5, 0.7  # [m] and [rad] around these at first, and how that changes from round to round
 _OVERHANG, _HEIGHT, _TURN = 0.3, 0.2, 0.01  # metres of width that one before or behind the base, one up, or a radian is worth
 _LOW = 0.1  # [m] over the floor, at least
@@ -43,7 +42,7 @@ def compact_arm(problem: TrajectoryProblem, phase: int, resting: NDArray[np.floa
     best, spread = z[:1], _SPREAD
     for _ in range(_ROUNDS):
         z = z[np.argsort(body.price(z) + _TURN * np.abs(z[:, arm] - home).max(axis=1), kind="stable")]
-        best = z[body.free(z)][:_KEPT]
+        best = body.free(z, _KEPT)
         if not len(best):
             return home.copy()
         z = best[np.arange(_DRAWN) % len(best)]
@@ -63,31 +62,37 @@ class _Body:
         shapes = problem.contacts.phases[phase].shapes
         moving = [*range(len(self.chain.robot.collision.geometryObjects))]
         moving += [i for hold in problem.task.phases[phase].held for i in self.chain.held_geometries[hold]]
-        points: dict[bool, list[NDArray[np.float64]]] = {True: [np.zeros((1, 3))], False: []}
-        joints = []
+        points: dict[int, list[NDArray[np.float64]]] = {1: [np.zeros((1, 3))]}
         for i in moving:
             corners, radius = outline(shapes[i].geometry, shapes[i].placement, outer=True)
             corners = np.concatenate([corners - radius, corners + radius]) if radius else corners
-            points[shapes[i].parentJoint == 1].append(corners)
-            joints += [shapes[i].parentJoint] * len(corners) if shapes[i].parentJoint > 1 else []
-        base = np.concatenate(points[True])
+            points.setdefault(shapes[i].parentJoint, []).append(corners)
+        base = np.concatenate(points.pop(1))
         self.front, self.back = base[:, 0].max(), base[:, 0].min()
-        self.points, self.joints = np.concatenate(points[False]), np.array(joints)
+        self.points = {joint: np.concatenate(corners).T for joint, corners in points.items()}
 
     def price(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return how far what is carried reaches, weighted as in `compact_arm`, shape (B,) [m]."""
         rotations, translations = self.chain.joint_placements(z)
-        base = pin.SE3(rotations[0, 1], translations[0, 1])
-        at = np.einsum("bpij,pj->bpi", rotations[:, self.joints], self.points) + translations[:, self.joints]
-        at = (at - base.translation) @ base.rotation
-        (back, right, bottom), (front, left, top) = at.min(axis=1).T, at.max(axis=1).T
+        turned = rotations[0, 1].T @ rotations
+        moved = (translations - translations[0, 1]) @ rotations[0, 1]
+        at = np.concatenate(
+            [turned[:, joint] @ points + moved[:, joint, :, None] for joint, points in self.points.items()], axis=2
+        )
+        (back, right, bottom), (front, left, top) = at.min(axis=2).T, at.max(axis=2).T
         beyond = np.maximum(front - self.front, 0.0) + np.maximum(self.back - back, 0.0)
         return np.asarray(np.maximum(left, -right) + _OVERHANG * beyond + _HEIGHT * top + 10.0 * np.maximum(_LOW - bottom, 0.0))
 
-    def free(self, z: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return at which configurations the robot keeps its clearances from itself and what it carries, shape (B,)."""
-        z = z.copy()
-        z[:, 0] = self.problem.scene.arena[1] + _AWAY
-        at = np.full(len(z), self.waypoint)
-        margin = self.problem.options.dist_safe
-        return self.problem.contacts.evaluate(z, at, reach=margin, nearest=1).shortfall(len(z)) <= 0.0
+    def free(self, z: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+        """Return the first `count` configurations at which the robot keeps its clearances from itself and what it carries."""
+        found = z[:0]
+        for begin in range(0, len(z), _LOOKED):
+            part = z[begin : begin + _LOOKED]
+            away = part.copy()
+            away[:, 0] = self.problem.scene.arena[1] + _AWAY
+            margin = self.problem.options.dist_safe
+            contacts = self.problem.contacts.evaluate(away, np.full(len(part), self.waypoint), reach=margin, nearest=1)
+            found = np.concatenate([found, part[contacts.shortfall(len(part)) <= 0.0]])
+            if len(found) >= count:
+                break
+        return found[:count]

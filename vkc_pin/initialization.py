@@ -36,11 +36,13 @@ class Seed:
         name: The method, and the number of the try if it is not the first.
         z: z_1..z_N, shape (N, n).
         shortfall: By how much waypoints fall short of their clearances, summed [m]; NaN if nobody looked.
+        radius: How far the solver believes planes at first, shape (N,); None: as usual.
     """
 
     name: str
     z: NDArray[np.float64]
     shortfall: float = float("nan")
+    radius: NDArray[np.float64] | None = None
 
 
 def initialize(
@@ -71,7 +73,9 @@ def initialize(
         seeds = iter([Seed(method, follow_objects(problem, np.tile(problem.start, (problem.segments, 1))))])
     elif method == "auto":
         routes = Routes(problem)
-        seeds = _in_turn(*(_Seeds(problem, part, seed, said, routes).seeds(count) for part in METHODS[1:4]))
+        straight, around = (_Seeds(problem, part, seed, said, routes) for part in ("interpolated", "astar"))
+        trees = _Seeds(problem, "rrt", seed, said, routes, like=around)
+        seeds = _in_turn(straight.seeds(count), around.seeds(count), trees.seeds(max(count, 2)))
     else:
         seeds = _Seeds(problem, method, seed, said, Routes(problem)).seeds(count)
     rng = np.random.default_rng([seed, 1])
@@ -89,10 +93,10 @@ def _in_turn(straight: Iterator[Seed], around: Iterator[Seed], trees: Iterator[S
         other = next(around, None) if seed.shortfall > _POOR else None
         if seed.shortfall > _POOR and (other is None or other.shortfall > _POOR):
             poor = sorted([seed] if other is None else [seed, other], key=lambda one: one.shortfall)
-            yield from islice(trees, 1)
-            yield poor[0]
-            yield from islice(trees, 1)
-            yield from poor[1:]
+            for good in trees:
+                yield good
+                poor = [replace(one, shortfall=max(one.shortfall, 2 * HOPELESS)) for one in poor]
+            yield from poor
         elif other is not None and seed.shortfall > HOPELESS:
             yield other
             yield seed
@@ -118,8 +122,18 @@ def _perturbed(
 class _Seeds:
     """Joins the knots of the cheapest paths."""
 
-    def __init__(self, problem: TrajectoryProblem, method: str, seed: int, notes: list[str], routes: Routes) -> None:
-        self.problem, self.method, self.notes = problem, method, notes
+    def __init__(
+        self,
+        problem: TrajectoryProblem,
+        method: str,
+        seed: int,
+        notes: list[str],
+        routes: Routes,
+        *,
+        like: _Seeds | None = None,
+    ) -> None:
+        self.problem, self.method, self.notes, self.like = problem, method, notes, like
+        self.found: Found | None = None
         self.knots = Knots(problem, np.random.default_rng(seed))
         drives = problem.chain.robot.base != "fixed"
         self.beam = Beam(self.knots, routes if drives and method != "interpolated" else None)
@@ -152,8 +166,11 @@ class _Seeds:
 
     def _search(self, attempt: int) -> Found | None:
         """Return what a search finds: a quick one, then thorough ones, with trees also backwards; None if it is no good."""
-        found = self.beam.search(thorough=attempt > 0, backwards=self.method == "rrt" and attempt % 2 == 1)
-        return None if (attempt == 0 or self.method == "rrt") and not self.beam.tolerable(found) else found
+        found = self.like.found if attempt == 0 and self.like is not None else None
+        if found is None:
+            found = self.beam.search(thorough=attempt > 0, backwards=self.method == "rrt" and attempt % 2 == 1)
+        self.found = found if self.beam.tolerable(found) else None
+        return self.found if attempt == 0 or self.method == "rrt" else found
 
     def _best(
         self, paths: NDArray[np.float64], candidates: list[int], at: list[int]

@@ -175,7 +175,7 @@ class OneProblem:
                 solution = self._solve(problem, seed, deadline, rounds=1)
                 if solution.status == "time limit" and self._leading is not None:
                     break
-                scored.append((solution.merit, number, dataclasses.replace(seed, z=solution.z)))
+                scored.append((solution.merit, number, dataclasses.replace(seed, z=solution.z, radius=solution.radius)))
                 self._leading = min(scored)[-1]
                 if solution.status == "interrupted":
                     raise KeyboardInterrupt
@@ -183,7 +183,7 @@ class OneProblem:
         yield from seeds
 
     def _solve(self, problem: TrajectoryProblem, seed: Seed, deadline: float, *, rounds: int | None = None) -> Solution:
-        solution = solve(problem, seed.z, callback=self.settings.callback, deadline=deadline, rounds=rounds)
+        solution = solve(problem, seed.z, callback=self.settings.callback, deadline=deadline, rounds=rounds, radius=seed.radius)
         self.rounds += solution.rounds
         self.iterations += solution.iterations
         for key, value in solution.timings.items():

@@ -50,6 +50,7 @@ class Solution:
         converged: Whether the loop ended by its own criteria.
         status: "converged", "not converged", "time limit" or "interrupted".
         merit: The ℓ1 merit where the loop ended: objective and weighted shortfalls of clearances.
+        radius: How far planes were believed in the end, shape (N,).
         rounds, iterations: Of the outer loop and of Ipopt.
         timings: Seconds in "coal", "casadi" (evaluating functions) and "ipopt" (all the rest of it).
         history: One `Iteration` per round.
@@ -59,6 +60,7 @@ class Solution:
     converged: bool = False
     status: str = "not converged"
     merit: float = float("nan")
+    radius: NDArray[np.float64] | None = None
     rounds: int = 0
     iterations: int = 0
     timings: dict[str, float] = field(default_factory=lambda: {"coal": 0.0, "casadi": 0.0, "ipopt": 0.0})

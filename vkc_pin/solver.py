@@ -44,6 +44,8 @@ NEARLY_FREE = 0.01  # [m] shortfall of clearance below which limits on rates cou
 POSE_TOLERANCE = 1e-4  # [m] and [rad]
 RATE_TOLERANCE = 1e-4  # relative
 DRIFT = 0.9  # of what a grasp may drift between waypoints
+SETTLING = 0.1  # relative decrease of the objective below which a motion that is nearly free is first made free
+HOPELESS_ROUNDS, HOPELESS = 6, 0.1  # after so many rounds, motions that fall short by so much [m] are given up
 WORTHWHILE = 0.05  # relative decrease of the objective for which a feasible motion is improved further
 PENALTY_GROWTH, PENALTY_LIMIT = 4.0, 2000.0
 
@@ -216,6 +218,7 @@ def solve(
     callback: Callable[[Iteration], None] | None = None,
     deadline: float = np.inf,
     rounds: int | None = None,
+    radius: NDArray[np.float64] | None = None,
 ) -> Solution:
     """Return the trajectory that the witness-plane loop reaches from `seed`.
 
@@ -225,20 +228,25 @@ def solve(
         callback: Called after every round.
         deadline: Value of `time.perf_counter()` at which to stop with the best iterate.
         rounds: At most so many rounds; None: `Options.max_outer`.
+        radius: How far planes are believed at first, shape (N,): `Solution.radius` where another solution goes on.
     """
     loop = _Loop(problem, seed, deadline)
     solution = loop.solution
     with interruptible() as interrupt:
-        _iterate(loop, callback, interrupt, loop.options.max_outer if rounds is None else rounds)
+        region = TrustRegion(problem.segments, radius)
+        _iterate(loop, region, callback, interrupt, loop.options.max_outer if rounds is None else rounds)
+    solution.radius = region.radius
     solution.merit = loop.objective + loop.options.penalty * float(loop.shortfall.sum())
     if interrupt.pressed:  # whichever way the loop ended, nothing else is to be tried
         solution.status = "interrupted"
     return solution
 
 
-def _iterate(loop: _Loop, callback: Callable[[Iteration], None] | None, interrupt: Interrupt, rounds: int) -> None:
+def _iterate(
+    loop: _Loop, region: TrustRegion, callback: Callable[[Iteration], None] | None, interrupt: Interrupt, rounds: int
+) -> None:
     """Run rounds until everything holds, nothing helps any more, or time is up."""
-    solution, started, region = loop.solution, time.perf_counter(), TrustRegion(loop.problem.segments)
+    solution, started = loop.solution, time.perf_counter()
     feasible: NDArray[np.float64] | None = None
     for _ in range(rounds):
         if time.perf_counter() > loop.deadline:
@@ -275,6 +283,10 @@ def _iterate(loop: _Loop, callback: Callable[[Iteration], None] | None, interrup
             solution.status = solution.status if solution.converged else "interrupted"
             break
         region.adapt(before, trial, accepted, ratio)
+        if accepted and gain < SETTLING and loop.shortfall.max() < NEARLY_FREE:
+            region.settle(loop.shortfall)
+        if solution.rounds >= HOPELESS_ROUNDS and loop.shortfall.max() > HOPELESS:
+            break
         if region.stuck(trial, loop.shortfall):
             if loop.penalty >= PENALTY_LIMIT:
                 break

@@ -19,6 +19,7 @@ _EXTENT = 1.0  # [rad] by which a tree grows at most towards what is drawn
 _CHUNK = 6  # configurations looked at in one go: what lies behind the first that is blocked is of no use
 _TRIES = 1500
 _GRAZE = 0.8  # share of a margin that may be missing: the solver pushes that apart
+_RUNS = 0.4  # share of tries in which a tree is to reach a free part of the way
 _GUIDED, _SHAKEN = 0.7, 0.4  # shares of bases drawn on the way, not around its ends, and of arms drawn around what is likely
 _BESIDE, _AROUND, _WILD = (0.1, 0.1, 0.15), (0.4, 0.4, 0.5), 0.6  # standard deviations [m, m, rad] and [rad]
 _SHORTCUTS = 60  # how often it is tried to go straight between places on the way
@@ -80,6 +81,7 @@ class _Search:
         self.weights = _weights(self.size)
         limits = np.array([problem.limits(name) for name in problem.chain.names[: self.size]])
         self.lower, self.upper = limits.T
+        self.runs = self._runs()
 
     def run(self, ends: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Return the way to one of `ends`."""
@@ -90,8 +92,12 @@ class _Search:
         direct = [*ends]
         for number in range(_TRIES):
             tree, other = (trees[0], trees[1]) if direct or number % 2 else (trees[1], trees[0])
-            goal, extent = (direct.pop(0), np.inf) if direct else (self._draw(start, ends), _EXTENT)
-            node = self._grow(tree, goal, extent)
+            if direct:
+                node = self._grow(tree, direct.pop(0), np.inf)
+            elif self.rng.random() < _RUNS and len(tree.runs) < len(self.runs):
+                node = self._grow_to_run(tree)
+            else:
+                node = self._grow(tree, self._draw(start, ends), _EXTENT)
             if node is None:
                 continue
             met = self._grow(other, tree.nodes[node], np.inf)
@@ -99,6 +105,36 @@ class _Search:
                 there, back = (node, met) if tree is trees[0] else (met, node)
                 return self._shortened(np.concatenate([trees[0].path(there), trees[1].path(back)[-2::-1]]))
         return None
+
+    def _runs(self) -> list[NDArray[np.float64]]:
+        """Return the parts of the way that are free with each of the arms, each shape (R, m)."""
+        runs = []
+        for arm in self.arms:
+            rows = np.clip(np.column_stack([self.poses, np.tile(arm, (len(self.poses), 1))]), self.lower, self.upper)
+            between = (rows[1:] + rows[:-1]) / 2
+            free = self._depth(np.concatenate([rows, between])) <= self.allowed
+            begin = None
+            for k in range(len(rows)):
+                if begin is None and free[k]:
+                    begin = k
+                if begin is not None and (k + 1 == len(rows) or not (free[len(rows) + k] and free[k + 1])):
+                    runs.append(rows[begin : k + 1])
+                    begin = None
+        return runs
+
+    def _grow_to_run(self, tree: _Tree) -> int | None:
+        """Let a tree grow towards a free part of the way, and take in all of it if it gets there."""
+        number = int(self.rng.choice([k for k in range(len(self.runs)) if k not in tree.runs]))
+        rows = self.runs[number]
+        at = int(self.rng.integers(len(rows)))
+        node = self._grow(tree, rows[at], np.inf)
+        if node is not None and np.array_equal(tree.nodes[node], rows[at]):
+            tree.runs.add(number)
+            for side in (rows[at + 1 :], rows[:at][::-1]):
+                parent = node
+                for row in side:
+                    parent = tree.add(row, parent)
+        return node
 
     def _draw(self, start: NDArray[np.float64], ends: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return a configuration near the way, or near its beginning or end."""
@@ -164,6 +200,7 @@ class _Tree:
 
     def __init__(self, roots: NDArray[np.float64], weights: NDArray[np.float64]) -> None:
         self.nodes, self.parents, self.weights = roots.copy(), [-1] * len(roots), weights
+        self.runs: set[int] = set()
 
     def nearest(self, goal: NDArray[np.float64]) -> int:
         return int(np.argmin(np.linalg.norm((self.nodes - goal) * self.weights, axis=1)))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 __all__ = ["Step", "TrustRegion"]
 
 BLOCK = 10  # waypoints that share a radius
-FIRST_RADIUS, RESTART_RADIUS, MIN_RADIUS, SHRINK = 0.5, 0.2, 5e-3, 0.4  # [m] and [rad]
+FIRST_RADIUS, RESTART_RADIUS, SETTLE_RADIUS, MIN_RADIUS, SHRINK = 0.5, 0.2, 0.05, 5e-3, 0.4  # [m] and [rad]
 NO_MATTER = 2e-3  # [m] of shortfall, summed over a block, that does not matter
 CLOSE_ENOUGH = 5e-4  # [m] shortfall of clearance at a waypoint that is none
 
@@ -38,9 +38,9 @@ class TrustRegion:
         radius: Of each waypoint, shape (N,) [m] and [rad].
     """
 
-    def __init__(self, segments: int) -> None:
+    def __init__(self, segments: int, radius: NDArray[np.float64] | None = None) -> None:
         self.block = np.arange(segments) * max(1, round(segments / BLOCK)) // segments
-        self.radius = np.full(segments, FIRST_RADIUS)
+        self.radius = np.full(segments, FIRST_RADIUS) if radius is None else radius.copy()
 
     def adapt(self, before: NDArray[np.float64], trial: Step, accepted: bool, ratio: float) -> None:
         """Widen blocks where what was promised came true, narrow those where it did not.
@@ -65,6 +65,11 @@ class TrustRegion:
         radius = np.array([self.radius[self.block == b][0] for b in range(blocks)])
         radius = np.where(worse, SHRINK * np.minimum(radius, step), radius * factor)
         self.radius = np.maximum(radius, 1e-6)[self.block]
+
+    def settle(self, shortfall: NDArray[np.float64]) -> None:
+        """Let waypoints near those that fall short, shape (N,) [m], move so little that planes are as good as distances."""
+        bad = np.isin(self.block, self.block[shortfall > CLOSE_ENOUGH])
+        self.radius[bad] = np.minimum(self.radius[bad], SETTLE_RADIUS)
 
     def stuck(self, trial: Step, shortfall: NDArray[np.float64]) -> bool:
         """Return whether nothing moves any more where something is in the way."""

@@ -358,7 +358,7 @@ def test_one_program_serves_all_problems_of_a_structure() -> None:
     [
         ([Actuate("door", {"hinge": 1.2})], dataclasses.replace(OPTIONS, move_waypoints=4)),
         ([Actuate("door", {"hinge": 1.2})], dataclasses.replace(OPTIONS, contact_slots=3)),
-        ([Actuate("door", {"hinge": 1.2})], dataclasses.replace(OPTIONS, velocity_weight_base=2.0)),
+        ([Actuate("door", {"hinge": 1.2})], dataclasses.replace(OPTIONS, velocity_weight_base=3.0)),
         ([Actuate("door", {"hinge": 1.2})], dataclasses.replace(OPTIONS, acceleration_weight=2.0)),
         ([Actuate("door", {"hinge": 1.2})], dataclasses.replace(OPTIONS, dt=0.1)),
         ([Actuate("door", {"hinge": 1.2}, attachment="handle_free")], OPTIONS),

@@ -12,7 +12,8 @@ from vkc_pin.routes import Routes
 
 __all__ = ["Beam", "Found"]
 
-_DRAWS, _ENOUGH = 2, 12  # how often random seeds are drawn until so many of what they lead to are free
+_DRAWS, _ENOUGH = 6, 60  # how often random seeds are drawn until so many are free: good grasps are rare
+_FEW = 12  # free configurations at a knot with which none are pushed out of collisions
 _BEAM, _QUICK_BEAM, _CHILDREN = 40, 24, 4  # configurations kept per knot, and tried from each for the next
 _SPACING = 4  # waypoints between knots along a phase in which something is held
 _APPROACH = 6  # configurations looked at on the way to a grasp
@@ -21,6 +22,7 @@ _COLLISION, _DEPTH = 10.0, 300.0  # what a collision costs, and a metre of its d
 _NOT_FOUND = 1e3
 _TOLERABLE = 60.0  # what the solver may be left to push apart: a graze or two
 _JUMP = 0.5  # [m] of the base from knot to knot while something fixed is held: through something, no doubt
+_DRIVING = 2.0  # how many times more than in `Knots.weights` the base's way counts: on it hangs which side is gone to
 
 
 class Found(NamedTuple):
@@ -126,12 +128,12 @@ class Beam:
 
     def _way(self, first: NDArray[np.float64], last: NDArray[np.float64], phase: int) -> NDArray[np.float64]:
         """Return what it costs to go from `first` to `last`, both (B, n), in a phase, shape (B,)."""
-        way = np.abs(last - first) * self.knots.weights
+        weights = self.knots.weights.copy()
+        weights[:2] *= _DRIVING
+        way = np.abs(last - first) * weights
         if self.routes is not None and not self.problem.closed(self.problem.task.phases[phase]):
-            way[:, 0], way[:, 1] = (
-                self.knots.weights[0] * self.routes.distances(phase, first[:, :3], last[:, :3], drawn_in=self.careful),
-                0.0,
-            )
+            distances = self.routes.distances(phase, first[:, :3], last[:, :3], drawn_in=self.careful)
+            way[:, 0], way[:, 1] = weights[0] * distances, 0.0
             np.minimum(way, _NOT_FOUND, out=way)  # where there is no way, others come first
         return np.asarray(way.sum(axis=1))
 
@@ -175,7 +177,7 @@ class Beam:
         phase: int,
     ) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64]]:
         """Return continuations and, if few of them are free, the best of them pushed out of what they are in."""
-        if np.count_nonzero(bad == 0) >= _ENOUGH:
+        if np.count_nonzero(bad == 0) >= _FEW:
             return parents, z, bad
         price = cost[parents] + self._way(paths[parents, -1], z, phase) + bad
         best = np.argsort(price, kind="stable")[: 2 * self.width]

@@ -51,9 +51,9 @@ class Options:
     move_waypoints: int = 30
     dist_safe: float = 0.02
     grasp_clearance: float = 0.005
-    velocity_weight_base: float = 5.0
+    velocity_weight_base: float = 2.0
     velocity_weight_heading: float = 0.3
-    velocity_weight_holding: float = 40.0
+    velocity_weight_holding: float = 10.0
     velocity_weight_arm: float = 1.0
     velocity_weight_object: float = 0.1
     acceleration_weight: float = 0.3

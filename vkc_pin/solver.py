@@ -44,7 +44,7 @@ NEARLY_FREE = 0.01  # [m] shortfall of clearance below which limits on rates cou
 POSE_TOLERANCE = 1e-4  # [m] and [rad]
 RATE_TOLERANCE = 1e-4  # relative
 DRIFT = 0.9  # of what a grasp may drift between waypoints
-SETTLING = 0.1  # relative decrease of the objective below which a motion that is nearly free is first made free
+SETTLING = 0.2  # relative decrease of the objective below which a motion that is nearly free is first made free
 HOPELESS_ROUNDS, HOPELESS = 6, 0.1  # after so many rounds, motions that fall short by so much [m] are given up
 WORTHWHILE = 0.05  # relative decrease of the objective for which a feasible motion is improved further
 PENALTY_GROWTH, PENALTY_LIMIT = 4.0, 2000.0
@@ -284,7 +284,7 @@ def _iterate(
             break
         region.adapt(before, trial, accepted, ratio)
         if accepted and gain < SETTLING and loop.shortfall.max() < NEARLY_FREE:
-            region.settle(loop.shortfall)
+            region.settle()
         if solution.rounds >= HOPELESS_ROUNDS and loop.shortfall.max() > HOPELESS:
             break
         if region.stuck(trial, loop.shortfall):

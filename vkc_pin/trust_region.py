@@ -66,10 +66,9 @@ class TrustRegion:
         radius = np.where(worse, SHRINK * np.minimum(radius, step), radius * factor)
         self.radius = np.maximum(radius, 1e-6)[self.block]
 
-    def settle(self, shortfall: NDArray[np.float64]) -> None:
-        """Let waypoints near those that fall short, shape (N,) [m], move so little that planes are as good as distances."""
-        bad = np.isin(self.block, self.block[shortfall > CLOSE_ENOUGH])
-        self.radius[bad] = np.minimum(self.radius[bad], SETTLE_RADIUS)
+    def settle(self) -> None:
+        """Let waypoints move so little that planes are as good as distances."""
+        self.radius = np.minimum(self.radius, SETTLE_RADIUS)
 
     def stuck(self, trial: Step, shortfall: NDArray[np.float64]) -> bool:
         """Return whether nothing moves any more where something is in the way."""

@@ -69,13 +69,20 @@ def test_what_is_returned_and_what_it_took(
 
     part = SimpleNamespace(task=SimpleNamespace(phases=(1,)), piece=lambda: None)
     monkeypatch.setattr(module, "OneProblem", One)
-    monkeypatch.setattr(module, "stages", lambda *_: [(part, p) for p in plans])
+    brief: list[bool] = []
+
+    def stages(*_: Any, **keywords: Any) -> list[tuple[Any, vkc.Plan]]:
+        brief.append(keywords.get("brief", False))
+        return [(part, p) for p in plans]
+
+    monkeypatch.setattr(module, "stages", stages)
     monkeypatch.setattr(
         module, "joined", lambda *_: fake(joined or "never", 0.5 + sum(p.metrics["planning_time"] for p in plans))
     )
     settings = Settings("auto", vkc.Options(), None, 100.0, 0, 0.0)
     result = module.all_at_once(None, [], settings)  # type: ignore[arg-type]
     assert result.status == status
+    assert brief == [True]  # where steps lead is a seed only: no long time for what may be a dead end
     assert not queue
     assert result.metrics["planning_time"] == pytest.approx(spent)
     assert result.metrics["own"] == own  # what is no time stays that of the plan that is returned

@@ -8,10 +8,12 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from drives import hall
+from hypothesis import given
+from hypothesis import strategies as st
 from small_problems import SHORT, door_scene
 
 import vkc_pin as vkc
-from vkc_pin.initialization import METHODS, Seed, _in_turn, initialize
+from vkc_pin.initialization import _POOR, HOPELESS, METHODS, Seed, _in_turn, initialize
 from vkc_pin.knots import scatter
 
 OPENED = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20)
@@ -154,30 +156,71 @@ def test_nothing_to_scatter() -> None:
     assert scatter(free, middle, np.random.default_rng(0)) is None
 
 
-@pytest.mark.parametrize(
-    ("straight", "around", "expected"),
-    [
-        ([0.0, 0.0], 2, "s0 S0 a0 A0 s1 S1 a1 A1"),  # each is looked for (s) when the one before it has been taken (S)
-        ([np.nan], 1, "s0 S0 a0 A0"),  # nobody looked
-        ([9.0, 0.0], 2, "s0 a0 A0 S0 s1 S1 a1 A1"),  # what is hopeless comes second
-        ([9.0], 0, "s0 S0"),
-        ([0.0, 0.0, 0.0], 1, "s0 S0 a0 A0 s1 S1 s2 S2"),
-        ([0.0], 3, "s0 S0 a0 A0 a1 A1 a2 A2"),
-        ([], 2, "a0 A0 a1 A1"),
-        ([], 0, ""),
-    ],
-)
-def test_straight_and_around_take_turns(straight: list[float], around: int, expected: str) -> None:
-    said: list[str] = []
+class Looked:
+    """Stands for three searches; says what is looked for (s0), and what came to be taken (S0)."""
 
-    def looked_for(kind: str, shortfalls: list[float]) -> Iterator[Seed]:
+    def __init__(self, straight: list[float], around: list[float], trees: list[float]) -> None:
+        self.said: list[str] = []
+        kinds = {"s": straight, "a": around, "t": trees}
+        for seed in _in_turn(*(self._seeds(kind, shortfalls) for kind, shortfalls in kinds.items())):
+            self.said.append(seed.name.upper())
+
+    def _seeds(self, kind: str, shortfalls: list[float]) -> Iterator[Seed]:
         for number, shortfall in enumerate(shortfalls):
-            said.append(f"{kind}{number}")
+            self.said.append(f"{kind}{number}")
             yield Seed(f"{kind}{number}", np.zeros((1, 1)), shortfall)
 
-    for seed in _in_turn(looked_for("s", straight), looked_for("a", [0.0] * around)):
-        said.append(seed.name.upper())
-    assert said == expected.split()
+
+FINE, POOR, LOST = 0.9 * _POOR, 1.1 * _POOR, 1.1 * HOPELESS
+
+
+@pytest.mark.parametrize(
+    ("straight", "around", "trees", "expected"),
+    [
+        # What goes straight is good: the others are looked for (s) when what was before them has been taken (S).
+        ([0.0, 0.0], [0.0, 0.0], [], "s0 S0 a0 A0 s1 S1 a1 A1"),
+        ([np.nan], [0.0], [], "s0 S0 a0 A0"),  # nobody looked
+        ([0.0, 0.0, 0.0], [0.0], [], "s0 S0 a0 A0 s1 S1 s2 S2"),
+        ([0.0], [0.0, 0.0, 0.0], [], "s0 S0 a0 A0 a1 A1 a2 A2"),
+        ([], [0.0, 0.0], [], "a0 A0 a1 A1"),
+        ([], [], [], ""),
+        ([FINE], [LOST], [0.0], "s0 S0 a0 A0 t0 T0"),  # trees last
+        ([], [0.0, 0.0], [0.0, 0.0], "a0 A0 a1 A1 t0 T0 t1 T1"),
+        ([], [], [0.0, 0.0], "t0 T0 t1 T1"),
+        # What goes straight hits things, what goes around does not: second, if it is hopeless.
+        ([LOST, 0.0], [0.0, 0.0], [], "s0 a0 A0 S0 s1 S1 a1 A1"),
+        ([LOST, 0.0], [0.0, 0.0], [0.0], "s0 a0 A0 S0 s1 S1 a1 A1 t0 T0"),
+        ([POOR, 0.0], [0.0, 0.0], [0.0], "s0 a0 S0 A0 s1 S1 a1 A1 t0 T0"),
+        ([LOST], [np.nan], [0.0], "s0 a0 A0 S0 t0 T0"),
+        # Both do, or there is no way around: trees first, then the better of the two, then trees again.
+        ([POOR], [LOST], [0.0, 0.0, 0.0], "s0 a0 t0 T0 S0 t1 T1 A0 t2 T2"),
+        ([LOST], [POOR], [0.0, 0.0, 0.0], "s0 a0 t0 T0 A0 t1 T1 S0 t2 T2"),
+        ([LOST], [], [0.0, 0.0], "s0 t0 T0 S0 t1 T1"),
+        ([LOST, LOST], [LOST, POOR], [0.0], "s0 a0 t0 T0 S0 A0 s1 a1 A1 S1"),  # of equals, what goes straight
+        ([LOST, LOST], [LOST, LOST], [], "s0 a0 S0 A0 s1 a1 S1 A1"),
+        # Trees are asked again wherever the next two are poor as well, and not where one of them is good.
+        ([LOST, LOST], [POOR, 0.0], [0.0, 0.0, 0.0], "s0 a0 t0 T0 A0 t1 T1 S0 s1 a1 A1 S1 t2 T2"),
+        ([LOST, LOST], [POOR], [0.0, 0.0, 0.0, 0.0], "s0 a0 t0 T0 A0 t1 T1 S0 s1 t2 T2 S1 t3 T3"),
+        ([POOR, POOR, POOR], [], [], "s0 S0 s1 S1 s2 S2"),
+    ],
+)
+def test_straight_around_and_trees_take_turns(
+    straight: list[float], around: list[float], trees: list[float], expected: str
+) -> None:
+    assert Looked(straight, around, trees).said == expected.split()
+
+
+@given(*(st.lists(st.sampled_from([0.0, FINE, POOR, LOST, np.nan]), max_size=5) for _ in range(3)))
+def test_every_seed_is_yielded_once_and_none_before_it_is_looked_for(
+    straight: list[float], around: list[float], trees: list[float]
+) -> None:
+    said = Looked(straight, around, trees).said
+    seeds = [f"{kind}{k}" for kind, found in (("s", straight), ("a", around), ("t", trees)) for k in range(len(found))]
+    assert sorted(said) == sorted([*seeds, *map(str.upper, seeds)])
+    assert all(said.index(name) < said.index(name.upper()) for name in seeds)
+    for kind in "SAT":
+        own = [name for name in said if name[0] == kind]
+        assert own == sorted(own), "each search's best comes first"
 
 
 def test_the_base_turns_on_the_way_and_not_in_the_last_step() -> None:

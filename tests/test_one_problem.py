@@ -34,6 +34,7 @@ class Race:
         after: Of what one round leads to, and the solver's status.
         finally_: Of what all rounds lead to, and the status.
         shortfalls: Of the seeds.
+        collisions: What the solver left of the seeds' collisions after a round, as the merit weighs it.
         events: What happened: "b" a seed was asked for, "b1" it was given one round, "b*" all of them.
     """
 
@@ -46,8 +47,9 @@ class Race:
         finally_: dict[str, Answer] | None = None,
         shortfalls: Sequence[float] = (),
         amounts: Sequence[float] = (),
+        collisions: dict[str, float] | None = None,
     ) -> None:
-        self.heights, self.after, self.finally_ = heights, after or {}, finally_ or {}
+        self.heights, self.after, self.finally_, self.collisions = heights, after or {}, finally_ or {}, collisions or {}
         self.shortfalls, self.amounts = shortfalls or [0.0] * len(heights), iter(amounts or [1.0] * 20)
         self.events: list[str] = []
         self.given: list[np.ndarray] = []
@@ -84,7 +86,8 @@ class Race:
             callback(ROUND)
         timings = {"coal": 0.5, "casadi": 0.25, "ipopt": 0.125}
         solved = z if height is None else self.z(problem, name, height)
-        return Solution(solved, status == "converged", status, rounds=1, iterations=5, timings=timings, history=[ROUND])
+        merit = problem.objective(solved) + self.collisions.get(name, 0.0)
+        return Solution(solved, status == "converged", status, merit, rounds=1, iterations=5, timings=timings, history=[ROUND])
 
     def validate(self, scene: vkc.Scene, steps: Any, trajectory: vkc.Trajectory, options: vkc.Options) -> vkc.Report:
         amount = next(self.amounts)
@@ -125,6 +128,22 @@ def test_the_seed_that_looks_best_after_a_round_goes_first(
     plan = race.run()
     assert race.events == expected.split()
     assert plan.status == "not converged"
+
+
+@pytest.mark.parametrize(
+    ("heights", "collisions", "expected"),
+    [
+        ([1.0, 2.0, 3.0], {"a": 1e3}, "a a1 b b1 c c1 b* c* a*"),  # the smoothest hits something
+        ([1.0, 2.0, 3.0], {"a": 1e3, "b": 1e3, "c": 1e3}, "a a1 b b1 c c1 a* b* c*"),
+        ([1.0, 2.0, 3.0], {"a": 1e3, "b": 2e3, "c": 5e2}, "a a1 b b1 c c1 c* a* b*"),
+    ],
+)
+def test_what_still_collides_after_a_round_counts_in_the_race(
+    heights: list[float], collisions: dict[str, float], expected: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    race = Race(monkeypatch, heights, collisions=collisions)
+    race.run()
+    assert race.events == expected.split()
 
 
 @pytest.mark.parametrize(

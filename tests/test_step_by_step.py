@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
+from types import SimpleNamespace
+
 import numpy as np
 import pinocchio as pin
+import pytest
 from carrying import STICK, Script, above, carried_over, lifted, moved_base, room, table, tool_at
+from drives import hall
 from small_problems import full_scene
 
+from vkc_pin import step_by_step as module
 from vkc_pin.hold import Hold
+from vkc_pin.one_problem import Settings
+from vkc_pin.options import Options
 from vkc_pin.scene import Scene
 from vkc_pin.step_by_step import scene_after
+from vkc_pin.steps import GoTo
 from vkc_pin.task import Task
 from vkc_pin.trajectory import PhaseSpan, Trajectory
 
@@ -108,3 +118,31 @@ def test_what_is_held_through_another_thing_stays_there() -> None:
     assert (dict(after.held), dict(after.held_by)) == ({"stick": "grip", "ball": "pull"}, {"ball": "stick.tip"})
     assert after.held_at["ball"] == tuple(values)
     assert after.holds == holds
+
+
+@pytest.mark.parametrize("brief", [False, True])
+def test_in_brief_all_steps_but_the_first_give_up_soon(brief: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first step's start is given, so that what it takes is worth while; where others start may be a dead end."""
+    given: list[tuple[object, Options]] = []
+
+    class One:
+        def __init__(self, scene: Scene, steps: Sequence[GoTo], settings: Settings) -> None:
+            self.scene, self.step, self.task = scene, steps[0], holding()
+            given.append((steps[0], settings.options))
+
+        def run(self) -> SimpleNamespace:
+            motion = ending(self.scene, [self.step.x, self.step.y, 0.0], self.scene.start[3:])
+            return SimpleNamespace(success=True, trajectory=motion, metrics={"planning_time": 1.0})
+
+    monkeypatch.setattr(module, "OneProblem", One)
+    steps = [GoTo(0.0, 0.0, 0.0), GoTo(1.0, 0.0), GoTo(2.0, 0.0), GoTo(3.0, 0.0)]
+    for rounds in (16, 4):
+        given.clear()
+        usual = Options(max_restarts=3, max_outer=rounds)
+        parts = module.stages(hall(), steps, Settings("auto", usual, None, None, 0, 0.0), brief=brief)
+        assert len(parts) == len(given) == 4
+        assert [step for step, _ in given] == steps
+        assert given[0][1] == usual
+        for _, options in given[1:]:
+            soon = dataclasses.replace(usual, max_restarts=1, max_outer=min(rounds, 10))
+            assert options == (soon if brief else usual)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from functools import cache
 
 import numpy as np
@@ -47,7 +48,7 @@ def length(path: np.ndarray) -> float:
 def finely(path: np.ndarray, apart: float = 0.02) -> np.ndarray:
     """Return configurations on the straight pieces of a path, at most so far apart [rad]."""
     rows = [path[:1]]
-    for a, b in zip(path[:-1], path[1:], strict=True):
+    for a, b in itertools.pairwise(path):
         count = max(1, int(np.ceil(np.abs((b - a) * METRE).max() / apart)))
         rows.append(a + np.arange(1, count + 1)[:, None] / count * (b - a))
     return np.vstack(rows)
@@ -108,17 +109,20 @@ def test_there_is_no_way_to_what_is_walled_in(pose: tuple[float, float, float], 
         assert connect(problem, 0, problem.start, at(problem, pose)[None], poses=poses, arms=arms, rng=rng) is None
 
 
-def test_with_what_is_allowed_to_graze_at_least_one_end_is_tried() -> None:
-    """A goal that is closer to something than the margins leave is where one is sent."""
-    problem, guide, arms = gate()
-    end = at(problem, (1.895 - 0.49, 1.5, np.pi / 2))
-    end[3:] = arms[1]
-    by = [end + [x, *np.zeros(SIZE - 1)] for x in np.linspace(-0.3, 0.3, 121)]
-    short = missing(problem, np.array(by))
-    near = by[int(np.argmax(short > GRAZE * problem.options.dist_safe))]
-    assert GRAZE * problem.options.dist_safe < missing(problem, near[None])[0] < 0.03
-    path = connect(problem, 0, problem.start, near[None], poses=np.array([near[:3]]), arms=arms, rng=np.random.default_rng(0))
-    assert path is None or np.array_equal(path[-1], near)
+def test_of_ends_that_are_all_too_close_to_something_the_least_is_tried() -> None:
+    """A goal that is a little closer than may be is where one is sent; one in the wall is not."""
+    problem, _, arms = gate()
+    there, allowed = np.array([*at(problem, (1.895 - 0.49, 1.5, np.pi / 2))[:3], *arms[1]]), GRAZE * problem.options.dist_safe
+    towards = np.tile(there, (241, 1))
+    towards[:, 0] += np.linspace(-0.3, 0.3, 241)
+    short = missing(problem, towards)
+    near = towards[int(np.argmax(short > allowed))]
+    assert allowed < missing(problem, near[None])[0] < allowed + 3e-3
+    ends, poses = np.array([towards[-1], near]), np.array([problem.start[:3], near[:3]])
+    path = connect(problem, 0, problem.start, ends, poses=poses, arms=arms, rng=np.random.default_rng(0))
+    assert path is not None
+    np.testing.assert_array_equal(path[[0, -1]], [problem.start, near])
+    assert missing(problem, finely(path)).max() <= allowed + HIDDEN
 
 
 def test_who_is_there_already_stays() -> None:
@@ -167,7 +171,7 @@ def test_equal_random_numbers_give_equal_ways() -> None:
 
 def test_what_is_shortened_is_not_longer(monkeypatch: pytest.MonkeyPatch) -> None:
     """The trees are the same: they are grown before."""
-    for seed in range(6):
+    for seed in range(3):
         short = through(seed)
         with monkeypatch.context() as patch:
             patch.setattr(trees, "_SHORTCUTS", 0)
@@ -189,7 +193,7 @@ PATHS = st.integers(1, 6).flatmap(
 
 def walk(path: np.ndarray, far: float) -> np.ndarray:
     """Return where one is after so much of a path [rad]."""
-    for a, b in zip(path[:-1], path[1:], strict=True):
+    for a, b in itertools.pairwise(path):
         piece = length(np.array([a, b]))
         if far <= piece:
             return np.asarray(a + (far / piece if piece > 0.0 else 0.0) * (b - a))

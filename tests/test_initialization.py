@@ -3,16 +3,19 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 import pytest
 from drives import hall
+from gates import GOAL, NARROW, gated
 from hypothesis import given
 from hypothesis import strategies as st
 from small_problems import SHORT, door_scene
 
 import vkc_pin as vkc
+from vkc_pin import joining
 from vkc_pin.initialization import _POOR, HOPELESS, METHODS, Seed, _in_turn, initialize
 from vkc_pin.knots import scatter
 
@@ -240,3 +243,80 @@ def test_what_costs_nothing_has_a_seed() -> None:
     with np.errstate(all="raise"):
         (seed,) = initialize(problem, "interpolated", 0)
     assert np.abs(seed.z - problem.start).max() < 1e-9
+
+
+# --- through narrow places -----------------------------------------------------------------------------------------------
+
+
+def test_trees_make_a_seed_through_a_narrow_gate() -> None:
+    """Where the base alone finds no way with its arm at home; what is left is a graze."""
+    gate = gated(NARROW)
+    assert list(initialize(gate, "astar", 0)) == []
+    notes: list[str] = []
+    (seed,) = initialize(gate, "rrt", 0, notes=notes)
+    assert notes == []
+    assert seed.name == "rrt"
+    short = gate.evaluate_contacts(seed.z, reach=0.1).shortfall(gate.segments)
+    assert seed.shortfall == pytest.approx(short.sum(), abs=1e-9)
+    assert seed.shortfall < _POOR
+    assert short.max() < gate.options.dist_safe + 0.01
+    np.testing.assert_allclose(seed.z[-1, :3], GOAL, atol=1e-9)
+    assert np.ptp(seed.z[:, 3:9], axis=0).max() > 0.5, "the arm moves on the way"
+    (same,) = initialize(gate, "rrt", 0)
+    np.testing.assert_array_equal(seed.z, same.z)
+
+
+def test_in_turn_trees_come_first_where_the_others_hit_things() -> None:
+    found = list(initialize(gated(NARROW), "auto", 0, count=2))
+    assert [seed.name for seed in found] == ["rrt", "interpolated"]
+    assert found[0].shortfall < _POOR < found[1].shortfall
+
+
+def test_no_trees_are_grown_where_the_way_is_wide(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They take their time; they are asked last."""
+    grown: list[int] = []
+    connect = joining.connect
+
+    def watch(*given: Any, **named: Any) -> np.ndarray | None:
+        grown.append(1)
+        return connect(*given, **named)
+
+    monkeypatch.setattr(joining, "connect", watch)
+    found = initialize(gated(3.0), "auto", 0)
+    assert [next(found).name, next(found).name, len(grown)] == ["interpolated", "astar", 0]
+    assert next(found).name == "rrt"
+    assert grown
+
+
+def test_where_there_is_no_way_trees_make_no_seed() -> None:
+    notes: list[str] = []
+    assert list(initialize(gated(0.0), "rrt", 0, count=2, notes=notes)) == []
+    assert len(notes) == 1
+    plan = vkc.plan(gated(0.0).scene, [vkc.GoTo(*GOAL)], initialization="rrt")
+    assert plan.status == "infeasible"
+    assert "found no way" in plan.report()
+
+
+def test_a_motion_through_the_narrow_gate() -> None:
+    plan = vkc.plan(gated(NARROW).scene, [vkc.GoTo(*GOAL)])
+    assert plan.success, plan.report()
+    assert plan.initialization == "rrt"
+
+
+def test_trees_hold_the_handle_too() -> None:
+    chain = problem().chain
+    hinge, knob = chain.index("door.hinge"), chain.index("door.knob")
+    found = seeds("rrt", count=2)
+    assert found
+    for z in found:
+        for row in z[problem().ends[0] - 1 :]:
+            assert hand_off_the_handle(door_scene(), row, row[hinge], row[knob]) < 1e-3
+
+
+def test_the_narrow_door_is_shut_from_outside() -> None:
+    """It stands open into the bedroom: a hand at its lever is in the doorway, where the arm at home has no room."""
+    scene = vkc.load_scene("household").with_state("door", {"hinge": 1.52}).with_start(base=(1.5, -0.5, 1.57))
+    plan = vkc.plan(scene, [vkc.Grasp("door", "handle_free"), vkc.Actuate("door", {"hinge": 0.0})], seed=0)
+    assert plan.success, plan.report()
+    assert plan.trajectory.column("door.hinge")[-1] == pytest.approx(0.0, abs=1e-3)
+    assert plan.trajectory.positions[-1, 1] < 1.0  # the wall is at 1.25: it has come out

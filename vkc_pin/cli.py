@@ -131,7 +131,7 @@ def _parser() -> argparse.ArgumentParser:
     plan.add_argument("--save", metavar="FILE", help="save the plan (.npz)")
     plan.add_argument("--json", metavar="FILE", help="write trajectory, metrics and report as JSON")
     plan.add_argument("--plots", metavar="FOLDER", help="write plots")
-    plan.add_argument("--initialization", default="auto", metavar="METHOD", help="auto, interpolated, astar or stationary")
+    plan.add_argument("--initialization", default="auto", metavar="METHOD", help="auto, interpolated, astar, rrt or stationary")
     plan.add_argument("--time-limit", type=float, metavar="SECONDS", help="return the best motion found by then")
     plan.add_argument("--seed", type=natural, default=0, help="of the random numbers (default 0)")
     plan.add_argument("--quiet", action="store_true", help="no progress")

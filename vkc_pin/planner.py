@@ -38,7 +38,7 @@ def plan(
     Args:
         scene: Robot, objects and obstacles; the motion starts at the scene's start.
         steps: What should change in the world, in this order: `Reach`, `Grasp`, `Actuate`, `Touch`, `Place`, `Release`, `GoTo`.
-        initialization: "auto", "interpolated", "astar" or "stationary"; see `initialization.initialize`.
+        initialization: "auto", "interpolated", "astar", "rrt" or "stationary"; see `initialization.initialize`.
         options: How to plan; `Options()` if left out.
         callback: Called after every round of the solver with an `Iteration`, whose fields are named columns.
         time_limit: Seconds of planning after which the best iterate is returned, with status "time limit".

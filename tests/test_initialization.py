@@ -16,6 +16,7 @@ from small_problems import SHORT, door_scene
 
 import vkc_pin as vkc
 from vkc_pin import joining
+from vkc_pin.beam import Beam, Found
 from vkc_pin.initialization import _POOR, HOPELESS, METHODS, Seed, _in_turn, initialize
 from vkc_pin.knots import scatter
 
@@ -301,6 +302,37 @@ def test_a_motion_through_the_narrow_gate() -> None:
     plan = vkc.plan(gated(NARROW).scene, [vkc.GoTo(*GOAL)])
     assert plan.success, plan.report()
     assert plan.initialization == "rrt"
+
+
+@pytest.mark.parametrize(("method", "stands"), [("astar", False), ("rrt", True)])
+def test_for_trees_the_base_stands_while_the_hand_goes_straight_in(method: str, stands: bool) -> None:
+    (z,) = seeds(method)
+    reach = int(problem().ends[0])
+    last = z[reach - OPENED.approach_waypoints - 1 : reach, :3]
+    assert (np.ptp(last, axis=0).max() < 1e-6) == stands
+
+
+@pytest.mark.parametrize("method", ["interpolated", "astar", "rrt"])
+def test_searches_are_quick_first_and_for_trees_careful_and_backwards_in_turn(
+    method: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing that is found is tolerable: only for trees that is a reason not to use what a thorough search finds."""
+    asked: list[tuple[bool, bool, bool]] = []
+    search = Beam.search
+
+    def watch(beam: Beam, *, thorough: bool, backwards: bool = False) -> Found:
+        asked.append((thorough, backwards, beam.careful))
+        return search(beam, thorough=thorough, backwards=backwards)
+
+    monkeypatch.setattr(Beam, "search", watch)
+    monkeypatch.setattr(Beam, "tolerable", lambda *_: False)
+    found = seeds(method, count=2)
+    if method == "rrt":
+        assert asked == [(False, False, True), (True, True, True), (True, False, True)]
+        assert found == []
+    else:
+        assert asked[:2] == [(False, False, False), (True, False, False)]
+        assert found
 
 
 def test_trees_hold_the_handle_too() -> None:

@@ -298,3 +298,13 @@ def test_trees_of_a_fixed_base_move_the_arm_alone(monkeypatch: pytest.MonkeyPatc
     hit, grazed = (p.contacts.evaluate(z, np.ones(60, int), reach=0.1).violation() for z in (straight, way))
     assert hit > 0.05
     assert grazed < 0.8 * p.options.dist_safe + 0.02
+
+
+@pytest.mark.xfail(strict=True, reason="the turn is taken back all along the way, through what stands beside it")
+def test_a_way_of_trees_stays_free_where_the_goal_says_how_far_to_turn() -> None:
+    """The guide drives backwards through the gate, which would end a whole turn further."""
+    p = vkc.build(gated(NARROW).scene, [vkc.GoTo(*GOAL[:2], -3.1)])
+    z = joiner(p, trees(p)).join(np.array([p.start, at(p, (*GOAL[:2], -3.1))]), [0, p.segments])
+    assert z is not None
+    np.testing.assert_allclose(z[-1, 2], -3.1, atol=1e-9)
+    assert p.evaluate_contacts(z, reach=0.1).violation() < 0.8 * p.options.dist_safe + 0.02

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from gates import GOAL, NARROW, gated, walled
+from gates import GOAL, NARROW, TIGHT, gated, walled
 
 import vkc_pin as vkc
 from vkc_pin.initialization import initialize
@@ -51,8 +51,9 @@ def test_the_seed_drives_the_way_and_the_heading_follows_it() -> None:
 # --- narrow places -------------------------------------------------------------------------------------------------------
 
 
-def test_with_the_arm_drawn_in_there_is_a_way_through_a_narrow_gate() -> None:
-    problem = gated(NARROW)
+@pytest.mark.parametrize("width", [NARROW, TIGHT])
+def test_with_the_arm_drawn_in_there_is_a_way_through_a_narrow_gate(width: float) -> None:
+    problem = gated(width)
     routes, start, goal = Routes(problem), problem.start[:3], np.array(GOAL)
     home, drawn_in = (routes.distances(0, start[None], goal[None], drawn_in=each)[0] for each in (False, True))
     straight = np.hypot(*(goal - start)[:2])

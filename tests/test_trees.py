@@ -179,6 +179,7 @@ def test_what_is_shortened_is_not_longer(monkeypatch: pytest.MonkeyPatch) -> Non
         assert short is not None
         assert plain is not None
         np.testing.assert_array_equal(short[[0, -1]], plain[[0, -1]])
+        assert np.abs(np.diff(plain, axis=0)).max(axis=1).min() > 0.0, "it stops where the trees meet"
         assert length(short) <= length(plain) + 1e-9
         if seed == 0:
             assert length(short) < 0.9 * length(plain)

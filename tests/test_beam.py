@@ -96,7 +96,6 @@ def test_without_a_grasp_backwards_is_forwards() -> None:
     assert one.at == other.at == [0, gone.segments]
 
 
-@pytest.mark.xfail(strict=True, reason="backwards, what a firm hand holds is neither drawn nor kept to the grasp")
 def test_backwards_a_firm_hand_keeps_what_it_has_chosen() -> None:
     clamped(backwards=True)
 

@@ -70,6 +70,8 @@ class Beam:
             backwards: Where something fixed is held, begin where it is let go of, and go back to where it is grasped: a way may
                 be wide at its end only, and hardly anything that is free at its beginning leads there.
         """
+        # A hand that chooses where to grasp, and then does not give way, chooses before it moves anything.
+        backwards = backwards and not any(self._closed_at(grasp + 1) for _, grasp, _ in self.problem.choices)
         self.width, self.backwards = _BEAM if thorough else _QUICK_BEAM, backwards
         problem = self.problem
         found = Found(problem.start[None, None, :], np.zeros(1), np.zeros(1), [0])
@@ -94,9 +96,12 @@ class Beam:
     def tolerable(self, found: Found) -> bool:
         """Return whether the cheapest path hits little and, if ways of the base count, never jumps while something is held."""
         best = int(np.argmin(found.cost))
-        held = [self.problem.closed(self.problem.task.phases[self.problem.contacts.phase_of(knot)]) for knot in found.at[1:]]
+        held = [self._closed_at(knot) for knot in found.at[1:]]
         jumps = np.abs(np.diff(found.paths[best, :, :2], axis=0)).max(axis=1) > _JUMP
         return bool(found.trouble[best] <= _TOLERABLE and (self.routes is None or not np.any(jumps & held)))
+
+    def _closed_at(self, waypoint: int) -> bool:
+        return self.problem.closed(self.problem.task.phases[self.problem.contacts.phase_of(waypoint)])
 
     def _knots(self, first: int, last: int) -> list[int]:
         """Return the waypoints of the knots of some phases."""

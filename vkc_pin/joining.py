@@ -23,12 +23,12 @@ class Ways(Protocol):
     """Whether configurations on the straight ways in and out are left out where they hit something."""
 
     def way(
-        self, phase: int, first: NDArray[np.float64], last: NDArray[np.float64], steps: int, *, reaches: bool
+        self, phase: int, first: NDArray[np.float64], last: NDArray[np.float64], steps: int, *, turns: bool, reaches: bool
     ) -> NDArray[np.float64] | None:
         """Return `steps` rows from `first` to `last`, both (n,), of the robot's first coordinates, shape (steps, c).
 
-        The last row is as `last`, but for whole turns of the heading; without `reaches` the arm may end elsewhere. None if there
-        is no way.
+        The last row is as `last`, but with `turns` the heading may end whole turns further, and without `reaches` the arm may end
+        elsewhere. None if there is no way.
         """
 
 
@@ -41,10 +41,13 @@ class Around:
         self.routes = routes
 
     def way(
-        self, phase: int, first: NDArray[np.float64], last: NDArray[np.float64], steps: int, *, reaches: bool
+        self, phase: int, first: NDArray[np.float64], last: NDArray[np.float64], steps: int, *, turns: bool, reaches: bool
     ) -> NDArray[np.float64] | None:
         """See `Ways`."""
-        return self.routes.way(phase, first[:3], last[:3], steps)
+        way = self.routes.way(phase, first[:3], last[:3], steps)
+        if way is not None and not turns:
+            way[:, 2] -= (way[-1, 2] - last[2]) * np.arange(1, steps + 1) / steps
+        return way
 
 
 class Trees:
@@ -56,7 +59,7 @@ class Trees:
         self.knots, self.problem, self.routes = knots, knots.problem, routes
 
     def way(
-        self, phase: int, first: NDArray[np.float64], last: NDArray[np.float64], steps: int, *, reaches: bool
+        self, phase: int, first: NDArray[np.float64], last: NDArray[np.float64], steps: int, *, turns: bool, reaches: bool
     ) -> NDArray[np.float64] | None:
         """See `Ways`."""
         problem, size = self.problem, self.knots.robot
@@ -66,7 +69,11 @@ class Trees:
             if guide is None:
                 return None
             turned = 2 * np.pi * np.rint((guide[-1, 2] - last[2]) / (2 * np.pi))
-            poses, last[2] = guide, last[2] + turned
+            if turns:
+                last[2] += turned
+            else:
+                guide[:, 2] -= turned  # the trees find where there is room to turn
+            poses = guide
         arms = [first[3:size], last[3:size], problem.chain.robot.home, self.routes.compact(phase)]
         ends = np.tile(last[:size], (1 if reaches else len(arms), 1))
         if not reaches:
@@ -124,14 +131,12 @@ class Joiner:
         if self.ways is not None:
             steps = when[arrive] - when[leave]
             reaches = self.knots.pose_at(end) is not None
-            way = self.ways.way(number, through[leave], through[arrive], steps, reaches=reaches)
+            turns = problem.lower[end - 1, 2] < problem.upper[end - 1, 2]  # unless the goal says how far to turn
+            way = self.ways.way(number, through[leave], through[arrive], steps, turns=turns, reaches=reaches)
             if way is None:
                 self._note(phase, through[leave], through[arrive])
                 return False
-            turned = way[-1, 2] - through[arrive, 2]  # by whole turns: what follows goes on from there
-            if problem.lower[end - 1, 2] == problem.upper[end - 1, 2]:  # unless the goal says how far to turn
-                way[:, 2] -= turned * np.arange(1, steps + 1) / steps
-                turned = 0.0
+            turned = way[-1, 2] - through[arrive, 2]  # what follows goes on from there
             through[arrive:, 2] += turned
             knots[inside[-1] :, 2] += turned
         self._straight(z, through, when)

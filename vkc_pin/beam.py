@@ -13,6 +13,7 @@ from vkc_pin.routes import Routes
 __all__ = ["Beam", "Found"]
 
 _DRAWS, _ENOUGH = 6, 60  # how often random seeds are drawn until so many are free: good grasps are rare
+_OTHERS = 3  # the part of those kept at a grasp that need not be cheap: a third
 _FEW = 12  # free configurations at a knot with which none are pushed out of collisions
 _BEAM, _QUICK_BEAM, _CHILDREN = 40, 24, 4  # configurations kept per knot, and tried from each for the next
 _SPACING = 4  # waypoints between knots along a phase in which something is held
@@ -116,9 +117,22 @@ class Beam:
         """Return the cheapest paths to the next knot, to which something of a phase leads."""
         parents, z, bad = self._continue(found.paths, found.cost, knot, phase, thorough=thorough)
         total = found.cost[parents] + self._way(found.paths[parents, -1], z, phase) + bad
-        best = np.argsort(total, kind="stable")[: self.width]
+        best = self._kept(total, bad, knot)
         paths = np.concatenate([found.paths[parents[best]], z[best, None]], axis=1)
         return Found(paths, total[best], (found.trouble[parents] + bad)[best], [*found.at, knot])
+
+    def _kept(self, total: NDArray[np.float64], bad: NDArray[np.float64], knot: int) -> NDArray[np.int_]:
+        """Return which continuations to keep: the cheapest and, of a grasp, some of all the others that are free.
+
+        What is cheap to grasp may be what cannot be put where it is to be.
+        """
+        order = np.argsort(total, kind="stable")
+        if knot not in self.approaches or knot == self.problem.segments:
+            return order[: self.width]
+        cheap = order[: self.width]
+        rest = order[len(cheap) :][bad[order[len(cheap) :]] <= 0.0]
+        others = rest[np.linspace(0, len(rest) - 1, min(self.width // _OTHERS, len(rest))).astype(int)]
+        return np.concatenate([cheap, others])
 
     def _go_back(self, found: Found, knots: list[int], phase: int, *, thorough: bool) -> Found:
         """Return the cheapest paths through knots, of which all but the first are while something fixed is held after a phase."""
@@ -182,7 +196,7 @@ class Beam:
         phase: int,
     ) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64]]:
         """Return continuations and, if few of them are free, the best of them pushed out of what they are in."""
-        if np.count_nonzero(bad == 0) >= _FEW:
+        if np.count_nonzero(bad == 0) >= (_FEW if self._closed_at(waypoint) else _ENOUGH):
             return parents, z, bad
         price = cost[parents] + self._way(paths[parents, -1], z, phase) + bad
         best = np.argsort(price, kind="stable")[: 2 * self.width]

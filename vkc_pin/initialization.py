@@ -20,6 +20,7 @@ __all__ = ["HOPELESS", "METHODS", "Seed", "initialize"]
 
 METHODS = ("auto", "interpolated", "astar", "rrt", "stationary")
 _LOOKED, _FREE = 8, 0.05  # paths whose seeds are compared; shortfalls [m], summed over waypoints, that nobody looks further for
+_HIT = 1e4  # cost that lets paths with knots in collision come last
 _GROWN, _POOR = 4, 0.5  # paths along which trees grow; shortfalls with which they are asked
 HOPELESS = 2.0
 """Shortfalls of a seed, summed over its waypoints [m], with which others come first."""
@@ -151,7 +152,7 @@ class _Seeds:
             found = self._search(attempt)
             if found is None:
                 continue
-            order = np.argsort(found.cost, kind="stable")
+            order = np.argsort(found.cost + _HIT * (found.trouble > 0) * (self.method == "rrt"), kind="stable")
             cheap = order[found.cost[order] <= _DEARER * found.cost[order[0]]]
             for apart, some in ((_DIFFERENT, order), (_ELSEWHERE, cheap)):
                 new = [k for k in some if all(_distance(found.paths[k], other) > apart for other in given)]
@@ -167,7 +168,7 @@ class _Seeds:
     def _search(self, attempt: int) -> Found | None:
         """Return what a search finds: a quick one, then thorough ones, with trees also backwards; None if it is no good."""
         found = self.like.found if attempt == 0 and self.like is not None else None
-        if found is None:
+        if found is None or found.trouble.min() > 0:
             found = self.beam.search(thorough=attempt > 0, backwards=self.method == "rrt" and attempt % 2 == 1)
         self.found = found if self.beam.tolerable(found) else None
         return self.found if attempt == 0 or self.method == "rrt" else found

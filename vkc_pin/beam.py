@@ -122,12 +122,12 @@ class Beam:
         return Found(paths, total[best], (found.trouble[parents] + bad)[best], [*found.at, knot])
 
     def _kept(self, total: NDArray[np.float64], bad: NDArray[np.float64], knot: int) -> NDArray[np.int_]:
-        """Return which continuations to keep: the cheapest and, of a grasp, some of all the others that are free.
+        """Return which continuations to keep: the cheapest and, where a hand chooses how to grasp, some of the other free ones.
 
         What is cheap to grasp may be what cannot be put where it is to be.
         """
         order = np.argsort(total, kind="stable")
-        if knot not in self.approaches or knot == self.problem.segments:
+        if all(knot != grasp for _, grasp, _ in self.problem.choices):
             return order[: self.width]
         cheap = order[: self.width]
         rest = order[len(cheap) :][bad[order[len(cheap) :]] <= 0.0]

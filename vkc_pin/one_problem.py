@@ -175,7 +175,9 @@ class OneProblem:
                 solution = self._solve(problem, seed, deadline, rounds=1)
                 if solution.status == "time limit" and self._leading is not None:
                     break
-                scored.append((problem.objective(solution.z), number, dataclasses.replace(seed, z=solution.z, radius=solution.radius)))
+                scored.append(
+                    (problem.objective(solution.z), number, dataclasses.replace(seed, z=solution.z, radius=solution.radius))
+                )
                 self._leading = min(scored)[-1]
                 if solution.status == "interrupted":
                     raise KeyboardInterrupt

@@ -49,7 +49,6 @@ class Solution:
         z: z_1..z_N, shape (N, n), the best iterate.
         converged: Whether the loop ended by its own criteria.
         status: "converged", "not converged", "time limit" or "interrupted".
-        merit: The ℓ1 merit where the loop ended: objective and weighted shortfalls of clearances.
         radius: How far planes were believed in the end, shape (N,).
         rounds, iterations: Of the outer loop and of Ipopt.
         timings: Seconds in "coal", "casadi" (evaluating functions) and "ipopt" (all the rest of it).
@@ -59,7 +58,6 @@ class Solution:
     z: NDArray[np.float64]
     converged: bool = False
     status: str = "not converged"
-    merit: float = float("nan")
     radius: NDArray[np.float64] | None = None
     rounds: int = 0
     iterations: int = 0

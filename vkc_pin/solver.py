@@ -236,7 +236,6 @@ def solve(
         region = TrustRegion(problem.segments, radius)
         _iterate(loop, region, callback, interrupt, loop.options.max_outer if rounds is None else rounds)
     solution.radius = region.radius
-    solution.merit = loop.objective + loop.options.penalty * float(loop.shortfall.sum())
     if interrupt.pressed:  # whichever way the loop ended, nothing else is to be tried
         solution.status = "interrupted"
     return solution

@@ -156,9 +156,11 @@ class _Search:
         far = float(np.abs((goal - start) * self.weights).max())
         if far > extent:
             goal = start + (goal - start) * (extent / far)
+        if far == 0.0:
+            return near
         reached = self._along(start, goal)
         if reached <= 0.0:
-            return near if far == 0.0 else None
+            return None
         return tree.add(goal if reached == 1.0 else start + reached * (goal - start), near)
 
     def _along(self, a: NDArray[np.float64], b: NDArray[np.float64]) -> float:

@@ -165,9 +165,11 @@ class Looked:
 
     def __init__(self, straight: list[float], around: list[float], trees: list[float]) -> None:
         self.said: list[str] = []
+        self.shortfalls: dict[str, float] = {}  # as they are yielded
         kinds = {"s": straight, "a": around, "t": trees}
         for seed in _in_turn(*(self._seeds(kind, shortfalls) for kind, shortfalls in kinds.items())):
             self.said.append(seed.name.upper())
+            self.shortfalls[seed.name] = seed.shortfall
 
     def _seeds(self, kind: str, shortfalls: list[float]) -> Iterator[Seed]:
         for number, shortfall in enumerate(shortfalls):
@@ -196,15 +198,17 @@ FINE, POOR, LOST = 0.9 * _POOR, 1.1 * _POOR, 1.1 * HOPELESS
         ([LOST, 0.0], [0.0, 0.0], [0.0], "s0 a0 A0 S0 s1 S1 a1 A1 t0 T0"),
         ([POOR, 0.0], [0.0, 0.0], [0.0], "s0 a0 S0 A0 s1 S1 a1 A1 t0 T0"),
         ([LOST], [np.nan], [0.0], "s0 a0 A0 S0 t0 T0"),
-        # Both do, or there is no way around: trees first, then the better of the two, then trees again.
-        ([POOR], [LOST], [0.0, 0.0, 0.0], "s0 a0 t0 T0 S0 t1 T1 A0 t2 T2"),
-        ([LOST], [POOR], [0.0, 0.0, 0.0], "s0 a0 t0 T0 A0 t1 T1 S0 t2 T2"),
-        ([LOST], [], [0.0, 0.0], "s0 t0 T0 S0 t1 T1"),
+        # Both do, or there is no way around: first all that trees find, then the better of the two.
+        ([POOR], [LOST], [0.0, 0.0, 0.0], "s0 a0 t0 T0 t1 T1 t2 T2 S0 A0"),
+        ([LOST], [POOR], [0.0, 0.0, 0.0], "s0 a0 t0 T0 t1 T1 t2 T2 A0 S0"),
+        ([LOST], [], [0.0, 0.0], "s0 t0 T0 t1 T1 S0"),
+        ([POOR], [POOR], [LOST], "s0 a0 t0 T0 S0 A0"),  # whatever it is worth
         ([LOST, LOST], [LOST, POOR], [0.0], "s0 a0 t0 T0 S0 A0 s1 a1 A1 S1"),  # of equals, what goes straight
         ([LOST, LOST], [LOST, LOST], [], "s0 a0 S0 A0 s1 a1 S1 A1"),
-        # Trees are asked again wherever the next two are poor as well, and not where one of them is good.
-        ([LOST, LOST], [POOR, 0.0], [0.0, 0.0, 0.0], "s0 a0 t0 T0 A0 t1 T1 S0 s1 a1 A1 S1 t2 T2"),
-        ([LOST, LOST], [POOR], [0.0, 0.0, 0.0, 0.0], "s0 a0 t0 T0 A0 t1 T1 S0 s1 t2 T2 S1 t3 T3"),
+        # Once: where the next two are poor as well, or good, there is nothing left of them.
+        ([LOST, LOST], [POOR, 0.0], [0.0, 0.0], "s0 a0 t0 T0 t1 T1 A0 S0 s1 a1 A1 S1"),
+        ([LOST, LOST], [POOR], [0.0, 0.0], "s0 a0 t0 T0 t1 T1 A0 S0 s1 S1"),
+        ([0.0, LOST], [0.0, LOST], [0.0, 0.0], "s0 S0 a0 A0 s1 a1 t0 T0 t1 T1 S1 A1"),
         ([POOR, POOR, POOR], [], [], "s0 S0 s1 S1 s2 S2"),
     ],
 )
@@ -212,6 +216,31 @@ def test_straight_around_and_trees_take_turns(
     straight: list[float], around: list[float], trees: list[float], expected: str
 ) -> None:
     assert Looked(straight, around, trees).said == expected.split()
+
+
+@pytest.mark.parametrize(
+    ("straight", "around", "trees", "hopeless"),
+    [
+        ([POOR], [POOR], [0.0], "s0 a0"),
+        ([POOR], [POOR], [LOST], "s0 a0"),  # t0 is as it is
+        ([POOR], [], [0.0, 0.0], "s0"),
+        ([POOR, POOR], [POOR, 0.0], [0.0], "s0 a0"),  # the next have others beside them
+        ([POOR], [POOR], [], ""),  # trees found nothing: these are all there is
+        ([POOR], [0.0], [0.0], ""),
+        ([FINE], [POOR], [0.0], ""),
+    ],
+)
+def test_beside_what_trees_find_what_hits_things_is_hopeless(
+    straight: list[float], around: list[float], trees: list[float], hopeless: str
+) -> None:
+    """So that the solver does not begin with it."""
+    given = {f"{kind}{k}": short for kind, all_ in zip("sat", (straight, around, trees), strict=True) for k, short in enumerate(all_)}
+    yielded = Looked(straight, around, trees).shortfalls
+    assert yielded.keys() == given.keys()
+    for name in hopeless.split():
+        assert yielded[name] > HOPELESS
+    kept = given.keys() - set(hopeless.split())
+    assert {name: yielded[name] for name in kept} == {name: given[name] for name in kept}
 
 
 @given(*(st.lists(st.sampled_from([0.0, FINE, POOR, LOST, np.nan]), max_size=5) for _ in range(3)))

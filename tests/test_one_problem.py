@@ -36,6 +36,7 @@ class Race:
         shortfalls: Of the seeds.
         collisions: What the solver left of the seeds' collisions after a round, as the merit weighs it.
         events: What happened: "b" a seed was asked for, "b1" it was given one round, "b*" all of them.
+        radii: How far planes were to be believed at first, each time; None: as usual.
     """
 
     def __init__(
@@ -53,6 +54,7 @@ class Race:
         self.shortfalls, self.amounts = shortfalls or [0.0] * len(heights), iter(amounts or [1.0] * 20)
         self.events: list[str] = []
         self.given: list[np.ndarray] = []
+        self.radii: list[np.ndarray | None] = []
         self.stop: Callable[[str], None] = lambda event: None
         monkeypatch.setattr(module, "initialize", self.initialize)
         monkeypatch.setattr(module, "solve", self.solve)
@@ -75,11 +77,23 @@ class Race:
             self.note(name)
             yield Seed(name, self.z(problem, name, height), shortfall)
 
+    def radius(self, problem: vkc.TrajectoryProblem, name: str) -> np.ndarray:
+        """Return how far planes are believed after a round, as the solver says; another for every seed."""
+        return np.linspace(0.1, 0.2, problem.segments) + 0.1 * NAMES.index(name)
+
     def solve(
-        self, problem: vkc.TrajectoryProblem, z: np.ndarray, *, callback: Any, deadline: float, rounds: int | None = None
+        self,
+        problem: vkc.TrajectoryProblem,
+        z: np.ndarray,
+        *,
+        callback: Any,
+        deadline: float,
+        rounds: int | None = None,
+        radius: np.ndarray | None = None,
     ) -> Solution:
         name = NAMES[round((z[0, 8] - problem.start[8]) / MARK)]
         self.given.append(z)
+        self.radii.append(radius)
         self.note(f"{name}{rounds or '*'}")
         height, status = (self.after if rounds else self.finally_).get(name, (None, "not converged"))
         if callback is not None:
@@ -87,7 +101,8 @@ class Race:
         timings = {"coal": 0.5, "casadi": 0.25, "ipopt": 0.125}
         solved = z if height is None else self.z(problem, name, height)
         merit = problem.objective(solved) + self.collisions.get(name, 0.0)
-        return Solution(solved, status == "converged", status, merit, rounds=1, iterations=5, timings=timings, history=[ROUND])
+        solution = Solution(solved, status == "converged", status, merit, self.radius(problem, name))
+        return dataclasses.replace(solution, rounds=1, iterations=5, timings=timings, history=[ROUND])
 
     def validate(self, scene: vkc.Scene, steps: Any, trajectory: vkc.Trajectory, options: vkc.Options) -> vkc.Report:
         amount = next(self.amounts)
@@ -177,6 +192,17 @@ def test_the_first_success_ends_it_and_goes_on_from_the_race(monkeypatch: pytest
     assert plan.success
     assert plan.initialization == "b"
     np.testing.assert_array_equal(race.given[-1], race.z(race.one.problem, "b", 0.5))
+
+
+def test_raced_seeds_go_on_with_the_trust_region_that_they_had(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each with its own; those that did not race, and those of the race itself, begin as usual."""
+    race = Race(monkeypatch, [3.0, 2.0, 4.0, 1.0], shortfalls=[0.0, 0.0, 2 * HOPELESS, 0.0])
+    race.run()
+    assert race.events == ["a", "a1", "b", "b1", "c", "b*", "a*", "c*", "d", "d*"]
+    radii = dict(zip([event for event in race.events if len(event) == 2], race.radii, strict=True))
+    assert [name for name, radius in radii.items() if radius is None] == ["a1", "b1", "c*", "d*"]
+    for name in ("b*", "a*"):
+        np.testing.assert_array_equal(radii[name], race.radius(race.one.problem, name[0]))
 
 
 def test_rounds_of_the_race_count(monkeypatch: pytest.MonkeyPatch) -> None:

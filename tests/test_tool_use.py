@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pinocchio as pin
@@ -10,6 +10,7 @@ import pytest
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks.initialization import TARGET
+from vkc_pin.initialization import Seed
 from vkc_pin.one_problem import OneProblem, Settings
 from vkc_pin.pieces import seed_of
 from vkc_pin.step_by_step import scene_after, stages
@@ -22,9 +23,8 @@ def start(seed: int = 5) -> vkc.Scene:
 
 
 @cache
-def plan(attachment: str = "grip", seed: int = 5) -> vkc.Plan:
-    steps = [vkc.Grasp("stick", attachment), vkc.Touch("stick.tip", TARGET)]
-    return vkc.plan(start(seed), steps, initialization="astar")
+def plan() -> vkc.Plan:
+    return vkc.plan(start(), [vkc.Grasp("stick", "grip"), vkc.Touch("stick.tip", TARGET)], initialization="astar")
 
 
 def tip(scene: vkc.Scene, row: np.ndarray, trajectory: vkc.Trajectory) -> np.ndarray:
@@ -48,17 +48,39 @@ def test_the_tip_reaches_its_target_to_a_millimetre() -> None:
 
 
 def test_grasping_anywhere_costs_less_than_at_one_place() -> None:
-    efforts = []
+    """From one motion, that found with the fixed grasp: what is minimised (eq. 1) falls further if the grasp may move.
+
+    Searches from random seeds promise nothing of the kind for one start: either may end in a local minimum. And as the solver
+    stops where a round saves little, going on with the fixed grasp saves something, too.
+    """
+    settings, saved = Settings("astar", vkc.Options(), None, None, 0, 0.0), []
     for seed in range(5, 10):
-        anywhere, fixed = plan(seed=seed), plan("end", seed)
-        assert anywhere.success, anywhere.report()
-        assert fixed.success, fixed.report()
-        slide = anywhere.trajectory.column("stick.grip_slide")
-        turn = anywhere.trajectory.column("stick.grip_turn")
-        assert abs(slide[-1]) > 5e-3 or abs(turn[-1]) > 5e-2  # it makes use of it
-        efforts.append([p.trajectory.base_effort() + p.trajectory.arm_effort() for p in (anywhere, fixed)])
-    some, one = np.median(efforts, axis=0)  # of single starts either may end in a local minimum
-    assert some < 0.97 * one
+        fixed, again, anywhere = (
+            OneProblem(start(seed), [vkc.Grasp("stick", name), vkc.Touch("stick.tip", TARGET)], settings)
+            for name in ("end", "end", "grip")
+        )
+        found = fixed.run()
+        assert found.success, found.report()
+        before = fixed.problem.objective(fixed.z)
+        more, better = (one.run(partial(going_on, fixed)) for one in (again, anywhere))
+        for motion in (more, better):
+            assert motion.success, motion.report()
+            assert motion.initialization == "as with the fixed grasp"
+        same = going_on(fixed, anywhere.problem).z
+        assert anywhere.problem.pose_error(same) < 1e-3
+        assert anywhere.problem.objective(same) == pytest.approx(before, rel=1e-9)
+        slide, turn = (better.trajectory.column(f"stick.grip_{name}")[-1] for name in ("slide", "turn"))
+        assert abs(slide) > 5e-3 or abs(turn) > 5e-2, "it makes no use of it"
+        assert anywhere.problem.objective(anywhere.z) < 0.97 * before
+        saved.append(anywhere.problem.objective(anywhere.z) / again.problem.objective(again.z))
+    assert np.median(saved) < 0.97
+
+
+def going_on(fixed: OneProblem, problem: vkc.TrajectoryProblem) -> Seed:
+    """Return the motion found with the fixed grasp, which is the middle of all: 0 along and about the stick."""
+    z = np.zeros((problem.segments, problem.chain.size))
+    z[:, [problem.chain.index(name) for name in fixed.problem.chain.names]] = fixed.z
+    return Seed("as with the fixed grasp", z)
 
 
 def test_one_problem_costs_less_than_step_after_step() -> None:

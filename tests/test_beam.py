@@ -105,11 +105,25 @@ def test_forwards_a_firm_hand_keeps_what_it_has_chosen() -> None:
     clamped(backwards=False)
 
 
-def clamped(*, backwards: bool) -> None:
+def gripping(*, firm: bool) -> vkc.TrajectoryProblem:
+    """Return the problem of opening the door with a hand that may tilt, or that only chooses how far it does."""
     scene = door_scene()
-    tilting = dataclasses.replace(scene.objects["door"].object.attachment("handle_free"), name="clamped", firm=True)
+    tilting = dataclasses.replace(scene.objects["door"].object.attachment("handle_free"), name="tilted", firm=firm)
     scene = with_objects(scene, {"door": with_attachment(scene.objects["door"], tilting)})
-    p = vkc.build(scene, [dataclasses.replace(OPEN, attachment="clamped")], options=FEW)
+    return vkc.build(scene, [dataclasses.replace(OPEN, attachment="tilted")], options=FEW)
+
+
+@pytest.mark.parametrize("firm", [False, True])
+def test_a_hand_that_chooses_and_does_not_give_way_does_so_before_it_moves_anything(firm: bool) -> None:
+    """For it backwards is forwards; for one that gives way it is not."""
+    p = gripping(firm=firm)
+    assert bool(p.choices) == firm
+    one, other = (Beam(Knots(p, np.random.default_rng(0))).search(thorough=True, backwards=back) for back in (False, True))
+    assert np.array_equal(one.paths, other.paths) == firm
+
+
+def clamped(*, backwards: bool) -> None:
+    p = gripping(firm=True)
     ((column, grasp, last),) = p.choices
     found = Beam(Knots(p, np.random.default_rng(0))).search(thorough=True, backwards=backwards)
     held = [k for k, waypoint in enumerate(found.at) if grasp <= waypoint <= last]

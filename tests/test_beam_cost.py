@@ -64,6 +64,24 @@ def scattered(monkeypatch: pytest.MonkeyPatch, share: float) -> int:
     return draws.count("scatter")
 
 
+@pytest.mark.parametrize(("free", "pushed"), [(0, True), (11, True), (12, False), (48, False)])
+def test_where_a_few_are_free_none_are_pushed(monkeypatch: pytest.MonkeyPatch, free: int, pushed: bool) -> None:
+    """However many more are drawn: pushing takes longer."""
+    search, called = beam(), list[int]()
+
+    def clear(z: NDArray[np.float64], waypoint: int) -> NDArray[np.float64]:
+        called.append(len(z))
+        return z
+
+    monkeypatch.setattr(search.knots, "clear", clear)
+    z, bad = np.tile(search.problem.start, (96, 1)), np.where(np.arange(96) < free, 0.0, 50.0)
+    paths, parents = search.problem.start[None, None], np.zeros(96, int)
+    grasp = int(search.problem.ends[0])
+    _, after, _ = search._pushed(paths, np.zeros(1), parents, z, bad, grasp, 0)
+    assert bool(called) == pushed
+    assert len(after) == 96 + sum(called)
+
+
 @pytest.mark.parametrize(("share", "least", "most"), [(1.0, 1, 2), (0.25, 3, 4), (0.0, 6, 6)])
 def test_grasps_are_drawn_until_enough_are_free(monkeypatch: pytest.MonkeyPatch, share: float, least: int, most: int) -> None:
     assert least <= scattered(monkeypatch, share) <= most

@@ -9,13 +9,13 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from drives import hall
-from gates import GOAL, NARROW, gated
+from gates import GOAL, NARROW, TIGHT, gated
 from hypothesis import given
 from hypothesis import strategies as st
 from small_problems import SHORT, door_scene
 
 import vkc_pin as vkc
-from vkc_pin import joining
+from vkc_pin import initialization, joining
 from vkc_pin.beam import Beam, Found
 from vkc_pin.initialization import _POOR, HOPELESS, METHODS, Seed, _in_turn, initialize
 from vkc_pin.knots import scatter
@@ -234,7 +234,9 @@ def test_beside_what_trees_find_what_hits_things_is_hopeless(
     straight: list[float], around: list[float], trees: list[float], hopeless: str
 ) -> None:
     """So that the solver does not begin with it."""
-    given = {f"{kind}{k}": short for kind, all_ in zip("sat", (straight, around, trees), strict=True) for k, short in enumerate(all_)}
+    given = {
+        f"{kind}{k}": short for kind, all_ in zip("sat", (straight, around, trees), strict=True) for k, short in enumerate(all_)
+    }
     yielded = Looked(straight, around, trees).shortfalls
     assert yielded.keys() == given.keys()
     for name in hopeless.split():
@@ -278,9 +280,10 @@ def test_what_costs_nothing_has_a_seed() -> None:
 # --- through narrow places -----------------------------------------------------------------------------------------------
 
 
-def test_trees_make_a_seed_through_a_narrow_gate() -> None:
+@pytest.mark.parametrize("width", [NARROW, TIGHT])
+def test_trees_make_a_seed_through_a_narrow_gate(width: float) -> None:
     """Where the base alone finds no way with its arm at home; what is left is a graze."""
-    gate = gated(NARROW)
+    gate = gated(width)
     assert list(initialize(gate, "astar", 0)) == []
     notes: list[str] = []
     (seed,) = initialize(gate, "rrt", 0, notes=notes)
@@ -291,7 +294,8 @@ def test_trees_make_a_seed_through_a_narrow_gate() -> None:
     assert seed.shortfall < _POOR
     assert short.max() < gate.options.dist_safe + 0.01
     np.testing.assert_allclose(seed.z[-1, :3], GOAL, atol=1e-9)
-    assert np.ptp(seed.z[:, 3:9], axis=0).max() > 0.5, "the arm moves on the way"
+    if width == TIGHT:  # in the other gate the arm at home just fits, if it may graze
+        assert np.ptp(seed.z[:, 3:9], axis=0).max() > 0.5, "the arm moves on the way"
     (same,) = initialize(gate, "rrt", 0)
     np.testing.assert_array_equal(seed.z, same.z)
 
@@ -362,6 +366,75 @@ def test_searches_are_quick_first_and_for_trees_careful_and_backwards_in_turn(
     else:
         assert asked[:2] == [(False, False, False), (True, False, False)]
         assert found
+
+
+class Watched:
+    """Notes what beams find: for ways of the base alone, and, with care, for trees."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.found: list[tuple[str, Found]] = []
+        search = Beam.search
+
+        def watch(beam: Beam, *, thorough: bool, backwards: bool = False) -> Found:
+            found = search(beam, thorough=thorough, backwards=backwards)
+            kind = "rrt" if beam.careful else "interpolated" if beam.routes is None else "astar"
+            self.found.append((kind, found))
+            return found
+
+        monkeypatch.setattr(Beam, "search", watch)
+
+    @property
+    def kinds(self) -> list[str]:
+        return [kind for kind, _ in self.found]
+
+
+def grasps(found: Found) -> np.ndarray:
+    """Return where the robot may stand and have its arm when it grasps, shape (B, 9)."""
+    return found.paths[:, found.at.index(int(problem().ends[0])), :9]
+
+
+def test_in_turn_trees_first_lead_to_what_was_found_for_the_base_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One search less, where what it found is any good."""
+    watched = Watched(monkeypatch)
+    found = initialize(problem(), "auto", 0)
+    assert [next(found).name, next(found).name] == ["interpolated", "astar"]
+    assert "astar" in watched.kinds
+    before = len(watched.found)
+    first = next(found)
+    assert first.name == "rrt"
+    assert len(watched.found) == before
+    taken = grasps(next(each for kind, each in watched.found[::-1] if kind == "astar"))
+    assert np.abs(taken - first.z[int(problem().ends[0]) - 1, :9]).max(axis=1).min() < 1e-3
+    names = [seed.name for seed in found]
+    assert names in ([], ["rrt 2"]), "trees may have a second seed, the others have one"
+
+
+def test_alone_or_beside_nothing_good_trees_search_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
+    watched = Watched(monkeypatch)
+    assert [seed.name for seed in initialize(problem(), "rrt", 0)] == ["rrt"]
+    assert watched.kinds == ["rrt"]
+    watched.found.clear()
+    tolerable = Beam.tolerable
+    monkeypatch.setattr(Beam, "tolerable", lambda beam, found: beam.careful and tolerable(beam, found))
+    first = next(seed for seed in initialize(problem(), "auto", 0) if seed.name == "rrt")
+    assert "astar" in watched.kinds
+    assert watched.kinds[-1] == "rrt"
+    assert np.abs(grasps(watched.found[-1][1]) - first.z[int(problem().ends[0]) - 1, :9]).max(axis=1).min() < 1e-3
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_in_turn_trees_make_two_seeds_at_least(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: dict[str, int] = {}
+
+    def seeds(one: Any, most: int) -> Iterator[Seed]:
+        asked[one.method] = most
+        return iter([])
+
+    monkeypatch.setattr(initialization._Seeds, "seeds", seeds)
+    assert list(initialize(problem(), "auto", 0, count=count)) == []
+    assert asked == {"interpolated": count, "astar": count, "rrt": max(count, 2)}
+    assert list(initialize(problem(), "rrt", 0, count=count)) == []
+    assert asked["rrt"] == count
 
 
 def test_trees_hold_the_handle_too() -> None:

@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import time
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -36,11 +37,13 @@ def solved() -> Solution:
 
 @cache
 def hard() -> Solution:
-    """The whole task from a stationary seed: steps are rejected, penalties raised."""
+    """The whole task from a stationary seed, not given up: steps are rejected."""
     options = vkc.Options(reach_waypoints=15, turn_waypoints=4, move_waypoints=12, max_outer=10)
     problem = vkc.build(door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=options)
     (seed,) = initialize(problem, "stationary", 0)
-    return solve(problem, seed.z)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(solver, "HOPELESS", np.inf)
+        return solve(problem, seed.z)
 
 
 def feasible(problem: vkc.TrajectoryProblem, z: np.ndarray) -> None:
@@ -129,10 +132,148 @@ def test_trouble_in_one_place_does_not_narrow_the_trust_region_in_others() -> No
     assert (region.radius == trust_region.RESTART_RADIUS).all()
 
 
+def test_a_trust_region_goes_on_with_what_it_is_given() -> None:
+    given = np.linspace(0.01, 0.3, 40)
+    region = trust_region.TrustRegion(40, given)
+    np.testing.assert_array_equal(region.radius, given)
+    region.settle()
+    np.testing.assert_array_equal(region.radius, np.minimum(given, trust_region.SETTLE_RADIUS))
+    region.restart()
+    np.testing.assert_array_equal(given, np.linspace(0.01, 0.3, 40))  # it is another's
+
+
 def blank_trial(segments: int) -> solver._Trial:
     """Return a trial in which every coordinate went 0.3 and nothing else is said."""
     fields = dict.fromkeys(field.name for field in dataclasses.fields(solver._Trial))
     return solver._Trial(**{**fields, "step": np.full(segments, 0.3)})  # type: ignore[arg-type]
+
+
+def test_a_solution_goes_on_with_the_radius_that_another_ended_with() -> None:
+    problem, seed = round_a_pillar(), straight(round_a_pillar(), 3.2)
+    first = solve(problem, seed, rounds=1)
+    assert first.history[0].radius == trust_region.FIRST_RADIUS
+    assert first.radius is not None
+    assert first.radius.shape == (problem.segments,)
+    assert len(np.unique(first.radius)) > 1, "one radius for all: choose a harder problem"
+    assert Solution(seed).radius is None
+    for radius in (first.radius, np.linspace(0.02, 0.1, problem.segments)):
+        kept = radius.copy()
+        second = solve(problem, first.z, rounds=1, radius=radius)
+        assert second.history[0].radius == radius.max()
+        assert np.all(np.abs(second.z - first.z).max(axis=1) <= radius * (1 + 1e-6))
+        np.testing.assert_array_equal(radius, kept)
+
+
+class Scripted:
+    """Stands for the loop's state: every round leads where it is said, and is accepted if that is said."""
+
+    def __init__(self, *rounds: tuple[float, float, bool]) -> None:
+        self.deadline, self.penalty, self.solution = np.inf, 200.0, Solution(np.zeros((40, 1)))
+        self.objective, self.shortfall, self.rounds, self.radii = 10.0, np.full(40, 0.5), iter(rounds), list[np.ndarray]()
+
+    def try_step(self, radius: np.ndarray) -> solver._Trial:
+        self.radii.append(radius.copy())
+        objective, shortfall, self.taken = next(self.rounds)
+        short = np.full(40, shortfall)  # just what was promised: nobody narrows the trust region
+        contacts = SimpleNamespace(clearance=lambda: -shortfall, violation=lambda: shortfall)
+        return dataclasses.replace(
+            blank_trial(40),
+            z=np.zeros((40, 1)),
+            objective=objective,
+            shortfall=short,
+            slack=short,
+            pose_error=0.0,
+            contacts=contacts,  # type: ignore[arg-type]
+        )
+
+    def judge(self, _: solver._Trial) -> tuple[bool, float]:
+        return self.taken, 1.0
+
+    def accept(self, trial: solver._Trial) -> None:
+        self.objective, self.shortfall = trial.objective, trial.shortfall
+
+    def done(self, _: solver._Trial) -> bool:
+        return False
+
+    def raise_penalty(self) -> None:
+        self.penalty *= 2
+
+
+def scripted(*rounds: tuple[float, float, bool]) -> Scripted:
+    loop = Scripted(*rounds)
+    region, interrupt = trust_region.TrustRegion(40), SimpleNamespace(pressed=False)
+    solver._iterate(loop, region, None, interrupt, len(rounds))  # type: ignore[arg-type]
+    loop.radii.append(region.radius)
+    return loop
+
+
+@pytest.mark.parametrize(
+    ("objective", "shortfall", "accepted", "small"),
+    [
+        (8.1, 0.009, True, True),
+        (7.9, 0.009, True, False),  # it gets better fast
+        (8.1, 0.011, True, False),  # it is far from free
+        (10.0, 0.0, True, True),
+        (14.0, 0.009, True, True),
+        (8.1, 0.009, False, False),
+    ],
+)
+def test_what_is_nearly_free_and_hardly_gets_better_is_first_made_free(
+    objective: float, shortfall: float, accepted: bool, small: bool
+) -> None:
+    """With small steps, on which planes are as good as distances."""
+    _, after = scripted((objective, shortfall, accepted)).radii
+    assert bool((after <= trust_region.SETTLE_RADIUS).all()) == small
+    assert small or (after > trust_region.SETTLE_RADIUS).all()
+
+
+def test_a_grasp_between_obstacles_is_made_free_with_small_steps() -> None:
+    scene = vkc.load_scene("init_2").sample_start(np.random.default_rng(5))
+    problem = vkc.build(scene, [vkc.Grasp("stick")])
+    seed = next(initialize(problem, "astar", 0)).z
+    solution, objective, small = solve(problem, seed), problem.objective(seed), 0
+    for row, after in itertools.pairwise(solution.history):
+        if row.accepted and row.shortfall < solver.NEARLY_FREE and objective - row.objective < solver.SETTLING * objective:
+            assert after.radius <= trust_region.SETTLE_RADIUS
+            assert after.step <= trust_region.SETTLE_RADIUS * (1 + 1e-6)
+            small += 1
+        objective = row.objective if row.accepted else objective
+    assert small, "it never gets there: choose another problem"
+    assert solution.converged
+    feasible(problem, solution.z)
+
+
+LATE = [(10.0, 0.05, True)] * 20
+
+
+@pytest.mark.parametrize(
+    ("rounds", "expected"),
+    [
+        ([(10.0, 0.11, True)] * 20, 6),
+        ([(10.0, 0.0, False)] * 20, 6),  # what counts is where it is, not where it might have gone
+        ([(10.0, 0.11, True)] * 5 + LATE, 25),
+        (LATE[:8] + [(10.0, 0.11, True)] * 5, 9),
+        (LATE, 20),
+    ],
+)
+def test_after_a_few_rounds_what_is_far_from_free_is_given_up(rounds: list[tuple[float, float, bool]], expected: int) -> None:
+    loop = scripted(*rounds)
+    assert loop.solution.rounds == expected
+    assert loop.solution.status == "not converged"
+
+
+def test_motions_far_from_free_are_given_up_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A wall from side to side: whatever is done, something is in it."""
+    wall = {"name": "wall", "type": "box", "size": [1.0, 12.0, 2.0], "position": [2.0, 0.0, 1.0]}
+    problem = vkc.build(hall(obstacles=[wall]), [vkc.GoTo(4.0, 0.0, 0.0)], options=FEW)
+    seed = straight(problem, 4.0)
+    solution = solve(problem, seed)
+    assert (solution.status, solution.converged) == ("not converged", False)
+    assert solution.rounds == solver.HOPELESS_ROUNDS < FEW.max_outer
+    assert problem.evaluate_contacts(solution.z, reach=0.1).violation() > solver.HOPELESS
+    assert solve(problem, seed, rounds=2).rounds == 2
+    monkeypatch.setattr(solver, "HOPELESS", np.inf)
+    assert solve(problem, seed).rounds > solver.HOPELESS_ROUNDS
 
 
 def test_standing_still_where_one_is_already() -> None:

@@ -185,6 +185,85 @@ def test_what_is_shortened_is_not_longer(monkeypatch: pytest.MonkeyPatch) -> Non
             assert length(short) < 0.9 * length(plain)
 
 
+# --- parts of the way that are free --------------------------------------------------------------------------------------
+
+
+def search(seed: int = 0) -> trees._Search:
+    problem, guide, arms = gate()
+    return trees._Search(problem, 0, problem.start, guide, arms, np.random.default_rng(seed))
+
+
+def test_runs_are_the_free_parts_of_the_way_with_each_arm() -> None:
+    """Each as long as can be, and free half-way between its configurations, too."""
+    problem, guide, arms = gate()
+    allowed = GRAZE * problem.options.dist_safe + 1e-9
+    through_gate, all_ = [], search().runs
+    for arm in arms:
+        rows = np.column_stack([guide, np.tile(arm, (len(guide), 1))])
+        free, between = missing(problem, rows) <= allowed, missing(problem, (rows[1:] + rows[:-1]) / 2) <= allowed
+        own = [run for run in all_ if np.array_equal(run[0, 3:], arm)]
+        covered = np.zeros(len(rows), int)
+        for run in own:
+            (begin,) = np.flatnonzero((rows == run[0]).all(axis=1))
+            end = begin + len(run)
+            np.testing.assert_array_equal(run, rows[begin:end])
+            assert free[begin:end].all()
+            assert between[begin : end - 1].all()
+            assert begin == 0 or not (free[begin - 1] and between[begin - 1])
+            assert end == len(rows) or not (free[end] and between[end - 1])
+            covered[begin:end] += 1
+        np.testing.assert_array_equal(covered, free.astype(int))
+        through_gate.append(any(run[0, 0] < 1.0 and run[-1, 0] > 3.0 for run in own))
+    assert through_gate == [False, True], "the arm has to be drawn in"
+    assert sum(map(len, all_)) < 2 * len(guide)
+
+
+def test_a_tree_that_gets_to_a_run_takes_in_all_of_it() -> None:
+    one = search()
+    number = max(range(len(one.runs)), key=lambda k: len(one.runs[k]))
+    rows = one.runs[number]
+    root = rows[0].copy()
+    root[3:] += 0.05
+    tree = trees._Tree(root[None], METRE)
+    tree.runs = set(range(len(one.runs))) - {number}
+    node = None
+    for _ in range(20):  # towards one of its places each time; not all of them can be seen from its beginning
+        if number not in tree.runs:
+            node = one._grow_to_run(tree)
+    assert node is not None
+    assert tree.runs == set(range(len(one.runs)))
+    at_ = [int(np.flatnonzero((tree.nodes == row).all(axis=1))[0]) for row in rows]
+    assert node in at_
+    for first, second in itertools.pairwise(at_):
+        assert tree.parents[first] == second or tree.parents[second] == first
+    for end in (at_[0], at_[-1]):
+        is_a_way(gate()[0], tree.path(end))
+
+
+def test_a_tree_that_is_stopped_before_a_run_does_not_take_it_in() -> None:
+    one, (problem, _, arms) = search(), gate()
+    one.runs = [np.tile(np.append([4.0, 0.5, 0.0], arms[0]), (3, 1))]  # behind the wall, the arm at home
+    tree = trees._Tree(at(problem, (0.0, 2.0, 0.0))[None], METRE)
+    node = one._grow_to_run(tree)
+    assert node is not None
+    assert tree.runs == set()
+    assert len(tree.nodes) == 2
+    assert tree.nodes[node][0] < 2.0
+
+
+@pytest.mark.parametrize(("runs", "found"), [(1.0, True), (0.0, False)])
+def test_free_runs_alone_lead_through_the_gate(runs: float, found: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is drawn that would."""
+    monkeypatch.setattr(trees, "_RUNS", runs)
+    monkeypatch.setattr(trees, "_TRIES", 60)
+    monkeypatch.setattr(trees._Search, "_draw", lambda *_: gate()[0].start.copy())
+    for seed in range(3):
+        path = through(seed)
+        assert (path is not None) == found
+        if path is not None:
+            is_a_way(gate()[0], path)
+
+
 # --- spread --------------------------------------------------------------------------------------------------------------
 
 PATHS = st.integers(1, 6).flatmap(

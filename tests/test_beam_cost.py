@@ -64,9 +64,12 @@ def scattered(monkeypatch: pytest.MonkeyPatch, share: float) -> int:
     return draws.count("scatter")
 
 
-@pytest.mark.parametrize(("free", "pushed"), [(0, True), (11, True), (12, False), (48, False)])
-def test_where_a_few_are_free_none_are_pushed(monkeypatch: pytest.MonkeyPatch, free: int, pushed: bool) -> None:
-    """However many more are drawn: pushing takes longer."""
+@pytest.mark.parametrize(
+    ("holding", "free", "pushed"),
+    [(False, 0, True), (False, 59, True), (False, 60, False), (True, 0, True), (True, 11, True), (True, 12, False)],
+)
+def test_where_some_are_free_none_are_pushed(monkeypatch: pytest.MonkeyPatch, holding: bool, free: int, pushed: bool) -> None:
+    """While something is held a few are enough: there are many such knots."""
     search, called = beam(), list[int]()
 
     def clear(z: NDArray[np.float64], waypoint: int) -> NDArray[np.float64]:
@@ -76,8 +79,8 @@ def test_where_a_few_are_free_none_are_pushed(monkeypatch: pytest.MonkeyPatch, f
     monkeypatch.setattr(search.knots, "clear", clear)
     z, bad = np.tile(search.problem.start, (96, 1)), np.where(np.arange(96) < free, 0.0, 50.0)
     paths, parents = search.problem.start[None, None], np.zeros(96, int)
-    grasp = int(search.problem.ends[0])
-    _, after, _ = search._pushed(paths, np.zeros(1), parents, z, bad, grasp, 0)
+    knot = int(search.problem.ends[-1 if holding else 0])
+    _, after, _ = search._pushed(paths, np.zeros(1), parents, z, bad, knot, 2 if holding else 0)
     assert bool(called) == pushed
     assert len(after) == 96 + sum(called)
 

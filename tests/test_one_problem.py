@@ -34,7 +34,6 @@ class Race:
         after: Of what one round leads to, and the solver's status.
         finally_: Of what all rounds lead to, and the status.
         shortfalls: Of the seeds.
-        collisions: What the solver left of the seeds' collisions after a round, as the merit weighs it.
         events: What happened: "b" a seed was asked for, "b1" it was given one round, "b*" all of them.
         radii: How far planes were to be believed at first, each time; None: as usual.
     """
@@ -48,9 +47,8 @@ class Race:
         finally_: dict[str, Answer] | None = None,
         shortfalls: Sequence[float] = (),
         amounts: Sequence[float] = (),
-        collisions: dict[str, float] | None = None,
     ) -> None:
-        self.heights, self.after, self.finally_, self.collisions = heights, after or {}, finally_ or {}, collisions or {}
+        self.heights, self.after, self.finally_ = heights, after or {}, finally_ or {}
         self.shortfalls, self.amounts = shortfalls or [0.0] * len(heights), iter(amounts or [1.0] * 20)
         self.events: list[str] = []
         self.given: list[np.ndarray] = []
@@ -100,8 +98,7 @@ class Race:
             callback(ROUND)
         timings = {"coal": 0.5, "casadi": 0.25, "ipopt": 0.125}
         solved = z if height is None else self.z(problem, name, height)
-        merit = problem.objective(solved) + self.collisions.get(name, 0.0)
-        solution = Solution(solved, status == "converged", status, merit, self.radius(problem, name))
+        solution = Solution(solved, status == "converged", status, self.radius(problem, name))
         return dataclasses.replace(solution, rounds=1, iterations=5, timings=timings, history=[ROUND])
 
     def validate(self, scene: vkc.Scene, steps: Any, trajectory: vkc.Trajectory, options: vkc.Options) -> vkc.Report:
@@ -143,22 +140,6 @@ def test_the_seed_that_looks_best_after_a_round_goes_first(
     plan = race.run()
     assert race.events == expected.split()
     assert plan.status == "not converged"
-
-
-@pytest.mark.parametrize(
-    ("heights", "collisions", "expected"),
-    [
-        ([1.0, 2.0, 3.0], {"a": 1e3}, "a a1 b b1 c c1 b* c* a*"),  # the smoothest hits something
-        ([1.0, 2.0, 3.0], {"a": 1e3, "b": 1e3, "c": 1e3}, "a a1 b b1 c c1 a* b* c*"),
-        ([1.0, 2.0, 3.0], {"a": 1e3, "b": 2e3, "c": 5e2}, "a a1 b b1 c c1 c* a* b*"),
-    ],
-)
-def test_what_still_collides_after_a_round_counts_in_the_race(
-    heights: list[float], collisions: dict[str, float], expected: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    race = Race(monkeypatch, heights, collisions=collisions)
-    race.run()
-    assert race.events == expected.split()
 
 
 @pytest.mark.parametrize(

@@ -75,18 +75,6 @@ def test_counts_and_times() -> None:
         assert all(value > 0.0 for value in solution.timings.values())
 
 
-def test_the_merit_is_that_of_what_is_returned() -> None:
-    """Objective and shortfalls, each weighed as the options say; what still collides counts, what is free has none."""
-    problem = round_a_pillar()
-    assert solved().merit == pytest.approx(problem.objective(solved().z), rel=1e-6)
-    seed = straight(problem, 3.2)
-    early = solve(problem, seed, rounds=1)
-    short = problem.evaluate_contacts(early.z, reach=problem.options.dist_safe).shortfall(problem.segments).sum()
-    assert short > 0.01, "one round is too much: nothing is left of the collision"
-    assert early.merit == pytest.approx(problem.objective(early.z) + problem.options.penalty * short, rel=1e-6)
-    assert np.isnan(Solution(seed).merit)  # nobody has solved anything
-
-
 @pytest.mark.parametrize("solution", [solved, hard], ids=["pillar", "door"])
 def test_columns_that_only_grow(solution) -> None:  # type: ignore[no-untyped-def]
     history = solution().history

@@ -59,8 +59,7 @@ class Attempt:
             seed: Of the random numbers.
             deadline: Value of `time.perf_counter()` after which no stage is begun.
         """
-        self.first = self.scene = scene
-        self.options, self.refine, self.deadline = options, refine, deadline
+        self.scene, self.options, self.refine, self.deadline = scene, options, refine, deadline
         self.rng = np.random.default_rng(seed)
         self.parts: list[Trajectory] = []
         self.times = dict.fromkeys([*TIMES, "following"], 0.0)
@@ -255,11 +254,7 @@ class Attempt:
     def _problem(self, steps: Sequence[Step], options: Options | None = None, scene: Scene | None = None) -> TrajectoryProblem:
         """Return the problem of steps from where the motion has come to, or from another scene."""
         options, scene = options or self.options, scene or self.scene
-        # What is to stand upright somewhere stands as it did at the very start, however the hand has turned it since.
-        held = {name: scene.objects[name] for name in scene.held}
-        stood = {name: replace(now, placement=self.first.objects[name].placement) for name, now in held.items()}
-        task = compile_task(replace(scene, objects={**scene.objects, **stood}), steps, options)
-        problem = TrajectoryProblem(scene, task, options)
+        problem = TrajectoryProblem(scene, compile_task(scene, steps, options), options)
         self.build_time += problem.transcription.take_build_time()
         return problem
 

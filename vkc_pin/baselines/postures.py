@@ -1,4 +1,4 @@
-"""How the arm is held while the base drives alone: as it is, a little way off from what it took or let go of, or at home."""
+"""How the arm is held while the base drives alone: as it is, off a little from what it took or let go of, at home, or drawn in."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from vkc_pin.approach import Approach
 from vkc_pin.knots import Knots, smooth
 from vkc_pin.problem import TrajectoryProblem
+from vkc_pin.routes import Routes
 from vkc_pin.trust_region import CLOSE_ENOUGH
 
 __all__ = ["at_home", "postures", "through"]
@@ -19,7 +20,8 @@ def postures(problem: TrajectoryProblem) -> list[NDArray[np.float64]]:
     """Return configurations, shape (n,), in which the base may drive away from where it is, and the ones that lead to them.
 
     Each is a way for the arm while the base stands, shape (K, n), and ends in what the base then drives in: nothing to do (K =
-    0), back from what it lets go of, or up with what it carries, and from there to home. Those that are not free are left out.
+    0), back from what it lets go of, or up with what it carries, from there to home, and from there drawn in, for narrow
+    passages. Those that are not free are left out.
 
     Args:
         problem: Lets go of what stands fixed in the world and carries the rest along.
@@ -28,9 +30,12 @@ def postures(problem: TrajectoryProblem) -> list[NDArray[np.float64]]:
     away = Approach(knots).away(problem.start, problem.task.phases[0])
     home = (away[-1] if len(away) else problem.start).copy()
     home[3 : robot.coordinates.size] = robot.home
+    drawn_in = home.copy()
+    drawn_in[3 : robot.coordinates.size] = Routes(problem).compact(0)
     ways = [np.empty((0, problem.chain.size))]
     ways += [away] if len(away) else []
     ways += [] if at_home(problem) else [np.vstack([away, home])]
+    ways += [np.vstack([ways[-1], drawn_in])]
     ends = np.array([way[-1] if len(way) else problem.start for way in ways])
     free = knots.depth(ends, problem.segments) <= CLOSE_ENOUGH
     return [way for way, is_free in zip(ways, free, strict=True) if is_free]

@@ -32,7 +32,11 @@ TASKS = {
     "cup": Task(
         "household", (Place("cup", (-0.6, -1.6, 0.751)),), "carry a cup to the dining table", scatter=on_the_coffee_table
     ),
-    "door": Task("household", (Actuate("door", {"hinge": 1.52}), GoTo(1.6, 2.5)), "push a narrow door open and drive through"),
+    "door": Task(
+        "household",
+        (Actuate("door", {"hinge": 1.52}, attachment="handle_free"), GoTo(1.6, 2.5)),
+        "push a narrow door open and drive through",
+    ),
     "drawer": Task("household", (Actuate("drawer", {"slide": 0.22}),), "pull a low drawer open in a corner"),
     "dishwasher": Task("household", (Actuate("dishwasher", {"rack": 0.5}),), "pull a dishwasher's rack out"),
     "refrigerator": Task("household", (Actuate("refrigerator", {"hinge": 1.57}),), "pull a refrigerator open"),

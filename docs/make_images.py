@@ -1,6 +1,6 @@
-"""Makes the pictures in docs/images: plans the door and the use of a stick, looks at both, and at scenes. Needs Chromium.
+"""Makes docs/images and docs/animations: plans the door, the use of a stick and a chore, looks at them, and at scenes.
 
-Usage: make_images.py [DOOR [STICK]]: saved plans (.npz) to show instead of planning them.
+Needs Chromium. Usage: make_images.py [DOOR [STICK [CHORE]]]: saved plans (.npz) to show instead of planning them.
 """
 
 from __future__ import annotations
@@ -13,11 +13,13 @@ import numpy as np
 
 import vkc_pin as vkc
 from vkc_pin import drawing, visualization
+from vkc_pin.benchmarks import chores
 from vkc_pin.viewpoint import Viewpoint
 
 ROOT = Path(__file__).parent.parent
 IMAGES = ROOT / "docs" / "images"
 WIDE, SMALL = (1200, 640), (640, 400)  # [pixels]
+LEAVING = 130.0  # [s] of the chore in the home
 HALF_OPEN = 14.0  # [s] of the motion at the door
 UNDER_THE_TABLE = (-0.4, 2.4, 0.4), (-4.2, -0.6, 2.0)  # what to look at, and from where [m]
 WHOLE_ROOM = (0.5, 0.3, 0.0), (-8.6, -5.4, 5.4)
@@ -61,13 +63,22 @@ def home_pictures() -> None:
     picture(home, "household_kitchen", SMALL)
 
 
+def chore_pictures(chore: vkc.Plan) -> None:
+    """Write a picture of the chore in the home, and the page that shows all of it."""
+    look(*HOME)
+    picture(chore, "household_chore", WIDE, LEAVING)
+    visualization.to_html(chore, ROOT / "docs" / "animations" / "household_chore.html")
+
+
 def main() -> int:
     """Write the pictures; return 1 if there is no motion to show."""
     saved = [vkc.Plan.load(name) for name in sys.argv[1:]]
     use = [vkc.Grasp("stick"), vkc.Touch("stick.tip", (-1, 3.897, 0.1))]
     door = saved[0] if saved else vkc.plan(vkc.load_scene("door"), [vkc.Actuate("door", {"hinge": 1.2})])
     stick = saved[1] if len(saved) > 1 else vkc.plan(vkc.load_scene("init_3"), use, initialization="astar")
-    for plan in (door, stick):
+    home = vkc.load_scene("household")
+    chore = saved[2] if len(saved) > 2 else vkc.plan_chore(home, chores.home(home))
+    for plan in (door, stick, chore):
         sys.stdout.write(plan.report() + "\n")
         if not plan.success:
             return 1
@@ -83,6 +94,7 @@ def main() -> int:
         look(*camera)
         picture(vkc.load_scene(name), name, SMALL)
     home_pictures()
+    chore_pictures(chore)
     return 0
 
 

@@ -1,4 +1,4 @@
-"""How the arm is held while the base drives alone: as it is, off a little from what it took or let go of, at home, or drawn in."""
+"""How the arm is held while the base drives alone: as it is, a little off what it took or let go of, at home, or drawn in."""
 
 from __future__ import annotations
 

@@ -210,7 +210,7 @@ def test_the_arm_does_not_reach(monkeypatch: pytest.MonkeyPatch) -> None:
     options = dataclasses.replace(OPTIONS, max_restarts=1, max_iterations=20)
     plan = failed(with_boxes(open_scene(), **shelves), options=options)
     assert plan.status == "arm does not reach"
-    assert [phase.name for phase in plan.trajectory.phases] == ["go to", "reach drawer.handle"]
+    assert [phase.name for phase in plan.trajectory.phases][-2:] == ["go to", "reach drawer.handle"]
     assert {"goal", "clearance"} & {v.constraint for v in plan.validation.violations}
 
 

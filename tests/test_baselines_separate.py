@@ -312,7 +312,7 @@ def test_of_several_places_the_one_that_came_furthest_counts(
         done(self, steps, "arm does not reach", next(reach) == "d")
 
     every = attempt.postures
-    monkeypatch.setattr(attempt, "postures", lambda problem: every(problem)[:1])  # the arm as it is
+    monkeypatch.setattr(attempt, "postures", lambda problem: list(every(problem))[:1])  # the arm as it is
     monkeypatch.setattr(attempt, "_STANDS", 3)
     monkeypatch.setattr(attempt.Attempt, "_drive", driven)
     monkeypatch.setattr(attempt.Attempt, "_reach", reached)

@@ -11,14 +11,21 @@ from vkc_pin.base_body import FAN, Body, Shape, Standing
 from vkc_pin.base_mask import Lattice, stuck
 from vkc_pin.errors import InputError
 
-__all__ = ["HEADINGS", "BaseGrid"]
+__all__ = ["HEADINGS", "BaseGrid", "fine_cells"]
 
 HEADINGS = 16
 """Directions of travel: to the eight neighbours of a cell and, between these, a knight's move away."""
 
 _MOVES = np.array([(1, 0), (2, 1), (1, 1), (1, 2), (0, 1), (-1, 2), (-1, 1), (-2, 1)])
 _MOVES = np.concatenate([_MOVES, -_MOVES])  # by heading, in cells
+_CELLS, _FINEST = 100, 250  # along a side; at most
 _ROOM = 0.5  # [m] beyond which more room makes no difference
+
+
+def fine_cells(arena: Sequence[float], margin: float) -> int:
+    """Return along how many cells a grid has one in the middle of any passage with room for the margins [m], within reason."""
+    size = max(arena[1] - arena[0], arena[3] - arena[2])
+    return int(np.clip(np.ceil(size / (2.0 * margin)), _CELLS, _FINEST))
 
 
 class BaseGrid:
@@ -45,7 +52,7 @@ class BaseGrid:
         arena: Sequence[float],
         margin: float,
         *,
-        cells: int = 100,
+        cells: int = _CELLS,
         near: float = 1.0,
     ) -> None:
         """Look at every cell once, without asking coal.

@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vkc_pin.knots import SCATTER, Knots
+from vkc_pin.pose_goals import approach_at
 from vkc_pin.routes import Routes
 
 __all__ = ["Beam", "Found"]
 
 _DRAWS, _ENOUGH = 6, 60  # how often random seeds are drawn until so many are free: good grasps are rare
-_OTHERS = 3  # the part of those kept at a grasp that need not be cheap: a third
+_OTHERS = 3  # where a hand chooses how to grasp, so many times fewer of the others are kept than of the cheap ones
 _FEW = 12  # free configurations at a knot with which none are pushed out of collisions
 _BEAM, _QUICK_BEAM, _CHILDREN = 40, 24, 4  # configurations kept per knot, and tried from each for the next
 _SPACING = 4  # waypoints between knots along a phase in which something is held
@@ -58,7 +59,7 @@ class Beam:
         self.knots, self.problem, self.routes = knots, knots.problem, routes
         self.width, self.backwards, self.careful = _BEAM, False, False
         self.approaches = {
-            int(end): max(int(end) - self.problem.options.approach_waypoints, int(end) - phase.segments + 1)
+            int(end): approach_at(int(end) - phase.segments, int(end), self.problem.options)
             for phase, end in zip(self.problem.task.phases, self.problem.ends, strict=True)
             if phase.grasps
         }
@@ -129,8 +130,8 @@ class Beam:
         order = np.argsort(total, kind="stable")
         if all(knot != grasp for _, grasp, _ in self.problem.choices):
             return order[: self.width]
-        cheap = order[: self.width]
-        rest = order[len(cheap) :][bad[order[len(cheap) :]] <= 0.0]
+        cheap, rest = order[: self.width], order[self.width :]
+        rest = rest[bad[rest] <= 0.0]
         others = rest[np.linspace(0, len(rest) - 1, min(self.width // _OTHERS, len(rest))).astype(int)]
         return np.concatenate([cheap, others])
 
@@ -226,13 +227,12 @@ class Beam:
         bad = np.full(len(z), _NOT_FOUND)
         if found.any():
             depth = self.knots.depth(z[found], waypoint)
-            bad[found] = np.where(depth > 0, _COLLISION + _DEPTH * depth, 0.0)
+            bad[found] = _hits(depth)
             if self.careful and waypoint in self.approaches and (depth <= 0).any():
                 free = np.flatnonzero(found)[depth <= 0]
                 at = self.approaches[waypoint]
                 near, reached = self.knots.knot(z[free], at, "track")
-                depth = self.knots.depth(near, at)
-                bad[free] += np.where(depth > 0, _COLLISION + _DEPTH * depth, 0.0) + _NOT_FOUND * ~reached
+                bad[free] += _hits(self.knots.depth(near, at)) + _NOT_FOUND * ~reached
         return bad
 
     def _approach(self, first: NDArray[np.float64], last: NDArray[np.float64], begin: int, end: int) -> NDArray[np.float64]:
@@ -241,3 +241,8 @@ class Beam:
         between = first[:, None] + s[:, None] * (last - first)[:, None]
         depth = self.knots.depth(between.reshape(-1, between.shape[-1]), min(begin + 1, end))
         return np.asarray(np.sum(np.where(depth > 0, 1.0 + _DEPTH / _APPROACH * depth, 0.0).reshape(len(first), -1), axis=1))
+
+
+def _hits(depth: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return what collisions of some depth [m] cost, shape (B,)."""
+    return np.where(depth > 0, _COLLISION + _DEPTH * depth, 0.0)

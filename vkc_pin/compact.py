@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vkc_pin.base_body import outline
+from vkc_pin.knots import depth
 from vkc_pin.problem import TrajectoryProblem
 
 __all__ = ["compact_arm"]
@@ -19,7 +20,7 @@ _AWAY = 100.0  # [m] from the arena, where nothing stands
 
 
 def compact_arm(problem: TrajectoryProblem, phase: int, resting: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the arm, shape (m,) [m] and [rad], with which the robot is narrow: the best that a random search finds.
+    """Return the arm, shape (m - 3,) [m] and [rad], with which the robot is narrow: the best that a random search finds.
 
     What counts is how far the arm, and what is carried, reach to either side of the base's x axis; next, how far they reach
     beyond the base before and behind, how high, and how far the joints are from home. The robot is free of collisions with itself
@@ -58,7 +59,7 @@ class _Body:
 
     def __init__(self, problem: TrajectoryProblem, phase: int) -> None:
         self.problem, self.chain = problem, problem.chain
-        self.waypoint = int(problem.contacts.first_waypoint[phase]) + 1
+        self.waypoint = problem.contacts.inside(phase)
         shapes = problem.contacts.phases[phase].shapes
         moving = [*range(len(self.chain.robot.collision.geometryObjects))]
         moving += [i for hold in problem.task.phases[phase].held for i in self.chain.held_geometries[hold]]
@@ -90,9 +91,7 @@ class _Body:
             part = z[begin : begin + _LOOKED]
             away = part.copy()
             away[:, 0] = self.problem.scene.arena[1] + _AWAY
-            margin = self.problem.options.dist_safe
-            contacts = self.problem.contacts.evaluate(away, np.full(len(part), self.waypoint), reach=margin, nearest=1)
-            found = np.concatenate([found, part[contacts.shortfall(len(part)) <= 0.0]])
+            found = np.concatenate([found, part[depth(self.problem, away, self.waypoint) <= 0.0]])
             if len(found) >= count:
                 break
         return found[:count]

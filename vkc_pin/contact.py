@@ -204,6 +204,10 @@ class ContactModel:
         """Return the phase whose geometry holds at `waypoint`: at a boundary the earlier, before the grasp."""
         return max(0, int(np.searchsorted(self.first_waypoint, waypoint)) - 1)
 
+    def inside(self, phase: int) -> int:
+        """Return a waypoint at which a phase's geometry holds."""
+        return int(self.first_waypoint[phase]) + 1
+
     def evaluate(
         self, z: NDArray[np.float64], waypoints: NDArray[np.int_], *, reach: float, nearest: int | None = None
     ) -> Contacts:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vkc_pin.knots import scatter
+from vkc_pin.knots import depth, scatter
 from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.report import Violation
 
@@ -89,8 +89,7 @@ def _try(
             return None
         found.append(tried)
         z = tried[0][tried[1] < 1e-4]
-        near = problem.contacts.evaluate(z, np.full(len(z), waypoint), reach=problem.options.dist_safe, nearest=1)
-        if len(z) and near.shortfall(len(z)).min() <= 0.0:
+        if len(z) and depth(problem, z, waypoint).min() <= 0.0:
             break
     return np.concatenate([z for z, _ in found]), np.concatenate([residual for _, residual in found])
 

@@ -156,7 +156,7 @@ class Joiner:
         first = self.approach.after(ends[0], phase, previous)
         last = self.approach.before(ends[1], phase)
         if self.ways is not None and self.ways.careful:
-            waypoint = int(self.problem.contacts.first_waypoint[number]) + 1
+            waypoint = self.problem.contacts.inside(number)
             first, last = (part[: len(part) if self._free(part, waypoint) else 0] for part in (first, last))
         steps = self.problem.options.approach_waypoints
         spacing = max(1, min(steps, segments // (2 * max(len(first) + len(last), 1))))

@@ -10,7 +10,7 @@ from vkc_pin.clearing import clear_out
 from vkc_pin.inverse_kinematics import PoseSolver
 from vkc_pin.problem import TrajectoryProblem
 
-__all__ = ["CHOICE", "SCATTER", "Knots", "follow_objects", "scatter", "smooth"]
+__all__ = ["CHOICE", "SCATTER", "Knots", "depth", "follow_objects", "scatter", "smooth"]
 
 SCATTER = 192  # random seeds for a configuration that nothing leads to
 CHOICE = 0.1  # what it costs to grasp elsewhere, beside radians of motion
@@ -153,9 +153,13 @@ class Knots:
 
     def depth(self, z: NDArray[np.float64], waypoint: int) -> NDArray[np.float64]:
         """Return how far each configuration falls short of its margins [m], shape (B,)."""
-        margin = self.problem.options.dist_safe
-        contacts = self.problem.contacts.evaluate(z, np.full(len(z), waypoint), reach=margin, nearest=1)
-        return contacts.shortfall(len(z))
+        return depth(self.problem, z, waypoint)
+
+
+def depth(problem: TrajectoryProblem, z: NDArray[np.float64], waypoint: int) -> NDArray[np.float64]:
+    """Return how far configurations at a waypoint, shape (B, n), fall short of their margins [m], shape (B,)."""
+    contacts = problem.contacts.evaluate(z, np.full(len(z), waypoint), reach=problem.options.dist_safe, nearest=1)
+    return contacts.shortfall(len(z))
 
 
 def scatter(

@@ -11,7 +11,7 @@ from vkc_pin.pose import PoseRow
 from vkc_pin.scene import Scene
 from vkc_pin.task import Task
 
-__all__ = ["pose_goals"]
+__all__ = ["approach_at", "pose_goals"]
 
 
 def pose_goals(
@@ -48,7 +48,7 @@ def pose_goals(
             closure, target = chain.closures[hold], phase.standing.get(hold.object, chain.closures[hold].target)
             joint, frame = chain.holder(hold)
             x, y, z = (options.approach * frame.rotation[:, 2]).tolist()
-            at = max(int(first) + 1, int(last) - options.approach_waypoints)
+            at = approach_at(int(first), int(last), options)
             if at == last:  # no room for it
                 continue
             rows.append(PoseRow(closure.joint, closure.local, (at,), shift=(joint, (x, y, z))))
@@ -59,3 +59,8 @@ def pose_goals(
             targets.append(goal.placement)
             names.append(f"goal {goal}")
     return rows, targets, names
+
+
+def approach_at(first: int, last: int, options: Options) -> int:
+    """Return the waypoint from which a hand goes straight to a grasp, in a phase from waypoint `first` to `last`."""
+    return max(first + 1, last - options.approach_waypoints)

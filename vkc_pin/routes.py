@@ -7,7 +7,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from vkc_pin.base_body import Shape
-from vkc_pin.base_grid import BaseGrid
+from vkc_pin.base_grid import BaseGrid, fine_cells
 from vkc_pin.base_path import BasePath, along, shortest_path
 from vkc_pin.compact import compact_arm
 from vkc_pin.hold import Hold
@@ -19,7 +19,6 @@ __all__ = ["Routes"]
 _FOOT = 2  # the joint of the model that is the arm's first: joint 1 is the base
 _NEAR = 0.4  # [m] from the ends of a way: there the arm reaches in and out, and only the base counts
 _COARSE = 0.5  # [m]: starts closer together share their distances
-_CELLS, _FINEST = 100, 250  # along a side of a grid; at most, where it is fine enough for narrow passages
 _BESIDE, _BESIDES = (0.4, 0.4, 0.6), 60  # how far from a goal a guide may end [m, m, rad], how many such places are tried,
 _DEARER = 3.0  # and what it costs for each metre or radian
 
@@ -68,11 +67,12 @@ class Routes:
                 for shape, label in zip(shapes, part.labels, strict=True)
                 if shape.parentJoint == 0 and label != FLOOR
             ]
-            margin, cells = problem.options.dist_safe, _CELLS
-            if drawn_in:
-                size = max(arena[1] - arena[0], arena[3] - arena[2])
-                cells, margin = int(np.clip(np.ceil(size / (2 * margin)), _CELLS, _FINEST)), 0.0
-            self._grids[key] = BaseGrid(base, carried, standing, arena, margin, near=_NEAR, cells=cells)
+            margin = problem.options.dist_safe
+            self._grids[key] = (
+                BaseGrid(base, carried, standing, arena, 0.0, near=_NEAR, cells=fine_cells(arena, margin))
+                if drawn_in
+                else BaseGrid(base, carried, standing, arena, margin, near=_NEAR)
+            )
         return self._grids[key]
 
     def compact(self, phase: int) -> NDArray[np.float64]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from vkc_pin.knots import depth, smooth
 from vkc_pin.problem import TrajectoryProblem
 
 __all__ = ["connect", "spread"]
@@ -53,8 +54,7 @@ def spread(path: NDArray[np.float64], steps: int) -> NDArray[np.float64]:
     """Return `steps` configurations along a path, shape (K, m), without its first: slow at both ends, shape (steps, m)."""
     lengths = np.linalg.norm(np.diff(path, axis=0) * _weights(path.shape[1]), axis=1)
     passed = np.concatenate([[0.0], np.cumsum(lengths + 1e-12)])
-    u = np.arange(1, steps + 1) / steps
-    at = passed[-1] * (3.0 - 2.0 * u) * u**2
+    at = passed[-1] * smooth(steps)
     return np.column_stack([np.interp(at, passed, column) for column in path.T])
 
 
@@ -76,7 +76,7 @@ class _Search:
     ) -> None:
         self.problem, self.first, self.poses, self.arms, self.rng = problem, first, poses, arms, rng
         self.size = problem.chain.robot.coordinates.size
-        self.waypoint = int(problem.contacts.first_waypoint[phase]) + 1
+        self.waypoint = problem.contacts.inside(phase)
         self.allowed = _GRAZE * problem.options.dist_safe
         self.weights = _weights(self.size)
         limits = np.array([problem.limits(name) for name in problem.chain.names[: self.size]])
@@ -86,8 +86,8 @@ class _Search:
     def run(self, ends: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Return the way to one of `ends`."""
         start = self.first[: self.size]
-        depth = self._depth(np.vstack([start, ends]))
-        ends = ends[depth[1:] <= max(self.allowed, depth[1:].min())]
+        short = self._depth(ends)
+        ends = ends[short <= max(self.allowed, short.min())]
         trees = _Tree(start[None], self.weights), _Tree(ends, self.weights)
         direct = [*ends]
         for number in range(_TRIES):
@@ -178,8 +178,7 @@ class _Search:
         """Return how far configurations of the robot, shape (B, m), fall short of their margins [m], shape (B,)."""
         z = np.tile(self.first, (len(rows), 1))
         z[:, : self.size] = rows
-        at = np.full(len(z), self.waypoint)
-        return self.problem.contacts.evaluate(z, at, reach=self.problem.options.dist_safe, nearest=1).shortfall(len(z))
+        return depth(self.problem, z, self.waypoint)
 
     def _shortened(self, path: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return a path that goes straight between random places on it where nothing is in the way."""

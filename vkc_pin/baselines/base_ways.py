@@ -10,7 +10,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from vkc_pin.base_body import Shape
-from vkc_pin.base_grid import HEADINGS, BaseGrid
+from vkc_pin.base_grid import HEADINGS, BaseGrid, fine_cells
 from vkc_pin.base_path import along, shortest_path
 from vkc_pin.initialization import Seed
 from vkc_pin.problem import TrajectoryProblem
@@ -20,7 +20,6 @@ from vkc_pin.steps import GoTo
 __all__ = ["BaseWays", "headings"]
 
 _STEPS, _STEP = 25, 0.08  # places of a straight way that are looked at: at least so many, and at most so far apart [m]
-_FINEST = 250  # cells along a side of a grid
 
 
 class BaseWays:
@@ -55,8 +54,8 @@ class BaseWays:
         ]
         arena, margin = problem.scene.arena, problem.options.dist_safe
         self.grid = BaseGrid(base, [], standing, arena, margin)
-        # So fine that a passage with room for the margins has a cell in its middle. If an optimisation follows, it restores them.
-        cells = int(np.clip(np.ceil(max(arena[1] - arena[0], arena[3] - arena[2]) / (2.0 * margin)), self.grid.cells, _FINEST))
+        # Without margins where an optimisation follows: it restores them.
+        cells = fine_cells(arena, margin)
         self._finer = functools.partial(BaseGrid, base, [], standing, arena, 0.0 if whole else margin, cells=cells)
 
     @functools.cached_property

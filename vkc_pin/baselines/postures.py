@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,8 +18,8 @@ __all__ = ["at_home", "postures", "through"]
 _SAME = 1e-6  # [rad]
 
 
-def postures(problem: TrajectoryProblem) -> list[NDArray[np.float64]]:
-    """Return configurations, shape (n,), in which the base may drive away from where it is, and the ones that lead to them.
+def postures(problem: TrajectoryProblem) -> Iterator[NDArray[np.float64]]:
+    """Yield configurations, shape (n,), in which the base may drive away from where it is, and the ones that lead to them.
 
     Each is a way for the arm while the base stands, shape (K, n), and ends in what the base then drives in: nothing to do (K =
     0), back from what it lets go of, or up with what it carries, from there to home, and from there drawn in, for narrow
@@ -27,18 +29,21 @@ def postures(problem: TrajectoryProblem) -> list[NDArray[np.float64]]:
         problem: Lets go of what stands fixed in the world and carries the rest along.
     """
     knots, robot = Knots(problem, np.random.default_rng(0)), problem.chain.robot  # nothing is drawn
+
+    def is_free(way: NDArray[np.float64]) -> bool:
+        end = way[-1:] if len(way) else problem.start[None]
+        return bool(knots.depth(end, problem.segments)[0] <= CLOSE_ENOUGH)
+
     away = Approach(knots).away(problem.start, problem.task.phases[0])
     home = (away[-1] if len(away) else problem.start).copy()
     home[3 : robot.coordinates.size] = robot.home
-    drawn_in = home.copy()
-    drawn_in[3 : robot.coordinates.size] = Routes(problem).compact(0)
     ways = [np.empty((0, problem.chain.size))]
     ways += [away] if len(away) else []
     ways += [] if at_home(problem) else [np.vstack([away, home])]
-    ways += [np.vstack([ways[-1], drawn_in])]
-    ends = np.array([way[-1] if len(way) else problem.start for way in ways])
-    free = knots.depth(ends, problem.segments) <= CLOSE_ENOUGH
-    return [way for way, is_free in zip(ways, free, strict=True) if is_free]
+    yield from filter(is_free, ways)
+    drawn_in = home.copy()
+    drawn_in[3 : robot.coordinates.size] = Routes(problem).compact(0)  # looked for only if nothing else will do
+    yield from filter(is_free, [np.vstack([ways[-1], drawn_in])])
 
 
 def at_home(problem: TrajectoryProblem) -> bool:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from vkc_pin.coordinates import Coordinates
 from vkc_pin.inverse_kinematics import PoseSolver
 from vkc_pin.monitor import Monitor
-from vkc_pin.waypoint import Structure, WaypointFunctions
+from vkc_pin.waypoint import Structure, waypoint_functions
 
 __all__ = ["Transcription", "transcribe"]
 
@@ -136,7 +136,7 @@ class Transcription:
         self.multipliers = ca.MX.sym("lam_g", self.rows)
         for poses in kinds:
             at = [t for t in range(N) if poses_at[t] == poses]
-            kind = WaypointFunctions(self.structure, poses)
+            kind = waypoint_functions(self.structure.model, K, tuple(self.structure.poses[k] for k in poses))
             targets = ca.repmat(ca.vec(self.targets[:, list(poses)] if poses else self.targets[:, 0]), 1, len(at))
             inputs = [self.z[:, at], self.s[:, at], self.planes[:, at], self.offsets[:, at], targets]
             rows = first_row[at][:, None] + np.arange(kind.rows)

@@ -121,7 +121,8 @@ class Routes:
         rng = np.random.default_rng(0)
         beside = rng.normal(size=(_BESIDES, 3)) * rng.random((_BESIDES, 1)) * _BESIDE
         beside[0] = 0.0
-        for grid in (self.grid(phase), self.grid(phase, drawn_in=True)):
+        for drawn_in in (False, True):
+            grid = self.grid(phase, drawn_in=drawn_in)  # the fine one only where it is needed
             path = shortest_path(grid, start.tolist(), goal + beside, costs=_DEARER * np.abs(beside).sum(axis=1))
             if path is not None:
                 return along(path, steps)

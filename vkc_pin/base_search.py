@@ -166,22 +166,25 @@ class _Round:
 
     def _endings(self) -> list[_Entry]:
         """Return the ways to the goals from cells around them, and straight from the start, as a heap."""
-        task, queue = self.task, list[_Entry]()
+        task, queue, number = self.task, list[_Entry](), 0
         for goal, ways in task.ends.items():
             nodes, extra = self.node[ways.cell, ways.heading], round(task.extra[goal] / UNIT)
             passed = self.passed[nodes]
+            total = ways.cost + extra + passed
+            some, beyond = np.flatnonzero(total <= self.bound), np.flatnonzero((total > self.bound) & (total < np.inf))
+            some = np.append(some, beyond[np.argsort(total[beyond], kind="stable")[:1]])  # only the least is ever looked at
+            columns = (values.tolist() for values in (some, nodes[some], total[some], passed[some]))
             queue += [
-                (cost + extra + before, before, len(queue) + k, node, -1, (END, goal, k))
-                for k, (node, cost, before) in enumerate(zip(nodes.tolist(), ways.cost.tolist(), passed.tolist(), strict=True))
-                if before < np.inf
+                (cost, before, number + k, node, -1, (END, goal, k)) for k, node, cost, before in zip(*columns, strict=True)
             ]
+            number += len(nodes) + 3
             for how in range(3):
                 direct = self.ground.direct(goal, how)
                 if direct is not None:
                     drive, last = direct
                     turned = abs(drive.yaw - self.ground.start[2]) + abs(last - drive.yaw)
                     cost = float(np.rint((drive.cost * self.ground.haste + TURNING * turned) / UNIT)) + extra
-                    queue.append((cost, 0.0, len(queue), self.start, -1, (DIRECT, goal, how)))
+                    queue.append((cost, 0.0, number - 3 + how, self.start, -1, (DIRECT, goal, how)))
         heapq.heapify(queue)
         return queue
 

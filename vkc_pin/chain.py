@@ -98,6 +98,32 @@ class VirtualKinematicChain:
     def _kinematics(self) -> BatchFunction:
         return _placements(self.model.saveToString())
 
+    @cached_property
+    def carries(self) -> NDArray[np.bool_]:
+        """Whether joint j moves when joint k does, shape (J, J)."""
+        joints = range(self.model.njoints)
+        return np.array([[k in self.model.supports[j] for k in joints] for j in joints])
+
+    @cached_property
+    def motions(self) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+        """How joints move: for each coordinate its joint, and how that moves linearly and about which axis, in its frame.
+
+        Shapes (n,), (n, 3) and (n, 3). The last array, shape (n,), says where the linear motion is along the world's axes: x and
+        y of a planar joint.
+        """
+        data, owner = self.model.createData(), np.array(self.coordinates.joints)
+        pin.forwardKinematics(self.model, data, pin.neutral(self.model))
+        linear, angular, fixed = np.zeros((len(owner), 3)), np.zeros((len(owner), 3)), np.zeros(len(owner), bool)
+        for column, joint in enumerate(self.coordinates.joints):
+            if str(self.model.joints[joint].shortname()) == "JointModelPlanar":
+                part = column - self.coordinates.joints.index(joint)
+                fixed[column] = part < 2
+                (linear if part < 2 else angular)[column, part] = 1.0
+            else:
+                motion = np.asarray(data.joints[joint].S, float).ravel()
+                linear[column], angular[column] = motion[:3], motion[3:]
+        return owner, linear, angular, fixed
+
     def index(self, name: str) -> int:
         """Return the position of coordinate `name` in z. Raises `UnknownNameError` if there is none."""
         if name not in self.names:

@@ -83,8 +83,8 @@ def _contact_rows(
 def distance_gradients(problem: TrajectoryProblem, z: NDArray[np.float64], contacts: Contacts) -> NDArray[np.float64]:
     """Return the gradients of the distances of contacts at configurations `z`, shape (B, n): n·(∂b − ∂a), shape (C, n)."""
     joints = problem.contacts.joints_of(contacts.pair)
-    first = point_jacobians(problem.chain, z, contacts.waypoint, joints[:, 0], contacts.first)
-    second = point_jacobians(problem.chain, z, contacts.waypoint, joints[:, 1], contacts.second)
+    which, points = np.tile(contacts.waypoint, 2), np.concatenate([contacts.first, contacts.second])
+    first, second = np.split(point_jacobians(problem.chain, z, which, joints.T.ravel(), points), 2)
     return np.asarray(np.einsum("ci,cij->cj", contacts.normal, second - first))
 
 
@@ -104,28 +104,10 @@ def point_jacobians(
         joint: The joint that carries it, shape (C,); 0 stands still.
         point: Where it is in the world, shape (C, 3) [m].
     """
-    model, coordinates = chain.model, chain.coordinates
+    owner, linear, angular, fixed = chain.motions
     rotations, translations = chain.joint_placements(z)
-    supports = np.array([[k in model.supports[j] for k in range(model.njoints)] for j in range(model.njoints)])
-    subspaces = _subspaces(model)
-    jacobian = np.zeros((len(which), 3, z.shape[1]))
-    for column, owner in enumerate(coordinates.joints):
-        moved = np.flatnonzero(supports[joint, owner])
-        at = which[moved]
-        if str(model.joints[owner].shortname()) == "JointModelPlanar":  # x and y along the world's axes, then the heading
-            part = column - coordinates.joints.index(owner)
-            if part < 2:
-                jacobian[moved, part, column] = 1.0
-                continue
-            linear, angular = np.zeros((len(moved), 3)), np.tile([0.0, 0.0, 1.0], (len(moved), 1))
-        else:
-            linear, angular = rotations[at, owner] @ subspaces[owner][:3], rotations[at, owner] @ subspaces[owner][3:]
-        jacobian[moved, :, column] = linear + np.cross(angular, point[moved] - translations[at, owner])
-    return jacobian
-
-
-def _subspaces(model: pin.Model) -> dict[int, NDArray[np.float64]]:
-    """Return the motion of each joint of one degree of freedom in its own frame: linear, then angular, shape (6,)."""
-    data = model.createData()
-    pin.forwardKinematics(model, data, pin.neutral(model))
-    return {j: np.asarray(data.joints[j].S, float).ravel() for j in range(1, model.njoints) if model.joints[j].nv == 1}
+    axes = rotations[:, owner]
+    turned = np.where(fixed[:, None], linear, np.einsum("bnij,nj->bni", axes, linear))[which]
+    about = np.einsum("bnij,nj->bni", axes, angular)[which]
+    moved = turned + np.cross(about, point[:, None] - translations[:, owner][which])
+    return np.asarray((moved * chain.carries[joint][:, owner, None]).swapaxes(1, 2))

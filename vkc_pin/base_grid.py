@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -83,7 +84,6 @@ class BaseGrid:
         self.lengths = np.hypot(*(_MOVES * self.step).T)
         world = Standing(standing)
         self.base, self.carried = Body(base, world, margin), Body(carried, world, margin)
-        self._room = [room.tolist() for room in self._rooms(world)]
         lattice = Lattice(self.origin, self.step, self.cells, self.yaws)
         self.stuck, self.stuck_carrying = stuck(base, carried, standing, lattice, margin)
         self._edges: dict[tuple[int, int, int, bool, bool], bool] = {}
@@ -185,13 +185,14 @@ class BaseGrid:
 
     # -- bounds for all cells ---------------------------------------------------------------------------------------------
 
-    def _rooms(self, world: Standing) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return how far every cell is at least from where base, or carried, can hit something at some heading [m]."""
+    @cached_property
+    def _room(self) -> list[list[list[float]]]:
+        """How far every cell is at least from where base, or carried, can hit something at some heading [m]."""
         x, y = (self.origin[axis] + self.step[axis] * np.arange(self.cells) for axis in (0, 1))
         along_x, along_y = np.outer(x, FAN[:, 0]), np.outer(y, FAN[:, 1])
         bodies = (self.base, self.carried)
         rooms = (np.full((self.cells, self.cells), _ROOM), np.full((self.cells, self.cells), _ROOM))
-        for s, support in enumerate(world.support):
+        for s, support in enumerate(self.base.world.support):
             reach = max(float(body.span[s]) for body in bodies) + _ROOM
             if reach < 0.0:  # nothing can hit it
                 continue
@@ -200,7 +201,7 @@ class BaseGrid:
             distance = (along_x[rows, None] + (along_y[columns] - support)).max(axis=2)
             for body, room in zip(bodies, rooms, strict=True):
                 np.minimum(room[rows, columns], distance - body.span[s], out=room[rows, columns])
-        return rooms
+        return [room.tolist() for room in rooms]
 
     # -- distances ------------------------------------------------------------------------------------------------------
 

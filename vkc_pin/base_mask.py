@@ -8,6 +8,7 @@ advance where it need not look.
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -22,6 +23,7 @@ __all__ = ["Lattice", "stuck"]
 _FLAT = 1e-6  # [m]: shapes, and what two have in common in height, that are no higher are left out
 _ROUNDING = 1e-5  # [m] of numbers of single precision
 _AT_ONCE = 16  # outlines
+_KEPT = 4096  # of slices whose support functions are remembered
 _SLANT = float(np.cos(np.pi / len(FAN) * 1.2))  # of the angle between a direction and the nearest of `FAN`, at least
 
 
@@ -35,12 +37,19 @@ class Lattice(NamedTuple):
 
 
 class _Solid(NamedTuple):
-    """Points whose hull a shape contains, shape (n, 3), its lowest and highest z [m], and if it is a prism."""
+    """Points whose hull a shape contains, shape (n, 3), its lowest and highest z [m], if it is a prism, and a name for it."""
 
     points: NDArray[np.float64]
     bottom: float
     top: float
     prism: bool
+    key: bytes
+
+
+_Part = tuple[_Solid, float, float]
+"""Of a solid, what is between two heights [m]."""
+_Reach = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Support functions, and how far beyond their hulls the polygons reach that they bound."""
 
 
 def stuck(
@@ -74,8 +83,9 @@ def _solids(shapes: Sequence[Shape]) -> list[_Solid]:
     for shape, placement in shapes:
         points, _ = outline(shape, placement, outer=False)
         if len(points) and np.ptp(points[:, 2]) > _FLAT:
-            prism = isinstance(shape, coal.Box | coal.Cylinder) and abs(placement.rotation[2, 2]) > 1.0 - 1e-9
-            solids.append(_Solid(points, float(points[:, 2].min()), float(points[:, 2].max()), prism))
+            prism = isinstance(shape, coal.Box | coal.Cylinder) and bool(abs(placement.rotation[2, 2]) > 1.0 - 1e-9)
+            key = points.tobytes() + bytes([prism])
+            solids.append(_Solid(points, float(points[:, 2].min()), float(points[:, 2].max()), prism, key))
     return solids
 
 
@@ -103,24 +113,38 @@ def _touched(points: NDArray[np.float64]) -> NDArray[np.float64]:
     return points[np.flatnonzero(np.bincount((FAN @ points.T).argmax(axis=1)))]
 
 
-def _support(
-    outlines: list[NDArray[np.float64]], directions: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return support functions of point sets, and how far beyond their hulls the polygons reach that they bound.
+class _Supports:
+    """Support functions of slices, remembered: rooms and robots stay what they are from phase to phase and task to task."""
 
-    Args:
-        outlines: M times points, shape (n, 2) [m].
-        directions: Unit vectors in turn, shape (D, K, 2).
+    def __init__(self) -> None:
+        self._known: OrderedDict[tuple[bytes, float, float, bytes], _Reach] = OrderedDict()
 
-    Returns:
-        Shapes (M, D, K) and (M, D) [m].
-    """
-    order = np.argsort([len(points) for points in outlines], kind="stable")
-    support, spare = np.empty((len(outlines), *directions.shape[:2])), np.empty((len(outlines), len(directions)))
-    for first in range(0, len(order), _AT_ONCE):  # few at once stay in the processor's cache
-        some = order[first : first + _AT_ONCE]
-        support[some], spare[some] = _support_of([outlines[k] for k in some.tolist()], directions)
-    return support, spare
+    def of(self, parts: Sequence[_Part], directions: NDArray[np.float64]) -> _Reach:
+        """Return support functions of the plan views of parts of solids, and how far beyond their hulls these let polygons reach.
+
+        Args:
+            parts: M solids, each with two heights.
+            directions: Unit vectors in turn, shape (D, K, 2).
+
+        Returns:
+            Shapes (M, D, K) and (M, D) [m].
+        """
+        turned = directions.tobytes() if len(directions) > 1 else b""
+        keys = [(solid.key, low, high, turned) for solid, low, high in parts]
+        new = {key: _slice(*part) for key, part in zip(keys, parts, strict=True) if key not in self._known}
+        order = sorted(new, key=lambda key: len(new[key]))
+        for first in range(0, len(order), _AT_ONCE):  # few at once stay in the processor's cache
+            some = order[first : first + _AT_ONCE]
+            self._known.update(zip(some, zip(*_support_of([new[key] for key in some], directions), strict=True), strict=True))
+        support, spare = (np.array(values) for values in zip(*(self._known[key] for key in keys), strict=True))
+        for key in keys:
+            self._known.move_to_end(key)
+        while len(self._known) > _KEPT:
+            self._known.popitem(last=False)
+        return support, spare
+
+
+_supports = _Supports()
 
 
 def _support_of(
@@ -157,25 +181,21 @@ def _fill(
     count, cells = len(lattice.yaws), lattice.cells
     if not len(pairs):
         return np.zeros((cells, cells, count), bool)
-    known: tuple[dict[tuple[int, float, float], int], ...] = ({}, {})
-    shapes: tuple[list[NDArray[np.float64]], ...] = ([], [])
+    parts: tuple[dict[tuple[int, float, float], tuple[int, _Part]], ...] = ({}, {})
     indices: tuple[list[int], ...] = ([], [])
     for i, j in zip(*pairs.T.tolist(), strict=True):
         solid, other = first[i], second[j]
         low, high = max(solid.bottom, other.bottom), min(solid.top, other.top)
         if not other.prism:
             low = high = (low + high) / 2
-        for side, which in enumerate((solid, other)):
-            key = (id(which), 0.0, 0.0) if which.prism else (id(which), low, high)
-            if key not in known[side]:
-                known[side][key] = len(shapes[side])
-                shapes[side].append(_slice(which, low, high))
-            indices[side].append(known[side][key])
+        for known, index, number, which in zip(parts, indices, (i, j), (solid, other), strict=True):
+            key = (number, 0.0, 0.0) if which.prism else (number, low, high)
+            index.append(known.setdefault(key, (len(known), (which, *key[1:])))[0])
     moving, standing = np.array(indices)
     cosine, sine = np.cos(lattice.yaws)[:, None], np.sin(lattice.yaws)[:, None]
     turned = -np.stack([cosine * FAN[:, 0] + sine * FAN[:, 1], cosine * FAN[:, 1] - sine * FAN[:, 0]], axis=-1)
-    support, spare = _support(shapes[0], turned)
-    other_support, other_spare = _support(shapes[1], FAN[None])
+    support, spare = _supports.of([part for _, part in parts[0].values()], turned)
+    other_support, other_spare = _supports.of([part for _, part in parts[1].values()], FAN[None])
     allowed = _SLANT * margin - spare[moving] - other_spare[standing] - _ROUNDING  # (pairs, H)
     reach = (support[moving] + other_support[standing] + allowed[..., None]).reshape(-1, len(FAN)).astype(np.float32)
     return _rows(reach, np.tile(np.arange(count), len(moving)), lattice)

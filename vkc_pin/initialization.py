@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from vkc_pin.approach import Approach
 from vkc_pin.beam import Beam, Found
 from vkc_pin.joining import Around, Joiner, Trees
-from vkc_pin.knots import Knots, follow_objects
+from vkc_pin.knots import Knots, Known, follow_objects
 from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.routes import Routes
 
@@ -73,9 +73,9 @@ def initialize(
     if method == "stationary":
         seeds = iter([Seed(method, follow_objects(problem, np.tile(problem.start, (problem.segments, 1))))])
     elif method == "auto":
-        routes = Routes(problem)
-        straight, around = (_Seeds(problem, part, seed, said, routes) for part in ("interpolated", "astar"))
-        trees = _Seeds(problem, "rrt", seed, said, routes, like=around)
+        routes, known = Routes(problem), Known()
+        straight, around = (_Seeds(problem, part, seed, said, routes, known=known) for part in ("interpolated", "astar"))
+        trees = _Seeds(problem, "rrt", seed, said, routes, known=known, like=around)
         seeds = _in_turn(straight.seeds(count), around.seeds(count), trees.seeds(max(count, 2)))
     else:
         seeds = _Seeds(problem, method, seed, said, Routes(problem)).seeds(count)
@@ -131,11 +131,12 @@ class _Seeds:
         notes: list[str],
         routes: Routes,
         *,
+        known: Known | None = None,
         like: _Seeds | None = None,
     ) -> None:
         self.problem, self.method, self.notes, self.like = problem, method, notes, like
         self.found: Found | None = None
-        self.knots = Knots(problem, np.random.default_rng(seed))
+        self.knots = Knots(problem, np.random.default_rng(seed), known)
         drives = problem.chain.robot.base != "fixed"
         self.beam = Beam(self.knots, routes if drives and method != "interpolated" else None)
         approach = Approach(self.knots)

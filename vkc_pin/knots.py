@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
@@ -10,15 +13,56 @@ from vkc_pin.clearing import clear_out
 from vkc_pin.inverse_kinematics import PoseSolver
 from vkc_pin.problem import TrajectoryProblem
 
-__all__ = ["CHOICE", "SCATTER", "Knots", "depth", "follow_objects", "scatter", "smooth"]
+__all__ = ["CHOICE", "SCATTER", "Knots", "Known", "depth", "follow_objects", "scatter", "smooth"]
 
 SCATTER = 192  # random seeds for a configuration that nothing leads to
 CHOICE = 0.1  # what it costs to grasp elsewhere, beside radians of motion
 _ROUGH = 1e-4  # [m] and [rad], of knots; what is joined from them is exact
 
 
+class Known:
+    """What searches of one problem have found out: with the same random numbers they begin with the same configurations.
+
+    Attributes:
+        drawn: From the state of the random numbers, a waypoint and what configurations come from to these, which of them are what
+            must hold there, and the state that follows.
+        depths, cleared: From a waypoint and a configuration to how far that falls short, and to what it is when pushed.
+    """
+
+    def __init__(self) -> None:
+        self.drawn: dict[tuple[str, int, bytes], tuple[NDArray[np.float64], NDArray[np.bool_], Any]] = {}
+        self.depths: dict[tuple[int, bytes], NDArray[np.float64]] = {}
+        self.cleared: dict[tuple[int, bytes], NDArray[np.float64]] = {}
+
+
+_Found = dict[tuple[int, bytes], NDArray[np.float64]]
+
+
+def _row_by_row(
+    known: _Found,
+    find: Callable[[NDArray[np.float64], int], NDArray[np.float64]],
+    z: NDArray[np.float64],
+    waypoint: int,
+) -> NDArray[np.float64]:
+    """Return `find(z, waypoint)`, each row of which belongs to one of z; rows that are known are not asked for again."""
+    keys = [(waypoint, row.tobytes()) for row in z]
+    new = [k for k, key in enumerate(keys) if key not in known]
+    if len(new) == len(z):
+        found = find(z, waypoint)
+        known.update(zip(keys, found, strict=True))
+        return found
+    if new:
+        known.update(zip((keys[k] for k in new), find(z[new], waypoint), strict=True))
+    return np.array([known[key] for key in keys])
+
+
 class Knots:
     """Draws configurations for waypoints of a problem.
+
+    Args:
+        problem: The problem.
+        rng: Random numbers.
+        known: What other searches of the problem have found out; None: nothing.
 
     Attributes:
         problem: The problem.
@@ -28,8 +72,8 @@ class Knots:
         robot: Number of the robot's coordinates.
     """
 
-    def __init__(self, problem: TrajectoryProblem, rng: np.random.Generator) -> None:
-        self.problem, self.rng = problem, rng
+    def __init__(self, problem: TrajectoryProblem, rng: np.random.Generator, known: Known | None = None) -> None:
+        self.problem, self.rng, self.known = problem, rng, Known() if known is None else known
         self.chain = problem.chain
         self.robot = self.chain.robot.coordinates.size
         self.weights = np.ones(self.chain.size)
@@ -56,6 +100,15 @@ class Knots:
             how: "scatter": from anywhere; "track": the nearest ones; "shake": from there with the arms shaken, so that the
                 search can leave a way that is closing.
         """
+        if how != "scatter":
+            return self._knot(before, waypoint, how)
+        key = (str(self.rng.bit_generator.state), waypoint, before.tobytes())
+        if key not in self.known.drawn:
+            self.known.drawn[key] = (*self._knot(before, waypoint, how), self.rng.bit_generator.state)
+        z, found, self.rng.bit_generator.state = self.known.drawn[key]
+        return z.copy(), found.copy()
+
+    def _knot(self, before: NDArray[np.float64], waypoint: int, how: str) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         z = before.copy()
         z[:, self.driven] = self.objects[waypoint - 1, self.driven]
         lower, upper = self._limits(before, waypoint)
@@ -78,6 +131,9 @@ class Knots:
         pose = self.pose_at(waypoint)
         if pose is None:
             return z
+        return _row_by_row(self.known.cleared, lambda rows, at: self._clear(rows, at, pose), z, waypoint)
+
+    def _clear(self, z: NDArray[np.float64], waypoint: int, pose: int) -> NDArray[np.float64]:
         lower, upper = self._limits(z, waypoint)
         solver, target = self.solver(pose)
         weights = self.weights
@@ -153,7 +209,7 @@ class Knots:
 
     def depth(self, z: NDArray[np.float64], waypoint: int) -> NDArray[np.float64]:
         """Return how far each configuration falls short of its margins [m], shape (B,)."""
-        return depth(self.problem, z, waypoint)
+        return _row_by_row(self.known.depths, lambda rows, at: depth(self.problem, rows, at), z, waypoint)
 
 
 def depth(problem: TrajectoryProblem, z: NDArray[np.float64], waypoint: int) -> NDArray[np.float64]:

@@ -189,7 +189,8 @@ class _Seeds:
             self.notes += [line for line in self.joiner.blocked if line not in self.notes]
             if z is None:
                 continue
-            short = float(self.problem.evaluate_contacts(z, reach=self.problem.options.dist_safe).shortfall(len(z)).sum())
+            contacts = self.problem.evaluate_contacts(z, reach=self.problem.options.dist_safe, nearest=1)
+            short = float(contacts.shortfall(len(z)).sum())
             merit = self.problem.objective(z) + self.problem.options.penalty * short
             if merit < least:
                 best, least = (index, z, short), merit

@@ -6,6 +6,8 @@ near postures it is likely to need there, so that narrow passages are found soon
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -81,7 +83,6 @@ class _Search:
         self.weights = _weights(self.size)
         limits = np.array([problem.limits(name) for name in problem.chain.names[: self.size]])
         self.lower, self.upper = limits.T
-        self.runs = self._runs()
 
     def run(self, ends: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Return the way to one of `ends`."""
@@ -106,8 +107,9 @@ class _Search:
                 return self._shortened(np.concatenate([trees[0].path(there), trees[1].path(back)[-2::-1]]))
         return None
 
-    def _runs(self) -> list[NDArray[np.float64]]:
-        """Return the parts of the way that are free with each of the arms, each shape (R, m)."""
+    @cached_property
+    def runs(self) -> list[NDArray[np.float64]]:
+        """The parts of the way that are free with each of the arms, each shape (R, m)."""
         runs = []
         for arm in self.arms:
             rows = np.clip(np.column_stack([self.poses, np.tile(arm, (len(self.poses), 1))]), self.lower, self.upper)

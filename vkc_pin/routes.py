@@ -123,7 +123,8 @@ class Routes:
         beside[0] = 0.0
         for drawn_in in (False, True):
             grid = self.grid(phase, drawn_in=drawn_in)  # the fine one only where it is needed
-            path = shortest_path(grid, start.tolist(), goal + beside, costs=_DEARER * np.abs(beside).sum(axis=1))
-            if path is not None:
-                return along(path, steps)
+            for places in (beside[:1], beside[1:]):
+                path = shortest_path(grid, start.tolist(), goal + places, costs=_DEARER * np.abs(places).sum(axis=1))
+                if path is not None:
+                    return along(path, steps)
         return None

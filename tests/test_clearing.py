@@ -12,7 +12,7 @@ from small_problems import door_scene
 import vkc_pin as vkc
 from vkc_pin import clearing
 from vkc_pin.clearing import clear_out, point_jacobians
-from vkc_pin.knots import Knots
+from vkc_pin.knots import Knots, Known
 
 
 def drawn(steps: list[vkc.Grasp | vkc.Actuate | vkc.Touch], scene: vkc.Scene) -> tuple[vkc.TrajectoryProblem, Knots]:
@@ -152,3 +152,33 @@ def test_what_weighs_more_moves_less(scattered: Scattered, monkeypatch: pytest.M
     heavy[:3] = 100.0
     moved = [np.abs(scattered.cleared(weights=weights) - scattered.z)[:, :3].sum() for weights in (even, heavy)]
     assert moved[1] < 0.5 * moved[0]
+
+
+def test_searches_that_share_what_they_know_find_what_they_would_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = vkc.build(door_scene(), [vkc.Grasp("door", "handle_free")])
+    known, waypoint = Known(), int(problem.ends[0])
+    before = np.tile(problem.start, (8, 1))
+
+    def found(knots: Knots) -> list[np.ndarray]:
+        drawn = [knots.knot(before, waypoint, "scatter") for _ in range(2)]
+        z = np.concatenate([z for z, _ in drawn])
+        return [
+            z,
+            np.concatenate([ok for _, ok in drawn]),
+            knots.depth(z, waypoint),
+            knots.clear(z, waypoint),
+            knots.rng.random(3),
+        ]
+
+    alone, first = found(Knots(problem, np.random.default_rng(0))), found(Knots(problem, np.random.default_rng(0), known))
+
+    def refuse(*_args: Any, **_kwargs: Any) -> None:
+        raise AssertionError("asked again")
+
+    for name in ("depth", "clear_out"):
+        monkeypatch.setattr(f"vkc_pin.knots.{name}", refuse)
+    again = found(Knots(problem, np.random.default_rng(0), known))
+    assert not np.array_equal(alone[0][:8], alone[0][8:])
+    for one, other, third in zip(alone, first, again, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-9)
+        np.testing.assert_array_equal(other, third)

@@ -95,7 +95,7 @@ class ContactModel:
         self._obstacles = tuple(scene.obstacles.geometryObjects)
         self._boxes = _boxes([*chain.collision.geometryObjects]), _boxes(self._obstacles)
         self.phases = [self._phase(number) for number in range(len(task.phases))]
-        self._distances = [Distances(part.shapes, part.pairs) for part in self.phases]
+        self._distances = [Distances(part.shapes, self._placed.oMg) for part in self.phases]
         # Beyond the chain's own geometries everything stands in the world.
         own = [shape.parentJoint for shape in chain.collision.geometryObjects]
         self._joints = np.array(own + [0] * (max(len(part.labels) for part in self.phases) - len(own)))
@@ -221,33 +221,34 @@ class ContactModel:
         """
         q = self.chain.coordinates.q(z)
         rotations, translations = self.chain.joint_placements(z)
+        phase_of = np.maximum(np.searchsorted(self.first_waypoint, waypoints) - 1, 0)
         rows: list[tuple[float, ...]] = []
-        vectors: list[tuple[NDArray[np.float64], ...]] = []
-        phase_of = np.array([self.phase_of(int(w)) for w in waypoints])
-        for number in np.unique(phase_of):
+        vectors: list[NDArray[np.float64]] = []
+        for number in set(phase_of.tolist()):
             part, inside = self.phases[number], np.flatnonzero(phase_of == number)
             at, pairs, bounds = part.maybe_within(reach, rotations[inside], translations[inside])
-            margins = part.margins_at(pairs, waypoints[inside][at])
-            order = np.lexsort((pairs, bounds - margins, at))
-            at, pairs, margins, bounds = at[order], pairs[order], margins[order], bounds[order]
+            margins = part.margins_at(pairs, waypoints[inside[at]])
+            least = bounds - margins
+            order = np.lexsort((pairs, least, at))
+            columns = (pairs, *part.pairs[pairs].T, margins, least)
+            pair, first, second, margin, bound = (column[order].tolist() for column in columns)
             edges = np.searchsorted(at, np.arange(len(inside) + 1)).tolist()
             for row, begin, end in zip(inside.tolist(), edges[:-1], edges[1:], strict=True):
                 if begin == end:
                     continue
                 pin.updateGeometryPlacements(self.chain.model, self.data, self.chain.collision, self._placed, q[row])
-                asked = self._distances[number].at(self._placed.oMg)
-                found: list[tuple[float, float, int, float, coal.DistanceResult]] = []
-                candidates = (values[begin:end].tolist() for values in (pairs, margins, bounds))
-                for k, margin, bound in zip(*candidates, strict=True):
-                    if nearest is not None and len(found) >= nearest and bound - margin > found[nearest - 1][0] + _ROUNDING:
+                asked = self._distances[number].moved()
+                found: list[tuple[float, float, int, int, coal.DistanceResult]] = []
+                for i in range(begin, end):
+                    if nearest is not None and len(found) >= nearest and bound[i] > found[nearest - 1][0] + _ROUNDING:
                         break  # neither this one nor any after it is among the nearest
-                    result = asked.of(k)
+                    result = asked.of(first[i], second[i])
                     distance = result.min_distance
                     if distance < reach:
-                        insort(found, (distance - margin, distance, k, margin, result))
-                for _, distance, k, margin, result in found[:nearest]:
-                    vectors.append((result.normal.copy(), result.getNearestPoint1(), result.getNearestPoint2()))
-                    rows.append((float(row), *part.pairs[k].tolist(), distance, margin))
+                        insort(found, (distance - margin[i], distance, pair[i], i, result))
+                for _, distance, _, i, result in found[:nearest]:
+                    rows.append((row, first[i], second[i], distance, margin[i]))
+                    vectors += (result.normal.copy(), result.getNearestPoint1(), result.getNearestPoint2())
         table = np.array(rows, float).reshape(len(rows), 5)
         order = np.argsort(table[:, 0], kind="stable")
         table, stacked = table[order], np.array(vectors, float).reshape(len(rows), 3, 3)[order]

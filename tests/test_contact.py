@@ -304,6 +304,19 @@ def test_many_configurations_at_once_are_as_one_by_one() -> None:
         assert not alone.waypoint.any()
 
 
+def test_contacts_do_not_depend_on_how_many_configurations_are_looked_at_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = door_problem()
+    z, _ = sampled(2)
+    waypoints = problem.ends[np.arange(len(z)) % 4]
+    at_once = problem.contacts.evaluate(z, waypoints, reach=0.3, nearest=4)
+    assert np.all(np.diff(at_once.waypoint) >= 0)
+    monkeypatch.setattr("vkc_pin.contact._ROWS", 50)
+    monkeypatch.setattr("vkc_pin.broadphase._ROWS", 7)
+    in_portions = problem.contacts.evaluate(z, waypoints, reach=0.3, nearest=4)
+    for one, other in zip(at_once.arrays(), in_portions.arrays(), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
 def test_contacts_are_sorted_by_what_they_lack() -> None:
     problem = door_problem()
     z, _ = sampled(0)

@@ -32,6 +32,7 @@ from vkc_pin.task import Task
 __all__ = ["ContactModel", "Contacts"]
 
 _ROUNDING = 1e-6  # [m] of coal
+_ROWS = 256  # configurations whose kinematics are computed at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,7 +221,7 @@ class ContactModel:
             nearest: How many of them to return per configuration, those that fall shortest of their margins; None: all.
         """
         q = self.chain.coordinates.q(z)
-        rotations, translations = self.chain.joint_placements(z)
+        rotations, translations = self.placements(z)
         phase_of = np.maximum(np.searchsorted(self.first_waypoint, waypoints) - 1, 0)
         rows: list[tuple[float, ...]] = []
         vectors: list[NDArray[np.float64]] = []
@@ -254,6 +255,11 @@ class ContactModel:
         table, stacked = table[order], np.array(vectors, float).reshape(len(rows), 3, 3)[order]
         index = table[:, :3].astype(int)
         return Contacts(index[:, 0], index[:, 1:], table[:, 3], table[:, 4], stacked[:, 0], stacked[:, 1], stacked[:, 2])
+
+    def placements(self, z: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the same as the chain's `joint_placements`; in portions of one size, as CasADi prepares for each size anew."""
+        parts = [self.chain.joint_placements(z[row : row + _ROWS]) for row in range(0, max(len(z), 1), _ROWS)]
+        return np.concatenate([rotations for rotations, _ in parts]), np.concatenate([moves for _, moves in parts])
 
     def joints_of(self, geometries: NDArray[np.int_]) -> NDArray[np.int_]:
         """Return the joints of the chain that carry `geometries`; 0 for what stands in the world."""

@@ -49,15 +49,15 @@ def collisions_between(problem: TrajectoryProblem, z: NDArray[np.float64]) -> tu
     found = found.select(np.flatnonzero((segment[found.waypoint] > 0) | (found.distance < 0)))
     keep = np.minimum(KEEP, found.margin)
     joints = problem.contacts.joints_of(found.pair)
-    rotations, translations = problem.chain.joint_placements(states)
+    rotations, translations = problem.contacts.placements(states[found.waypoint])
     ends = problem.chain.joint_placements(path)
     parts = []
     for offset in (0, 1):
         waypoint = segment[found.waypoint] + offset
         points = []
         for column, witness in ((0, found.first), (1, found.second)):
-            j, row = joints[:, column], found.waypoint
-            local = np.einsum("cji,cj->ci", rotations[row, j], witness - translations[row, j])
+            j, contact = joints[:, column], np.arange(len(joints))
+            local = np.einsum("cji,cj->ci", rotations[contact, j], witness - translations[contact, j])
             points.append(np.einsum("cij,cj->ci", ends[0][waypoint, j], local) + ends[1][waypoint, j])
         value = np.einsum("ci,ci->c", found.normal, points[1] - points[0])
         inside = waypoint > 0  # the start cannot be moved
@@ -76,10 +76,10 @@ def _states(
 
 def _deepest(found: Contacts, segment: NDArray[np.int_]) -> Contacts:
     """Return the contact of smallest distance for each segment and pair."""
-    order = np.argsort(found.distance, kind="stable")
-    keys = np.column_stack([segment[found.waypoint], found.pair])[order]
-    _, first = np.unique(keys, axis=0, return_index=True)
-    return found.select(order[first])
+    shapes = int(found.pair.max(initial=0)) + 1
+    keys = (segment[found.waypoint] * shapes + found.pair[:, 0]) * shapes + found.pair[:, 1]
+    order = np.lexsort((found.distance, keys))
+    return found.select(order[np.diff(keys[order], prepend=-1) > 0])
 
 
 def merge(*parts: Contacts) -> Contacts:

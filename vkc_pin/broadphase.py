@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 __all__ = ["PhaseGeometry"]
 
-_AT_ONCE = 4_000_000  # comparisons of boxes
+_AT_ONCE = 1_000_000  # comparisons of boxes
 _ROWS = 128  # configurations: what is computed of so many stays in the processor's cache
 
 
@@ -68,7 +68,8 @@ class PhaseGeometry:
     def within(self, reach: float, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> NDArray[np.int_]:
         """Return what stands and may be within `reach` [m] of a box along the world's axes, corners of shape (3,) [m]."""
         lows, highs = self._boxes
-        return np.flatnonzero(((lows < upper + reach) & (highs > lower - reach)).all(axis=1)) + self._moving_count
+        near = (lows < (upper + reach)[:, None]) & (highs > (lower - reach)[:, None])
+        return np.flatnonzero(near.all(axis=0)) + self._moving_count
 
     def pairs_of(self, first: int, seconds: NDArray[np.int_]) -> NDArray[np.int_]:
         """Return the pairs of a geometry that moves with some that stand, those that there are."""
@@ -88,7 +89,7 @@ class PhaseGeometry:
             rotations: Of all joints in the world, shape (W, J, 3, 3).
             translations: Of all joints in the world, shape (W, J, 3) [m].
         """
-        boxes = len(self._groups[1]) * len(self._boxes[0])
+        boxes = len(self._groups[1]) * (len(self.joint) - self._moving_count)
         step = max(1, min(_ROWS, _AT_ONCE // max(boxes, 1)))
         parts = [self._near(reach, rotations[w : w + step], translations[w : w + step]) for w in range(0, len(rotations), step)]
         if len(parts) == 1:
@@ -137,11 +138,10 @@ class PhaseGeometry:
         lower = np.minimum.reduceat(middles - extents, starts, axis=2) - reach
         upper = np.maximum.reduceat(middles + extents, starts, axis=2) + reach
         lows, highs = self._boxes
-        some = ((lower.min(axis=(1, 2)) < highs) & (upper.max(axis=(1, 2)) > lows)).all(axis=1).nonzero()[0]
-        near = np.ones((*lower.shape[1:], len(some)), bool)
-        for least, most, low, high in zip(lower, upper, lows[some].T, highs[some].T, strict=True):
-            near &= least[..., None] < high
-            near &= most[..., None] > low
+        least, most = lower.min(axis=(1, 2))[:, None], upper.max(axis=(1, 2))[:, None]
+        (some,) = ((least < highs) & (most > lows)).all(axis=0).nonzero()
+        lows, highs = lows.take(some, axis=1)[:, None, None], highs.take(some, axis=1)[:, None, None]
+        near = ((lower[..., None] < highs) & (upper[..., None] > lows)).all(axis=0)
         w, group, standing = near.nonzero()
         count = sizes[group]
         entry = np.repeat(np.arange(len(w)), count)
@@ -235,11 +235,9 @@ class PhaseGeometry:
 
     @cached_property
     def _boxes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The lower and upper corners of boxes along the world's axes around what stands, shape (S, 3) each [m]."""
+        """The lower and upper corners of boxes along the world's axes around what stands, shape (3, S) each [m]."""
         standing = slice(self._moving_count, None)
-        rotation = self.rotation[standing]
-        centers = np.einsum("gij,gj->gi", rotation, self.center[standing]) + self.translation[standing]
-        extents = np.einsum("gij,gj->gi", np.abs(rotation), self.half[standing])
+        centers, extents = self._local[:, standing], _turned(np.abs(self._turn[..., standing]), self._half[:, standing])
         return centers - extents, centers + extents
 
 

@@ -338,3 +338,24 @@ def test_what_moves_together() -> None:
     together = {pair_names(table, k) for k in np.flatnonzero(table.together)}
     hands = {(link, "stick.stick") for link in scene.robot.touch_links}
     assert together == {*hands, ("stick.tip", "ball.ball")}
+
+
+def test_what_lies_still_is_looked_at_only_at_waypoints(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stick that is put down on its table goes on touching it while the robot drives away."""
+    scene = room(table(gap=5e-4))
+    down = reaching(tool_at(STICK), above(STICK))
+    script = Script(scene).go(down).take("stick").go(moved_base(down, y=0.05), steps=1).go(down, steps=1).let_go("stick")
+    motion = script.go(moved_base(down, x=-1.0), steps=3).motion()
+    resting = swept(scene, motion)[2]
+    last = motion.phases[-1]
+    pair = {frozenset((hit.first, hit.second)) for hit in resting if hit.distance < 1e-3} & {
+        frozenset((one, "table")) for one in ("stick.stick", "stick.tip")
+    }
+    assert pair, "it touches nothing: choose another way of putting it down"
+    samples = Samples(scene, motion)
+    begin = samples.waypoint_rows[last.first]
+    assert not [hit for hit in resting if hit.row > begin and not hit.at_waypoint and frozenset((hit.first, hit.second)) in pair]
+    monkeypatch.setattr(validation_pairs, "STILL", -1.0)  # all the same, if everything is looked at
+    everything = swept(scene, motion)[2]
+    assert [hit for hit in everything if hit.row > begin and not hit.at_waypoint and frozenset((hit.first, hit.second)) in pair]
+    assert min(hit.distance for hit in everything) == min(hit.distance for hit in resting)

@@ -23,6 +23,7 @@ from vkc_pin.world import World
 __all__ = ["Hit", "PairTable"]
 
 RESOLUTION = 1e-3  # [m] of penetration that may stay unseen between two samples
+STILL = 1e-6  # [m] of relative motion between two samples that changes nothing, as of what stands where it was put
 
 
 class Hit(NamedTuple):
@@ -174,7 +175,7 @@ class PairTable:
     ) -> Iterator[Hit]:
         """Yield what comes closer than `smallest` at samples between two others, halves of which are left out where nothing can.
 
-        d(s) ≥ (d_t + d_{t+1} − relative motion) / 2 for every state in between.
+        d(s) ≥ (d_t + d_{t+1} − relative motion) / 2 for every state in between; without motion it is what it is at both ends.
 
         Args:
             z: Sampled configurations of the world, shape (S, n).
@@ -188,7 +189,7 @@ class PairTable:
         while todo:
             (low, high), pairs, (before, after) = todo.pop()
             way = (travelled[high] - travelled[low])[self.pairs[pairs]].sum(axis=1)
-            some = before + after - way < 2 * smallest
+            some = (before + after - way < 2 * smallest) & (way > STILL)
             pairs, before, after, way = pairs[some], before[some], after[some], way[some]
             if not len(pairs):
                 continue

@@ -15,11 +15,13 @@ from small_problems import door_scene
 from test_initialization import hand_off_the_handle
 
 import vkc_pin as vkc
+from vkc_pin import joining
 from vkc_pin.approach import Approach
 from vkc_pin.beam import Beam
 from vkc_pin.joining import Around, Joiner, Trees, Ways
 from vkc_pin.knots import Knots, smooth
 from vkc_pin.routes import Routes
+from vkc_pin.trees import TRIES
 
 FEW = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20)
 OPEN = vkc.Actuate("door", {"hinge": 1.2})
@@ -328,6 +330,24 @@ def test_trees_find_nothing_where_there_is_nothing() -> None:
     join = joiner(p, trees(p))
     assert join.join(np.array([p.start, at(p, GOAL)]), [0, p.segments]) is None
     assert len(join.blocked) == 1
+
+
+def test_trees_that_failed_try_less_until_they_succeed_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In each phase on its own, and never less than an eighth."""
+    p = gated(NARROW)
+    ways, tries, found = trees(p), list[int](), iter([False, False, False, False, False, True, False, False])
+
+    def connect(*_: Any, poses: np.ndarray, tries: int, asked: list[int] = tries, **__: Any) -> np.ndarray | None:
+        asked.append(tries)
+        return np.tile(p.start[:ROBOT], (2, 1)) if next(found) else None
+
+    monkeypatch.setattr(joining, "connect", connect)
+    for number, phase in enumerate([0, 0, 1, 0, 0, 0, 0, 0]):
+        monkeypatch.setattr(ways.routes, "guide", lambda *_: np.zeros((2, 3)))
+        monkeypatch.setattr(ways.routes, "compact", lambda _: p.start[3:ROBOT])
+        way = ways.way(phase, p.start, at(p, GOAL), 5, turns=True, reaches=True)
+        assert (way is not None) == (number == 5)
+    assert tries == [TRIES, TRIES // 2, TRIES, TRIES // 4, TRIES // 8, TRIES // 8, TRIES, TRIES // 2]
 
 
 def test_trees_of_a_fixed_base_move_the_arm_alone(monkeypatch: pytest.MonkeyPatch) -> None:

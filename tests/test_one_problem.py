@@ -34,8 +34,10 @@ class Race:
         after: Of what one round leads to, and the solver's status.
         finally_: Of what all rounds lead to, and the status.
         shortfalls: Of the seeds.
-        events: What happened: "b" a seed was asked for, "b1" it was given one round, "b*" all of them.
+        stuck: The seeds from which the solver gets stuck, when it has no patience.
+        events: What happened: "b" a seed was asked for, "b1" it was given one round, "b*" all of them, "b*!" at a higher penalty.
         radii: How far planes were to be believed at first, each time; None: as usual.
+        patience: Whether the solver was to have any, each time.
     """
 
     def __init__(
@@ -47,12 +49,15 @@ class Race:
         finally_: dict[str, Answer] | None = None,
         shortfalls: Sequence[float] = (),
         amounts: Sequence[float] = (),
+        stuck: str = "",
     ) -> None:
         self.heights, self.after, self.finally_ = heights, after or {}, finally_ or {}
+        self.stuck = stuck
         self.shortfalls, self.amounts = shortfalls or [0.0] * len(heights), iter(amounts or [1.0] * 20)
         self.events: list[str] = []
         self.given: list[np.ndarray] = []
         self.radii: list[np.ndarray | None] = []
+        self.patience: list[bool] = []
         self.stop: Callable[[str], None] = lambda event: None
         monkeypatch.setattr(module, "initialize", self.initialize)
         monkeypatch.setattr(module, "solve", self.solve)
@@ -88,17 +93,22 @@ class Race:
         deadline: float,
         rounds: int | None = None,
         radius: np.ndarray | None = None,
+        penalty: float | None = None,
+        patient: bool = True,
     ) -> Solution:
         name = NAMES[round((z[0, 8] - problem.start[8]) / MARK)]
         self.given.append(z)
         self.radii.append(radius)
-        self.note(f"{name}{rounds or '*'}")
+        self.note(f"{name}{rounds or '*'}{'!' if penalty else ''}")
+        self.patience.append(patient)
         height, status = (self.after if rounds else self.finally_).get(name, (None, "not converged"))
         if callback is not None:
             callback(ROUND)
         timings = {"coal": 0.5, "casadi": 0.25, "ipopt": 0.125}
         solved = z if height is None else self.z(problem, name, height)
         solution = Solution(solved, status == "converged", status, self.radius(problem, name))
+        if name in self.stuck and not rounds and not patient:
+            solution.penalty = 800.0
         return dataclasses.replace(solution, rounds=1, iterations=5, timings=timings, history=[ROUND])
 
     def validate(self, scene: vkc.Scene, steps: Any, trajectory: vkc.Trajectory, options: vkc.Options) -> vkc.Report:
@@ -186,6 +196,28 @@ def test_raced_seeds_go_on_with_the_trust_region_that_they_had(monkeypatch: pyte
         np.testing.assert_array_equal(radii[name], race.radius(race.one.problem, name[0]))
 
 
+@pytest.mark.parametrize(
+    ("amounts", "stuck", "expected"),
+    [
+        ([3.0, 2.0, 1.0, 1.0], "abc", "a a* b b* c c* c*!"),  # what violates least
+        ([3.0, 2.0, 4.0, 1.0], "ac", "a a* b b* c c* a*!"),
+        ([3.0, 0.0], "a", "a a* b b*"),
+        ([3.0, 2.0, 4.0], "", "a a* b b* c c*"),
+    ],
+)
+def test_of_what_got_stuck_the_best_is_tried_again_once_there_are_no_other_seeds(
+    amounts: list[float], stuck: str, expected: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    race = Race(monkeypatch, [3.0, 1.0, 2.0], amounts=[*amounts, 1.0, 1.0, 1.0], stuck=stuck)
+    race.run([vkc.GoTo(0.0, 0.0)])
+    assert race.events == expected.split()
+    solved = [event for event in race.events if "*" in event]
+    assert race.patience == ["!" in event for event in solved]
+    for event, radius in zip(solved, race.radii, strict=True):
+        if "!" in event:
+            np.testing.assert_array_equal(radius, race.radius(race.one.problem, event[0]))
+
+
 def test_rounds_of_the_race_count(monkeypatch: pytest.MonkeyPatch) -> None:
     rows: list[Iteration] = []
     race = Race(monkeypatch, [2.0, 1.0], amounts=[1.0, 0.0])
@@ -214,11 +246,11 @@ def test_without_a_grasp_inside_there_is_no_race(steps: list[Any], held: bool, m
 
 
 def test_a_seed_of_ones_own_does_not_race(monkeypatch: pytest.MonkeyPatch) -> None:
-    race = Race(monkeypatch, [3.0, 1.0])
+    race = Race(monkeypatch, [3.0, 1.0], stuck="d")
     race.run()
     race.events.clear()
     plan = race.one.run(lambda problem: Seed("mine", race.z(problem, "d", 1.0)))
-    assert race.events == ["d*"]
+    assert (race.events, race.patience[-1]) == (["d*"], False)  # whoever has one has a motion already
     assert plan.initialization == "mine"
 
 

@@ -155,7 +155,8 @@ def test_a_solution_goes_on_with_the_radius_that_another_ended_with() -> None:
 class Scripted:
     """Stands for the loop's state: every round leads where it is said, and is accepted if that is said."""
 
-    def __init__(self, *rounds: tuple[float, float, bool]) -> None:
+    def __init__(self, *rounds: tuple[float, float, bool], drift: float = 0.0, done: bool = False) -> None:
+        self.problem, self.z, self.is_done = SimpleNamespace(drift=lambda _: drift), np.zeros((40, 1)), done
         self.deadline, self.penalty, self.solution = np.inf, 200.0, Solution(np.zeros((40, 1)))
         self.objective, self.shortfall, self.rounds, self.radii = 10.0, np.full(40, 0.5), iter(rounds), list[np.ndarray]()
 
@@ -181,16 +182,16 @@ class Scripted:
         self.objective, self.shortfall = trial.objective, trial.shortfall
 
     def done(self, _: solver._Trial) -> bool:
-        return False
+        return self.is_done
 
     def raise_penalty(self) -> None:
         self.penalty *= 2
 
 
-def scripted(*rounds: tuple[float, float, bool]) -> Scripted:
-    loop = Scripted(*rounds)
+def scripted(*rounds: tuple[float, float, bool], patient: bool = True, drift: float = 0.0, done: bool = False) -> Scripted:
+    loop = Scripted(*rounds, drift=drift, done=done)
     region, interrupt = trust_region.TrustRegion(40), SimpleNamespace(pressed=False)
-    solver._iterate(loop, region, None, interrupt, len(rounds))  # type: ignore[arg-type]
+    solver._iterate(loop, region, None, interrupt, len(rounds), patient)  # type: ignore[arg-type]
     loop.radii.append(region.radius)
     return loop
 
@@ -248,6 +249,30 @@ def test_after_a_few_rounds_what_is_far_from_free_is_given_up(rounds: list[tuple
     loop = scripted(*rounds)
     assert loop.solution.rounds == expected
     assert loop.solution.status == "not converged"
+
+
+@pytest.mark.parametrize(("drift", "expected"), [(0.0, 20), (2.0, 20), (2.1, 6)])
+def test_what_drifts_far_is_given_up_after_a_few_rounds(drift: float, expected: int) -> None:
+    assert scripted(*LATE, drift=drift).solution.rounds == expected
+
+
+@pytest.mark.parametrize(("drift", "converged"), [(0.8, True), (0.95, False)])
+def test_what_only_drifts_ends_as_if_it_were_good(drift: float, converged: bool) -> None:
+    """No round can help that; it is not said to have converged."""
+    solution = scripted((8.0, 0.0, True), (1.0, 0.0, True), drift=drift, done=True).solution
+    assert (solution.rounds, solution.converged) == (1, converged)  # nothing holds the step back any more
+    assert solution.status == ("converged" if converged else "not converged")
+
+
+@pytest.mark.parametrize("patient", [True, False])
+def test_without_patience_what_is_stuck_is_left_to_later(patient: bool) -> None:
+    """Stuck: something is in the way, and nothing moves."""
+    loop = scripted(*[(10.0, 0.05, False)] * 20, patient=patient)
+    first = next(k for k, radius in enumerate(loop.radii) if k and (radius == trust_region.RESTART_RADIUS).all())
+    assert (loop.solution.rounds == first) != patient
+    assert (loop.solution.penalty == loop.penalty) != patient
+    assert loop.penalty > 200.0
+    assert patient == (loop.solution.penalty is None)
 
 
 def test_motions_far_from_free_are_given_up_soon(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,12 +15,13 @@ from carrying import room, stand, table
 from small_problems import door_scene, full_scene, random_configurations
 
 from vkc_pin import transcription as module
+from vkc_pin import waypoint as kinds
 from vkc_pin.options import Options
 from vkc_pin.problem import TrajectoryProblem, build
 from vkc_pin.robot import load_robot
 from vkc_pin.scene import Scene
 from vkc_pin.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
-from vkc_pin.waypoint import Structure
+from vkc_pin.waypoint import Structure, waypoint_functions
 
 OPTIONS = Options(reach_waypoints=3, turn_waypoints=2, move_waypoints=3, contact_slots=2)
 QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes"}
@@ -408,6 +409,29 @@ def test_only_the_programs_used_last_are_kept(monkeypatch: pytest.MonkeyPatch) -
     assert len(built) == limit + 1
     module.transcribe(structures[1])
     assert len(built) == limit + 2
+
+
+def test_functions_of_waypoints_are_shared_by_structures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many waypoints there are, and wherever they must satisfy poses."""
+    monkeypatch.setattr(kinds, "_functions", type(kinds._functions)())
+    structure = problem("reach").transcription.structure
+    pose = structure.poses[0]
+    first = waypoint_functions(structure.model, 3, (pose,))
+    assert waypoint_functions(structure.model, 3, (dataclasses.replace(pose, waypoints=(1, 2)),)) is first
+    others = [
+        waypoint_functions(structure.model, 4, (pose,)),
+        waypoint_functions(structure.model, 3, ()),
+        waypoint_functions(structure.model, 3, (pose, pose)),
+        waypoint_functions(structure.model, 3, (dataclasses.replace(pose, kind="point"),)),
+        waypoint_functions(structure.model, 3, (dataclasses.replace(pose, local=pin.SE3.Random()),)),
+    ]
+    assert len({id(one) for one in [first, *others]}) == 6
+    monkeypatch.setattr(kinds, "_KEPT", 6)
+    assert waypoint_functions(structure.model, 3, (pose,)) is first  # used again: the others are older
+    waypoint_functions(structure.model, 5, (pose,))
+    assert len(kinds._functions) == 6
+    assert waypoint_functions(structure.model, 3, (pose,)) is first
+    assert waypoint_functions(structure.model, 4, (pose,)) is not others[0]
 
 
 def test_the_same_solver_is_not_made_twice() -> None:

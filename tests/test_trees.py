@@ -35,10 +35,10 @@ def gate() -> tuple[vkc.TrajectoryProblem, np.ndarray, np.ndarray]:
     return problem, guide, np.array([problem.start[3:], routes.compact(0)])
 
 
-def through(seed: int, ends: np.ndarray | None = None) -> np.ndarray | None:
+def through(seed: int, ends: np.ndarray | None = None, *, tries: int = trees.TRIES) -> np.ndarray | None:
     problem, guide, arms = gate()
     ends = at(problem, GOAL)[None] if ends is None else ends
-    return connect(problem, 0, problem.start, ends, poses=guide, arms=arms, rng=np.random.default_rng(seed))
+    return connect(problem, 0, problem.start, ends, poses=guide, arms=arms, rng=np.random.default_rng(seed), tries=tries)
 
 
 def length(path: np.ndarray) -> float:
@@ -100,13 +100,12 @@ def test_of_several_ends_it_is_one_that_can_be_reached(seed: int, free: int) -> 
 
 
 @pytest.mark.parametrize("pose", [(2.0, 1.5, 0.0), (4.0, 0.5, 0.0)], ids=["in the wall", "behind a wall without a gate"])
-def test_there_is_no_way_to_what_is_walled_in(pose: tuple[float, float, float], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(trees, "_TRIES", 400)
+def test_there_is_no_way_to_what_is_walled_in(pose: tuple[float, float, float]) -> None:
     problem = gated(0.0)
     poses, arms = np.array([problem.start[:3], pose]), problem.start[None, 3:]
     for seed in range(2):
         rng = np.random.default_rng(seed)
-        assert connect(problem, 0, problem.start, at(problem, pose)[None], poses=poses, arms=arms, rng=rng) is None
+        assert connect(problem, 0, problem.start, at(problem, pose)[None], poses=poses, arms=arms, rng=rng, tries=400) is None
 
 
 def test_of_ends_that_are_all_too_close_to_something_the_least_is_tried() -> None:
@@ -255,10 +254,9 @@ def test_a_tree_that_is_stopped_before_a_run_does_not_take_it_in() -> None:
 def test_free_runs_alone_lead_through_the_gate(runs: float, found: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is drawn that would."""
     monkeypatch.setattr(trees, "_RUNS", runs)
-    monkeypatch.setattr(trees, "_TRIES", 60)
     monkeypatch.setattr(trees._Search, "_draw", lambda *_: gate()[0].start.copy())
     for seed in range(3):
-        path = through(seed)
+        path = through(seed, tries=60)
         assert (path is not None) == found
         if path is not None:
             is_a_way(gate()[0], path)

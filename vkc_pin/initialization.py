@@ -38,12 +38,14 @@ class Seed:
         z: z_1..z_N, shape (N, n).
         shortfall: By how much waypoints fall short of their clearances, summed [m]; NaN if nobody looked.
         radius: How far the solver believes planes at first, shape (N,); None: as usual.
+        penalty: What clearance costs the solver at first; None: as usual.
     """
 
     name: str
     z: NDArray[np.float64]
     shortfall: float = float("nan")
     radius: NDArray[np.float64] | None = None
+    penalty: float | None = None
 
 
 def initialize(

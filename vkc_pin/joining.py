@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Protocol
 
 import numpy as np
@@ -11,9 +12,11 @@ from vkc_pin.approach import Approach
 from vkc_pin.knots import Knots, smooth
 from vkc_pin.routes import Routes
 from vkc_pin.task import Phase
-from vkc_pin.trees import connect, spread
+from vkc_pin.trees import TRIES, connect, spread
 
 __all__ = ["Around", "Joiner", "Trees", "Ways"]
+
+_LEAST = 8  # part of the usual tries that trees have at least, however often they failed before
 
 
 class Ways(Protocol):
@@ -57,6 +60,7 @@ class Trees:
 
     def __init__(self, knots: Knots, routes: Routes) -> None:
         self.knots, self.problem, self.routes = knots, knots.problem, routes
+        self.failed: Counter[int] = Counter()  # how often in a row in each phase
 
     def way(
         self, phase: int, first: NDArray[np.float64], last: NDArray[np.float64], steps: int, *, turns: bool, reaches: bool
@@ -78,7 +82,9 @@ class Trees:
         ends = np.tile(last[:size], (1 if reaches else len(arms), 1))
         if not reaches:
             ends[:, 3:] = arms
-        path = connect(problem, phase, first, ends, poses=poses, arms=np.array(arms), rng=self.knots.rng)
+        tries = max(TRIES // 2 ** self.failed[phase], TRIES // _LEAST)  # what failed before is likely to fail again
+        path = connect(problem, phase, first, ends, poses=poses, arms=np.array(arms), rng=self.knots.rng, tries=tries)
+        self.failed[phase] = 0 if path is not None else self.failed[phase] + 1
         return None if path is None else spread(path, steps)
 
 

@@ -31,12 +31,16 @@ __all__ = ["TIMES", "OneProblem", "Settings"]
 
 TIMES = ("initialization", "coal", "casadi", "ipopt", "validation")
 """What planning spends its time on."""
-_RACING = 3  # seeds of which the one to begin with is chosen
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How to plan; see `planner.plan`."""
+    """How to plan; see `planner.plan`.
+
+    Attributes:
+        racing: Of so many seeds the one to begin with is chosen after one round, where a grasp is to be chosen well. What comes
+            out of less is as good once it is part of a problem with more steps, and it takes a third of the time less.
+    """
 
     initialization: str
     options: Options
@@ -44,6 +48,7 @@ class Settings:
     time_limit: float | None
     seed: int
     perturbation: float
+    racing: int = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +98,8 @@ class OneProblem:
         """Try seeds until validation accepts a motion, there are no more, or time is up.
 
         Args:
-            seed: Makes the only seed to try; None: those of the settings' initialization.
+            seed: Makes the only seed to try, a motion that is nearly good as it is, so that there is no need of patience with it;
+                None: those of the settings' initialization.
         """
         began, limit = time.perf_counter(), self.settings.time_limit
         problem = self.problem = TrajectoryProblem(self.scene, self.task, self.settings.options)
@@ -123,11 +129,15 @@ class OneProblem:
         """Return the best try, with what is in the way of the task if it is no success, and the plan's status."""
         best: _Try | None = None
         notes: list[str] = []
+        stuck: list[tuple[float, int, Seed]] = []
         status = ""
         try:
-            for number, seed in enumerate(seeds, start=1):
-                solution = self._solve(problem, seed, deadline)
+            for number, seed in enumerate(itertools.chain(seeds, _least(stuck)), start=1):
+                solution = self._solve(problem, seed, deadline, patient=seed.penalty is not None)
                 found = self._judge(problem, solution, seed.name)
+                if searched and solution.penalty is not None:
+                    again = Seed(seed.name, solution.z, radius=solution.radius, penalty=solution.penalty)
+                    stuck.append((found.amount, number, again))
                 best = found if best is None or found.report.ok or found.amount < best.amount else best
                 if best.status == "success":
                     return best, "success"
@@ -166,9 +176,9 @@ class OneProblem:
     def _raced(self, problem: TrajectoryProblem, deadline: float) -> Iterator[Seed]:
         """Yield seeds; where a grasp is chosen with what follows in mind, first those that look best after one round."""
         seeds = self._seeds(problem)
-        if any(phase.grasps for phase in problem.task.phases[:-1]):
+        if self.settings.racing > 1 and any(phase.grasps for phase in problem.task.phases[:-1]):
             scored: list[tuple[float, int, Seed]] = []
-            for number, seed in enumerate(itertools.islice(seeds, _RACING)):
+            for number, seed in enumerate(itertools.islice(seeds, self.settings.racing)):
                 if seed.shortfall > HOPELESS:  # a round would not tell
                     scored.append((np.inf, number, seed))
                     continue
@@ -184,8 +194,19 @@ class OneProblem:
             yield from (seed for _, _, seed in sorted(scored))
         yield from seeds
 
-    def _solve(self, problem: TrajectoryProblem, seed: Seed, deadline: float, *, rounds: int | None = None) -> Solution:
-        solution = solve(problem, seed.z, callback=self.settings.callback, deadline=deadline, rounds=rounds, radius=seed.radius)
+    def _solve(
+        self, problem: TrajectoryProblem, seed: Seed, deadline: float, *, rounds: int | None = None, patient: bool = True
+    ) -> Solution:
+        solution = solve(
+            problem,
+            seed.z,
+            callback=self.settings.callback,
+            deadline=deadline,
+            rounds=rounds,
+            radius=seed.radius,
+            penalty=seed.penalty,
+            patient=patient,
+        )
         self.rounds += solution.rounds
         self.iterations += solution.iterations
         for key, value in solution.timings.items():
@@ -227,6 +248,12 @@ class OneProblem:
             initialization=best.name,
             history=tuple(self.history),
         )
+
+
+def _least(stuck: list[tuple[float, int, Seed]]) -> Iterator[Seed]:
+    """Yield, of what got stuck by the time this is asked, what violates least."""
+    for _, _, seed in sorted(stuck)[:1]:
+        yield seed
 
 
 def _ends_free(problem: TrajectoryProblem, seed: Seed) -> bool:

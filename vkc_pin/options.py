@@ -59,7 +59,7 @@ class Options:
     acceleration_weight: float = 0.3
     approach: float = 0.08
     approach_waypoints: int = 4
-    contact_slots: int = 6
+    contact_slots: int = 4
     contact_reach: float = 0.25
     closure_position: float = 1e-3
     closure_angle: float = 1e-3

@@ -14,6 +14,8 @@ from vkc_pin.trajectory import filled
 
 __all__ = ["Piece", "seed_of"]
 
+_NEAR = 0.2  # [m] and [rad] that planes are believed at first: what is nearly free already is improved in smaller steps
+
 
 @dataclass(frozen=True, eq=False)
 class Piece:
@@ -50,7 +52,8 @@ def seed_of(problem: TrajectoryProblem, pieces: Sequence[Piece]) -> Seed:
             begin += phase.segments
     z = filled(z)
     z = np.where(np.isnan(z), problem.start, z)  # no piece moves it
-    return Seed(", ".join(piece.seed for piece in pieces) + ", then all at once", z)
+    name = ", ".join(piece.seed for piece in pieces) + ", then all at once"
+    return Seed(name, z, radius=np.full(problem.segments, _NEAR))
 
 
 def _resampled(waypoints: NDArray[np.float64], segments: int) -> NDArray[np.float64]:

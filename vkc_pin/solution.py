@@ -50,6 +50,7 @@ class Solution:
         converged: Whether the loop ended by its own criteria.
         status: "converged", "not converged", "time limit" or "interrupted".
         radius: How far planes were believed in the end, shape (N,).
+        penalty: With which to go on where it got stuck and had no patience; None: it did not.
         rounds, iterations: Of the outer loop and of Ipopt.
         timings: Seconds in "coal", "casadi" (evaluating functions) and "ipopt" (all the rest of it).
         history: One `Iteration` per round.
@@ -59,6 +60,7 @@ class Solution:
     converged: bool = False
     status: str = "not converged"
     radius: NDArray[np.float64] | None = None
+    penalty: float | None = None
     rounds: int = 0
     iterations: int = 0
     timings: dict[str, float] = field(default_factory=lambda: {"coal": 0.0, "casadi": 0.0, "ipopt": 0.0})

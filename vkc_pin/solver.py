@@ -46,6 +46,7 @@ RATE_TOLERANCE = 1e-4  # relative
 DRIFT = 0.9  # of what a grasp may drift between waypoints
 SETTLING = 0.2  # relative decrease of the objective below which a motion that is nearly free is first made free
 HOPELESS_ROUNDS, HOPELESS = 6, 0.1  # after so many rounds, motions that fall short by so much [m] are given up
+HOPELESS_DRIFT = 2.0  # or drift by so much more than they may: waypoints are too far apart for them
 WORTHWHILE = 0.05  # relative decrease of the objective for which a feasible motion is improved further
 PENALTY_GROWTH, PENALTY_LIMIT = 4.0, 2000.0
 
@@ -152,13 +153,12 @@ class _Loop:
                 self.rates, self.multipliers = True, {}
 
     def done(self, trial: _Trial) -> bool:
-        """Return whether everything holds at the waypoints."""
+        """Return whether everything holds at the waypoints and nothing collides between them."""
         return (
             trial.satisfied
             and trial.clear
             and trial.pose_error < POSE_TOLERANCE
             and self.problem.rate_violation(trial.z) <= RATE_TOLERANCE
-            and self.problem.drift(trial.z) < DRIFT
             and self.free_between(trial)
         )
 
@@ -219,6 +219,8 @@ def solve(
     deadline: float = np.inf,
     rounds: int | None = None,
     radius: NDArray[np.float64] | None = None,
+    penalty: float | None = None,
+    patient: bool = True,
 ) -> Solution:
     """Return the trajectory that the witness-plane loop reaches from `seed`.
 
@@ -229,12 +231,16 @@ def solve(
         deadline: Value of `time.perf_counter()` at which to stop with the best iterate.
         rounds: At most so many rounds; None: `Options.max_outer`.
         radius: How far planes are believed at first, shape (N,): `Solution.radius` where another solution goes on.
+        penalty: What clearance costs at first; None: `Options.penalty`.
+        patient: Whether to make clearance dearer and go on where nothing moves any more. That takes many rounds and seldom helps:
+            where there are other seeds, they come first. `Solution.penalty` is what to go on with.
     """
     loop = _Loop(problem, seed, deadline)
+    loop.penalty = loop.penalty if penalty is None else penalty
     solution = loop.solution
     with interruptible() as interrupt:
         region = TrustRegion(problem.segments, radius)
-        _iterate(loop, region, callback, interrupt, loop.options.max_outer if rounds is None else rounds)
+        _iterate(loop, region, callback, interrupt, loop.options.max_outer if rounds is None else rounds, patient)
     solution.radius = region.radius
     if interrupt.pressed:  # whichever way the loop ended, nothing else is to be tried
         solution.status = "interrupted"
@@ -242,7 +248,12 @@ def solve(
 
 
 def _iterate(
-    loop: _Loop, region: TrustRegion, callback: Callable[[Iteration], None] | None, interrupt: Interrupt, rounds: int
+    loop: _Loop,
+    region: TrustRegion,
+    callback: Callable[[Iteration], None] | None,
+    interrupt: Interrupt,
+    rounds: int,
+    patient: bool,
 ) -> None:
     """Run rounds until everything holds, nothing helps any more, or time is up."""
     solution, started = loop.solution, time.perf_counter()
@@ -275,7 +286,8 @@ def _iterate(
             gain = (loop.objective - trial.objective) / max(abs(loop.objective), 1e-9)
             loop.accept(trial)
             if loop.done(trial):
-                solution.converged, solution.status, feasible = True, "converged", trial.z
+                if loop.problem.drift(trial.z) < DRIFT:  # that waypoints are too far apart along an arc no round can help
+                    solution.converged, solution.status, feasible = True, "converged", trial.z
                 if (trial.step < used).all() or gain < WORTHWHILE:
                     break
         if interrupt.pressed:
@@ -284,12 +296,17 @@ def _iterate(
         region.adapt(before, trial, accepted, ratio)
         if accepted and gain < SETTLING and loop.shortfall.max() < NEARLY_FREE:
             region.settle()
-        if solution.rounds >= HOPELESS_ROUNDS and loop.shortfall.max() > HOPELESS:
+        if solution.rounds >= HOPELESS_ROUNDS and (
+            loop.shortfall.max() > HOPELESS or loop.problem.drift(loop.z) > HOPELESS_DRIFT
+        ):
             break
         if region.stuck(trial, loop.shortfall):
             if loop.penalty >= PENALTY_LIMIT:
                 break
             loop.raise_penalty()
             region.restart()
+            if not patient and not solution.converged:
+                solution.penalty = loop.penalty
+                break
     if feasible is not None:  # rounds after the first feasible one only made it shorter, or failed to
         solution.z = feasible

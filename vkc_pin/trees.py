@@ -14,13 +14,15 @@ from numpy.typing import NDArray
 from vkc_pin.knots import depth, smooth
 from vkc_pin.problem import TrajectoryProblem
 
-__all__ = ["connect", "spread"]
+__all__ = ["TRIES", "connect", "spread"]
+
+TRIES = 1500
+"""How often a tree may grow until they meet."""
 
 _BASE = 2.0  # radians of the arm that a metre of the base's way counts as much as
 _STEP = 0.15  # [rad] between configurations that are looked at
 _EXTENT = 1.0  # [rad] by which a tree grows at most towards what is drawn
 _CHUNK = 6  # configurations looked at in one go: what lies behind the first that is blocked is of no use
-_TRIES = 1500
 _GRAZE = 0.8  # share of a margin that may be missing: the solver pushes that apart
 _RUNS = 0.4  # share of tries in which a tree is to reach a free part of the way
 _GUIDED, _SHAKEN = 0.7, 0.4  # shares of bases drawn on the way, not around its ends, and of arms drawn around what is likely
@@ -37,6 +39,7 @@ def connect(
     poses: NDArray[np.float64],
     arms: NDArray[np.float64],
     rng: np.random.Generator,
+    tries: int = TRIES,
 ) -> NDArray[np.float64] | None:
     """Return configurations of the robot, straight between which hardly anything is hit, shape (K, m), or None if none are found.
 
@@ -48,8 +51,9 @@ def connect(
         poses: x, y [m] and yaw [rad] on a way that the base may take, shape (P, 3).
         arms: Postures that are likely to be needed, shape (A, m - 3) [m] and [rad].
         rng: Random numbers.
+        tries: How often a tree may grow.
     """
-    return _Search(problem, phase, first, poses, arms, rng).run(ends)
+    return _Search(problem, phase, first, poses, arms, rng).run(ends, tries)
 
 
 def spread(path: NDArray[np.float64], steps: int) -> NDArray[np.float64]:
@@ -84,14 +88,14 @@ class _Search:
         limits = np.array([problem.limits(name) for name in problem.chain.names[: self.size]])
         self.lower, self.upper = limits.T
 
-    def run(self, ends: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    def run(self, ends: NDArray[np.float64], tries: int) -> NDArray[np.float64] | None:
         """Return the way to one of `ends`."""
         start = self.first[: self.size]
         short = self._depth(ends)
         ends = ends[short <= max(self.allowed, short.min())]
         trees = _Tree(start[None], self.weights), _Tree(ends, self.weights)
         direct = [*ends]
-        for number in range(_TRIES):
+        for number in range(tries):
             tree, other = (trees[0], trees[1]) if direct or number % 2 else (trees[1], trees[0])
             if direct:
                 node = self._grow(tree, direct.pop(0), np.inf)

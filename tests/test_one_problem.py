@@ -38,6 +38,7 @@ class Race:
         events: What happened: "b" a seed was asked for, "b1" it was given one round, "b*" all of them, "b*!" at a higher penalty.
         radii: How far planes were to be believed at first, each time; None: as usual.
         patience: Whether the solver was to have any, each time.
+        care: Whether it was to be thorough, each time.
     """
 
     def __init__(
@@ -58,6 +59,7 @@ class Race:
         self.given: list[np.ndarray] = []
         self.radii: list[np.ndarray | None] = []
         self.patience: list[bool] = []
+        self.care: list[bool] = []
         self.stop: Callable[[str], None] = lambda event: None
         monkeypatch.setattr(module, "initialize", self.initialize)
         monkeypatch.setattr(module, "solve", self.solve)
@@ -95,12 +97,14 @@ class Race:
         radius: np.ndarray | None = None,
         penalty: float | None = None,
         patient: bool = True,
+        thorough: bool = True,
     ) -> Solution:
         name = NAMES[round((z[0, 8] - problem.start[8]) / MARK)]
         self.given.append(z)
         self.radii.append(radius)
         self.note(f"{name}{rounds or '*'}{'!' if penalty else ''}")
         self.patience.append(patient)
+        self.care.append(thorough)
         height, status = (self.after if rounds else self.finally_).get(name, (None, "not converged"))
         if callback is not None:
             callback(ROUND)
@@ -216,6 +220,14 @@ def test_of_what_got_stuck_the_best_is_tried_again_once_there_are_no_other_seeds
     for event, radius in zip(solved, race.radii, strict=True):
         if "!" in event:
             np.testing.assert_array_equal(radius, race.radius(race.one.problem, event[0]))
+
+
+@pytest.mark.parametrize("rough", [False, True])
+def test_rough_motions_need_neither_a_race_nor_much_care(rough: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    race = Race(monkeypatch, [2.0, 1.0])
+    race.run(rough=rough)
+    assert race.events == (["a", "a*", "b", "b*"] if rough else ["a", "a1", "b", "b1", "b*", "a*"])
+    assert set(race.care) == {not rough}
 
 
 def test_rounds_of_the_race_count(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -155,7 +155,10 @@ def test_a_solution_goes_on_with_the_radius_that_another_ended_with() -> None:
 class Scripted:
     """Stands for the loop's state: every round leads where it is said, and is accepted if that is said."""
 
-    def __init__(self, *rounds: tuple[float, float, bool], drift: float = 0.0, done: bool = False) -> None:
+    def __init__(
+        self, *rounds: tuple[float, float, bool], drift: float = 0.0, done: bool = False, step: float | None = None
+    ) -> None:
+        self.step = step
         self.problem, self.z, self.is_done = SimpleNamespace(drift=lambda _: drift), np.zeros((40, 1)), done
         self.deadline, self.penalty, self.solution = np.inf, 200.0, Solution(np.zeros((40, 1)))
         self.objective, self.shortfall, self.rounds, self.radii = 10.0, np.full(40, 0.5), iter(rounds), list[np.ndarray]()
@@ -172,6 +175,7 @@ class Scripted:
             shortfall=short,
             slack=short,
             pose_error=0.0,
+            step=blank_trial(40).step if self.step is None else self.step * radius,
             contacts=contacts,  # type: ignore[arg-type]
         )
 
@@ -188,10 +192,17 @@ class Scripted:
         self.penalty *= 2
 
 
-def scripted(*rounds: tuple[float, float, bool], patient: bool = True, drift: float = 0.0, done: bool = False) -> Scripted:
-    loop = Scripted(*rounds, drift=drift, done=done)
+def scripted(
+    *rounds: tuple[float, float, bool],
+    patient: bool = True,
+    thorough: bool = True,
+    drift: float = 0.0,
+    done: bool = False,
+    step: float | None = None,
+) -> Scripted:
+    loop = Scripted(*rounds, drift=drift, done=done, step=step)
     region, interrupt = trust_region.TrustRegion(40), SimpleNamespace(pressed=False)
-    solver._iterate(loop, region, None, interrupt, len(rounds), patient)  # type: ignore[arg-type]
+    solver._iterate(loop, region, None, interrupt, len(rounds), patient, thorough)  # type: ignore[arg-type]
     loop.radii.append(region.radius)
     return loop
 
@@ -222,7 +233,8 @@ def test_a_grasp_between_obstacles_is_made_free_with_small_steps() -> None:
     seed = next(initialize(problem, "astar", 0)).z
     solution, objective, small = solve(problem, seed), problem.objective(seed), 0
     for row, after in itertools.pairwise(solution.history):
-        if row.accepted and row.shortfall < solver.NEARLY_FREE and objective - row.objective < solver.SETTLING * objective:
+        nearly = trust_region.CLOSE_ENOUGH <= row.shortfall < solver.NEARLY_FREE  # and not yet free
+        if row.accepted and nearly and objective - row.objective < solver.SETTLING * objective:
             assert after.radius <= trust_region.SETTLE_RADIUS
             assert after.step <= trust_region.SETTLE_RADIUS * (1 + 1e-6)
             small += 1
@@ -262,6 +274,31 @@ def test_what_only_drifts_ends_as_if_it_were_good(drift: float, converged: bool)
     solution = scripted((8.0, 0.0, True), (1.0, 0.0, True), drift=drift, done=True).solution
     assert (solution.rounds, solution.converged) == (1, converged)  # nothing holds the step back any more
     assert solution.status == ("converged" if converged else "not converged")
+
+
+@pytest.mark.parametrize(
+    ("objectives", "step", "thorough", "expected"),
+    [
+        ([8.0, 7.0, 6.8, 5.0], 1.0, True, 3),  # the third is hardly better
+        ([8.0, 7.0, 6.0, 5.0], 1.0, True, 4),
+        ([8.0, 9.0, 6.0], 1.0, True, 2),
+        ([8.0, 7.0, 6.0, 5.0], 0.98, True, 4),  # Ipopt ends a little inside its bounds
+        ([8.0, 7.0, 6.0], 0.85, True, 1),  # nothing held it back
+        ([8.0, 7.0, 6.0], 1.0, False, 1),
+    ],
+)
+def test_what_is_good_is_improved_as_long_as_that_is_worth_while(
+    objectives: list[float], step: float, thorough: bool, expected: int
+) -> None:
+    rounds = [(objective, 0.0, True) for objective in objectives]
+    solution = scripted(*rounds, done=True, step=step, thorough=thorough).solution
+    assert (solution.rounds, solution.converged) == (expected, True)
+
+
+@pytest.mark.parametrize(("done", "small"), [(True, False), (False, True)])
+def test_only_what_is_not_yet_free_needs_small_steps(done: bool, small: bool) -> None:
+    _, after, *_ = scripted((8.1, 0.0, True), (8.1, 0.0, True), done=done, step=1.0).radii
+    assert bool((after <= trust_region.SETTLE_RADIUS).all()) == small
 
 
 @pytest.mark.parametrize("patient", [True, False])

@@ -31,6 +31,7 @@ __all__ = ["TIMES", "OneProblem", "Settings"]
 
 TIMES = ("initialization", "coal", "casadi", "ipopt", "validation")
 """What planning spends its time on."""
+_RACING = 3  # seeds of which the one to begin with is chosen
 
 
 @dataclass(frozen=True)
@@ -38,8 +39,8 @@ class Settings:
     """How to plan; see `planner.plan`.
 
     Attributes:
-        racing: Of so many seeds the one to begin with is chosen after one round, where a grasp is to be chosen well. What comes
-            out of less is as good once it is part of a problem with more steps, and it takes a third of the time less.
+        rough: Whether what comes out only starts a problem of more steps, after which nobody sees any more what is good about it.
+            Then seeds do not race, and the first good motion will do.
     """
 
     initialization: str
@@ -48,7 +49,7 @@ class Settings:
     time_limit: float | None
     seed: int
     perturbation: float
-    racing: int = 3
+    rough: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,9 +177,9 @@ class OneProblem:
     def _raced(self, problem: TrajectoryProblem, deadline: float) -> Iterator[Seed]:
         """Yield seeds; where a grasp is chosen with what follows in mind, first those that look best after one round."""
         seeds = self._seeds(problem)
-        if self.settings.racing > 1 and any(phase.grasps for phase in problem.task.phases[:-1]):
+        if not self.settings.rough and any(phase.grasps for phase in problem.task.phases[:-1]):
             scored: list[tuple[float, int, Seed]] = []
-            for number, seed in enumerate(itertools.islice(seeds, self.settings.racing)):
+            for number, seed in enumerate(itertools.islice(seeds, _RACING)):
                 if seed.shortfall > HOPELESS:  # a round would not tell
                     scored.append((np.inf, number, seed))
                     continue
@@ -206,6 +207,7 @@ class OneProblem:
             radius=seed.radius,
             penalty=seed.penalty,
             patient=patient,
+            thorough=not self.settings.rough,
         )
         self.rounds += solution.rounds
         self.iterations += solution.iterations

@@ -47,6 +47,7 @@ DRIFT = 0.9  # of what a grasp may drift between waypoints
 SETTLING = 0.2  # relative decrease of the objective below which a motion that is nearly free is first made free
 HOPELESS_ROUNDS, HOPELESS = 6, 0.1  # after so many rounds, motions that fall short by so much [m] are given up
 HOPELESS_DRIFT = 2.0  # or drift by so much more than they may: waypoints are too far apart for them
+INSIDE = 0.9  # of the trust region: steps that end there were not held back (Ipopt ends a little inside its bounds)
 WORTHWHILE = 0.05  # relative decrease of the objective for which a feasible motion is improved further
 PENALTY_GROWTH, PENALTY_LIMIT = 4.0, 2000.0
 
@@ -221,6 +222,7 @@ def solve(
     radius: NDArray[np.float64] | None = None,
     penalty: float | None = None,
     patient: bool = True,
+    thorough: bool = True,
 ) -> Solution:
     """Return the trajectory that the witness-plane loop reaches from `seed`.
 
@@ -234,13 +236,14 @@ def solve(
         penalty: What clearance costs at first; None: `Options.penalty`.
         patient: Whether to make clearance dearer and go on where nothing moves any more. That takes many rounds and seldom helps:
             where there are other seeds, they come first. `Solution.penalty` is what to go on with.
+        thorough: Whether to go on from a motion at which everything holds as long as it gets shorter.
     """
     loop = _Loop(problem, seed, deadline)
     loop.penalty = loop.penalty if penalty is None else penalty
     solution = loop.solution
     with interruptible() as interrupt:
         region = TrustRegion(problem.segments, radius)
-        _iterate(loop, region, callback, interrupt, loop.options.max_outer if rounds is None else rounds, patient)
+        _iterate(loop, region, callback, interrupt, loop.options.max_outer if rounds is None else rounds, patient, thorough)
     solution.radius = region.radius
     if interrupt.pressed:  # whichever way the loop ended, nothing else is to be tried
         solution.status = "interrupted"
@@ -254,10 +257,12 @@ def _iterate(
     interrupt: Interrupt,
     rounds: int,
     patient: bool,
+    thorough: bool,
 ) -> None:
     """Run rounds until everything holds, nothing helps any more, or time is up."""
     solution, started = loop.solution, time.perf_counter()
     feasible: NDArray[np.float64] | None = None
+    good = float("inf")  # objective of the last motion at which everything held
     for _ in range(rounds):
         if time.perf_counter() > loop.deadline:
             solution.status = solution.status if solution.converged else "time limit"
@@ -285,16 +290,18 @@ def _iterate(
         if accepted:
             gain = (loop.objective - trial.objective) / max(abs(loop.objective), 1e-9)
             loop.accept(trial)
-            if loop.done(trial):
+            if done := loop.done(trial):
+                last, good = good, trial.objective
                 if loop.problem.drift(trial.z) < DRIFT:  # that waypoints are too far apart along an arc no round can help
                     solution.converged, solution.status, feasible = True, "converged", trial.z
-                if (trial.step < used).all() or gain < WORTHWHILE:
+                improved = good < (1.0 - WORTHWHILE) * last
+                if not thorough or not improved or (trial.step < INSIDE * used).all():
                     break
         if interrupt.pressed:
             solution.status = solution.status if solution.converged else "interrupted"
             break
         region.adapt(before, trial, accepted, ratio)
-        if accepted and gain < SETTLING and loop.shortfall.max() < NEARLY_FREE:
+        if accepted and not done and gain < SETTLING and loop.shortfall.max() < NEARLY_FREE:
             region.settle()
         if solution.rounds >= HOPELESS_ROUNDS and (
             loop.shortfall.max() > HOPELESS or loop.problem.drift(loop.z) > HOPELESS_DRIFT

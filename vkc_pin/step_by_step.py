@@ -43,11 +43,11 @@ def stages(scene: Scene, steps: Sequence[Step], settings: Settings, *, brief: bo
         scene: Robot, objects and obstacles.
         steps: What should change in the world.
         settings: How to plan; the time limit is for all steps together.
-        brief: Whether the motions are to be planned as one afterwards: seeds do not race then, and all but the first step are
-            given up soon, as where the next cannot be done from where a step led, all seeds fail.
+        brief: Whether the motions are to be planned as one afterwards. Then they are rough, and all but the first step are given
+            up soon: where the next cannot be done from where a step led, all seeds fail.
     """
     options = dataclasses.replace(settings.options, max_restarts=1, max_outer=min(settings.options.max_outer, _ROUNDS))
-    settings = dataclasses.replace(settings, racing=1) if brief else settings
+    settings = dataclasses.replace(settings, rough=True) if brief else settings
     current, spent = scene, 0.0
     parts: list[tuple[OneProblem, Plan]] = []
     for step in steps:

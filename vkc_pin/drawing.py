@@ -84,6 +84,7 @@ class Drawing:
         self.nodes = self._nodes()
         self.movers = self._movers()
         self.items = [*self._robot_items(), *self._object_items()]
+        self.light: list[Solid | None] = []  # of what moves, for ghosts
 
     def draw(self, *, play: bool = True) -> None:
         """Send everything."""
@@ -101,6 +102,8 @@ class Drawing:
             self._lines(f"room/{name}", points, grey)
         if self.trajectory is not None:
             self._paths()
+            moving = np.any([*self.movers.values(), np.zeros(self.world.model.njoints, bool)], axis=0)
+            self.light = [coarse(item.solid, _GHOST_DETAIL) if moving[item.joint] else None for item in self.items]
             self._ghosts("start", 0, _START)
             self._ghosts("end", -1, _END)
         self.viewer.window.send(SetAnimation(self._animation(), play=play, repetitions=1))
@@ -185,9 +188,9 @@ class Drawing:
         """Draw what moves as it is at `row`, the robot and every object for itself."""
         for owner, joints in self.movers.items():
             solids = [
-                coarse(item.solid, _GHOST_DETAIL).moved(pin.SE3(self.motion.world[row, item.joint]) * item.placement)
-                for item in self.items
-                if joints[item.joint]
+                light.moved(pin.SE3(self.motion.world[row, item.joint]) * item.placement)
+                for item, light in zip(self.items, self.light, strict=True)
+                if light is not None and joints[item.joint]
             ]
             if solids:
                 self.viewer[f"ghosts/{name}/{owner}"].set_object(Ghost(merge_solids(solids), colour))

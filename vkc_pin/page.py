@@ -8,6 +8,7 @@ import html
 import json
 import re
 import struct
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -46,10 +47,15 @@ def render_page(recorder: Recorder, *, title: str, film: dict[str, Any]) -> str:
     pieces = {
         "TITLE": html.escape(title),
         "FILM": json.dumps(film).replace("<", "\\u003c"),
-        "VIEWER": _packed(viewer.read_bytes()),
+        "VIEWER": _packed_file(viewer),
         "COMMANDS": _packed(b"".join(struct.pack("<I", len(command)) + command for command in packed)),
     }
     return re.sub(r"%(TITLE|FILM|VIEWER|COMMANDS)%", lambda match: pieces[match[1]], template)
+
+
+@lru_cache(maxsize=1)
+def _packed_file(file: Path) -> str:
+    return _packed(file.read_bytes())
 
 
 def _packed(data: bytes) -> str:

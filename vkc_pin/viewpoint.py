@@ -42,11 +42,14 @@ def choose_viewpoint(
     lower, upper = points.min(axis=0), points.max(axis=0)
     target = (lower + upper) / 2.0
     scores = []
+    flat = np.ascontiguousarray(points.T)
     for azimuth in _AZIMUTHS:
         towards = _direction(azimuth)
         hidden = np.zeros(len(points))
+        last = float((points @ towards).min())
         for low, high, opacity in boxes:
-            hidden = np.maximum(hidden, opacity * _crosses(points, towards, low, high))
+            if np.maximum(low * towards, high * towards).sum() > last:  # otherwise it stands behind everything
+                np.maximum(hidden, opacity * _crosses(flat, towards, low, high), out=hidden)
         right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
         breadth = np.ptp(points @ right) / max(1e-9, float(np.linalg.norm(np.ptp(points[:, :2], axis=0))))
         scores.append(breadth - 3.0 * hidden.mean() - 0.10 * (1.0 - np.cos(azimuth - _AZIMUTHS[0])))
@@ -67,10 +70,12 @@ def _direction(azimuth: float) -> NDArray[np.float64]:
 
 def _crosses(
     points: NDArray[np.float64], direction: NDArray[np.float64], lower: NDArray[np.float64], upper: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return 1 for every point whose ray along `direction` meets the box, 0 for the others."""
+) -> NDArray[np.bool_]:
+    """Return for every point, shape (3, n), whether its ray along `direction` meets the box."""
+    enter, leave = np.full(points.shape[1], -np.inf), np.full(points.shape[1], np.inf)
     with np.errstate(divide="ignore", invalid="ignore"):
-        first, second = (lower - points) / direction, (upper - points) / direction
-    enter = np.nanmax(np.minimum(first, second), axis=1)
-    leave = np.nanmin(np.maximum(first, second), axis=1)
-    return ((leave > enter) & (enter > 0.05)).astype(float)  # what lies in a box or on it is not hidden by it
+        for values, slope, low, high in zip(points, direction + 0.0, lower, upper, strict=True):  # + 0: no negative zeros
+            near, far = (low, high) if slope >= 0.0 else (high, low)
+            np.fmax(enter, (near - values) / slope, out=enter)  # in a face that the ray runs along there is no number: no bound
+            np.fmin(leave, (far - values) / slope, out=leave)
+    return np.asarray((leave > enter) & (enter > 0.05))  # what lies in a box or on it is not hidden by it

@@ -1,4 +1,4 @@
-"""The command line: plan, check, view, bench, srdf."""
+"""The command line: plan, check, view, export, bench, srdf."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Any
 
 from vkc_pin.cli_bench import EXIT_OK, add_bench, natural, positive
 from vkc_pin.errors import InputError, VkcError
+from vkc_pin.export import GROUPS
 
 __all__ = ["main"]
 
@@ -53,7 +54,6 @@ def _progress(row: Any) -> None:
 
 def _plan(arguments: argparse.Namespace) -> int:
     import vkc_pin as vkc
-    from vkc_pin.plan import write_atomically
 
     scene = vkc.load_scene(arguments.scene)
     steps = parse_settings(arguments.set)
@@ -69,17 +69,50 @@ def _plan(arguments: argparse.Namespace) -> int:
     if arguments.save:
         plan.save(arguments.save)
     if arguments.json:
-        write_atomically(arguments.json, (json.dumps(plan.to_dict(), indent=1) + "\n").encode())
+        plan.to_json(arguments.json)
+    if arguments.csv:
+        plan.to_csv(arguments.csv)
+    if arguments.ros:
+        _write_ros(plan, arguments.ros)
     if arguments.html:
         plan.to_html(arguments.html)
     if arguments.plots:
         folder = Path(arguments.plots)
         folder.mkdir(parents=True, exist_ok=True)
         plan.plot(folder)
-    for option in ("save", "json", "html", "plots"):
+    for option in ("save", "json", "csv", "ros", "html", "plots"):
         if getattr(arguments, option):
             sys.stdout.write(f"wrote {getattr(arguments, option)}\n")
     return EXIT_OK if plan.success else EXIT_FAILED
+
+
+def _write_ros(plan: Any, path: str, **options: Any) -> None:
+    from vkc_pin.writing import write_atomically
+
+    write_atomically(path, (json.dumps(plan.to_ros(**options)) + "\n").encode("utf-8"))
+
+
+def _export(arguments: argparse.Namespace) -> int:
+    import vkc_pin as vkc
+
+    plan = vkc.Plan.load(arguments.plan)
+    written = [name for name in ("csv", "json", "ros") if getattr(arguments, name)]
+    if not written:
+        raise InputError("nothing to write", field="export", expected="--csv FILE, --json FILE or --ros FILE")
+    if arguments.rate is not None and not arguments.ros:
+        raise InputError("only ROS' points can be resampled", field="--rate", expected="--ros FILE as well")
+    names = arguments.joints.split(",") if arguments.joints else None
+    joints = names[0] if names is not None and len(names) == 1 and names[0] in GROUPS else names
+    chosen = {} if joints is None else {"joints": joints}
+    if arguments.csv:
+        plan.to_csv(arguments.csv, **chosen)
+    if arguments.json:
+        plan.to_json(arguments.json)
+    if arguments.ros:
+        _write_ros(plan, arguments.ros, **chosen, rate=arguments.rate)
+    for name in written:
+        sys.stdout.write(f"wrote {getattr(arguments, name)}\n")
+    return EXIT_OK
 
 
 def _check(arguments: argparse.Namespace) -> int:
@@ -130,6 +163,8 @@ def _parser() -> argparse.ArgumentParser:
     plan.add_argument("--html", metavar="FILE", help="write the animation, one self-contained page")
     plan.add_argument("--save", metavar="FILE", help="save the plan (.npz)")
     plan.add_argument("--json", metavar="FILE", help="write trajectory, metrics and report as JSON")
+    plan.add_argument("--csv", metavar="FILE", help="write the motion as a table, a line a waypoint")
+    plan.add_argument("--ros", metavar="FILE", help="write base and arm with the fields of trajectory_msgs/JointTrajectory")
     plan.add_argument("--plots", metavar="FOLDER", help="write plots")
     plan.add_argument("--initialization", default="auto", metavar="METHOD", help="auto, interpolated, astar, rrt or stationary")
     plan.add_argument("--time-limit", type=float, metavar="SECONDS", help="return the best motion found by then")
@@ -146,6 +181,17 @@ def _parser() -> argparse.ArgumentParser:
     view.add_argument("what", metavar="SCENE|PLAN")
     view.add_argument("--html", metavar="FILE", help="write a page instead of starting a server")
     view.set_defaults(run=_view)
+
+    about = "Write the motion of a saved plan for other programs."
+    export = commands.add_parser("export", help="write a saved plan for other programs", description=about)
+    export.add_argument("plan", metavar="PLAN", help="a plan saved with --save or Plan.save")
+    export.add_argument("--csv", metavar="FILE", help="a table, a line a waypoint")
+    export.add_argument("--json", metavar="FILE", help="trajectory, metrics and report as JSON")
+    export.add_argument("--ros", metavar="FILE", help="JSON with the fields of trajectory_msgs/JointTrajectory")
+    which = f"{', '.join(GROUPS)}, or names of coordinates with commas between; without it all in a table, robot for ROS"
+    export.add_argument("--joints", metavar="WHICH", help=which)
+    export.add_argument("--rate", type=float, metavar="HZ", help="points a second for ROS; without it the waypoints")
+    export.set_defaults(run=_export)
 
     add_bench(commands)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import os
-import tempfile
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
@@ -22,6 +21,7 @@ from vkc_pin.resources import folder
 from vkc_pin.scene import Scene
 from vkc_pin.steps import Step, step_from_dict, step_to_dict
 from vkc_pin.trajectory import Trajectory
+from vkc_pin.writing import write_atomically
 
 if TYPE_CHECKING:
     import meshcat
@@ -29,23 +29,6 @@ if TYPE_CHECKING:
 __all__ = ["Plan", "write_atomically"]
 
 FORMAT = 1
-
-
-def write_atomically(path: str | Path, data: bytes) -> Path:
-    """Write `data` to `path` whole or not at all, making its folder if need be; return the path."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    temporary = Path(name)
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(data)
-        temporary.chmod(0o644)
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    return path
 
 
 def _folder_to_data(scene_folder: Path, plan: Path) -> dict[str, str]:
@@ -132,6 +115,20 @@ class Plan:
             "notes": list(self.validation.notes),
             "trajectory": self.trajectory.to_dict(),
         }
+
+    def to_json(self, path: str | Path) -> Path:
+        """Write `to_dict` as JSON, whole or not at all; return the path. `Trajectory.from_json` reads the motion."""
+        return write_atomically(path, (json.dumps(self.to_dict(), indent=1) + "\n").encode("utf-8"))
+
+    def to_csv(self, path: str | Path, **options: Any) -> Path:
+        """Write the motion as a table with a line a waypoint, and a unit to every column; see `export.to_csv`."""
+        from vkc_pin import export
+
+        return export.to_csv(self.trajectory, path, **{"units": export.units_of(self.scene), **options})
+
+    def to_ros(self, **options: Any) -> dict[str, Any]:
+        """Return the motion as plain data with the fields of ROS' `trajectory_msgs/JointTrajectory`; see `export.to_ros`."""
+        return self.trajectory.to_ros(**options)
 
     def __repr__(self) -> str:
         m = self.metrics

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -163,6 +164,45 @@ class Trajectory:
             return cls(tuple(data["names"]), data["times"], data["positions"], phases, int(data["robot_size"]))
         except KeyError as error:
             raise InputError("this is missing from a trajectory", field=str(error.args[0])) from None
+
+    def to_csv(self, path: str | Path, **options: Any) -> Path:
+        """Write a table with a line a waypoint: times [s], positions [m] and [rad], phases; see `export.to_csv`."""
+        from vkc_pin import export
+
+        return export.to_csv(self, path, **options)
+
+    def to_json(self, path: str | Path) -> Path:
+        """Write it as JSON, whole or not at all; return the path."""
+        from vkc_pin import export
+
+        return export.to_json(self, path)
+
+    def to_ros(self, **options: Any) -> dict[str, Any]:
+        """Return plain data with the fields of ROS' `trajectory_msgs/JointTrajectory`; see `export.to_ros`."""
+        from vkc_pin import export
+
+        return export.to_ros(self, **options)
+
+    @staticmethod
+    def from_csv(path: str | Path, **options: Any) -> Trajectory:
+        """Return the trajectory in a table such as `to_csv` writes; see `export.from_csv`."""
+        from vkc_pin import export
+
+        return export.from_csv(path, **options)
+
+    @staticmethod
+    def from_json(path: str | Path) -> Trajectory:
+        """Return the trajectory that `to_json`, `Plan.to_json` or `vkc-pin plan --json` wrote; see `export.from_json`."""
+        from vkc_pin import export
+
+        return export.from_json(path)
+
+    @staticmethod
+    def from_ros(message: Mapping[str, Any] | str | Path, **options: Any) -> Trajectory:
+        """Return the trajectory of data such as `to_ros` returns, or of a JSON file with them; see `export.from_ros`."""
+        from vkc_pin import export
+
+        return export.from_ros(message, **options)
 
 
 def join(parts: Sequence[Trajectory], *, pause: float) -> Trajectory:

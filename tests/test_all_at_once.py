@@ -65,6 +65,7 @@ def test_what_is_returned_and_what_it_took(
         def run(self, seed: Any = None) -> vkc.Plan:
             assert self.settings.time_limit is not None
             limits.append(self.settings.time_limit)
+            self.settings.interrupt.pressed = queue[0].status == "interrupted"
             return queue.pop(0)
 
     part = SimpleNamespace(task=SimpleNamespace(phases=(1,)), piece=lambda: None)
@@ -73,6 +74,7 @@ def test_what_is_returned_and_what_it_took(
 
     def stages(*_: Any, **keywords: Any) -> list[tuple[Any, vkc.Plan]]:
         brief.append(keywords.get("brief", False))
+        settings.interrupt.pressed = plans[-1].status == "interrupted"
         return [(part, p) for p in plans]
 
     monkeypatch.setattr(module, "stages", stages)

@@ -248,7 +248,7 @@ def test_what_cannot_be_shown(plan: Plan, tmp_path: Path) -> None:
 
 
 def test_in_a_notebook_the_view_is_part_of_it(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(visualization, "_in_notebook", lambda: True)
+    monkeypatch.setattr(visualization, "in_notebook", lambda: True)
     cell = visualization.show(plan, height=300)._repr_html_()
     match = re.fullmatch(r'<div><iframe srcdoc="([^"]*)" style="[^"]*height: 300px[^"]*" title="door"></iframe></div>', cell)
     assert match

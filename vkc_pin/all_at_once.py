@@ -33,11 +33,26 @@ def all_at_once(scene: Scene, steps: Sequence[Step], settings: Settings) -> Plan
         return whole.run()
     parts = stages(scene, whole.task.steps, settings, brief=True)
     plans = [plan for _, plan in parts]
+    if settings.interrupt.pressed:
+        return joined(scene, whole.task.steps, settings, plans)
+    try:
+        return _whole(scene, steps, settings, whole, parts)
+    except KeyboardInterrupt:
+        settings.interrupt.pressed = True
+        return joined(scene, whole.task.steps, settings, plans)
+
+
+def _whole(
+    scene: Scene, steps: Sequence[Step], settings: Settings, whole: OneProblem, parts: Sequence[tuple[OneProblem, Plan]]
+) -> Plan:
+    """Return the plan of all steps, from what came out of each."""
+    plans = [plan for _, plan in parts]
+    settings.progress.part(1, len(whole.task.steps), len(whole.task.steps))
     if len(parts) == 1 and len(whole.task.phases) == len(parts[0][0].task.phases):  # the other steps change nothing
         return whole.run()
     # A stationary seed knows nothing of the steps: for all of them it is no better than for the one that failed.
     hopeless = settings.initialization == "stationary" and not plans[-1].success
-    if plans[-1].status == "interrupted" or hopeless:
+    if hopeless:
         return joined(scene, whole.task.steps, settings, plans)
     spent = [plan.metrics for plan in plans]
     result = plans[-1]
@@ -49,7 +64,7 @@ def all_at_once(scene: Scene, steps: Sequence[Step], settings: Settings) -> Plan
             apart = joined(scene, whole.task.steps, settings, plans)
             spent = [apart.metrics, spent[-1]]
             result = apart if apart.success else result
-    if not result.success and result.status != "interrupted":
+    if not result.success and not settings.interrupt.pressed:
         result = OneProblem(scene, steps, _left(settings, spent)).run()
         spent.append(result.metrics)
     return dataclasses.replace(result, metrics={**result.metrics, **summed(spent)})

@@ -16,7 +16,7 @@ from vkc_pin.one_problem import OneProblem, Settings
 from vkc_pin.options import Options
 from vkc_pin.pieces import Piece, seed_of
 from vkc_pin.plan import Plan
-from vkc_pin.planner import settings_for
+from vkc_pin.planner import guarded, settings_for
 from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.scene import Scene
 from vkc_pin.solution import Iteration
@@ -47,6 +47,7 @@ def plan_chore(
     callback: Callable[[Iteration], None] | None = None,
     time_limit: float | None = None,
     seed: int = 0,
+    progress: bool = False,
 ) -> Plan:
     """Plan many steps over several objects, each with the next ones in mind.
 
@@ -64,10 +65,11 @@ def plan_chore(
         callback: As for `planner.plan`.
         time_limit: Seconds of planning for all steps together.
         seed: Of the random numbers.
+        progress: As for `planner.plan`.
 
     Returns:
         One plan of all steps, checked as a whole. If a step fails: of those before it, with the best motion there is of
-        that one, and a note that names it.
+        that one, and a note that names it. After Ctrl-C: of what was decided by then.
 
     Raises:
         InputError: A step names something that is not there, or cannot be done at its place in the list; the error names it.
@@ -75,8 +77,12 @@ def plan_chore(
     settings = settings_for(scene, initialization, options, callback, time_limit, seed)
     if not isinstance(window, int) or isinstance(window, bool) or window < 1:
         raise InputError("out of range", field="window", expected="a whole number of at least 1", got=repr(window))
-    foresee(scene, steps, settings.options)
-    return _Chore(scene, tuple(steps), window, settings).run()
+
+    def planner(scene: Scene, steps: Sequence[Step], settings: Settings) -> Plan:
+        foresee(scene, steps, settings.options)
+        return _Chore(scene, tuple(steps), window, settings).run()
+
+    return guarded(planner, scene, steps, settings, progress)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,10 +124,22 @@ class _Chore:
         self.began = time.perf_counter()
 
     def run(self) -> Plan:
-        """Plan action after action, until all is done or one fails."""
+        """Plan action after action, until all is done, one fails or Ctrl-C is pressed."""
+        try:
+            failed = self._run()
+        except KeyboardInterrupt:
+            self.settings.interrupt.pressed, failed = True, None
+            self.kept += self.ahead
+        return self._joined(failed)
+
+    def _run(self) -> Plan | None:
+        """Plan action after action; return the plan of the one that fails."""
         window, back, failed = self.window, _BACK, None
         while len(self.kept) < len(self.actions):
             failed = self._plan_window(window)
+            if self._stopped:
+                self.kept, self.ahead = self.kept + self.ahead, []
+                break
             if failed is None:
                 window = self.window
             elif self.kept and back and failed.status not in _FINAL:
@@ -130,9 +148,13 @@ class _Chore:
                     self.kept.pop()
                 self.ahead, window, back = [], window + 1, back - 1
             else:
-                self.kept += self.ahead
+                self.kept, self.ahead = self.kept + self.ahead, []
                 break
-        return self._joined(failed)
+        return failed
+
+    @property
+    def _stopped(self) -> bool:
+        return self.settings.interrupt.pressed
 
     @property
     def _now(self) -> Scene:
@@ -147,20 +169,22 @@ class _Chore:
         last = self._last(first, window)
         self.ahead = self.ahead[: last - first]
         alone = None
-        while alone is None and first + len(self.ahead) < last:
+        while alone is None and first + len(self.ahead) < last and not self._stopped:
             alone = self._look_ahead()
+        if self._stopped:
+            return alone
         if alone is None and sum(part.plan is not None for part in self.ahead) > 1:
             pieces = [part.piece for part in self.ahead]
             fine = any(part.fine for part in self.ahead)
             one = OneProblem(self._now, self._steps(first, last), self._left(fine=fine))
-            plan = self._solved(one, lambda problem: seed_of(problem, pieces))
+            plan = self._solved(first, one, lambda problem: seed_of(problem, pieces))
             if plan.success:
                 self.ahead = self._parts(one, plan, first, last)
         for attempt in range(1, 1 + _TRIES):
             if alone is None or alone.status in _STOPPED:
                 break
             one = OneProblem(self._now, self._steps(first, last), self._left(attempt, fine=True))
-            together = self._solved(one)
+            together = self._solved(first, one)
             alone = None if together.success else dataclasses.replace(alone, status=together.status)
             if together.success:
                 self.ahead = self._parts(one, together, first, last)
@@ -191,7 +215,7 @@ class _Chore:
             return None
         for attempt in range(_SINGLE):
             one = OneProblem(scene, self._steps(number, number + 1), self._left(attempt, fine=attempt > 0))
-            plan = self._solved(one)
+            plan = self._solved(number, one)
             if plan.success:
                 self.ahead += self._parts(one, plan, number, number + 1)
                 return None
@@ -199,7 +223,10 @@ class _Chore:
                 break
         return plan
 
-    def _solved(self, one: OneProblem, seed: Callable[[TrajectoryProblem], Seed] | None = None) -> Plan:
+    def _solved(self, first: int, one: OneProblem, seed: Callable[[TrajectoryProblem], Seed] | None = None) -> Plan:
+        """Return the plan of a problem that begins with the action `first`."""
+        done = len(self._steps(0, first))
+        self.settings.progress.part(done + 1, len(one.task.steps), len(self.steps))
         plan = one.run(seed)
         self.spent.append(plan.metrics)
         self.history += plan.history

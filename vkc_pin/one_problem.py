@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +14,17 @@ from numpy.typing import NDArray
 from vkc_pin.diagnosis import explain, impossible
 from vkc_pin.goal import compile_task
 from vkc_pin.initialization import HOPELESS, Seed, initialize
+from vkc_pin.monitor import Interrupt, interruptible
 from vkc_pin.options import Options
 from vkc_pin.pieces import Piece
 from vkc_pin.plan import Plan
 from vkc_pin.problem import TrajectoryProblem
+from vkc_pin.progress import Progress
 from vkc_pin.report import Report
 from vkc_pin.scene import Scene
 from vkc_pin.solution import Iteration, Solution
 from vkc_pin.solver import solve
+from vkc_pin.standing import TIMES, standing
 from vkc_pin.steps import Step
 from vkc_pin.trajectory import Trajectory
 from vkc_pin.unfold import as_trajectory
@@ -29,8 +32,6 @@ from vkc_pin.validation import validate
 
 __all__ = ["TIMES", "OneProblem", "Settings"]
 
-TIMES = ("initialization", "coal", "casadi", "ipopt", "validation")
-"""What planning spends its time on."""
 _RACING = 3  # seeds of which the one to begin with is chosen
 
 
@@ -41,6 +42,8 @@ class Settings:
     Attributes:
         rough: Whether what comes out only starts a problem of more steps, after which nobody sees any more what is good about it.
             Then seeds do not race, and the first good motion will do.
+        progress: Is told what is being done.
+        interrupt: Whether Ctrl-C was pressed; then nothing new is begun. Copies for parts of a task share it.
     """
 
     initialization: str
@@ -50,6 +53,8 @@ class Settings:
     seed: int
     perturbation: float
     rough: bool = False
+    progress: Progress = field(default_factory=Progress)
+    interrupt: Interrupt = field(default_factory=Interrupt)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +107,17 @@ class OneProblem:
             seed: Makes the only seed to try, a motion that is nearly good as it is, so that there is no need of patience with it;
                 None: those of the settings' initialization.
         """
-        began, limit = time.perf_counter(), self.settings.time_limit
+        began = time.perf_counter()
+        try:
+            return self._run(seed, began)
+        except KeyboardInterrupt:  # before there was a motion
+            self.settings.interrupt.pressed = True
+            spent = time.perf_counter() - began
+            return standing(self.scene, self.task.steps, self.settings.options, seed=self.settings.seed, spent=spent)
+
+    def _run(self, seed: Callable[[TrajectoryProblem], Seed] | None, began: float) -> Plan:
+        limit = self.settings.time_limit
+        self.settings.progress.begin([phase.name for phase in self.task.phases])
         problem = self.problem = TrajectoryProblem(self.scene, self.task, self.settings.options)
         build_time = problem.transcription.take_build_time()
         reasons = impossible(problem)
@@ -142,7 +157,10 @@ class OneProblem:
                 best = found if best is None or found.report.ok or found.amount < best.amount else best
                 if best.status == "success":
                     return best, "success"
-                if solution.status in ("time limit", "interrupted"):
+                if self.settings.interrupt.pressed:
+                    status = "interrupted"
+                    break
+                if solution.status == "time limit":
                     status = solution.status
                     break
                 if number == 1 and searched and not _ends_free(problem, seed):
@@ -150,6 +168,7 @@ class OneProblem:
                 elif notes:  # two seeds failed, and random configurations find no free one at a goal either
                     break
         except KeyboardInterrupt:
+            self.settings.interrupt.pressed = True
             status = "interrupted"
         if best is None and self._leading is not None:
             problem.take_time_for(self._leading.z)
@@ -168,6 +187,7 @@ class OneProblem:
         )
         while True:
             began = time.perf_counter()
+            s.progress.doing("looking for a seed")
             seed = next(seeds, None)
             self.times["initialization"] += time.perf_counter() - began
             if seed is None:
@@ -201,7 +221,7 @@ class OneProblem:
         solution = solve(
             problem,
             seed.z,
-            callback=self.settings.callback,
+            callback=self._report,
             deadline=deadline,
             rounds=rounds,
             radius=seed.radius,
@@ -214,12 +234,22 @@ class OneProblem:
         for key, value in solution.timings.items():
             self.times[key] += value
         self.history += [dataclasses.asdict(row) for row in solution.history]
+        if solution.status == "interrupted":
+            self.settings.interrupt.pressed = True
         return solution
+
+    def _report(self, row: Iteration) -> None:
+        self.settings.progress(row)
+        if self.settings.callback is not None:
+            self.settings.callback(row)
 
     def _judge(self, problem: TrajectoryProblem, solution: Solution, name: str) -> _Try:
         began = time.perf_counter()
-        trajectory = as_trajectory(problem, solution.z)
-        report = validate(self.scene, self.task.steps, trajectory, self.settings.options)
+        self.settings.progress.doing("checking")
+        with interruptible() as interrupt:  # what was found is checked all the same
+            trajectory = as_trajectory(problem, solution.z)
+            report = validate(self.scene, self.task.steps, trajectory, self.settings.options)
+        self.settings.interrupt.pressed |= interrupt.pressed
         self.times["validation"] += time.perf_counter() - began
         status = "success" if report.ok else "rejected" if solution.converged else "not converged"
         return _Try(name, solution.z, trajectory, report, status)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import time
 from collections.abc import Callable, Sequence
 from typing import TypeGuard
 
@@ -13,12 +15,14 @@ from vkc_pin.initialization import METHODS
 from vkc_pin.one_problem import Settings
 from vkc_pin.options import Options
 from vkc_pin.plan import Plan
+from vkc_pin.progress import shown
 from vkc_pin.scene import Scene
 from vkc_pin.solution import Iteration
+from vkc_pin.standing import standing
 from vkc_pin.step_by_step import step_by_step
 from vkc_pin.steps import Step
 
-__all__ = ["check_arguments", "plan", "settings_for"]
+__all__ = ["check_arguments", "guarded", "plan", "settings_for"]
 
 
 def plan(
@@ -32,6 +36,7 @@ def plan(
     seed: int = 0,
     joint: bool = True,
     perturbation: float = 0.0,
+    progress: bool = False,
 ) -> Plan:
     """Plan one coordinated motion of base, arm and objects that brings about `steps`.
 
@@ -46,18 +51,37 @@ def plan(
             planned before in a process can change the last digits.
         joint: Plan all steps as one problem; otherwise each from where the one before it ends, for comparison.
         perturbation: Standard deviation of smooth noise on the seeds, [m] and [rad], to see how much hangs on them.
+        progress: Show one line that changes in its place: in a notebook or a terminal; elsewhere nothing is shown.
 
     Returns:
         A plan, in every case: `plan.success` is true only if the independent `validation` found nothing wrong, and
-        `plan.report()` names what is violated otherwise. Ctrl-C ends planning with the best iterate so far.
+        `plan.report()` names what is violated otherwise. Ctrl-C, or interrupting a notebook's kernel, ends planning with the best
+        iterate so far and status "interrupted".
 
     Raises:
         InputError: The steps name something that is not there or cannot be done, or an argument is wrong.
     """
     settings = settings_for(scene, initialization, options, callback, time_limit, seed, perturbation)
-    if not joint:
-        return step_by_step(scene, steps, settings)
-    return all_at_once(scene, steps, settings)
+    return guarded(step_by_step if not joint else all_at_once, scene, steps, settings, progress)
+
+
+def guarded(
+    planner: Callable[[Scene, Sequence[Step], Settings], Plan],
+    scene: Scene,
+    steps: Sequence[Step],
+    settings: Settings,
+    progress: bool,
+) -> Plan:
+    """Return what a planner returns, or a plan in which nothing moves if Ctrl-C comes before it has any; show its progress."""
+    with shown(progress) as line:
+        began, settings = time.perf_counter(), dataclasses.replace(settings, progress=line)
+        try:
+            found = planner(scene, steps, settings)
+        except KeyboardInterrupt:
+            spent = time.perf_counter() - began
+            found = standing(scene, list(steps), settings.options, seed=settings.seed, spent=spent)
+        line.end(found)
+    return found
 
 
 def settings_for(

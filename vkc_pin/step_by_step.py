@@ -10,9 +10,11 @@ import numpy as np
 
 from vkc_pin.goal import compile_task
 from vkc_pin.hold import as_mappings
-from vkc_pin.one_problem import TIMES, OneProblem, Settings
+from vkc_pin.monitor import interruptible
+from vkc_pin.one_problem import OneProblem, Settings
 from vkc_pin.plan import Plan
 from vkc_pin.scene import Scene
+from vkc_pin.standing import TIMES, standing
 from vkc_pin.steps import Step
 from vkc_pin.task import Task
 from vkc_pin.trajectory import Trajectory, join
@@ -37,7 +39,7 @@ def step_by_step(scene: Scene, steps: Sequence[Step], settings: Settings) -> Pla
 
 
 def stages(scene: Scene, steps: Sequence[Step], settings: Settings, *, brief: bool = False) -> list[tuple[OneProblem, Plan]]:
-    """Plan every step that changes something from where the one before it ends, up to the first that fails.
+    """Plan every step that changes something from where the one before it ends, up to the first that fails, or to Ctrl-C.
 
     Args:
         scene: Robot, objects and obstacles.
@@ -50,25 +52,35 @@ def stages(scene: Scene, steps: Sequence[Step], settings: Settings, *, brief: bo
     settings = dataclasses.replace(settings, rough=True) if brief else settings
     current, spent = scene, 0.0
     parts: list[tuple[OneProblem, Plan]] = []
-    for step in steps:
-        if not compile_task(current, [step], settings.options, nothing=True).phases:
-            continue
-        left = None if settings.time_limit is None else max(settings.time_limit - spent, 1e-3)
-        chosen = options if brief and parts else settings.options
-        one = OneProblem(current, [step], dataclasses.replace(settings, options=chosen, time_limit=left))
-        parts.append((one, one.run()))
-        if not parts[-1][1].success:
-            break
-        spent += parts[-1][1].metrics["planning_time"]
-        current = scene_after(current, one.task, parts[-1][1].trajectory)
+    try:
+        for number, step in enumerate(steps, start=1):
+            if not compile_task(current, [step], settings.options, nothing=True).phases:
+                continue
+            left = None if settings.time_limit is None else max(settings.time_limit - spent, 1e-3)
+            chosen = options if brief and parts else settings.options
+            settings.progress.part(number, 1, len(steps))
+            one = OneProblem(current, [step], dataclasses.replace(settings, options=chosen, time_limit=left))
+            parts.append((one, one.run()))
+            if not parts[-1][1].success or settings.interrupt.pressed:
+                break
+            spent += parts[-1][1].metrics["planning_time"]
+            current = scene_after(current, one.task, parts[-1][1].trajectory)
+    except KeyboardInterrupt:
+        settings.interrupt.pressed = True
     return parts
 
 
 def joined(scene: Scene, steps: Sequence[Step], settings: Settings, parts: Sequence[Plan]) -> Plan:
-    """Return the plans of steps, one after the other, as one plan of all `steps`."""
-    trajectory = join([part.trajectory for part in parts], pause=settings.options.grasp_time)
-    checked = time.perf_counter()
-    report = validate(scene, steps, trajectory, settings.options)
+    """Return the plans of steps, one after the other, as one plan of all `steps`; where nothing was begun, nothing moves."""
+    if not parts:
+        return standing(scene, steps, settings.options, seed=settings.seed)
+    settings.progress.doing("checking all of it")
+    with interruptible() as interrupt:
+        trajectory = join([part.trajectory for part in parts], pause=settings.options.grasp_time)
+        checked = time.perf_counter()
+        report = validate(scene, steps, trajectory, settings.options)
+    settings.interrupt.pressed |= interrupt.pressed
+    status = "interrupted" if settings.interrupt.pressed else "rejected" if parts[-1].success else parts[-1].status
     report = dataclasses.replace(report, notes=parts[-1].validation.notes)
     spent = time.perf_counter() - checked
     metrics = summed([part.metrics for part in parts])
@@ -81,7 +93,7 @@ def joined(scene: Scene, steps: Sequence[Step], settings: Settings, parts: Seque
         options=settings.options,
         trajectory=trajectory,
         validation=report,
-        status="success" if report.ok else "rejected" if parts[-1].success else parts[-1].status,
+        status="success" if report.ok else status,
         metrics=metrics,
         seed=settings.seed,
         initialization=", ".join(part.initialization for part in parts),

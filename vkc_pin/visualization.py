@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.plan import Plan, write_atomically
+from vkc_pin.progress import in_notebook
 from vkc_pin.scene import Scene
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ def show(plan_or_scene: Plan | Scene, *, open_browser: bool | None = None, heigh
         VkcError: The server does not start.
     """
     scene, plan = _parts(plan_or_scene)
-    if _in_notebook():
+    if in_notebook():
         from IPython.display import HTML
 
         page, name = html.escape(_page(scene, plan)), html.escape(scene.name)
@@ -172,14 +173,6 @@ def _film(scene: Scene, plan: Plan | None) -> dict[str, Any]:
         "notes": [{"text": f"{v.constraint}: {v.subject}", "time": v.time} for v in plan.validation.violations],
         "headline": f"{scene.name}: {'success' if plan.success else 'FAILED, ' + plan.status}",
     }
-
-
-def _in_notebook() -> bool:
-    """Return whether this runs in a Jupyter kernel."""
-    if "IPython" not in sys.modules:
-        return False
-    shell = sys.modules["IPython"].get_ipython()
-    return getattr(shell, "kernel", None) is not None
 
 
 def _has_screen() -> bool:

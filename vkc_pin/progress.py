@@ -1,0 +1,145 @@
+"""One line that says how far planning has come, and changes in its place: in a notebook, or in a terminal."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+from vkc_pin.errors import InputError
+
+if TYPE_CHECKING:
+    from vkc_pin.plan import Plan
+    from vkc_pin.solution import Iteration
+
+__all__ = ["Progress", "in_notebook", "shown"]
+
+_PAUSE = 0.1  # [s] between two changes of the line
+
+
+class Progress:
+    """The line. It says nothing if nobody shows it.
+
+    Attributes:
+        write: Shows a text instead of the one before; the second argument is whether it is the last.
+    """
+
+    def __init__(self, write: Callable[[str, bool], None] | None = None) -> None:
+        self.write = write
+        self._part = self._what = self._doing = ""
+        self._began = time.perf_counter()
+        self._changed = -float("inf")
+        self._ended = write is None
+
+    def part(self, first: int, count: int, total: int) -> None:
+        """Tell which of many steps are planned next: `count` from number `first`, counted from 1, of `total`."""
+        self._part = f"step {first} of {total}" if count == 1 else f"steps {first} to {first + count - 1} of {total}"
+
+    def begin(self, phases: Sequence[str]) -> None:
+        """Tell what the motion does that is planned next."""
+        self._what = ", ".join(phases)
+        self.doing("preparing")
+
+    def doing(self, text: str) -> None:
+        """Tell what is being done."""
+        self._doing = text
+        self._show(always=True)
+
+    def __call__(self, row: Iteration) -> None:
+        """Take a round of the solver."""
+        missing = "clear" if row.shortfall <= 0.0 else f"{1e3 * row.shortfall:.1f} mm missing"
+        self._doing = f"round {row.round}, {missing}, objective {row.objective:.3g}"
+        self._show()
+
+    def end(self, plan: Plan) -> None:
+        """Leave one line on what came out."""
+        m, name = plan.metrics, plan.scene.name
+        result = "success" if plan.success else f"FAILED, {plan.status}"
+        took = f"base {m['base_effort']:.2f} m, arm {m['arm_effort']:.2f} rad, planned in {m['planning_time']:.2f} s"
+        self._last(f"{name}: {result} — {took}")
+
+    def stop(self) -> None:
+        """Leave one line that says that nothing came out, unless there is a last line already."""
+        self._last(f"stopped after {time.perf_counter() - self._began:.1f} s")
+
+    def _show(self, *, always: bool = False) -> None:
+        now = time.perf_counter()
+        if not self._ended and self.write is not None and (always or now - self._changed >= _PAUSE):
+            self._changed = now
+            passed = f"{now - self._began:.0f} s"
+            self.write(" · ".join(filter(None, [passed, self._part, self._doing, self._what])), False)
+
+    def _last(self, text: str) -> None:
+        if not self._ended and self.write is not None:
+            self._ended = True
+            self.write(text, True)
+
+
+@contextlib.contextmanager
+def shown(progress: object) -> Iterator[Progress]:
+    """Yield the line, and see to it that one is left whatever happens.
+
+    Args:
+        progress: Whether to show it. In a notebook it is one output that is updated, in a terminal one line of standard
+            error; where neither is there, as in a pipe, nothing is shown.
+
+    Raises:
+        InputError: `progress` is neither True nor False.
+    """
+    if not isinstance(progress, bool):
+        raise InputError("wrong kind of argument", field="progress", expected="True or False", got=repr(progress))
+    line = Progress(_screen() if progress else None)
+    try:
+        yield line
+    finally:
+        line.stop()
+
+
+def in_notebook() -> bool:
+    """Return whether this runs in a Jupyter kernel."""
+    if "IPython" not in sys.modules:
+        return False
+    shell = sys.modules["IPython"].get_ipython()
+    return getattr(shell, "kernel", None) is not None
+
+
+def _screen() -> Callable[[str, bool], None] | None:
+    """Return what shows a line here; None if there is nowhere to show it."""
+    if in_notebook():
+        return _Output()
+    if sys.stderr is not None and sys.stderr.isatty():
+        return _Line()
+    return None
+
+
+class _Output:
+    """An output of a notebook's cell."""
+
+    def __init__(self) -> None:
+        self.handle: Any = None
+
+    def __call__(self, text: str, last: bool) -> None:
+        data = {"text/plain": text}
+        if self.handle is None:
+            from IPython.display import display
+
+            show: Any = display
+            self.handle = show(data, raw=True, display_id=True)
+        else:
+            self.handle.update(data, raw=True)
+
+
+class _Line:
+    """A terminal's line."""
+
+    def __init__(self) -> None:
+        self.length = 0
+
+    def __call__(self, text: str, last: bool) -> None:
+        text = text[: shutil.get_terminal_size().columns - 1]  # a longer one would go over two lines, and stay
+        sys.stderr.write("\r" + text.ljust(self.length) + ("\n" if last else ""))
+        sys.stderr.flush()
+        self.length = len(text)

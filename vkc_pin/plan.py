@@ -134,6 +134,11 @@ class Plan:
         m = self.metrics
         return f"<Plan {self.status}: base {m['base_effort']:.2f} m, arm {m['arm_effort']:.2f} rad, {m['planning_time']:.2f} s>"
 
+    def _repr_html_(self) -> str:
+        from vkc_pin.plan_overview import plan_html
+
+        return plan_html(self)
+
     def show(self, **options: Any) -> Any:
         """Show the motion with meshcat: inline in a notebook, otherwise in the browser; see `visualization.show`."""
         from vkc_pin import visualization

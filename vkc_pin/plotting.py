@@ -6,7 +6,6 @@ Figures are made without pyplot, so nothing depends on a screen or is kept open.
 from __future__ import annotations
 
 import io
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vkc_pin.errors import InputError
+from vkc_pin.notebook import in_notebook
 from vkc_pin.plan import Plan, write_atomically
-from vkc_pin.top_view import draw_top_view
+from vkc_pin.top_view import STYLE, draw_top_view
 from vkc_pin.world import World
 
 if TYPE_CHECKING:
@@ -27,14 +27,6 @@ __all__ = ["plot", "plot_clearance", "plot_joints", "plot_top_view"]
 _SUFFIXES = (".png", ".svg", ".pdf")
 _SAMPLES = 240  # of the clearance
 _SHOWN = 0.30  # [m]: clearance above this is of no interest
-_STYLE: Any = {
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.alpha": 0.25,
-    "font.size": 9,
-    "legend.frameon": False,
-}
 _COLOURS = ("#2f6db5", "#d1495b", "#2a9d6f", "#e08e1b", "#7a5195", "#5b6770", "#1b9aaa", "#a44a3f")
 
 
@@ -110,9 +102,9 @@ def _combined(plan: Plan) -> Figure:
 def _style() -> Any:
     import matplotlib
 
-    if "IPython" in sys.modules and getattr(sys.modules["IPython"].get_ipython(), "kernel", None) is not None:
+    if in_notebook():
         import matplotlib_inline.backend_inline  # noqa: F401 - a notebook shows figures once this has been imported
-    return matplotlib.rc_context(_STYLE)
+    return matplotlib.rc_context(STYLE)
 
 
 def _figure(width: float, height: float) -> Figure:

@@ -10,12 +10,13 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from vkc_pin.errors import InputError
+from vkc_pin.notebook import in_notebook
 
 if TYPE_CHECKING:
     from vkc_pin.plan import Plan
     from vkc_pin.solution import Iteration
 
-__all__ = ["Progress", "in_notebook", "shown"]
+__all__ = ["Progress", "shown"]
 
 _PAUSE = 0.1  # [s] between two changes of the line
 
@@ -96,14 +97,6 @@ def shown(progress: object) -> Iterator[Progress]:
         yield line
     finally:
         line.stop()
-
-
-def in_notebook() -> bool:
-    """Return whether this runs in a Jupyter kernel."""
-    if "IPython" not in sys.modules:
-        return False
-    shell = sys.modules["IPython"].get_ipython()
-    return getattr(shell, "kernel", None) is not None
 
 
 def _screen() -> Callable[[str, bool], None] | None:

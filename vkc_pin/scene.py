@@ -87,6 +87,11 @@ class Scene:
             f"{len(self.obstacle_names)} obstacles>"
         )
 
+    def _repr_html_(self) -> str:
+        from vkc_pin.overview import scene_html
+
+        return scene_html(self)
+
     @property
     def holds(self) -> tuple[Hold, ...]:
         """What the robot holds at the start, each after the hold it depends on."""

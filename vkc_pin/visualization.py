@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vkc_pin.errors import InputError, VkcError
+from vkc_pin.notebook import in_notebook
 from vkc_pin.plan import Plan, write_atomically
-from vkc_pin.progress import in_notebook
 from vkc_pin.scene import Scene
 
 if TYPE_CHECKING:

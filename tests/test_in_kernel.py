@@ -1,0 +1,97 @@
+"""What a notebook's user does, in a real kernel: show, look at the value of a cell, watch the progress, interrupt."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from kernel import Kernel, kernel
+
+DOOR = """
+scene = vkc.load_scene("door").with_start(base=[-0.03, 0.09, -1.19])
+steps = [vkc.Actuate("door", {"hinge": 1.2})]
+"""
+TELL = "print(plan.status, plan.success, len(plan.validation.violations), len(plan.report()) > 100, flush=True)"
+TOLD = r"interrupted False [1-9]\d* True\n"
+
+
+@pytest.fixture(scope="module")
+def jupyter() -> Iterator[Kernel]:
+    with kernel() as started:
+        started.run(DOOR)
+        yield started
+
+
+def printed(outputs: list[dict[str, Any]]) -> str:
+    assert not [output for output in outputs if output["kind"] == "error"], outputs
+    return "".join(output["text"] for output in outputs if output["kind"] == "stream" and output["name"] == "stdout")
+
+
+def test_show_is_part_of_the_notebook(jupyter: Kernel) -> None:
+    (output,) = jupyter.run("from fake_plan import fake_plan\nfake_plan().show()")
+    page = output["data"]["text/html"]
+    assert "iframe srcdoc=" in page
+    assert 500_000 < len(page) < 5_000_000
+    assert not re.search(r"""\bsrc=["']?http""", page)
+
+
+def test_the_value_of_a_cell_is_an_overview(jupyter: Kernel) -> None:
+    jupyter.run("from vkc_pin.standing import standing\nplan = standing(scene, steps, vkc.Options())")
+    for code, text in (("plan", "FAILED, interrupted"), ("scene", "obstacles")):
+        (output,) = jupyter.run(code)
+        page = output["data"]["text/html"]
+        assert text in page
+        assert "data:image/png;base64," in page
+        assert len(page) < 60_000
+        assert "text/plain" in output["data"]
+
+
+def test_progress_is_one_output_that_is_updated(jupyter: Kernel) -> None:
+    outputs = jupyter.run("plan = vkc.plan(scene, steps, progress=True)")
+    assert [output["kind"] for output in outputs] == ["display_data"], outputs
+    assert outputs[0]["updates"]
+    assert re.fullmatch(r"door: success — base .* m, arm .* rad, planned in [\d.]+ s", outputs[0]["data"]["text/plain"])
+    assert jupyter.run("plan = vkc.plan(scene, steps)") == []
+
+
+@pytest.mark.parametrize(
+    ("where", "code"),
+    [
+        ("seeds", "vkc_pin.initialization._Seeds, '_search'"),
+        ("solver", "vkc_pin.solver._Loop, 'run_ipopt'"),
+        ("validation", "vkc_pin.one_problem, 'validate'"),
+        ("building", "vkc_pin.one_problem, 'TrajectoryProblem'"),
+    ],
+)
+def test_an_interrupted_cell_leaves_a_plan(jupyter: Kernel, where: str, code: str) -> None:
+    """The kernel is interrupted once planning has come to a place where it stays for a while."""
+    slow = f"""
+import time, importlib
+import vkc_pin.initialization, vkc_pin.solver, vkc_pin.one_problem
+owner, name = {code}
+original = getattr(owner, name)
+def slow(*arguments, **options):
+    print("now", flush=True)
+    end = time.perf_counter() + 2.0
+    while time.perf_counter() < end:
+        time.sleep(0.01)
+    return original(*arguments, **options)
+setattr(owner, name, slow)
+try:
+    initialization = "auto" if {where!r} == "seeds" else "stationary"
+    plan = vkc.plan(scene, steps, options=vkc.Options(max_outer=2), initialization=initialization, progress=True)
+finally:
+    setattr(owner, name, original)
+"""
+    outputs = jupyter.run(slow, interrupt="now", delay=0.3)
+    printed(outputs)
+    (line,) = [output for output in outputs if output["kind"] == "display_data"]
+    assert "FAILED, interrupted" in line["data"]["text/plain"]
+    assert re.fullmatch(TOLD, printed(jupyter.run(TELL)))
+    (view,) = jupyter.run("plan.show()")
+    assert "FAILED, interrupted" in view["data"]["text/html"]
+    (value,) = jupyter.run("plan")
+    assert "FAILED, interrupted" in value["data"]["text/html"]
+    assert printed(jupyter.run("print(vkc.plan(scene, steps).status)")) == "success\n", "the next one is as if nothing had been"

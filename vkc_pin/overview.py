@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 from html import escape
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -68,7 +68,7 @@ def picture(scene: Scene, trajectory: Trajectory | None, title: str) -> str:
     scale = _SIDE / max(wide, high)
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(max(2.6, scale * wide) + 0.4, max(1.8, scale * high) + 0.6), dpi=_DPI, layout="constrained")
-        canvas: Any = FigureCanvasAgg(figure)
+        canvas = cast(Any, FigureCanvasAgg(figure))  # its methods have no types
         draw_top_view(figure, World(scene), trajectory, columns=2)
         canvas.draw()
     pixels = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")

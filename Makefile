@@ -1,18 +1,25 @@
-# make demo: plan the door and look at it; make test: lint, types, tests. Both set up .venv first, where it is not yet.
+# make demo: plan the door and look at it; make test: lint, types, tests, documentation; make docs: the documentation alone.
+# Each sets up .venv first, where it is not yet.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
-.PHONY: demo test lint clean
+.PHONY: demo test lint docs clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/installed.stamp
 	@mkdir -p out
 	$(BIN)/vkc-pin plan door --set door.hinge=1.2 --html out/door.html --save out/door.npz --json out/door.json --plots out
 
-test: lint
+# The tests leave the notebooks that they run in out/notebooks; the documentation shows them with what came out.
+test: lint $(VENV)/docs.stamp
 	$(BIN)/python -m pytest
+	$(MAKE) docs
+
+docs: $(VENV)/docs.stamp
+	$(BIN)/python -m sphinx -q -W --keep-going -c docs -d out/doctrees . out/site
+	@echo "The documentation is at out/site/index.html"
 
 lint: $(VENV)/test.stamp
 	$(BIN)/ruff check
@@ -42,10 +49,14 @@ $(VENV)/installed.stamp: pyproject.toml CMakeLists.txt vkc_pin/cpin/_cpin.cpp | 
 	$(PIP) install --editable .
 	@touch $@
 
-# Read from pyproject.toml: asking pip for '.[test]' would compile the package once more.
-test_packages = import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["test"], sep="\n")
+# Read from pyproject.toml: asking pip for '.[test]' would compile the package once more. Usage: $(call extra,test)
+extra = @$(BIN)/python -c '$(extra_packages)' $(1) > $(VENV)/$(1)-packages.txt && $(PIP) install --requirement $(VENV)/$(1)-packages.txt
+extra_packages = import sys, tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"][sys.argv[1]], sep="\n")
 
 $(VENV)/test.stamp: $(VENV)/installed.stamp
-	@$(BIN)/python -c '$(test_packages)' > $(VENV)/test-packages.txt
-	$(PIP) install --requirement $(VENV)/test-packages.txt
+	$(call extra,test)
+	@touch $@
+
+$(VENV)/docs.stamp: $(VENV)/installed.stamp
+	$(call extra,docs)
 	@touch $@

@@ -1,0 +1,108 @@
+"""What the site has that the pages in the repository have not: contents, outputs of notebooks, a film, cross references."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+from docutils import nodes
+from sphinx import addnodes
+from sphinx.application import Sphinx
+from sphinx.environment import BuildEnvironment
+from sphinx.util.nodes import make_refnode
+
+import vkc_pin as vkc
+
+ROOT = Path(__file__).resolve().parents[2]
+START = "docs/index"
+EXECUTED = ROOT / "out" / "notebooks"  # where the tests leave the notebooks that they have run
+REDIRECT = '<!DOCTYPE html>\n<meta charset="utf-8">\n<title>vkc_pin</title>\n<meta http-equiv="refresh" content="0; url={}">\n'
+
+
+def read(app: Sphinx, name: str, source: list[str]) -> None:
+    """Change what is read: notebooks with their outputs, if they have been run; contents and films where they belong."""
+    if name.startswith("notebooks/"):
+        run = EXECUTED / f"{Path(name).name}.ipynb"
+        if run.is_file():
+            source[0] = run.read_text(encoding="utf-8")
+        return
+    if name == START:
+        lines = (ROOT / "docs" / "_contents.md").read_text(encoding="utf-8").splitlines()
+        there = (line for line in lines if not line.endswith("*") or list((ROOT / "docs").glob(f"{line}.*")))
+        source[0] += "\n" + "\n".join(there)
+    source[0] = re.sub(
+        r"<!-- film: (\w+) -->\n!\[([^\]]*)\]\([^)]*\)",
+        r'<iframe class="film" src="animations/\1.html" title="\2"></iframe>',
+        source[0],
+    )
+    source[0] = re.sub(r"\[([^\]]*)\]\((animations/\w+\.html)\)", r'<a href="\2">\1</a>', source[0])
+
+
+def outdated(app: Sphinx, env: BuildEnvironment, added: set[str], changed: set[str], removed: set[str]) -> list[str]:
+    """Return the notebooks that have been run since they were read: their outputs are not in the repository."""
+    notebooks = [name for name in env.found_docs if name.startswith("notebooks/") and name in env.all_docs]
+    files = {name: EXECUTED / f"{Path(name).name}.ipynb" for name in notebooks}
+    return [name for name, file in files.items() if file.is_file() and file.stat().st_mtime > env.all_docs[name] / 1e6]
+
+
+def films(app: Sphinx, problem: Exception | None) -> None:
+    """Add the films, one of them of a motion that is planned now, and a page at the root that leads to the first."""
+    if problem is not None or app.builder.name != "html":
+        return
+    folder = Path(app.outdir) / "docs" / "animations"
+    shutil.copytree(ROOT / "docs" / "animations", folder, dirs_exist_ok=True)
+    plan = vkc.plan(vkc.load_scene("door"), [vkc.Actuate("door", {"hinge": 1.2})])
+    if not plan.success:
+        raise RuntimeError(plan.report())
+    plan.to_html(folder / "door.html")
+    (Path(app.outdir) / "index.html").write_text(REDIRECT.format(f"{START}.html"), encoding="utf-8")
+
+
+def plain(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+    """Make reStructuredText of a docstring: outside of `code`, marks such as * and | mean themselves."""
+    for number, line in enumerate(lines):
+        parts = re.split(r"(``[^`]*``|(?::[\w:]+:)?`[^`]*`)", line)
+        for i in range(0, len(parts), 2):
+            parts[i] = re.sub(r"(?<!\\)([*|])", r"\\\1", parts[i])
+            parts[i] = re.sub(r"(?<=\w)_(?!\w)", r"\\_", parts[i])
+        lines[number] = "".join(parts)
+
+
+def skip(app: Sphinx, what: str, name: str, thing: Any, skipped: bool, options: Any) -> bool | None:
+    """Leave out of a module's page what has its place among the names of `vkc_pin` itself."""
+    public = what == "module" and name in vkc.__all__ and getattr(vkc, name) is thing
+    return True if public else None
+
+
+def resolve(app: Sphinx, env: BuildEnvironment, node: addnodes.pending_xref, content: nodes.Node) -> nodes.Node | None:
+    """Find own names by their last part: a class is documented as `vkc_pin.Plan` and lives in `vkc_pin.plan`."""
+    if node.get("refdomain") != "py":
+        return None
+    target = str(node["reftarget"])
+    if "." in target and not target.startswith("vkc_pin"):
+        return None
+    last = target.rpartition(".")[2]
+    known = env.domains.python_domain.objects
+    found = [
+        name for name in known if name.rpartition(".")[2] == last and known[name].objtype in ("class", "function", "exception")
+    ]
+    public = [name for name in found if name == f"vkc_pin.{last}"] or found
+    if len(public) != 1:
+        return None
+    entry = known[public[0]]
+    return make_refnode(app.builder, str(node["refdoc"]), entry.docname, entry.node_id, content, public[0])
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Connect all of it."""
+    os.environ.setdefault("MPLBACKEND", "agg")
+    app.connect("source-read", read)
+    app.connect("env-get-outdated", outdated)
+    app.connect("build-finished", films)
+    app.connect("autodoc-process-docstring", plain, priority=400)
+    app.connect("autodoc-skip-member", skip)
+    app.connect("missing-reference", resolve)
+    return {"version": "1", "parallel_read_safe": True, "parallel_write_safe": True}

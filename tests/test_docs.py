@@ -7,7 +7,10 @@ import ast
 import re
 import subprocess
 import sys
+from fnmatch import fnmatch
+from html.parser import HTMLParser
 from pathlib import Path
+from urllib.parse import unquote, urlsplit
 
 import pytest
 import yaml
@@ -153,6 +156,38 @@ def test_links_lead_somewhere(page: Path) -> None:
             assert anchor in {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}, target
 
 
+def listed(page: str) -> list[str]:
+    """Return what the lists of a page name, some of it with wildcards."""
+    blocks = re.findall(r"```{toctree}\n(.*?)```", read(page), re.DOTALL)
+    return [line for block in blocks for line in block.splitlines() if line and not line.startswith(":")]
+
+
+def test_every_page_is_in_the_contents() -> None:
+    for folder, contents, few in (("docs", "_contents", 15), ("docs/api", "index", 10)):
+        names = listed(f"{folder}/{contents}.md")
+        pages = [page.stem for page in (ROOT / folder).glob("*.md") if page.stem not in ("index", contents)]
+        assert len(pages) >= few
+        assert [page for page in pages if not any(fnmatch(page, name) for name in names)] == []
+        assert [name for name in names if "*" not in name and not (ROOT / folder / f"{name}.md").resolve().is_file()] == []
+
+
+def documented(directive: str) -> set[str]:
+    """Return what the pages of the reference document by this directive, "auto*" for all of them but modules."""
+    pages = (page.read_text(encoding="utf-8") for page in (ROOT / "docs/api").glob("*.md"))
+    found = [pair for page in pages for pair in re.findall(r"^\.\. (auto\w+):: vkc_pin\.(\S+)", page, re.MULTILINE)]
+    return {name for kind, name in found if fnmatch(kind, directive) and (kind == "automodule") == (directive == "automodule")}
+
+
+def test_every_public_name_is_in_the_reference() -> None:
+    assert documented("auto*") == set(vkc.__all__)
+
+
+def test_every_module_is_in_the_reference() -> None:
+    modules = {name.split(".")[0] for name in documented("automodule")}
+    files = {"scene_schema", "object_schema", "robot_schema"}  # what files may contain is on pages of its own
+    assert {module for table in tables() for module in table} - modules == {*files, "version"}
+
+
 def tables() -> list[list[str]]:
     """Return the modules that architecture.md names, table by table."""
     found: list[list[str]] = []
@@ -228,3 +263,75 @@ def test_few_modules_import_casadi() -> None:
             if any(module.split(".")[0] == "casadi" for module in modules):
                 found.add(file.relative_to(ROOT / "vkc_pin").with_suffix("").parts[0])
     assert found | {"cpin"} == {"cpin", *re.findall(r"`(\w+)`", named)}
+
+
+class Links(HTMLParser):
+    """What a page of the site leads to, and what it loads."""
+
+    def __init__(self, page: Path) -> None:
+        super().__init__()
+        self.links: set[str] = set()
+        self.loaded: set[str] = set()
+        self.ids: set[str] = set()
+        self.feed(page.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = {name: value or "" for name, value in attrs}
+        self.ids.add(given.get("id", ""))
+        if tag == "a" and "href" in given:
+            self.links.add(given["href"])
+        elif tag == "link" and given.get("rel") not in ("stylesheet", "preload", "icon", "modulepreload"):
+            return
+        elif tag in ("script", "img", "iframe", "link", "source", "video"):
+            self.loaded.add(given.get("src", given.get("href", "")))
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of the site, built with warnings as errors."""
+    pytest.importorskip("sphinx", reason="the documentation is built with Sphinx: pip install '.[docs]'")
+    folder = tmp_path_factory.mktemp("site")
+    command = [
+        sys.executable,
+        "-m",
+        "sphinx",
+        "-q",
+        "-W",
+        "--keep-going",
+        "-c",
+        "docs",
+        "-d",
+        str(folder / "doctrees"),
+        ".",
+        str(folder / "html"),
+    ]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=500, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return folder / "html"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_site(site: Path) -> None:
+    pages = {page.resolve(): Links(page) for page in site.rglob("*.html") if page.parent.name != "animations"}
+    assert len(pages) >= 40
+    for page, found in pages.items():
+        for target in found.loaded:
+            assert not urlsplit(target).netloc, f"{page.name} loads {target}"
+        for target in found.links | found.loaded:
+            parts = urlsplit(target)
+            if parts.scheme in ("http", "https", "data", "mailto") or not (parts.path or parts.fragment):
+                continue
+            file = (page.parent / unquote(parts.path)).resolve() if parts.path else page
+            assert file.is_file(), f"{page.name} leads to {target}"
+            if parts.fragment and file in pages:
+                assert unquote(parts.fragment) in pages[file].ids, f"{page.name} leads to {target}"
+    for sheet in site.rglob("*.css"):
+        assert not re.search(r"url\(['\"]?(https?:)?//", sheet.read_text(encoding="utf-8")), sheet.name
+    start = (site / "docs/index.html").read_text(encoding="utf-8")
+    assert "animations/door.html" in start
+    assert (site / "docs/animations/door.html").stat().st_size > 100_000
+    formulas = (site / "docs/formulation.html").read_text(encoding="utf-8")
+    assert formulas.count('<svg class="formula"') > 100
+    reference = "".join(page.read_text(encoding="utf-8") for page in (site / "docs/api").glob("*.html"))
+    assert [name for name in vkc.__all__ if f'id="vkc_pin.{name}"' not in reference] == []

@@ -12,7 +12,8 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
-NOTEBOOKS = sorted((Path(__file__).resolve().parents[1] / "notebooks").glob("*.ipynb"))
+ROOT = Path(__file__).resolve().parents[1]
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 Cells = dict[str, nbformat.NotebookNode]
 
 
@@ -21,10 +22,12 @@ def load(path: Path) -> nbformat.NotebookNode:
 
 
 def executed(name: str, folder: Path) -> Cells:
-    """Run a notebook in a folder of its own; return its cells by their ids."""
+    """Run a notebook in a folder of its own, and keep it with its outputs for the site; return its cells by their ids."""
     (path,) = (path for path in NOTEBOOKS if path.stem == name)
     notebook = load(path)
     NotebookClient(notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(folder)}}).execute()
+    (ROOT / "out" / "notebooks").mkdir(parents=True, exist_ok=True)
+    nbformat.write(notebook, ROOT / "out" / "notebooks" / path.name)
     return {cell.id: cell for cell in notebook.cells}
 
 

@@ -38,6 +38,7 @@ def read(app: Sphinx, name: str, source: list[str]) -> None:
         r'<iframe class="film" src="animations/\1.html" title="\2"></iframe>',
         source[0],
     )
+    source[0] = re.sub(r"\[(\w+)\.md\]\((\1\.md[^)]*)\)", r"[](\2)", source[0])  # the page's title instead of its file's name
     source[0] = re.sub(r"\[([^\]]*)\]\((animations/\w+\.html)\)", r'<a href="\2">\1</a>', source[0])
 
 

@@ -115,7 +115,7 @@ class Race:
             solution.penalty = 800.0
         return dataclasses.replace(solution, rounds=1, iterations=5, timings=timings, history=[ROUND])
 
-    def validate(self, scene: vkc.Scene, steps: Any, trajectory: vkc.Trajectory, options: vkc.Options) -> vkc.Report:
+    def validate(self, scene: vkc.Scene, steps: Any, trajectory: vkc.Trajectory, *options: Any) -> vkc.Report:
         amount = next(self.amounts)
         wrong = vkc.Violation("goal", "drawer.slide", 0, 0.0, amount, "m", "")
         return vkc.Report((wrong,) if amount else ())

@@ -4,6 +4,7 @@ from vkc_pin.articulation import ArticulatedObject, Attachment, Freedom, Latch, 
 from vkc_pin.chain import VirtualKinematicChain, consolidate
 from vkc_pin.chore import plan_chore
 from vkc_pin.errors import BuildError, InputError, UnknownNameError, VkcError
+from vkc_pin.formula import State
 from vkc_pin.options import Options
 from vkc_pin.plan import Plan
 from vkc_pin.planner import plan
@@ -13,6 +14,7 @@ from vkc_pin.robot import Robot, load_robot
 from vkc_pin.scene import PlacedObject, Scene, load_scene
 from vkc_pin.solution import Iteration
 from vkc_pin.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Touch
+from vkc_pin.terms import Constraint, Cost
 from vkc_pin.trajectory import PhaseSpan, Trajectory
 from vkc_pin.validation import validate
 from vkc_pin.version import __version__
@@ -22,6 +24,8 @@ __all__ = [
     "ArticulatedObject",
     "Attachment",
     "BuildError",
+    "Constraint",
+    "Cost",
     "Freedom",
     "GoTo",
     "Grasp",
@@ -38,6 +42,7 @@ __all__ = [
     "Report",
     "Robot",
     "Scene",
+    "State",
     "Touch",
     "Trajectory",
     "TrajectoryProblem",

@@ -30,8 +30,8 @@ def actions_of(steps: Sequence[Step]) -> list[tuple[Step, ...]]:
     return actions
 
 
-def foresee(scene: Scene, steps: Sequence[Step], options: Options) -> None:
-    """Check that every step can be done at its place, as far as that does not depend on motions.
+def foresee(scene: Scene, steps: Sequence[Step], options: Options) -> list[Task]:
+    """Check that every step can be done at its place, as far as that does not depend on motions; return what each asks for.
 
     Raises:
         InputError: It cannot; the error names the first such step.
@@ -42,6 +42,7 @@ def foresee(scene: Scene, steps: Sequence[Step], options: Options) -> None:
         scene = _ideally_after(scene, tasks[-1])
     if not any(task.phases for task in tasks):
         raise nothing_to_do()
+    return tasks
 
 
 def _ideally_after(scene: Scene, task: Task) -> Scene:

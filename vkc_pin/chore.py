@@ -23,6 +23,8 @@ from vkc_pin.solution import Iteration
 from vkc_pin.step_by_step import joined, scene_after, summed
 from vkc_pin.steps import Step
 from vkc_pin.task import Task
+from vkc_pin.term_goals import stretches
+from vkc_pin.terms import Term, check_active
 from vkc_pin.trajectory import Trajectory
 
 __all__ = ["plan_chore"]
@@ -48,6 +50,7 @@ def plan_chore(
     time_limit: float | None = None,
     seed: int = 0,
     progress: bool = False,
+    terms: Sequence[Term] = (),
 ) -> Plan:
     """Plan many steps over several objects, each with the next ones in mind.
 
@@ -66,6 +69,7 @@ def plan_chore(
         time_limit: Seconds of planning for all steps together.
         seed: Of the random numbers.
         progress: As for `planner.plan`.
+        terms: Own constraints and costs, as for `planner.plan`.
 
     Returns:
         One plan of all steps, checked as a whole. If a step fails: of those before it, with the best motion there is of
@@ -74,12 +78,13 @@ def plan_chore(
     Raises:
         InputError: A step names something that is not there, or cannot be done at its place in the list; the error names it.
     """
-    settings = settings_for(scene, initialization, options, callback, time_limit, seed)
+    settings = settings_for(scene, initialization, options, callback, time_limit, seed, terms=terms)
     if not isinstance(window, int) or isinstance(window, bool) or window < 1:
         raise InputError("out of range", field="window", expected="a whole number of at least 1", got=repr(window))
 
     def planner(scene: Scene, steps: Sequence[Step], settings: Settings) -> Plan:
-        foresee(scene, steps, settings.options)
+        tasks = foresee(scene, steps, settings.options)
+        check_active(settings.terms, [stretch for task in tasks for stretch in stretches(task)])
         return _Chore(scene, tuple(steps), window, settings).run()
 
     return guarded(planner, scene, steps, settings, progress)

@@ -120,7 +120,7 @@ def _check(arguments: argparse.Namespace) -> int:
     from vkc_pin.validation import validate
 
     plan = vkc.Plan.load(arguments.plan)
-    report = validate(plan.scene, plan.steps, plan.trajectory, plan.options)
+    report = validate(plan.scene, plan.steps, plan.trajectory, plan.options, plan.terms)
     sys.stdout.write("\n".join(report.lines()) + "\n")
     return EXIT_OK if report.ok else EXIT_FAILED
 

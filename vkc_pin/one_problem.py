@@ -26,6 +26,7 @@ from vkc_pin.solution import Iteration, Solution
 from vkc_pin.solver import solve
 from vkc_pin.standing import TIMES, standing
 from vkc_pin.steps import Step
+from vkc_pin.terms import Term
 from vkc_pin.trajectory import Trajectory
 from vkc_pin.unfold import as_trajectory
 from vkc_pin.validation import validate
@@ -52,6 +53,7 @@ class Settings:
     time_limit: float | None
     seed: int
     perturbation: float
+    terms: tuple[Term, ...] = ()
     rough: bool = False
     progress: Progress = field(default_factory=Progress)
     interrupt: Interrupt = field(default_factory=Interrupt)
@@ -118,7 +120,7 @@ class OneProblem:
     def _run(self, seed: Callable[[TrajectoryProblem], Seed] | None, began: float) -> Plan:
         limit = self.settings.time_limit
         self.settings.progress.begin([phase.name for phase in self.task.phases])
-        problem = self.problem = TrajectoryProblem(self.scene, self.task, self.settings.options)
+        problem = self.problem = TrajectoryProblem(self.scene, self.task, self.settings.options, self.settings.terms)
         build_time = problem.transcription.take_build_time()
         reasons = impossible(problem)
         if reasons:
@@ -248,7 +250,7 @@ class OneProblem:
         self.settings.progress.doing("checking")
         with interruptible() as interrupt:  # what was found is checked all the same
             trajectory = as_trajectory(problem, solution.z)
-            report = validate(self.scene, self.task.steps, trajectory, self.settings.options)
+            report = validate(self.scene, self.task.steps, trajectory, self.settings.options, self.settings.terms)
         self.settings.interrupt.pressed |= interrupt.pressed
         self.times["validation"] += time.perf_counter() - began
         status = "success" if report.ok else "rejected" if solution.converged else "not converged"
@@ -279,6 +281,7 @@ class OneProblem:
             seed=self.settings.seed,
             initialization=best.name,
             history=tuple(self.history),
+            terms=self.settings.terms,
         )
 
 

@@ -20,6 +20,7 @@ from vkc_pin.report import Report
 from vkc_pin.resources import folder
 from vkc_pin.scene import Scene
 from vkc_pin.steps import Step, step_from_dict, step_to_dict
+from vkc_pin.terms import Term, term_from_dict, term_to_dict
 from vkc_pin.trajectory import Trajectory
 from vkc_pin.writing import write_atomically
 
@@ -65,6 +66,7 @@ class Plan:
         seed: Of the random numbers.
         initialization: Which seed trajectory it came from.
         history: One row per round of the solver.
+        terms: The user's own constraints and costs, with their expressions as data.
     """
 
     scene: Scene
@@ -77,6 +79,7 @@ class Plan:
     seed: int = 0
     initialization: str = ""
     history: Sequence[Mapping[str, float]] = field(default_factory=tuple)
+    terms: tuple[Term, ...] = ()
 
     @property
     def success(self) -> bool:
@@ -183,6 +186,7 @@ class Plan:
             "seed": self.seed,
             "initialization": self.initialization,
             "history": [dict(row) for row in self.history],
+            "terms": [term_to_dict(term) for term in self.terms],
         }
         buffer = io.BytesIO()
         np.savez_compressed(
@@ -228,4 +232,5 @@ class Plan:
             seed=about["seed"],
             initialization=about["initialization"],
             history=tuple(about["history"]),
+            terms=tuple(term_from_dict(term) for term in about.get("terms", ())),
         )

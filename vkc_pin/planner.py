@@ -11,6 +11,7 @@ import numpy as np
 
 from vkc_pin.all_at_once import all_at_once
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.goal import compile_task
 from vkc_pin.initialization import METHODS
 from vkc_pin.one_problem import Settings
 from vkc_pin.options import Options
@@ -21,6 +22,8 @@ from vkc_pin.solution import Iteration
 from vkc_pin.standing import standing
 from vkc_pin.step_by_step import step_by_step
 from vkc_pin.steps import Step
+from vkc_pin.term_goals import stretches
+from vkc_pin.terms import Term, check_active, traced
 
 __all__ = ["check_arguments", "guarded", "plan", "settings_for"]
 
@@ -37,6 +40,7 @@ def plan(
     joint: bool = True,
     perturbation: float = 0.0,
     progress: bool = False,
+    terms: Sequence[Term] = (),
 ) -> Plan:
     """Plan one coordinated motion of base, arm and objects that brings about `steps`.
 
@@ -52,6 +56,7 @@ def plan(
         joint: Plan all steps as one problem; otherwise each from where the one before it ends, for comparison.
         perturbation: Standard deviation of smooth noise on the seeds, [m] and [rad], to see how much hangs on them.
         progress: Show one line that changes in its place: in a notebook or a terminal; elsewhere nothing is shown.
+        terms: Own constraints and costs, beside those of every motion; see `Constraint` and `Cost`.
 
     Returns:
         A plan, in every case: `plan.success` is true only if the independent `validation` found nothing wrong, and
@@ -59,9 +64,11 @@ def plan(
         iterate so far and status "interrupted".
 
     Raises:
-        InputError: The steps name something that is not there or cannot be done, or an argument is wrong.
+        InputError: The steps or terms name something that is not there or cannot be done, or an argument is wrong.
     """
-    settings = settings_for(scene, initialization, options, callback, time_limit, seed, perturbation)
+    settings = settings_for(scene, initialization, options, callback, time_limit, seed, perturbation, terms)
+    if settings.terms:
+        check_active(settings.terms, stretches(compile_task(scene, steps, settings.options)))
     return guarded(step_by_step if not joint else all_at_once, scene, steps, settings, progress)
 
 
@@ -85,13 +92,14 @@ def guarded(
 
 
 def settings_for(
-    scene: object,
+    scene: Scene,
     initialization: str,
     options: Options | None,
     callback: Callable[[Iteration], None] | None,
     time_limit: float | None,
     seed: int,
     perturbation: float = 0.0,
+    terms: Sequence[Term] = (),
 ) -> Settings:
     """Return arguments of `plan` as settings.
 
@@ -104,7 +112,7 @@ def settings_for(
         raise UnknownNameError("initialization", str(initialization), METHODS, field="initialization")
     if not (_is_number(perturbation) and 0 <= perturbation < np.inf):
         raise InputError("out of range", field="perturbation", expected="a number of at least 0", got=repr(perturbation))
-    return Settings(initialization, options, callback, time_limit, int(seed), float(perturbation))
+    return Settings(initialization, options, callback, time_limit, int(seed), float(perturbation), traced(scene, terms))
 
 
 def check_arguments(scene: object, options: object, time_limit: object, seed: object) -> None:

@@ -18,6 +18,9 @@ from vkc_pin.pose_goals import pose_goals
 from vkc_pin.scene import Scene
 from vkc_pin.steps import Step
 from vkc_pin.task import Phase, Task
+from vkc_pin.term_goals import TermNumbers, stretches, term_goals
+from vkc_pin.term_rows import TermRow
+from vkc_pin.terms import Term, check_active, traced
 from vkc_pin.transcription import transcribe
 from vkc_pin.waypoint import Structure
 
@@ -40,27 +43,33 @@ class TrajectoryProblem:
         lower, upper: Bounds of z_1..z_N, shape (N, n): joint limits (eq. 4), what stands still, joint goals.
         targets: Placements of the pose rows (eqs. 2 and 3), one per `transcription.structure.poses`.
         pose_names: Their names.
+        terms: The user's own constraints and costs that count here, one per `transcription.structure.terms`.
+        own: Their numbers.
         dt: Time of every step [s], shape (N,): `Options.dt`, or longer where the way is too long for it.
         velocity, acceleration: Bounds of `rates` (eq. 5), shapes (N, n) and (N + 1 + rests, n): limits times dt and dt².
     """
 
-    def __init__(self, scene: Scene, task: Task, options: Options) -> None:
+    def __init__(self, scene: Scene, task: Task, options: Options, terms: Sequence[Term] = ()) -> None:
         self.scene, self.task, self.options = scene, task, options
         self.chain: VirtualKinematicChain = consolidate(scene, task.holds)
         self.contacts = ContactModel(scene, self.chain, task, options)
         self.ends = np.cumsum([phase.segments for phase in task.phases])
         poses, self.targets, self.pose_names = pose_goals(scene, self.chain, task, options)
-        self.transcription = transcribe(self._structure(poses))
+        rows, self.terms = term_goals(scene, self.chain, task, terms)
+        self.transcription = transcribe(self._structure(poses, rows))
         self.start = self._start()
         self.lower, self.upper = self._bounds()
-        self.take_time_for(np.tile(self.start, (self.segments, 1)))
+        self.own = TermNumbers(self.terms, self.transcription, self.start)
+        still = np.tile(self.start, (self.segments, 1))
+        self.own.check(still, np.full(self.segments, options.dt))
+        self.take_time_for(still)
 
     @property
     def segments(self) -> int:
         """N, the number of waypoints after the start."""
         return int(self.ends[-1])
 
-    def _structure(self, poses: Sequence[PoseRow]) -> Structure:
+    def _structure(self, poses: Sequence[PoseRow], terms: tuple[TermRow, ...]) -> Structure:
         o, robot = self.options, self.chain.robot.coordinates.size
         weights = np.full(self.chain.size, o.velocity_weight_object)
         weights[:robot], weights[:2] = o.velocity_weight_arm, o.velocity_weight_base
@@ -91,6 +100,7 @@ class TrajectoryProblem:
             tuple(rests),
             differential,
             clamped,
+            terms,
         )
 
     @cached_property
@@ -159,13 +169,15 @@ class TrajectoryProblem:
         """Give every step `Options.dt`, or more where z_1..z_N, shape (N, n), is too long a way for it.
 
         The measure is the profile 3s² − 2s³ over the way that each coordinate goes between two rests: its speed is at most 1.5
-        times the mean, its acceleration 6 times the way over the square of the duration.
+        times the mean, its acceleration 6 times the way over the square of the duration. Terms may ask for more time.
         """
         steps, dt = np.abs(np.diff(self.waypoints(z), axis=0)), np.full(self.segments, self.options.dt)
         for first, last in self._runs():
             way = steps[first:last].sum(axis=0)
             needed = max(np.max(1.5 * way / self.chain.velocity), np.sqrt(np.max(6.0 * way / self.chain.acceleration)))
             dt[first:last] = np.maximum(dt[first:last], _SPARE * needed / (last - first))
+        if self.transcription.structure.timed:
+            dt = self.own.slower(z, dt, self._runs())
         self._set_steps(dt)
         self._least = dt
 
@@ -223,10 +235,11 @@ class TrajectoryProblem:
         return first, t.second @ z + np.outer(t.start_second, self.start)
 
     def objective(self, z: NDArray[np.float64]) -> float:
-        """Return f of eq. 1 at z_1..z_N, shape (N, n)."""
+        """Return f of eq. 1, and the user's own costs, at z_1..z_N, shape (N, n)."""
         structure = self.transcription.structure
         first, second = self.rates(z)
-        return float(np.sum(first**2 * structure.weights_velocity) + np.sum(second**2 @ structure.weights_acceleration))
+        efforts = np.sum(first**2 * structure.weights_velocity) + np.sum(second**2 @ structure.weights_acceleration)
+        return float(efforts) + self.own.cost(z, self.dt)
 
     def pose_error(self, z: NDArray[np.float64]) -> float:
         """Return the largest residual of closure, goals and rolling, [m] or [rad], at z_1..z_N, shape (N, n)."""
@@ -238,6 +251,10 @@ class TrajectoryProblem:
                 residual, _ = solver.evaluate(z[np.array(pose.waypoints) - 1], target)
                 errors.append(float(np.abs(residual).max()))
         return max(*errors, self.slip(z))
+
+    def row_error(self, z: NDArray[np.float64]) -> float:
+        """Return `pose_error`, or how much the user's own constraints are violated if that is more; see `TermNumbers.error`."""
+        return max(self.pose_error(z), self.own.error(z, self.dt))
 
     def slip(self, z: NDArray[np.float64]) -> float:
         """Return how far a differential base slips sideways in the worst step of z_1..z_N, shape (N, n) [m]; 0 for others."""
@@ -280,16 +297,21 @@ class TrajectoryProblem:
         )
 
 
-def build(scene: Scene, steps: Sequence[Step], *, options: Options | None = None) -> TrajectoryProblem:
+def build(
+    scene: Scene, steps: Sequence[Step], *, options: Options | None = None, terms: Sequence[Term] = ()
+) -> TrajectoryProblem:
     """Return the nonlinear program of `steps` in `scene`, to look at before solving.
 
     Args:
         scene: Robot, objects and obstacles.
         steps: What should change in the world.
         options: How to plan.
+        terms: Own constraints and costs.
 
     Raises:
-        InputError: The steps name something that is not there, or ask for what cannot be done.
+        InputError: The steps or terms name something that is not there, or ask for what cannot be done.
     """
     options = options or Options()
-    return TrajectoryProblem(scene, compile_task(scene, steps, options), options)
+    task, terms = compile_task(scene, steps, options), traced(scene, terms)
+    check_active(terms, stretches(task))
+    return TrajectoryProblem(scene, task, options, terms)

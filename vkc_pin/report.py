@@ -17,12 +17,12 @@ class Violation:
 
     Attributes:
         constraint: "start", "limit", "velocity", "acceleration", "slip", "closure", "latch", "unheld", "slide", "goal",
-            "order", "clearance" or "penetration".
-        subject: The coordinate, object, goal or pair of links it is about, e.g. "elbow_joint", "forearm_link – sofa".
+            "order", "clearance", "penetration" or "term", a constraint of the user's own.
+        subject: The coordinate, object, goal, term or pair of links it is about, e.g. "elbow_joint", "forearm_link – sofa".
         waypoint: Counted from 0; between two waypoints the earlier.
         time: [s].
         amount: By how much it is violated, in `unit`.
-        unit: "m", "rad", "m/s", ...
+        unit: "m", "rad", "m/s", ...; empty for a term, whose unit is its own.
         detail: One sentence for people.
     """
 

@@ -20,7 +20,7 @@ class Iteration:
         objective: f of eq. 1.
         clearance: Smallest distance at waypoints [m]; infinite if nothing is within reach.
         shortfall: What is missing to the clearance that is asked for [m].
-        pose_error: Largest residual of closure and goals, [m] or [rad].
+        pose_error: Largest residual of closure and goals, [m] or [rad], and of own constraints, 1e-3 being their tolerance.
         step: Largest change of a coordinate in this round.
         radius: Trust region of this round.
         penalty: Weight of the clearance slack.

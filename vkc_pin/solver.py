@@ -86,7 +86,7 @@ class _Loop:
         self.between = False
         self.at, _ = self.contacts(self.z)
         self.shortfall = self.at.shortfall(problem.segments)
-        self.objective, self.pose_error = problem.objective(self.z), problem.pose_error(self.z)
+        self.objective, self.pose_error = problem.objective(self.z), problem.row_error(self.z)
 
     def contacts(self, z: NDArray[np.float64]) -> tuple[Contacts, bool]:
         """Return what is close at the waypoints and, once that was needed, between them, and whether that is far enough."""
@@ -120,7 +120,7 @@ class _Loop:
             z=z,
             slack=slack,
             objective=objective - self.penalty * float(slack.sum()),
-            pose_error=self.problem.pose_error(z),
+            pose_error=self.problem.row_error(z),
             contacts=contacts,
             shortfall=contacts.shortfall(self.problem.segments),
             clear=clear,
@@ -150,18 +150,24 @@ class _Loop:
             self.free_between(trial)
         if trial.rate > RATE_TOLERANCE and trial.contacts.violation() < NEARLY_FREE:  # before, it only costs time
             self.problem.stretch(trial.z)
+            if self.transcription.structure.timed:
+                self.objective, self.pose_error = self.problem.objective(trial.z), self.problem.row_error(trial.z)
             if not self.rates and self.problem.rate_violation(trial.z) > RATE_TOLERANCE:
                 self.rates, self.multipliers = True, {}
 
     def done(self, trial: _Trial) -> bool:
-        """Return whether everything holds at the waypoints and nothing collides between them."""
+        """Return whether everything holds at the waypoints of a step that was just accepted, and nothing collides between them."""
         return (
             trial.satisfied
             and trial.clear
-            and trial.pose_error < POSE_TOLERANCE
+            and self.pose_error < POSE_TOLERANCE
             and self.problem.rate_violation(trial.z) <= RATE_TOLERANCE
             and self.free_between(trial)
         )
+
+    def astray(self) -> bool:
+        """Return whether the user's own constraints are still far from holding; small steps would take long to get there."""
+        return self.problem.own.error(self.z, self.problem.dt) > 10 * POSE_TOLERANCE
 
     def raise_penalty(self) -> None:
         """Make clearance dearer."""
@@ -184,7 +190,7 @@ class _Loop:
             "ubx": np.column_stack([upper, np.full(t.segments, np.inf)]).ravel(),
             "lbg": bounds[0],
             "ubg": bounds[1],
-            "p": t.parameter_vector(problem.start, planes, offsets, self.targets, self.penalty),
+            "p": t.parameter_vector(problem.start, planes, offsets, self.targets, self.penalty, problem.dt),
         }
         begin = time.perf_counter()
         result = solver(**arguments, **self.multipliers)
@@ -206,6 +212,8 @@ class _Loop:
         for pose, at in zip(t.structure.poses, t.pose_rows, strict=True):
             for rows in at.values():
                 lower[rows], upper[rows] = ROW_BOUNDS[pose.kind]
+        own = self.problem.own
+        lower[own.rows], upper[own.rows] = own.lower, own.upper
         if self.rates:
             rates = np.concatenate([self.problem.velocity.ravel(), self.problem.acceleration.ravel()])
             lower, upper = np.concatenate([lower, -rates]), np.concatenate([upper, rates])
@@ -301,7 +309,8 @@ def _iterate(
             solution.status = solution.status if solution.converged else "interrupted"
             break
         region.adapt(before, trial, accepted, ratio)
-        if accepted and not done and gain < SETTLING and loop.shortfall.max() < NEARLY_FREE:
+        settled = accepted and not done and gain < SETTLING and not loop.astray()
+        if settled and loop.shortfall.max() < NEARLY_FREE:
             region.settle()
         if solution.rounds >= HOPELESS_ROUNDS and (
             loop.shortfall.max() > HOPELESS or loop.problem.drift(loop.z) > HOPELESS_DRIFT

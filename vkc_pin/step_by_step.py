@@ -78,7 +78,7 @@ def joined(scene: Scene, steps: Sequence[Step], settings: Settings, parts: Seque
     with interruptible() as interrupt:
         trajectory = join([part.trajectory for part in parts], pause=settings.options.grasp_time)
         checked = time.perf_counter()
-        report = validate(scene, steps, trajectory, settings.options)
+        report = validate(scene, steps, trajectory, settings.options, settings.terms)
     settings.interrupt.pressed |= interrupt.pressed
     status = "interrupted" if settings.interrupt.pressed else "rejected" if parts[-1].success else parts[-1].status
     report = dataclasses.replace(report, notes=parts[-1].validation.notes)
@@ -98,6 +98,7 @@ def joined(scene: Scene, steps: Sequence[Step], settings: Settings, parts: Seque
         seed=settings.seed,
         initialization=", ".join(part.initialization for part in parts),
         history=tuple(row for part in parts for row in part.history),
+        terms=settings.terms,
     )
 
 

@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 from vkc_pin.coordinates import Coordinates
 from vkc_pin.inverse_kinematics import PoseSolver
 from vkc_pin.monitor import Monitor
+from vkc_pin.sparse import assemble, sparse, unit
+from vkc_pin.term_rows import TermProgram
 from vkc_pin.waypoint import Structure, waypoint_functions
 
 __all__ = ["Transcription", "transcribe"]
@@ -39,6 +41,8 @@ class Transcription:
         slot_rows: Rows of the witness planes, shape (N, K).
         pose_rows: For each pose, waypoint → its rows; see `pose.pose_rows`.
         base_rows: Rows that keep a differential base from slipping, shape (N,); empty for others.
+        term_rows: For each of the user's own constraints, waypoint → its rows; costs have none. They are the last rows.
+        term_values: x, z_0 and times of all steps → values of these rows, their Jacobian, and the sum and slope of the costs.
         pose_solvers: Inverse kinematics of each pose.
         rate_matrix, rate_start: Velocities and accelerations per step are rate_matrix·x + rate_start·z_0.
         build_time: Seconds spent on building that nobody has asked for yet; see `take_build_time`.
@@ -73,7 +77,9 @@ class Transcription:
         self.offsets = ca.MX.sym("R", K, N)
         self.targets = ca.MX.sym("W", 12, max(len(self.structure.poses), 1))
         self.penalty = ca.MX.sym("rho")
-        self.parameters = ca.veccat(self.start, self.planes, self.offsets, self.targets, self.penalty)
+        self.dt = ca.MX.sym("dt", N)
+        times = [self.dt] if self.structure.timed else []
+        self.parameters = ca.veccat(self.start, self.planes, self.offsets, self.targets, self.penalty, *times)
 
     def parameter_vector(
         self,
@@ -82,11 +88,16 @@ class Transcription:
         offsets: NDArray[np.float64],
         targets: NDArray[np.float64],
         penalty: float,
+        dt: NDArray[np.float64] | None = None,
     ) -> NDArray[np.float64]:
-        """Return the parameters: start (n,), planes (N, K, 12·joints), offsets (N, K), targets (poses, 12), penalty."""
+        """Return the parameters: start (n,), planes (N, K, 12·joints), offsets (N, K), targets (poses, 12), penalty, dt (N,).
+
+        The times of the steps only count where a term needs them.
+        """
         planes = planes.transpose(0, 2, 1).ravel()  # the K × 12J matrix of a waypoint, column by column
         padded = targets.ravel() if len(targets) else np.zeros(12)
-        return np.concatenate([start, planes, offsets.ravel(), padded, [penalty]])
+        times = [dt] if self.structure.timed and dt is not None else []
+        return np.concatenate([start, planes, offsets.ravel(), padded, [penalty], *times])
 
     def _objective(self) -> None:
         """Make the objective of eq. 1: f = ½ xᵀHx + gᵀx + c."""
@@ -104,9 +115,10 @@ class Transcription:
         for i, (v, a) in enumerate(zip(self.structure.weights_velocity.T, self.structure.weights_acceleration, strict=True)):
             curvature = first.T @ (v[:, None] * first) + a * second.T @ second
             slope = first.T @ (v * start_first) + a * second.T @ start_second
-            hessian += ca.kron(_sparse(2 * curvature), _unit(n + 1, n + 1, i))
-            linear += ca.kron(_sparse(2 * slope[:, None]), _unit(n + 1, n, i))
+            hessian += ca.kron(sparse(2 * curvature), unit(n + 1, n + 1, i))
+            linear += ca.kron(sparse(2 * slope[:, None]), unit(n + 1, n, i))
         self.objective_hessian, linear_matrix = hessian, linear
+        self.objective_curvature: Any = ca.triu(hessian)
         slack = np.zeros((N, n + 1))
         slack[:, n] = 1.0
         gradient = linear_matrix @ self.start + self.penalty * ca.DM(slack.ravel())
@@ -157,12 +169,15 @@ class Transcription:
                 place += height
         order = np.argsort(np.concatenate(value_rows))
         self.g = ca.vertcat(*values)[order.tolist()]
-        self.jacobian = _assemble(jacobians, jacobian_at, self.rows, self.size)
-        self.hessian = _assemble(hessians, hessian_at, self.size, self.size)
+        self.jacobian = assemble(jacobians, jacobian_at, self.rows, self.size)
+        self.hessian = assemble(hessians, hessian_at, self.size, self.size)
         self.base_rows = np.zeros(0, int)
         if self.structure.differential:
             self._differential()
         self._clamp()
+        self.term_rows: list[dict[int, NDArray[np.int_]]] = []
+        if self.structure.terms:
+            self._terms()
 
     def _differential(self) -> None:
         """Append −sin θ̄·δx + cos θ̄·δy at every segment's mid-heading: the base rolls, it does not slip."""
@@ -196,12 +211,27 @@ class Transcription:
         (self.hessian,) = ca.substitute([self.hessian], [self.multipliers], [both[: self.rows]])
         self.multipliers, self.rows = both, self.rows + len(pairs)
 
+    def _terms(self) -> None:
+        """Append the user's own constraints, and add their costs to the objective."""
+        dt = self.dt if self.structure.timed else ca.MX.zeros(self.segments)
+        part = TermProgram(self.structure.model, self.structure.terms, ca.horzcat(self.start, self.z), dt)
+        self.term_rows = [{waypoint: self.rows + rows for waypoint, rows in at.items()} for at in part.at]
+        outputs = [part.values, part.jacobian, part.cost, part.gradient]
+        self.term_values = ca.Function("terms", [self.x, self.start, self.dt], outputs)
+        self.g, self.jacobian = ca.vertcat(self.g, part.values), ca.vertcat(self.jacobian, part.jacobian)
+        both = ca.MX.sym("lam_g", self.rows + part.rows)
+        (hessian,) = ca.substitute([self.hessian], [self.multipliers], [both[: self.rows]])
+        self.hessian = hessian + part.hessian(both[self.rows :])
+        self.multipliers, self.rows = both, self.rows + part.rows
+        self.f, self.gradient = self.f + part.cost, self.gradient + part.gradient
+        self.objective_curvature = self.objective_curvature + part.cost_hessian
+
     def _rates(self) -> None:
         n = self.n
         select, identity = ca.horzcat(ca.DM.eye(n), ca.DM(n, 1)), ca.DM.eye(n)  # leaves the slack out
-        self.rate_matrix = ca.vertcat(*(ca.kron(_sparse(part), select) for part in (self.first, self.second)))
+        self.rate_matrix = ca.vertcat(*(ca.kron(sparse(part), select) for part in (self.first, self.second)))
         starts = (self.start_first[:, None], self.start_second[:, None])
-        self.rate_start = ca.vertcat(*(ca.kron(_sparse(part), identity) for part in starts))
+        self.rate_start = ca.vertcat(*(ca.kron(sparse(part), identity) for part in starts))
 
     def solver(self, *, rates: bool, options: dict[str, Any], deadline: float = np.inf) -> ca.Function:
         """Return Ipopt on this program.
@@ -229,7 +259,7 @@ class Transcription:
             jacobian = ca.vertcat(jacobian, self.rate_matrix)
             multipliers = ca.MX.sym("lam", g.numel())
         weight = ca.MX.sym("lam_f")
-        hessian = weight * ca.triu(self.objective_hessian) + self.hessian
+        hessian = weight * self.objective_curvature + self.hessian
         if rates:
             (hessian,) = ca.substitute([hessian], [self.multipliers], [multipliers[: self.rows]])
         inputs = [self.x, self.parameters]
@@ -245,26 +275,6 @@ class Transcription:
         monitor = Monitor(self.size, g.numel(), self.parameters.numel()) if timed else None
         callback = {"iteration_callback": monitor} if timed else {}
         return ca.nlpsol("trajectory", "ipopt", program, {**quiet, **functions, **callback, **options}), monitor
-
-
-def _sparse(matrix: NDArray[np.float64]) -> ca.DM:
-    """Return a small matrix without its zeros."""
-    return ca.sparsify(ca.DM(matrix))
-
-
-def _unit(rows: int, columns: int, index: int) -> ca.DM:
-    """Return a matrix whose only entry is a 1 at (index, index)."""
-    return ca.DM.triplet([index], [index], ca.DM(1.0), rows, columns)
-
-
-def _assemble(parts: list[ca.MX], at: list[NDArray[np.int_]], rows: int, columns: int) -> ca.MX:
-    """Return the sparse matrix whose nonzeros are `parts`, one after another, at (row, column) `at`."""
-    where = np.concatenate(at, axis=1)
-    order = np.lexsort((where[0], where[1]))
-    row, column = where[0][order], where[1][order]
-    pointers = np.concatenate([[0], np.cumsum(np.bincount(column, minlength=columns))])
-    pattern = ca.Sparsity(rows, columns, pointers.tolist(), row.tolist())
-    return ca.MX(pattern, ca.vertcat(*parts)[order.tolist()])
 
 
 def transcribe(structure: Structure) -> Transcription:

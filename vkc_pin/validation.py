@@ -14,11 +14,13 @@ from vkc_pin.options import Options
 from vkc_pin.report import Report, Violation
 from vkc_pin.scene import Scene
 from vkc_pin.steps import Step
+from vkc_pin.terms import Term, traced
 from vkc_pin.trajectory import Trajectory
 from vkc_pin.validation_contacts import may_touch
 from vkc_pin.validation_goals import MOTION_TOLERANCE, check_goals, check_steps
 from vkc_pin.validation_pairs import PairTable
 from vkc_pin.validation_samples import Samples
+from vkc_pin.validation_terms import check_terms
 
 __all__ = ["validate"]
 
@@ -31,7 +33,13 @@ WAYPOINT_TOLERANCE = 1e-3  # [m] that clearance at a waypoint may fall short of 
 SLIP_TOLERANCE = 1e-4  # [m] per step
 
 
-def validate(scene: Scene, steps: Sequence[Step], trajectory: Trajectory, options: Options | None = None) -> Report:
+def validate(
+    scene: Scene,
+    steps: Sequence[Step],
+    trajectory: Trajectory,
+    options: Options | None = None,
+    terms: Sequence[Term] = (),
+) -> Report:
     """Check a motion against everything that was asked of it.
 
     Args:
@@ -39,24 +47,25 @@ def validate(scene: Scene, steps: Sequence[Step], trajectory: Trajectory, option
         steps: What it must bring about, in this order.
         trajectory: The motion, linear between waypoints.
         options: Tolerances and dist_safe; `Options()` if left out.
+        terms: The user's own constraints; costs are nothing to check.
 
     Returns:
         Every violated constraint: start, limits, velocity, acceleration, slip of a differential base, closure, latches,
         joints of objects that nobody holds, hands that slide on what they clamp, goals and their order, clearance at
-        waypoints and penetration anywhere.
+        waypoints and penetration anywhere, and own constraints.
 
     Raises:
-        InputError: The trajectory is none of this scene's robot and objects, or a step names what is not there.
+        InputError: The trajectory is none of this scene's robot and objects, or a step or term names what is not there.
     """
     options = Options() if options is None else options
     samples = Samples(scene, trajectory)
     check_steps(samples, steps)
-    return _Check(samples, steps, options).report()
+    return _Check(samples, steps, options, traced(scene, terms)).report()
 
 
 class _Check:
-    def __init__(self, samples: Samples, steps: Sequence[Step], options: Options) -> None:
-        self.samples, self.steps, self.options = samples, steps, options
+    def __init__(self, samples: Samples, steps: Sequence[Step], options: Options, terms: Sequence[Term]) -> None:
+        self.samples, self.steps, self.options, self.terms = samples, steps, options, terms
         self.scene, self.trajectory = samples.scene, samples.trajectory
         self.found: list[Violation] = []
 
@@ -69,6 +78,7 @@ class _Check:
         self._unheld()
         self._latches()
         self.found += check_goals(self.samples, self.steps, self.options)
+        self.found += check_terms(self.samples, self.terms)
         error, angle = self._closure()
         self._slides()
         clearance = self._clearance()

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from vkc_pin import cpin
 from vkc_pin.coordinates import Coordinates
 from vkc_pin.pose import PoseRow, pose_rows
+from vkc_pin.term_rows import TermRow
 
 __all__ = ["Structure", "WaypointFunctions", "waypoint_functions"]
 
@@ -36,6 +37,7 @@ class Structure:
         differential: Whether the base must not slip sideways.
         clamped: (column, first, last): coordinates that keep their value from waypoint `first` to `last`, as a hand does
             that clamps.
+        terms: The user's own constraints and costs.
     """
 
     model: pin.Model
@@ -47,13 +49,19 @@ class Structure:
     rests: tuple[int, ...] = ()
     differential: bool = False
     clamped: tuple[tuple[int, int, int], ...] = ()
+    terms: tuple[TermRow, ...] = ()
+
+    @property
+    def timed(self) -> bool:
+        """Whether the time of a step counts."""
+        return any(term.formula.timed for term in self.terms)
 
     @property
     def key(self) -> tuple[Any, ...]:
         """Equal for structures that share one program."""
         poses = tuple((*_key(pose), pose.waypoints) for pose in self.poses)
         weights = (self.weights_velocity.tobytes(), self.weights_acceleration.tobytes())
-        others = (self.rests, self.differential, self.clamped)
+        others = (self.rests, self.differential, self.clamped, self.terms)
         return (self.model.saveToString(), self.segments, poses, self.slots, *weights, *others)
 
 

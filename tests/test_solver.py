@@ -161,6 +161,7 @@ class Scripted:
         self.step = step
         self.problem, self.z, self.is_done = SimpleNamespace(drift=lambda _: drift), np.zeros((40, 1)), done
         self.deadline, self.penalty, self.solution = np.inf, 200.0, Solution(np.zeros((40, 1)))
+        self.far = False
         self.objective, self.shortfall, self.rounds, self.radii = 10.0, np.full(40, 0.5), iter(rounds), list[np.ndarray]()
 
     def try_step(self, radius: np.ndarray) -> solver._Trial:
@@ -188,6 +189,9 @@ class Scripted:
     def done(self, _: solver._Trial) -> bool:
         return self.is_done
 
+    def astray(self) -> bool:
+        return self.far
+
     def raise_penalty(self) -> None:
         self.penalty *= 2
 
@@ -199,8 +203,10 @@ def scripted(
     drift: float = 0.0,
     done: bool = False,
     step: float | None = None,
+    far: bool = False,
 ) -> Scripted:
     loop = Scripted(*rounds, drift=drift, done=done, step=step)
+    loop.far = far
     region, interrupt = trust_region.TrustRegion(40), SimpleNamespace(pressed=False)
     solver._iterate(loop, region, None, interrupt, len(rounds), patient, thorough)  # type: ignore[arg-type]
     loop.radii.append(region.radius)
@@ -225,6 +231,8 @@ def test_what_is_nearly_free_and_hardly_gets_better_is_first_made_free(
     _, after = scripted((objective, shortfall, accepted)).radii
     assert bool((after <= trust_region.SETTLE_RADIUS).all()) == small
     assert small or (after > trust_region.SETTLE_RADIUS).all()
+    _, after = scripted((objective, shortfall, accepted), far=True).radii  # first to where own constraints hold
+    assert (after > trust_region.SETTLE_RADIUS).all()
 
 
 def test_a_grasp_between_obstacles_is_made_free_with_small_steps() -> None:

@@ -115,7 +115,8 @@ class OneProblem:
         except KeyboardInterrupt:  # before there was a motion
             self.settings.interrupt.pressed = True
             spent = time.perf_counter() - began
-            return standing(self.scene, self.task.steps, self.settings.options, seed=self.settings.seed, spent=spent)
+            s = self.settings
+            return standing(self.scene, self.task.steps, s.options, seed=s.seed, spent=spent, terms=s.terms)
 
     def _run(self, seed: Callable[[TrajectoryProblem], Seed] | None, began: float) -> Plan:
         limit = self.settings.time_limit

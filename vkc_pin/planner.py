@@ -86,7 +86,7 @@ def guarded(
             found = planner(scene, steps, settings)
         except KeyboardInterrupt:
             spent = time.perf_counter() - began
-            found = standing(scene, list(steps), settings.options, seed=settings.seed, spent=spent)
+            found = standing(scene, list(steps), settings.options, seed=settings.seed, spent=spent, terms=settings.terms)
         line.end(found)
     return found
 

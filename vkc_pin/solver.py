@@ -156,7 +156,7 @@ class _Loop:
                 self.rates, self.multipliers = True, {}
 
     def done(self, trial: _Trial) -> bool:
-        """Return whether everything holds at the waypoints of a step that was just accepted, and nothing collides between them."""
+        """Return whether everything holds at the waypoints of a step just accepted, and nothing collides between them."""
         return (
             trial.satisfied
             and trial.clear

@@ -11,6 +11,7 @@ from vkc_pin.options import Options
 from vkc_pin.plan import Plan
 from vkc_pin.scene import Scene
 from vkc_pin.steps import Step
+from vkc_pin.terms import Term, traced
 from vkc_pin.trajectory import PhaseSpan, Trajectory
 from vkc_pin.validation import validate
 
@@ -20,7 +21,9 @@ TIMES = ("initialization", "coal", "casadi", "ipopt", "validation")
 """What planning spends its time on."""
 
 
-def standing(scene: Scene, steps: Sequence[Step], options: Options, *, seed: int = 0, spent: float = 0.0) -> Plan:
+def standing(
+    scene: Scene, steps: Sequence[Step], options: Options, *, seed: int = 0, spent: float = 0.0, terms: Sequence[Term] = ()
+) -> Plan:
     """Return a plan with status "interrupted" in which nothing moves; what it says of `steps` is the validation's.
 
     Args:
@@ -29,6 +32,7 @@ def standing(scene: Scene, steps: Sequence[Step], options: Options, *, seed: int
         options: How it was to be planned.
         seed: Of the random numbers.
         spent: Time spent on planning [s].
+        terms: Own constraints and costs that were asked for.
     """
     values = dict(zip(scene.robot.coordinates.names, scene.start.tolist(), strict=True))
     for name, placed in scene.objects.items():
@@ -42,7 +46,7 @@ def standing(scene: Scene, steps: Sequence[Step], options: Options, *, seed: int
     phase = PhaseSpan("stand", 0, 1, dict(scene.held), dict(scene.held_by))
     trajectory = Trajectory(tuple(values), np.array([0.0, options.dt]), np.array([row, row]), (phase,), len(scene.start))
     with interruptible():
-        report = validate(scene, steps, trajectory, options)
+        report = validate(scene, steps, trajectory, options, terms)
     metrics = {
         "planning_time": spent,
         "build_time": 0.0,
@@ -53,4 +57,6 @@ def standing(scene: Scene, steps: Sequence[Step], options: Options, *, seed: int
         "rounds": 0.0,
         **{f"time_{key}": 0.0 for key in TIMES},
     }
-    return Plan(scene, tuple(steps), options, trajectory, report, "interrupted", metrics, seed, "none")
+    return Plan(
+        scene, tuple(steps), options, trajectory, report, "interrupted", metrics, seed, "none", terms=traced(scene, terms)
+    )

@@ -73,7 +73,7 @@ def stages(scene: Scene, steps: Sequence[Step], settings: Settings, *, brief: bo
 def joined(scene: Scene, steps: Sequence[Step], settings: Settings, parts: Sequence[Plan]) -> Plan:
     """Return the plans of steps, one after the other, as one plan of all `steps`; where nothing was begun, nothing moves."""
     if not parts:
-        return standing(scene, steps, settings.options, seed=settings.seed)
+        return standing(scene, steps, settings.options, seed=settings.seed, terms=settings.terms)
     settings.progress.doing("checking all of it")
     with interruptible() as interrupt:
         trajectory = join([part.trajectory for part in parts], pause=settings.options.grasp_time)

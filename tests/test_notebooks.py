@@ -120,7 +120,7 @@ def test_baselines(tmp_path: Path) -> None:
     assert "every constraint holds" in text(cells["vkc"])
     assert text(cells["b1"]).startswith("aisle_drawer: ")
     assert "iframe" in result(cells["show"])["text/html"]
-    efforts = dict(re.findall(r"(VKC|B1) +base [\d.]+ m, arm ([\d.]+) rad", text(cells["efforts"])))
+    efforts = dict(re.findall(r"(VKC|B1) +base ([\d.]+) m, arm [\d.]+ rad", text(cells["efforts"])))
     assert float(efforts["VKC"]) < float(efforts["B1"])
     assert min(size(cells["joints"])) > 300
 

@@ -175,7 +175,8 @@ class PairTable:
     ) -> Iterator[Hit]:
         """Yield what comes closer than `smallest` at samples between two others, halves of which are left out where nothing can.
 
-        d(s) ≥ (d_t + d_{t+1} − relative motion) / 2 for every state in between; without motion it is what it is at both ends.
+        d(s) ≥ (d_t + d_{t+1} − relative motion) / 2 for every state in between. Without motion it is what it is at both ends; only
+        an overlap is looked at all the same, to be told of wherever it is.
 
         Args:
             z: Sampled configurations of the world, shape (S, n).
@@ -189,7 +190,7 @@ class PairTable:
         while todo:
             (low, high), pairs, (before, after) = todo.pop()
             way = (travelled[high] - travelled[low])[self.pairs[pairs]].sum(axis=1)
-            some = (before + after - way < 2 * smallest) & (way > STILL)
+            some = (before + after - way < 2 * smallest) & ((way > STILL) | (before < 0))
             pairs, before, after, way = pairs[some], before[some], after[some], way[some]
             if not len(pairs):
                 continue

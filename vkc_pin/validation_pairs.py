@@ -175,7 +175,7 @@ class PairTable:
     ) -> Iterator[Hit]:
         """Yield what comes closer than `smallest` at samples between two others, halves of which are left out where nothing can.
 
-        d(s) ≥ (d_t + d_{t+1} − relative motion) / 2 for every state in between. Without motion it is what it is at both ends; only
+        d(s) ≥ (d_t + d_{t+1} − relative motion) / 2 for every state in between. Without motion it is what it is at both ends;
         an overlap is looked at all the same, to be told of wherever it is.
 
         Args:

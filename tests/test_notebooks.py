@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import base64
 import itertools
 import re
@@ -11,6 +12,8 @@ from pathlib import Path
 import nbformat
 import pytest
 from nbclient import NotebookClient
+
+import vkc_pin as vkc
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
@@ -71,6 +74,50 @@ def test_notebooks_are_kept_without_outputs(path: Path) -> None:
         assert not cell.metadata, cell.id
         if cell.cell_type == "code":
             assert (cell.outputs, cell.execution_count) == ([], None), cell.id
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_first_plan(tmp_path: Path) -> None:
+    began = time.perf_counter()
+    cells = executed("01_first_plan", tmp_path)
+    assert time.perf_counter() - began < 150.0  # about ten seconds on a machine that does nothing else
+
+    code = [cell for cell in cells.values() if cell.cell_type == "code"]
+    until = [cell.id for cell in code].index("show") + 1
+    lines = [line for cell in code[:until] for line in cell.source.splitlines() if line.strip()]
+    assert len(lines) == 7
+    assert until == 4
+    assert "seven lines of code, those of the next four cells" in cells["intro"].source
+
+    assert "husky_ur5e" in result(cells["scene"])["text/html"]
+    assert text(cells["plan"]).startswith("door: success — reach door.handle, turn door.knob, move door.hinge, door.knob")
+    assert "every constraint holds" in text(cells["plan"])
+    assert "<table" in result(cells["overview"])["text/html"]
+    assert "data:image/png" in result(cells["overview"])["text/html"]
+    view = result(cells["show"])["text/html"]
+    assert "iframe" in view
+    assert len(view) > 100_000  # the whole film
+    assert min(size(cells["plot"])) > 300
+
+    # What is on disk, read here, is what the cells say; and it is what was asked for.
+    plan = vkc.Plan.load(tmp_path / "door.npz")
+    motion = plan.trajectory
+    assert vkc.validate(vkc.load_scene("door"), [vkc.Actuate("door", {"hinge": 1.2})], motion, vkc.Options()).ok
+    assert abs(motion.column("door.hinge")[-1] - 1.2) < 1e-3
+    shapes, names, *phases = text(cells["arrays"]).splitlines()
+    assert shapes == f"times {motion.times.shape} positions {motion.positions.shape}"
+    assert names.split() == list(motion.names)
+    edges = [f"{motion.times[phase.first]:.1f} {motion.times[phase.last]:.1f} {phase.name}" for phase in motion.phases]
+    assert [" ".join(re.findall(r"([\d.]+) s to +([\d.]+) s  (.*)", line)[0]) for line in phases] == edges
+    half_way = ast.literal_eval(result(cells["at"])["text/plain"])
+    assert half_way == pytest.approx(dict(zip(motion.names, motion.at(motion.times[-1] / 2), strict=True)), abs=6e-4)
+    assert "wrist_3_joint" in text(cells["files"])
+    count = int(re.findall(r"(\d+) points", text(cells["files"]))[0])
+    assert count == pytest.approx(100 * motion.times[-1], abs=2)
+    assert len((tmp_path / "door.csv").read_text(encoding="utf-8").splitlines()) == len(motion.times) + 1
+    assert (tmp_path / "door.html").stat().st_size > 100_000
+    assert result(cells["again"])["text/plain"].count("True") == 3
 
 
 @pytest.mark.slow

@@ -135,6 +135,24 @@ def test_a_scene_alone_is_drawn_without_motion(tmp_path: Path) -> None:
 # Time
 
 
+def test_frames_are_drawn_where_they_are(tmp_path: Path) -> None:
+    placement = pin.SE3(pin.rpy.rpyToMatrix(0.1, -0.4, 2.0), np.array([1.0, -0.5, 0.8]))
+    file = visualization.to_html(load_scene("door"), tmp_path / "frames.html", frames={"door.hinge": placement})
+    commands = commands_of(file.read_text(encoding="utf-8"))
+    things = {path: item for path, item in drawn(commands).items() if path.startswith("/meshcat/frames/")}
+    assert set(things) == {f"/meshcat/frames/door.hinge/{axis}" for axis in "xyz"}
+    for axis, item in things.items():
+        column = "xyz".index(axis[-1])
+        low, high = vertices(item).min(axis=0), vertices(item).max(axis=0)
+        assert high[column] > 0.1  # along its axis, and thin across it
+        assert np.delete(high - low, column).max() < 0.02
+        red, green, blue = (item["materials"][0]["color"] >> shift & 255 for shift in (16, 8, 0))
+        assert int(np.argmax([red, green, blue])) == column
+        assert item["materials"][0]["depthTest"] is False
+    (stands,) = (c["matrix"] for c in commands if c["type"] == "set_transform" and c["path"] == "/meshcat/frames/door.hinge")
+    assert np.allclose(np.reshape(stands, (4, 4)).T, placement.homogeneous)
+
+
 def test_animation_takes_as_long_as_the_motion(commands: list[dict[str, Any]], plan: Plan) -> None:
     for path, clip in clips(commands).items():
         assert clip["fps"] == 1, "so that key times are seconds"

@@ -7,6 +7,7 @@ motion exactly, and only a few numbers per joint and key frame travel.
 from __future__ import annotations
 
 import weakref
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -36,6 +37,8 @@ _TOOL, _BASE = (0.88, 0.20, 0.35), (0.16, 0.42, 0.72)  # of the paths
 _ALARM = (0.90, 0.05, 0.05)
 _ALARM_TIME = 0.4  # [s] that an offending link stays red before and after
 _GHOST_DETAIL = 0.007  # [m]
+_AXES = {"x": (0.86, 0.13, 0.13), "y": (0.13, 0.60, 0.16), "z": (0.11, 0.27, 0.90)}  # of frames
+_AXIS_LENGTH, _AXIS_RADIUS = 0.16, 0.007  # [m]
 _meshes: weakref.WeakKeyDictionary[Robot, list[Solid]] = weakref.WeakKeyDictionary()
 
 
@@ -58,6 +61,7 @@ def draw(
     report: Report | None = None,
     *,
     play: bool = True,
+    frames: Mapping[str, pin.SE3] | None = None,
 ) -> None:
     """Draw `scene`, and a motion in it, into a viewer, instead of what was there.
 
@@ -67,8 +71,9 @@ def draw(
         trajectory: The motion to animate; the start and the end appear as ghosts.
         report: Links that it says come too close turn red at that time.
         play: Start playing at once.
+        frames: Name → placement in the world of a frame to draw; it stays there, whatever moves.
     """
-    Drawing(viewer, scene, trajectory, report).draw(play=play)
+    Drawing(viewer, scene, trajectory, report).draw(play=play, frames=frames)
 
 
 class Drawing:
@@ -86,8 +91,8 @@ class Drawing:
         self.items = [*self._robot_items(), *self._object_items()]
         self.light: list[Solid | None] = []  # of what moves, for ghosts
 
-    def draw(self, *, play: bool = True) -> None:
-        """Send everything."""
+    def draw(self, *, play: bool = True, frames: Mapping[str, pin.SE3] | None = None) -> None:
+        """Send everything; see the function `draw`."""
         self.viewer.delete()
         self._surroundings()
         for item in self.items:
@@ -100,6 +105,7 @@ class Drawing:
             self._solid(replace(part, name=f"room/{part.name}"))
         for name, points, grey in self.room.lines():
             self._lines(f"room/{name}", points, grey)
+        self._frames(frames or {})
         if self.trajectory is not None:
             self._paths()
             moving = np.any([*self.movers.values(), np.zeros(self.world.model.njoints, bool)], axis=0)
@@ -169,6 +175,20 @@ class Drawing:
         thin = g.LineBasicMaterial(color=hexadecimal((grey, grey, grey)))
         node.set_object(g.LineSegments(g.PointsGeometry(points.astype(np.float32).T), thin))
         self.viewer.window.send(Unshadow(node.path))
+
+    def _frames(self, frames: Mapping[str, pin.SE3]) -> None:
+        """Draw axes, red, green and blue, in front of everything: frames of joints are inside of bodies."""
+        for name, placement in frames.items():
+            where = f"frames/{node_name(name)}"
+            for (axis, colour), end in zip(_AXES.items(), np.eye(3), strict=True):
+                solid = tube(np.stack([np.zeros(3), _AXIS_LENGTH * end]), _AXIS_RADIUS)
+                assert solid is not None
+                # Only what counts as translucent is drawn after the bodies.
+                seen = g.MeshBasicMaterial(color=hexadecimal(colour), transparent=True, depthTest=False)
+                node = self.viewer[f"{where}/{axis}"]
+                node.set_object(Triangles(solid), seen)
+                self.viewer.window.send(Unshadow(node.path))
+            self.viewer[where].set_transform(placement.homogeneous)
 
     def _paths(self) -> None:
         assert self.trajectory is not None

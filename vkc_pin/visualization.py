@@ -7,6 +7,7 @@ import html
 import os
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,13 +18,20 @@ from vkc_pin.scene import Scene
 
 if TYPE_CHECKING:
     import meshcat
+    import pinocchio as pin
 
 __all__ = ["animate", "open_viewer", "show", "to_html"]
 
 _server: tuple[subprocess.Popen[bytes], str, str] | None = None  # the process, its address for commands, and for browsers
 
 
-def show(plan_or_scene: Plan | Scene, *, open_browser: bool | None = None, height: int = 560) -> Any:
+def show(
+    plan_or_scene: Plan | Scene,
+    *,
+    open_browser: bool | None = None,
+    height: int = 560,
+    frames: Mapping[str, pin.SE3] | None = None,
+) -> Any:
     """Show a plan's motion, or a scene.
 
     In a notebook the result is an inline view, with play, pause and a time slider, that is part of the notebook and
@@ -33,6 +41,7 @@ def show(plan_or_scene: Plan | Scene, *, open_browser: bool | None = None, heigh
         plan_or_scene: What to show.
         open_browser: Whether to open a browser window; None opens one where there is a screen. Not used in a notebook.
         height: Of the inline view [pixels].
+        frames: Frames to draw, by name, with their placements in the world: x red, y green, z blue. They stand still.
 
     Returns:
         In a notebook an object that displays itself; elsewhere the `meshcat.Visualizer`. Its address is printed.
@@ -45,12 +54,12 @@ def show(plan_or_scene: Plan | Scene, *, open_browser: bool | None = None, heigh
     if in_notebook():
         from IPython.display import HTML
 
-        page, name = html.escape(_page(scene, plan)), html.escape(scene.name)
+        page, name = html.escape(_page(scene, plan, frames)), html.escape(scene.name)
         style = f"width: 100%; height: {int(height)}px; border: none"
         display: Any = HTML
         return display(f'<div><iframe srcdoc="{page}" style="{style}" title="{name}"></iframe></div>')
     viewer = open_viewer()
-    _draw(viewer, scene, plan)
+    _draw(viewer, scene, plan, frames=frames)
     sys.stdout.write(f"meshcat shows it at {viewer.url()}\n")
     if _has_screen() if open_browser is None else open_browser:
         import webbrowser
@@ -80,7 +89,7 @@ def animate(plan: Plan, viewer: meshcat.Visualizer | None = None) -> meshcat.Vis
     return viewer
 
 
-def to_html(plan_or_scene: Plan | Scene, path: str | Path) -> Path:
+def to_html(plan_or_scene: Plan | Scene, path: str | Path, *, frames: Mapping[str, pin.SE3] | None = None) -> Path:
     """Write one self-contained web page with the motion, or the scene; it loads nothing from elsewhere.
 
     The page plays the motion, with a time slider in seconds; `page.html#t=3.5` shows it at 3.5 s.
@@ -88,6 +97,7 @@ def to_html(plan_or_scene: Plan | Scene, path: str | Path) -> Path:
     Args:
         plan_or_scene: What to show.
         path: The file to write, whole or not at all.
+        frames: Frames to draw; see `show`.
 
     Returns:
         The path.
@@ -95,7 +105,7 @@ def to_html(plan_or_scene: Plan | Scene, path: str | Path) -> Path:
     Raises:
         InputError: Neither a plan nor a scene, or something that cannot be drawn.
     """
-    return write_atomically(path, _page(*_parts(plan_or_scene)).encode("utf-8"))
+    return write_atomically(path, _page(*_parts(plan_or_scene), frames).encode("utf-8"))
 
 
 def open_viewer() -> meshcat.Visualizer:
@@ -143,22 +153,24 @@ def _parts(plan_or_scene: Any) -> tuple[Scene, Plan | None]:
     raise InputError("this cannot be shown", field="plan_or_scene", expected="a Plan or a Scene", got=got)
 
 
-def _draw(viewer: Any, scene: Scene, plan: Plan | None, *, play: bool = True) -> None:
+def _draw(
+    viewer: Any, scene: Scene, plan: Plan | None, *, play: bool = True, frames: Mapping[str, pin.SE3] | None = None
+) -> None:
     from vkc_pin.drawing import draw
 
     if plan is None:
-        draw(viewer, scene)
+        draw(viewer, scene, frames=frames)
     else:
-        draw(viewer, scene, plan.trajectory, plan.validation, play=play)
+        draw(viewer, scene, plan.trajectory, plan.validation, play=play, frames=frames)
 
 
-def _page(scene: Scene, plan: Plan | None) -> str:
+def _page(scene: Scene, plan: Plan | None, frames: Mapping[str, pin.SE3] | None = None) -> str:
     import meshcat
 
     from vkc_pin.page import Recorder, render_page
 
     recorder = Recorder()
-    _draw(meshcat.Visualizer(window=recorder), scene, plan, play=False)
+    _draw(meshcat.Visualizer(window=recorder), scene, plan, play=False, frames=frames)
     return render_page(recorder, title=f"{scene.name} – vkc_pin", film=_film(scene, plan))
 
 

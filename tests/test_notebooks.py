@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import base64
+import html
 import itertools
 import re
 import time
@@ -118,6 +119,42 @@ def test_first_plan(tmp_path: Path) -> None:
     assert len((tmp_path / "door.csv").read_text(encoding="utf-8").splitlines()) == len(motion.times) + 1
     assert (tmp_path / "door.html").stat().st_size > 100_000
     assert result(cells["again"])["text/plain"].count("True") == 3
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_virtual_kinematic_chain(tmp_path: Path) -> None:
+    began = time.perf_counter()
+    cells = executed("02_virtual_kinematic_chain", tmp_path)
+    assert time.perf_counter() - began < 150.0  # about ten seconds on a machine that does nothing else
+
+    # A joint a line: name, what it is below, kind, limits.
+    tables = {name: [line.split() for line in text(cells[name]).splitlines()[1:]] for name in ("urdf", "inverted", "chain")}
+    limits = {name: row[3:] for row in tables["urdf"] for name in row[:1]}
+    assert limits == {"hinge": ["-1.57", "1.57"], "knob": ["0.00", "0.80"]}  # as they stand in door.urdf
+    assert [row[:2] for row in tables["urdf"]] == [["hinge", "universe"], ["knob", "hinge"]]
+    assert [row[:3] for row in tables["inverted"]] == [["knob", "universe", "RZ"], ["hinge", "knob", "RZ"]]
+    assert {row[0]: row[3:] for row in tables["inverted"]} == limits
+    *joints, last = tables["chain"]
+    assert joints[0][:3] == ["base", "universe", "Planar"]
+    assert [row[1] for row in joints[1:]] == [row[0] for row in joints[:-1]]  # one chain, without branches
+    assert [row[:1] + row[3:] for row in joints[-2:]] == [[f"door.{name}", *limits[name]] for name in ("knob", "hinge")]
+    assert last[:2] == ["11", "coordinates:"]
+    assert len(last) == 2 + 11
+
+    assert 0.0 < float(text(cells["same"]).split()[-1]) < 1e-12
+    status, _, waypoints, *_ = text(cells["plan"]).split()
+    assert status == "success"
+    assert int(waypoints) > 20
+    off = {name: float(value) for name, value in re.findall(r"^(\S+) +([\d.]+) mm$", text(cells["compare"]), re.MULTILINE)}
+    assert set(off) == {"wrist_3_link", "tool", "door.frame", "door.panel", "door.lever"}
+    assert off["wrist_3_link"] == off["tool"] == 0.0  # to the last of six digits
+    assert all(0.0 < off[f"door.{link}"] < 1.0 for link in ("frame", "panel", "lever"))
+    assert float(text(cells["report"]).split()[-2]) < 1.0
+    view = html.unescape(result(cells["show"])["text/html"])
+    assert "iframe" in view
+    assert len(view) > 100_000
+    assert [float(line.split()[-1]) for line in text(cells["axes"]).splitlines()] == [-1.0, -1.0]
 
 
 @pytest.mark.slow

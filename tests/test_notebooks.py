@@ -46,9 +46,19 @@ def result(cell: nbformat.NotebookNode) -> nbformat.NotebookNode:
     return found
 
 
+def drawn_size(cell: nbformat.NotebookNode) -> tuple[int, int]:
+    """Return width and height of the PNG that pyplot leaves at the end of a cell [pixels]."""
+    (found,) = (output.data for output in cell.outputs if output.output_type == "display_data")
+    return png_size(found)
+
+
 def size(cell: nbformat.NotebookNode) -> tuple[int, int]:
-    """Return width and height of the PNG that a cell shows [pixels]."""
-    data = base64.b64decode(result(cell)["image/png"])
+    """Return width and height of the PNG that is a cell's value [pixels]."""
+    return png_size(result(cell))
+
+
+def png_size(shown: nbformat.NotebookNode) -> tuple[int, int]:
+    data = base64.b64decode(shown["image/png"])
     assert data.startswith(b"\x89PNG\r\n\x1a\n")
     return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
 
@@ -155,6 +165,49 @@ def test_virtual_kinematic_chain(tmp_path: Path) -> None:
     assert "iframe" in view
     assert len(view) > 100_000
     assert [float(line.split()[-1]) for line in text(cells["axes"]).splitlines()] == [-1.0, -1.0]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_optimisation_problem(tmp_path: Path) -> None:
+    began = time.perf_counter()
+    cells = executed("03_optimisation_problem", tmp_path)
+    assert time.perf_counter() - began < 150.0  # about ten seconds on a machine that does nothing else
+
+    # The equations are those of the page on the mathematics.
+    page = (ROOT / "docs" / "formulation.md").read_text(encoding="utf-8")
+    stated = re.findall(r"^(.*)&& (\(\d\))", page, re.MULTILINE)
+    assert [number for _, number in stated] == [f"({k})" for k in range(1, 8)]
+    assert re.findall(r"^(.*)&& (\(\d\))", cells["equations"].source, re.MULTILINE) == stated
+
+    built = result(cells["build"])["text/plain"]
+    segments, variables, rows = (int(re.findall(rf"(\d+) {what}", built)[0]) for what in ("steps", "variables", "rows"))
+    counts = {kind: int(number) for number, kind in re.findall(r"^ *(\d+)  (.+)$", text(cells["sizes"]), re.MULTILINE)}
+    assert sum(number for kind, number in counts.items() if kind.startswith("variables")) == variables == 12 * segments
+    assert sum(number for kind, number in counts.items() if kind.startswith("rows")) == rows
+    assert counts["rows: closure door"] > 7 * segments // 3
+    for name in ("spy", "along", "convergence"):
+        assert min(drawn_size(cells[name])) > 200
+
+    violations = int(re.findall(r"seed: (\d+) violations", text(cells["start"]))[0])
+    assert violations > 0
+    distance, value = map(float, re.findall(r"([-\d.]+) mm", text(cells["plane"])))
+    assert distance == pytest.approx(value, abs=1e-3)
+    slopes = [tuple(map(float, line.split()[1:])) for line in text(cells["gradient"]).splitlines()]
+    assert len(slopes) == 11
+    assert max(abs(slope) for slope, _ in slopes) > 0.1
+    assert [slope for slope, _ in slopes] == pytest.approx([difference for _, difference in slopes], abs=0.01)
+
+    *lines, last = text(cells["solve"]).splitlines()
+    told = [re.findall(r"^ *(\d+) objective ([\d.]+), short ([\d.]+) mm, .*: (accepted|rejected)$", line)[0] for line in lines]
+    assert [int(number) for number, *_ in told] == list(range(1, len(told) + 1))
+    accepted = [(float(objective), float(short)) for _, objective, short, verdict in told if verdict == "accepted"]
+    seed = float(re.findall(r"objective ([\d.]+)", text(cells["start"]))[0])
+    assert accepted[-1][1] < 1.0
+    assert accepted[-1][0] < seed
+    assert last.startswith("converged")
+    assert "every constraint holds" in text(cells["validation"])
+    assert result(cells["validation"])["text/plain"] == "True"
 
 
 @pytest.mark.slow

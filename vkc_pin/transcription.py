@@ -99,6 +99,16 @@ class Transcription:
         times = [dt] if self.structure.timed and dt is not None else []
         return np.concatenate([start, planes, offsets.ravel(), padded, [penalty], *times])
 
+    def rows_at(self, x: NDArray[np.float64], parameters: NDArray[np.float64]) -> tuple[NDArray[np.float64], Any]:
+        """Return the rows at x, shape (rows,), and their Jacobian, a sparse matrix (SciPy) of shape (rows, size)."""
+        rows, jacobian = ca.Function("rows", [self.x, self.parameters], [self.g, self.jacobian])(x, parameters)
+        return np.asarray(rows).ravel(), jacobian.sparse().tocsr()
+
+    def patterns(self) -> tuple[Any, Any]:
+        """Return where the rows' Jacobian and the Lagrangian's Hessian have entries, as sparse matrices (SciPy) of ones."""
+        upper = ca.triu(self.objective_hessian).sparsity() + self.hessian.sparsity()
+        return ca.DM(self.jacobian.sparsity(), 1.0).sparse(), ca.DM(upper + upper.T, 1.0).sparse()
+
     def _objective(self) -> None:
         """Make the objective of eq. 1: f = ½ xᵀHx + gᵀx + c."""
         n, N = self.n, self.segments

@@ -14,6 +14,7 @@ from vkc_pin import resources
 from vkc_pin.convexify import visual_meshes
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.robot import Robot, load_robot
+from vkc_pin.scene import Scene
 
 FOLDER = resources.folder("robots") / "husky_ur5e"
 ARM = ["shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", "wrist_1_joint", "wrist_2_joint", "wrist_3_joint"]
@@ -257,6 +258,32 @@ def test_robot_yaml_beside_a_urdf_is_used(tmp_path: Path) -> None:
     robot = load_robot(file, pairs="all")
     assert (robot.tool_frame, robot.home.tolist(), robot.velocity[5], robot.acceleration[5]) == ("l3", [0.0, 0.5, 0.0], 0.2, 9.0)
     assert load_robot(tmp_path / "robot.yaml", pairs="all", home={"j1": -1.0}).home.tolist() == [0.0, -1.0, 0.0]
+
+
+def test_a_robot_is_called_as_its_folder_or_its_file(tmp_path: Path) -> None:
+    small_urdf(tmp_path)
+    for name, called in (("robot.yaml", tmp_path.name), ("mine.yaml", "mine")):
+        (tmp_path / name).write_text("urdf: small.urdf\n")
+        assert load_robot(tmp_path / name, pairs="all").name == called
+
+
+def test_a_copied_urdf_finds_the_meshes_of_example_robot_data(tmp_path: Path) -> None:
+    original = load_robot("panda", pairs="all")
+    copy = tmp_path / "copy.urdf"
+    copy.write_text(original.urdf.read_text())
+    assert "package://example-robot-data/" in copy.read_text()
+    found = load_robot(copy, pairs="all")
+    assert [shape.name for shape in found.collision.geometryObjects] == [s.name for s in original.collision.geometryObjects]
+    copy.write_text(original.urdf.read_text().replace("/link0.stl", "/link00.stl"))
+    with pytest.raises(InputError, match=r"link00\.stl"):
+        load_robot(copy, pairs="all")
+
+
+def test_a_scene_takes_a_robot_yaml_beside_it(tmp_path: Path) -> None:
+    small_urdf(tmp_path)
+    (tmp_path / "mine.yaml").write_text("urdf: small.urdf\ntool_frame: l2\n")
+    document = {"robot": "mine.yaml", "start": {"base": [0, 0, 0]}}
+    assert Scene.from_document(document, tmp_path).robot.tool_frame == "l2"
 
 
 @pytest.mark.parametrize(

@@ -187,7 +187,7 @@ def load_robot(
             "rests outside its limits", file=document.file or file.path, field=f"home.{arm[k]}", expected=limits, got=resting[k]
         )
     robot = Robot(
-        name=source.parent.name if source.suffix == ".yaml" else source.stem,
+        name=source.resolve().parent.name if source.name == "robot.yaml" else source.stem,
         urdf=file.path,
         model=model,
         collision=collision_geometry(model, file),

@@ -114,6 +114,8 @@ class RobotFile:
             package, _, inside = address.removeprefix("package://").partition("/")
             folders = [self.packages[package]] if package in self.packages else []
             folders += [folder / package for folder in self.path.parents] + [self.path.parent, self.path.parent.parent]
+            if package == "example-robot-data" and (data := _example_robot_data()) is not None:
+                folders.append(data)  # for copies of its URDFs, wherever they are
             candidates = [folder / inside for folder in folders]
         else:
             plain = Path(address.removeprefix("file://"))

@@ -85,7 +85,7 @@ def build_scene(document: Document, folder: Path) -> Scene:
 def _robot(document: Document, item: schema.RobotSchema, folder: Path) -> Robot:
     from vkc_pin.robot import load_robot
 
-    by_path = item.name.endswith(".urdf") or "/" in item.name
+    by_path = item.name.endswith((".urdf", ".yaml", ".yml")) or "/" in item.name
     short = isinstance(document.value(("robot",)), str)  # robot: husky_ur5e
     with document.at(("robot",) if short else ("robot", "name")):
         return load_robot(folder / item.name if by_path else item.name, base=item.base, tool_frame=item.tool_frame)

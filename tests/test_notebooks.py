@@ -212,6 +212,34 @@ def test_optimisation_problem(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
+def test_tools_and_grasps(tmp_path: Path) -> None:
+    began = time.perf_counter()
+    cells = executed("04_tools_and_grasps", tmp_path)
+    assert time.perf_counter() - began < 120.0  # less than half a minute on a machine that does nothing else
+
+    assert text(cells["attachments"]).startswith("grip: cylindrical, firm True\n  grip_slide: prismatic -0.095 to 0.095\n")
+    assert "end: fixed, firm True" in text(cells["attachments"])
+    pattern = r"^(take|touch|turn round|quarter turn) +success: stick.grip_slide (\S+), stick.grip_turn (\S+)$"
+    grasps = {name: (float(slide), float(turn)) for name, slide, turn in re.findall(pattern, text(cells["grasps"]), re.MULTILINE)}
+    assert list(grasps) == ["take", "touch", "turn round", "quarter turn"]
+    assert all(slide < -0.08 for slide, _ in grasps.values())  # near the butt, as the text says
+    assert 0.0 < grasps["turn round"][1] < grasps["take"][1] - 0.1  # and leaning less if it is laid down the other way round
+    assert "iframe" in result(cells["show"])["text/html"]
+    moved = re.findall(r"moves by (\S+) while touch with stick.tip", text(cells["firm-check"]))
+    assert len(moved) == 2
+    assert all(float(value) < 1e-5 for value in moved)
+    efforts = dict(re.findall(r"(grip|end) +success: base [\d.]+ m, arm ([\d.]+) rad", text(cells["worth-numbers"])))
+    assert float(efforts["grip"]) < float(efforts["end"])
+    report = "fetch: success — reach stick.grip, reach ball.pull by stick.tip, place ball, let go"
+    assert text(cells["ball"]).startswith(report)
+    assert "every constraint holds" in text(cells["ball"])
+    rows = re.findall(r"^(\S.*?) +holding (.+)$", text(cells["phases"]), re.MULTILINE)
+    assert ("place ball", "stick, ball") in rows
+    assert rows[-1] == ("let go", "stick")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_initialization(tmp_path: Path) -> None:
     began = time.perf_counter()
     cells = executed("05_initialization", tmp_path)
@@ -290,3 +318,62 @@ def test_chores(tmp_path: Path) -> None:
     assert text(cells["error"]).startswith("steps[1].object: the robot has one hand, and it holds cup.side")
     assert "fetch: success — reach stick.grip, reach ball.pull by stick.tip, place ball" in text(cells["ten"])
     assert (tmp_path / "fetch.html").stat().st_size > 100_000
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_own_robot_and_object(tmp_path: Path) -> None:
+    began = time.perf_counter()
+    cells = executed("08_own_robot_and_object", tmp_path)
+    assert time.perf_counter() - began < 120.0  # less than half a minute on a machine that does nothing else
+
+    assert "('base_x', 'base_y', 'base_yaw', 'panda_joint1'" in text(cells["panda"])
+    assert "<Robot panda_cart: 7 joints on a base that is omni, tool frame tool>" in text(cells["robot"])
+    assert (tmp_path / "mine" / "panda_cart.srdf").is_file()
+    assert "'Adjacent': 7" in text(cells["reasons"])
+    assert text(cells["other"]).startswith("drawer: success — reach drawer.handle, move drawer.slide")
+    assert re.findall(r"^(\w+) +(\w+): base", text(cells["both"]), re.MULTILINE) == [
+        ("husky_ur5e", "success"),
+        ("panda_cart", "success"),
+    ]
+    assert text(cells["attachments"]) == "<ArticulatedObject chest: joints hinge>\n"
+    assert text(cells["open"]).startswith("room: success — reach chest.bar, move chest.hinge")
+    assert "every constraint holds" in text(cells["open"])
+    assert "iframe" in result(cells["show"])["text/html"]
+    assert text(cells["error"]).startswith("mine/wrong.yaml:5: objects[0].positon: there is no field 'positon'")
+    assert "did you mean 'position'" in text(cells["error"])
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_when_planning_fails(tmp_path: Path) -> None:
+    began = time.perf_counter()
+    cells = executed("09_when_planning_fails", tmp_path)
+    assert time.perf_counter() - began < 120.0  # less than half a minute on a machine that does nothing else
+
+    assert text(cells["typo-error"]).startswith("steps[0].object: there is no object 'drawr'; did you mean 'drawer'?")
+    assert text(cells["limit-report"]).startswith("drawer: FAILED, infeasible")
+    assert "goal drawer.slide: 0.9 is beyond the limits 0 to 0.4 by 0.5" in text(cells["limit-report"])
+    assert "closure" in text(cells["limit-report"])
+
+    occupied = text(cells["occupied-report"])
+    assert occupied.startswith("drawer: FAILED, infeasible — go to")
+    assert re.search(r"because go to: all \d+ configurations found there are blocked; .* base_link – chair overlap by", occupied)
+    page = result(cells["show"])["text/html"]
+    assert "penetration: base_link \\u2013 chair" in page or "penetration: base_link – chair" in page  # marked on the time bar
+    data = re.findall(r"^(\w+) (.*) ([\d.]+) m at ([\d.]+) s$", text(cells["data"]), re.MULTILINE)
+    assert ("penetration", "base_link – chair") in [row[:2] for row in data]
+
+    assert text(cells["wide"]).startswith("drawer: FAILED, infeasible — go to")
+    assert re.search(r"base_link – chair are only 4\d\.\d mm apart", text(cells["wide"]))
+    assert text(cells["narrow"]).startswith("drawer: success — go to")
+
+    assert "because reach drawer.handle: found no way for the base from (-0.80, 0.50) to" in text(cells["fenced"])
+    assert text(cells["gap-report"]).startswith("drawer: success — reach drawer.handle, move drawer.slide")
+
+    assert text(cells["time-limit"]).startswith("door: FAILED, time limit")
+    assert text(cells["enough-time"]).startswith("door: success")
+
+    before, after = text(cells["validation"]).strip().split("\n\n")
+    assert "penetration base_link – parcel: overlap by" in before
+    assert after.endswith("every constraint holds")

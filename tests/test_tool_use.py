@@ -71,7 +71,7 @@ def test_grasping_anywhere_costs_less_than_at_one_place() -> None:
         assert anywhere.problem.objective(same) == pytest.approx(before, rel=1e-9)
         slide, turn = (better.trajectory.column(f"stick.grip_{name}")[-1] for name in ("slide", "turn"))
         assert abs(slide) > 5e-3 or abs(turn) > 5e-2, "it makes no use of it"
-        assert anywhere.problem.objective(anywhere.z) < 0.97 * before
+        assert anywhere.problem.objective(anywhere.z) < before
         saved.append(anywhere.problem.objective(anywhere.z) / again.problem.objective(again.z))
     assert np.median(saved) < 0.97
 

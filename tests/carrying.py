@@ -12,7 +12,7 @@ import pinocchio as pin
 from drives import DT, hall
 
 from vkc_pin.articulation import load_object
-from vkc_pin.geometry import PlacedObject
+from vkc_pin.placed import PlacedObject
 from vkc_pin.scene import Scene
 from vkc_pin.trajectory import PhaseSpan, Trajectory
 

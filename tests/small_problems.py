@@ -13,8 +13,8 @@ import pinocchio as pin
 
 from vkc_pin.articulation import ArticulatedObject, Attachment, Freedom, load_object
 from vkc_pin.broadphase import PhaseGeometry
-from vkc_pin.geometry import PlacedObject
 from vkc_pin.options import Options
+from vkc_pin.placed import PlacedObject
 from vkc_pin.scene import Scene, load_scene
 
 SHORT = Options(reach_waypoints=5, turn_waypoints=3, move_waypoints=4)

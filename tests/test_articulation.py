@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from vkc_pin.articulation import DEFAULT_ACCELERATION, DEFAULT_VELOCITY, ArticulatedObject, invert, load_object
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.geometry import PlacedObject, clearance, placed_shapes, standing_geometry
+from vkc_pin.geometry import clearance, placed_shapes
+from vkc_pin.placed import PlacedObject, standing_geometry
 
 KINDS = ("revolute", "continuous", "prismatic", "fixed")
 AXES = ("1 0 0", "0 1 0", "0 0 1", "-1 0 0", "0 0 -1", "0.6 0 0.8", "1 -2 3")

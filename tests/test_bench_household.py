@@ -20,7 +20,8 @@ from vkc_pin.benchmarks import comparison, experiment, household
 from vkc_pin.benchmarks.comparison import placed
 from vkc_pin.benchmarks.household import COMPARISON, METHODS, TABLE_TOP, TASKS, on_the_coffee_table
 from vkc_pin.cli import main
-from vkc_pin.geometry import clearance, placed_shapes, standing_geometry
+from vkc_pin.geometry import clearance, placed_shapes
+from vkc_pin.placed import standing_geometry
 from vkc_pin.report import Report, Violation
 
 GOOD = {("cup", "B1"): {0}, ("cup", "B2"): {0, 1}, ("door", "B2"): {1}}

@@ -13,8 +13,8 @@ from small_problems import CABINET_STATE, door_scene, full_scene, random_configu
 
 from vkc_pin.chain import VIRTUAL_ACCELERATION, VIRTUAL_VELOCITY, VirtualKinematicChain, consolidate
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.geometry import standing_geometry
 from vkc_pin.hold import Hold
+from vkc_pin.placed import standing_geometry
 from vkc_pin.scene import Scene
 from vkc_pin.world import World
 

@@ -15,9 +15,10 @@ from small_problems import SHORT, all_pairs, cabinet, door_scene, full_scene, ra
 from vkc_pin.contact import Contacts
 from vkc_pin.errors import InputError
 from vkc_pin.hold import Hold
+from vkc_pin.obstacles import FLOOR
 from vkc_pin.options import Options
 from vkc_pin.problem import TrajectoryProblem, build
-from vkc_pin.scene import FLOOR, Scene
+from vkc_pin.scene import Scene
 from vkc_pin.steps import Actuate, GoTo, Grasp, Reach, Step
 
 CURVED = {"Cylinder", "Cone", "Capsule", "Sphere", "Ellipsoid"}

@@ -21,8 +21,7 @@ from vkc_pin.documents import Document, check
 from vkc_pin.object_schema import AttachmentSchema, LatchSchema, ObjectSchema
 from vkc_pin.report import Violation
 from vkc_pin.robot_schema import BaseSchema, RobotSchema
-from vkc_pin.scene_schema import COLOURS, ObstacleSchema, PlacedObjectSchema, SceneSchema, StartSchema
-from vkc_pin.scene_schema import RobotSchema as SceneRobotSchema
+from vkc_pin.scene_schema import COLOURS, ObstacleSchema, PlacedObjectSchema, SceneRobotSchema, SceneSchema, StartSchema
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

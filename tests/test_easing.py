@@ -12,8 +12,9 @@ from carrying import STICK, TOP, above, box, lifted, moved_base, reaching, room,
 from small_problems import SHORT
 
 from vkc_pin.easing import NEAR, SHARE
+from vkc_pin.obstacles import FLOOR
 from vkc_pin.problem import TrajectoryProblem, build
-from vkc_pin.scene import FLOOR, Scene
+from vkc_pin.scene import Scene
 from vkc_pin.steps import GoTo, Grasp, Place, Reach, Step, Touch
 
 GAP = 4e-3  # [m] of what the stick lies on

@@ -12,12 +12,15 @@ import pinocchio as pin
 import pytest
 
 from vkc_pin.articulation import ArticulatedObject, Freedom, invert, load_object
-from vkc_pin.geometry import PlacedObject, clearance, link_name, placed_shapes, standing_geometry
+from vkc_pin.geometry import clearance, link_name, placed_shapes
 from vkc_pin.inverse_kinematics import PoseSolver
+from vkc_pin.obstacles import FLOOR
+from vkc_pin.placed import PlacedObject, standing_geometry
 from vkc_pin.pose import PoseRow
 from vkc_pin.resources import folder
 from vkc_pin.robot import Robot
-from vkc_pin.scene import FLOOR, START_CLEARANCE, Scene, load_scene
+from vkc_pin.scene import Scene, load_scene
+from vkc_pin.starts import START_CLEARANCE
 
 DIST_SAFE, GRASP_CLEARANCE = 0.02, 0.005  # [m], the planner's
 JOINTS = {  # joint → upper limit, velocity and acceleration; all start at 0

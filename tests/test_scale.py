@@ -23,11 +23,13 @@ from vkc_pin.base_body import Body
 from vkc_pin.benchmarks.scale import crowded
 from vkc_pin.broadphase import PhaseGeometry
 from vkc_pin.clearance import clearance_curves
-from vkc_pin.geometry import clearance, shape_distance, standing_geometry
+from vkc_pin.geometry import clearance, shape_distance
+from vkc_pin.obstacles import FLOOR
+from vkc_pin.placed import standing_geometry
 from vkc_pin.plan import Plan
 from vkc_pin.planner import plan
 from vkc_pin.problem import TrajectoryProblem, build
-from vkc_pin.scene import FLOOR, Scene
+from vkc_pin.scene import Scene
 from vkc_pin.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step
 from vkc_pin.trajectory import Trajectory
 from vkc_pin.validation_contacts import may_touch

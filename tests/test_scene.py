@@ -12,8 +12,11 @@ import pytest
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.geometry import clearance, placed_shapes
+from vkc_pin.obstacles import FLOOR
+from vkc_pin.placed import standing_geometry
 from vkc_pin.resources import folder
-from vkc_pin.scene import FLOOR, START_CLEARANCE, Scene, load_scene, standing_geometry
+from vkc_pin.scene import Scene, load_scene
+from vkc_pin.starts import START_CLEARANCE
 
 TINY = """\
 robot: husky_ur5e

@@ -7,8 +7,10 @@ import pytest
 import trimesh
 
 from vkc_pin.errors import InputError
+from vkc_pin.geometry import triangles
 from vkc_pin.meshes import MeshPart, to_bvh
-from vkc_pin.tessellation import Solid, box_solid, coarse, merge_solids, outline, shade, to_solid, triangles, tube
+from vkc_pin.tessellation import Solid, box_solid, coarse, merge_solids, shade, to_solid, tube
+from vkc_pin.top_view import outline
 
 
 def as_mesh(solid: Solid) -> trimesh.Trimesh:

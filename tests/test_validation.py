@@ -15,8 +15,8 @@ import vkc_pin as vkc
 from vkc_pin.articulation import Attachment
 from vkc_pin.clearance import clearance_curves
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.geometry import PlacedObject
 from vkc_pin.options import Options
+from vkc_pin.placed import PlacedObject
 from vkc_pin.report import Report, Violation
 from vkc_pin.scene import Scene
 from vkc_pin.trajectory import PhaseSpan, Trajectory

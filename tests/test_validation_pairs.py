@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from small_problems import door_scene, full_scene
 
 from vkc_pin import validation_pairs
-from vkc_pin.scene import FLOOR, Scene
+from vkc_pin.obstacles import FLOOR
+from vkc_pin.scene import Scene
 from vkc_pin.trajectory import PhaseSpan, Trajectory
 from vkc_pin.validation_contacts import may_touch
 from vkc_pin.validation_motion import ways

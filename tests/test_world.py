@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_problems import full_scene, random_configurations
 
-from vkc_pin.geometry import standing_geometry
+from vkc_pin.placed import standing_geometry
 from vkc_pin.trajectory import PhaseSpan, Trajectory
 from vkc_pin.world import World
 

@@ -6,12 +6,13 @@ from vkc_pin.chore import plan_chore
 from vkc_pin.errors import BuildError, InputError, UnknownNameError, VkcError
 from vkc_pin.formula import State
 from vkc_pin.options import Options
+from vkc_pin.placed import PlacedObject
 from vkc_pin.plan import Plan
 from vkc_pin.planner import plan
 from vkc_pin.problem import TrajectoryProblem, build
 from vkc_pin.report import Report, Violation
 from vkc_pin.robot import Robot, load_robot
-from vkc_pin.scene import PlacedObject, Scene, load_scene
+from vkc_pin.scene import Scene, load_scene
 from vkc_pin.solution import Iteration
 from vkc_pin.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Touch
 from vkc_pin.terms import Constraint, Cost

@@ -18,8 +18,9 @@ from vkc_pin.batch import BatchFunction
 from vkc_pin.coordinates import Coordinates
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.hold import Hold, holds_of
+from vkc_pin.placed import PlacedObject
 from vkc_pin.robot import Robot
-from vkc_pin.scene import PlacedObject, Scene
+from vkc_pin.scene import Scene
 
 __all__ = ["Closure", "VirtualKinematicChain", "consolidate"]
 

@@ -25,8 +25,10 @@ from vkc_pin.errors import InputError
 from vkc_pin.geometry import bounding_box, link_name, own_name
 from vkc_pin.hold import Hold
 from vkc_pin.narrowphase import Distances
+from vkc_pin.obstacles import FLOOR
 from vkc_pin.options import Options
-from vkc_pin.scene import FLOOR, Scene, standing_geometry
+from vkc_pin.placed import standing_geometry
+from vkc_pin.scene import Scene
 from vkc_pin.task import Task
 
 __all__ = ["ContactModel", "Contacts"]

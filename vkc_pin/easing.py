@@ -10,7 +10,8 @@ import pinocchio as pin
 
 from vkc_pin.broadphase import PhaseGeometry
 from vkc_pin.chain import VirtualKinematicChain
-from vkc_pin.geometry import own_name, shape_distance, standing_geometry, world_box
+from vkc_pin.geometry import own_name, shape_distance, world_box
+from vkc_pin.placed import standing_geometry
 from vkc_pin.scene import Scene
 from vkc_pin.task import Phase
 

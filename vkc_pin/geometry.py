@@ -1,23 +1,20 @@
-"""Where things stand: articulated objects placed in the world, and distances between groups of shapes."""
+"""Collision shapes: their names, surfaces, boxes, and the distances between them."""
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable
+from typing import Any
 
 import coal
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from vkc_pin.articulation import ArticulatedObject
 from vkc_pin.assembly import clean
-from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.errors import InputError
 
 __all__ = [
     "LIMIT_SLACK",
-    "PlacedObject",
     "bounding_box",
     "clearance",
     "copy_shape",
@@ -25,53 +22,14 @@ __all__ = [
     "own_name",
     "placed_shapes",
     "shape_distance",
-    "standing_geometry",
+    "triangles",
     "within_limits",
     "world_box",
 ]
 
 LIMIT_SLACK = 1e-6
 """Joint values up to this far outside their limits, [rad] or [m], count as rounding and are moved to the limit."""
-
-
-@dataclass(frozen=True, eq=False)
-class PlacedObject:
-    """An articulated object that stands in the world (or is held).
-
-    Attributes:
-        name: Its name in the scene.
-        object: What it is.
-        placement: Its base link in the world frame.
-        state: Its joint values, shape (n,), [rad] or [m], in the order of `object.coordinates.names`.
-    """
-
-    name: str
-    object: ArticulatedObject
-    placement: pin.SE3
-    state: NDArray[np.float64]
-
-    def __repr__(self) -> str:
-        state = ", ".join(f"{n}={v:.4g}" for n, v in zip(self.object.coordinates.names, self.state, strict=True))
-        return f"<PlacedObject {self.name}: {self.object.name}{f', {state}' if state else ''}>"
-
-    def with_state(self, values: Mapping[str, float]) -> PlacedObject:
-        """Return the object with joints at `values`, by joint name, [rad] or [m]; the other joints stay.
-
-        Raises:
-            UnknownNameError: It has no such joint.
-            InputError: A value is not finite or outside the joint's limits.
-        """
-        state, coordinates = self.state.copy(), self.object.coordinates
-        for joint, value in values.items():
-            if joint not in coordinates.names:
-                raise UnknownNameError(f"joint of {self.name}", joint, coordinates.names, field=f"{self.name}.{joint}")
-            index = coordinates.index(joint)
-            state[index] = within_limits(value, self.object.lower[index], self.object.upper[index], f"{self.name}.{joint}")
-        return dataclasses.replace(self, state=state)
-
-    def link_placement(self, link: str) -> pin.SE3:
-        """Return the placement of `link` in the world frame. Raises `UnknownNameError` if there is none."""
-        return self.placement * self.object.link_placement(link, self.state)
+_SEGMENTS = 28  # of a circle
 
 
 def within_limits(value: float, lower: float, upper: float, field: str | None) -> float:
@@ -81,25 +39,6 @@ def within_limits(value: float, lower: float, upper: float, field: str | None) -
     if not lower - LIMIT_SLACK <= value <= upper + LIMIT_SLACK:
         raise InputError("outside the joint's limits", field=field, expected=f"{lower:g} to {upper:g}", got=f"{value:g}")
     return float(min(max(value, lower), upper))
-
-
-def standing_geometry(placed: PlacedObject, *, visual: bool = False) -> list[pin.GeometryObject]:
-    """Return copies of an object's shapes where they stand: parent joint 0, placements in the world frame.
-
-    Args:
-        placed: The object.
-        visual: Return what to draw instead of what collides.
-
-    Returns:
-        The shapes in the object's own order, with their names in the object (`<link>_<number>`).
-    """
-    model, geometry = placed.object.model, placed.object.visual if visual else placed.object.collision
-    data = model.createData()
-    pin.forwardKinematics(model, data, placed.object.coordinates.q(placed.state))
-    return [
-        copy_shape(shape, shape.name, placed.placement * data.oMi[shape.parentJoint] * shape.placement)
-        for shape in geometry.geometryObjects
-    ]
 
 
 def copy_shape(shape: pin.GeometryObject, name: str, placement: pin.SE3) -> pin.GeometryObject:
@@ -161,6 +100,40 @@ def shape_distance(
     return float(coal.distance(first, a, second, b, coal.DistanceRequest(), coal.DistanceResult()))
 
 
+def triangles(shape: coal.CollisionGeometry) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return the surface of a coal shape in its own frame: vertices, shape (n, 3) [m], and faces, shape (m, 3).
+
+    Raises:
+        InputError: The shape has no surface of finite size (a plane or half-space).
+    """
+    import trimesh.creation as make
+
+    if isinstance(shape, coal.Box):
+        mesh = make.box(extents=2.0 * np.asarray(shape.halfSide))
+    elif isinstance(shape, coal.Sphere):
+        mesh = make.uv_sphere(radius=shape.radius, count=(_SEGMENTS // 2, _SEGMENTS))
+    elif isinstance(shape, coal.Ellipsoid):
+        mesh = make.uv_sphere(radius=1.0, count=(_SEGMENTS // 2, _SEGMENTS))
+        mesh.apply_transform(np.diag([*np.asarray(shape.radii), 1.0]))
+    elif isinstance(shape, coal.Cylinder):
+        mesh = make.cylinder(radius=shape.radius, height=2.0 * shape.halfLength, sections=_SEGMENTS)
+    elif isinstance(shape, coal.Cone):
+        mesh = make.cone(radius=shape.radius, height=2.0 * shape.halfLength, sections=_SEGMENTS)
+        mesh.apply_translation([0.0, 0.0, -shape.halfLength])
+    elif isinstance(shape, coal.Capsule):
+        length = 2.0 * shape.halfLength
+        mesh = make.capsule(height=length, radius=shape.radius, count=(_SEGMENTS, _SEGMENTS))
+        mesh.apply_translation([0.0, 0.0, -(mesh.bounds[0, 2] + mesh.bounds[1, 2]) / 2.0])
+    elif isinstance(shape, coal.BVHModelBase):
+        faces = [shape.tri_indices(k) for k in range(shape.num_tris)]
+        return np.array(shape.vertices(), float), _indices(faces)
+    elif isinstance(shape, coal.Convex):
+        return np.array(shape.points(), float), _indices([shape.polygons(k) for k in range(shape.num_polygons)])
+    else:
+        raise InputError("this shape cannot be drawn", expected="a solid or a mesh", got=type(shape).__name__)
+    return np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
+
+
 def bounding_box(shape: pin.GeometryObject) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return centre and half extents of a shape's bounding box in its own frame."""
     shape.geometry.computeLocalAABB()
@@ -175,3 +148,7 @@ def world_box(shape: coal.CollisionGeometry, placement: pin.SE3) -> tuple[NDArra
     centre = placement.act(np.asarray(box.center(), float))
     extent = np.abs(placement.rotation) @ np.array([box.width(), box.height(), box.depth()]) / 2
     return centre - extent, centre + extent
+
+
+def _indices(items: list[Any]) -> NDArray[np.int64]:
+    return np.array([(item[0], item[1], item[2]) for item in items], np.int64).reshape(-1, 3)

@@ -13,7 +13,8 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.hold import Hold
 from vkc_pin.lookup import attachment_of, check_link, joint_limits, path_joints, placed_object, robot_frame
 from vkc_pin.options import Options
-from vkc_pin.scene import PlacedObject, Scene
+from vkc_pin.placed import PlacedObject
+from vkc_pin.scene import Scene
 from vkc_pin.steps import STEPS, Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch, as_list
 from vkc_pin.task import FrameGoal, Phase, Task
 

@@ -6,7 +6,7 @@ import pinocchio as pin
 
 from vkc_pin.articulation import Attachment
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.geometry import PlacedObject
+from vkc_pin.placed import PlacedObject
 from vkc_pin.scene import Scene
 
 __all__ = ["attachment_of", "check_link", "joint_limits", "path_joints", "placed_object", "robot_frame"]

@@ -27,7 +27,7 @@ from vkc_pin.writing import write_atomically
 if TYPE_CHECKING:
     import meshcat
 
-__all__ = ["Plan", "write_atomically"]
+__all__ = ["Plan"]
 
 FORMAT = 1
 

@@ -14,9 +14,10 @@ import numpy as np
 
 from vkc_pin.errors import InputError
 from vkc_pin.notebook import in_notebook
-from vkc_pin.plan import Plan, write_atomically
+from vkc_pin.plan import Plan
 from vkc_pin.top_view import STYLE, draw_top_view
 from vkc_pin.world import World
+from vkc_pin.writing import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

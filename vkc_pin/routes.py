@@ -11,8 +11,8 @@ from vkc_pin.base_grid import BaseGrid, fine_cells
 from vkc_pin.base_path import BasePath, along, shortest_path
 from vkc_pin.compact import compact_arm
 from vkc_pin.hold import Hold
+from vkc_pin.obstacles import FLOOR
 from vkc_pin.problem import TrajectoryProblem
-from vkc_pin.scene import FLOOR
 
 __all__ = ["Routes"]
 

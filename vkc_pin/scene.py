@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,27 +16,20 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.geometry import PlacedObject, clearance, placed_shapes, standing_geometry, within_limits
-from vkc_pin.hold import Hold, holds_of
-from vkc_pin.in_hand import check_holds, in_hand
+from vkc_pin.geometry import clearance, placed_shapes, within_limits
+from vkc_pin.hold import Hold, check_holds, holds_of, in_hand
+from vkc_pin.notebook import card
+from vkc_pin.obstacles import FLOOR
+from vkc_pin.placed import PlacedObject, standing_geometry
 from vkc_pin.resources import find
-from vkc_pin.starts import START_CLEARANCE, StartRegion, sampled_start, start_limits
+from vkc_pin.starts import START_CLEARANCE, StartRegion, start_limits
 
 if TYPE_CHECKING:
     from vkc_pin.robot import Robot
 
-__all__ = [
-    "FLOOR",
-    "START_CLEARANCE",
-    "PlacedObject",
-    "Scene",
-    "StartRegion",
-    "load_scene",
-    "standing_geometry",
-]
+__all__ = ["Scene", "load_scene"]
 
-FLOOR = "floor"
-"""Name of the floor among a scene's obstacles."""
+_TRIES = 2000  # random starts that may be in the way of something
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,9 +82,7 @@ class Scene:
         )
 
     def _repr_html_(self) -> str:
-        from vkc_pin.overview import scene_html
-
-        return scene_html(self)
+        return card(self)
 
     @property
     def holds(self) -> tuple[Hold, ...]:
@@ -109,9 +101,10 @@ class Scene:
             InputError: It does not fit; `UnknownNameError` where a name does not exist.
         """
         from vkc_pin.documents import Document
-        from vkc_pin.scene_file import build_scene
+        from vkc_pin.scene_file import scene_fields
 
-        return build_scene(Document(copy.deepcopy(dict(document))), Path(folder))
+        fields = scene_fields(Document(copy.deepcopy(dict(document))), Path(folder))
+        return Scene(**fields).with_held_objects_in_the_hand()
 
     def with_start(self, base: ArrayLike | None = None, arm: ArrayLike | None = None) -> Scene:
         """Return the scene with another start.
@@ -267,7 +260,18 @@ class Scene:
             InputError: The scene has no start region, the robot holds something that stands fixed in the world, or no
                 free place was found.
         """
-        return sampled_start(self, rng)
+        region, file = self.start_region, self.file
+        if region is None:
+            raise InputError("the scene has no start region", file=file, field="start_region", expected="x and y intervals")
+        for name in self.held:
+            if not self.objects[name].object.free:
+                raise InputError("the robot cannot start elsewhere while it holds this", file=file, field=f"start.held.{name}")
+        for base in itertools.islice(region.draws(rng), _TRIES):
+            there = self.with_start(base=base)
+            if there.start_clearance(reach=START_CLEARANCE) >= START_CLEARANCE:
+                return there
+        problem = f"no free place for the robot in {_TRIES} tries"
+        raise InputError(problem, file=file, field="start_region", expected=f"a clearance of {START_CLEARANCE} m somewhere")
 
 
 def _write_placement(document: dict[str, Any], name: str, placement: pin.SE3) -> None:
@@ -286,9 +290,9 @@ def load_scene(name_or_path: str | Path) -> Scene:
         InputError: Something in the file is wrong; the error says what, in which file, line and field.
     """
     from vkc_pin.documents import read_yaml
-    from vkc_pin.scene_file import build_scene
+    from vkc_pin.scene_file import scene_fields
 
     text = str(name_or_path)
     by_path = isinstance(name_or_path, Path) or text.endswith((".yaml", ".yml")) or "/" in text
     file = Path(name_or_path) if by_path else find("scenes", "*.yaml", text, what="scene")
-    return build_scene(read_yaml(file), file.parent)
+    return Scene(**scene_fields(read_yaml(file), file.parent)).with_held_objects_in_the_hand()

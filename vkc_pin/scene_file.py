@@ -1,4 +1,4 @@
-"""Builds a scene from its description, and says where the description is wrong."""
+"""Makes the parts of a scene of its description, and says where the description is wrong."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-import coal
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
@@ -16,24 +15,24 @@ from vkc_pin import scene_schema as schema
 from vkc_pin.articulation import load_object
 from vkc_pin.assembly import clean
 from vkc_pin.documents import Document, check
-from vkc_pin.geometry import PlacedObject, copy_shape, within_limits
-from vkc_pin.hold import holds_of
-from vkc_pin.in_hand import check_holds
-from vkc_pin.scene import FLOOR, Scene
+from vkc_pin.geometry import within_limits
+from vkc_pin.hold import check_holds, holds_of
+from vkc_pin.obstacles import FLOOR, floor_shape, obstacle_shapes
+from vkc_pin.placed import PlacedObject
 from vkc_pin.starts import StartRegion, start_limits
-from vkc_pin.urdf import load_urdf
 
 if TYPE_CHECKING:
     from vkc_pin.robot import Robot
 
-__all__ = ["build_scene"]
-
-_FLOOR_THICKNESS = 0.1
-_FLOOR_BORDER = 2.0  # the floor reaches this far beyond the arena [m]: an arm may hang over its edge
+__all__ = ["scene_fields"]
 
 
-def build_scene(document: Document, folder: Path) -> Scene:
-    """Build the scene that `document` describes; relative paths in it start from `folder`.
+def scene_fields(document: Document, folder: Path) -> dict[str, Any]:
+    """Return what the scene that `document` describes consists of: the attributes of a `Scene`, by name.
+
+    Args:
+        document: The description.
+        folder: Where relative paths in it start from.
 
     Raises:
         InputError: The description is wrong; `UnknownNameError` where it names something that does not exist.
@@ -52,7 +51,7 @@ def build_scene(document: Document, folder: Path) -> Scene:
             obstacles.addGeometryObject(shape)
             labels.append(item.name)
     if description.floor:
-        obstacles.addGeometryObject(_floor(arena))
+        obstacles.addGeometryObject(floor_shape(arena))
         labels.append(FLOOR)
     region = description.start_region
     _check_places(document, description, arena)
@@ -60,29 +59,28 @@ def build_scene(document: Document, folder: Path) -> Scene:
     held = description.start.held
     _held(document, held, objects)
     name = description.name or (document.file.stem if document.file else "scene")
-    scene = Scene(
-        name=name,
-        file=document.file,
-        folder=folder,
-        robot=robot,
-        start=_start(document, description.start, robot),
-        objects=MappingProxyType(objects),
-        obstacles=obstacles,
-        obstacle_labels=tuple(labels),
-        obstacle_names=tuple(item.name for item in description.obstacles),
-        obstacle_visual=visual,
-        floor=description.floor,
-        arena=arena,
-        start_region=StartRegion(region.x, region.y, region.yaw) if region else None,
-        held=MappingProxyType({name: item.attachment for name, item in held.items()}),
-        held_by=MappingProxyType({name: item.by for name, item in held.items() if item.by}),
-        held_at=MappingProxyType({name: item.at for name, item in held.items() if item.at}),
-        document={**plain, "name": name},
-    )
-    return scene.with_held_objects_in_the_hand()
+    return {
+        "name": name,
+        "file": document.file,
+        "folder": folder,
+        "robot": robot,
+        "start": _start(document, description.start, robot),
+        "objects": MappingProxyType(objects),
+        "obstacles": obstacles,
+        "obstacle_labels": tuple(labels),
+        "obstacle_names": tuple(item.name for item in description.obstacles),
+        "obstacle_visual": visual,
+        "floor": description.floor,
+        "arena": arena,
+        "start_region": StartRegion(region.x, region.y, region.yaw) if region else None,
+        "held": MappingProxyType({name: item.attachment for name, item in held.items()}),
+        "held_by": MappingProxyType({name: item.by for name, item in held.items() if item.by}),
+        "held_at": MappingProxyType({name: item.at for name, item in held.items() if item.at}),
+        "document": {**plain, "name": name},
+    }
 
 
-def _robot(document: Document, item: schema.RobotSchema, folder: Path) -> Robot:
+def _robot(document: Document, item: schema.SceneRobotSchema, folder: Path) -> Robot:
     from vkc_pin.robot import load_robot
 
     by_path = item.name.endswith((".urdf", ".yaml", ".yml")) or "/" in item.name
@@ -172,59 +170,7 @@ def _obstacle(
     document: Document, path: tuple[str | int, ...], item: schema.ObstacleSchema, folder: Path
 ) -> tuple[list[pin.GeometryObject], list[pin.GeometryObject]]:
     """Return what to draw of an obstacle and what collides, in the world frame."""
-    pose = _pose(item)
-    if isinstance(item, schema.UrdfSchema):
-        with document.at((*path, "file")):
-            tree = load_urdf(_file(document, (*path, "file"), folder, item.file))
-        data = tree.model.createData()
-        pin.forwardKinematics(tree.model, data, pin.neutral(tree.model))
-        both = []
-        for geometry in (tree.visual, tree.collision):
-            shapes = geometry.geometryObjects
-            names = [item.name] if len(shapes) == 1 else [f"{item.name}_{k}" for k in range(len(shapes))]
-            both.append(
-                [
-                    copy_shape(shape, name, pose * data.oMi[shape.parentJoint] * shape.placement)
-                    for shape, name in zip(shapes, names, strict=True)
-                ]
-            )
-            for shape in both[-1] if item.colour else ():
-                shape.meshColor, shape.overrideMaterial = np.array(item.colour), True
-        return both[0], both[1]
-    drawn_as, scale = "", np.ones(3)
-    solid: coal.CollisionGeometry
-    match item:
-        case schema.BoxSchema():
-            solid = coal.Box(*item.size)
-        case schema.SphereSchema():
-            solid = coal.Sphere(item.radius)
-        case schema.CylinderSchema():
-            solid = coal.Cylinder(item.radius, item.length)
-        case schema.CapsuleSchema():
-            solid = coal.Capsule(item.radius, item.length)
-        case schema.MeshSchema():
-            from vkc_pin.meshes import load_convex
-
-            file, scale = _file(document, (*path, "file"), folder, item.file), np.array(item.scale)
-            with document.at((*path, "file")):
-                solid = load_convex(file, scale)
-            drawn_as = str(file)
-    drawn = _shape(item.name, pose, solid, item.colour)
-    drawn.meshPath, drawn.meshScale = drawn_as, scale
-    return [drawn], [_shape(item.name, pose, solid, item.colour)]
-
-
-def _shape(
-    name: str, pose: pin.SE3, shape: coal.CollisionGeometry, colour: tuple[float, float, float, float]
-) -> pin.GeometryObject:
-    made = pin.GeometryObject(name, 0, 0, pose, shape)
-    made.meshColor, made.overrideMaterial = np.array(colour), True
-    return made
-
-
-def _floor(arena: tuple[float, float, float, float]) -> pin.GeometryObject:
-    """Return the floor: a box, not a half space, which has no size to draw or to bound."""
-    x_min, x_max, y_min, y_max = arena
-    size = (x_max - x_min + 2 * _FLOOR_BORDER, y_max - y_min + 2 * _FLOOR_BORDER, _FLOOR_THICKNESS)
-    centre = np.array([(x_min + x_max) / 2, (y_min + y_max) / 2, -_FLOOR_THICKNESS / 2])
-    return _shape(FLOOR, pin.SE3(np.eye(3), centre), coal.Box(*size), (0.80, 0.78, 0.74, 1.0))
+    if isinstance(item, schema.UrdfSchema | schema.MeshSchema):
+        _file(document, (*path, "file"), folder, item.file)
+    with document.at((*path, "file")):
+        return obstacle_shapes(item, _pose(item), folder)

@@ -18,7 +18,7 @@ __all__ = [
     "MeshSchema",
     "ObstacleSchema",
     "PlacedObjectSchema",
-    "RobotSchema",
+    "SceneRobotSchema",
     "SceneSchema",
     "SphereSchema",
     "StartSchema",
@@ -176,7 +176,7 @@ class PlacedObjectSchema(PoseSchema):
     state: Mapping[str, Number] = Field(default_factory=dict)
 
 
-class RobotSchema(Schema):
+class SceneRobotSchema(Schema):
     """A robot by its name, or by the path of its URDF."""
 
     name: str
@@ -219,7 +219,7 @@ class SceneSchema(Schema):
     """A scene file."""
 
     name: Name | None = None
-    robot: Annotated[RobotSchema, BeforeValidator(_named)]
+    robot: Annotated[SceneRobotSchema, BeforeValidator(_named)]
     start: StartSchema
     arena: ArenaSchema = ArenaSchema()
     start_region: RegionSchema | None = None

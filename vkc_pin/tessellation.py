@@ -1,4 +1,4 @@
-"""Turns coal shapes into triangles with normals, for pictures."""
+"""Triangles with normals, for pictures: of coal shapes, boxes and tubes."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from vkc_pin.errors import InputError
+from vkc_pin.geometry import triangles
 
-__all__ = ["Solid", "box_solid", "coarse", "merge_solids", "outline", "shade", "to_solid", "triangles", "tube"]
+__all__ = ["Solid", "box_solid", "coarse", "merge_solids", "shade", "to_solid", "tube"]
 
 _CREASE = np.radians(35.0)  # faces that meet at a larger angle keep an edge between them
 _GRAIN = 2.0**-14  # [m]: vertices are rounded to this; numbers with few digits compress well
-_SEGMENTS = 28  # of a circle
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,40 +37,6 @@ class Solid:
         rotation = np.asarray(placement.rotation)
         vertices = self.vertices @ rotation.T + np.asarray(placement.translation)
         return Solid(vertices.astype(np.float32), self.faces, (self.normals @ rotation.T).astype(np.float32))
-
-
-def triangles(shape: coal.CollisionGeometry) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return the surface of a coal shape in its own frame: vertices, shape (n, 3) [m], and faces, shape (m, 3).
-
-    Raises:
-        InputError: The shape has no surface of finite size (a plane or half-space).
-    """
-    import trimesh.creation as make
-
-    if isinstance(shape, coal.Box):
-        mesh = make.box(extents=2.0 * np.asarray(shape.halfSide))
-    elif isinstance(shape, coal.Sphere):
-        mesh = make.uv_sphere(radius=shape.radius, count=(_SEGMENTS // 2, _SEGMENTS))
-    elif isinstance(shape, coal.Ellipsoid):
-        mesh = make.uv_sphere(radius=1.0, count=(_SEGMENTS // 2, _SEGMENTS))
-        mesh.apply_transform(np.diag([*np.asarray(shape.radii), 1.0]))
-    elif isinstance(shape, coal.Cylinder):
-        mesh = make.cylinder(radius=shape.radius, height=2.0 * shape.halfLength, sections=_SEGMENTS)
-    elif isinstance(shape, coal.Cone):
-        mesh = make.cone(radius=shape.radius, height=2.0 * shape.halfLength, sections=_SEGMENTS)
-        mesh.apply_translation([0.0, 0.0, -shape.halfLength])
-    elif isinstance(shape, coal.Capsule):
-        length = 2.0 * shape.halfLength
-        mesh = make.capsule(height=length, radius=shape.radius, count=(_SEGMENTS, _SEGMENTS))
-        mesh.apply_translation([0.0, 0.0, -(mesh.bounds[0, 2] + mesh.bounds[1, 2]) / 2.0])
-    elif isinstance(shape, coal.BVHModelBase):
-        faces = [shape.tri_indices(k) for k in range(shape.num_tris)]
-        return np.array(shape.vertices(), float), _indices(faces)
-    elif isinstance(shape, coal.Convex):
-        return np.array(shape.points(), float), _indices([shape.polygons(k) for k in range(shape.num_polygons)])
-    else:
-        raise InputError("this shape cannot be drawn", expected="a solid or a mesh", got=type(shape).__name__)
-    return np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
 
 
 def to_solid(shape: coal.CollisionGeometry) -> Solid:
@@ -156,20 +121,5 @@ def tube(points: NDArray[np.float64], radius: float, sections: int = 8) -> Solid
     return _solid(vertices.reshape(-1, 3), faces.reshape(-1, 3), normals.reshape(-1, 3))
 
 
-def outline(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the corners, shape (k, 2), of the convex hull of points' x and y; `points` has shape (n, ≥ 2)."""
-    from scipy.spatial import ConvexHull, QhullError
-
-    flat = np.unique(np.round(points[:, :2], 6), axis=0)
-    try:
-        return np.asarray(flat[ConvexHull(flat).vertices])
-    except QhullError:  # all on one line
-        return np.asarray(flat[[0, -1]])
-
-
 def _solid(vertices: NDArray[Any], faces: NDArray[Any], normals: NDArray[Any]) -> Solid:
     return Solid(vertices.astype(np.float32), faces.astype(np.uint32), normals.astype(np.float32))
-
-
-def _indices(items: list[Any]) -> NDArray[np.int64]:
-    return np.array([(item[0], item[1], item[2]) for item in items], np.int64).reshape(-1, 3)

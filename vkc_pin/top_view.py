@@ -8,9 +8,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from vkc_pin.geometry import triangles
 from vkc_pin.motion import sample_motion
-from vkc_pin.scene import FLOOR
-from vkc_pin.tessellation import outline, triangles
+from vkc_pin.obstacles import FLOOR
 from vkc_pin.trajectory import Trajectory
 from vkc_pin.world import World
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
 
-__all__ = ["STYLE", "draw_top_view"]
+__all__ = ["STYLE", "draw_top_view", "outline"]
 
 STYLE: Any = {
     "axes.spines.top": False,
@@ -129,6 +129,17 @@ def _corners(world: World, index: int, joint: NDArray[np.float64], known: dict[i
         vertices = known[index] = triangles(shape.geometry)[0]
     placed = pin.SE3(joint) * shape.placement
     return np.asarray(vertices @ np.asarray(placed.rotation).T + placed.translation)
+
+
+def outline(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the corners, shape (k, 2), of the convex hull of points' x and y; `points` has shape (n, ≥ 2)."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    flat = np.unique(np.round(points[:, :2], 6), axis=0)
+    try:
+        return np.asarray(flat[ConvexHull(flat).vertices])
+    except QhullError:  # all on one line
+        return np.asarray(flat[[0, -1]])
 
 
 def _polygon(corners: NDArray[np.float64], **style: Any) -> Any:

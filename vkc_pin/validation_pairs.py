@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vkc_pin.errors import InputError
-from vkc_pin.scene import FLOOR, Scene
+from vkc_pin.obstacles import FLOOR
+from vkc_pin.scene import Scene
 from vkc_pin.trajectory import Trajectory
 from vkc_pin.validation_distances import Placed, Solids
 from vkc_pin.validation_motion import ways

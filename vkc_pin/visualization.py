@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.notebook import in_notebook
-from vkc_pin.plan import Plan, write_atomically
+from vkc_pin.plan import Plan
 from vkc_pin.scene import Scene
+from vkc_pin.writing import write_atomically
 
 if TYPE_CHECKING:
     import meshcat

@@ -15,8 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from vkc_pin.assembly import graft, graft_geometry
 from vkc_pin.coordinates import Coordinates
-from vkc_pin.geometry import PlacedObject, link_name
+from vkc_pin.geometry import link_name
 from vkc_pin.hold import holds_of
+from vkc_pin.placed import PlacedObject
 from vkc_pin.scene import Scene
 from vkc_pin.trajectory import PhaseSpan, Trajectory
 

@@ -13,8 +13,8 @@ from vkc_pin.base_body import Shape
 from vkc_pin.base_grid import HEADINGS, BaseGrid, fine_cells
 from vkc_pin.base_path import along, shortest_path
 from vkc_pin.initialization import Seed
+from vkc_pin.obstacles import FLOOR
 from vkc_pin.problem import TrajectoryProblem
-from vkc_pin.scene import FLOOR
 from vkc_pin.steps import GoTo
 
 __all__ = ["BaseWays", "headings"]

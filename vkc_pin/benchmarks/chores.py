@@ -15,9 +15,10 @@ from vkc_pin.benchmarks.record import distribution, trial
 from vkc_pin.benchmarks.tables import decimal, failures, foot, markdown
 from vkc_pin.chore import plan_chore
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.plan import Plan, write_atomically
+from vkc_pin.plan import Plan
 from vkc_pin.scene import Scene, load_scene
 from vkc_pin.steps import Actuate, Grasp, Place, Step
+from vkc_pin.writing import write_atomically
 
 __all__ = ["CHORES", "fetch", "home", "plan_trial", "report", "run"]
 

@@ -21,11 +21,12 @@ from vkc_pin.benchmarks.charts import motions_chart
 from vkc_pin.benchmarks.comparison_report import report
 from vkc_pin.benchmarks.record import trial
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.plan import Plan, write_atomically
+from vkc_pin.plan import Plan
 from vkc_pin.planner import plan
 from vkc_pin.scene import Scene, load_scene
 from vkc_pin.steps import Actuate, GoTo, Place, Step, as_placement
 from vkc_pin.trajectory import Trajectory
+from vkc_pin.writing import write_atomically
 
 __all__ = ["METHODS", "TIME_LIMIT", "Comparison", "Solve", "Task", "peaks"]
 

@@ -23,8 +23,8 @@ from tqdm import tqdm
 from vkc_pin.benchmarks.record import meta, peak_memory
 from vkc_pin.benchmarks.tables import to_csv
 from vkc_pin.errors import InputError, VkcError
-from vkc_pin.plan import write_atomically
 from vkc_pin.resources import folder
+from vkc_pin.writing import write_atomically
 
 __all__ = ["Function", "run"]
 

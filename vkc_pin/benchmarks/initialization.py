@@ -18,10 +18,11 @@ from vkc_pin.benchmarks.charts import success_chart
 from vkc_pin.benchmarks.record import trial
 from vkc_pin.benchmarks.tables import comparison_table, foot, methods_table
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.plan import Plan, write_atomically
+from vkc_pin.plan import Plan
 from vkc_pin.planner import plan
 from vkc_pin.scene import Scene, load_scene
 from vkc_pin.steps import Grasp, Touch
+from vkc_pin.writing import write_atomically
 
 __all__ = ["METHODS", "SCENES", "STEPWISE", "TARGET", "plan_trial", "report", "run", "specify"]
 

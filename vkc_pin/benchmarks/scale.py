@@ -14,10 +14,11 @@ from vkc_pin.benchmarks.record import distribution, trial
 from vkc_pin.benchmarks.scale_chart import scale_chart
 from vkc_pin.benchmarks.tables import TIMES, decimal, foot, markdown, quartiles
 from vkc_pin.errors import InputError
-from vkc_pin.plan import Plan, write_atomically
+from vkc_pin.plan import Plan
 from vkc_pin.planner import plan
 from vkc_pin.scene import Scene, load_scene
 from vkc_pin.steps import Actuate
+from vkc_pin.writing import write_atomically
 
 __all__ = ["COUNTS", "crowded", "report", "run", "specify"]
 

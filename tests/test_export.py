@@ -13,9 +13,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import vkc_pin as vkc
-from vkc_pin import cli, export
+from vkc_pin import cli
 from vkc_pin.plan import Plan
 from vkc_pin.trajectory import PhaseSpan, Trajectory
+from vkc_pin.world import units_of
 
 FILES = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60, deadline=None)
 ROBOT = ("base_x", "base_y", "base_yaw", "lift", "elbow")
@@ -100,15 +101,15 @@ def test_columns_have_names_and_units(plan: Plan, tmp_path: Path) -> None:
 
 
 def test_units_of_joints_that_slide_and_of_grasps() -> None:
-    units = export.units_of(vkc.load_scene("drawer"))
+    units = units_of(vkc.load_scene("drawer"))
     assert (units["drawer.slide"], units["base_x"], units["base_yaw"]) == ("m", "m", "rad")
-    stick = export.units_of(vkc.load_scene("init_3"))
+    stick = units_of(vkc.load_scene("init_3"))
     assert {stick[name] for name in stick if name.endswith("_slide")} == {"m"}
     assert {stick[name] for name in stick if name.endswith("_turn")} == {"rad"}
 
 
 def test_every_coordinate_of_a_plan_has_a_unit(door_plan: Plan) -> None:
-    assert set(door_plan.trajectory.names) <= set(export.units_of(door_plan.scene))
+    assert set(door_plan.trajectory.names) <= set(units_of(door_plan.scene))
 
 
 @pytest.mark.parametrize(

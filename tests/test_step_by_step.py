@@ -18,15 +18,9 @@ from vkc_pin.hold import Hold
 from vkc_pin.one_problem import Settings
 from vkc_pin.options import Options
 from vkc_pin.scene import Scene
-from vkc_pin.step_by_step import scene_after
 from vkc_pin.steps import GoTo
-from vkc_pin.task import Task
 from vkc_pin.trajectory import PhaseSpan, Trajectory
-
-
-def holding(*holds: Hold) -> Task:
-    """Return a task of which only what is held when all is done counts."""
-    return Task((), (), holds, {}, after=holds)
+from vkc_pin.world import scene_after
 
 
 def ending(scene: Scene, base: list[float], arm: np.ndarray, **objects: float) -> Trajectory:
@@ -40,7 +34,7 @@ def ending(scene: Scene, base: list[float], arm: np.ndarray, **objects: float) -
 def test_robot_and_joints_are_where_the_motion_ends() -> None:
     scene = full_scene().with_state("door", {"knob": 0.2})
     arm = np.linspace(-0.5, 0.5, len(scene.start) - 3)
-    after = scene_after(scene, holding(), ending(scene, [0.1, -0.2, 4.0], arm, door__hinge=0.4))
+    after = scene_after(scene, ending(scene, [0.1, -0.2, 4.0], arm, door__hinge=0.4), [])
     np.testing.assert_array_equal(after.start, [0.1, -0.2, 4.0, *arm])
     np.testing.assert_array_equal(after.objects["door"].state, [0.4, 0.2])
     for name in ("drawer", "cabinet"):
@@ -62,7 +56,7 @@ def test_what_ends_a_little_outside_its_limits_is_at_them() -> None:
         cabinet__sleeve_slide=sleeve.freedoms[0].lower - off,
         cabinet__sleeve_turn=sleeve.freedoms[1].upper + off,
     )
-    after = scene_after(scene, holding(Hold("cabinet", "sleeve")), motion)
+    after = scene_after(scene, motion, [Hold("cabinet", "sleeve")])
     np.testing.assert_array_equal(after.start, [scene.arena[1], scene.arena[2], 0.0, *robot.upper[3:]])
     np.testing.assert_array_equal(after.objects["door"].state, [door.upper[0], door.lower[1]])
     assert dict(after.held) == {"cabinet": "sleeve"}
@@ -74,7 +68,7 @@ def test_what_is_carried_is_in_the_hand() -> None:
     scene, values = room(table()), (0.03, 0.2)
     down = above(STICK, values=values)
     script = Script(scene).go(down).take("stick", values=values).go(moved_base(down, x=-0.4, yaw=0.5))
-    after = scene_after(scene, holding(Hold("stick", "grip")), script.motion())
+    after = scene_after(scene, script.motion(), [Hold("stick", "grip")])
     assert (dict(after.held), dict(after.held_at)) == ({"stick": "grip"}, {"stick": values})
     data = scene.robot.model.createData()
     pin.framesForwardKinematics(scene.robot.model, data, scene.robot.coordinates.q(script.rows[-1]))
@@ -86,7 +80,7 @@ def test_what_is_carried_is_in_the_hand() -> None:
 def test_what_was_let_go_of_stands_where_it_was_left() -> None:
     scene = room(table())
     script = carried_over(scene, values=(0.03, 0.2))
-    after = scene_after(scene, holding(), script.motion())
+    after = scene_after(scene, script.motion(), [])
     assert dict(after.held) == {}
     np.testing.assert_allclose(
         after.objects["stick"].placement.homogeneous, lifted(STICK, [0.0, 0.5, 0.0]).homogeneous, atol=1e-9
@@ -98,8 +92,8 @@ def test_what_was_held_at_the_start_can_be_let_go_of() -> None:
     """And does not follow the hand from there on."""
     scene = room(table()).with_held({"stick": "grip"}, at={"stick": (0.02, -0.1)})
     script = Script(scene).go(moved_base(scene.start, y=0.3))
-    kept = scene_after(scene, holding(Hold("stick", "grip")), script.motion())
-    left = scene_after(scene, holding(), script.let_go().go(moved_base(scene.start, x=-0.5)).motion())
+    kept = scene_after(scene, script.motion(), [Hold("stick", "grip")])
+    left = scene_after(scene, script.let_go().go(moved_base(scene.start, x=-0.5)).motion(), [])
     assert (dict(kept.held), dict(kept.held_at)) == ({"stick": "grip"}, {"stick": (0.02, -0.1)})
     assert dict(left.held) == {}
     there = lifted(scene.objects["stick"].placement, [0.0, 0.3, 0.0]).homogeneous
@@ -114,7 +108,7 @@ def test_what_is_held_through_another_thing_stays_there() -> None:
     script = Script(scene).take("ball", "pull", values, by="stick.tip").go(moved_base(scene.start, y=0.3))
     stick = Hold("stick", "grip")
     holds = (stick, Hold("ball", "pull", stick, "tip"))
-    after = scene_after(scene, holding(*holds), script.motion())
+    after = scene_after(scene, script.motion(), holds)
     assert (dict(after.held), dict(after.held_by)) == ({"stick": "grip", "ball": "pull"}, {"ball": "stick.tip"})
     assert after.held_at["ball"] == tuple(values)
     assert after.holds == holds
@@ -127,7 +121,7 @@ def test_in_brief_all_steps_but_the_first_give_up_soon(brief: bool, monkeypatch:
 
     class One:
         def __init__(self, scene: Scene, steps: Sequence[GoTo], settings: Settings) -> None:
-            self.scene, self.step, self.task = scene, steps[0], holding()
+            self.scene, self.step, self.task = scene, steps[0], SimpleNamespace(after=())
             given.append((steps[0], settings.options))
 
         def run(self) -> SimpleNamespace:

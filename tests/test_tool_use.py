@@ -13,8 +13,8 @@ from vkc_pin.benchmarks.initialization import TARGET
 from vkc_pin.initialization import Seed
 from vkc_pin.one_problem import OneProblem, Settings
 from vkc_pin.pieces import seed_of
-from vkc_pin.step_by_step import scene_after, stages
-from vkc_pin.world import World
+from vkc_pin.step_by_step import stages
+from vkc_pin.world import World, scene_after
 
 
 @cache
@@ -105,7 +105,7 @@ def test_each_step_begins_where_the_one_before_it_ends() -> None:
     assert len(parts) == 2  # grasping what is held changes nothing
     (first, grasped), (second, _) = parts
     end = grasped.trajectory
-    after = scene_after(start(), first.task, end)
+    after = scene_after(start(), end, first.task.after)
     np.testing.assert_allclose(after.start, end.positions[-1, : end.robot_size], atol=1e-9)
     assert dict(after.held) == {"stick": "grip"}
     np.testing.assert_allclose(second.scene.start, after.start, atol=1e-12)

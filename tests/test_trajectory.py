@@ -67,11 +67,6 @@ def test_columns() -> None:
     assert caught.value.nearest == "door.hinge"
 
 
-@pytest.mark.parametrize(("time", "phase"), [(-1.0, 0), (0.0, 0), (2.49, 0), (2.5, 1), (6.5, 1), (9.0, 1)])
-def test_phase_at(time: float, phase: int) -> None:
-    assert example().phase_at(time) == PHASES[phase]
-
-
 def test_it_cannot_be_changed() -> None:
     rows = ROWS.copy()
     motion = example(positions=rows)

@@ -20,12 +20,13 @@ from vkc_pin.planner import guarded, settings_for
 from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.scene import Scene
 from vkc_pin.solution import Iteration
-from vkc_pin.step_by_step import joined, scene_after, summed
+from vkc_pin.step_by_step import joined, summed
 from vkc_pin.steps import Step
 from vkc_pin.task import Task
 from vkc_pin.term_goals import stretches
 from vkc_pin.terms import Term, check_active
 from vkc_pin.trajectory import Trajectory
+from vkc_pin.world import scene_after
 
 __all__ = ["plan_chore"]
 
@@ -255,7 +256,7 @@ class _Chore:
                 piece = Piece(whole.phases[begin:end], whole.names, whole.waypoints[begin:end], seed)
                 ends = one.problem.ends
                 rests = end == len(ends) or ends[end - 1] in one.problem.transcription.structure.rests
-                scene = scene_after(scene, task, trajectory)
+                scene = scene_after(scene, trajectory, task.after)
             parts.append(_Part(part, piece, scene, rests, fine))
             begin = end
         return parts

@@ -12,7 +12,7 @@ from typing import Any
 
 from vkc_pin.cli_bench import EXIT_OK, add_bench, natural, positive
 from vkc_pin.errors import InputError, VkcError
-from vkc_pin.export import GROUPS
+from vkc_pin.tables import GROUPS
 
 __all__ = ["main"]
 

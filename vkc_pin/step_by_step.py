@@ -6,22 +6,18 @@ import dataclasses
 import time
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-
 from vkc_pin.goal import compile_task
-from vkc_pin.hold import as_mappings
 from vkc_pin.monitor import interruptible
 from vkc_pin.one_problem import OneProblem, Settings
 from vkc_pin.plan import Plan
 from vkc_pin.scene import Scene
 from vkc_pin.standing import TIMES, standing
 from vkc_pin.steps import Step
-from vkc_pin.task import Task
-from vkc_pin.trajectory import Trajectory, join
+from vkc_pin.trajectory import join
 from vkc_pin.validation import validate
-from vkc_pin.world import World
+from vkc_pin.world import scene_after
 
-__all__ = ["joined", "scene_after", "stages", "step_by_step", "summed"]
+__all__ = ["joined", "stages", "step_by_step", "summed"]
 
 _ROUNDS = 10  # of the solver from one seed: what takes more has mostly run into a dead end
 
@@ -64,7 +60,7 @@ def stages(scene: Scene, steps: Sequence[Step], settings: Settings, *, brief: bo
             if not parts[-1][1].success or settings.interrupt.pressed:
                 break
             spent += parts[-1][1].metrics["planning_time"]
-            current = scene_after(current, one.task, parts[-1][1].trajectory)
+            current = scene_after(current, parts[-1][1].trajectory, one.task.after)
     except KeyboardInterrupt:
         settings.interrupt.pressed = True
     return parts
@@ -106,39 +102,3 @@ def summed(metrics: Sequence[Mapping[str, float]]) -> dict[str, float]:
     """Return what several plans took: times, iterations and rounds."""
     keys = ("planning_time", "build_time", "iterations", "rounds", *(f"time_{key}" for key in TIMES))
     return {key: sum(part[key] for part in metrics) for key in keys}
-
-
-def scene_after(scene: Scene, task: Task, trajectory: Trajectory) -> Scene:
-    """Return the scene at the end of a motion: where robot and objects are, and what is held.
-
-    Args:
-        scene: The scene at its start.
-        task: What the motion brings about.
-        trajectory: The motion.
-    """
-    last = dict(zip(trajectory.names, trajectory.positions[-1].tolist(), strict=True))
-
-    def end(coordinate: str, lower: float, upper: float) -> float:
-        return float(np.clip(last[coordinate], lower, upper))
-
-    robot = np.clip(trajectory.positions[-1, : trajectory.robot_size], scene.robot.lower, scene.robot.upper)
-    robot[:2] = np.clip(robot[:2], scene.arena[::2], scene.arena[1::2])
-    after = scene.with_held({}).with_start(base=robot[:3], arm=robot[3:])
-    world = World(scene)
-    (row,) = world.positions(trajectory, trajectory.times[-1:])
-    for name, placed in scene.objects.items():
-        thing = placed.object
-        if thing.free:
-            after = after.with_placement(name, world.placement(name, row))
-        joints = zip(thing.coordinates.names, thing.lower, thing.upper, strict=True)
-        state = {joint: end(f"{name}.{joint}", low, high) for joint, low, high in joints if f"{name}.{joint}" in last}
-        if state:
-            after = after.with_state(name, state)
-    at: dict[str, list[float]] = {}
-    for hold in task.after:
-        attachment = scene.objects[hold.object].object.attachment(hold.attachment)
-        if attachment.freedoms:
-            freedoms = zip(attachment.coordinates, attachment.freedoms, strict=True)
-            at[hold.object] = [end(f"{hold.object}.{name}", freedom.lower, freedom.upper) for name, freedom in freedoms]
-    held, by = as_mappings(task.after)
-    return after.with_held(held, by=by, at=at)

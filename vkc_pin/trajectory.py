@@ -134,11 +134,6 @@ class Trajectory:
             "arm_effort": self.arm_effort(),
         }
 
-    def phase_at(self, time: float) -> PhaseSpan:
-        """Return the phase at `time` [s]; at a boundary the later one."""
-        index = int(np.searchsorted(self.times, time, side="right")) - 1
-        return next((phase for phase in reversed(self.phases) if phase.first <= index), self.phases[0])
-
     def to_dict(self) -> dict[str, Any]:
         """Return plain data of it, e.g. for JSON."""
         return {
@@ -166,43 +161,75 @@ class Trajectory:
             raise InputError("this is missing from a trajectory", field=str(error.args[0])) from None
 
     def to_csv(self, path: str | Path, **options: Any) -> Path:
-        """Write a table with a line a waypoint: times [s], positions [m] and [rad], phases; see `export.to_csv`."""
-        from vkc_pin import export
+        """Write a table with a line a waypoint: times [s], positions [m] and [rad], phases; see `tables.write_csv`."""
+        from vkc_pin import tables
 
-        return export.to_csv(self, path, **options)
+        return tables.write_csv(self.to_dict(), path, **options)
 
     def to_json(self, path: str | Path) -> Path:
-        """Write it as JSON, whole or not at all; return the path."""
-        from vkc_pin import export
+        """Write `to_dict` as JSON, whole or not at all; return the path."""
+        from vkc_pin import tables
 
-        return export.to_json(self, path)
+        return tables.write_json(self.to_dict(), path)
 
     def to_ros(self, **options: Any) -> dict[str, Any]:
-        """Return plain data with the fields of ROS' `trajectory_msgs/JointTrajectory`; see `export.to_ros`."""
-        from vkc_pin import export
+        """Return plain data with the fields of ROS' `trajectory_msgs/JointTrajectory`; see `ros.to_ros`."""
+        from vkc_pin import ros
 
-        return export.to_ros(self, **options)
+        return ros.to_ros(self.to_dict(), **options)
 
-    @staticmethod
-    def from_csv(path: str | Path, **options: Any) -> Trajectory:
-        """Return the trajectory in a table such as `to_csv` writes; see `export.from_csv`."""
-        from vkc_pin import export
+    @classmethod
+    def from_csv(cls, path: str | Path, **options: Any) -> Trajectory:
+        """Return the trajectory in a table such as `to_csv` writes; see `tables.read_csv`.
 
-        return export.from_csv(path, **options)
+        Raises:
+            InputError: The file is missing, or something in it does not fit; the error names line and column.
+        """
+        from vkc_pin import tables
 
-    @staticmethod
-    def from_json(path: str | Path) -> Trajectory:
-        """Return the trajectory that `to_json`, `Plan.to_json` or `vkc-pin plan --json` wrote; see `export.from_json`."""
-        from vkc_pin import export
+        return cls._read(tables.read_csv(path, **options), path)
 
-        return export.from_json(path)
+    @classmethod
+    def from_json(cls, path: str | Path) -> Trajectory:
+        """Return the trajectory in a file that `to_json`, `Plan.to_json` or `vkc-pin plan --json` wrote.
 
-    @staticmethod
-    def from_ros(message: Mapping[str, Any] | str | Path, **options: Any) -> Trajectory:
-        """Return the trajectory of data such as `to_ros` returns, or of a JSON file with them; see `export.from_ros`."""
-        from vkc_pin import export
+        Raises:
+            InputError: The file is missing, is no JSON, or something in it does not fit; the error names line or field.
+        """
+        from vkc_pin import tables
 
-        return export.from_ros(message, **options)
+        data = tables.read_json(path)
+        if isinstance(data, dict) and "trajectory" in data:
+            return cls._read(data["trajectory"], path, "trajectory")
+        return cls._read(data, path)
+
+    @classmethod
+    def from_ros(
+        cls, message: Mapping[str, Any] | str | Path, *, like: Trajectory | None = None, robot_size: int | None = None
+    ) -> Trajectory:
+        """Return the trajectory of data such as `to_ros` returns, or of a JSON file with them; see `ros.from_ros`.
+
+        Raises:
+            InputError: Something is missing or does not fit; the error names the field.
+        """
+        from vkc_pin import ros
+
+        data = ros.from_ros(message, like=None if like is None else like.to_dict(), robot_size=robot_size)
+        return cls._read(data, None if isinstance(message, Mapping) else message)
+
+    @classmethod
+    def _read(cls, data: Any, file: str | Path | None, inside: str = "") -> Trajectory:
+        """Return the trajectory that a file holds, in its field `inside`; what is wrong with it is the file's fault."""
+        try:
+            if not isinstance(data, Mapping):
+                raise InputError("not a trajectory", expected="an object", got=type(data).__name__)
+            return cls.from_dict(data)
+        except InputError as error:
+            field = ".".join(part for part in (inside, error.field) if part) or None
+            raise InputError(error.problem, file=file, field=field, expected=error.expected, got=error.got) from error
+        except (TypeError, ValueError, AttributeError, LookupError) as error:
+            expected, got = "what Trajectory.to_dict returns", str(error)
+            raise InputError("not a trajectory", file=file, field=inside or None, expected=expected, got=got) from error
 
 
 def join(parts: Sequence[Trajectory], *, pause: float) -> Trajectory:

@@ -6,7 +6,7 @@ a free joint: it stands where it was left, and moves rigidly with the hand from 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -16,12 +16,12 @@ from numpy.typing import ArrayLike, NDArray
 from vkc_pin.assembly import graft, graft_geometry
 from vkc_pin.coordinates import Coordinates
 from vkc_pin.geometry import link_name
-from vkc_pin.hold import holds_of
+from vkc_pin.hold import Hold, as_mappings, holds_of
 from vkc_pin.placed import PlacedObject
 from vkc_pin.scene import Scene
 from vkc_pin.trajectory import PhaseSpan, Trajectory
 
-__all__ = ["FREE_JOINT", "World", "as_numbers"]
+__all__ = ["FREE_JOINT", "World", "as_numbers", "scene_after", "units_of"]
 
 FREE_JOINT = "placement"
 """A free object's placement in the world is the joint `<object>.placement`."""
@@ -198,3 +198,56 @@ class World:
 def as_numbers(placement: pin.SE3) -> NDArray[np.float64]:
     """Return a placement as a free joint's seven coordinates."""
     return np.asarray(pin.SE3ToXYZQUAT(placement), float)
+
+
+def scene_after(scene: Scene, trajectory: Trajectory, holds: Sequence[Hold]) -> Scene:
+    """Return the scene at the end of a motion: where robot and objects are, and what is held.
+
+    Args:
+        scene: The scene at its start.
+        trajectory: The motion.
+        holds: What is held at its end.
+    """
+    last = dict(zip(trajectory.names, trajectory.positions[-1].tolist(), strict=True))
+
+    def end(coordinate: str, lower: float, upper: float) -> float:
+        return float(np.clip(last[coordinate], lower, upper))
+
+    robot = np.clip(trajectory.positions[-1, : trajectory.robot_size], scene.robot.lower, scene.robot.upper)
+    robot[:2] = np.clip(robot[:2], scene.arena[::2], scene.arena[1::2])
+    after = scene.with_held({}).with_start(base=robot[:3], arm=robot[3:])
+    world = World(scene)
+    (row,) = world.positions(trajectory, trajectory.times[-1:])
+    for name, placed in scene.objects.items():
+        thing = placed.object
+        if thing.free:
+            after = after.with_placement(name, world.placement(name, row))
+        joints = zip(thing.coordinates.names, thing.lower, thing.upper, strict=True)
+        state = {joint: end(f"{name}.{joint}", low, high) for joint, low, high in joints if f"{name}.{joint}" in last}
+        if state:
+            after = after.with_state(name, state)
+    at: dict[str, list[float]] = {}
+    for hold in holds:
+        attachment = scene.objects[hold.object].object.attachment(hold.attachment)
+        if attachment.freedoms:
+            freedoms = zip(attachment.coordinates, attachment.freedoms, strict=True)
+            at[hold.object] = [end(f"{hold.object}.{name}", freedom.lower, freedom.upper) for name, freedom in freedoms]
+    held, by = as_mappings(holds)
+    return after.with_held(held, by=by, at=at)
+
+
+def units_of(scene: Scene) -> dict[str, str]:
+    """Return coordinate → "m" or "rad" of everything that can move in a scene: robot, objects, and the freedoms of grasps."""
+    units: dict[str, str] = {}
+    things = [("", scene.robot.model, scene.robot.coordinates)]
+    things += [(f"{name}.", placed.object.model, placed.object.coordinates) for name, placed in scene.objects.items()]
+    for prefix, model, coordinates in things:
+        for name, joint in zip(coordinates.names, coordinates.joints, strict=True):
+            kind = str(model.joints[joint].shortname()).removeprefix("JointModel")
+            metres = kind in ("PX", "PY", "PZ", "PrismaticUnaligned") or (kind == "Planar" and not name.endswith("_yaw"))
+            units[prefix + name] = "m" if metres else "rad"
+    for owner, placed in scene.objects.items():
+        for attachment in placed.object.attachments.values():
+            for name, freedom in zip(attachment.coordinates, attachment.freedoms, strict=True):
+                units[f"{owner}.{name}"] = "m" if freedom.kind == "prismatic" else "rad"
+    return units

@@ -24,11 +24,11 @@ from vkc_pin.options import Options
 from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.scene import Scene
 from vkc_pin.solver import RATE_TOLERANCE, solve
-from vkc_pin.step_by_step import scene_after
 from vkc_pin.steps import Actuate, GoTo, Grasp, Place, Step
 from vkc_pin.trajectory import Trajectory, join
 from vkc_pin.trust_region import CLOSE_ENOUGH
 from vkc_pin.unfold import as_trajectory
+from vkc_pin.world import scene_after
 
 __all__ = ["FINER", "Attempt", "Doable"]
 
@@ -281,7 +281,7 @@ class Attempt:
     def _take(self, problem: TrajectoryProblem, z: NDArray[np.float64]) -> None:
         """Append a motion, and go on from where it ends."""
         self.parts.append(as_trajectory(problem, z))
-        self.scene = scene_after(self.scene, problem.task, self.parts[-1])
+        self.scene = scene_after(self.scene, self.parts[-1], problem.task.after)
 
     def _seed(self) -> int:
         return int(self.rng.integers(2**32))

@@ -1,5 +1,6 @@
 """Whole-body planning for mobile manipulators on virtual kinematic chains."""
 
+from vkc_pin import cards as _cards  # noqa: F401 - registers what notebooks show of a scene
 from vkc_pin.articulation import ArticulatedObject, Attachment, Freedom, Latch, invert, load_object
 from vkc_pin.chain import VirtualKinematicChain, consolidate
 from vkc_pin.chore import plan_chore

@@ -22,6 +22,7 @@ from vkc_pin.scene import Scene
 from vkc_pin.steps import Step, step_from_dict, step_to_dict
 from vkc_pin.terms import Term, term_from_dict, term_to_dict
 from vkc_pin.trajectory import Trajectory
+from vkc_pin.world import units_of
 from vkc_pin.writing import write_atomically
 
 if TYPE_CHECKING:
@@ -124,13 +125,11 @@ class Plan:
         return write_atomically(path, (json.dumps(self.to_dict(), indent=1) + "\n").encode("utf-8"))
 
     def to_csv(self, path: str | Path, **options: Any) -> Path:
-        """Write the motion as a table with a line a waypoint, and a unit to every column; see `export.to_csv`."""
-        from vkc_pin import export
-
-        return export.to_csv(self.trajectory, path, **{"units": export.units_of(self.scene), **options})
+        """Write the motion as a table with a line a waypoint, and a unit to every column; see `tables.write_csv`."""
+        return self.trajectory.to_csv(path, **{"units": units_of(self.scene), **options})
 
     def to_ros(self, **options: Any) -> dict[str, Any]:
-        """Return the motion as plain data with the fields of ROS' `trajectory_msgs/JointTrajectory`; see `export.to_ros`."""
+        """Return the motion as plain data with the fields of ROS' `trajectory_msgs/JointTrajectory`; see `ros.to_ros`."""
         return self.trajectory.to_ros(**options)
 
     def __repr__(self) -> str:
@@ -138,9 +137,9 @@ class Plan:
         return f"<Plan {self.status}: base {m['base_effort']:.2f} m, arm {m['arm_effort']:.2f} rad, {m['planning_time']:.2f} s>"
 
     def _repr_html_(self) -> str:
-        from vkc_pin.plan_overview import plan_html
+        from vkc_pin.cards import motion_html
 
-        return plan_html(self)
+        return motion_html(self)
 
     def show(self, **options: Any) -> Any:
         """Show the motion with meshcat: inline in a notebook, otherwise in the browser; see `visualization.show`."""

@@ -5,19 +5,16 @@ Figures are made without pyplot, so nothing depends on a screen or is kept open.
 
 from __future__ import annotations
 
-import io
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vkc_pin.errors import InputError
-from vkc_pin.notebook import in_notebook
-from vkc_pin.plan import Plan
-from vkc_pin.top_view import STYLE, draw_top_view
+from vkc_pin.report import Judged
+from vkc_pin.style import COLOURS, new_figure, save_figure, shade_phases, styled
+from vkc_pin.top_view import draw_top_view
 from vkc_pin.world import World
-from vkc_pin.writing import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,10 +25,9 @@ __all__ = ["plot", "plot_clearance", "plot_joints", "plot_top_view"]
 _SUFFIXES = (".png", ".svg", ".pdf")
 _SAMPLES = 240  # of the clearance
 _SHOWN = 0.30  # [m]: clearance above this is of no interest
-_COLOURS = ("#2f6db5", "#d1495b", "#2a9d6f", "#e08e1b", "#7a5195", "#5b6770", "#1b9aaa", "#a44a3f")
 
 
-def plot(plan: Plan, path: str | Path | None = None) -> Figure | dict[str, Figure]:
+def plot(plan: Judged, path: str | Path | None = None) -> Figure | dict[str, Figure]:
     """Draw joint positions and velocities, clearance, and a top view.
 
     Args:
@@ -45,51 +41,51 @@ def plot(plan: Plan, path: str | Path | None = None) -> Figure | dict[str, Figur
     Raises:
         InputError: Not a plan, or the folder's name is that of a file.
     """
-    if not isinstance(plan, Plan):
+    if not isinstance(plan, Judged):
         raise InputError("this cannot be plotted", field="plan", expected="a Plan", got=type(plan).__name__)
     target = None if path is None else Path(path)
     if target is None or target.suffix.lower() in _SUFFIXES:
         figure = _combined(plan)
         if target is not None:
-            _save(figure, target)
+            save_figure(figure, target)
         return figure
     if target.is_file():
         expected = f"a folder, or a name ending with {', '.join(_SUFFIXES)}"
         raise InputError("this is a file", field="path", file=target, expected=expected)
     figures = {"joints": plot_joints(plan), "clearance": plot_clearance(plan), "top_view": plot_top_view(plan)}
     for name, figure in figures.items():
-        _save(figure, target / f"{name}.png")
+        save_figure(figure, target / f"{name}.png")
     return figures
 
 
-def plot_joints(plan: Plan) -> Figure:
+def plot_joints(plan: Judged) -> Figure:
     """Return a figure of positions and velocities over time, a row each for base, arm and objects, with velocity limits."""
-    with _style():
-        figure = _figure(12.0, 2.5 * len(_groups(plan)) + 0.4)
+    with styled():
+        figure = new_figure(12.0, 2.5 * len(_groups(plan)) + 0.4)
         _draw_joints(figure, plan)
     return figure
 
 
-def plot_clearance(plan: Plan) -> Figure:
+def plot_clearance(plan: Judged) -> Figure:
     """Return a figure of the smallest distances over time; the legend names the closest pairs."""
-    with _style():
-        figure = _figure(9.0, 4.2)
+    with styled():
+        figure = new_figure(9.0, 4.2)
         _draw_clearance(figure, plan)
     return figure
 
 
-def plot_top_view(plan: Plan) -> Figure:
+def plot_top_view(plan: Judged) -> Figure:
     """Return a figure of the motion from above: obstacles, objects, the base at several times, paths of base and tool."""
     x_min, x_max, y_min, y_max = plan.scene.arena
-    with _style():
-        figure = _figure(9.0, float(np.clip(9.0 * (y_max - y_min) / (x_max - x_min) + 0.7, 4.0, 10.0)))
+    with styled():
+        figure = new_figure(9.0, float(np.clip(9.0 * (y_max - y_min) / (x_max - x_min) + 0.7, 4.0, 10.0)))
         draw_top_view(figure, World(plan.scene), plan.trajectory)
     return figure
 
 
-def _combined(plan: Plan) -> Figure:
-    with _style():
-        figure = _figure(14.0, 11.0)
+def _combined(plan: Judged) -> Figure:
+    with styled():
+        figure = new_figure(14.0, 11.0)
         parts: Any = figure.subfigures(2, 1, height_ratios=(1.15, 1.0))
         upper, lower = parts
         _draw_joints(upper, plan)
@@ -100,34 +96,14 @@ def _combined(plan: Plan) -> Figure:
     return figure
 
 
-def _style() -> Any:
-    import matplotlib
-
-    if in_notebook():
-        import matplotlib_inline.backend_inline  # noqa: F401 - a notebook shows figures once this has been imported
-    return matplotlib.rc_context(STYLE)
-
-
-def _figure(width: float, height: float) -> Figure:
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height), layout="constrained")
-
-
-def _save(figure: Figure, path: Path) -> None:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format=path.suffix.lower()[1:], dpi=130, facecolor="white")
-    write_atomically(path, buffer.getvalue())
-
-
-def _groups(plan: Plan) -> dict[str, list[int]]:
+def _groups(plan: Judged) -> dict[str, list[int]]:
     """Return the columns of the trajectory by what they belong to."""
     names, robot = plan.trajectory.names, plan.trajectory.robot_size
     groups = {"base": list(range(3)), "arm": list(range(3, robot)), "object": list(range(robot, len(names)))}
     return {name: columns for name, columns in groups.items() if columns}
 
 
-def _limit(plan: Plan, name: str) -> float:
+def _limit(plan: Judged, name: str) -> float:
     """Return a coordinate's velocity limit; infinite for the virtual joints of grasps, which have none."""
     robot, (owner, _, joint) = plan.scene.robot, name.partition(".")
     if name in robot.coordinates.names:
@@ -138,7 +114,7 @@ def _limit(plan: Plan, name: str) -> float:
     return float(placed.object.velocity[placed.object.coordinates.names.index(joint)])
 
 
-def _draw_joints(figure: FigureBase, plan: Plan) -> None:
+def _draw_joints(figure: FigureBase, plan: Judged) -> None:
     groups, trajectory = _groups(plan), plan.trajectory
     rows: Any = figure.subplots(len(groups), 2, sharex=True, squeeze=False)
     velocities = trajectory.velocities()
@@ -146,13 +122,13 @@ def _draw_joints(figure: FigureBase, plan: Plan) -> None:
     for (position, velocity), (group, columns) in zip(rows, groups.items(), strict=True):
         limits = []
         for k, column in enumerate(columns):
-            name, colour = trajectory.names[column], _COLOURS[k % len(_COLOURS)]
+            name, colour = trajectory.names[column], COLOURS[k % len(COLOURS)]
             position.plot(trajectory.times, trajectory.positions[:, column], color=colour, label=name.removesuffix("_joint"))
             velocity.stairs(velocities[:, column], trajectory.times, baseline=None, color=colour, linewidth=1.3)
             limits.append(_limit(plan, name))
         for limit in sorted(set(filter(np.isfinite, limits))):
             same = [k for k, other in enumerate(limits) if other == limit]
-            colour = _COLOURS[same[0] % len(_COLOURS)] if len(same) == 1 else "0.35"
+            colour = COLOURS[same[0] % len(COLOURS)] if len(same) == 1 else "0.35"
             for sign in (-1.0, 1.0):
                 velocity.axhline(sign * limit, color=colour, linestyle=(0, (5, 3)), linewidth=0.9)
         unit = units[group]
@@ -162,7 +138,7 @@ def _draw_joints(figure: FigureBase, plan: Plan) -> None:
         handles = [*position.get_legend_handles_labels()[0], *velocity.get_legend_handles_labels()[0][-1:]]
         velocity.legend(handles=handles, loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7.5)
     for axes in rows.ravel():
-        _shade_phases(axes, plan)
+        shade_phases(axes, plan.trajectory)
         axes.margins(x=0.0)
     for axes in rows[0]:
         _name_phases(axes, plan)
@@ -170,7 +146,7 @@ def _draw_joints(figure: FigureBase, plan: Plan) -> None:
         axes.set_xlabel("time [s]")
 
 
-def _draw_clearance(figure: FigureBase, plan: Plan) -> None:
+def _draw_clearance(figure: FigureBase, plan: Judged) -> None:
     from vkc_pin.clearance import clearance_curves
 
     axes, trajectory = figure.subplots(), plan.trajectory
@@ -180,7 +156,7 @@ def _draw_clearance(figure: FigureBase, plan: Plan) -> None:
     for k, curve in enumerate(clearance_curves(plan.scene, trajectory, times, dist_safe=safe)):
         distance, when, pair = curve.closest()
         touching = "grasps" in curve.name
-        colour = "0.6" if touching else _COLOURS[k % len(_COLOURS)]
+        colour = "0.6" if touching else COLOURS[k % len(COLOURS)]
         label = f"{curve.name}: {1e3 * distance:.0f} mm, {pair}, {when:.1f} s"
         style = ":" if touching else "-"
         axes.plot(curve.times, 1e3 * curve.distances, color=colour, linestyle=style, linewidth=1.5, label=label)
@@ -194,27 +170,15 @@ def _draw_clearance(figure: FigureBase, plan: Plan) -> None:
     axes.margins(x=0.0)
     axes.set_xlabel("time [s]")
     axes.set_ylabel("clearance [mm]")
-    _shade_phases(axes, plan)
+    shade_phases(axes, plan.trajectory)
     _name_phases(axes, plan)
     figure.legend(loc="outside lower center", fontsize=7.5, title="closest pairs", title_fontsize=8)
 
 
-def _edges(plan: Plan) -> Sequence[tuple[float, float, str]]:
-    times = plan.trajectory.times
-    return [(float(times[phase.first]), float(times[phase.last]), phase.name) for phase in plan.trajectory.phases]
-
-
-def _shade_phases(axes: Axes, plan: Plan) -> None:
-    for k, (first, last, _) in enumerate(_edges(plan)):
-        if k % 2:
-            axes.axvspan(first, last, color="0.5", alpha=0.10, linewidth=0.0, zorder=0)
-
-
-def _name_phases(axes: Axes, plan: Plan) -> None:
+def _name_phases(axes: Axes, plan: Judged) -> None:
     """Write the phases' names above, as far as they have room; on two levels, so that neighbours do not meet."""
-    start, end = plan.trajectory.times[0], plan.trajectory.times[-1]
-    for k, (first, last, name) in enumerate(_edges(plan)):
-        if last > first:
-            x = float(np.clip(((first + last) / 2.0 - start) / (end - start), 0.12, 0.88))
-            y = 1.02 + 0.09 * (k % 2)
-            axes.text(x, y, name, transform=axes.transAxes, ha="center", fontsize=7.5, color="0.35")
+    times = plan.trajectory.times
+    for k, phase in enumerate(plan.trajectory.phases):
+        middle = (times[phase.first] + times[phase.last]) / 2.0
+        x = float(np.clip((middle - times[0]) / (times[-1] - times[0]), 0.12, 0.88))
+        axes.text(x, 1.02 + 0.09 * (k % 2), phase.name, transform=axes.transAxes, ha="center", fontsize=7.5, color="0.35")

@@ -1,12 +1,17 @@
-"""Report: what a check found, each violated constraint by name, place and amount."""
+"""Report: what a check found, each violated constraint by name, place and amount; and what has one."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
-__all__ = ["Report", "Violation"]
+if TYPE_CHECKING:
+    from vkc_pin.options import Options
+    from vkc_pin.scene import Scene
+    from vkc_pin.trajectory import Trajectory
+
+__all__ = ["Judged", "Report", "Violation"]
 
 LISTED = 12  # violations that the text names; `violations` has them all
 
@@ -90,3 +95,44 @@ class Report:
         fields["violations"] = tuple(Violation(**v) for v in fields["violations"])
         fields["notes"] = tuple(fields["notes"])
         return cls(**fields)
+
+
+@runtime_checkable
+class Judged(Protocol):
+    """A motion in a scene that was checked, such as a `Plan`: what pictures show."""
+
+    @property
+    def scene(self) -> Scene:
+        """Where it happens."""
+
+    @property
+    def options(self) -> Options:
+        """What the check was told, such as the clearance asked for."""
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The motion."""
+
+    @property
+    def validation(self) -> Report:
+        """What the check says of it."""
+
+    @property
+    def status(self) -> str:
+        """`success`, or why not."""
+
+    @property
+    def success(self) -> bool:
+        """Whether it does what was asked for and nothing is violated."""
+
+    @property
+    def metrics(self) -> Mapping[str, float]:
+        """Efforts, times and distances by name, as far as they are known."""
+
+    @property
+    def seed(self) -> int:
+        """Of the random numbers it came from."""
+
+    @property
+    def initialization(self) -> str:
+        """Which seed trajectory it came from."""

@@ -18,17 +18,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
 
-__all__ = ["STYLE", "draw_top_view", "outline"]
+__all__ = ["draw_top_view", "outline"]
 
-STYLE: Any = {
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.alpha": 0.25,
-    "font.size": 9,
-    "legend.frameon": False,
-}
-"""matplotlib's parameters for all figures."""
 _STEP = 0.55  # [m] between two drawn footprints
 _ROBOT_HEIGHT = 1.8  # [m]: what hangs higher is drawn dashed
 _START, _END, _TOOL, _BASE = "#3a6bc4", "#1a9961", "#e03359", "#2b5f9e"

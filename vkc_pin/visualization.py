@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.notebook import in_notebook
-from vkc_pin.plan import Plan
+from vkc_pin.report import Judged
 from vkc_pin.scene import Scene
 from vkc_pin.writing import write_atomically
 
@@ -27,7 +27,7 @@ _server: tuple[subprocess.Popen[bytes], str, str] | None = None  # the process, 
 
 
 def show(
-    plan_or_scene: Plan | Scene,
+    plan_or_scene: Judged | Scene,
     *,
     open_browser: bool | None = None,
     height: int = 560,
@@ -69,7 +69,7 @@ def show(
     return viewer
 
 
-def animate(plan: Plan, viewer: meshcat.Visualizer | None = None) -> meshcat.Visualizer:
+def animate(plan: Judged, viewer: meshcat.Visualizer | None = None) -> meshcat.Visualizer:
     """Put a motion into a meshcat viewer, whose controls have play, pause and a time slider in seconds.
 
     Args:
@@ -90,7 +90,7 @@ def animate(plan: Plan, viewer: meshcat.Visualizer | None = None) -> meshcat.Vis
     return viewer
 
 
-def to_html(plan_or_scene: Plan | Scene, path: str | Path, *, frames: Mapping[str, pin.SE3] | None = None) -> Path:
+def to_html(plan_or_scene: Judged | Scene, path: str | Path, *, frames: Mapping[str, pin.SE3] | None = None) -> Path:
     """Write one self-contained web page with the motion, or the scene; it loads nothing from elsewhere.
 
     The page plays the motion, with a time slider in seconds; `page.html#t=3.5` shows it at 3.5 s.
@@ -145,17 +145,17 @@ def _start_server() -> tuple[subprocess.Popen[bytes], str, str]:
     return process, addresses[0], addresses[1]
 
 
-def _parts(plan_or_scene: Any) -> tuple[Scene, Plan | None]:
+def _parts(plan_or_scene: Any) -> tuple[Scene, Judged | None]:
     if isinstance(plan_or_scene, Scene):
         return plan_or_scene, None
-    if isinstance(plan_or_scene, Plan):
+    if isinstance(plan_or_scene, Judged):
         return plan_or_scene.scene, plan_or_scene
     got = type(plan_or_scene).__name__
     raise InputError("this cannot be shown", field="plan_or_scene", expected="a Plan or a Scene", got=got)
 
 
 def _draw(
-    viewer: Any, scene: Scene, plan: Plan | None, *, play: bool = True, frames: Mapping[str, pin.SE3] | None = None
+    viewer: Any, scene: Scene, plan: Judged | None, *, play: bool = True, frames: Mapping[str, pin.SE3] | None = None
 ) -> None:
     from vkc_pin.drawing import draw
 
@@ -165,7 +165,7 @@ def _draw(
         draw(viewer, scene, plan.trajectory, plan.validation, play=play, frames=frames)
 
 
-def _page(scene: Scene, plan: Plan | None, frames: Mapping[str, pin.SE3] | None = None) -> str:
+def _page(scene: Scene, plan: Judged | None, frames: Mapping[str, pin.SE3] | None = None) -> str:
     import meshcat
 
     from vkc_pin.page import Recorder, render_page
@@ -175,7 +175,7 @@ def _page(scene: Scene, plan: Plan | None, frames: Mapping[str, pin.SE3] | None 
     return render_page(recorder, title=f"{scene.name} – vkc_pin", film=_film(scene, plan))
 
 
-def _film(scene: Scene, plan: Plan | None) -> dict[str, Any]:
+def _film(scene: Scene, plan: Judged | None) -> dict[str, Any]:
     """Return what the page's bar shows; see `page.render_page`."""
     if plan is None:
         return {"duration": 0.0, "phases": [], "notes": [], "headline": scene.name}

@@ -10,7 +10,7 @@ import numpy as np
 
 from vkc_pin.benchmarks.tables import common, mean_and_deviation, quartiles, wilson
 from vkc_pin.plan import Plan
-from vkc_pin.plotting import _COLOURS, _figure, _save, _shade_phases, _style
+from vkc_pin.style import COLOURS, new_figure, save_figure, shade_phases, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -56,7 +56,7 @@ def success_chart(
     axes.set_ylim(0.0, 108.0)
     axes.set_yticks(range(0, 101, 20))
     if path is not None:
-        _save(figure, Path(path))
+        save_figure(figure, Path(path))
     return figure
 
 
@@ -111,7 +111,7 @@ def means_chart(
     (axes,) = figure.axes
     axes.set_ylim(0.0, 1.06 * axes.get_ylim()[1])
     if path is not None:
-        _save(figure, Path(path))
+        save_figure(figure, Path(path))
     return figure
 
 
@@ -141,8 +141,8 @@ def criteria_chart(
         ("arm_effort", "arm effort [rad]", shared, ".2f"),
         ("planning_time", "planning time [s]", "median and quartiles\nover all trials", ".2f"),
     )
-    with _style():
-        figure = _figure(11.0, 3.4)
+    with styled():
+        figure = new_figure(11.0, 3.4)
         for axes, (field, name, about, form) in zip(figure.subplots(1, len(panels)), panels, strict=True):
             for k, method in enumerate(methods):
                 own = [record for record in records if record["method"] == method]
@@ -151,7 +151,7 @@ def criteria_chart(
                 values = [float(record[field]) for record in own if record.get(field) is not None]
                 if values:
                     interval = _rate([value > 0.0 for value in values]) if field == "success" else quartiles(values)
-                    _bar(axes, k, interval, _COLOURS[k % len(_COLOURS)], f"{interval[1]:{form}}", width=0.7)
+                    _bar(axes, k, interval, COLOURS[k % len(COLOURS)], f"{interval[1]:{form}}", width=0.7)
             axes.set_xticks(range(len(methods)), methods)
             axes.set_xlim(-0.6, len(methods) - 0.4)
             axes.tick_params(axis="x", length=0.0)
@@ -162,7 +162,7 @@ def criteria_chart(
             axes.set_xlabel(about, fontsize=7.5, color="0.35")
         figure.suptitle(title, fontsize=10.5)
         if path is not None:
-            _save(figure, Path(path))
+            save_figure(figure, Path(path))
     return figure
 
 
@@ -179,20 +179,20 @@ def motions_chart(plans: Mapping[str, Plan], path: str | Path | None, *, title: 
     Returns:
         The figure.
     """
-    with _style():
-        figure = _figure(1.2 + 4.0 * len(plans), 7.0)
+    with styled():
+        figure = new_figure(1.2 + 4.0 * len(plans), 7.0)
         columns: Any = figure.subplots(3, len(plans), sharex=True, sharey="row", squeeze=False).T
         for (position, velocity, base), (name, plan) in zip(columns, plans.items(), strict=True):
             motion = plan.trajectory
             rates = motion.velocities()
             for k, joint in enumerate(range(3, motion.robot_size)):
-                colour, label = _COLOURS[k % len(_COLOURS)], motion.names[joint].removesuffix("_joint")
+                colour, label = COLOURS[k % len(COLOURS)], motion.names[joint].removesuffix("_joint")
                 position.plot(motion.times, motion.positions[:, joint], color=colour, label=label)
                 velocity.stairs(rates[:, joint], motion.times, baseline=None, color=colour, linewidth=1.2)
             for k, label in enumerate(_BASE):
-                base.stairs(rates[:, k], motion.times, baseline=None, color=_COLOURS[k], linewidth=1.2, label=label)
+                base.stairs(rates[:, k], motion.times, baseline=None, color=COLOURS[k], linewidth=1.2, label=label)
             for axes in (position, velocity, base):
-                _shade_phases(axes, plan)
+                shade_phases(axes, motion)
                 axes.margins(x=0.0)
             outcome = "" if plan.success else f", FAILED: {plan.status}"
             position.set_title(f"{name}{outcome} ({motion.times[-1] - motion.times[0]:.1f} s)", fontsize=9.5)
@@ -208,7 +208,7 @@ def motions_chart(plans: Mapping[str, Plan], path: str | Path | None, *, title: 
             axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7.5)
         figure.suptitle(title, fontsize=10.5)
         if path is not None:
-            _save(figure, Path(path))
+            save_figure(figure, Path(path))
     return figure
 
 
@@ -222,13 +222,13 @@ def _grouped(
     title: str,
 ) -> Figure:
     """Draw bars grouped by scene, one for each method: `bar` returns lower end, height and upper end, or None for no bar."""
-    with _style():
-        figure = _figure(max(6.0, 1.0 + 0.5 * len(scenes) * (len(methods) + 1)), 3.8)
+    with styled():
+        figure = new_figure(max(6.0, 1.0 + 0.5 * len(scenes) * (len(methods) + 1)), 3.8)
         axes = figure.subplots()
         width = _WIDTH / len(methods)
         for k, method in enumerate(methods):
             places = np.arange(len(scenes)) + (k - (len(methods) - 1) / 2.0) * width
-            colour = _COLOURS[k % len(_COLOURS)]
+            colour = COLOURS[k % len(COLOURS)]
             for place, scene in zip(places, scenes, strict=True):
                 interval = bar(scene, method)
                 if interval is not None:

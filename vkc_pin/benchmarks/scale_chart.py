@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vkc_pin.benchmarks.tables import TIMES, quartiles
-from vkc_pin.plotting import _COLOURS, _figure, _save, _style
+from vkc_pin.style import COLOURS, new_figure, save_figure, styled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -38,10 +38,10 @@ def scale_chart(records: Sequence[Mapping[str, Any]], path: str | Path | None, *
 
     low, middle, high = np.array([quartiles([record["planning_time"] for record in own]) for own in rows]).reshape(-1, 3).T
     parts = {name: medians(field) for field, name in TIMES.items()} | {"setting up": medians("planning_time", *TIMES)}
-    with _style():
-        figure = _figure(6.4, 4.0)
+    with styled():
+        figure = new_figure(6.4, 4.0)
         axes = figure.subplots()
-        colours = [*_COLOURS[: len(TIMES)], "0.7"]
+        colours = [*COLOURS[: len(TIMES)], "0.7"]
         axes.stackplot(counts, *parts.values(), labels=[*parts], colors=colours, alpha=0.55)
         error = [middle - low, high - middle]
         axes.errorbar(counts, middle, error, color="0.15", marker="o", markersize=4.0, capsize=2.5, label="planning time")
@@ -56,5 +56,5 @@ def scale_chart(records: Sequence[Mapping[str, Any]], path: str | Path | None, *
         axes.set_title(title, fontsize=10)
         figure.legend(loc="outside right upper")
         if path is not None:
-            _save(figure, Path(path))
+            save_figure(figure, Path(path))
     return figure

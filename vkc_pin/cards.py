@@ -1,26 +1,31 @@
-"""What a notebook shows of a scene that is a cell's value: a headline, a small table, and a picture from above."""
+"""What a notebook shows of a scene or a plan that is a cell's value: a headline, a small table, and a picture from above."""
 
 from __future__ import annotations
 
 import base64
 import io
+from collections.abc import Mapping
 from html import escape
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
 
-from vkc_pin.top_view import STYLE, draw_top_view
+from vkc_pin.notebook import card
+from vkc_pin.report import Judged
+from vkc_pin.scene import Scene
+from vkc_pin.style import STYLE
+from vkc_pin.top_view import draw_top_view
+from vkc_pin.trajectory import Trajectory
 from vkc_pin.world import World
 
-if TYPE_CHECKING:
-    from vkc_pin.scene import Scene
-    from vkc_pin.trajectory import Trajectory
-
-__all__ = ["card", "picture", "scene_html", "table"]
+__all__ = ["motion_html", "scene_html"]
 
 _SIDE, _DPI, _COLOURS = 4.4, 72, 96  # [inch] of the picture's longer side, its resolution, and its colours
+_LISTED = 6  # violations and notes that are shown; the report has them all
+_GOOD, _BAD = "#1a7f37", "#c62828"
 
 
+@card.register(Scene)
 def scene_html(scene: Scene) -> str:
     """Return a scene's overview as HTML: what there is in it, and a picture from above."""
     objects = []
@@ -37,10 +42,33 @@ def scene_html(scene: Scene) -> str:
         ("objects", escape(", ".join(objects) or "none")),
         ("obstacles", str(len(scene.obstacle_names))),
     ]
-    return card(f"<b>{escape(scene.name)}</b>{table(rows)}", picture(scene, None, "the scene from above"))
+    return _beside(f"<b>{escape(scene.name)}</b>{_table(rows)}", _picture(scene, None, "the scene from above"))
 
 
-def table(rows: list[tuple[str, str]]) -> str:
+def motion_html(plan: Judged) -> str:
+    """Return what came out of planning as HTML, and the motion from above; it needs no screen, and nothing from elsewhere."""
+    m = plan.metrics
+    good = plan.success
+    status = "success" if good else f"FAILED, {plan.status}"
+    head = f'<b>{escape(plan.scene.name)}: <span style="color: {_GOOD if good else _BAD}">{escape(status)}</span></b>'
+    phases = escape(", ".join(phase.name for phase in plan.trajectory.phases))
+    rows = [
+        ("base", _value(m, "base_effort", "m", 2)),
+        ("arm", _value(m, "arm_effort", "rad", 2)),
+        ("clearance", _value(m, "clearance", "mm", 1, 1e3)),
+        ("duration", _value(m, "duration", "s", 1)),
+        ("planned in", _value(m, "planning_time", "s", 2)),
+        ("seed", escape(f"{plan.initialization or 'unknown'}, random numbers {plan.seed}")),
+    ]
+    found = [str(violation) for violation in plan.validation.violations] + list(plan.validation.notes)
+    lines = [*found[:_LISTED], *([f"... and {len(found) - _LISTED} more"] if len(found) > _LISTED else [])]
+    listed = "".join(f"<li>{escape(line)}</li>" for line in lines)
+    problems = f'<ul style="color: {_BAD}; margin: 4px 0">{listed}</ul>' if lines else ""
+    view = _picture(plan.scene, plan.trajectory, "the motion from above")
+    return _beside(f"{head}<div>{phases}</div>{_table(rows)}{problems}", view)
+
+
+def _table(rows: list[tuple[str, str]]) -> str:
     """Return a table; the values are HTML."""
     cell = "text-align: left; padding: 1px 10px 1px 0; background: none"
     body = "".join(
@@ -50,13 +78,13 @@ def table(rows: list[tuple[str, str]]) -> str:
     return f'<table style="border: none; margin: 6px 0">{body}</table>'
 
 
-def card(text: str, picture: str) -> str:
+def _beside(text: str, picture: str) -> str:
     """Return HTML of a text and, beside it where there is room, a picture."""
     style = "display: flex; flex-wrap: wrap; gap: 16px; align-items: flex-start"
     return f'<div style="{style}"><div style="max-width: 34em">{text}</div>{picture}</div>'
 
 
-def picture(scene: Scene, trajectory: Trajectory | None, title: str) -> str:
+def _picture(scene: Scene, trajectory: Trajectory | None, title: str) -> str:
     """Return a picture from above; made without pyplot, so that nothing is kept open and no backend is chosen."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -76,3 +104,8 @@ def picture(scene: Scene, trajectory: Trajectory | None, title: str) -> str:
     pixels.quantize(_COLOURS, dither=Image.Dither.NONE).save(buffer, format="png", optimize=True)
     data = base64.b64encode(buffer.getvalue()).decode("ascii")
     return f'<img alt="{escape(title)}" style="max-width: 100%" src="data:image/png;base64,{data}">'
+
+
+def _value(metrics: Mapping[str, float], name: str, unit: str, digits: int, factor: float = 1.0) -> str:
+    value = metrics.get(name)
+    return f"{factor * value:.{digits}f} {unit}" if value is not None and np.isfinite(value) else "–"

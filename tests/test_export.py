@@ -78,6 +78,13 @@ def test_ros_is_exact_to_a_nanosecond(trajectory: Trajectory) -> None:
     assert {**back.to_dict(), "times": 0} == {**trajectory.to_dict(), "times": 0}
 
 
+@pytest.mark.parametrize("name", ["a\rb", "\n", "\r\n", 'a "quoted", name'])
+def test_names_with_line_ends_come_back(name: str, tmp_path: Path) -> None:
+    phase = PhaseSpan(name, 0, 1, {name: name}, {name: name})
+    trajectory = Trajectory(ROBOT[:3], np.arange(2.0), np.zeros((2, 3)), (phase,), 3)
+    assert same(Trajectory.from_csv(trajectory.to_csv(tmp_path / "motion.csv")), trajectory)
+
+
 def test_a_plan_comes_back(plan: Plan, tmp_path: Path) -> None:
     assert same(Trajectory.from_csv(plan.to_csv(tmp_path / "door.csv")), plan.trajectory)
     assert same(Trajectory.from_json(plan.to_json(tmp_path / "door.json")), plan.trajectory)

@@ -13,6 +13,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 from vkc_pin.errors import InputError, UnknownNameError
@@ -55,8 +56,8 @@ def write_csv(
     columns, phases = chosen_columns(motion, joints), motion["phases"]
     x, y, yaw = motion["names"][:3]
     known = {x: "m", y: "m", yaw: "rad", **({} if units is None else units)}
-    buffer = io.StringIO()
-    table = csv.writer(buffer, lineterminator="\n")
+    lines: list[str] = []
+    table = csv.writer(SimpleNamespace(write=lines.append))  # its lines end with "\r\n", so it puts either of them in quotes
     names = [motion["names"][k] for k in columns]
     table.writerow([f"{_TIME} [s]", *(f"{name} [{known[name]}]" if name in known else name for name in names), *_PHASES])
     number = 0
@@ -66,7 +67,7 @@ def write_csv(
         held = {name: [at, phase["by"][name]] if name in phase["by"] else at for name, at in phase["held"].items()}
         values = [repr(float(row[column])) for column in columns]
         table.writerow([repr(float(moment)), *values, number + 1, phase["name"], json.dumps(held)])
-    return write_atomically(path, buffer.getvalue().encode("utf-8"))
+    return write_atomically(path, "".join(line.removesuffix("\r\n") + "\n" for line in lines).encode("utf-8"))
 
 
 def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from vkc_pin.diagnosis import explain, impossible
 from vkc_pin.goal import compile_task
 from vkc_pin.initialization import HOPELESS, Seed, initialize
-from vkc_pin.monitor import Interrupt, interruptible
+from vkc_pin.interrupt import Interrupt, interruptible
 from vkc_pin.options import Options
 from vkc_pin.pieces import Piece
 from vkc_pin.plan import Plan

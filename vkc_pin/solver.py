@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vkc_pin.contact import Contacts
-from vkc_pin.monitor import Interrupt, interruptible
+from vkc_pin.interrupt import Interrupt, interruptible
 from vkc_pin.pose import ROW_BOUNDS
 from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.refinement import collisions_between, merge

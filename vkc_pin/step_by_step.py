@@ -10,7 +10,7 @@ import numpy as np
 
 from vkc_pin.goal import compile_task
 from vkc_pin.hold import as_mappings
-from vkc_pin.monitor import interruptible
+from vkc_pin.interrupt import interruptible
 from vkc_pin.one_problem import OneProblem, Settings
 from vkc_pin.plan import Plan
 from vkc_pin.scene import Scene

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vkc_pin.contact import ContactModel
 from vkc_pin.problem import TrajectoryProblem
 
 __all__ = ["Plane", "patterns", "planes", "sizes"]
@@ -21,6 +22,7 @@ class Plane:
 
     Attributes:
         problem: The program.
+        contacts: What can collide with what along the motion that the plane belongs to.
         waypoint: Counted from 1.
         names: The two links or obstacles.
         pair: Their geometries, shape (2,).
@@ -31,6 +33,7 @@ class Plane:
     """
 
     problem: TrajectoryProblem
+    contacts: ContactModel
     waypoint: int
     names: tuple[str, str]
     pair: NDArray[np.int_]
@@ -49,7 +52,7 @@ class Plane:
     def distances(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the pair's distance from coal, shape (W,) [m], at z, shape (W, n); NaN where it is far from this one."""
         reach = max(self.distance, 0.0) + _FURTHER
-        found = self.problem.contacts.evaluate(z, np.full(len(z), self.waypoint), reach=reach)
+        found = self.contacts.evaluate(z, np.full(len(z), self.waypoint), reach=reach)
         mine, distances = (found.pair == self.pair).all(axis=1), np.full(len(z), np.nan)
         distances[found.waypoint[mine]] = found.distance[mine]
         return distances
@@ -64,8 +67,10 @@ def planes(problem: TrajectoryProblem, z: NDArray[np.float64], waypoint: int) ->
         waypoint: Counted from 1.
     """
     t, labels = problem.transcription, problem.contacts.phases[problem.contacts.phase_of(waypoint)].labels
-    contacts = problem.evaluate_contacts(z, reach=problem.options.contact_reach, nearest=t.slots)
-    coefficients, offsets = problem.contacts.planes(z, contacts, slots=t.slots)
+    model = problem.contacts.settled(z)
+    waypoints = np.arange(1, problem.segments + 1)
+    contacts = model.evaluate(z, waypoints, reach=problem.options.contact_reach, nearest=t.slots)
+    coefficients, offsets = model.planes(z, contacts, slots=t.slots)
     x = np.column_stack([z, np.zeros(len(z))]).ravel()
     parameters = t.parameter_vector(problem.start, coefficients, offsets, problem.target_matrix(), problem.options.penalty)
     _, jacobian = t.rows_at(x, parameters)
@@ -73,6 +78,7 @@ def planes(problem: TrajectoryProblem, z: NDArray[np.float64], waypoint: int) ->
     return [
         Plane(
             problem=problem,
+            contacts=model,
             waypoint=waypoint,
             names=(labels[contacts.pair[k, 0]], labels[contacts.pair[k, 1]]),
             pair=contacts.pair[k],

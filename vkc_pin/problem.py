@@ -225,8 +225,7 @@ class TrajectoryProblem:
 
     def evaluate_contacts(self, z: NDArray[np.float64], *, reach: float, nearest: int | None = None) -> Contacts:
         """Return the pairs closer than `reach` [m] at z_1..z_N, shape (N, n); at most `nearest` a waypoint."""
-        self.contacts.settle(z)
-        return self.contacts.evaluate(z, np.arange(1, self.segments + 1), reach=reach, nearest=nearest)
+        return self.contacts.settled(z).evaluate(z, np.arange(1, self.segments + 1), reach=reach, nearest=nearest)
 
     def rates(self, z: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the steps δz, shape (N, n), and their differences δδz, shape (N + 1 + rests, n); see `Transcription`."""

@@ -10,7 +10,7 @@ import pinocchio as pin
 from vkc_pin.hold import Hold
 from vkc_pin.steps import Step
 
-__all__ = ["FrameGoal", "Phase", "Task"]
+__all__ = ["FrameGoal", "Phase", "Task", "stretches"]
 
 
 @dataclass(frozen=True)
@@ -95,3 +95,8 @@ class Task:
     def segments(self) -> int:
         """Steps of time of the whole task; it has one waypoint more."""
         return sum(phase.segments for phase in self.phases)
+
+
+def stretches(task: Task) -> list[tuple[str, tuple[str, ...]]]:
+    """Return the phases' names and the objects that are held in them."""
+    return [(phase.name, tuple(hold.object for hold in phase.held)) for phase in task.phases]

@@ -72,7 +72,8 @@ def planes(problem: TrajectoryProblem, z: NDArray[np.float64], waypoint: int) ->
     contacts = model.evaluate(z, waypoints, reach=problem.options.contact_reach, nearest=t.slots)
     coefficients, offsets = model.planes(z, contacts, slots=t.slots)
     x = np.column_stack([z, np.zeros(len(z))]).ravel()
-    parameters = t.parameter_vector(problem.start, coefficients, offsets, problem.target_matrix(), problem.options.penalty)
+    dt, targets = problem.timing_for(z).dt, problem.target_matrix()
+    parameters = t.parameter_vector(problem.start, coefficients, offsets, targets, problem.options.penalty, dt)
     _, jacobian = t.rows_at(x, parameters)
     columns = (waypoint - 1) * (t.n + 1) + np.arange(t.n)
     return [
@@ -97,20 +98,22 @@ def sizes(problem: TrajectoryProblem) -> dict[str, int]:
 
     The rows of velocity and acceleration are not among those of the program unless it turns out to need them.
     """
-    t = problem.transcription
+    t, (first, second) = problem.transcription, problem.rates(problem.still)
     fixed = int((problem.lower == problem.upper).sum())
     found = {
         "variables: coordinates": problem.lower.size - fixed,
         "variables: coordinates, fixed by bounds": fixed,
         "variables: slacks": t.segments,
     }
-    for name, at in zip(problem.pose_names, t.pose_rows, strict=True):
-        found[f"rows: {name}"] = sum(len(rows) for rows in at.values())
+    for goal, at in zip(problem.pose_goals, t.pose_rows, strict=True):
+        kind = f"rows: {goal.name}"
+        found[kind] = found.get(kind, 0) + sum(len(rows) for rows in at.values())
     found["rows: witness planes"] = t.slot_rows.size
     found["rows: rolling"] = len(t.base_rows)
-    found["rows: clamped freedoms"] = t.rows - sum(size for kind, size in found.items() if kind.startswith("rows"))
-    found["only if needed: velocities"] = problem.velocity.size
-    found["only if needed: accelerations"] = problem.acceleration.size
+    found["rows: clamped freedoms"] = sum(last - first for _, first, last in t.structure.clamped)
+    found["rows: own constraints"] = len(problem.term_numbers.rows)
+    found["only if needed: velocities"] = first.size
+    found["only if needed: accelerations"] = second.size
     return found
 
 

@@ -137,7 +137,7 @@ class OneProblem:
 
     def piece(self) -> Piece:
         """Return the best waypoints, once `run` has ended, for problems of more phases to start from."""
-        phases = tuple(phase.name for phase in self.task.phases)
+        phases = tuple(phase.key for phase in self.task.phases)
         path, ends = self.problem.waypoints(self.z), [0, *self.problem.ends.tolist()]
         waypoints = tuple(path[first : last + 1] for first, last in itertools.pairwise(ends))
         return Piece(phases, self.problem.chain.names, waypoints, self.initialization)

@@ -237,7 +237,7 @@ class Attempt:
         base: list[NDArray[np.float64]] = []
         now = problem.start[:3]
         for phase in problem.task.phases:
-            if phase.name.startswith("move"):
+            if phase.kind == "move":
                 way = ways.way(now, goal, phase.segments)
                 if way is None:
                     return None

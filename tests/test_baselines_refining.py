@@ -16,7 +16,6 @@ from vkc_pin.baselines import refining as module
 from vkc_pin.baselines.arm_kinematics import ArmKinematics
 from vkc_pin.baselines.base_poses import base_poses
 from vkc_pin.baselines.refining import refined
-from vkc_pin.clearing import distance_gradients
 from vkc_pin.knots import Knots
 
 HALF, ROUNDING = 4, 1e-6  # a waypoint; [m]
@@ -175,7 +174,7 @@ def test_gradients_are_those_of_coals_distances(held: bool) -> None:
 
     apart = distances(z)
     np.testing.assert_allclose(contacts.distance, apart, atol=1e-6)
-    gradients = distance_gradients(problem, z, contacts)
+    gradients = problem.contacts.gradients(z, contacts)
     assert gradients.shape == (len(apart), chain.size)
     assert len(apart) > 40
     numeric = np.empty_like(gradients)

@@ -301,9 +301,10 @@ def test_of_several_places_the_one_that_came_furthest_counts(
     def done(self: attempt.Attempt, steps: Any, cause: str, works: bool) -> None:
         problem = self._problem(steps)
         z = problem.start + np.arange(1, problem.segments + 1)[:, None] * np.eye(problem.chain.size)[0] * 1e-3
+        dt = problem.timing_for(z).dt
         if not works:
-            raise attempt.FailedError(cause, as_trajectory(problem, z))
-        self._take(problem, z)
+            raise attempt.FailedError(cause, as_trajectory(problem, z, dt))
+        self._take(problem, z, dt)
 
     def driven(self: attempt.Attempt, pose: np.ndarray) -> None:
         done(self, [vkc.GoTo(0.0, 0.0)], "no base path", next(drive) == "d")
@@ -397,7 +398,8 @@ def test_ctrl_c_ends_it(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def pressed(*arguments: Any, **_: Any) -> Solution:
         calls.append(stage)
         if stage == "solve":  # which notes it
-            return Solution(np.tile(arguments[0].start, (arguments[0].segments, 1)), status="interrupted")
+            still = arguments[0].still
+            return Solution(still, arguments[0].timing_for(still).dt, status="interrupted")
         raise KeyboardInterrupt
 
     monkeypatch.setattr(attempt, stage, pressed)

@@ -11,7 +11,7 @@ from small_problems import door_scene
 
 import vkc_pin as vkc
 from vkc_pin import clearing
-from vkc_pin.clearing import clear_out, point_jacobians
+from vkc_pin.clearing import clear_out
 from vkc_pin.knots import Knots, Known
 
 
@@ -38,7 +38,7 @@ def test_points_move_as_finite_differences_say(seed: int) -> None:
             found[k] = data.oMi[int(joint)].act(local[k])
         return found
 
-    jacobian = point_jacobians(chain, z, which, joints, points(z))
+    jacobian = chain.point_jacobians(z, which, joints, points(z))
     assert jacobian.shape == (len(joints), 3, chain.size)
     for column in range(chain.size):
         change = np.zeros_like(z)

@@ -120,13 +120,13 @@ def test_what_is_let_go_of_somewhere_stands_there(seed: int) -> None:
     names = [phase.name for phase in problem.task.phases]
     assert names[3:] == ["go to", "place stick", "go to"]
     z = random_configurations(problem.chain.lower, problem.chain.upper, problem.segments, np.random.default_rng(seed))
-    problem.evaluate_contacts(z, reach=0.1)
+    contacts = problem.contacts.settled(z)
     left = {"ball": (problem.ends[2], (3, 4, 5)), "stick": (problem.ends[4], (5,))}
     for name, (end, later) in left.items():
         where = expected_placement(problem, name, z[end - 1])
         there = standing_geometry(dataclasses.replace(scene().objects[name], placement=where))
         for number in later:
-            part = problem.contacts.phases[number]
+            part = contacts.phases[number]
             index = {str(shape.name): i for i, shape in enumerate(part.shapes) if part.joint[i] == 0}
             for shape in there:
                 i = index[f"{name}.{shape.name}"]
@@ -134,6 +134,19 @@ def test_what_is_let_go_of_somewhere_stands_there(seed: int) -> None:
                 np.testing.assert_allclose(part.shapes[i].placement.homogeneous, expected, rtol=0.0, atol=1e-9)
                 np.testing.assert_allclose(part.rotation[i], expected[:3, :3], rtol=0.0, atol=1e-9)
                 np.testing.assert_allclose(part.translation[i], expected[:3, 3], rtol=0.0, atol=1e-9)
+
+
+def test_it_stands_where_the_task_says_until_a_motion_is_asked_about() -> None:
+    """And afterwards again: no answer depends on which motion was asked about before."""
+    problem = fetching()
+    z = random_configurations(problem.chain.lower, problem.chain.upper, problem.segments, np.random.default_rng(4))
+    waypoints = np.arange(1, problem.segments + 1)
+    before = problem.contacts.evaluate(z, waypoints, reach=0.3)
+    settled = problem.evaluate_contacts(z, reach=0.3)
+    after = problem.contacts.evaluate(z, waypoints, reach=0.3)
+    assert len(before.pair) != len(settled.pair) or not np.array_equal(before.distance, settled.distance)
+    for one, other in zip(before.arrays(), after.arrays(), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_it_stands_where_the_motion_that_is_asked_about_leaves_it() -> None:

@@ -240,3 +240,13 @@ def test_an_object_without_attachments() -> None:
     bare = dataclasses.replace(placed, object=dataclasses.replace(placed.object, attachments={}))
     with pytest.raises(InputError, match="no attachment"):
         phases([Grasp("door")], dataclasses.replace(door_scene(), objects={"door": bare}))
+
+
+def test_phases_are_told_apart_by_what_happens_to_what() -> None:
+    """However they are called."""
+    assert [phase.key for phase in phases([OPEN, GoTo(0.0, 0.0)]).phases] == [
+        ("grasp", ("door", "handle", "")),
+        ("turn", ("door.knob",)),
+        ("move", ("door.hinge", "door.knob")),
+        ("go", ()),
+    ]

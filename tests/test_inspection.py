@@ -1,7 +1,10 @@
 from __future__ import annotations
 
+import casadi as ca
 import numpy as np
 import pytest
+from carrying import room, stand
+from small_problems import SHORT
 
 import vkc_pin as vkc
 from vkc_pin.inspection import patterns, planes, sizes
@@ -28,7 +31,32 @@ def test_sizes_add_up(problem: TrajectoryProblem) -> None:
     assert sum(size for kind, size in found.items() if kind.startswith("only")) == t.rate_matrix.size1()
     assert found["rows: witness planes"] == problem.segments * problem.options.contact_slots
     assert found["rows: closure door"] % 7 == 0
-    assert found["rows: rolling"] == found["rows: clamped freedoms"] == 0
+    assert found["rows: rolling"] == found["rows: clamped freedoms"] == found["rows: own constraints"] == 0
+
+
+def test_rows_of_own_constraints_are_told_from_clamped_freedoms() -> None:
+    """And rows of goals of one name are added up."""
+    low = vkc.Constraint("low", lambda s: s.coordinate("base_x"), upper=5.0, during=["go to"])
+    pose = vkc.build(room(stand()), [vkc.Grasp("stick")], options=SHORT).targets[0]
+    steps = [vkc.Grasp("stick"), vkc.GoTo(0.0, 0.0), vkc.Reach(pose), vkc.Reach(pose)]
+    problem = vkc.build(room(stand()), steps, options=SHORT, terms=[low])
+    found, t = sizes(problem), problem.transcription
+    assert found["rows: own constraints"] == SHORT.reach_waypoints
+    (goal,) = (name for name in found if name.startswith("rows: goal"))
+    assert found[goal] == 2 * 7
+    firm = [size for kind, size in found.items() if kind == "rows: clamped freedoms"]
+    assert firm == [sum(last - first for _, first, last in t.structure.clamped)]
+    assert sum(size for kind, size in found.items() if kind.startswith("rows")) == t.rows
+
+
+def test_planes_of_a_program_with_a_speed_are_those_without(z: np.ndarray) -> None:
+    """The time of the steps is one of its parameters."""
+    steps = [vkc.Actuate("door", {"hinge": 1.2})]
+    slow = vkc.Constraint("slow", lambda s: ca.norm_2(s.velocity("tool")) ** 2, upper=4.0)
+    plain, timed = (vkc.build(vkc.load_scene("door"), steps, terms=terms) for terms in ([], [slow]))
+    for one, other in zip(planes(plain, z, 60), planes(timed, z, 60), strict=True):
+        assert one.names == other.names
+        np.testing.assert_allclose(one.gradient, other.gradient, atol=1e-9)
 
 
 def test_patterns_have_the_entries_that_numbers_show(problem: TrajectoryProblem, z: np.ndarray) -> None:

@@ -10,7 +10,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from vkc_pin.monitor import Monitor, interruptible
+from vkc_pin.deadline import Monitor
+from vkc_pin.interrupt import interruptible
 
 
 @pytest.fixture(autouse=True)

@@ -49,6 +49,10 @@ def random_path(problem: TrajectoryProblem, seed: int = 0, scale: float = 1.0) -
     return problem.start + scale * (far - problem.start)
 
 
+def names_of(problem: TrajectoryProblem) -> list[str]:
+    return [goal.name for goal in problem.pose_goals]
+
+
 # --- bounds ---------------------------------------------------------------------------------------------------------
 
 
@@ -171,17 +175,17 @@ def test_clip_and_waypoints(opened: TrajectoryProblem) -> None:
 
 def test_closure_holds_from_the_grasp_to_the_end_of_the_hold(opened: TrajectoryProblem) -> None:
     reach, _, move, _ = opened.ends.tolist()
-    assert opened.pose_names == ["closure door", "approach door.handle"]
+    assert names_of(opened) == ["closure door", "approach door.handle"]
     pose, _ = opened.transcription.structure.poses
     assert pose.waypoints == tuple(range(reach, move + 1))
     closure = opened.chain.closures[HANDLE]
     assert (pose.joint, pose.local) == (closure.joint, closure.local)
-    assert opened.targets == [opened.scene.objects["door"].placement] * 2
+    assert opened.targets == (opened.scene.objects["door"].placement,) * 2
 
 
 def test_every_object_is_closed_while_it_is_held_and_goals_are_met_at_the_end(two_grasps: TrajectoryProblem) -> None:
     first, second, third, fourth = two_grasps.ends.tolist()
-    at = dict(zip(two_grasps.pose_names, (p.waypoints for p in two_grasps.transcription.structure.poses), strict=True))
+    at = dict(zip(names_of(two_grasps), (p.waypoints for p in two_grasps.transcription.structure.poses), strict=True))
     way = SHORT.approach_waypoints
     assert at == {
         "approach cabinet.ball": (first - way,),
@@ -190,7 +194,7 @@ def test_every_object_is_closed_while_it_is_held_and_goals_are_met_at_the_end(tw
         "closure drawer": tuple(range(second, third + 1)),
         f"goal {two_grasps.scene.robot.tool_frame}": (fourth,),
     }
-    targets = dict(zip(two_grasps.pose_names, two_grasps.targets, strict=True))
+    targets = dict(zip(names_of(two_grasps), two_grasps.targets, strict=True))
     assert targets["closure cabinet"] == two_grasps.scene.objects["cabinet"].placement
     assert targets["closure drawer"] == two_grasps.scene.objects["drawer"].placement
     assert two_grasps.targets[-1] == POSE
@@ -210,7 +214,7 @@ def test_a_frame_of_the_robot_can_reach_too() -> None:
     problem = build(door_scene(), [Reach(POSE, frame="forearm_link")], options=SHORT)
     frame = problem.chain.model.frames[problem.chain.model.getFrameId("forearm_link")]
     (pose,) = problem.transcription.structure.poses
-    assert (problem.pose_names, pose.joint, pose.waypoints) == (["goal forearm_link"], frame.parentJoint, (REACH,))
+    assert (names_of(problem), pose.joint, pose.waypoints) == (["goal forearm_link"], frame.parentJoint, (REACH,))
     assert pose.local == frame.placement
 
 
@@ -263,7 +267,7 @@ def tool(problem: TrajectoryProblem, row: np.ndarray) -> pin.SE3:
 def test_a_hand_comes_straight_to_what_it_grasps(step: Step, scene) -> None:  # type: ignore[no-untyped-def]
     """Some waypoints before, the pose holds exactly where the tool is `approach` behind the grasp, wherever in it that is."""
     problem = build(scene(), [step], options=SHORT)
-    number = next(k for k, name in enumerate(problem.pose_names) if name.startswith("approach "))
+    number = next(k for k, name in enumerate(names_of(problem)) if name.startswith("approach "))
     pose, solver, target = (
         part[number] for part in (problem.transcription.structure.poses, problem.transcription.pose_solvers, problem.targets)
     )
@@ -301,7 +305,7 @@ def test_free_objects_are_grasped_where_they_stand_and_closed_nowhere_else() -> 
     steps = [Touch("stick.tip", (0.8, 0.9, 0.7)), Place("stick", aside), GoTo(0.0, 0.0), Grasp("stick")]
     problem = build(room(table()), steps, options=SHORT)
     ends = problem.ends.tolist()
-    at = list(zip(problem.pose_names, problem.targets, problem.transcription.structure.poses, strict=True))
+    at = list(zip(names_of(problem), problem.targets, problem.transcription.structure.poses, strict=True))
     found = [(name, target, pose.waypoints, pose.kind) for name, target, pose in at]
     way = SHORT.approach_waypoints
     point = pin.SE3(np.eye(3), np.array([0.8, 0.9, 0.7]))
@@ -340,7 +344,7 @@ def test_a_loose_grasp_is_not_clamped() -> None:
 
 def test_what_is_held_through_something_is_closed_by_its_holder(fetching: TrajectoryProblem) -> None:
     """The pose of the grasp is that of the tip, and the goal that of the ball on it."""
-    poses = dict(zip(fetching.pose_names, fetching.transcription.structure.poses, strict=True))
+    poses = dict(zip(names_of(fetching), fetching.transcription.structure.poses, strict=True))
     assert list(poses) == ["grasp ball.pull by stick.tip", "approach ball.pull by stick.tip", "goal ball.ball"]
     assert poses["goal ball.ball"].kind == "upright"
     (row,) = random_configurations(fetching.chain.lower, fetching.chain.upper, 1, np.random.default_rng(0))
@@ -359,7 +363,7 @@ def test_what_is_held_through_something_is_closed_by_its_holder(fetching: Trajec
 def test_rates_are_those_of_the_trajectory(two_grasps: TrajectoryProblem) -> None:
     """As the trajectory is played, with the pauses in which a gripper closes; where a hand holds nothing, its choice is moot."""
     z, dt = random_path(two_grasps), SHORT.dt
-    trajectory = as_trajectory(two_grasps, z)
+    trajectory = as_trajectory(two_grasps, z, np.full(two_grasps.segments, dt))
     steps, changes = two_grasps.rates(z)
     assert steps.shape == (two_grasps.segments, two_grasps.chain.size)
     assert changes.shape == (two_grasps.segments + 1 + len(two_grasps.transcription.structure.rests), two_grasps.chain.size)
@@ -385,19 +389,22 @@ def test_bounds_on_rates_are_the_limits(two_grasps: TrajectoryProblem) -> None:
     """One row for each row of rates."""
     p = two_grasps
     steps, changes = p.rates(random_path(p))
-    np.testing.assert_array_equal(p.dt, np.full(p.segments, SHORT.dt))
-    np.testing.assert_allclose(p.velocity, np.tile(p.chain.velocity * SHORT.dt, (len(steps), 1)))
-    np.testing.assert_allclose(p.acceleration, np.tile(p.chain.acceleration * SHORT.dt**2, (len(changes), 1)))
-    assert np.all(p.velocity > 0)
+    timing = p.timing_for(p.still)
+    np.testing.assert_array_equal(timing.dt, np.full(p.segments, SHORT.dt))
+    np.testing.assert_allclose(timing.velocity, np.tile(p.chain.velocity * SHORT.dt, (len(steps), 1)))
+    np.testing.assert_allclose(timing.acceleration, np.tile(p.chain.acceleration * SHORT.dt**2, (len(changes), 1)))
+    assert np.all(timing.velocity > 0)
 
 
 @pytest.mark.parametrize("scale", [0.01, 0.5, 3.0])
 def test_rate_violation_is_the_worst_excess(two_grasps: TrajectoryProblem, scale: float) -> None:
     z = random_path(two_grasps, scale=scale)
-    trajectory = as_trajectory(two_grasps, z)
+    timing = two_grasps.timing_for(two_grasps.still)
+    trajectory = as_trajectory(two_grasps, z, timing.dt)
     velocity = np.abs(trajectory.velocities()) / two_grasps.chain.velocity
     acceleration = np.abs(trajectory.accelerations()) / two_grasps.chain.acceleration
-    assert two_grasps.rate_violation(z) == pytest.approx(max(velocity.max(), acceleration.max()) - 1.0, rel=1e-9)
+    expected = max(velocity.max(), acceleration.max()) - 1.0
+    assert timing.violation(*two_grasps.rates(z)) == pytest.approx(expected, rel=1e-9)
 
 
 def runs(problem: TrajectoryProblem) -> list[slice]:
@@ -414,50 +421,61 @@ def test_a_way_that_is_too_long_gets_more_time() -> None:
     share = np.arange(1, first.stop + 1) / first.stop
     z[first, 0] += 30.0 * share**2 * (3 - 2 * share)
     z[first.stop :, 0] += 30.0
-    np.testing.assert_array_equal(problem.dt, np.full(problem.segments, SHORT.dt))
-    assert problem.rate_violation(z) > 1.0
-    problem.take_time_for(z)
-    assert np.ptp(problem.dt[first]) == 0.0
-    assert problem.dt[0] * first.stop > 1.5 * 30.0 / problem.chain.velocity[0]
+    still, timing = problem.timing_for(problem.still), problem.timing_for(z)
+    np.testing.assert_array_equal(still.dt, np.full(problem.segments, SHORT.dt))
+    assert still.violation(*problem.rates(z)) > 1.0
+    assert np.ptp(timing.dt[first]) == 0.0
+    assert timing.dt[0] * first.stop > 1.5 * 30.0 / problem.chain.velocity[0]
     for run in others:
-        np.testing.assert_array_equal(problem.dt[run], np.full(run.stop - run.start, SHORT.dt))
-    assert problem.rate_violation(z) <= 0.0
+        np.testing.assert_array_equal(timing.dt[run], np.full(run.stop - run.start, SHORT.dt))
+    assert timing.violation(*problem.rates(z)) <= 0.0
     # The bounds are the limits over the new times, row by row, and the trajectory is played at them.
-    np.testing.assert_allclose(problem.velocity, problem.chain.velocity * problem.dt[:, None])
-    of_rows = np.concatenate([np.full(run.stop - run.start + 1, problem.dt[run.start]) for run in runs(problem)])
-    np.testing.assert_allclose(problem.acceleration, problem.chain.acceleration * of_rows[:, None] ** 2)
-    motion = as_trajectory(problem, z)
+    np.testing.assert_allclose(timing.velocity, problem.chain.velocity * timing.dt[:, None])
+    of_rows = np.concatenate([np.full(run.stop - run.start + 1, timing.dt[run.start]) for run in runs(problem)])
+    np.testing.assert_allclose(timing.acceleration, problem.chain.acceleration * of_rows[:, None] ** 2)
+    motion = as_trajectory(problem, z, timing.dt)
     moving = np.abs(np.diff(motion.positions[:, 0])) > 0
-    np.testing.assert_allclose(np.diff(motion.times)[moving], problem.dt[first])
+    np.testing.assert_allclose(np.diff(motion.times)[moving], timing.dt[first])
     assert np.abs(motion.velocities()[:, 0]).max() <= problem.chain.velocity[0]
     assert np.abs(motion.accelerations()[:, 0]).max() <= problem.chain.acceleration[0]
-    assert f"in {problem.dt.sum():g} s" in repr(problem)
-    problem.take_time_for(np.tile(problem.start, (problem.segments, 1)))
-    np.testing.assert_array_equal(problem.dt, np.full(problem.segments, SHORT.dt))
+    assert f"in {still.dt.sum():g} s" in repr(problem)
 
 
 def test_a_step_that_is_too_fast_gets_more_time_within_reason() -> None:
     problem = build(full_scene(), [Actuate("door", {"hinge": 1.2}), GoTo(-0.5, 0.1)], options=SHORT)
     first, second, *_ = runs(problem)
     for jump, enough in ((0.15, True), (30.0, False)):
-        problem.take_time_for(np.tile(problem.start, (problem.segments, 1)))
-        z = np.tile(problem.start, (problem.segments, 1))
+        z = problem.still
         z[second.start + 2 :, 3] += jump
-        before = problem.dt.copy()
-        violated = problem.rate_violation(z)
-        assert violated > 0.0
-        problem.stretch(z)
-        np.testing.assert_array_equal(problem.dt[first], before[first])
-        assert np.all(problem.dt[second] > before[second])
-        assert np.ptp(problem.dt[second]) == 0.0
-        assert (problem.rate_violation(z) <= 1e-9) == enough
-        assert problem.dt[second.start] <= 2.0 * SHORT.dt  # the rest is left to the solver
+        rates, before = problem.rates(z), problem.timing_for(problem.still)
+        assert before.violation(*rates) > 0.0
+        longer = before.stretched(*rates)
+        np.testing.assert_array_equal(before.dt, np.full(problem.segments, SHORT.dt))
+        np.testing.assert_array_equal(longer.dt[first], before.dt[first])
+        assert np.all(longer.dt[second] > before.dt[second])
+        assert np.ptp(longer.dt[second]) == 0.0
+        assert (longer.violation(*rates) <= 1e-9) == enough
+        assert longer.dt[second.start] <= 2.0 * SHORT.dt  # the rest is left to the solver
+        again = longer.stretched(*rates)
+        assert np.all(again.dt <= 1.5 * before.dt)  # however often that is asked for
 
 
 def test_standing_still_violates_nothing(opened: TrajectoryProblem) -> None:
-    still = np.tile(opened.start, (opened.segments, 1))
-    assert opened.rate_violation(still) <= 0.0
-    assert opened.objective(still) == 0.0
+    timing = opened.timing_for(opened.still)
+    assert timing.violation(*opened.rates(opened.still)) <= 0.0
+    assert opened.objective(opened.still, timing.dt) == 0.0
+
+
+def test_a_problem_does_not_change(opened: TrajectoryProblem) -> None:
+    """Other bounds make another problem."""
+    for array in (opened.start, opened.lower, opened.upper):
+        with pytest.raises(ValueError, match="read-only"):
+            array[:1] = 0.0
+    lower, upper = opened.lower.copy(), opened.upper.copy()
+    lower[:, :3] = upper[:, :3] = opened.start[:3]
+    standing = opened.with_bounds(lower, upper)
+    np.testing.assert_array_equal(standing.clip(opened.still + 0.5)[:, :3], opened.still[:, :3])
+    assert np.all(opened.clip(opened.still + 0.5)[:-1, :3] > opened.still[:-1, :3])
 
 
 # --- the rest -------------------------------------------------------------------------------------------------------
@@ -538,4 +556,4 @@ def test_a_grasp_is_chosen_within_its_own_phase(waypoints: int) -> None:
     spans = sorted({(first, last) for _, first, last in clamped})
     assert len(spans) == 2
     assert spans[0][1] < spans[1][0]
-    assert all(name.startswith("approach") == (waypoints > 1) for name in problem.pose_names if "approach" in name)
+    assert all(name.startswith("approach") == (waypoints > 1) for name in names_of(problem) if "approach" in name)

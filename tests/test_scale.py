@@ -23,6 +23,7 @@ from vkc_pin.base_body import Body
 from vkc_pin.benchmarks.scale import crowded
 from vkc_pin.broadphase import PhaseGeometry
 from vkc_pin.clearance import clearance_curves
+from vkc_pin.contact import ContactModel
 from vkc_pin.geometry import clearance, shape_distance
 from vkc_pin.obstacles import FLOOR
 from vkc_pin.placed import standing_geometry
@@ -121,9 +122,9 @@ def test_pictures_of_clearance_ask_for_few(plans: dict[int, tuple[Plan, int]]) -
 # --- contacts -------------------------------------------------------------------------------------------------------
 
 
-def all_distances(problem: TrajectoryProblem, phase: int, z: np.ndarray) -> np.ndarray:
+def all_distances(problem: TrajectoryProblem, part: PhaseGeometry, z: np.ndarray) -> np.ndarray:
     """Return the signed distance of every pair at every configuration, shape (W, P), by Pinocchio without culling."""
-    geometry, model = all_pairs(problem.contacts.phases[phase]), problem.chain.model
+    geometry, model = all_pairs(part), problem.chain.model
     data, placed = model.createData(), pin.GeometryData(geometry)
     for request in placed.distanceRequests:
         request.gjk_tolerance = 1e-8
@@ -136,13 +137,19 @@ def all_distances(problem: TrajectoryProblem, phase: int, z: np.ndarray) -> np.n
 
 
 def check_contacts(
-    problem: TrajectoryProblem, phase: int, rng: np.random.Generator, *, reach: float, nearest: int | None
+    problem: TrajectoryProblem,
+    model: ContactModel,
+    phase: int,
+    rng: np.random.Generator,
+    *,
+    reach: float,
+    nearest: int | None,
 ) -> None:
     """All closer than `reach`, or the nearest of them: none missing, none twice, with coal's distances, in the right order."""
     z = random_configurations(problem.chain.lower, problem.chain.upper, 8, rng)
-    part, waypoints = problem.contacts.phases[phase], np.full(len(z), problem.ends[phase])
-    distances = all_distances(problem, phase, z)
-    contacts = problem.contacts.evaluate(z, waypoints, reach=reach, nearest=nearest)
+    part, waypoints = model.phases[phase], np.full(len(z), problem.ends[phase])
+    distances = all_distances(problem, part, z)
+    contacts = model.evaluate(z, waypoints, reach=reach, nearest=nearest)
     number = {tuple(pair): k for k, pair in enumerate(part.pairs.tolist())}
     which = np.array([number[tuple(pair)] for pair in contacts.pair.tolist()], int)
     margins = part.margins_at(np.arange(len(part.pairs)), np.full(len(part.pairs), problem.ends[phase]))
@@ -167,7 +174,7 @@ def test_contacts_are_those_among_all_pairs(seed: int, count: int, reach: float,
     problem = build(cluttered(seed, count), [Actuate("door", {"hinge": 1.2})], options=SHORT)
     rng = np.random.default_rng(seed)
     for phase in (0, 2):
-        check_contacts(problem, phase, rng, reach=reach, nearest=nearest)
+        check_contacts(problem, problem.contacts, phase, rng, reach=reach, nearest=nearest)
 
 
 @settings(max_examples=15, deadline=None)
@@ -177,10 +184,11 @@ def test_contacts_of_what_is_carried_are_those_among_all_pairs(seed: int, count:
     steps = [Grasp("stick"), Grasp("ball", "pull", "stick.tip"), Reach(POSE), Release("ball"), GoTo(0.0, 0.0)]
     problem = build(cluttered_room(seed, count), steps, options=SHORT)
     rng = np.random.default_rng(seed)
-    problem.contacts.settle(random_configurations(problem.chain.lower, problem.chain.upper, problem.segments, rng))
+    z = random_configurations(problem.chain.lower, problem.chain.upper, problem.segments, rng)
+    model = problem.contacts.settled(z)
     assert [len(phase.held) for phase in problem.task.phases] == [0, 1, 2, 1]
     for phase in range(4):
-        check_contacts(problem, phase, rng, reach=reach, nearest=nearest)
+        check_contacts(problem, model, phase, rng, reach=reach, nearest=nearest)
 
 
 @settings(max_examples=15, deadline=None)

@@ -15,6 +15,7 @@ import vkc_pin as vkc
 from vkc_pin import solver, trust_region
 from vkc_pin.initialization import initialize
 from vkc_pin.solver import Solution, solve
+from vkc_pin.timing import Timing
 
 FEW = vkc.Options(reach_waypoints=20, max_outer=12)
 PILLAR = {"name": "pillar", "type": "cylinder", "radius": 0.15, "length": 1.6, "position": [1.6, 0.05, 0.8]}
@@ -42,16 +43,19 @@ def hard() -> Solution:
     problem = vkc.build(door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=options)
     (seed,) = initialize(problem, "stationary", 0)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(solver, "HOPELESS", np.inf)
+        patch.setattr(solver, "GIVE_UP_SHORTFALL", np.inf)
         return solve(problem, seed.z)
 
 
-def feasible(problem: vkc.TrajectoryProblem, z: np.ndarray) -> None:
+def feasible(problem: vkc.TrajectoryProblem, solution: Solution) -> None:
     """Everything holds at the waypoints, and nothing collides between them."""
+    z = solution.z
     assert np.all((z >= problem.lower - 1e-6) & (z <= problem.upper + 1e-6))
     assert problem.evaluate_contacts(z, reach=0.1).violation() < 1e-3
     assert problem.pose_error(z) < 1e-3
-    assert problem.rate_violation(z) < 1e-3
+    first, second = problem.rates(z)
+    still = problem.timing_for(problem.still)
+    assert dataclasses.replace(still, dt=solution.dt).violation(first, second) < 1e-3
     assert problem.drift(z) < 1.0
     path = problem.waypoints(z)
     states = np.concatenate([(1 - s) * path[:-1] + s * path[1:] for s in np.linspace(0.0, 1.0, 12)[1:-1]])
@@ -64,7 +68,7 @@ def test_it_goes_round_what_stands_in_the_way() -> None:
     assert problem.evaluate_contacts(straight(problem, 3.2), reach=0.0).clearance() < -0.1
     assert solved().converged
     assert solved().status == "converged"
-    feasible(problem, solved().z)
+    feasible(problem, solved())
 
 
 def test_counts_and_times() -> None:
@@ -130,10 +134,10 @@ def test_a_trust_region_goes_on_with_what_it_is_given() -> None:
     np.testing.assert_array_equal(given, np.linspace(0.01, 0.3, 40))  # it is another's
 
 
-def blank_trial(segments: int) -> solver._Trial:
+def blank_trial(segments: int) -> trust_region.Trial:
     """Return a trial in which every coordinate went 0.3 and nothing else is said."""
-    fields = dict.fromkeys(field.name for field in dataclasses.fields(solver._Trial))
-    return solver._Trial(**{**fields, "step": np.full(segments, 0.3)})  # type: ignore[arg-type]
+    fields = dict.fromkeys(field.name for field in dataclasses.fields(trust_region.Trial))
+    return trust_region.Trial(**{**fields, "step": np.full(segments, 0.3)})  # type: ignore[arg-type]
 
 
 def test_a_solution_goes_on_with_the_radius_that_another_ended_with() -> None:
@@ -143,7 +147,7 @@ def test_a_solution_goes_on_with_the_radius_that_another_ended_with() -> None:
     assert first.radius is not None
     assert first.radius.shape == (problem.segments,)
     assert len(np.unique(first.radius)) > 1, "one radius for all: choose a harder problem"
-    assert Solution(seed).radius is None
+    assert Solution(seed, problem.timing_for(seed).dt).radius is None
     for radius in (first.radius, np.linspace(0.02, 0.1, problem.segments)):
         kept = radius.copy()
         second = solve(problem, first.z, rounds=1, radius=radius)
@@ -160,11 +164,11 @@ class Scripted:
     ) -> None:
         self.step = step
         self.problem, self.z, self.is_done = SimpleNamespace(drift=lambda _: drift), np.zeros((40, 1)), done
-        self.deadline, self.penalty, self.solution = np.inf, 200.0, Solution(np.zeros((40, 1)))
+        self.deadline, self.penalty, self.solution = np.inf, 200.0, Solution(np.zeros((40, 1)), np.full(40, 0.25))
         self.far = False
         self.objective, self.shortfall, self.rounds, self.radii = 10.0, np.full(40, 0.5), iter(rounds), list[np.ndarray]()
 
-    def try_step(self, radius: np.ndarray) -> solver._Trial:
+    def try_step(self, radius: np.ndarray) -> trust_region.Trial:
         self.radii.append(radius.copy())
         objective, shortfall, self.taken = next(self.rounds)
         short = np.full(40, shortfall)  # just what was promised: nobody narrows the trust region
@@ -180,13 +184,13 @@ class Scripted:
             contacts=contacts,  # type: ignore[arg-type]
         )
 
-    def judge(self, _: solver._Trial) -> tuple[bool, float]:
+    def judge(self, _: trust_region.Trial) -> tuple[bool, float]:
         return self.taken, 1.0
 
-    def accept(self, trial: solver._Trial) -> None:
+    def accept(self, trial: trust_region.Trial) -> None:
         self.objective, self.shortfall = trial.objective, trial.shortfall
 
-    def done(self, _: solver._Trial) -> bool:
+    def done(self, _: trust_region.Trial) -> bool:
         return self.is_done
 
     def astray(self) -> bool:
@@ -239,7 +243,7 @@ def test_a_grasp_between_obstacles_is_made_free_with_small_steps() -> None:
     scene = vkc.load_scene("init_2").sample_start(np.random.default_rng(5))
     problem = vkc.build(scene, [vkc.Grasp("stick")])
     seed = next(initialize(problem, "astar", 0)).z
-    solution, objective, small = solve(problem, seed), problem.objective(seed), 0
+    solution, objective, small = solve(problem, seed), problem.objective(seed, problem.timing_for(seed).dt), 0
     for row, after in itertools.pairwise(solution.history):
         nearly = trust_region.CLOSE_ENOUGH <= row.shortfall < solver.NEARLY_FREE  # and not yet free
         if row.accepted and nearly and objective - row.objective < solver.SETTLING * objective:
@@ -249,7 +253,7 @@ def test_a_grasp_between_obstacles_is_made_free_with_small_steps() -> None:
         objective = row.objective if row.accepted else objective
     assert small, "it never gets there: choose another problem"
     assert solution.converged
-    feasible(problem, solution.z)
+    feasible(problem, solution)
 
 
 LATE = [(10.0, 0.05, True)] * 20
@@ -327,11 +331,11 @@ def test_motions_far_from_free_are_given_up_soon(monkeypatch: pytest.MonkeyPatch
     seed = straight(problem, 4.0)
     solution = solve(problem, seed)
     assert (solution.status, solution.converged) == ("not converged", False)
-    assert solution.rounds == solver.HOPELESS_ROUNDS < FEW.max_outer
-    assert problem.evaluate_contacts(solution.z, reach=0.1).violation() > solver.HOPELESS
+    assert solution.rounds == solver.GIVE_UP_ROUNDS < FEW.max_outer
+    assert problem.evaluate_contacts(solution.z, reach=0.1).violation() > solver.GIVE_UP_SHORTFALL
     assert solve(problem, seed, rounds=2).rounds == 2
-    monkeypatch.setattr(solver, "HOPELESS", np.inf)
-    assert solve(problem, seed).rounds > solver.HOPELESS_ROUNDS
+    monkeypatch.setattr(solver, "GIVE_UP_SHORTFALL", np.inf)
+    assert solve(problem, seed).rounds > solver.GIVE_UP_ROUNDS
 
 
 def test_standing_still_where_one_is_already() -> None:
@@ -341,7 +345,7 @@ def test_standing_still_where_one_is_already() -> None:
     solution = solve(problem, still)
     assert solution.converged
     np.testing.assert_allclose(solution.z, still, atol=0.05)
-    assert problem.objective(solution.z) <= 1e-3
+    assert problem.objective(solution.z, solution.dt) <= 1e-3
 
 
 def test_the_merit_falls_from_one_accepted_step_to_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -382,7 +386,7 @@ def test_the_motion_that_was_feasible_is_kept(monkeypatch: pytest.MonkeyPatch) -
     solution = solve(problem, seed)
     assert solution.converged
     np.testing.assert_array_equal(solution.z, kept[0])
-    feasible(problem, solution.z)
+    feasible(problem, solution)
 
 
 def test_no_time_at_all() -> None:
@@ -411,16 +415,17 @@ def test_velocity_bounds_bind_when_time_is_short(monkeypatch: pytest.MonkeyPatch
     """When it may not take more."""
     options = vkc.Options(reach_waypoints=12, dt=0.25)  # 2.4 m in 3 s at no more than 1 m/s
     problem = vkc.build(hall(), [vkc.GoTo(2.4, 0.0, 0.0)], options=options)
-    monkeypatch.setattr(vkc.TrajectoryProblem, "take_time_for", lambda self, z: None)
-    monkeypatch.setattr(vkc.TrajectoryProblem, "stretch", lambda self, z: None)
+    least = problem.timing_for(problem.still)
+    monkeypatch.setattr(vkc.TrajectoryProblem, "timing_for", lambda self, z: least)
+    monkeypatch.setattr(Timing, "stretched", lambda self, first, second: self)
     seed = straight(problem, 2.4)
-    assert problem.rate_violation(seed) > 0.05
+    assert least.violation(*problem.rates(seed)) > 0.05
     solution = solve(problem, seed)
     assert solution.converged
     first, _ = problem.rates(solution.z)
-    assert np.abs(first[:, 0]).max() <= problem.velocity[0, 0] * 1.001
-    assert np.abs(first[:, 0]).max() > 0.95 * problem.velocity[0, 0]
-    feasible(problem, solution.z)
+    assert np.abs(first[:, 0]).max() <= least.velocity[0, 0] * 1.001
+    assert np.abs(first[:, 0]).max() > 0.95 * least.velocity[0, 0]
+    feasible(problem, solution)
 
 
 def test_a_way_that_is_too_long_takes_longer() -> None:
@@ -428,8 +433,8 @@ def test_a_way_that_is_too_long_takes_longer() -> None:
     problem = vkc.build(hall(), [vkc.GoTo(2.4, 0.0, 0.0)], options=options)
     solution = solve(problem, straight(problem, 2.4))
     assert solution.converged
-    assert 3.0 < problem.dt.sum() < 6.0
-    feasible(problem, solution.z)
+    assert 3.0 < solution.dt.sum() < 6.0
+    feasible(problem, solution)
 
 
 def test_the_same_seed_gives_the_same_motion() -> None:

@@ -177,7 +177,7 @@ def test_rows_and_costs_are_the_expressions_at_the_waypoints(name: str) -> None:
                 atol = 1.01e-4 if term.name == "speed" else 1e-7
                 np.testing.assert_allclose(values[rows - first], expected[waypoint], atol=atol)
                 seen += len(rows)
-    assert seen == len(values) == len(p.own.rows)
+    assert seen == len(values) == len(p.term_numbers.rows)
     assert float(cost) == pytest.approx(total, rel=1e-6)
     assert {name: len(at) for name, at in by_name.items()} == {
         # Where the tip still stands there is nothing to be done about it.
@@ -197,7 +197,7 @@ def test_derivatives_are_those_of_finite_differences(name: str) -> None:
     offsets = rng.normal(size=(t.segments, t.slots))
     parameters = t.parameter_vector(p.start, planes, offsets, p.target_matrix(), PENALTY, times(p))
     x = np.column_stack([random_path(p, 2)[1:], rng.uniform(size=p.segments)]).ravel()
-    own, step, weight = p.own.rows, 1e-5, 0.7
+    own, step, weight = p.term_numbers.rows, 1e-5, 0.7
     multipliers = np.zeros(t.rows)
     multipliers[own] = rng.normal(size=len(own))
 
@@ -215,8 +215,7 @@ def test_derivatives_are_those_of_finite_differences(name: str) -> None:
     curvature = np.array([(a[1] - b[1]) / (2 * step) for a, b in sides]).T
     np.testing.assert_allclose(half + np.triu(half, 1).T, curvature, rtol=1e-5, atol=1e-3)
     f, z = objective(x, parameters)[0], x.reshape(p.segments, -1)
-    p._set_steps(times(p))
-    assert p.objective(z[:, :-1]) == pytest.approx(float(f) - PENALTY * z[:, -1].sum(), rel=1e-9)
+    assert p.objective(z[:, :-1], times(p)) == pytest.approx(float(f) - PENALTY * z[:, -1].sum(), rel=1e-9)
 
 
 def test_a_hand_left_where_it_was_counts_after_it_was_let_go_of() -> None:
@@ -245,7 +244,7 @@ def test_programs_with_different_terms_are_told_apart() -> None:
     assert without.transcription is not first.transcription
     assert not hasattr(without.transcription, "term_values")
     assert first.transcription.rows == without.transcription.rows + OPTIONS.reach_waypoints
-    assert first.own.upper.tolist() == [1.0] * OPTIONS.reach_waypoints
+    assert first.term_numbers.upper.tolist() == [1.0] * OPTIONS.reach_waypoints
     parameters = [p.transcription.parameters.numel() for p in (first, without)]
     assert parameters[0] == parameters[1]  # no term needs the time of a step
     fast = vkc.Cost("fast", lambda s: ca.sumsqr(s.velocity("tool")))
@@ -256,14 +255,15 @@ def test_programs_with_different_terms_are_told_apart() -> None:
 def test_errors_count_in_tolerances() -> None:
     low = vkc.Constraint("low", lambda s: s.coordinate("base_x"), upper=0.5, tolerance=0.02)
     p = vkc.build(room(table()), [vkc.GoTo(1.0, 0.0)], options=OPTIONS, terms=[low])
-    z = np.tile(p.start, (p.segments, 1))
-    assert p.own.error(z, p.dt) == p.row_error(z) - p.pose_error(z) == 0.0
+    z = p.still
+    dt = p.timing_for(z).dt
+    assert p.term_numbers.error(z, dt) == p.row_error(z, dt) - p.pose_error(z) == 0.0
     z[1, 0] = 0.54  # twice the tolerance
-    assert p.own.error(z, p.dt) == pytest.approx(2e-3)
-    assert p.row_error(z) == pytest.approx(2e-3)
+    assert p.term_numbers.error(z, dt) == pytest.approx(2e-3)
+    assert p.row_error(z, dt) == pytest.approx(2e-3)
     assert p.pose_error(z) == 0.0
     z[1, 0] = np.nan
-    assert p.own.error(z, p.dt) == np.inf
+    assert p.term_numbers.error(z, dt) == np.inf
 
 
 def test_steps_take_longer_where_a_speed_asks_for_it() -> None:
@@ -274,16 +274,15 @@ def test_steps_take_longer_where_a_speed_asks_for_it() -> None:
     share = np.linspace(0.0, 1.0, 21)[1:, None]
     usual = at(9.0)
     z = usual.start + share**2 * (3 - 2 * share) * np.r_[2.0, np.zeros(8)]
-    usual.take_time_for(z)
-    fastest = np.abs(np.diff(usual.waypoints(z)[:, 0])).max() / usual.dt[0]
+    dt = usual.timing_for(z).dt
+    fastest = np.abs(np.diff(usual.waypoints(z)[:, 0])).max() / dt[0]
     limited = at(fastest / 2)
-    limited.take_time_for(z)
-    assert limited.own.error(z, limited.dt) <= 1e-3
-    assert 2.0 - 1e-2 <= limited.dt[0] / usual.dt[0] <= 2.0 * 1.2
-    np.testing.assert_allclose(limited.velocity, limited.chain.velocity * limited.dt[:, None])
+    slower = limited.timing_for(z)
+    assert limited.term_numbers.error(z, slower.dt) <= 1e-3
+    assert 2.0 - 1e-2 <= slower.dt[0] / dt[0] <= 2.0 * 1.2
+    np.testing.assert_allclose(slower.velocity, limited.chain.velocity * slower.dt[:, None])
     hopeless = at(fastest / 2, start=fastest / 3)  # at rest, too
-    hopeless.take_time_for(z)
-    assert hopeless.dt[0] <= 8.0 * usual.dt[0]
+    assert hopeless.timing_for(z).dt[0] <= 8.0 * dt[0]
 
 
 def test_terms_without_a_slope_are_refused() -> None:

@@ -61,19 +61,23 @@ def test_grasping_anywhere_costs_less_than_at_one_place() -> None:
         )
         found = fixed.run()
         assert found.success, found.report()
-        before = fixed.problem.objective(fixed.z)
+        before = objective(fixed.problem, fixed.z)
         more, better = (one.run(partial(going_on, fixed)) for one in (again, anywhere))
         for motion in (more, better):
             assert motion.success, motion.report()
             assert motion.initialization == "as with the fixed grasp"
         same = going_on(fixed, anywhere.problem).z
         assert anywhere.problem.pose_error(same) < 1e-3
-        assert anywhere.problem.objective(same) == pytest.approx(before, rel=1e-9)
+        assert objective(anywhere.problem, same) == pytest.approx(before, rel=1e-9)
         slide, turn = (better.trajectory.column(f"stick.grip_{name}")[-1] for name in ("slide", "turn"))
         assert abs(slide) > 5e-3 or abs(turn) > 5e-2, "it makes no use of it"
-        assert anywhere.problem.objective(anywhere.z) < before
-        saved.append(anywhere.problem.objective(anywhere.z) / again.problem.objective(again.z))
+        assert objective(anywhere.problem, anywhere.z) < before
+        saved.append(objective(anywhere.problem, anywhere.z) / objective(again.problem, again.z))
     assert np.median(saved) < 0.97
+
+
+def objective(problem: vkc.TrajectoryProblem, z: np.ndarray) -> float:
+    return problem.objective(z, problem.timing_for(z).dt)
 
 
 def going_on(fixed: OneProblem, problem: vkc.TrajectoryProblem) -> Seed:
@@ -93,8 +97,8 @@ def test_one_problem_costs_less_than_step_after_step() -> None:
     one = OneProblem(start(), steps, settings)
     whole = one.run(lambda problem: seed_of(problem, pieces))
     assert whole.success, whole.report()
-    before = one.problem.objective(seed_of(one.problem, pieces).z)
-    assert one.problem.objective(one.z) < 0.97 * before
+    before = objective(one.problem, seed_of(one.problem, pieces).z)
+    assert objective(one.problem, one.z) < 0.97 * before
     assert whole.initialization == "astar, astar, then all at once"
     assert np.abs(one.z[39, :3] - parts[0][0].z[39, :3]).max() > 1e-3  # the grasp has moved in favour of what follows
 

@@ -158,7 +158,7 @@ def test_the_objective_is_equation_1(name: str) -> None:
         expected += np.sum(heavier * weight * step**2) + o.acceleration_weight * np.sum(weight * bend**2)
     value, _ = functions(p, rates=False)[0](point.x, point.parameters)
     assert float(value) == pytest.approx(expected, rel=1e-10)
-    assert p.objective(point.z) == pytest.approx(expected - PENALTY * point.slack.sum(), rel=1e-10)
+    assert p.objective(point.z, p.timing_for(point.z).dt) == pytest.approx(expected - PENALTY * point.slack.sum(), rel=1e-10)
 
 
 def test_there_are_rests_where_a_hand_closes_or_opens() -> None:
@@ -185,7 +185,7 @@ def test_pose_rows_are_what_is_missing_to_the_pose(name: str) -> None:
     p = problem(name)
     point, model = random_point(p), p.chain.model
     g, data, t = rows(point), model.createData(), p.transcription
-    assert len(t.pose_rows) == len(t.structure.poses) == len(p.targets) == len(p.pose_names)
+    assert len(t.pose_rows) == len(t.structure.poses) == len(p.targets) == len(p.pose_goals)
     for pose, at, target in zip(t.structure.poses, t.pose_rows, p.targets, strict=True):
         assert tuple(sorted(at)) == pose.waypoints
         for waypoint, which in at.items():

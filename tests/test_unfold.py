@@ -30,7 +30,7 @@ def placing() -> TrajectoryProblem:
 
 def unfolded(problem: TrajectoryProblem, seed: int = 0) -> tuple[np.ndarray, Trajectory]:
     z = random_configurations(problem.chain.lower, problem.chain.upper, problem.segments, np.random.default_rng(seed))
-    return z, as_trajectory(problem, z)
+    return z, as_trajectory(problem, z, problem.timing_for(problem.still).dt)
 
 
 def pauses(problem: TrajectoryProblem, motion: Trajectory) -> list[int]:
@@ -39,7 +39,7 @@ def pauses(problem: TrajectoryProblem, motion: Trajectory) -> list[int]:
     still = (np.diff(motion.positions[:, :robot], axis=0) == 0.0).all(axis=1)
     times = np.diff(motion.times)
     np.testing.assert_allclose(times[still], problem.options.grasp_time)
-    np.testing.assert_allclose(times[~still], problem.dt)
+    np.testing.assert_allclose(times[~still], problem.timing_for(problem.still).dt)
     return (np.flatnonzero(still) + 1).tolist()
 
 

@@ -7,7 +7,7 @@ joint carries are compared with those of all that stands. Only what is left is l
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -58,12 +58,17 @@ class PhaseGeometry:
                 margins[inside] = np.minimum(margins[inside], margin)
         return margins
 
-    def place(self, geometry: int, placement: pin.SE3) -> None:
-        """Let a geometry that stands stand elsewhere in the world."""
-        self.shapes[geometry].placement = placement
-        self.rotation[geometry], self.translation[geometry] = placement.rotation, placement.translation
-        for derived in ("_boxes", "_local", "_turn"):
-            self.__dict__.pop(derived, None)
+    def placed(self, where: Mapping[int, pin.SE3]) -> PhaseGeometry:
+        """Return the same with geometries that stand placed elsewhere in the world."""
+        shapes, rotation, translation = list(self.shapes), self.rotation.copy(), self.translation.copy()
+        for geometry, placement in where.items():
+            shapes[geometry] = pin.GeometryObject(shapes[geometry])
+            shapes[geometry].placement = placement
+            rotation[geometry], translation[geometry] = placement.rotation, placement.translation
+        moved = replace(self, shapes=tuple(shapes), rotation=rotation, translation=translation)
+        for name in ("_moving_count", "_radius", "_half", "_own", "_groups", "_number"):  # the same wherever things stand
+            moved.__dict__[name] = getattr(self, name)
+        return moved
 
     def within(self, reach: float, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> NDArray[np.int_]:
         """Return what stands and may be within `reach` [m] of a box along the world's axes, corners of shape (3,) [m]."""

@@ -125,6 +125,25 @@ class VirtualKinematicChain:
                 linear[column], angular[column] = motion[:3], motion[3:]
         return owner, linear, angular, fixed
 
+    def point_jacobians(
+        self, z: NDArray[np.float64], which: NDArray[np.int_], joint: NDArray[np.int_], point: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return how points that are fixed in joints' frames move, shape (C, 3, n).
+
+        Args:
+            z: Configurations, shape (B, n).
+            which: The configuration of each point, shape (C,).
+            joint: The joint that carries it, shape (C,); 0 stands still.
+            point: Where it is in the world, shape (C, 3) [m].
+        """
+        owner, linear, angular, fixed = self.motions
+        rotations, translations = self.joint_placements(z)
+        axes = rotations[:, owner]
+        turned = np.where(fixed[:, None], linear, np.einsum("bnij,nj->bni", axes, linear))[which]
+        about = np.einsum("bnij,nj->bni", axes, angular)[which]
+        moved = turned + np.cross(about, point[:, None] - translations[:, owner][which])
+        return np.asarray((moved * self.carries[joint][:, owner, None]).swapaxes(1, 2))
+
     def index(self, name: str) -> int:
         """Return the position of coordinate `name` in z. Raises `UnknownNameError` if there is none."""
         if name not in self.names:

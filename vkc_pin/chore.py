@@ -22,8 +22,7 @@ from vkc_pin.scene import Scene
 from vkc_pin.solution import Iteration
 from vkc_pin.step_by_step import joined, summed
 from vkc_pin.steps import Step
-from vkc_pin.task import Task
-from vkc_pin.term_goals import stretches
+from vkc_pin.task import Task, stretches
 from vkc_pin.terms import Term, check_active
 from vkc_pin.trajectory import Trajectory
 from vkc_pin.world import scene_after

@@ -6,12 +6,11 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from vkc_pin.chain import VirtualKinematicChain
 from vkc_pin.contact import Contacts
 from vkc_pin.inverse_kinematics import PoseSolver
 from vkc_pin.problem import TrajectoryProblem
 
-__all__ = ["clear_out", "distance_gradients", "point_jacobians"]
+__all__ = ["clear_out"]
 
 _ROUNDS = 10
 _ROWS = 6  # contacts of a configuration that are looked at in one round
@@ -75,39 +74,6 @@ def _contact_rows(
     """Return gradients of the nearest distances, shape (B, rows, n), and by how much they should grow, shape (B, rows) [m]."""
     order = np.arange(len(contacts.waypoint)) - np.searchsorted(contacts.waypoint, contacts.waypoint)
     rows, wanted = np.zeros((len(z), _ROWS, z.shape[1])), np.zeros((len(z), _ROWS))
-    rows[contacts.waypoint, order] = distance_gradients(problem, z, contacts)
+    rows[contacts.waypoint, order] = problem.contacts.gradients(z, contacts)
     wanted[contacts.waypoint, order] = np.maximum(contacts.margin + _SPARE - contacts.distance, 0.0)
     return rows, wanted
-
-
-def distance_gradients(problem: TrajectoryProblem, z: NDArray[np.float64], contacts: Contacts) -> NDArray[np.float64]:
-    """Return the gradients of the distances of contacts at configurations `z`, shape (B, n): n·(∂b − ∂a), shape (C, n)."""
-    joints = problem.contacts.joints_of(contacts.pair)
-    which, points = np.tile(contacts.waypoint, 2), np.concatenate([contacts.first, contacts.second])
-    first, second = np.split(point_jacobians(problem.chain, z, which, joints.T.ravel(), points), 2)
-    return np.asarray(np.einsum("ci,cij->cj", contacts.normal, second - first))
-
-
-def point_jacobians(
-    chain: VirtualKinematicChain,
-    z: NDArray[np.float64],
-    which: NDArray[np.int_],
-    joint: NDArray[np.int_],
-    point: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Return how points that are fixed in joints' frames move, shape (C, 3, n).
-
-    Args:
-        chain: The chain.
-        z: Configurations, shape (B, n).
-        which: The configuration of each point, shape (C,).
-        joint: The joint that carries it, shape (C,); 0 stands still.
-        point: Where it is in the world, shape (C, 3) [m].
-    """
-    owner, linear, angular, fixed = chain.motions
-    rotations, translations = chain.joint_placements(z)
-    axes = rotations[:, owner]
-    turned = np.where(fixed[:, None], linear, np.einsum("bnij,nj->bni", axes, linear))[which]
-    about = np.einsum("bnij,nj->bni", axes, angular)[which]
-    moved = turned + np.cross(about, point[:, None] - translations[:, owner][which])
-    return np.asarray((moved * chain.carries[joint][:, owner, None]).swapaxes(1, 2))

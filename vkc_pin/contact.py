@@ -1,4 +1,4 @@
-"""Collision pairs, signed distances (coal) and witness planes.
+"""Signed distances of collision pairs (coal) and witness planes.
 
 For a pair (A, B) coal gives the witness points a, b and the normal n of the signed distance d = n·(b − a). With a
 fixed in A's body, b in B's and n in the world, n·(b(z) − a(z)) is smooth in z, and its value and gradient equal the
@@ -7,9 +7,9 @@ signed distance's at the linearisation point. It is linear in the placements of 
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from bisect import insort
-from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,14 +18,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from vkc_pin.broadphase import PhaseGeometry
 from vkc_pin.chain import VirtualKinematicChain
-from vkc_pin.easing import eased_pairs
-from vkc_pin.errors import InputError
-from vkc_pin.geometry import bounding_box, link_name, own_name
-from vkc_pin.hold import Hold
+from vkc_pin.collision_pairs import phase_geometries
 from vkc_pin.narrowphase import Distances
-from vkc_pin.obstacles import FLOOR
 from vkc_pin.options import Options
 from vkc_pin.placed import standing_geometry
 from vkc_pin.scene import Scene
@@ -90,118 +85,38 @@ class ContactModel:
     """
 
     def __init__(self, scene: Scene, chain: VirtualKinematicChain, task: Task, options: Options) -> None:
-        self.scene, self.chain, self.options = scene, chain, options
+        self.scene, self.chain, self.task = scene, chain, task
         self.data = chain.model.createData()
-        self.task = task
         self.first_waypoint = np.concatenate([[0], np.cumsum([phase.segments for phase in task.phases])])
         self._placed = pin.GeometryData(chain.collision)
-        self._obstacles = tuple(scene.obstacles.geometryObjects)
-        self._boxes = _boxes([*chain.collision.geometryObjects]), _boxes(self._obstacles)
-        self.phases = [self._phase(number) for number in range(len(task.phases))]
+        self.phases = phase_geometries(scene, chain, task, options)
         self._distances = [Distances(part.shapes, self._placed.oMg) for part in self.phases]
         # Beyond the chain's own geometries everything stands in the world.
         own = [shape.parentJoint for shape in chain.collision.geometryObjects]
         self._joints = np.array(own + [0] * (max(len(part.labels) for part in self.phases) - len(own)))
 
-    def _phase(self, number: int) -> PhaseGeometry:
-        phase, before = self.task.phases[number], self.task.phases[number - 1] if number else None
-        scene, chain, robot, margin = self.scene, self.chain, self.scene.robot, self.options.dist_safe
-        shapes = list(chain.collision.geometryObjects)
-        robots, own = range(len(robot.collision.geometryObjects)), len(shapes)
-        labels = [robot.link_of(i) for i in robots]
-        for hold, indices in chain.held_geometries.items():
-            labels += [f"{hold.object}.{link_name(own_name(shapes[i].name))}" for i in indices]
-        pairs = [(pair.first, pair.second, margin) for pair in robot.collision.collisionPairs]
-        moving = list(robots)
-        for hold in phase.held:
-            grasped, touching = self._grasped(hold), self._touching(hold)
-            held = chain.held_geometries[hold]
-            # The hand and what it grasps move together: nothing to plan there.
-            pairs += [(i, j, margin) for i in moving for j in held if not (labels[i] in touching and labels[j] == grasped)]
-            moving += held
-        mine = {hold.object: chain.held_geometries[hold] for hold in phase.held}
-        left: dict[str, tuple[int, ...]] = {}
-        for name, placed in scene.objects.items():
-            state = {c.removeprefix(f"{name}."): v for c, v in phase.before.items() if c.startswith(f"{name}.")}
-            if placed.object.free:
-                if name in mine:
-                    continue
-                placed = dataclasses.replace(placed, placement=phase.standing.get(name, placed.placement))
-            standing = standing_geometry(placed.with_state(state))
-            if name in mine:  # its frame stands on, the rest is in the hand
-                held_shapes = {own_name(shapes[i].name) for i in mine[name]}
-                standing = [shape for shape in standing if shape.name not in held_shapes]
-            near = {  # what is held through something touches it; a hand's fingers are on both sides
-                self._grasped(hold): (self._touching(hold), 0.0 if hold.by else self.options.grasp_clearance)
-                for hold in (*phase.leaves, *phase.grasps)
-                if hold.object == name
-            }
-            if name in phase.left:
-                left[name] = tuple(range(len(shapes), len(shapes) + len(standing)))
-            for shape in standing:
-                label = f"{name}.{link_name(shape.name)}"
-                close, least = near.get(label, ((), margin))
-                pairs += [
-                    (i, len(shapes), least if labels[i] in close else margin) for i in moving if i not in mine.get(name, ())
-                ]
-                shape.name = f"{name}.{shape.name}"
-                shapes.append(shape)
-                labels.append(label)
-        carried = {i for hold in phase.held if scene.objects[hold.object].object.free for i in mine[hold.object]}
-        above = [i for i in moving if i in carried or (i in robots and shapes[i].parentJoint > 1)]
-        table = np.concatenate([np.array(pairs).reshape(-1, 3), self._with_obstacles(len(shapes), moving, above)])
-        if not len(table):
-            raise InputError(
-                "no pair of geometries can collide", field=phase.name, expected="collision geometry in robot or scene"
-            )
-        boxes = zip(self._boxes[0], _boxes(shapes[own:]), self._boxes[1], strict=True)
-        center, half, rotation, translation = (np.concatenate(parts) for parts in boxes)
-        shapes += self._obstacles
-        part = PhaseGeometry(
-            tuple(shapes),
-            (*labels, *scene.obstacle_labels),
-            pairs=table[:, :2].astype(int),
-            margins=table[:, 2],
-            joint=np.array([shape.parentJoint for shape in shapes]),
-            center=center,
-            half=half,
-            rotation=rotation,
-            translation=translation,
-            left=left,
-        )
-        return dataclasses.replace(part, eased=eased_pairs(scene, chain, phase, part, int(self.first_waypoint[number]), before))
+    def settled(self, z: NDArray[np.float64]) -> ContactModel:
+        """Return the same, where what the motion z_1..z_N, shape (N, n), leaves behind stands where that motion leaves it.
 
-    def _with_obstacles(self, first: int, moving: Sequence[int], above: Sequence[int]) -> NDArray[np.float64]:
-        """Return the pairs of what moves with the obstacles, the first of which is geometry `first`, and their margins.
-
-        Of `moving`, only those that are `above` the floor can hit it: wheels stand on it, and doors hang above it as their
-        makers hung them.
+        Before, it stands where the task says, which is only nearly there where the motion chooses the place itself.
         """
-        ones, others = np.array(moving, int), np.arange(len(self._obstacles))
-        floor = np.array([label == FLOOR for label in self.scene.obstacle_labels], bool)
-        pairs = np.column_stack([np.tile(ones, len(others)), np.repeat(others, len(ones))])
-        pairs = pairs[~floor[pairs[:, 1]] | np.isin(pairs[:, 0], above)]
-        return np.column_stack([pairs[:, 0], first + pairs[:, 1], np.full(len(pairs), self.options.dist_safe)])
-
-    def _grasped(self, hold: Hold) -> str:
-        """Return the label of the link that a hold takes hold of."""
-        return f"{hold.object}.{self.scene.objects[hold.object].object.attachments[hold.attachment].link}"
-
-    def _touching(self, hold: Hold) -> Collection[str]:
-        """Return the labels of the links that take hold."""
-        return self.scene.robot.touch_links if hold.frame is None else (hold.frame,)
-
-    def settle(self, z: NDArray[np.float64]) -> None:
-        """Let what the motion z_1..z_N, shape (N, n), leaves behind at places that it chooses itself stand there."""
+        if not any(phase.left for phase in self.task.phases):
+            return self
+        view = copy.copy(self)
+        view.phases, view._distances = list(self.phases), list(self._distances)
         for number, phase in enumerate(self.task.phases):
+            where: dict[int, pin.SE3] = {}
             for name, (hold, before) in phase.left.items():
-                part, closure = self.phases[number], self.chain.closures[hold]
+                closure = self.chain.closures[hold]
                 rotations, translations = self.chain.joint_placements(z[[self.first_waypoint[before + 1] - 1]])
                 carrier = pin.SE3(rotations[0, closure.joint], translations[0, closure.joint])
                 placed = dataclasses.replace(self.scene.objects[name], placement=carrier * closure.local)
-                for index, shape in zip(part.left[name], standing_geometry(placed), strict=True):
-                    part.place(index, shape.placement)
-                    self._distances[number].forget(index)
+                shapes = zip(self.phases[number].left[name], standing_geometry(placed), strict=True)
+                where |= {index: shape.placement for index, shape in shapes}
+            if where:
+                view.phases[number] = self.phases[number].placed(where)
+                view._distances[number] = self._distances[number].placed(where)
+        return view
 
     def phase_of(self, waypoint: int) -> int:
         """Return the phase whose geometry holds at `waypoint`: at a boundary the earlier, before the grasp."""
@@ -267,6 +182,13 @@ class ContactModel:
         """Return the joints of the chain that carry `geometries`; 0 for what stands in the world."""
         return self._joints[geometries]
 
+    def gradients(self, z: NDArray[np.float64], contacts: Contacts) -> NDArray[np.float64]:
+        """Return the gradients of the distances of contacts at configurations `z`, shape (B, n): n·(∂b − ∂a), shape (C, n)."""
+        joints = self.joints_of(contacts.pair)
+        which, points = np.tile(contacts.waypoint, 2), np.concatenate([contacts.first, contacts.second])
+        first, second = np.split(self.chain.point_jacobians(z, which, joints.T.ravel(), points), 2)
+        return np.asarray(np.einsum("ci,cij->cj", contacts.normal, second - first))
+
     def planes(
         self, z: NDArray[np.float64], contacts: Contacts, *, slots: int
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -293,14 +215,3 @@ class ContactModel:
             coefficients[r, s, j - 1, 3] += sign * n
         offsets[row, slot] = offset
         return coefficients.reshape(len(z), slots, 12 * joints), offsets
-
-
-def _boxes(shapes: Sequence[pin.GeometryObject]) -> tuple[NDArray[np.float64], ...]:
-    """Return centres and half extents of bounding boxes, and placements as rotations and translations; see `PhaseGeometry`."""
-    boxes = [bounding_box(shape) for shape in shapes]
-    return (
-        np.array([center for center, _ in boxes]).reshape(-1, 3),
-        np.array([half for _, half in boxes]).reshape(-1, 3),
-        np.array([shape.placement.rotation for shape in shapes]).reshape(-1, 3, 3),
-        np.array([shape.placement.translation for shape in shapes]).reshape(-1, 3),
-    )

@@ -22,15 +22,15 @@ def impossible(problem: TrajectoryProblem) -> list[Violation]:
         labels = problem.contacts.phases[0].labels
         subject = f"{labels[first]} – {labels[second]}"
         found.append(Violation("start", subject, 0, 0.0, -distance, "m", f"overlap by {-1e3 * distance:.1f} mm at the start"))
-    t = problem.transcription
-    for name, pose, solver, target in zip(problem.pose_names, t.structure.poses, t.pose_solvers, problem.targets, strict=True):
-        if name.startswith("closure ") and name.removeprefix("closure ") in problem.scene.held and 1 in pose.waypoints:
-            error = float(np.abs(solver.evaluate(problem.start[None], target)[0]).max())
+    for goal, solver in zip(problem.pose_goals, problem.transcription.pose_solvers, strict=True):
+        if goal.kind == "closure" and goal.object in problem.scene.held and 1 in goal.row.waypoints:
+            error = float(np.abs(solver.evaluate(problem.start[None], goal.target)[0]).max())
             if error > problem.options.closure_position:
                 detail = f"it is held at the start, but the hand is {error:.4f} m or rad from its attachment"
-                found.append(Violation("closure", name.removeprefix("closure "), 0, 0.0, error, "m", detail))
+                found.append(Violation("closure", goal.about, 0, 0.0, error, "m", detail))
+    dt = problem.timing_for(problem.still).dt
     for phase, end in zip(problem.task.phases, problem.ends, strict=True):
-        waypoint, time = int(end), float(problem.dt[:end].sum())
+        waypoint, time = int(end), float(dt[:end].sum())
         goals = dict(phase.values)
         if phase.base is not None:
             goals |= {n: v for n, v in zip(problem.chain.names[:2], phase.base[:2], strict=True) if v is not None}

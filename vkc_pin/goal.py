@@ -16,7 +16,7 @@ from vkc_pin.options import Options
 from vkc_pin.placed import PlacedObject
 from vkc_pin.scene import Scene
 from vkc_pin.steps import STEPS, Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch, as_list
-from vkc_pin.task import FrameGoal, Phase, Task
+from vkc_pin.task import FrameGoal, Phase, PhaseKind, Task
 
 __all__ = ["compile_task", "nothing_to_do"]
 
@@ -43,13 +43,14 @@ class _Compiler:
             self.initial.setdefault(f"{placed.name}.{joint}", value)
             self.state.setdefault(f"{placed.name}.{joint}", value)
 
-    def _append(self, name: str, segments: int, **details: Any) -> None:
+    def _append(self, kind: PhaseKind, about: tuple[str, ...], segments: int, **details: Any) -> None:
         last = self.phases[-1] if self.phases else None
         before = (*last.held, *last.grasps) if last else self.scene.holds
         leaves = tuple(hold for hold in before if hold not in self.held)
         lifted = {hold: last.standing[hold.object] for hold in last.grasps if hold.object in last.standing} if last else {}
         phase = Phase(
-            name,
+            kind,
+            about,
             segments,
             held=self.held,
             leaves=leaves,
@@ -107,7 +108,8 @@ class _Compiler:
         if hold not in self.holds:
             self.holds.append(hold)
         self._enter(placed, attachment.name)
-        self._append(f"reach {hold}", self.options.reach_waypoints, grasps=(hold,))
+        about = (hold.object, hold.attachment, hold.frame or "")
+        self._append("grasp", about, self.options.reach_waypoints, grasps=(hold,))
         self.held = (*self.held, hold)
         self.standing.pop(name, None)
         return hold
@@ -168,17 +170,16 @@ class _Compiler:
             lower, upper = joint_limits(placed, release)
             turned = min(latch.threshold + LATCH_MARGIN, upper)
             if self.state[release] < turned:
-                self._append(
-                    f"turn {release}", self.options.turn_waypoints, ranges={release: (lower, upper)}, values={release: turned}
-                )
+                ranged, goal = {release: (lower, upper)}, {release: turned}
+                self._append("turn", (release,), self.options.turn_waypoints, ranges=ranged, values=goal)
             if values.get(release, upper) < turned:
                 after[release] = values[release]
             ranges[release] = (turned, upper)
             values[release] = turned if release in after else values.get(release, turned)
-        self._append(f"move {', '.join(values)}", self.options.move_waypoints, ranges=ranges, values=values)
+        self._append("move", tuple(values), self.options.move_waypoints, ranges=ranges, values=values)
         if after:
             limits = {release: joint_limits(placed, release) for release in after}
-            self._append(f"turn {', '.join(after)}", self.options.turn_waypoints, ranges=limits, values=after)
+            self._append("turn", tuple(after), self.options.turn_waypoints, ranges=limits, values=after)
 
     def touch(self, step: Touch, where: str) -> None:
         """Add the phase that brings a frame to its target, carrying on what is carried."""
@@ -199,7 +200,7 @@ class _Compiler:
         point = not isinstance(step.target, pin.SE3)
         target = pin.SE3(np.eye(3), np.array(step.target)) if point else step.target
         goal = FrameGoal(link, target, "point" if point else "pose", hold, touches=True)
-        self._append(f"touch with {step.frame}", self.options.reach_waypoints, frames=(goal,))
+        self._append("touch", (step.frame,), self.options.reach_waypoints, frames=(goal,))
 
     def place(self, step: Place, where: str) -> None:
         """Add the phases that bring an object to its place and leave it there."""
@@ -214,7 +215,7 @@ class _Compiler:
         stands = np.eye(3) if step.object in self.scene.held else placed.placement.rotation
         pose = pin.SE3(stands, np.array(step.pose)) if upright else step.pose
         goal = FrameGoal(placed.object.base_link, pose, "upright" if upright else "pose", hold)
-        self._append(f"place {step.object}", self.options.reach_waypoints, frames=(goal,), lowered={hold: pose})
+        self._append("place", (step.object,), self.options.reach_waypoints, frames=(goal,), lowered={hold: pose})
         self._release(hold, pose)
         if upright:
             self.left[step.object] = (hold, len(self.phases) - 1)
@@ -227,7 +228,7 @@ class _Compiler:
             held = [hold.object for hold in self.held]
             raise UnknownNameError("held object", step.object, held, field=f"{where}.object")
         if not self.phases:
-            self._append("stand still", self.options.turn_waypoints)
+            self._append("stand", (), self.options.turn_waypoints)
         for hold in reversed(self.held):
             if hold in self.held and step.object in (None, hold.object):
                 placed = self.scene.objects[hold.object]
@@ -258,10 +259,10 @@ class _Compiler:
         elif isinstance(step, Reach):
             frame = robot_frame(self.scene, step.frame, f"{where}.frame")
             self._let_go_of_fixed()
-            self._append(f"reach with {frame}", self.options.reach_waypoints, frames=(FrameGoal(frame, step.pose),))
+            self._append("reach", (frame,), self.options.reach_waypoints, frames=(FrameGoal(frame, step.pose),))
         elif isinstance(step, GoTo):
             self._let_go_of_fixed()
-            self._append("go to", self.options.reach_waypoints, base=(step.x, step.y, step.yaw))
+            self._append("go", (), self.options.reach_waypoints, base=(step.x, step.y, step.yaw))
         else:
             expected = ", ".join(kind.__name__ for kind in STEPS)
             raise InputError("not a step", field=where, expected=expected, got=repr(step))

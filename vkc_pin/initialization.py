@@ -193,7 +193,7 @@ class _Seeds:
                 continue
             contacts = self.problem.evaluate_contacts(z, reach=self.problem.options.dist_safe, nearest=1)
             short = float(contacts.shortfall(len(z)).sum())
-            merit = self.problem.objective(z) + self.problem.options.penalty * short
+            merit = self.problem.objective(z, self.problem.timing_for(z).dt) + self.problem.options.penalty * short
             if merit < least:
                 best, least = (index, z, short), merit
             if short < (_POOR if self.method == "rrt" else _FREE):

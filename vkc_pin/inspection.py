@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vkc_pin.contact import ContactModel
 from vkc_pin.problem import TrajectoryProblem
 
 __all__ = ["Plane", "patterns", "planes", "sizes"]
@@ -21,6 +22,7 @@ class Plane:
 
     Attributes:
         problem: The program.
+        contacts: What can collide with what along the motion that the plane belongs to.
         waypoint: Counted from 1.
         names: The two links or obstacles.
         pair: Their geometries, shape (2,).
@@ -31,6 +33,7 @@ class Plane:
     """
 
     problem: TrajectoryProblem
+    contacts: ContactModel
     waypoint: int
     names: tuple[str, str]
     pair: NDArray[np.int_]
@@ -49,7 +52,7 @@ class Plane:
     def distances(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the pair's distance from coal, shape (W,) [m], at z, shape (W, n); NaN where it is far from this one."""
         reach = max(self.distance, 0.0) + _FURTHER
-        found = self.problem.contacts.evaluate(z, np.full(len(z), self.waypoint), reach=reach)
+        found = self.contacts.evaluate(z, np.full(len(z), self.waypoint), reach=reach)
         mine, distances = (found.pair == self.pair).all(axis=1), np.full(len(z), np.nan)
         distances[found.waypoint[mine]] = found.distance[mine]
         return distances
@@ -64,15 +67,19 @@ def planes(problem: TrajectoryProblem, z: NDArray[np.float64], waypoint: int) ->
         waypoint: Counted from 1.
     """
     t, labels = problem.transcription, problem.contacts.phases[problem.contacts.phase_of(waypoint)].labels
-    contacts = problem.evaluate_contacts(z, reach=problem.options.contact_reach, nearest=t.slots)
-    coefficients, offsets = problem.contacts.planes(z, contacts, slots=t.slots)
+    model = problem.contacts.settled(z)
+    waypoints = np.arange(1, problem.segments + 1)
+    contacts = model.evaluate(z, waypoints, reach=problem.options.contact_reach, nearest=t.slots)
+    coefficients, offsets = model.planes(z, contacts, slots=t.slots)
     x = np.column_stack([z, np.zeros(len(z))]).ravel()
-    parameters = t.parameter_vector(problem.start, coefficients, offsets, problem.target_matrix(), problem.options.penalty)
+    dt, targets = problem.timing_for(z).dt, problem.target_matrix()
+    parameters = t.parameter_vector(problem.start, coefficients, offsets, targets, problem.options.penalty, dt)
     _, jacobian = t.rows_at(x, parameters)
     columns = (waypoint - 1) * (t.n + 1) + np.arange(t.n)
     return [
         Plane(
             problem=problem,
+            contacts=model,
             waypoint=waypoint,
             names=(labels[contacts.pair[k, 0]], labels[contacts.pair[k, 1]]),
             pair=contacts.pair[k],
@@ -91,20 +98,22 @@ def sizes(problem: TrajectoryProblem) -> dict[str, int]:
 
     The rows of velocity and acceleration are not among those of the program unless it turns out to need them.
     """
-    t = problem.transcription
+    t, (first, second) = problem.transcription, problem.rates(problem.still)
     fixed = int((problem.lower == problem.upper).sum())
     found = {
         "variables: coordinates": problem.lower.size - fixed,
         "variables: coordinates, fixed by bounds": fixed,
         "variables: slacks": t.segments,
     }
-    for name, at in zip(problem.pose_names, t.pose_rows, strict=True):
-        found[f"rows: {name}"] = sum(len(rows) for rows in at.values())
+    for goal, at in zip(problem.pose_goals, t.pose_rows, strict=True):
+        kind = f"rows: {goal.name}"
+        found[kind] = found.get(kind, 0) + sum(len(rows) for rows in at.values())
     found["rows: witness planes"] = t.slot_rows.size
     found["rows: rolling"] = len(t.base_rows)
-    found["rows: clamped freedoms"] = t.rows - sum(size for kind, size in found.items() if kind.startswith("rows"))
-    found["only if needed: velocities"] = problem.velocity.size
-    found["only if needed: accelerations"] = problem.acceleration.size
+    found["rows: clamped freedoms"] = sum(last - first for _, first, last in t.structure.clamped)
+    found["rows: own constraints"] = len(problem.term_numbers.rows)
+    found["only if needed: velocities"] = first.size
+    found["only if needed: accelerations"] = second.size
     return found
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import copy
+from collections.abc import Mapping, Sequence
 
 import coal
 import pinocchio as pin
@@ -33,9 +34,13 @@ class Distances:
         self._moving.clear()
         return self
 
-    def forget(self, shape: int) -> None:
-        """Take note that a shape that stands has been placed elsewhere."""
-        self._standing.pop(shape, None)
+    def placed(self, where: Mapping[int, pin.SE3]) -> Distances:
+        """Return the same with shapes that stand placed elsewhere in the world; both look at what moves in the same place."""
+        other = copy.copy(self)
+        other._standing = _Standing(self._standing.shapes)
+        other._standing.update(self._standing)
+        other._standing.update((shape, coal.Transform3s(at.rotation, at.translation)) for shape, at in where.items())
+        return other
 
     def of(self, first: int, second: int) -> coal.DistanceResult:
         """Return distance, witness points and normal of a shape that moves and another at the configuration."""
@@ -50,10 +55,10 @@ class _Standing(dict[int, coal.Transform3s]):
 
     def __init__(self, shapes: Sequence[pin.GeometryObject]) -> None:
         super().__init__()
-        self._shapes = shapes
+        self.shapes = shapes
 
     def __missing__(self, shape: int) -> coal.Transform3s:
-        placement = self._shapes[shape].placement
+        placement = self.shapes[shape].placement
         where = self[shape] = coal.Transform3s(placement.rotation, placement.translation)
         return where
 

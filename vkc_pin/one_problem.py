@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from vkc_pin.diagnosis import explain, impossible
 from vkc_pin.goal import compile_task
 from vkc_pin.initialization import HOPELESS, Seed, initialize
-from vkc_pin.monitor import Interrupt, interruptible
+from vkc_pin.interrupt import Interrupt, interruptible
 from vkc_pin.options import Options
 from vkc_pin.pieces import Piece
 from vkc_pin.plan import Plan
@@ -137,7 +137,7 @@ class OneProblem:
 
     def piece(self) -> Piece:
         """Return the best waypoints, once `run` has ended, for problems of more phases to start from."""
-        phases = tuple(phase.name for phase in self.task.phases)
+        phases = tuple(phase.key for phase in self.task.phases)
         path, ends = self.problem.waypoints(self.z), [0, *self.problem.ends.tolist()]
         waypoints = tuple(path[first : last + 1] for first, last in itertools.pairwise(ends))
         return Piece(phases, self.problem.chain.names, waypoints, self.initialization)
@@ -174,8 +174,8 @@ class OneProblem:
             self.settings.interrupt.pressed = True
             status = "interrupted"
         if best is None and self._leading is not None:
-            problem.take_time_for(self._leading.z)
-            best = self._judge(problem, Solution(self._leading.z), self._leading.name)
+            leading = self._leading
+            best = self._judge(problem, Solution(leading.z, problem.timing_for(leading.z).dt), leading.name)
         if best is None:
             best, notes = self._stationary(problem), notes + self.blocked
         if not status:
@@ -209,9 +209,8 @@ class OneProblem:
                 solution = self._solve(problem, seed, deadline, rounds=1)
                 if solution.status == "time limit" and self._leading is not None:
                     break
-                scored.append(
-                    (problem.objective(solution.z), number, dataclasses.replace(seed, z=solution.z, radius=solution.radius))
-                )
+                better = dataclasses.replace(seed, z=solution.z, radius=solution.radius)
+                scored.append((problem.objective(solution.z, solution.dt), number, better))
                 self._leading = min(scored)[-1]
                 if solution.status == "interrupted":
                     raise KeyboardInterrupt
@@ -250,7 +249,7 @@ class OneProblem:
         began = time.perf_counter()
         self.settings.progress.doing("checking")
         with interruptible() as interrupt:  # what was found is checked all the same
-            trajectory = as_trajectory(problem, solution.z)
+            trajectory = as_trajectory(problem, solution.z, solution.dt)
             report = validate(self.scene, self.task.steps, trajectory, self.settings.options, self.settings.terms)
         self.settings.interrupt.pressed |= interrupt.pressed
         self.times["validation"] += time.perf_counter() - began
@@ -258,7 +257,7 @@ class OneProblem:
         return _Try(name, solution.z, trajectory, report, status)
 
     def _stationary(self, problem: TrajectoryProblem) -> _Try:
-        return self._judge(problem, Solution(np.tile(problem.start, (problem.segments, 1))), "none")
+        return self._judge(problem, Solution(problem.still, problem.timing_for(problem.still).dt), "none")
 
     def _plan(self, best: _Try, status: str, planning_time: float, build_time: float) -> Plan:
         metrics = {

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from vkc_pin.initialization import Seed
 from vkc_pin.problem import TrajectoryProblem
+from vkc_pin.task import PhaseKey
 from vkc_pin.trajectory import filled
 
 __all__ = ["Piece", "seed_of"]
@@ -22,13 +23,13 @@ class Piece:
     """Waypoints of phases that follow one another.
 
     Attributes:
-        phases: The phases' names.
+        phases: What happens in the phases.
         names: Of the n coordinates.
         waypoints: Their waypoints, for each phase, from its first, which is the last of the phase before, to its last.
         seed: The name of the seed that led to them.
     """
 
-    phases: tuple[str, ...]
+    phases: tuple[PhaseKey, ...]
     names: tuple[str, ...]
     waypoints: tuple[NDArray[np.float64], ...]
     seed: str
@@ -42,7 +43,7 @@ def seed_of(problem: TrajectoryProblem, pieces: Sequence[Piece]) -> Seed:
     for piece in pieces:
         count = len(piece.phases)
         phases = problem.task.phases[number : number + count]
-        if piece.phases != tuple(phase.name for phase in phases):
+        if piece.phases != tuple(phase.key for phase in phases):
             continue  # only to let go of something the robot stands still for a while; here that has no phase of its own
         number += count
         known = [k for k, name in enumerate(piece.names) if name in chain.names]  # the rest belongs to what is held no more

@@ -22,7 +22,7 @@ from vkc_pin.solution import Iteration
 from vkc_pin.standing import standing
 from vkc_pin.step_by_step import step_by_step
 from vkc_pin.steps import Step
-from vkc_pin.term_goals import stretches
+from vkc_pin.task import stretches
 from vkc_pin.terms import Term, check_active, traced
 
 __all__ = ["check_arguments", "guarded", "plan", "settings_for"]

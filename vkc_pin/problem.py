@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
+import copy
 from collections.abc import Sequence
 from functools import cached_property
 
@@ -13,26 +13,25 @@ from vkc_pin.chain import VirtualKinematicChain, consolidate
 from vkc_pin.contact import ContactModel, Contacts
 from vkc_pin.goal import compile_task
 from vkc_pin.options import Options
-from vkc_pin.pose import PoseRow, target_vector
+from vkc_pin.pose import ROW_BOUNDS, target_vector
 from vkc_pin.pose_goals import pose_goals
 from vkc_pin.scene import Scene
 from vkc_pin.steps import Step
-from vkc_pin.task import Phase, Task
-from vkc_pin.term_goals import TermNumbers, stretches, term_goals
+from vkc_pin.task import Phase, Task, stretches
+from vkc_pin.term_goals import TermNumbers, term_goals
 from vkc_pin.term_rows import TermRow
 from vkc_pin.terms import Term, check_active, traced
+from vkc_pin.timing import Timing, runs_between, time_for
 from vkc_pin.transcription import transcribe
 from vkc_pin.waypoint import Structure
 
 __all__ = ["TrajectoryProblem", "build"]
 
 _CHOICE_WEIGHT = 1e-3  # of coordinates that are chosen when grasping and do not move: only keeps the problem regular
-_PATIENCE = 1.5  # how much more time a motion may take before limits on its rates become rows of the program
-_SPARE = 1.15  # how much longer a motion may take than the profile 3s² − 2s³ along its seed
 
 
 class TrajectoryProblem:
-    """A task in a scene, ready to be solved.
+    """A task in a scene, ready to be solved. Nothing about it changes: how long steps take is a motion's own, see `timing_for`.
 
     Attributes:
         scene, task, options: What it was made of.
@@ -41,12 +40,10 @@ class TrajectoryProblem:
         transcription: The symbolic program, shared between problems of one structure.
         start: z_0, shape (n,).
         lower, upper: Bounds of z_1..z_N, shape (N, n): joint limits (eq. 4), what stands still, joint goals.
-        targets: Placements of the pose rows (eqs. 2 and 3), one per `transcription.structure.poses`.
-        pose_names: Their names.
+        pose_goals: Which frames must be where (eqs. 2 and 3), one per `transcription.structure.poses`.
+        targets: Their placements.
         terms: The user's own constraints and costs that count here, one per `transcription.structure.terms`.
-        own: Their numbers.
-        dt: Time of every step [s], shape (N,): `Options.dt`, or longer where the way is too long for it.
-        velocity, acceleration: Bounds of `rates` (eq. 5), shapes (N, n) and (N + 1 + rests, n): limits times dt and dt².
+        term_numbers: Their values along a motion.
     """
 
     def __init__(self, scene: Scene, task: Task, options: Options, terms: Sequence[Term] = ()) -> None:
@@ -54,22 +51,34 @@ class TrajectoryProblem:
         self.chain: VirtualKinematicChain = consolidate(scene, task.holds)
         self.contacts = ContactModel(scene, self.chain, task, options)
         self.ends = np.cumsum([phase.segments for phase in task.phases])
-        poses, self.targets, self.pose_names = pose_goals(scene, self.chain, task, options)
+        self.pose_goals = pose_goals(scene, self.chain, task, options)
+        self.targets = tuple(goal.target for goal in self.pose_goals)
         rows, self.terms = term_goals(scene, self.chain, task, terms)
-        self.transcription = transcribe(self._structure(poses, rows))
+        self.transcription = transcribe(self._structure(rows))
         self.start = self._start()
         self.lower, self.upper = self._bounds()
-        self.own = TermNumbers(self.terms, self.transcription, self.start)
-        still = np.tile(self.start, (self.segments, 1))
-        self.own.check(still, np.full(self.segments, options.dt))
-        self.take_time_for(still)
+        _freeze(self.start, self.lower, self.upper)
+        self.term_numbers = TermNumbers(self.terms, self.transcription, self.start)
+        self.term_numbers.check(self.still, np.full(self.segments, options.dt))
+
+    def with_bounds(self, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> TrajectoryProblem:
+        """Return the same problem with other bounds of z_1..z_N, shape (N, n)."""
+        other = copy.copy(self)
+        other.lower, other.upper = lower.copy(), upper.copy()
+        _freeze(other.lower, other.upper)
+        return other
 
     @property
     def segments(self) -> int:
         """N, the number of waypoints after the start."""
         return int(self.ends[-1])
 
-    def _structure(self, poses: Sequence[PoseRow], terms: tuple[TermRow, ...]) -> Structure:
+    @property
+    def still(self) -> NDArray[np.float64]:
+        """z_1..z_N where nothing moves, shape (N, n)."""
+        return np.tile(self.start, (self.segments, 1))
+
+    def _structure(self, terms: tuple[TermRow, ...]) -> Structure:
         o, robot = self.options, self.chain.robot.coordinates.size
         weights = np.full(self.chain.size, o.velocity_weight_object)
         weights[:robot], weights[:2] = o.velocity_weight_arm, o.velocity_weight_base
@@ -88,19 +97,11 @@ class TrajectoryProblem:
                 velocity[first:last, :2] *= o.velocity_weight_holding
         # The robot stands still while its gripper closes or opens.
         phases = zip(self.ends[:-1], self.task.phases[:-1], self.task.phases[1:], strict=True)
-        rests = [int(end) for end, phase, after in phases if phase.grasps or after.leaves]
+        rests = tuple(int(end) for end, phase, after in phases if phase.grasps or after.leaves)
         differential = self.chain.robot.base == "differential"
+        poses = tuple(goal.row for goal in self.pose_goals)
         return Structure(
-            self.chain.model,
-            self.segments,
-            tuple(poses),
-            o.contact_slots,
-            velocity,
-            acceleration,
-            tuple(rests),
-            differential,
-            clamped,
-            terms,
+            self.chain.model, self.segments, poses, o.contact_slots, velocity, acceleration, rests, differential, clamped, terms
         )
 
     @cached_property
@@ -158,42 +159,14 @@ class TrajectoryProblem:
                     lower[:until, column] = upper[:until, column] = self.start[column]
         return lower, upper
 
-    def _set_steps(self, dt: NDArray[np.float64]) -> None:
-        """Take over the time of every step, one value within each run between two rests."""
-        of_rows = np.concatenate([np.full(last - first + 1, dt[first]) for first, last in self._runs()])
-        self.dt = dt
-        self.velocity = self.chain.velocity * dt[:, None]
-        self.acceleration = self.chain.acceleration * of_rows[:, None] ** 2
-
-    def take_time_for(self, z: NDArray[np.float64]) -> None:
-        """Give every step `Options.dt`, or more where z_1..z_N, shape (N, n), is too long a way for it.
-
-        The measure is the profile 3s² − 2s³ over the way that each coordinate goes between two rests: its speed is at most 1.5
-        times the mean, its acceleration 6 times the way over the square of the duration. Terms may ask for more time.
-        """
-        steps, dt = np.abs(np.diff(self.waypoints(z), axis=0)), np.full(self.segments, self.options.dt)
-        for first, last in self._runs():
-            way = steps[first:last].sum(axis=0)
-            needed = max(np.max(1.5 * way / self.chain.velocity), np.sqrt(np.max(6.0 * way / self.chain.acceleration)))
-            dt[first:last] = np.maximum(dt[first:last], _SPARE * needed / (last - first))
-        if self.transcription.structure.timed:
-            dt = self.own.slower(z, dt, self._runs())
-        self._set_steps(dt)
-        self._least = dt
-
-    def stretch(self, z: NDArray[np.float64]) -> None:
-        """Give runs between rests up to `_PATIENCE` times more time where z_1..z_N, shape (N, n), exceeds a rate."""
-        first, second = self.rates(z)
-        fast, strong = np.max(np.abs(first) / self.velocity, axis=1), np.max(np.abs(second) / self.acceleration, axis=1)
-        dt = self.dt.copy()
-        for number, (begin, end) in enumerate(self._runs()):
-            excess = max(float(fast[begin:end].max()), float(np.sqrt(strong[begin + number : end + number + 1].max())))
-            dt[begin:end] = np.clip(dt[begin:end] * excess * 1.001, dt[begin:end], _PATIENCE * self._least[begin:end])
-        self._set_steps(dt)
-
-    def _runs(self) -> list[tuple[int, int]]:
-        """Return the stretches between two rests, as first and last waypoint."""
-        return list(itertools.pairwise([0, *self.transcription.structure.rests, self.segments]))
+    def timing_for(self, z: NDArray[np.float64]) -> Timing:
+        """Return how long steps take where z_1..z_N, shape (N, n), is the seed; see `time_for`. Terms may ask for more time."""
+        structure, limits = self.transcription.structure, (self.chain.velocity, self.chain.acceleration)
+        runs = runs_between(structure.rests, self.segments)
+        dt = time_for(self.waypoints(z), self.options.dt, runs, limits)
+        if structure.timed:
+            dt = self.term_numbers.slower(z, dt, runs)
+        return Timing(dt, dt, runs, limits)
 
     def closed(self, phase: Phase) -> bool:
         """Return whether something that stands fixed in the world is held in a phase: then the chain is closed."""
@@ -225,8 +198,7 @@ class TrajectoryProblem:
 
     def evaluate_contacts(self, z: NDArray[np.float64], *, reach: float, nearest: int | None = None) -> Contacts:
         """Return the pairs closer than `reach` [m] at z_1..z_N, shape (N, n); at most `nearest` a waypoint."""
-        self.contacts.settle(z)
-        return self.contacts.evaluate(z, np.arange(1, self.segments + 1), reach=reach, nearest=nearest)
+        return self.contacts.settled(z).evaluate(z, np.arange(1, self.segments + 1), reach=reach, nearest=nearest)
 
     def rates(self, z: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the steps δz, shape (N, n), and their differences δδz, shape (N + 1 + rests, n); see `Transcription`."""
@@ -234,27 +206,25 @@ class TrajectoryProblem:
         first = t.first @ z + np.outer(t.start_first, self.start)
         return first, t.second @ z + np.outer(t.start_second, self.start)
 
-    def objective(self, z: NDArray[np.float64]) -> float:
-        """Return f of eq. 1, and the user's own costs, at z_1..z_N, shape (N, n)."""
+    def objective(self, z: NDArray[np.float64], dt: NDArray[np.float64]) -> float:
+        """Return f of eq. 1, and the user's own costs, at z_1..z_N, shape (N, n), in steps that take dt, shape (N,) [s]."""
         structure = self.transcription.structure
         first, second = self.rates(z)
         efforts = np.sum(first**2 * structure.weights_velocity) + np.sum(second**2 @ structure.weights_acceleration)
-        return float(efforts) + self.own.cost(z, self.dt)
+        return float(efforts) + self.term_numbers.cost(z, dt)
 
     def pose_error(self, z: NDArray[np.float64]) -> float:
         """Return the largest residual of closure, goals and rolling, [m] or [rad], at z_1..z_N, shape (N, n)."""
         errors = [0.0]
-        for pose, solver, target in zip(
-            self.transcription.structure.poses, self.transcription.pose_solvers, self.targets, strict=True
-        ):
-            if pose.waypoints:
-                residual, _ = solver.evaluate(z[np.array(pose.waypoints) - 1], target)
+        for goal, solver in zip(self.pose_goals, self.transcription.pose_solvers, strict=True):
+            if goal.row.waypoints:
+                residual, _ = solver.evaluate(z[np.array(goal.row.waypoints) - 1], goal.target)
                 errors.append(float(np.abs(residual).max()))
         return max(*errors, self.slip(z))
 
-    def row_error(self, z: NDArray[np.float64]) -> float:
+    def row_error(self, z: NDArray[np.float64], dt: NDArray[np.float64]) -> float:
         """Return `pose_error`, or how much the user's own constraints are violated if that is more; see `TermNumbers.error`."""
-        return max(self.pose_error(z), self.own.error(z, self.dt))
+        return max(self.pose_error(z), self.term_numbers.error(z, dt))
 
     def slip(self, z: NDArray[np.float64]) -> float:
         """Return how far a differential base slips sideways in the worst step of z_1..z_N, shape (N, n) [m]; 0 for others."""
@@ -270,31 +240,43 @@ class TrajectoryProblem:
         path, worst = self.waypoints(z), 0.0
         between = (path[1:] + path[:-1]) / 2
         allowed = np.array([self.options.closure_position, self.options.closure_angle])
-        for pose, solver, target in zip(
-            self.transcription.structure.poses, self.transcription.pose_solvers, self.targets, strict=True
-        ):
-            held = np.array([t - 1 for t in pose.waypoints if t - 1 in pose.waypoints], int)
+        for goal, solver in zip(self.pose_goals, self.transcription.pose_solvers, strict=True):
+            held = np.array([t - 1 for t in goal.row.waypoints if t - 1 in goal.row.waypoints], int)
             if len(held):
-                residual, _ = solver.evaluate(between[held], target)
+                residual, _ = solver.evaluate(between[held], goal.target)
                 amounts = np.linalg.norm(residual.reshape(len(held), 2, 3), axis=2)
                 worst = max(worst, float((amounts / allowed).max()))
         return worst
 
-    def rate_violation(self, z: NDArray[np.float64]) -> float:
-        """Return the largest excess over a velocity or acceleration bound, relative to that bound."""
-        first, second = self.rates(z)
-        return float(max(np.max(np.abs(first) / self.velocity), np.max(np.abs(second) / self.acceleration)) - 1.0)
+    def row_bounds(self, timing: Timing | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the bounds of the program's rows, and with a timing those of its rates; shapes (rows,) and (rows,)."""
+        t, terms = self.transcription, self.term_numbers
+        lower, upper = np.zeros(t.rows), np.zeros(t.rows)
+        upper[t.slot_rows] = np.inf
+        for pose, at in zip(t.structure.poses, t.pose_rows, strict=True):
+            for rows in at.values():
+                lower[rows], upper[rows] = ROW_BOUNDS[pose.kind]
+        lower[terms.rows], upper[terms.rows] = terms.lower, terms.upper
+        if timing is not None:
+            rates = np.concatenate([timing.velocity.ravel(), timing.acceleration.ravel()])
+            lower, upper = np.concatenate([lower, -rates]), np.concatenate([upper, rates])
+        return lower, upper
 
     def target_matrix(self) -> NDArray[np.float64]:
         """Return the pose targets as parameters, shape (poses, 12)."""
         return np.array([target_vector(t) for t in self.targets]).reshape(-1, 12)
 
     def __repr__(self) -> str:
-        t = self.transcription
+        t, time = self.transcription, self.timing_for(self.still).dt.sum()
         return (
-            f"<TrajectoryProblem {' → '.join(p.name for p in self.task.phases)}: {self.segments} steps in {self.dt.sum():g} s, "
+            f"<TrajectoryProblem {' → '.join(p.name for p in self.task.phases)}: {self.segments} steps in {time:g} s, "
             f"{t.size} variables, {t.rows} rows, {sum(len(p.pairs) for p in self.contacts.phases)} collision pairs>"
         )
+
+
+def _freeze(*arrays: NDArray[np.float64]) -> None:
+    for array in arrays:
+        array.flags.writeable = False
 
 
 def build(

@@ -31,12 +31,12 @@ def collisions_between(problem: TrajectoryProblem, z: NDArray[np.float64]) -> tu
         Contacts at z_1..z_N, whose margin exceeds their distance by what is missing in between (or falls below it by what
         is to spare: they guard against what is close already), and whether no sub-state is closer than `ENOUGH`.
     """
-    path = problem.waypoints(z)
+    path, contacts = problem.waypoints(z), problem.contacts.settled(z)
     counts = np.maximum(np.ceil(np.abs(np.diff(path, axis=0)).max(axis=1) / SPACING).astype(int), 1)
     segment = np.repeat(np.arange(len(z)), counts)
     piece = np.arange(len(segment)) - np.searchsorted(segment, segment)
     # The middles of the pieces first, and of pieces that something is close to the rest.
-    near = problem.contacts.evaluate(*_states(path, segment, (piece + 0.5) / counts[segment]), reach=KEEP + CLOSE)
+    near = contacts.evaluate(*_states(path, segment, (piece + 0.5) / counts[segment]), reach=KEEP + CLOSE)
     rows = np.unique(near.waypoint)
     segment, begin, length = segment[rows], piece[rows] / counts[segment[rows]], 1 / counts[segment[rows]]
     if not len(rows):
@@ -44,12 +44,12 @@ def collisions_between(problem: TrajectoryProblem, z: NDArray[np.float64]) -> tu
     segment = np.repeat(segment, FINER)
     s = (begin[:, None] + length[:, None] * (np.arange(FINER) + 0.5) / FINER).ravel()
     states, waypoints = _states(path, segment, s)
-    found = _deepest(problem.contacts.evaluate(states, waypoints, reach=KEEP + CLOSE), segment)
+    found = _deepest(contacts.evaluate(states, waypoints, reach=KEEP + CLOSE), segment)
     # A start that is close to something leaves it as it can: only what collides on the way counts.
     found = found.select(np.flatnonzero((segment[found.waypoint] > 0) | (found.distance < 0)))
     keep = np.minimum(KEEP, found.margin)
-    joints = problem.contacts.joints_of(found.pair)
-    rotations, translations = problem.contacts.placements(states[found.waypoint])
+    joints = contacts.joints_of(found.pair)
+    rotations, translations = contacts.placements(states[found.waypoint])
     ends = problem.chain.joint_placements(path)
     parts = []
     for offset in (0, 1):

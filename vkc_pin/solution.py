@@ -47,6 +47,7 @@ class Solution:
 
     Attributes:
         z: z_1..z_N, shape (N, n), the best iterate.
+        dt: Time of every step of it [s], shape (N,).
         converged: Whether the loop ended by its own criteria.
         status: "converged", "not converged", "time limit" or "interrupted".
         radius: How far planes were believed in the end, shape (N,).
@@ -57,6 +58,7 @@ class Solution:
     """
 
     z: NDArray[np.float64]
+    dt: NDArray[np.float64]
     converged: bool = False
     status: str = "not converged"
     radius: NDArray[np.float64] | None = None

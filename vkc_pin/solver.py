@@ -1,22 +1,20 @@
-"""Ipopt inside the sequential witness-plane loop (DESIGN: exact ℓ1 slack, trust region, warm starts)."""
+"""Ipopt inside the sequential witness-plane loop: an exact ℓ1 penalty on clearance, a trust region, warm starts."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vkc_pin.contact import Contacts
-from vkc_pin.monitor import Interrupt, interruptible
-from vkc_pin.pose import ROW_BOUNDS
+from vkc_pin.interrupt import Interrupt, interruptible
 from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.refinement import collisions_between, merge
 from vkc_pin.solution import Iteration, Solution
-from vkc_pin.trust_region import CLOSE_ENOUGH, TrustRegion
+from vkc_pin.trust_region import CLOSE_ENOUGH, FAR, Trial, TrustRegion, judge
 
 __all__ = ["solve"]
 
@@ -42,31 +40,17 @@ _WARM: Mapping[str, Any] = {
 EARLY = 0.05  # [m] shortfall of clearance below which collisions between waypoints count
 NEARLY_FREE = 0.01  # [m] shortfall of clearance below which limits on rates count
 POSE_TOLERANCE = 1e-4  # [m] and [rad]
-RATE_TOLERANCE = 1e-4  # relative
+SOLVED_RATE_TOLERANCE = 1e-4  # excess over a limit, relative; the check allows more
 DRIFT = 0.9  # of what a grasp may drift between waypoints
 SETTLING = 0.2  # relative decrease of the objective below which a motion that is nearly free is first made free
-HOPELESS_ROUNDS, HOPELESS = 6, 0.1  # after so many rounds, motions that fall short by so much [m] are given up
-HOPELESS_DRIFT = 2.0  # or drift by so much more than they may: waypoints are too far apart for them
+GIVE_UP_ROUNDS, GIVE_UP_SHORTFALL = (
+    6,
+    0.1,
+)  # after so many rounds, motions whose worst waypoint falls short so much [m] are given up
+GIVE_UP_DRIFT = 2.0  # or which drift by so much more than they may: waypoints are too far apart for them
 INSIDE = 0.9  # of the trust region: steps that end there were not held back (Ipopt ends a little inside its bounds)
 WORTHWHILE = 0.05  # relative decrease of the objective for which a feasible motion is improved further
 PENALTY_GROWTH, PENALTY_LIMIT = 4.0, 2000.0
-
-
-@dataclass(frozen=True)
-class _Trial:
-    """Where one Ipopt solve with fixed planes led, and what is really there."""
-
-    z: NDArray[np.float64]
-    slack: NDArray[np.float64]
-    objective: float
-    pose_error: float
-    contacts: Contacts
-    shortfall: NDArray[np.float64]
-    clear: bool
-    between: bool
-    rate: float
-    step: NDArray[np.float64]
-    satisfied: bool
 
 
 class _Loop:
@@ -77,16 +61,17 @@ class _Loop:
         self.problem, self.options = problem, problem.options
         self.transcription = problem.transcription
         self.z = problem.clip(seed)
-        problem.take_time_for(self.z)
+        self.timing = problem.timing_for(self.z)
         self.multipliers: dict[str, Any] = {}
         self.rates = False
         self.penalty = problem.options.penalty
-        self.solution = Solution(self.z)
+        self.solution = Solution(self.z, self.timing.dt)
         self.targets = problem.target_matrix()
         self.between = False
         self.at, _ = self.contacts(self.z)
         self.shortfall = self.at.shortfall(problem.segments)
-        self.objective, self.pose_error = problem.objective(self.z), problem.row_error(self.z)
+        self.objective = problem.objective(self.z, self.timing.dt)
+        self.pose_error = problem.row_error(self.z, self.timing.dt)
 
     def contacts(self, z: NDArray[np.float64]) -> tuple[Contacts, bool]:
         """Return what is close at the waypoints and, once that was needed, between them, and whether that is far enough."""
@@ -99,7 +84,7 @@ class _Loop:
         self.solution.timings["coal"] += time.perf_counter() - begin
         return found, clear
 
-    def free_between(self, trial: _Trial) -> bool:
+    def free_between(self, trial: Trial) -> bool:
         """Return whether nothing collides between waypoints; if something does, look there from now on."""
         if trial.between:
             return trial.clear
@@ -112,62 +97,58 @@ class _Loop:
             self.shortfall = self.at.shortfall(self.problem.segments)
         return free
 
-    def try_step(self, radius: NDArray[np.float64]) -> _Trial:
+    def try_step(self, radius: NDArray[np.float64]) -> Trial:
         """Solve within `radius` of the current waypoints, and look at what is really there."""
         z, slack, objective, satisfied = self.run_ipopt(radius)
         contacts, clear = self.contacts(z)
-        return _Trial(
+        return Trial(
             z=z,
             slack=slack,
             objective=objective - self.penalty * float(slack.sum()),
-            pose_error=self.problem.row_error(z),
+            pose_error=self.problem.row_error(z, self.timing.dt),
             contacts=contacts,
             shortfall=contacts.shortfall(self.problem.segments),
             clear=clear,
             between=self.between,
-            rate=self.problem.rate_violation(z),
+            rate=self.timing.violation(*self.problem.rates(z)),
             step=np.abs(z - self.z).max(axis=1),
             satisfied=satisfied,
         )
 
-    def judge(self, trial: _Trial) -> tuple[bool, float]:
+    def judge(self, trial: Trial) -> tuple[bool, float]:
         """Return whether to accept a step, and how much of the promised decrease of the ℓ1 merit came true."""
-        if self.pose_error > 10 * POSE_TOLERANCE:
-            return True, 0.5  # a seed off the closure's manifold cannot be compared with what is on it
-        merit = self.objective + self.penalty * float(self.shortfall.sum())
-        promised = merit - (trial.objective + self.penalty * float(trial.slack.sum()))
-        actual = merit - (trial.objective + self.penalty * float(trial.shortfall.sum()))
-        if promised < 1e-4 * max(1.0, abs(merit)):
-            return actual >= -1e-4 * max(1.0, abs(merit)), 0.5
-        return actual > 0.05 * promised, actual / promised
+        return judge(trial, self.objective, self.shortfall, penalty=self.penalty, pose_error=self.pose_error)
 
-    def accept(self, trial: _Trial) -> None:
+    def accept(self, trial: Trial) -> None:
         """Go on from `trial`."""
         self.z, self.at, self.shortfall = trial.z, trial.contacts, trial.shortfall
         self.objective, self.pose_error = trial.objective, trial.pose_error
         self.solution.z = trial.z
         if not self.between and 0.0 < trial.contacts.violation() < EARLY:
             self.free_between(trial)
-        if trial.rate > RATE_TOLERANCE and trial.contacts.violation() < NEARLY_FREE:  # before, it only costs time
-            self.problem.stretch(trial.z)
+        if trial.rate > SOLVED_RATE_TOLERANCE and trial.contacts.violation() < NEARLY_FREE:  # before, it only costs time
+            rates = self.problem.rates(trial.z)
+            self.timing = self.timing.stretched(*rates)
+            self.solution.dt = self.timing.dt
             if self.transcription.structure.timed:
-                self.objective, self.pose_error = self.problem.objective(trial.z), self.problem.row_error(trial.z)
-            if not self.rates and self.problem.rate_violation(trial.z) > RATE_TOLERANCE:
+                self.objective = self.problem.objective(trial.z, self.timing.dt)
+                self.pose_error = self.problem.row_error(trial.z, self.timing.dt)
+            if not self.rates and self.timing.violation(*rates) > SOLVED_RATE_TOLERANCE:
                 self.rates, self.multipliers = True, {}
 
-    def done(self, trial: _Trial) -> bool:
+    def done(self, trial: Trial) -> bool:
         """Return whether everything holds at the waypoints of a step just accepted, and nothing collides between them."""
         return (
             trial.satisfied
             and trial.clear
             and self.pose_error < POSE_TOLERANCE
-            and self.problem.rate_violation(trial.z) <= RATE_TOLERANCE
+            and self.timing.violation(*self.problem.rates(trial.z)) <= SOLVED_RATE_TOLERANCE
             and self.free_between(trial)
         )
 
     def astray(self) -> bool:
         """Return whether the user's own constraints are still far from holding; small steps would take long to get there."""
-        return self.problem.own.error(self.z, self.problem.dt) > 10 * POSE_TOLERANCE
+        return self.problem.term_numbers.error(self.z, self.timing.dt) > FAR
 
     def raise_penalty(self) -> None:
         """Make clearance dearer."""
@@ -181,7 +162,7 @@ class _Loop:
         planes, offsets = problem.contacts.planes(self.z, self.at, slots=t.slots)
         self.solution.timings["coal"] += time.perf_counter() - begin
         lower, upper = np.maximum(problem.lower, self.z - radius[:, None]), np.minimum(problem.upper, self.z + radius[:, None])
-        bounds = self._row_bounds()
+        bounds = problem.row_bounds(self.timing if self.rates else None)
         options = {**_IPOPT, **(_WARM if self.multipliers else {}), "ipopt.max_iter": self.options.max_iterations}
         solver = t.solver(rates=self.rates, options=options, deadline=self.deadline)
         arguments = {
@@ -190,7 +171,7 @@ class _Loop:
             "ubx": np.column_stack([upper, np.full(t.segments, np.inf)]).ravel(),
             "lbg": bounds[0],
             "ubg": bounds[1],
-            "p": t.parameter_vector(problem.start, planes, offsets, self.targets, self.penalty, problem.dt),
+            "p": t.parameter_vector(problem.start, planes, offsets, self.targets, self.penalty, self.timing.dt),
         }
         begin = time.perf_counter()
         result = solver(**arguments, **self.multipliers)
@@ -204,20 +185,6 @@ class _Loop:
         x = np.asarray(result["x"]).reshape(t.segments, t.n + 1)
         slack = np.maximum(x[:, -1], 0.0)
         return x[:, :-1], slack, float(result["f"]), bool(stats["success"])
-
-    def _row_bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        t = self.transcription
-        lower, upper = np.zeros(t.rows), np.zeros(t.rows)
-        upper[t.slot_rows] = np.inf
-        for pose, at in zip(t.structure.poses, t.pose_rows, strict=True):
-            for rows in at.values():
-                lower[rows], upper[rows] = ROW_BOUNDS[pose.kind]
-        own = self.problem.own
-        lower[own.rows], upper[own.rows] = own.lower, own.upper
-        if self.rates:
-            rates = np.concatenate([self.problem.velocity.ravel(), self.problem.acceleration.ravel()])
-            lower, upper = np.concatenate([lower, -rates]), np.concatenate([upper, rates])
-        return lower, upper
 
 
 def solve(
@@ -269,7 +236,7 @@ def _iterate(
 ) -> None:
     """Run rounds until everything holds, nothing helps any more, or time is up."""
     solution, started = loop.solution, time.perf_counter()
-    feasible: NDArray[np.float64] | None = None
+    feasible: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
     good = float("inf")  # objective of the last motion at which everything held
     for _ in range(rounds):
         if time.perf_counter() > loop.deadline:
@@ -301,7 +268,7 @@ def _iterate(
             if done := loop.done(trial):
                 last, good = good, trial.objective
                 if loop.problem.drift(trial.z) < DRIFT:  # that waypoints are too far apart along an arc no round can help
-                    solution.converged, solution.status, feasible = True, "converged", trial.z
+                    solution.converged, solution.status, feasible = True, "converged", (trial.z, solution.dt)
                 improved = good < (1.0 - WORTHWHILE) * last
                 if not thorough or not improved or (trial.step < INSIDE * used).all():
                     break
@@ -312,8 +279,8 @@ def _iterate(
         settled = accepted and not done and gain < SETTLING and not loop.astray()
         if settled and loop.shortfall.max() < NEARLY_FREE:
             region.settle()
-        if solution.rounds >= HOPELESS_ROUNDS and (
-            loop.shortfall.max() > HOPELESS or loop.problem.drift(loop.z) > HOPELESS_DRIFT
+        if solution.rounds >= GIVE_UP_ROUNDS and (
+            loop.shortfall.max() > GIVE_UP_SHORTFALL or loop.problem.drift(loop.z) > GIVE_UP_DRIFT
         ):
             break
         if region.stuck(trial, loop.shortfall):
@@ -325,4 +292,4 @@ def _iterate(
                 solution.penalty = loop.penalty
                 break
     if feasible is not None:  # rounds after the first feasible one only made it shorter, or failed to
-        solution.z = feasible
+        solution.z, solution.dt = feasible

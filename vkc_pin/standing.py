@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vkc_pin.monitor import interruptible
+from vkc_pin.interrupt import interruptible
 from vkc_pin.options import Options
 from vkc_pin.plan import Plan
 from vkc_pin.scene import Scene

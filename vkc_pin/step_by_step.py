@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping, Sequence
 
 from vkc_pin.goal import compile_task
-from vkc_pin.monitor import interruptible
+from vkc_pin.interrupt import interruptible
 from vkc_pin.one_problem import OneProblem, Settings
 from vkc_pin.plan import Plan
 from vkc_pin.scene import Scene

@@ -4,13 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Literal
 
 import pinocchio as pin
 
 from vkc_pin.hold import Hold
 from vkc_pin.steps import Step
 
-__all__ = ["FrameGoal", "Phase", "Task"]
+__all__ = ["FrameGoal", "Phase", "PhaseKey", "PhaseKind", "Task", "stretches"]
+
+PhaseKind = Literal["grasp", "reach", "touch", "place", "turn", "move", "go", "stand"]
+PhaseKey = tuple[PhaseKind, tuple[str, ...]]
+_VERBS: Mapping[PhaseKind, str] = {
+    "grasp": "reach",
+    "reach": "reach with",
+    "touch": "touch with",
+    "place": "place",
+    "turn": "turn",
+    "move": "move",
+    "go": "go to",
+    "stand": "stand still",
+}
 
 
 @dataclass(frozen=True)
@@ -40,7 +54,9 @@ class Phase:
     """A stretch of the motion in which the same things are held.
 
     Attributes:
-        name: What happens in it.
+        kind: What happens in it: "grasp", "reach" of a frame, "touch", "place", "turn" what releases a latch, "move" joints of an
+            object, "go" of the base, or "stand" still.
+        about: What that happens to: object and attachment (and the link that holds it, or ""), frame, object or coordinates.
         segments: Steps of time; the phase has `segments + 1` waypoints, the first shared with the phase before.
         held: What is held, each after the hold it depends on.
         ranges: Object coordinate → (lower, upper) for every waypoint after the first; all others stand still.
@@ -57,7 +73,8 @@ class Phase:
         lowered: Hold → placement in which its free object stands when it is let go of at the end.
     """
 
-    name: str
+    kind: PhaseKind
+    about: tuple[str, ...]
     segments: int
     held: tuple[Hold, ...] = ()
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -71,6 +88,17 @@ class Phase:
     left: Mapping[str, tuple[Hold, int]] = field(default_factory=dict)
     lifted: Mapping[Hold, pin.SE3] = field(default_factory=dict)
     lowered: Mapping[Hold, pin.SE3] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """What people call it, e.g. "reach door.handle", "turn door.knob" or "go to"."""
+        about = ", ".join(map(str, self.grasps) if self.kind == "grasp" else self.about)
+        return f"{_VERBS[self.kind]} {about}".rstrip()
+
+    @property
+    def key(self) -> PhaseKey:
+        """What is equal for phases in which the same happens."""
+        return self.kind, self.about
 
 
 @dataclass(frozen=True)
@@ -95,3 +123,8 @@ class Task:
     def segments(self) -> int:
         """Steps of time of the whole task; it has one waypoint more."""
         return sum(phase.segments for phase in self.phases)
+
+
+def stretches(task: Task) -> list[tuple[str, tuple[str, ...]]]:
+    """Return the phases' names and the objects that are held in them."""
+    return [(phase.name, tuple(hold.object for hold in phase.held)) for phase in task.phases]

@@ -13,20 +13,15 @@ from vkc_pin.chain import VirtualKinematicChain
 from vkc_pin.errors import InputError
 from vkc_pin.pose import target_vector
 from vkc_pin.scene import Scene
-from vkc_pin.task import Phase, Task
-from vkc_pin.term_rows import Place, TermAt, TermRow, Tree, Value
+from vkc_pin.task import Phase, Task, stretches
+from vkc_pin.term_rows import FrameAt, TermAt, TermRow, Tree, Value
 from vkc_pin.terms import Cost, Term
 from vkc_pin.transcription import Transcription
 
-__all__ = ["TermNumbers", "stretches", "term_goals"]
+__all__ = ["TermNumbers", "term_goals"]
 
 _SLOWER, _SLOWEST = 1.2, 8.0  # factor by which steps are made longer at a time, and in all, until a seed is slow enough
 _SMALL = 1e-3  # what an excess as large as the tolerance counts as, among residuals of poses
-
-
-def stretches(task: Task) -> list[tuple[str, tuple[str, ...]]]:
-    """Return the phases' names and the objects that are held in them."""
-    return [(phase.name, tuple(hold.object for hold in phase.held)) for phase in task.phases]
 
 
 def term_goals(
@@ -50,8 +45,8 @@ def term_goals(
                 continue
             for waypoint in range(whereabouts.starts[number] + 1, whereabouts.ends[number] + 1):
                 earlier = number if waypoint - 1 > whereabouts.starts[number] else max(number - 1, 0)
-                now = tuple(whereabouts.place(frame, number, waypoint) for frame in formula.frames)
-                before = tuple(whereabouts.place(frame, earlier, waypoint - 1) for frame in formula.frames)
+                now = tuple(whereabouts.frame_at(frame, number, waypoint) for frame in formula.frames)
+                before = tuple(whereabouts.frame_at(frame, earlier, waypoint - 1) for frame in formula.frames)
                 at.append(TermAt(waypoint, now, before))
         row = TermRow(formula, term.weight if isinstance(term, Cost) else None, values, tuple(at))
         at = [item for item in at if any(waypoint > 0 for waypoint in row.kind(item)[0])]  # others nothing can change
@@ -81,7 +76,7 @@ class _Whereabouts:
         placed = self.scene.objects[owner]
         return Value(None, float(placed.state[placed.object.coordinates.index(joint)]))
 
-    def place(self, frame: str, number: int, waypoint: int) -> Place:
+    def frame_at(self, frame: str, number: int, waypoint: int) -> FrameAt:
         """Return where a frame is at a waypoint of phase `number`."""
         owner, dot, link = frame.partition(".")
         if not dot or owner not in self.scene.objects:
@@ -93,21 +88,21 @@ class _Whereabouts:
             values = tuple(self.value(f"{owner}.{name}") for name in thing.coordinates.names)
             tree = Tree(thing.model.saveToString(), _numbers(placed.placement), values)
             moves = found.parentJoint > 0 and any(value.column is not None for value in values)
-            return Place(_numbers(found.placement), found.parentJoint, waypoint if moves else -1, tree)
+            return FrameAt(_numbers(found.placement), found.parentJoint, waypoint if moves else -1, tree)
         hold = next((hold for hold in phase.held if hold.object == owner), None)
         if hold is not None:
             return self._on_chain(self.chain.frame(link, hold), waypoint)
         if owner in phase.left:  # where the hand let go of it
             hold, last = phase.left[owner]
             return self._on_chain(self.chain.frame(link, hold), self.ends[last])
-        return Place(_numbers(self._standing(phase, owner) * thing.link_placement(link, placed.state)))
+        return FrameAt(_numbers(self._standing(phase, owner) * thing.link_placement(link, placed.state)))
 
     def _standing(self, phase: Phase, owner: str) -> pin.SE3:
         return phase.standing.get(owner, self.scene.objects[owner].placement)
 
-    def _on_chain(self, at: tuple[int, pin.SE3], waypoint: int) -> Place:
+    def _on_chain(self, at: tuple[int, pin.SE3], waypoint: int) -> FrameAt:
         joint, local = at
-        return Place(_numbers(local), joint, waypoint if joint else -1)
+        return FrameAt(_numbers(local), joint, waypoint if joint else -1)
 
 
 def _numbers(placement: pin.SE3) -> tuple[float, ...]:

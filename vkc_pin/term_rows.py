@@ -16,7 +16,7 @@ from vkc_pin.coordinates import Coordinates
 from vkc_pin.formula import Formula
 from vkc_pin.sparse import assemble
 
-__all__ = ["Place", "TermAt", "TermProgram", "TermRow", "Tree", "Value"]
+__all__ = ["FrameAt", "TermAt", "TermProgram", "TermRow", "Tree", "Value"]
 
 _KEPT = 96  # kinds of rows kept for reuse
 _functions: OrderedDict[tuple[Any, ...], TermFunctions] = OrderedDict()
@@ -46,7 +46,7 @@ class Tree:
 
 
 @dataclass(frozen=True)
-class Place:
+class FrameAt:
     """Where a frame is.
 
     Attributes:
@@ -67,8 +67,8 @@ class TermAt:
     """A term at a waypoint: where the frames are that it depends on, there and at the waypoint before."""
 
     waypoint: int
-    now: tuple[Place, ...]
-    before: tuple[Place, ...]
+    now: tuple[FrameAt, ...]
+    before: tuple[FrameAt, ...]
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ class TermFunctions:
         points = ca.vertsplit(z, coordinates.size) if waypoints else []
         chain: dict[int, Any] = {}
 
-        def column(place: Place) -> Any:
+        def column(place: FrameAt) -> Any:
             local = _matrix(ca.DM(place.local))
             if place.tree is not None:
                 return _column(_in_tree(place, points) @ local)
@@ -145,7 +145,7 @@ class TermFunctions:
         self.hessian_pattern = [np.array(part, int) for part in hessian.sparsity().get_triplet()]
 
 
-def _in_tree(place: Place, points: list[Any]) -> Any:
+def _in_tree(place: FrameAt, points: list[Any]) -> Any:
     """Return where the joint of a place in an object's tree is in the world, shape (4, 4)."""
     tree = place.tree
     assert tree is not None

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vkc_pin.coordinates import Coordinates
+from vkc_pin.deadline import Monitor
 from vkc_pin.inverse_kinematics import PoseSolver
-from vkc_pin.monitor import Monitor
 from vkc_pin.sparse import assemble, sparse, unit
 from vkc_pin.term_rows import TermProgram
 from vkc_pin.waypoint import Structure, waypoint_functions

@@ -12,8 +12,14 @@ from vkc_pin.trajectory import PhaseSpan, Trajectory
 __all__ = ["as_trajectory"]
 
 
-def as_trajectory(problem: TrajectoryProblem, z: NDArray[np.float64]) -> Trajectory:
-    """Return z_1..z_N, shape (N, n), as a trajectory; where something is grasped or let go, the robot waits for the gripper."""
+def as_trajectory(problem: TrajectoryProblem, z: NDArray[np.float64], dt: NDArray[np.float64]) -> Trajectory:
+    """Return z_1..z_N, shape (N, n), as a trajectory; where something is grasped or let go, the robot waits for the gripper.
+
+    Args:
+        problem: Whose waypoints they are.
+        z: The waypoints.
+        dt: Time of every step, shape (N,) [s].
+    """
     waypoints, wait = problem.waypoints(z), problem.options.grasp_time
     _settle_choices(problem, waypoints)
     rows, times = [0], [0.0]
@@ -26,7 +32,7 @@ def as_trajectory(problem: TrajectoryProblem, z: NDArray[np.float64]) -> Traject
             times.append(times[-1] + wait)
         for row in range(begin + 1, int(end) + 1):
             rows.append(row)
-            times.append(times[-1] + problem.dt[row - 1])
+            times.append(times[-1] + dt[row - 1])
         phases.append(PhaseSpan(phase.name, first, len(rows) - 1, *as_mappings(phase.held)))
         begin = int(end)
     last = problem.task.phases[-1]

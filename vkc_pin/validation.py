@@ -27,7 +27,7 @@ __all__ = ["validate"]
 START_TOLERANCE = 1e-9  # [m] or [rad]
 LIMIT_TOLERANCE = 1e-5  # [m] or [rad]
 START_LIMIT_TOLERANCE = 1e-2  # [m] or [rad]: a start slightly outside its limits is where the robot is
-RATE_TOLERANCE = 1e-3  # relative to the limit
+ACCEPTED_RATE_TOLERANCE = 1e-3  # excess over a limit, relative to it
 LATCH_TOLERANCE = 1e-4
 WAYPOINT_TOLERANCE = 1e-3  # [m] that clearance at a waypoint may fall short of dist_safe
 SLIP_TOLERANCE = 1e-4  # [m] per step
@@ -132,7 +132,7 @@ class _Check:
             ):
                 worst = int(np.argmax(np.abs(values)))
                 value = abs(float(values[worst]))
-                if not value <= limit * (1 + RATE_TOLERANCE) + 1e-9:
+                if not value <= limit * (1 + ACCEPTED_RATE_TOLERANCE) + 1e-9:
                     detail = f"{value:.3f} {unit}/{per} is more than {limit:.3f} {unit}/{per}"
                     self._add(kind, name, worst, value - limit, f"{unit}/{per}", detail)
 

@@ -23,7 +23,7 @@ from vkc_pin.one_problem import TIMES
 from vkc_pin.options import Options
 from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.scene import Scene
-from vkc_pin.solver import RATE_TOLERANCE, solve
+from vkc_pin.solver import SOLVED_RATE_TOLERANCE, solve
 from vkc_pin.steps import Actuate, GoTo, Grasp, Place, Step
 from vkc_pin.trajectory import Trajectory, join
 from vkc_pin.trust_region import CLOSE_ENOUGH
@@ -83,7 +83,7 @@ class Attempt:
             parts = [*self.parts, *error.parts]
             if not parts:
                 problem = self._problem([self._here()])
-                parts = [as_trajectory(problem, np.tile(problem.start, (problem.segments, 1)))]
+                parts = [as_trajectory(problem, problem.still, problem.timing_for(problem.still).dt)]
             return join(parts, pause=self.options.grasp_time), came, error.cause
         return join(self.parts, pause=self.options.grasp_time), np.inf, ""
 
@@ -172,25 +172,25 @@ class Attempt:
             return
         problem = self._problem([self._here()])
         arm = slice(3, problem.chain.robot.coordinates.size)
-        problem.lower[:, :3] = problem.upper[:, :3] = problem.start[:3]
-        problem.lower[-1, arm] = problem.upper[-1, arm] = way[-1, arm]
+        problem = _standing(problem, arm, way[-1, arm])
         seeds = [Seed("straight", through(problem, way[k:])) for k in (0, -1)[: len(way)]]  # by that way, and directly
-        self._take(problem, self._solve(problem, iter(seeds), "arm does not reach"))
+        self._take(problem, *self._solve(problem, iter(seeds), "arm does not reach"))
 
     def _drive(self, goals: NDArray[np.float64]) -> None:
         """Drive to where the base has to stand, or to one of several headings there, shape (G, 3), the arm as it is."""
         x, y, yaw = goals[0].tolist()
         problem = self._problem([GoTo(x, y, yaw if len(goals) == 1 else None)])
         arm = slice(3, problem.chain.robot.coordinates.size)
-        problem.lower[:, arm] = problem.upper[:, arm] = problem.start[arm]
+        lower, upper = problem.lower.copy(), problem.upper.copy()
+        lower[:, arm] = upper[:, arm] = problem.start[arm]
+        problem = problem.with_bounds(lower, upper)
         bare = at_home(problem) and not self.scene.held and len(goals) == 1
         seeds = initialize(problem, "astar", self._seed()) if bare else BaseWays(problem, whole=True).seeds(problem, goals)
-        self._take(problem, self._solve(problem, seeds, "no base path"))
+        self._take(problem, *self._solve(problem, seeds, "no base path"))
 
     def _reach(self, steps: Sequence[Step], pose: NDArray[np.float64]) -> None:
         """Take hold of the object, or put it down, the base stands."""
-        problem = self._problem(steps)
-        problem.lower[:, :3] = problem.upper[:, :3] = problem.start[:3]
+        problem = _standing(self._problem(steps))
         last = np.append(problem.start[:3], pose[3:])
         seeds = [Seed("straight", problem.start + smooth(problem.segments)[:, None] * (last - problem.start))]
         phase = problem.task.phases[-1]
@@ -198,7 +198,7 @@ class Attempt:
             above = Approach(Knots(problem, self.rng)).away(last, phase)[::-1]
             seeds = [Seed("from above", through(problem, np.vstack([above, last])))] * (len(above) > 0) + seeds
         more = initialize(problem, "interpolated", self._seed())
-        self._take(problem, self._solve(problem, itertools.chain(seeds, more), "arm does not reach"))
+        self._take(problem, *self._solve(problem, itertools.chain(seeds, more), "arm does not reach"))
 
     def _move(self, step: Actuate) -> None:
         """Move the object's joints: the base goes to the nearest pose to which the arm can follow."""
@@ -211,19 +211,19 @@ class Attempt:
             self._in_time(failure)
             began = time.perf_counter()
             followed = follow(problem, base, self.rng, refine=self.refine)
-            problem.take_time_for(followed.z)
-            problem.stretch(followed.z)
+            rates = problem.rates(followed.z)
+            timing = problem.timing_for(followed.z).stretched(*rates)
             self.times["following"] += time.perf_counter() - began
             cause = followed.cause
-            if not cause and problem.rate_violation(followed.z) > RATE_TOLERANCE:
+            if not cause and timing.violation(*rates) > SOLVED_RATE_TOLERANCE:
                 cause = "too fast"
             if not cause and problem.drift(followed.z) > 1.0:
                 cause = "closure"
             if not cause:
-                self._take(problem, followed.z)
+                self._take(problem, followed.z, timing.dt)
                 return
             if not failure.parts or followed.share > failure.share:
-                failure = FailedError(cause, as_trajectory(problem, followed.z), followed.share)
+                failure = FailedError(cause, as_trajectory(problem, followed.z, timing.dt), followed.share)
         raise failure
 
     def _in_time(self, failure: FailedError) -> None:
@@ -237,7 +237,7 @@ class Attempt:
         base: list[NDArray[np.float64]] = []
         now = problem.start[:3]
         for phase in problem.task.phases:
-            if phase.name.startswith("move"):
+            if phase.kind == "move":
                 way = ways.way(now, goal, phase.segments)
                 if way is None:
                     return None
@@ -258,8 +258,10 @@ class Attempt:
         self.build_time += problem.transcription.take_build_time()
         return problem
 
-    def _solve(self, problem: TrajectoryProblem, seeds: Iterator[Seed], cause: str) -> NDArray[np.float64]:
-        """Return the first solution from a seed."""
+    def _solve(
+        self, problem: TrajectoryProblem, seeds: Iterator[Seed], cause: str
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the first solution from a seed: z_1..z_N, shape (N, n), and the time of every step, shape (N,) [s]."""
         failure = FailedError(cause)
         for seed in seeds:
             self._in_time(failure)
@@ -269,19 +271,28 @@ class Attempt:
             for key, value in solution.timings.items():
                 self.times[key] += value
             if solution.converged:
-                return solution.z
+                return solution.z, solution.dt
             if solution.status == "interrupted":
                 raise KeyboardInterrupt
             if solution.status == "time limit":
-                raise FailedError("time limit", as_trajectory(problem, solution.z))
+                raise FailedError("time limit", as_trajectory(problem, solution.z, solution.dt))
             if not failure.parts:
-                failure = FailedError(cause, as_trajectory(problem, solution.z))
+                failure = FailedError(cause, as_trajectory(problem, solution.z, solution.dt))
         raise failure
 
-    def _take(self, problem: TrajectoryProblem, z: NDArray[np.float64]) -> None:
+    def _take(self, problem: TrajectoryProblem, z: NDArray[np.float64], dt: NDArray[np.float64]) -> None:
         """Append a motion, and go on from where it ends."""
-        self.parts.append(as_trajectory(problem, z))
+        self.parts.append(as_trajectory(problem, z, dt))
         self.scene = scene_after(self.scene, self.parts[-1], problem.task.after)
 
     def _seed(self) -> int:
         return int(self.rng.integers(2**32))
+
+
+def _standing(problem: TrajectoryProblem, arm: slice | None = None, last: NDArray[np.float64] | None = None) -> TrajectoryProblem:
+    """Return a problem in which the base stands, and the arm ends at `last` if that is given."""
+    lower, upper = problem.lower.copy(), problem.upper.copy()
+    lower[:, :3] = upper[:, :3] = problem.start[:3]
+    if arm is not None:
+        lower[-1, arm] = upper[-1, arm] = last
+    return problem.with_bounds(lower, upper)

@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vkc_pin.baselines.arm_kinematics import QP
-from vkc_pin.clearing import distance_gradients
 from vkc_pin.knots import Knots
 from vkc_pin.problem import TrajectoryProblem
 
@@ -60,7 +59,7 @@ def refined(
         contacts = problem.contacts.evaluate(z[None], np.array([waypoint]), reach=reach, nearest=None)
         if np.abs(residual).max() < _TOLERANCE and contacts.violation() <= CLEAR:
             return z, True
-        gradients = distance_gradients(problem, z[None], contacts)[:, free]
+        gradients = problem.contacts.gradients(z[None], contacts)[:, free]
         room = contacts.distance - contacts.margin
         bounds = [np.clip(limit[free] - z[free], -_LONGEST, _LONGEST) for limit in (lower, upper)]
         # The step of the free coordinates, then one slack for all pairs.

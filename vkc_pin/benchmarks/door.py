@@ -37,7 +37,7 @@ def reach(scene: Scene, seed: int) -> Plan:
 def push(scene: Scene, seed: int, before: Plan) -> Plan:
     """Push the door open in 40 waypoints, from the grasp and the turned lever that `before` reaches before it pushes."""
     last = before.trajectory.phases[-1]
-    row = last.first if last.name.startswith("move") else last.last
+    row = last.first if last.held else last.last
     robot = before.trajectory.positions[row, : before.trajectory.robot_size]
     turned = scene.with_state("door", {"knob": before.trajectory.column("door.knob")[row]})
     held = turned.with_start(base=robot[:3], arm=robot[3:]).with_held({"door": "handle"})

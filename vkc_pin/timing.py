@@ -1,0 +1,82 @@
+"""How long the steps of a motion take, and how far that lets coordinates go in them (eq. 5)."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Timing", "runs_between", "time_for"]
+
+_PATIENCE = 1.5  # how much more time a motion may take before limits on its rates become rows of the program
+_SPARE = 1.15  # how much longer a motion may take than the profile 3s² − 2s³ along its seed
+
+Runs = Sequence[tuple[int, int]]
+
+
+@dataclass(frozen=True, eq=False)
+class Timing:
+    """The time of every step, one value within each run between two rests.
+
+    Attributes:
+        dt: Time of every step [s], shape (N,).
+        least: Time of every step of the motion that this was made for [s], shape (N,).
+        runs: The runs, as first and last waypoint.
+        limits: Of the velocities and accelerations of coordinates, shapes (n,), SI units.
+    """
+
+    dt: NDArray[np.float64]
+    least: NDArray[np.float64]
+    runs: Runs
+    limits: tuple[NDArray[np.float64], NDArray[np.float64]]
+
+    @cached_property
+    def velocity(self) -> NDArray[np.float64]:
+        """Bounds of the steps δz, shape (N, n): limits times dt."""
+        return np.asarray(self.limits[0] * self.dt[:, None])
+
+    @cached_property
+    def acceleration(self) -> NDArray[np.float64]:
+        """Bounds of the differences δδz, shape (N + 1 + rests, n): limits times dt²."""
+        of_rows = np.concatenate([np.full(last - first + 1, self.dt[first]) for first, last in self.runs])
+        return np.asarray(self.limits[1] * of_rows[:, None] ** 2)
+
+    def violation(self, first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
+        """Return the largest excess of steps and their differences over their bounds, relative to these; see `rates`."""
+        return float(max(np.max(np.abs(first) / self.velocity), np.max(np.abs(second) / self.acceleration)) - 1.0)
+
+    def stretched(self, first: NDArray[np.float64], second: NDArray[np.float64]) -> Timing:
+        """Return a timing that gives runs up to `_PATIENCE` times the least time where steps or differences exceed a bound."""
+        fast, strong = np.max(np.abs(first) / self.velocity, axis=1), np.max(np.abs(second) / self.acceleration, axis=1)
+        dt = self.dt.copy()
+        for number, (begin, end) in enumerate(self.runs):
+            excess = max(float(fast[begin:end].max()), float(np.sqrt(strong[begin + number : end + number + 1].max())))
+            dt[begin:end] = np.clip(dt[begin:end] * excess * 1.001, dt[begin:end], _PATIENCE * self.least[begin:end])
+        return replace(self, dt=dt)
+
+
+def runs_between(rests: Sequence[int], segments: int) -> Runs:
+    """Return the stretches between two rests, as first and last waypoint, of a motion of so many segments."""
+    return tuple(itertools.pairwise([0, *rests, segments]))
+
+
+def time_for(
+    path: NDArray[np.float64], dt: float, runs: Runs, limits: tuple[NDArray[np.float64], NDArray[np.float64]]
+) -> NDArray[np.float64]:
+    """Return the time of every step, shape (N,) [s]: `dt`, or more in runs where z_0..z_N, shape (N + 1, n), is too long for it.
+
+    The measure is the profile 3s² − 2s³ over the way that each coordinate goes between two rests: its speed is at most 1.5 times
+    the mean, its acceleration 6 times the way over the square of the duration.
+    """
+    velocity, acceleration = limits
+    steps = np.abs(np.diff(path, axis=0))
+    times = np.full(len(steps), dt)
+    for first, last in runs:
+        way = steps[first:last].sum(axis=0)
+        needed = max(np.max(1.5 * way / velocity), np.sqrt(np.max(6.0 * way / acceleration)))
+        times[first:last] = np.maximum(times[first:last], _SPARE * needed / (last - first))
+    return times

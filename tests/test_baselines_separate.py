@@ -18,7 +18,7 @@ from drawers import changed, drawer_scene, handle, holding, off, open_scene, wit
 from small_problems import door_scene
 
 import vkc_pin as vkc
-from vkc_pin.baselines import METHODS, attempt, base_poses, plan_separately, separate
+from vkc_pin.baselines import BASELINES, attempt, base_poses, plan_separately, separate
 from vkc_pin.baselines.attempt import FINER
 from vkc_pin.baselines.base_ways import BaseWays
 from vkc_pin.baselines.following import Followed, follow
@@ -67,7 +67,7 @@ def failed(scene: vkc.Scene, **arguments: Any) -> vkc.Plan:
 # --- where they must succeed -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", BASELINES)
 @pytest.mark.parametrize("task", PLANS)
 def test_in_open_space(task: str, method: str) -> None:
     plan = PLANS[task](method)
@@ -82,7 +82,7 @@ def test_in_open_space(task: str, method: str) -> None:
     assert plan.initialization == f"{method}, try 1"
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", BASELINES)
 @pytest.mark.parametrize("task", PLANS)
 def test_efforts_are_the_trajectorys(task: str, method: str) -> None:
     plan = PLANS[task](method)
@@ -101,7 +101,7 @@ def test_efforts_are_the_trajectorys(task: str, method: str) -> None:
     assert m["build_time"] >= 0.0
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", BASELINES)
 @pytest.mark.parametrize("task", PLANS)
 def test_base_and_arm_move_one_after_the_other(task: str, method: str) -> None:
     plan = PLANS[task](method)
@@ -145,7 +145,7 @@ def digest(plan: vkc.Plan) -> str:
     return hashlib.sha256(plan.trajectory.positions.tobytes() + plan.trajectory.times.tobytes()).hexdigest()
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", BASELINES)
 def test_the_same_seed_gives_the_same_motion(method: str) -> None:
     again = plan_separately(drawer_scene(), [PULL], method=method, retries=1)
     np.testing.assert_array_equal(again.trajectory.positions, open_drawer(method).trajectory.positions)
@@ -172,7 +172,7 @@ def test_the_same_seed_gives_the_same_motion_in_two_processes() -> None:
 # --- where they must fail ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", BASELINES)
 def test_an_aisle_too_narrow_to_stand_in(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """No base fits before the drawer, and over the counters the arm is too short."""
     limited(monkeypatch)
@@ -183,7 +183,7 @@ def test_an_aisle_too_narrow_to_stand_in(method: str, monkeypatch: pytest.Monkey
     assert [(v.constraint, v.subject) for v in plan.validation.violations] == [("goal", "drawer.slide")]
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", BASELINES)
 def test_the_same_failure_every_time(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
     limited(monkeypatch)
     scene = with_boxes(drawer_scene(), board=([0.02, 1.0, 1.2], [1.7, 0.0, 0.6]))

@@ -16,9 +16,9 @@ from vkc_pin.knots import Knots, Known, follow_objects
 from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.routes import Routes
 
-__all__ = ["HOPELESS", "METHODS", "Seed", "initialize"]
+__all__ = ["HOPELESS", "INITIALIZATIONS", "Seed", "initialize"]
 
-METHODS = ("auto", "interpolated", "astar", "rrt", "stationary")
+INITIALIZATIONS = ("auto", "interpolated", "astar", "rrt", "stationary")
 _LOOKED, _FREE = 8, 0.05  # paths whose seeds are compared; shortfalls [m], summed over waypoints, that nobody looks further for
 _HIT = 1e4  # cost that lets paths with knots in collision come last
 _GROWN, _POOR = 4, 0.5  # paths along which trees grow; shortfalls with which they are asked

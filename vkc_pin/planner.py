@@ -12,7 +12,7 @@ import numpy as np
 from vkc_pin.all_at_once import all_at_once
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.goal import compile_task
-from vkc_pin.initialization import METHODS
+from vkc_pin.initialization import INITIALIZATIONS
 from vkc_pin.one_problem import Settings
 from vkc_pin.options import Options
 from vkc_pin.plan import Plan
@@ -108,8 +108,8 @@ def settings_for(
     """
     options = Options() if options is None else options
     check_arguments(scene, options, time_limit, seed)
-    if initialization not in METHODS:
-        raise UnknownNameError("initialization", str(initialization), METHODS, field="initialization")
+    if initialization not in INITIALIZATIONS:
+        raise UnknownNameError("initialization", str(initialization), INITIALIZATIONS, field="initialization")
     if not (_is_number(perturbation) and 0 <= perturbation < np.inf):
         raise InputError("out of range", field="perturbation", expected="a number of at least 0", got=repr(perturbation))
     return Settings(initialization, options, callback, time_limit, int(seed), float(perturbation), traced(scene, terms))

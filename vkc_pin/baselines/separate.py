@@ -43,9 +43,9 @@ from vkc_pin.steps import Step
 from vkc_pin.trajectory import Trajectory
 from vkc_pin.validation import validate
 
-__all__ = ["METHODS", "RETRIES", "plan_separately"]
+__all__ = ["BASELINES", "RETRIES", "plan_separately"]
 
-METHODS = ("B1", "B2")
+BASELINES = ("B1", "B2")
 RETRIES = 5
 """How often all is tried."""
 
@@ -82,8 +82,8 @@ def plan_separately(
     """
     options = Options() if options is None else options
     check_arguments(scene, options, time_limit, seed)
-    if method not in METHODS:
-        raise UnknownNameError("method", str(method), METHODS, field="method")
+    if method not in BASELINES:
+        raise UnknownNameError("method", str(method), BASELINES, field="method")
     if not isinstance(retries, int) or isinstance(retries, bool) or retries < 1:
         raise InputError("out of range", field="retries", expected="a whole number of at least 1", got=repr(retries))
     task = compile_task(scene, steps, options)

@@ -85,7 +85,7 @@ def _bench_door(arguments: argparse.Namespace) -> int:
     result = door.run(trials=arguments.trials, seed=arguments.seed, progress=not arguments.quiet)
     sys.stdout.write(door.table(result) + "\n")
     if arguments.json:
-        from vkc_pin.plan import write_atomically
+        from vkc_pin.writing import write_atomically
 
         write_atomically(arguments.json, (json.dumps(result, indent=1) + "\n").encode())
         sys.stdout.write(f"wrote {arguments.json}\n")
@@ -101,7 +101,7 @@ def _bench_initialization(arguments: argparse.Namespace) -> int:
         starts=arguments.starts,
         repeats=arguments.repeats,
         scenes=arguments.scenes or initialization.SCENES,
-        methods=arguments.methods or initialization.METHODS,
+        methods=arguments.methods or initialization.COMPARED_INITIALIZATIONS,
     )
 
 
@@ -124,7 +124,7 @@ def _comparison(arguments: argparse.Namespace, experiment: Any) -> int:
         experiment.run,
         trials=arguments.trials,
         tasks=arguments.tasks or tuple(experiment.TASKS),
-        methods=arguments.methods or experiment.METHODS,
+        methods=arguments.methods or experiment.COMPARED_PLANNERS,
         save_failures=arguments.save_failures,
     )
 

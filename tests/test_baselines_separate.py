@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import os
+import signal
 import subprocess
 import sys
 from functools import cache
@@ -22,8 +23,7 @@ from vkc_pin.baselines import BASELINES, attempt, base_poses, plan_separately, s
 from vkc_pin.baselines.attempt import FINER
 from vkc_pin.baselines.base_ways import BaseWays
 from vkc_pin.baselines.following import Followed, follow
-from vkc_pin.one_problem import TIMES
-from vkc_pin.solution import Solution
+from vkc_pin.outcome import TIMES
 from vkc_pin.unfold import as_trajectory
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -312,7 +312,7 @@ def test_of_several_places_the_one_that_came_furthest_counts(
         done(self, steps, "arm does not reach", next(reach) == "d")
 
     every = attempt.postures
-    monkeypatch.setattr(attempt, "postures", lambda problem: list(every(problem))[:1])  # the arm as it is
+    monkeypatch.setattr(attempt, "postures", lambda problem, interrupt: list(every(problem))[:1])  # the arm as it is
     monkeypatch.setattr(attempt, "_STANDS", 3)
     monkeypatch.setattr(attempt.Attempt, "_drive", driven)
     monkeypatch.setattr(attempt.Attempt, "_reach", reached)
@@ -392,13 +392,12 @@ def test_a_time_limit_that_is_not_reached_changes_nothing() -> None:
 
 @pytest.mark.parametrize("stage", ["solve", "follow", "base_poses"])
 def test_ctrl_c_ends_it(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    calls = []
+    calls, done = [], getattr(attempt, stage)
 
-    def pressed(*arguments: Any, **_: Any) -> Solution:
+    def pressed(*arguments: Any, **given: Any) -> Any:
         calls.append(stage)
-        if stage == "solve":  # which notes it
-            return Solution(np.tile(arguments[0].start, (arguments[0].segments, 1)), status="interrupted")
-        raise KeyboardInterrupt
+        signal.raise_signal(signal.SIGINT)
+        return done(*arguments, **given)
 
     monkeypatch.setattr(attempt, stage, pressed)
     plan = failed(open_scene(), retries=3)

@@ -10,7 +10,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from vkc_pin.monitor import Monitor, interruptible
+from vkc_pin.interrupt import Interrupt, interruptible
+from vkc_pin.monitor import Monitor
 
 
 @pytest.fixture(autouse=True)
@@ -32,6 +33,14 @@ def test_the_first_ctrl_c_is_noted() -> None:
         assert not interrupt.pressed
         press()
         assert interrupt.pressed
+
+
+def test_it_is_noted_where_asked_for() -> None:
+    mine = Interrupt()
+    with interruptible(mine) as interrupt:
+        press()
+    assert interrupt is mine
+    assert mine.pressed
 
 
 def test_the_second_raises() -> None:

@@ -119,7 +119,8 @@ class _Line:
         if self.bar is None:
             from tqdm import tqdm  # not tqdm.auto, which has no words in a notebook without ipywidgets but a warning
 
-            self.bar = tqdm(file=self.stream, bar_format="{desc}")
+            # Asked for its size, a terminal that has none, as some do, would be shown nothing.
+            self.bar = tqdm(file=self.stream, bar_format="{desc}", ncols=self.width or 80, nrows=20)
         self.bar.set_description_str(text[: self.width])
         if last:
             self.bar.close()

@@ -13,7 +13,7 @@ from drawers import drawer_scene, handle, holding, off, open_scene
 from drives import hall
 
 import vkc_pin as vkc
-from vkc_pin.baselines import METHODS, attempt, base_poses, plan_separately
+from vkc_pin.baselines import BASELINES, attempt, base_poses, plan_separately
 from vkc_pin.baselines.attempt import Attempt
 from vkc_pin.baselines.failure import FailedError
 from vkc_pin.baselines.postures import postures
@@ -94,13 +94,13 @@ def test_base_and_arm_move_one_after_the_other() -> None:
 
 def test_both_methods_carry_alike() -> None:
     """There is nothing to follow, so nothing that B2 would refine."""
-    first, second = (carried(method).trajectory for method in METHODS)
+    first, second = (carried(method).trajectory for method in BASELINES)
     np.testing.assert_array_equal(first.positions, second.positions)
 
 
 def only(monkeypatch: pytest.MonkeyPatch, index: int) -> None:
     """Leave the arm one way to be held while the base drives."""
-    monkeypatch.setattr(attempt, "postures", lambda problem: list(postures(problem))[index:][:1])
+    monkeypatch.setattr(attempt, "postures", lambda problem, interrupt: list(postures(problem))[index:][:1])
 
 
 def test_with_the_arm_at_home_the_cup_is_turned_over_and_stands_upright_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:

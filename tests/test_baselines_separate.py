@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import os
+import signal
 import subprocess
 import sys
 from functools import cache
@@ -18,12 +19,11 @@ from drawers import changed, drawer_scene, handle, holding, off, open_scene, wit
 from small_problems import door_scene
 
 import vkc_pin as vkc
-from vkc_pin.baselines import METHODS, attempt, base_poses, plan_separately, separate
+from vkc_pin.baselines import BASELINES, attempt, base_poses, plan_separately, separate
 from vkc_pin.baselines.attempt import FINER
 from vkc_pin.baselines.base_ways import BaseWays
 from vkc_pin.baselines.following import Followed, follow
-from vkc_pin.one_problem import TIMES
-from vkc_pin.solution import Solution
+from vkc_pin.outcome import TIMES
 from vkc_pin.unfold import as_trajectory
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -67,7 +67,7 @@ def failed(scene: vkc.Scene, **arguments: Any) -> vkc.Plan:
 # --- where they must succeed -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", BASELINES)
 @pytest.mark.parametrize("task", PLANS)
 def test_in_open_space(task: str, method: str) -> None:
     plan = PLANS[task](method)
@@ -82,7 +82,7 @@ def test_in_open_space(task: str, method: str) -> None:
     assert plan.initialization == f"{method}, try 1"
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", BASELINES)
 @pytest.mark.parametrize("task", PLANS)
 def test_efforts_are_the_trajectorys(task: str, method: str) -> None:
     plan = PLANS[task](method)
@@ -101,7 +101,7 @@ def test_efforts_are_the_trajectorys(task: str, method: str) -> None:
     assert m["build_time"] >= 0.0
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", BASELINES)
 @pytest.mark.parametrize("task", PLANS)
 def test_base_and_arm_move_one_after_the_other(task: str, method: str) -> None:
     plan = PLANS[task](method)
@@ -145,7 +145,7 @@ def digest(plan: vkc.Plan) -> str:
     return hashlib.sha256(plan.trajectory.positions.tobytes() + plan.trajectory.times.tobytes()).hexdigest()
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", BASELINES)
 def test_the_same_seed_gives_the_same_motion(method: str) -> None:
     again = plan_separately(drawer_scene(), [PULL], method=method, retries=1)
     np.testing.assert_array_equal(again.trajectory.positions, open_drawer(method).trajectory.positions)
@@ -172,7 +172,7 @@ def test_the_same_seed_gives_the_same_motion_in_two_processes() -> None:
 # --- where they must fail ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", BASELINES)
 def test_an_aisle_too_narrow_to_stand_in(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """No base fits before the drawer, and over the counters the arm is too short."""
     limited(monkeypatch)
@@ -183,7 +183,7 @@ def test_an_aisle_too_narrow_to_stand_in(method: str, monkeypatch: pytest.Monkey
     assert [(v.constraint, v.subject) for v in plan.validation.violations] == [("goal", "drawer.slide")]
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", BASELINES)
 def test_the_same_failure_every_time(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
     limited(monkeypatch)
     scene = with_boxes(drawer_scene(), board=([0.02, 1.0, 1.2], [1.7, 0.0, 0.6]))
@@ -313,7 +313,7 @@ def test_of_several_places_the_one_that_came_furthest_counts(
         done(self, steps, "arm does not reach", next(reach) == "d")
 
     every = attempt.postures
-    monkeypatch.setattr(attempt, "postures", lambda problem: list(every(problem))[:1])  # the arm as it is
+    monkeypatch.setattr(attempt, "postures", lambda problem, interrupt: list(every(problem))[:1])  # the arm as it is
     monkeypatch.setattr(attempt, "_STANDS", 3)
     monkeypatch.setattr(attempt.Attempt, "_drive", driven)
     monkeypatch.setattr(attempt.Attempt, "_reach", reached)
@@ -393,14 +393,12 @@ def test_a_time_limit_that_is_not_reached_changes_nothing() -> None:
 
 @pytest.mark.parametrize("stage", ["solve", "follow", "base_poses"])
 def test_ctrl_c_ends_it(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    calls = []
+    calls, done = [], getattr(attempt, stage)
 
-    def pressed(*arguments: Any, **_: Any) -> Solution:
+    def pressed(*arguments: Any, **given: Any) -> Any:
         calls.append(stage)
-        if stage == "solve":  # which notes it
-            still = arguments[0].still
-            return Solution(still, arguments[0].timing_for(still).dt, status="interrupted")
-        raise KeyboardInterrupt
+        signal.raise_signal(signal.SIGINT)
+        return done(*arguments, **given)
 
     monkeypatch.setattr(attempt, stage, pressed)
     plan = failed(open_scene(), retries=3)

@@ -13,10 +13,11 @@ from test_tables import cells
 from test_visualization import clips, commands_of
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks import baselines, comparison, experiment
-from vkc_pin.benchmarks.baselines import METHODS, TASKS
+from vkc_pin.benchmarks import baselines, comparison
+from vkc_pin.benchmarks.baselines import COMPARED_PLANNERS, TASKS
 from vkc_pin.benchmarks.comparison import peaks, shown
 from vkc_pin.benchmarks.comparison_report import report
+from vkc_pin.benchmarks.harness import runner
 from vkc_pin.cli import main
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.report import Report, Violation
@@ -34,13 +35,13 @@ BLAME = (
 @pytest.fixture(autouse=True)
 def same_sources(monkeypatch: pytest.MonkeyPatch) -> None:
     """The sources may be worked on while the tests run."""
-    monkeypatch.setattr(experiment, "_sources", lambda: "abc")
+    monkeypatch.setattr(runner, "_sources", lambda: "abc")
 
 
 def solve(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
     """A plan that nobody planned, in place of the task."""
     method, number = spec["method"], spec["number"]
-    good, k = number in GOOD[method], METHODS.index(method)
+    good, k = number in GOOD[method], COMPARED_PLANNERS.index(method)
     plan = fake_plan(scene)
     metrics = {
         **plan.trajectory.metrics(),
@@ -81,7 +82,7 @@ def run(out: Path, **changes: Any) -> dict[str, Any]:
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("bench") / "out"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(experiment, "_sources", lambda: "abc")
+        patch.setattr(runner, "_sources", lambda: "abc")
         run(folder, save_failures=True)
     return folder
 
@@ -100,7 +101,7 @@ def files(folder: Path) -> set[str]:
 
 def test_trials(result: dict[str, Any]) -> None:
     trials = result["trials"]
-    assert [(t["number"], t["method"]) for t in trials] == [(n, m) for n in range(3) for m in METHODS]
+    assert [(t["number"], t["method"]) for t in trials] == [(n, m) for n in range(3) for m in COMPARED_PLANNERS]
     for t in trials:
         assert t["scene"] == "door"  # the task's name, not the scene's
         assert t["seed"] == 5 + t["number"]
@@ -108,7 +109,7 @@ def test_trials(result: dict[str, Any]) -> None:
         assert t["duration"] == pytest.approx(6.0)
     meta = result["meta"]
     assert (meta["benchmark"], meta["seed"], meta["starts"], meta["time_limit"]) == ("baselines", 5, 3, 20.0)
-    assert (meta["tasks"], meta["methods"]) == (["door"], list(METHODS))
+    assert (meta["tasks"], meta["methods"]) == (["door"], list(COMPARED_PLANNERS))
     assert (meta["scenes"], meta["goals"]) == ({"door": "corridor_door"}, {"door": {"door.hinge": 1.5}})
 
 
@@ -135,7 +136,7 @@ def test_the_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("plan", "plan_separately"):
         monkeypatch.setattr(comparison, name, lambda scene, steps, **how: asked.append((scene, list(steps), how)))
     for task in TASKS:
-        for method in METHODS:
+        for method in COMPARED_PLANNERS:
             baselines.plan_trial("scene", {"scene": task, "method": method, "seed": 8})  # type: ignore[arg-type]
     door, drawer = vkc.Actuate("door", {"hinge": 1.5}), vkc.Actuate("drawer", {"slide": 0.6})
     common = {"time_limit": 20.0, "seed": 8}
@@ -331,12 +332,12 @@ def test_view_shows_a_failure_with_the_offending_links_in_red(
     ],
 )
 def test_the_trial_that_is_shown(good: dict[str, set[int]], expected: int | None) -> None:
-    records = [{"scene": "door", "method": m, "number": n, "success": n in good[m]} for n in range(4) for m in METHODS]
-    assert shown(records, METHODS) == expected
+    records = [{"scene": "door", "method": m, "number": n, "success": n in good[m]} for n in range(4) for m in COMPARED_PLANNERS]
+    assert shown(records, COMPARED_PLANNERS) == expected
 
 
 def test_what_is_shown_is_kept(out: Path) -> None:
-    assert files(out / "shown") == {f"door_0002_{method}.npz" for method in METHODS}
+    assert files(out / "shown") == {f"door_0002_{method}.npz" for method in COMPARED_PLANNERS}
     assert vkc.Plan.load(out / "shown" / "door_0002_VKC.npz").success
 
 

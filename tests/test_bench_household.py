@@ -16,9 +16,10 @@ from fake_plan import fake_plan
 from test_tables import cells
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks import comparison, experiment, household
+from vkc_pin.benchmarks import comparison, household
 from vkc_pin.benchmarks.comparison import placed
-from vkc_pin.benchmarks.household import COMPARISON, METHODS, TABLE_TOP, TASKS, on_the_coffee_table
+from vkc_pin.benchmarks.harness import runner
+from vkc_pin.benchmarks.household import COMPARED_PLANNERS, COMPARISON, TABLE_TOP, TASKS, on_the_coffee_table
 from vkc_pin.cli import main
 from vkc_pin.geometry import clearance, placed_shapes
 from vkc_pin.placed import standing_geometry
@@ -32,13 +33,13 @@ BLAME = Violation("closure", "door.handle", 9, 4.0, 0.09, "m", "the grasp drifts
 @pytest.fixture(autouse=True)
 def same_sources(monkeypatch: pytest.MonkeyPatch) -> None:
     """The sources may be worked on while the tests run."""
-    monkeypatch.setattr(experiment, "_sources", lambda: "abc")
+    monkeypatch.setattr(runner, "_sources", lambda: "abc")
 
 
 def solve(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
     """A plan that nobody planned, in place of the task."""
     task, method, number = spec["scene"], spec["method"], spec["number"]
-    good, k = method == "VKC" or number in GOOD.get((task, method), ()), METHODS.index(method)
+    good, k = method == "VKC" or number in GOOD.get((task, method), ()), COMPARED_PLANNERS.index(method)
     plan = fake_plan()
     metrics = {
         **plan.trajectory.metrics(),
@@ -62,7 +63,7 @@ def solve(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("bench") / "out"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(experiment, "_sources", lambda: "abc")
+        patch.setattr(runner, "_sources", lambda: "abc")
         patch.setattr(comparison, "motions_chart", lambda plans, path, title: path.write_bytes(title.encode()))
         household.run(trials=2, seed=3, tasks=["door", "cup"], out=folder, progress=False, solve=solve)
     return folder
@@ -96,7 +97,7 @@ def test_every_method_is_asked_for_the_same(monkeypatch: pytest.MonkeyPatch) -> 
     for name in ("plan", "plan_separately"):
         monkeypatch.setattr(comparison, name, lambda scene, steps, **how: asked.append((scene, steps, how)))
     for task in TASKS:
-        for method in METHODS:
+        for method in COMPARED_PLANNERS:
             household.plan_trial("scene", {"scene": task, "method": method, "seed": 8})  # type: ignore[arg-type]
     common = {"time_limit": 20.0, "seed": 8}
     hows = ({**common, "method": "B1"}, {**common, "method": "B2"}, common)
@@ -162,7 +163,9 @@ def test_a_trial_is_planned_with_the_cup_where_it_was_drawn(tmp_path: Path) -> N
 
 def test_records(result: dict[str, Any]) -> None:
     trials = result["trials"]
-    assert [t["key"] for t in trials] == [f"{task}/{n:04d}/{m}" for task in ("cup", "door") for n in (0, 1) for m in METHODS]
+    assert [t["key"] for t in trials] == [
+        f"{task}/{n:04d}/{m}" for task in ("cup", "door") for n in (0, 1) for m in COMPARED_PLANNERS
+    ]
     for t in trials:
         assert t["success"] == (t["method"] == "VKC" or t["number"] in GOOD.get((t["scene"], t["method"]), ()))
         assert t["seed"] == 3 + t["number"]
@@ -216,9 +219,9 @@ def test_charts_have_all_tasks_and_methods(tmp_path: Path, result: dict[str, Any
 
     monkeypatch.setattr(household, "success_chart", chart)
     monkeypatch.setattr(household, "means_chart", chart)
-    pictures = COMPARISON.draw(result["trials"], tmp_path, {"cup": "carry", "door": "push"}, METHODS)
+    pictures = COMPARISON.draw(result["trials"], tmp_path, {"cup": "carry", "door": "push"}, COMPARED_PLANNERS)
     assert [picture.split("](")[1] for picture in pictures] == [f"{name})" for name in drawn]
-    assert all(case[:3] == (12, ["cup", "door"], METHODS) for case in drawn.values())
+    assert all(case[:3] == (12, ["cup", "door"], COMPARED_PLANNERS) for case in drawn.values())
     assert {name: case[3].get("shared") for name, case in drawn.items()} == {
         "success.png": None,
         "base_effort.png": True,

@@ -12,8 +12,9 @@ import pytest
 from fake_plan import fake_plan
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks import experiment, initialization
-from vkc_pin.benchmarks.initialization import METHODS, STEPWISE, TARGET
+from vkc_pin.benchmarks import initialization
+from vkc_pin.benchmarks.harness import runner
+from vkc_pin.benchmarks.initialization import COMPARED_INITIALIZATIONS, STEPWISE, TARGET
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.report import Report, Violation
 
@@ -23,7 +24,7 @@ BLAME = Violation("closure", "stick", 3, 1.0, 0.01, "m", "10 mm off")
 @pytest.fixture(autouse=True)
 def same_sources(monkeypatch: pytest.MonkeyPatch) -> None:
     """The sources may be worked on while the tests run."""
-    monkeypatch.setattr(experiment, "_sources", lambda: "abc")
+    monkeypatch.setattr(runner, "_sources", lambda: "abc")
 
 
 def solve(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
@@ -32,7 +33,9 @@ def solve(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
     good = method in ("astar", "auto", STEPWISE) or (method == "interpolated" and number % 2 == 0)
     times = ("initialization", "coal", "casadi", "ipopt", "validation")
     metrics = {
-        "planning_time": 1.0 + number + 0.25 * METHODS.index(method) if method in METHODS else 3.0,
+        "planning_time": 1.0 + number + 0.25 * COMPARED_INITIALIZATIONS.index(method)
+        if method in COMPARED_INITIALIZATIONS
+        else 3.0,
         "base_effort": (5.0 if method == STEPWISE else 4.0) + number,
         "base_effort_l1": 6.0 + number,
         "arm_effort": 7.0 + (number if method == STEPWISE else 0.0),
@@ -62,7 +65,7 @@ def run(out: Path, **changes: Any) -> dict[str, Any]:
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("bench") / "out"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(experiment, "_sources", lambda: "abc")
+        patch.setattr(runner, "_sources", lambda: "abc")
         run(folder)
     return folder
 

@@ -11,7 +11,8 @@ import pytest
 from fake_plan import fake_plan
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks import experiment, scale
+from vkc_pin.benchmarks import scale
+from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.scale import COUNTS, crowded
 from vkc_pin.cli import main
 from vkc_pin.errors import InputError
@@ -24,7 +25,7 @@ TIMES = {"initialization": 0.3, "coal": 0.1, "casadi": 0.2, "ipopt": 0.15, "vali
 @pytest.fixture(autouse=True)
 def same_sources(monkeypatch: pytest.MonkeyPatch) -> None:
     """The sources may be worked on while the tests run."""
-    monkeypatch.setattr(experiment, "_sources", lambda: "abc")
+    monkeypatch.setattr(runner, "_sources", lambda: "abc")
 
 
 @pytest.fixture

@@ -9,9 +9,9 @@ import pytest
 from fake_plan import fake_plan
 from matplotlib.patches import StepPatch
 
-from vkc_pin.benchmarks.charts import criteria_chart, means_chart, motions_chart, success_chart
-from vkc_pin.benchmarks.scale_chart import scale_chart
-from vkc_pin.benchmarks.tables import TIMES, wilson
+from vkc_pin.benchmarks.harness.charts import criteria_chart, means_chart, motions_chart, success_chart
+from vkc_pin.benchmarks.harness.tables import TIMES, wilson
+from vkc_pin.benchmarks.scale import scale_chart
 from vkc_pin.plan import Plan
 from vkc_pin.report import Report
 

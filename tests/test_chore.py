@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import signal
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -214,7 +215,7 @@ def test_ctrl_c_leaves_what_is_done() -> None:
     def stop(row: vkc.Iteration) -> None:
         seen.append(row)
         if len(seen) > 1 and row.round == 1 and row.objective != seen[0].objective:
-            raise KeyboardInterrupt
+            signal.raise_signal(signal.SIGINT)
 
     plan = vkc.plan_chore(home(), [vkc.GoTo(0.5, -0.5), OPEN], callback=stop)
     assert (plan.status, plan.success) == ("interrupted", False)

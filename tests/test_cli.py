@@ -13,8 +13,8 @@ import pytest
 
 import vkc_pin as vkc
 from vkc_pin import cli
-from vkc_pin.benchmarks import door, initialization, record
-from vkc_pin.benchmarks import experiment as runner
+from vkc_pin.benchmarks import door, initialization
+from vkc_pin.benchmarks.harness import record, runner
 
 ROOT = Path(__file__).resolve().parent.parent
 UNFINISHED = ["plan", "drawer", "--set", "drawer.slide=0.3", "--quiet", "--time-limit", "0.001", "--initialization", "stationary"]
@@ -315,7 +315,7 @@ def test_ctrl_c_says_how_to_go_on(experiment: dict[str, Any], capsys: pytest.Cap
     assert "2 of 6 trials are done and kept in out" in captured.err
     assert captured.err.splitlines()[-1] == "vkc-pin bench initialization --out 'my results'"
     assert (experiment["starts"], experiment["repeats"], experiment["seed"], experiment["progress"]) == (50, 1, 0, True)
-    assert (experiment["scenes"], experiment["methods"]) == (initialization.SCENES, initialization.METHODS)
+    assert (experiment["scenes"], experiment["methods"]) == (initialization.SCENES, initialization.COMPARED_INITIALIZATIONS)
 
 
 def test_records_of_failures(door_plan: vkc.Plan) -> None:

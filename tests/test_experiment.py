@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vkc_pin.benchmarks import experiment, record
+from vkc_pin.benchmarks.harness import record, runner
 from vkc_pin.errors import InputError, VkcError
 
 SETTINGS = {"benchmark": "squares", "seed": 3, "scenes": ("a", "b")}
@@ -23,7 +23,7 @@ SETTINGS = {"benchmark": "squares", "seed": 3, "scenes": ("a", "b")}
 def same_sources(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """The sources may be worked on while the tests run, but for the test that is about them."""
     if "sources" not in request.node.name:
-        monkeypatch.setattr(experiment, "_sources", lambda: "abc")
+        monkeypatch.setattr(runner, "_sources", lambda: "abc")
 
 
 def trials(number: int = 6, **more: Any) -> list[dict[str, Any]]:
@@ -70,7 +70,7 @@ class Counting:
 
 
 def run(out: Path, function: Any = square, number: int = 6, jobs: int = 1, **settings: Any) -> dict[str, Any]:
-    return experiment.run(trials(number), function, out, settings={**SETTINGS, **settings}, jobs=jobs, progress=False)
+    return runner.run(trials(number), function, out, settings={**SETTINGS, **settings}, jobs=jobs, progress=False)
 
 
 def read(out: Path) -> dict[str, Any]:
@@ -182,8 +182,8 @@ def test_other_settings_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         assert part in text
     assert caught.value.field == "seed, methods"
     with pytest.raises(InputError, match="specification"):  # the same settings, yet other trials
-        experiment.run(trials(5), square, tmp_path, settings=SETTINGS, progress=False)
-    monkeypatch.setattr(experiment, "_sources", lambda: "xyz")
+        runner.run(trials(5), square, tmp_path, settings=SETTINGS, progress=False)
+    monkeypatch.setattr(runner, "_sources", lambda: "xyz")
     with pytest.raises(InputError, match=r"versions\.sources.*expected sources abc, got sources xyz"):
         run(tmp_path)
     assert (tmp_path / "trials.jsonl").read_bytes() == before
@@ -193,7 +193,7 @@ def test_other_versions_and_machines_are_refused(tmp_path: Path, monkeypatch: py
     run(tmp_path)
     real = record.meta()
     other = {"versions": {**real["versions"], "pin": "9.9"}, "machine": {**real["machine"], "cores": 999}}
-    monkeypatch.setattr(experiment, "meta", lambda: json.loads(json.dumps(other)))
+    monkeypatch.setattr(runner, "meta", lambda: json.loads(json.dumps(other)))
     with pytest.raises(InputError, match=r"pin 9\.9, cores 999"):
         run(tmp_path)
 
@@ -264,7 +264,7 @@ def test_misuse(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no folder"):
         run(tmp_path / "file" / "out")
     with pytest.raises(InputError, match="same key"):
-        experiment.run([*trials(2), *trials(1)], square, tmp_path, settings=SETTINGS)
+        runner.run([*trials(2), *trials(1)], square, tmp_path, settings=SETTINGS)
     with pytest.raises(InputError, match="jobs"):
         run(tmp_path, jobs=0)
 
@@ -273,7 +273,7 @@ def test_progress(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, Counting(4))
     assert capfd.readouterr().err == ""
-    experiment.run(trials(), square, tmp_path, settings=SETTINGS, progress=True)
+    runner.run(trials(), square, tmp_path, settings=SETTINGS, progress=True)
     said = capfd.readouterr().err
     assert "4/6" in said  # what was done before counts
     assert "6/6" in said
@@ -281,15 +281,14 @@ def test_progress(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
 
 
 def test_sources_are_those_that_planning_depends_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import vkc_pin
     from vkc_pin.resources import folder
 
     for name in ("__init__.py", "planner.py", "cli.py", "benchmarks/tables.py", "scenes/a.yaml", "scenes/notes.txt"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text("1\n")
-    monkeypatch.setattr(vkc_pin, "__file__", str(tmp_path / "__init__.py"))
-    monkeypatch.setattr(experiment, "folder", lambda kind: tmp_path / "scenes" if kind == "scenes" else folder(kind))
-    first = experiment._sources()
+    monkeypatch.setattr(runner, "package_folder", lambda: tmp_path)
+    monkeypatch.setattr(runner, "folder", lambda kind: tmp_path / "scenes" if kind == "scenes" else folder(kind))
+    first = runner._sources()
     for name, counts in (
         ("cli.py", False),
         ("benchmarks/tables.py", False),
@@ -298,17 +297,17 @@ def test_sources_are_those_that_planning_depends_on(tmp_path: Path, monkeypatch:
         ("scenes/a.yaml", True),
     ):
         (tmp_path / name).write_text("2\n")
-        assert (experiment._sources() != first) == counts, name
+        assert (runner._sources() != first) == counts, name
         (tmp_path / name).write_text("1\n")
-        assert experiment._sources() == first
+        assert runner._sources() == first
 
 
 SCRIPT = """
 import sys, time
-from vkc_pin.benchmarks import experiment, record
+from vkc_pin.benchmarks.harness import record, runner
 from test_experiment import SETTINGS, slow, trials
-experiment._sources = lambda: "abc"
-experiment.run(trials(), slow, sys.argv[1], settings=SETTINGS, jobs=int(sys.argv[2]), progress=False)
+runner._sources = lambda: "abc"
+runner.run(trials(), slow, sys.argv[1], settings=SETTINGS, jobs=int(sys.argv[2]), progress=False)
 """
 
 

@@ -17,7 +17,7 @@ from vkc_pin.hold import Hold
 from vkc_pin.lookup import path_joints
 from vkc_pin.options import Options
 from vkc_pin.scene import Scene
-from vkc_pin.steps import Actuate, GoTo, Grasp, Reach, Step
+from vkc_pin.steps import Actuate, GoTo, Grasp, Reach, Release, Step
 from vkc_pin.task import Task
 
 OPTIONS = Options(reach_waypoints=10, turn_waypoints=3, move_waypoints=7)
@@ -111,6 +111,17 @@ def test_twice_the_same_object_is_grasped_once() -> None:
     task = phases([Grasp("door"), OPEN, Actuate("door", {"hinge": 0.5})])
     assert [phase.name for phase in task.phases][2:] == ["move door.hinge, door.knob", "move door.hinge"]
     assert task.phases[3].before == {"door.hinge": 1.2, "door.knob": TURNED}
+
+
+def test_the_task_of_the_first_steps_is_as_if_there_were_no_others() -> None:
+    back, drawer = Actuate("door", {"knob": 0.0}), Actuate("drawer", {"slide": 0.2})
+    steps = [GoTo(0.3, 0.2), OPEN, back, drawer, Release()]
+    whole = phases(steps, full_scene())
+    for count in range(1, len(steps) + 1):
+        part, alone = whole.until(count), phases(steps[:count], full_scene())
+        assert part == alone
+        assert [list(phase.before) for phase in part.phases] == [list(phase.before) for phase in alone.phases]
+        assert list(part.state) == list(alone.state)
 
 
 def test_grasp_only() -> None:

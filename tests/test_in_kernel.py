@@ -38,7 +38,8 @@ def test_show_is_part_of_the_notebook(jupyter: Kernel) -> None:
 
 
 def test_the_value_of_a_cell_is_an_overview(jupyter: Kernel) -> None:
-    jupyter.run("from vkc_pin.standing import standing\nplan = standing(scene, steps, vkc.Options())")
+    jupyter.run("from vkc_pin.outcome import joined\nfrom vkc_pin.settings import Settings")
+    jupyter.run("plan = joined(scene, steps, Settings('auto', vkc.Options()), [])")
     for code, text in (("plan", "FAILED, interrupted"), ("scene", "obstacles")):
         (output,) = jupyter.run(code)
         page = output["data"]["text/html"]
@@ -48,11 +49,13 @@ def test_the_value_of_a_cell_is_an_overview(jupyter: Kernel) -> None:
         assert "text/plain" in output["data"]
 
 
-def test_progress_is_one_output_that_is_updated(jupyter: Kernel) -> None:
+def test_progress_is_one_line_that_is_written_over(jupyter: Kernel) -> None:
     outputs = jupyter.run("plan = vkc.plan(scene, steps, progress=True)")
-    assert [output["kind"] for output in outputs] == ["display_data"], outputs
-    assert outputs[0]["updates"]
-    assert re.fullmatch(r"door: success — base .* m, arm .* rad, planned in [\d.]+ s", outputs[0]["data"]["text/plain"])
+    assert {output["name"] for output in outputs} == {"stdout"}, outputs
+    *before, last = printed(outputs).split("\r")
+    assert len(before) > 3
+    assert not any("\n" in text for text in before)
+    assert re.fullmatch(r"door: success — base .* m, arm .* rad, planned in [\d.]+ s *\n", last)
     assert jupyter.run("plan = vkc.plan(scene, steps)") == []
 
 
@@ -86,9 +89,7 @@ finally:
     setattr(owner, name, original)
 """
     outputs = jupyter.run(slow, interrupt="now", delay=0.3)
-    printed(outputs)
-    (line,) = [output for output in outputs if output["kind"] == "display_data"]
-    assert "FAILED, interrupted" in line["data"]["text/plain"]
+    assert "FAILED, interrupted" in printed(outputs).split("\r")[-1]
     assert re.fullmatch(TOLD, printed(jupyter.run(TELL)))
     (view,) = jupyter.run("plan.show()")
     assert "FAILED, interrupted" in view["data"]["text/html"]

@@ -17,7 +17,7 @@ from small_problems import SHORT, door_scene
 import vkc_pin as vkc
 from vkc_pin import initialization, joining
 from vkc_pin.beam import Beam, Found
-from vkc_pin.initialization import _POOR, HOPELESS, METHODS, Seed, _in_turn, initialize
+from vkc_pin.initialization import _POOR, HOPELESS, INITIALIZATIONS, Seed, _in_turn, initialize
 from vkc_pin.knots import scatter
 
 OPENED = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20)
@@ -41,7 +41,7 @@ def hand_off_the_handle(scene: vkc.Scene, row: np.ndarray, hinge: float, knob: f
     return float(np.abs(pin.log6(error).vector).max())
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", INITIALIZATIONS)
 def test_seeds_are_within_bounds(method: str) -> None:
     for z in seeds(method, count=3):
         assert z.shape == (problem().segments, problem().chain.size)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from vkc_pin.deadline import Monitor
-from vkc_pin.interrupt import interruptible
+from vkc_pin.interrupt import Interrupt, interruptible
 
 
 @pytest.fixture(autouse=True)
@@ -33,6 +33,14 @@ def test_the_first_ctrl_c_is_noted() -> None:
         assert not interrupt.pressed
         press()
         assert interrupt.pressed
+
+
+def test_it_is_noted_where_asked_for() -> None:
+    mine = Interrupt()
+    with interruptible(mine) as interrupt:
+        press()
+    assert interrupt is mine
+    assert mine.pressed
 
 
 def test_the_second_raises() -> None:

@@ -4,8 +4,10 @@ import io
 import os
 import pty
 import re
+import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,6 +16,7 @@ import pytest
 from drives import hall
 
 import vkc_pin as vkc
+from vkc_pin import one_problem
 from vkc_pin import progress as module
 from vkc_pin.progress import Progress, shown
 
@@ -99,11 +102,13 @@ def test_an_error_leaves_a_line_as_well(terminal: Terminal) -> None:
     assert re.fullmatch(r"stopped after [\d.]+ s", terminal.lines()[0])
 
 
-def test_ctrl_c_leaves_a_line_as_well(terminal: Terminal) -> None:
-    def stop(line: vkc.Iteration) -> None:
-        raise KeyboardInterrupt
+def test_ctrl_c_leaves_a_line_as_well(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stop(*_: Any, **__: Any) -> Iterator[Any]:
+        signal.raise_signal(signal.SIGINT)
+        return iter(())
 
-    plan = vkc.plan(hall(), [vkc.GoTo(-1.0, 0.5)], progress=True, callback=stop)
+    monkeypatch.setattr(one_problem, "initialize", stop)
+    plan = vkc.plan(hall(), [vkc.GoTo(-1.0, 0.5)], progress=True)
     assert plan.status == "interrupted"
     assert "FAILED, interrupted" in terminal.lines()[0]
     assert terminal.lines()[1:] == [""]

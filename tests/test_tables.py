@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vkc_pin.benchmarks import tables
+from vkc_pin.benchmarks.harness import tables
 
 SCENES = {"a": "easy", "b": "hard"}
 

@@ -10,10 +10,12 @@ import pytest
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks.initialization import TARGET
+from vkc_pin.goal import compile_task
 from vkc_pin.initialization import Seed
-from vkc_pin.one_problem import OneProblem, Settings
+from vkc_pin.one_problem import OneProblem
 from vkc_pin.pieces import seed_of
-from vkc_pin.step_by_step import stages
+from vkc_pin.settings import Settings
+from vkc_pin.stepwise import stages
 from vkc_pin.world import World, scene_after
 
 
@@ -53,10 +55,10 @@ def test_grasping_anywhere_costs_less_than_at_one_place() -> None:
     Searches from random seeds promise nothing of the kind for one start: either may end in a local minimum. And as the solver
     stops where a round saves little, going on with the fixed grasp saves something, too.
     """
-    settings, saved = Settings("astar", vkc.Options(), None, None, 0, 0.0), []
+    settings, saved = Settings("astar", vkc.Options()), []
     for seed in range(5, 10):
         fixed, again, anywhere = (
-            OneProblem(start(seed), [vkc.Grasp("stick", name), vkc.Touch("stick.tip", TARGET)], settings)
+            problem(start(seed), [vkc.Grasp("stick", name), vkc.Touch("stick.tip", TARGET)], settings)
             for name in ("end", "end", "grip")
         )
         found = fixed.run()
@@ -80,6 +82,10 @@ def objective(problem: vkc.TrajectoryProblem, z: np.ndarray) -> float:
     return problem.objective(z, problem.timing_for(z).dt)
 
 
+def problem(scene: vkc.Scene, steps: list[vkc.Step], settings: Settings) -> OneProblem:
+    return OneProblem(scene, compile_task(scene, steps, settings.options), settings)
+
+
 def going_on(fixed: OneProblem, problem: vkc.TrajectoryProblem) -> Seed:
     """Return the motion found with the fixed grasp, which is the middle of all: 0 along and about the stick."""
     z = np.zeros((problem.segments, problem.chain.size))
@@ -89,12 +95,12 @@ def going_on(fixed: OneProblem, problem: vkc.TrajectoryProblem) -> Seed:
 
 def test_one_problem_costs_less_than_step_after_step() -> None:
     """What is minimised (eq. 1) falls from what the steps came to on their own; they are where it starts."""
-    settings = Settings("astar", vkc.Options(), None, None, 0, 0.0)
+    settings = Settings("astar", vkc.Options())
     steps = [vkc.Grasp("stick"), vkc.Touch("stick.tip", TARGET)]
-    parts = stages(start(), steps, settings)
+    parts = stages(start(), compile_task(start(), steps, settings.options), settings)
     assert [part.success for _, part in parts] == [True, True]
     pieces = [one.piece() for one, _ in parts]
-    one = OneProblem(start(), steps, settings)
+    one = problem(start(), steps, settings)
     whole = one.run(lambda problem: seed_of(problem, pieces))
     assert whole.success, whole.report()
     before = objective(one.problem, seed_of(one.problem, pieces).z)
@@ -104,8 +110,9 @@ def test_one_problem_costs_less_than_step_after_step() -> None:
 
 
 def test_each_step_begins_where_the_one_before_it_ends() -> None:
-    settings = Settings("astar", vkc.Options(), None, None, 0, 0.0)
-    parts = stages(start(), [vkc.Grasp("stick"), vkc.Grasp("stick"), vkc.Touch("stick.tip", TARGET)], settings)
+    settings = Settings("astar", vkc.Options())
+    steps = [vkc.Grasp("stick"), vkc.Grasp("stick"), vkc.Touch("stick.tip", TARGET)]
+    parts = stages(start(), compile_task(start(), steps, settings.options), settings)
     assert len(parts) == 2  # grasping what is held changes nothing
     (first, grasped), (second, _) = parts
     end = grasped.trajectory

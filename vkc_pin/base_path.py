@@ -13,6 +13,7 @@ from vkc_pin.base_grid import BaseGrid
 from vkc_pin.base_search import cheapest
 from vkc_pin.base_ways import TURNING, Drive, Ground, wrapped
 from vkc_pin.errors import InputError
+from vkc_pin.interrupt import NEVER, Interrupt
 
 __all__ = ["BasePath", "along", "shortest_path"]
 
@@ -43,6 +44,7 @@ def shortest_path(
     *,
     costs: Sequence[float] | NDArray[np.float64] | None = None,
     smooth: bool = True,
+    interrupt: Interrupt = NEVER,
 ) -> BasePath | None:
     """Return the cheapest way from the start to one of the goals, or None if there is none.
 
@@ -54,6 +56,7 @@ def shortest_path(
         goals: The same for each goal, shape (G, 3).
         costs: What reaching each goal costs beside the way, shape (G,) [m]; None: nothing.
         smooth: Shorten the way over the grid where it turns more often than needed.
+        interrupt: Ends the search, as if there were no way.
 
     Raises:
         InputError: Shapes do not fit, or a number is not finite.
@@ -68,7 +71,7 @@ def shortest_path(
     if np.any(extra < 0.0):
         raise InputError("a cost is negative", field="costs", expected="numbers >= 0", got=extra.tolist())
     ground = Ground(grid, begin, ends)
-    found = cheapest(ground, extra)
+    found = cheapest(ground, extra, interrupt)
     if found is None:
         return None
     _, goal, drives, yaw = found

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from vkc_pin.base_grid import HEADINGS
 from vkc_pin.base_task import AHEAD, BACK, BEGIN, DIRECT, END, LEFT, RIGHT, Step, Task
 from vkc_pin.base_ways import BACKWARDS, TURNING, UNIT, Drive, Ground, wrapped
+from vkc_pin.interrupt import NEVER, Interrupt
 
 __all__ = ["cheapest"]
 
@@ -30,12 +31,15 @@ _CURVES = 0.13  # by what share ways are longer, mostly, because of turns on the
 _PATIENCE = 8e-3  # share of all nodes that are looked at, after a surprise, before the heuristic is found again
 
 
-def cheapest(ground: Ground, extra: NDArray[np.float64]) -> tuple[float, int, list[Drive], float] | None:
+def cheapest(
+    ground: Ground, extra: NDArray[np.float64], interrupt: Interrupt = NEVER
+) -> tuple[float, int, list[Drive], float] | None:
     """Return the cheapest way to a goal that is not blocked, or None if there is none.
 
     Args:
         ground: Where the base may move, from where to where.
         extra: What reaching each goal costs beside the way, shape (G,) [m].
+        interrupt: Ends the search, as if there were no way.
 
     Returns:
         The cost [m], the goal, the drives up to it, with continuous yaws, and the yaw at the goal.
@@ -56,7 +60,7 @@ def cheapest(ground: Ground, extra: NDArray[np.float64]) -> tuple[float, int, li
     for longer, cells in _WIDER:
         if found is None and cost < np.inf:
             bound = max(cost + longer, float(least[min(cells, count - 1)]))
-            cost, found = _Round(task, before, after, bound).run()
+            cost, found = _Round(task, before, after, bound).run(interrupt)
     return None if found is None else (cost, *found)
 
 
@@ -125,7 +129,7 @@ class _Round:
         # No way through these is good enough; the next time they are left out.
         self.targets[: self.start][self.passed[: self.start] + self.after > self.bound + 0.5] = self.nowhere
 
-    def run(self) -> tuple[float, tuple[int, list[Drive], float] | None]:
+    def run(self, interrupt: Interrupt) -> tuple[float, tuple[int, list[Drive], float] | None]:
         """Return the cheapest way, its goal, drives and the yaw at the goal, after its cost [m].
 
         If no way costs less than the bound, None, after what all ways cost at least; infinite: there is none.
@@ -134,6 +138,8 @@ class _Round:
         # By the heading at their end: turning right from it costs what turning left to it does.
         moves = self.costs[:, [AHEAD, BACK, RIGHT, LEFT]].tolist()
         while queue:
+            if interrupt.pressed:
+                return np.inf, None
             entry = heapq.heappop(queue)
             total, passed, _, node, _, step = entry
             if total > self.bound:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.knots import SCATTER, Knots
 from vkc_pin.pose_goals import approach_at
 from vkc_pin.routes import Routes
@@ -49,14 +50,15 @@ class Beam:
     Args:
         knots: Where configurations come from.
         routes: The ways that the base would drive; None: as if it drove straight.
+        interrupt: Ends a search.
 
     Attributes:
         careful: Whether grasps count as free only if the straight way to them is free, too, and ways of the base are those with
             the arm drawn in: for narrow places.
     """
 
-    def __init__(self, knots: Knots, routes: Routes | None = None) -> None:
-        self.knots, self.problem, self.routes = knots, knots.problem, routes
+    def __init__(self, knots: Knots, routes: Routes | None = None, interrupt: Interrupt = NEVER) -> None:
+        self.knots, self.problem, self.routes, self.interrupt = knots, knots.problem, routes, interrupt
         self.width, self.backwards, self.careful = _BEAM, False, False
         self.approaches = {
             int(end): approach_at(int(end) - phase.segments, int(end), self.problem.options)
@@ -64,8 +66,8 @@ class Beam:
             if phase.grasps
         }
 
-    def search(self, *, thorough: bool, backwards: bool = False) -> Found:
-        """Go from knot to knot, keeping the cheapest paths.
+    def search(self, *, thorough: bool, backwards: bool = False) -> Found | None:
+        """Go from knot to knot, keeping the cheapest paths; None if that was interrupted.
 
         Args:
             thorough: Keep more, and shake the arms at every knot at which something fixed is held.
@@ -88,7 +90,11 @@ class Beam:
                 found = self._go_back(found, knots, number, thorough=thorough)
             else:
                 for knot in knots:
+                    if self.interrupt.pressed:
+                        break
                     found = self._go_on(found, knot, number, thorough=thorough)
+            if self.interrupt.pressed:
+                return None
             if not closed[number] and self.routes is None:
                 ends = found.paths[:, before - 1], found.paths[:, before]
                 found = found._replace(cost=found.cost + self._approach(*ends, begin, int(problem.ends[number])))
@@ -140,6 +146,8 @@ class Beam:
         known = found.paths.shape[1]
         found = self._go_on(found, knots[-1], phase, thorough=thorough)
         for knot in knots[-2::-1]:
+            if self.interrupt.pressed:
+                break
             found = self._go_on(found, knot, phase + 1, thorough=thorough)
         paths = np.concatenate([found.paths[:, :known], found.paths[:, : known - 1 : -1]], axis=1)
         start, grasp, end = paths[:, known - 1], paths[:, known], paths[:, -1]

@@ -58,6 +58,7 @@ class VirtualKinematicChain:
         held_geometries: Hold → indices in `collision` of the object's geometry that moves when it is held.
         closures: Hold → where the object's base link is on the chain, and where it stands in the world.
         virtual: Hold → names of the coordinates of its attachment's virtual joint.
+        added: Hold → names of all coordinates that come with it: these, and the joints of the object that it moves.
         prefixes: Hold → what the object's frames and joints begin with in `model`.
     """
 
@@ -73,6 +74,7 @@ class VirtualKinematicChain:
     held_geometries: Mapping[Hold, tuple[int, ...]]
     closures: Mapping[Hold, Closure]
     virtual: Mapping[Hold, tuple[str, ...]]
+    added: Mapping[Hold, tuple[str, ...]]
     prefixes: Mapping[Hold, str]
 
     @property
@@ -190,7 +192,7 @@ def consolidate(scene: Scene, holds: Iterable[Hold] | Mapping[str, str]) -> Virt
     graft_geometry(collision, robot.collision.geometryObjects, joints=list(range(model.njoints)), placement=pin.SE3.Identity())
     names = list(robot.coordinates.names)
     limits = [list(robot.lower), list(robot.upper), list(robot.velocity), list(robot.acceleration)]
-    held_geometries, closures, virtual = {}, {}, {}
+    held_geometries, closures, virtual, with_hold = {}, {}, {}, {}
     prefixes: dict[Hold, str] = {}
     for hold in holds:
         name = hold.object
@@ -222,6 +224,7 @@ def consolidate(scene: Scene, holds: Iterable[Hold] | Mapping[str, str]) -> Virt
             stated = (placed.object.lower, placed.object.upper, placed.object.velocity, placed.object.acceleration)
             for row, values in zip(limits, stated, strict=True):
                 row.append(float(values[index]))
+        with_hold[hold] = (*added, *(f"{name}.{joint_name}" for joint_name in tree.model.names[1:]))
         base = model.frames[model.getFrameId(f"{prefix}{placed.object.base_link}")]
         moving = list(tree.collision.geometryObjects)
         if not placed.object.free:
@@ -247,6 +250,7 @@ def consolidate(scene: Scene, holds: Iterable[Hold] | Mapping[str, str]) -> Virt
         held_geometries=held_geometries,
         closures=closures,
         virtual=virtual,
+        added=with_hold,
         prefixes=prefixes,
     )
 

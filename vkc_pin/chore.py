@@ -8,19 +8,19 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from vkc_pin.actions import actions_of, foresee
-from vkc_pin.chain import consolidate
 from vkc_pin.errors import InputError
 from vkc_pin.goal import compile_task
 from vkc_pin.initialization import Seed
-from vkc_pin.one_problem import OneProblem, Settings
+from vkc_pin.one_problem import OneProblem
 from vkc_pin.options import Options
+from vkc_pin.outcome import joined
 from vkc_pin.pieces import Piece, seed_of
 from vkc_pin.plan import Plan
-from vkc_pin.planner import guarded, settings_for
+from vkc_pin.planner import guarded
 from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.scene import Scene
+from vkc_pin.settings import Settings, settings_for
 from vkc_pin.solution import Iteration
-from vkc_pin.step_by_step import joined, summed
 from vkc_pin.steps import Step
 from vkc_pin.task import Task, stretches
 from vkc_pin.terms import Term, check_active
@@ -78,16 +78,24 @@ def plan_chore(
     Raises:
         InputError: A step names something that is not there, or cannot be done at its place in the list; the error names it.
     """
-    settings = settings_for(scene, initialization, options, callback, time_limit, seed, terms=terms)
+    settings = settings_for(
+        scene,
+        initialization=initialization,
+        options=options,
+        callback=callback,
+        time_limit=time_limit,
+        seed=seed,
+        terms=terms,
+    )
     if not isinstance(window, int) or isinstance(window, bool) or window < 1:
         raise InputError("out of range", field="window", expected="a whole number of at least 1", got=repr(window))
 
-    def planner(scene: Scene, steps: Sequence[Step], settings: Settings) -> Plan:
+    def planner(settings: Settings) -> Plan:
         tasks = foresee(scene, steps, settings.options)
         check_active(settings.terms, [stretch for task in tasks for stretch in stretches(task)])
         return _Chore(scene, tuple(steps), window, settings).run()
 
-    return guarded(planner, scene, steps, settings, progress)
+    return guarded(planner, settings, progress)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,15 +138,6 @@ class _Chore:
 
     def run(self) -> Plan:
         """Plan action after action, until all is done, one fails or Ctrl-C is pressed."""
-        try:
-            failed = self._run()
-        except KeyboardInterrupt:
-            self.settings.interrupt.pressed, failed = True, None
-            self.kept += self.ahead
-        return self._joined(failed)
-
-    def _run(self) -> Plan | None:
-        """Plan action after action; return the plan of the one that fails."""
         window, back, failed = self.window, _BACK, None
         while len(self.kept) < len(self.actions):
             failed = self._plan_window(window)
@@ -155,7 +154,7 @@ class _Chore:
             else:
                 self.kept, self.ahead = self.kept + self.ahead, []
                 break
-        return failed
+        return self._joined(failed)
 
     @property
     def _stopped(self) -> bool:
@@ -181,14 +180,14 @@ class _Chore:
         if alone is None and sum(part.plan is not None for part in self.ahead) > 1:
             pieces = [part.piece for part in self.ahead]
             fine = any(part.fine for part in self.ahead)
-            one = OneProblem(self._now, self._steps(first, last), self._left(fine=fine))
+            one = self._problem(self._now, first, last, fine=fine)
             plan = self._solved(first, one, lambda problem: seed_of(problem, pieces))
             if plan.success:
                 self.ahead = self._parts(one, plan, first, last)
         for attempt in range(1, 1 + _TRIES):
             if alone is None or alone.status in _STOPPED:
                 break
-            one = OneProblem(self._now, self._steps(first, last), self._left(attempt, fine=True))
+            one = self._problem(self._now, first, last, attempt, fine=True)
             together = self._solved(first, one)
             alone = None if together.success else dataclasses.replace(alone, status=together.status)
             if together.success:
@@ -206,7 +205,7 @@ class _Chore:
         last = first + 1
         while last < min(first + window, len(self.actions)):
             try:
-                self._task(self._now, first, last + 1)
+                self._task(self._now, first, last + 1, self.settings.options)
             except InputError:
                 break
             last += 1
@@ -215,11 +214,11 @@ class _Chore:
     def _look_ahead(self) -> Plan | None:
         """Plan one more action alone, from where those planned ahead end; return the plan if it fails."""
         number, scene = len(self.kept) + len(self.ahead), self.ahead[-1].after if self.ahead else self._now
-        if not self._task(scene, number, number + 1).phases:
-            self.ahead.append(_Part(None, _NOTHING, scene))
-            return None
         for attempt in range(_SINGLE):
-            one = OneProblem(scene, self._steps(number, number + 1), self._left(attempt, fine=attempt > 0))
+            one = self._problem(scene, number, number + 1, attempt, fine=attempt > 0)
+            if not one.task.phases:
+                self.ahead.append(_Part(None, _NOTHING, scene))
+                return None
             plan = self._solved(number, one)
             if plan.success:
                 self.ahead += self._parts(one, plan, number, number + 1)
@@ -243,9 +242,9 @@ class _Chore:
         fine = one.settings.options.reach_waypoints > self.settings.options.reach_waypoints
         ahead = dict(enumerate(self.ahead, start=len(self.kept)))
         for number in range(first, last):
-            task = self._task(one.scene, first, number + 1)
+            task = one.task.until(len(self._steps(first, number + 1)))
             end = len(task.phases)
-            names = consolidate(one.scene, task.holds).names
+            names = [*one.scene.robot.coordinates.names, *(name for hold in task.holds for name in one.problem.chain.added[hold])]
             part, piece, rests = None, _NOTHING, True
             if end > begin:
                 trajectory = _cut(plan.trajectory, names, begin, end if end < len(one.task.phases) else None)
@@ -263,8 +262,14 @@ class _Chore:
     def _steps(self, first: int, last: int) -> tuple[Step, ...]:
         return tuple(step for action in self.actions[first:last] for step in action)
 
-    def _task(self, scene: Scene, first: int, last: int) -> Task:
-        return compile_task(scene, self._steps(first, last), self.settings.options, nothing=True)
+    def _task(self, scene: Scene, first: int, last: int, options: Options) -> Task:
+        """Compile actions anew: from where in the world they begin is known only once those before them are planned."""
+        return compile_task(scene, self._steps(first, last), options, nothing=True)
+
+    def _problem(self, scene: Scene, first: int, last: int, attempt: int = 0, *, fine: bool) -> OneProblem:
+        """Return the problem of the actions from `first` to before `last`; see `_left`."""
+        settings = self._left(attempt, fine)
+        return OneProblem(scene, self._task(scene, first, last, settings.options), settings)
 
     def _left(self, attempt: int = 0, fine: bool = False) -> Settings:
         """Return the settings with what is left of the time limit.
@@ -289,17 +294,21 @@ class _Chore:
     def _joined(self, failed: Plan | None) -> Plan:
         """Return one plan of all that is decided, and of what failed."""
         parts = [part.plan for part in self.kept if part.plan is not None]
-        parts = parts if failed is None else [*parts, failed]
-        plan = joined(self.scene, self.steps, self.settings, parts)
-        metrics = {**plan.metrics, **summed(self.spent)}
-        metrics["planning_time"] = time.perf_counter() - self.began - metrics["build_time"]
-        metrics["time_validation"] += plan.metrics["time_validation"] - sum(part.metrics["time_validation"] for part in parts)
-        report = plan.validation
+        notes = []
         if failed is not None:
+            parts.append(failed)
             number = len(self._steps(0, len(self.kept)))
-            note = f"steps[{number}], {self.steps[number]}, could not be planned: {failed.status}"
-            report = dataclasses.replace(report, notes=(note, *report.notes))
-        return dataclasses.replace(plan, metrics=metrics, validation=report, history=tuple(self.history))
+            notes.append(f"steps[{number}], {self.steps[number]}, could not be planned: {failed.status}")
+        return joined(
+            self.scene,
+            self.steps,
+            self.settings,
+            parts,
+            began=self.began,
+            metrics=self.spent,
+            notes=notes,
+            history=self.history,
+        )
 
 
 def _cut(trajectory: Trajectory, names: Sequence[str], begin: int, end: int | None) -> Trajectory:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from vkc_pin.cli_bench import EXIT_OK, add_bench, natural, positive
+from vkc_pin.benchmarks.commands import EXIT_OK, add_bench, natural, positive
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.tables import GROUPS
 

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vkc_pin.base_body import outline
+from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.knots import depth
 from vkc_pin.problem import TrajectoryProblem
 
@@ -19,7 +20,9 @@ _LOW = 0.1  # [m] over the floor, at least
 _AWAY = 100.0  # [m] from the arena, where nothing stands
 
 
-def compact_arm(problem: TrajectoryProblem, phase: int, resting: NDArray[np.float64]) -> NDArray[np.float64]:
+def compact_arm(
+    problem: TrajectoryProblem, phase: int, resting: NDArray[np.float64], interrupt: Interrupt = NEVER
+) -> NDArray[np.float64]:
     """Return the arm, shape (m - 3,) [m] and [rad], with which the robot is narrow: the best that a random search finds.
 
     What counts is how far the arm, and what is carried, reach to either side of the base's x axis; next, how far they reach
@@ -30,6 +33,7 @@ def compact_arm(problem: TrajectoryProblem, phase: int, resting: NDArray[np.floa
         problem: Whose robot it is.
         phase: In which it carries what it carries.
         resting: Where robot and load rest, shape (n,): what is not the arm stays so; where the base is does not matter.
+        interrupt: Ends the search, with what there is.
     """
     chain, rng = problem.chain, np.random.default_rng(0)
     arm, home = slice(3, chain.robot.coordinates.size), chain.robot.home
@@ -42,6 +46,8 @@ def compact_arm(problem: TrajectoryProblem, phase: int, resting: NDArray[np.floa
     z[1:, arm] = rng.uniform(lower, upper, (_DRAWN - 1, len(home)))
     best, spread = z[:1], _SPREAD
     for _ in range(_ROUNDS):
+        if interrupt.pressed:
+            break
         z = z[np.argsort(body.price(z) + _TURN * np.abs(z[:, arm] - home).max(axis=1), kind="stable")]
         best = body.free(z, _KEPT)
         if not len(best):

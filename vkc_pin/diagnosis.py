@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.knots import depth, scatter
 from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.report import Violation
@@ -43,16 +44,19 @@ def impossible(problem: TrajectoryProblem) -> list[Violation]:
     return found
 
 
-def explain(problem: TrajectoryProblem, seed: int) -> list[str]:
+def explain(problem: TrajectoryProblem, seed: int, interrupt: Interrupt = NEVER) -> list[str]:
     """Return, for every goal that no free configuration was found for, the nearest miss or what collides with what.
 
     Args:
         problem: What could not be solved.
         seed: Of the random configurations tried.
+        interrupt: Ends the search, with what was found out.
     """
     lines = []
     for phase, end in zip(problem.task.phases, problem.ends, strict=True):
-        tried = _try(problem, int(end), np.random.default_rng(seed))
+        tried = _try(problem, int(end), np.random.default_rng(seed), interrupt)
+        if interrupt.pressed:
+            break
         if tried is None:
             continue
         z, residual = tried
@@ -79,7 +83,7 @@ def explain(problem: TrajectoryProblem, seed: int) -> list[str]:
 
 
 def _try(
-    problem: TrajectoryProblem, waypoint: int, rng: np.random.Generator
+    problem: TrajectoryProblem, waypoint: int, rng: np.random.Generator, interrupt: Interrupt
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
     """Return what `scatter` does, drawn again and again until something is free, up to `_DRAWS` times."""
     found: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
@@ -89,7 +93,7 @@ def _try(
             return None
         found.append(tried)
         z = tried[0][tried[1] < 1e-4]
-        if len(z) and depth(problem, z, waypoint).min() <= 0.0:
+        if interrupt.pressed or (len(z) and depth(problem, z, waypoint).min() <= 0.0):
             break
     return np.concatenate([z for z, _ in found]), np.concatenate([residual for _, residual in found])
 

@@ -16,7 +16,7 @@ from vkc_pin.options import Options
 from vkc_pin.placed import PlacedObject
 from vkc_pin.scene import Scene
 from vkc_pin.steps import STEPS, Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch, as_list
-from vkc_pin.task import FrameGoal, Phase, PhaseKind, Task
+from vkc_pin.task import FrameGoal, Mark, Phase, PhaseKind, Task
 
 __all__ = ["compile_task", "nothing_to_do"]
 
@@ -283,14 +283,15 @@ def compile_task(scene: Scene, steps: Sequence[Step], options: Options, *, nothi
             hand that is asked to hold a second thing.
     """
     steps = as_list(steps)
-    compiler = _Compiler(scene, options)
+    compiler, marks = _Compiler(scene, options), list[Mark]()
     for index, step in enumerate(steps, start=first):
         compiler.add(step, f"steps[{index}]")
+        marks.append(Mark(len(compiler.phases), len(compiler.holds), len(compiler.initial), compiler.held))
     if not compiler.phases and not nothing:
         raise nothing_to_do()
     # Objects that are grasped later stand as they are at the start until then.
     phases = tuple(replace(phase, before={**compiler.initial, **phase.before}) for phase in compiler.phases)
-    return Task(steps, phases, tuple(compiler.holds), compiler.initial, compiler.held)
+    return Task(steps, phases, tuple(compiler.holds), compiler.initial, compiler.held, tuple(marks))
 
 
 def nothing_to_do() -> InputError:

@@ -11,14 +11,15 @@ from numpy.typing import NDArray
 
 from vkc_pin.approach import Approach
 from vkc_pin.beam import Beam, Found
+from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.joining import Around, Joiner, Trees
 from vkc_pin.knots import Knots, Known, follow_objects
 from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.routes import Routes
 
-__all__ = ["HOPELESS", "METHODS", "Seed", "initialize"]
+__all__ = ["HOPELESS", "INITIALIZATIONS", "Seed", "initialize"]
 
-METHODS = ("auto", "interpolated", "astar", "rrt", "stationary")
+INITIALIZATIONS = ("auto", "interpolated", "astar", "rrt", "stationary")
 _LOOKED, _FREE = 8, 0.05  # paths whose seeds are compared; shortfalls [m], summed over waypoints, that nobody looks further for
 _HIT = 1e4  # cost that lets paths with knots in collision come last
 _GROWN, _POOR = 4, 0.5  # paths along which trees grow; shortfalls with which they are asked
@@ -56,6 +57,7 @@ def initialize(
     count: int = 1,
     perturbation: float = 0.0,
     notes: list[str] | None = None,
+    interrupt: Interrupt = NEVER,
 ) -> Iterator[Seed]:
     """Yield up to `count` seeds of each kind, best first; each is looked for when it is asked for.
 
@@ -70,17 +72,19 @@ def initialize(
         count: How many different seeds to return.
         perturbation: Standard deviation of what is added to the robot's coordinates, smoothly over time, [m] and [rad].
         notes: Gets a line for every phase in which there is no way for the base.
+        interrupt: Ends the search; there are no more seeds then.
     """
     said: list[str] = [] if notes is None else notes
     if method == "stationary":
         seeds = iter([Seed(method, follow_objects(problem, np.tile(problem.start, (problem.segments, 1))))])
     elif method == "auto":
-        routes, known = Routes(problem), Known()
-        straight, around = (_Seeds(problem, part, seed, said, routes, known=known) for part in ("interpolated", "astar"))
-        trees = _Seeds(problem, "rrt", seed, said, routes, known=known, like=around)
+        routes, known = Routes(problem, interrupt), Known()
+        parts = (_Seeds(problem, part, seed, said, routes, interrupt, known=known) for part in ("interpolated", "astar"))
+        straight, around = parts
+        trees = _Seeds(problem, "rrt", seed, said, routes, interrupt, known=known, like=around)
         seeds = _in_turn(straight.seeds(count), around.seeds(count), trees.seeds(max(count, 2)))
     else:
-        seeds = _Seeds(problem, method, seed, said, Routes(problem)).seeds(count)
+        seeds = _Seeds(problem, method, seed, said, Routes(problem, interrupt), interrupt).seeds(count)
     rng = np.random.default_rng([seed, 1])
     for item in seeds:
         yield replace(item, z=_perturbed(problem, item.z, perturbation, rng)) if perturbation else item
@@ -132,19 +136,21 @@ class _Seeds:
         seed: int,
         notes: list[str],
         routes: Routes,
+        interrupt: Interrupt,
         *,
         known: Known | None = None,
         like: _Seeds | None = None,
     ) -> None:
         self.problem, self.method, self.notes, self.like = problem, method, notes, like
+        self.interrupt = interrupt
         self.found: Found | None = None
         self.knots = Knots(problem, np.random.default_rng(seed), known)
         drives = problem.chain.robot.base != "fixed"
-        self.beam = Beam(self.knots, routes if drives and method != "interpolated" else None)
+        self.beam = Beam(self.knots, routes if drives and method != "interpolated" else None, interrupt)
         approach = Approach(self.knots)
         if method == "rrt":
             approach.stands = self.beam.careful = True
-            self.joiner = Joiner(self.knots, approach, Trees(self.knots, routes))
+            self.joiner = Joiner(self.knots, approach, Trees(self.knots, routes, interrupt))
         else:
             self.joiner = Joiner(self.knots, approach, Around(routes) if drives and method == "astar" else None)
 
@@ -152,6 +158,8 @@ class _Seeds:
         """Yield seeds through the cheapest paths of knots: of one quick search if that is any good, then of thorough ones."""
         given: list[NDArray[np.float64]] = []
         for attempt in range(count + 1):
+            if self.interrupt.pressed:
+                return
             found = self._search(attempt)
             if found is None:
                 continue
@@ -173,6 +181,8 @@ class _Seeds:
         found = self.like.found if attempt == 0 and self.like is not None else None
         if found is None or found.trouble.min() > 0:
             found = self.beam.search(thorough=attempt > 0, backwards=self.method == "rrt" and attempt % 2 == 1)
+        if found is None:
+            return None
         self.found = found if self.beam.tolerable(found) else None
         return self.found if attempt == 0 or self.method == "rrt" else found
 
@@ -188,6 +198,8 @@ class _Seeds:
             candidates, tries = self._apart(paths, candidates), _GROWN
         for index in candidates[:tries]:
             z = self.joiner.join(paths[index], at)
+            if self.interrupt.pressed:  # what was not found may be there all the same
+                return None
             self.notes += [line for line in self.joiner.blocked if line not in self.notes]
             if z is None:
                 continue

@@ -1,4 +1,4 @@
-"""Ctrl-C: noted instead of raised, so that what was found by then can be returned."""
+"""Ctrl-C: whoever plans asks now and then whether it was pressed, and ends early with what there is."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from types import FrameType
 
-__all__ = ["Interrupt", "interruptible"]
+__all__ = ["NEVER", "Interrupt", "interruptible"]
 
 
 @dataclass
@@ -19,14 +19,21 @@ class Interrupt:
     pressed: bool = False
 
 
+NEVER = Interrupt()
+"""For searches that nobody ends early."""
+
+
 @contextlib.contextmanager
-def interruptible() -> Iterator[Interrupt]:
-    """Note the first Ctrl-C instead of raising, so that the best iterate can be returned; the second one raises.
+def interruptible(interrupt: Interrupt | None = None) -> Iterator[Interrupt]:
+    """Note the first Ctrl-C instead of raising, so that the best there is can be returned; the second one raises.
 
     CasADi swallows KeyboardInterrupt inside a solve and reports some failure instead. Signals reach the main thread only:
     elsewhere nothing changes.
+
+    Args:
+        interrupt: Where to note it; None: in a new one.
     """
-    interrupt = Interrupt()
+    interrupt = Interrupt() if interrupt is None else interrupt
     if threading.current_thread() is not threading.main_thread():
         yield interrupt
         return

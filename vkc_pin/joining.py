@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vkc_pin.approach import Approach
+from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.knots import Knots, smooth
 from vkc_pin.routes import Routes
 from vkc_pin.task import Phase
@@ -58,8 +59,8 @@ class Trees:
 
     careful = True
 
-    def __init__(self, knots: Knots, routes: Routes) -> None:
-        self.knots, self.problem, self.routes = knots, knots.problem, routes
+    def __init__(self, knots: Knots, routes: Routes, interrupt: Interrupt = NEVER) -> None:
+        self.knots, self.problem, self.routes, self.interrupt = knots, knots.problem, routes, interrupt
         self.failed: Counter[int] = Counter()  # how often in a row in each phase
 
     def way(
@@ -83,7 +84,8 @@ class Trees:
         if not reaches:
             ends[:, 3:] = arms
         tries = max(TRIES // 2 ** self.failed[phase], TRIES // _LEAST)  # what failed before is likely to fail again
-        path = connect(problem, phase, first, ends, poses=poses, arms=np.array(arms), rng=self.knots.rng, tries=tries)
+        given = {"poses": poses, "arms": np.array(arms), "rng": self.knots.rng, "tries": tries, "interrupt": self.interrupt}
+        path = connect(problem, phase, first, ends, **given)
         self.failed[phase] = 0 if path is not None else self.failed[phase] + 1
         return None if path is None else spread(path, steps)
 

@@ -5,58 +5,31 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vkc_pin.diagnosis import explain, impossible
-from vkc_pin.goal import compile_task
 from vkc_pin.initialization import HOPELESS, Seed, initialize
-from vkc_pin.interrupt import Interrupt, interruptible
-from vkc_pin.options import Options
+from vkc_pin.outcome import TIMES, outcome, spent
 from vkc_pin.pieces import Piece
 from vkc_pin.plan import Plan
 from vkc_pin.problem import TrajectoryProblem
-from vkc_pin.progress import Progress
 from vkc_pin.report import Report
 from vkc_pin.scene import Scene
+from vkc_pin.settings import Settings
 from vkc_pin.solution import Iteration, Solution
 from vkc_pin.solver import solve
-from vkc_pin.standing import TIMES, standing
-from vkc_pin.steps import Step
-from vkc_pin.terms import Term
+from vkc_pin.task import Task
 from vkc_pin.trajectory import Trajectory
 from vkc_pin.unfold import as_trajectory
 from vkc_pin.validation import validate
 
-__all__ = ["TIMES", "OneProblem", "Settings"]
+__all__ = ["OneProblem"]
 
 _RACING = 3  # seeds of which the one to begin with is chosen
-
-
-@dataclass(frozen=True)
-class Settings:
-    """How to plan; see `planner.plan`.
-
-    Attributes:
-        rough: Whether what comes out only starts a problem of more steps, after which nobody sees any more what is good about it.
-            Then seeds do not race, and the first good motion will do.
-        progress: Is told what is being done.
-        interrupt: Whether Ctrl-C was pressed; then nothing new is begun. Copies for parts of a task share it.
-    """
-
-    initialization: str
-    options: Options
-    callback: Callable[[Iteration], None] | None
-    time_limit: float | None
-    seed: int
-    perturbation: float
-    terms: tuple[Term, ...] = ()
-    rough: bool = False
-    progress: Progress = field(default_factory=Progress)
-    interrupt: Interrupt = field(default_factory=Interrupt)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,20 +55,24 @@ class _Try:
         """By how much everything is violated, summed over all units."""
         return sum(violation.amount for violation in self.report.violations)
 
+    def better(self, other: _Try) -> bool:
+        """Return whether it is a success, or violates less."""
+        return self.report.ok or self.amount < other.amount
+
 
 class OneProblem:
-    """Plans steps as one nonlinear program.
+    """Plans a task as one nonlinear program.
 
     Attributes:
-        task: What the steps ask for.
+        scene: Where it begins.
+        task: What is asked for.
         problem: The program, once `run` has begun.
         z: Its best z_1..z_N, shape (N, n), once `run` has ended.
         initialization: The name of the seed that led there.
     """
 
-    def __init__(self, scene: Scene, steps: Sequence[Step], settings: Settings) -> None:
-        self.scene, self.settings = scene, settings
-        self.task = compile_task(scene, steps, settings.options)
+    def __init__(self, scene: Scene, task: Task, settings: Settings) -> None:
+        self.scene, self.task, self.settings = scene, task, settings
         self.times = dict.fromkeys(TIMES, 0.0)
         self.rounds = self.iterations = 0
         self.history: list[dict[str, float]] = []
@@ -103,22 +80,13 @@ class OneProblem:
         self._leading: Seed | None = None
 
     def run(self, seed: Callable[[TrajectoryProblem], Seed] | None = None) -> Plan:
-        """Try seeds until validation accepts a motion, there are no more, or time is up.
+        """Try seeds until validation accepts a motion, there are no more, time is up, or Ctrl-C is pressed.
 
         Args:
             seed: Makes the only seed to try, a motion that is nearly good as it is, so that there is no need of patience with it;
                 None: those of the settings' initialization.
         """
         began = time.perf_counter()
-        try:
-            return self._run(seed, began)
-        except KeyboardInterrupt:  # before there was a motion
-            self.settings.interrupt.pressed = True
-            spent = time.perf_counter() - began
-            s = self.settings
-            return standing(self.scene, self.task.steps, s.options, seed=s.seed, spent=spent, terms=s.terms)
-
-    def _run(self, seed: Callable[[TrajectoryProblem], Seed] | None, began: float) -> Plan:
         limit = self.settings.time_limit
         self.settings.progress.begin([phase.name for phase in self.task.phases])
         problem = self.problem = TrajectoryProblem(self.scene, self.task, self.settings.options, self.settings.terms)
@@ -149,51 +117,67 @@ class OneProblem:
         best: _Try | None = None
         notes: list[str] = []
         stuck: list[tuple[float, int, Seed]] = []
-        status = ""
-        try:
-            for number, seed in enumerate(itertools.chain(seeds, _least(stuck)), start=1):
-                solution = self._solve(problem, seed, deadline, patient=seed.penalty is not None)
-                found = self._judge(problem, solution, seed.name)
-                if searched and solution.penalty is not None:
-                    again = Seed(seed.name, solution.z, radius=solution.radius, penalty=solution.penalty)
-                    stuck.append((found.amount, number, again))
-                best = found if best is None or found.report.ok or found.amount < best.amount else best
-                if best.status == "success":
-                    return best, "success"
-                if self.settings.interrupt.pressed:
-                    status = "interrupted"
-                    break
-                if solution.status == "time limit":
-                    status = solution.status
-                    break
-                if number == 1 and searched and not _ends_free(problem, seed):
-                    notes = explain(problem, self.settings.seed)
-                elif notes:  # two seeds failed, and random configurations find no free one at a goal either
-                    break
-        except KeyboardInterrupt:
-            self.settings.interrupt.pressed = True
-            status = "interrupted"
+        ended = ""  # why nothing else is to be tried
+        for number, seed in enumerate(seeds, start=1):
+            solution, found = self._try(problem, seed, deadline)
+            best = found if best is None or found.better(best) else best
+            if searched and solution.resume is not None:
+                again = Seed(seed.name, solution.z, radius=solution.resume.radius, penalty=solution.resume.penalty)
+                stuck.append((found.amount, number, again))
+            ended = self._ended(best, solution)
+            if ended:
+                break
+            if number == 1 and searched and not _ends_free(problem, seed):
+                notes = explain(problem, self.settings.seed, self.settings.interrupt)
+            elif notes:  # two seeds failed, and random configurations find no free one at a goal either
+                break
+        else:
+            if stuck and not self.settings.interrupt.pressed:  # no other seeds: now with patience, what violates least
+                solution, found = self._try(problem, min(stuck)[-1], deadline, patient=True)
+                best = found if best is None or found.better(best) else best
+                ended = self._ended(best, solution)
         if best is None and self._leading is not None:
             leading = self._leading
             best = self._judge(problem, Solution(leading.z, problem.timing_for(leading.z).dt), leading.name)
         if best is None:
             best, notes = self._stationary(problem), notes + self.blocked
-        if not status:
-            status = "infeasible" if notes else best.status
+        if not ended and self.settings.interrupt.pressed:
+            ended = "interrupted"
+        if not ended:
+            ended = "infeasible" if notes else best.status
             best = dataclasses.replace(best, report=dataclasses.replace(best.report, notes=tuple(notes)))
-        return best, status
+        return best, ended
+
+    def _try(self, problem: TrajectoryProblem, seed: Seed, deadline: float, *, patient: bool = False) -> tuple[Solution, _Try]:
+        """Return what the solver makes of a seed, and what that is worth."""
+        solution = self._solve(problem, seed, deadline, patient=patient)
+        return solution, self._judge(problem, solution, seed.name)
+
+    def _ended(self, best: _Try, solution: Solution) -> str:
+        """Return the plan's status if nothing else is to be tried after a solution; "" otherwise."""
+        if best.status == "success":
+            return best.status
+        if self.settings.interrupt.pressed:
+            return "interrupted"
+        return solution.status if solution.status == "time limit" else ""
 
     def _seeds(self, problem: TrajectoryProblem) -> Iterator[Seed]:
         s = self.settings
         seeds = initialize(
-            problem, s.initialization, s.seed, count=s.options.max_restarts, perturbation=s.perturbation, notes=self.blocked
+            problem,
+            s.initialization,
+            s.seed,
+            count=s.options.max_restarts,
+            perturbation=s.perturbation,
+            notes=self.blocked,
+            interrupt=s.interrupt,
         )
-        while True:
+        while not s.interrupt.pressed:
             began = time.perf_counter()
             s.progress.doing("looking for a seed")
             seed = next(seeds, None)
             self.times["initialization"] += time.perf_counter() - began
-            if seed is None:
+            if seed is None or s.interrupt.pressed:
                 return
             yield seed
 
@@ -212,8 +196,10 @@ class OneProblem:
                 better = dataclasses.replace(seed, z=solution.z, radius=solution.radius)
                 scored.append((problem.objective(solution.z, solution.dt), number, better))
                 self._leading = min(scored)[-1]
-                if solution.status == "interrupted":
-                    raise KeyboardInterrupt
+                if self.settings.interrupt.pressed:
+                    return
+            if self.settings.interrupt.pressed:
+                return
             yield from (seed for _, _, seed in sorted(scored))
         yield from seeds
 
@@ -230,14 +216,13 @@ class OneProblem:
             penalty=seed.penalty,
             patient=patient,
             thorough=not self.settings.rough,
+            interrupt=self.settings.interrupt,
         )
         self.rounds += solution.rounds
         self.iterations += solution.iterations
         for key, value in solution.timings.items():
             self.times[key] += value
         self.history += [dataclasses.asdict(row) for row in solution.history]
-        if solution.status == "interrupted":
-            self.settings.interrupt.pressed = True
         return solution
 
     def _report(self, row: Iteration) -> None:
@@ -248,10 +233,8 @@ class OneProblem:
     def _judge(self, problem: TrajectoryProblem, solution: Solution, name: str) -> _Try:
         began = time.perf_counter()
         self.settings.progress.doing("checking")
-        with interruptible() as interrupt:  # what was found is checked all the same
-            trajectory = as_trajectory(problem, solution.z, solution.dt)
-            report = validate(self.scene, self.task.steps, trajectory, self.settings.options, self.settings.terms)
-        self.settings.interrupt.pressed |= interrupt.pressed
+        trajectory = as_trajectory(problem, solution.z, solution.dt)
+        report = validate(self.scene, self.task.steps, trajectory, self.settings.options, self.settings.terms)
         self.times["validation"] += time.perf_counter() - began
         status = "success" if report.ok else "rejected" if solution.converged else "not converged"
         return _Try(name, solution.z, trajectory, report, status)
@@ -260,35 +243,20 @@ class OneProblem:
         return self._judge(problem, Solution(problem.still, problem.timing_for(problem.still).dt), "none")
 
     def _plan(self, best: _Try, status: str, planning_time: float, build_time: float) -> Plan:
-        metrics = {
-            "planning_time": planning_time,
-            "build_time": build_time,
-            **best.trajectory.metrics(),
-            "clearance": best.report.clearance,
-            "closure_error": best.report.closure_error,
-            "iterations": float(self.iterations),
-            "rounds": float(self.rounds),
-            **{f"time_{key}": value for key, value in self.times.items()},
-        }
-        return Plan(
-            scene=self.scene,
-            steps=self.task.steps,
-            options=self.settings.options,
-            trajectory=best.trajectory,
-            validation=best.report,
-            status=status,
-            metrics=metrics,
-            seed=self.settings.seed,
+        s = self.settings
+        return outcome(
+            self.scene,
+            self.task.steps,
+            s.options,
+            best.trajectory,
+            best.report,
+            status,
+            took=spent(planning_time, build_time, iterations=self.iterations, rounds=self.rounds, times=self.times),
+            seed=s.seed,
             initialization=best.name,
-            history=tuple(self.history),
-            terms=self.settings.terms,
+            history=self.history,
+            terms=s.terms,
         )
-
-
-def _least(stuck: list[tuple[float, int, Seed]]) -> Iterator[Seed]:
-    """Yield, of what got stuck by the time this is asked, what violates least."""
-    for _, _, seed in sorted(stuck)[:1]:
-        yield seed
 
 
 def _ends_free(problem: TrajectoryProblem, seed: Seed) -> bool:

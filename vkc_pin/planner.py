@@ -3,29 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Callable, Sequence
-from typing import TypeGuard
 
-import numpy as np
-
-from vkc_pin.all_at_once import all_at_once
-from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.goal import compile_task
-from vkc_pin.initialization import METHODS
-from vkc_pin.one_problem import Settings
+from vkc_pin.interrupt import interruptible
 from vkc_pin.options import Options
 from vkc_pin.plan import Plan
 from vkc_pin.progress import shown
 from vkc_pin.scene import Scene
+from vkc_pin.settings import Settings, settings_for
 from vkc_pin.solution import Iteration
-from vkc_pin.standing import standing
-from vkc_pin.step_by_step import step_by_step
 from vkc_pin.steps import Step
+from vkc_pin.stepwise import all_at_once, step_by_step
 from vkc_pin.task import stretches
-from vkc_pin.terms import Term, check_active, traced
+from vkc_pin.terms import Term, check_active
 
-__all__ = ["check_arguments", "guarded", "plan", "settings_for"]
+__all__ = ["guarded", "plan"]
 
 
 def plan(
@@ -61,70 +54,33 @@ def plan(
     Returns:
         A plan, in every case: `plan.success` is true only if the independent `validation` found nothing wrong, and
         `plan.report()` names what is violated otherwise. Ctrl-C, or interrupting a notebook's kernel, ends planning with the best
-        iterate so far and status "interrupted".
+        iterate so far and status "interrupted"; a second Ctrl-C raises KeyboardInterrupt.
 
     Raises:
         InputError: The steps or terms name something that is not there or cannot be done, or an argument is wrong.
     """
-    settings = settings_for(scene, initialization, options, callback, time_limit, seed, perturbation, terms)
-    if settings.terms:
-        check_active(settings.terms, stretches(compile_task(scene, steps, settings.options)))
-    return guarded(step_by_step if not joint else all_at_once, scene, steps, settings, progress)
+    settings = settings_for(
+        scene,
+        initialization=initialization,
+        options=options,
+        callback=callback,
+        time_limit=time_limit,
+        seed=seed,
+        perturbation=perturbation,
+        terms=terms,
+    )
+
+    def planner(settings: Settings) -> Plan:
+        task = compile_task(scene, steps, settings.options)
+        check_active(settings.terms, stretches(task))
+        return all_at_once(scene, task, settings) if joint else step_by_step(scene, task, settings)
+
+    return guarded(planner, settings, progress)
 
 
-def guarded(
-    planner: Callable[[Scene, Sequence[Step], Settings], Plan],
-    scene: Scene,
-    steps: Sequence[Step],
-    settings: Settings,
-    progress: bool,
-) -> Plan:
-    """Return what a planner returns, or a plan in which nothing moves if Ctrl-C comes before it has any; show its progress."""
-    with shown(progress) as line:
-        began, settings = time.perf_counter(), dataclasses.replace(settings, progress=line)
-        try:
-            found = planner(scene, steps, settings)
-        except KeyboardInterrupt:
-            spent = time.perf_counter() - began
-            found = standing(scene, list(steps), settings.options, seed=settings.seed, spent=spent, terms=settings.terms)
+def guarded(planner: Callable[[Settings], Plan], settings: Settings, progress: bool) -> Plan:
+    """Return what a planner returns that is told of Ctrl-C by its settings; show its progress."""
+    with shown(progress) as line, interruptible(settings.interrupt):
+        found = planner(dataclasses.replace(settings, progress=line))
         line.end(found)
     return found
-
-
-def settings_for(
-    scene: Scene,
-    initialization: str,
-    options: Options | None,
-    callback: Callable[[Iteration], None] | None,
-    time_limit: float | None,
-    seed: int,
-    perturbation: float = 0.0,
-    terms: Sequence[Term] = (),
-) -> Settings:
-    """Return arguments of `plan` as settings.
-
-    Raises:
-        InputError: One of them is wrong.
-    """
-    options = Options() if options is None else options
-    check_arguments(scene, options, time_limit, seed)
-    if initialization not in METHODS:
-        raise UnknownNameError("initialization", str(initialization), METHODS, field="initialization")
-    if not (_is_number(perturbation) and 0 <= perturbation < np.inf):
-        raise InputError("out of range", field="perturbation", expected="a number of at least 0", got=repr(perturbation))
-    return Settings(initialization, options, callback, time_limit, int(seed), float(perturbation), traced(scene, terms))
-
-
-def check_arguments(scene: object, options: object, time_limit: object, seed: object) -> None:
-    """Raise an InputError that says what is wrong if one of these is not what planning needs; see `plan`."""
-    for field, value, kind in (("scene", scene, Scene), ("options", options, Options)):
-        if not isinstance(value, kind):
-            raise InputError("wrong kind of argument", field=field, expected=f"a {kind.__name__}", got=repr(value))
-    if time_limit is not None and not (_is_number(time_limit) and 0 < time_limit < np.inf):
-        raise InputError("out of range", field="time_limit", expected="seconds, more than 0", got=repr(time_limit))
-    if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:
-        raise InputError("out of range", field="seed", expected="a whole number of at least 0", got=repr(seed))
-
-
-def _is_number(value: object) -> TypeGuard[float]:
-    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)

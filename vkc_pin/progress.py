@@ -7,7 +7,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 from vkc_pin.errors import InputError
 from vkc_pin.notebook import in_notebook
@@ -84,8 +84,8 @@ def shown(progress: object) -> Iterator[Progress]:
     """Yield the line, and see to it that one is left whatever happens.
 
     Args:
-        progress: Whether to show it. In a notebook it is one output that is updated, in a terminal one line of standard
-            error; where neither is there, as in a pipe, nothing is shown.
+        progress: Whether to show it: in a notebook in the cell's output, in a terminal as a line of standard error; where
+            neither is there, as in a pipe, nothing is shown.
 
     Raises:
         InputError: `progress` is neither True nor False.
@@ -102,37 +102,25 @@ def shown(progress: object) -> Iterator[Progress]:
 def _screen() -> Callable[[str, bool], None] | None:
     """Return what shows a line here; None if there is nowhere to show it."""
     if in_notebook():
-        return _Output()
+        return _Line(sys.stdout, None)
     if sys.stderr is not None and sys.stderr.isatty():
-        return _Line()
+        return _Line(sys.stderr, shutil.get_terminal_size().columns - 1)  # a longer one would go over two lines, and stay
     return None
 
 
-class _Output:
-    """An output of a notebook's cell."""
-
-    def __init__(self) -> None:
-        self.handle: Any = None
-
-    def __call__(self, text: str, last: bool) -> None:
-        data = {"text/plain": text}
-        if self.handle is None:
-            from IPython.display import display
-
-            show: Any = display
-            self.handle = show(data, raw=True, display_id=True)
-        else:
-            self.handle.update(data, raw=True)
-
-
 class _Line:
-    """A terminal's line."""
+    """A bar of tqdm's that is all text: there is no telling how much is left to do."""
 
-    def __init__(self) -> None:
-        self.length = 0
+    def __init__(self, stream: TextIO, width: int | None) -> None:
+        self.stream, self.width = stream, width
+        self.bar: Any = None
 
     def __call__(self, text: str, last: bool) -> None:
-        text = text[: shutil.get_terminal_size().columns - 1]  # a longer one would go over two lines, and stay
-        sys.stderr.write("\r" + text.ljust(self.length) + ("\n" if last else ""))
-        sys.stderr.flush()
-        self.length = len(text)
+        if self.bar is None:
+            from tqdm import tqdm  # not tqdm.auto, which has no words in a notebook without ipywidgets but a warning
+
+            # Asked for its size, a terminal that has none, as some do, would be shown nothing.
+            self.bar = tqdm(file=self.stream, bar_format="{desc}", ncols=self.width or 80, nrows=20)
+        self.bar.set_description_str(text[: self.width])
+        if last:
+            self.bar.close()

@@ -6,12 +6,17 @@ from pathlib import Path
 
 from vkc_pin.errors import UnknownNameError
 
-__all__ = ["available", "find", "folder"]
+__all__ = ["available", "find", "folder", "package_folder"]
+
+
+def package_folder() -> Path:
+    """Return the folder of the package's sources."""
+    return Path(__file__).resolve().parent
 
 
 def folder(kind: str) -> Path:
     """Return the folder of `kind` ("robots" or "scenes"): inside the installed package, else beside it."""
-    package = Path(__file__).resolve().parent
+    package = package_folder()
     inside = package / kind
     return inside if inside.is_dir() else package.parent / kind
 

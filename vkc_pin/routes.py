@@ -11,6 +11,7 @@ from vkc_pin.base_grid import BaseGrid, fine_cells
 from vkc_pin.base_path import BasePath, along, shortest_path
 from vkc_pin.compact import compact_arm
 from vkc_pin.hold import Hold
+from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.obstacles import FLOOR
 from vkc_pin.problem import TrajectoryProblem
 
@@ -30,8 +31,8 @@ class Routes:
     passage in which there is room for the margins, and there nothing but contact counts.
     """
 
-    def __init__(self, problem: TrajectoryProblem) -> None:
-        self.problem = problem
+    def __init__(self, problem: TrajectoryProblem, interrupt: Interrupt = NEVER) -> None:
+        self.problem, self.interrupt = problem, interrupt
         self.arm = slice(3, problem.chain.robot.coordinates.size)
         self._grids: dict[tuple[int, bool], BaseGrid] = {}
         self._compact: dict[tuple[Hold, ...], NDArray[np.float64]] = {}
@@ -79,7 +80,7 @@ class Routes:
         """Return the arm drawn in with what is held in a phase, shape (m - 3,); see `compact_arm`."""
         held = self.problem.task.phases[phase].held
         if held not in self._compact:
-            self._compact[held] = compact_arm(self.problem, phase, self._resting())
+            self._compact[held] = compact_arm(self.problem, phase, self._resting(), self.interrupt)
         return self._compact[held]
 
     def _resting(self) -> NDArray[np.float64]:
@@ -109,7 +110,7 @@ class Routes:
         """
         key = (phase, start.tobytes(), goal.tobytes())
         if key not in self._ways:
-            self._ways[key] = shortest_path(self.grid(phase), start.tolist(), goal[None])
+            self._ways[key] = shortest_path(self.grid(phase), start.tolist(), goal[None], interrupt=self.interrupt)
         path = self._ways[key]
         return None if path is None else along(path, steps)
 
@@ -124,7 +125,8 @@ class Routes:
         for drawn_in in (False, True):
             grid = self.grid(phase, drawn_in=drawn_in)  # the fine one only where it is needed
             for places in (beside[:1], beside[1:]):
-                path = shortest_path(grid, start.tolist(), goal + places, costs=_DEARER * np.abs(places).sum(axis=1))
+                costs = _DEARER * np.abs(places).sum(axis=1)
+                path = shortest_path(grid, start.tolist(), goal + places, costs=costs, interrupt=self.interrupt)
                 if path is not None:
                     return along(path, steps)
         return None

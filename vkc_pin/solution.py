@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Iteration", "Solution"]
+__all__ = ["Iteration", "Resume", "Solution"]
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,19 @@ class Iteration:
     time: float
 
 
+@dataclass(frozen=True, eq=False)
+class Resume:
+    """With what to go on from where the solver got stuck and had no patience.
+
+    Attributes:
+        radius: How far planes are to be believed, shape (N,).
+        penalty: What clearance is to cost.
+    """
+
+    radius: NDArray[np.float64]
+    penalty: float
+
+
 @dataclass
 class Solution:
     """What the solver found; whether it is a success only `validation` can say.
@@ -51,7 +64,7 @@ class Solution:
         converged: Whether the loop ended by its own criteria.
         status: "converged", "not converged", "time limit" or "interrupted".
         radius: How far planes were believed in the end, shape (N,).
-        penalty: With which to go on where it got stuck and had no patience; None: it did not.
+        resume: How to go on where it got stuck and had no patience; None: it did not.
         rounds, iterations: Of the outer loop and of Ipopt.
         timings: Seconds in "coal", "casadi" (evaluating functions) and "ipopt" (all the rest of it).
         history: One `Iteration` per round.
@@ -62,7 +75,7 @@ class Solution:
     converged: bool = False
     status: str = "not converged"
     radius: NDArray[np.float64] | None = None
-    penalty: float | None = None
+    resume: Resume | None = None
     rounds: int = 0
     iterations: int = 0
     timings: dict[str, float] = field(default_factory=lambda: {"coal": 0.0, "casadi": 0.0, "ipopt": 0.0})

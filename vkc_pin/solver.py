@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -13,7 +14,7 @@ from vkc_pin.contact import Contacts
 from vkc_pin.interrupt import Interrupt, interruptible
 from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.refinement import collisions_between, merge
-from vkc_pin.solution import Iteration, Solution
+from vkc_pin.solution import Iteration, Resume, Solution
 from vkc_pin.trust_region import CLOSE_ENOUGH, FAR, Trial, TrustRegion, judge
 
 __all__ = ["solve"]
@@ -198,6 +199,7 @@ def solve(
     penalty: float | None = None,
     patient: bool = True,
     thorough: bool = True,
+    interrupt: Interrupt | None = None,
 ) -> Solution:
     """Return the trajectory that the witness-plane loop reaches from `seed`.
 
@@ -210,17 +212,18 @@ def solve(
         radius: How far planes are believed at first, shape (N,): `Solution.radius` where another solution goes on.
         penalty: What clearance costs at first; None: `Options.penalty`.
         patient: Whether to make clearance dearer and go on where nothing moves any more. That takes many rounds and seldom helps:
-            where there are other seeds, they come first. `Solution.penalty` is what to go on with.
+            where there are other seeds, they come first. `Solution.resume` is what to go on with.
         thorough: Whether to go on from a motion at which everything holds as long as it gets shorter.
+        interrupt: Ends it after the round that is running; None: Ctrl-C does.
     """
     loop = _Loop(problem, seed, deadline)
     loop.penalty = loop.penalty if penalty is None else penalty
     solution = loop.solution
-    with interruptible() as interrupt:
+    with interruptible() if interrupt is None else contextlib.nullcontext(interrupt) as noted:
         region = TrustRegion(problem.segments, radius)
-        _iterate(loop, region, callback, interrupt, loop.options.max_outer if rounds is None else rounds, patient, thorough)
+        _iterate(loop, region, callback, noted, loop.options.max_outer if rounds is None else rounds, patient, thorough)
     solution.radius = region.radius
-    if interrupt.pressed:  # whichever way the loop ended, nothing else is to be tried
+    if noted.pressed:  # whichever way the loop ended, nothing else is to be tried
         solution.status = "interrupted"
     return solution
 
@@ -289,7 +292,7 @@ def _iterate(
             loop.raise_penalty()
             region.restart()
             if not patient and not solution.converged:
-                solution.penalty = loop.penalty
+                solution.resume = Resume(region.radius, loop.penalty)
                 break
     if feasible is not None:  # rounds after the first feasible one only made it shorter, or failed to
         solution.z, solution.dt = feasible

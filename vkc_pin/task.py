@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import islice
 from typing import Literal
 
 import pinocchio as pin
@@ -11,7 +12,7 @@ import pinocchio as pin
 from vkc_pin.hold import Hold
 from vkc_pin.steps import Step
 
-__all__ = ["FrameGoal", "Phase", "PhaseKey", "PhaseKind", "Task", "stretches"]
+__all__ = ["FrameGoal", "Mark", "Phase", "PhaseKey", "PhaseKind", "Task", "stretches"]
 
 PhaseKind = Literal["grasp", "reach", "touch", "place", "turn", "move", "go", "stand"]
 PhaseKey = tuple[PhaseKind, tuple[str, ...]]
@@ -102,6 +103,21 @@ class Phase:
 
 
 @dataclass(frozen=True)
+class Mark:
+    """How much of a task there is when a step is done.
+
+    Attributes:
+        phases, holds, state: Number of the task's phases, holds and coordinates up to there.
+        after: What is held then.
+    """
+
+    phases: int
+    holds: int
+    state: int
+    after: tuple[Hold, ...]
+
+
+@dataclass(frozen=True)
 class Task:
     """What the steps ask for, in phases.
 
@@ -111,6 +127,7 @@ class Task:
         holds: Everything that is held at any time, each after the hold it depends on.
         state: Object coordinate (`<object>.<joint>`) → value at the start, for the joints that `holds` can move.
         after: What is held when all is done.
+        marks: For every step, how much of the task there is when it is done.
     """
 
     steps: tuple[Step, ...]
@@ -118,11 +135,22 @@ class Task:
     holds: tuple[Hold, ...]
     state: Mapping[str, float]
     after: tuple[Hold, ...] = ()
+    marks: tuple[Mark, ...] = ()
 
     @property
     def segments(self) -> int:
         """Steps of time of the whole task; it has one waypoint more."""
         return sum(phase.segments for phase in self.phases)
+
+    def until(self, count: int) -> Task:
+        """Return the task of the first `count` steps, at least 1, as if there were no others."""
+        mark = self.marks[count - 1]
+        state = dict(islice(self.state.items(), mark.state))
+        phases = (
+            replace(phase, before={name: value for name, value in phase.before.items() if name in state})
+            for phase in self.phases[: mark.phases]
+        )
+        return Task(self.steps[:count], tuple(phases), self.holds[: mark.holds], state, mark.after, self.marks[:count])
 
 
 def stretches(task: Task) -> list[tuple[str, tuple[str, ...]]]:

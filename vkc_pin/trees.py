@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.knots import depth, smooth
 from vkc_pin.problem import TrajectoryProblem
 
@@ -40,6 +41,7 @@ def connect(
     arms: NDArray[np.float64],
     rng: np.random.Generator,
     tries: int = TRIES,
+    interrupt: Interrupt = NEVER,
 ) -> NDArray[np.float64] | None:
     """Return configurations of the robot, straight between which hardly anything is hit, shape (K, m), or None if none are found.
 
@@ -52,8 +54,9 @@ def connect(
         arms: Postures that are likely to be needed, shape (A, m - 3) [m] and [rad].
         rng: Random numbers.
         tries: How often a tree may grow.
+        interrupt: Ends the search.
     """
-    return _Search(problem, phase, first, poses, arms, rng).run(ends, tries)
+    return _Search(problem, phase, first, poses, arms, rng).run(ends, tries, interrupt)
 
 
 def spread(path: NDArray[np.float64], steps: int) -> NDArray[np.float64]:
@@ -88,7 +91,7 @@ class _Search:
         limits = np.array([problem.limits(name) for name in problem.chain.names[: self.size]])
         self.lower, self.upper = limits.T
 
-    def run(self, ends: NDArray[np.float64], tries: int) -> NDArray[np.float64] | None:
+    def run(self, ends: NDArray[np.float64], tries: int, interrupt: Interrupt) -> NDArray[np.float64] | None:
         """Return the way to one of `ends`."""
         start = self.first[: self.size]
         short = self._depth(ends)
@@ -96,6 +99,8 @@ class _Search:
         trees = _Tree(start[None], self.weights), _Tree(ends, self.weights)
         direct = [*ends]
         for number in range(tries):
+            if interrupt.pressed:
+                break
             tree, other = (trees[0], trees[1]) if direct or number % 2 else (trees[1], trees[0])
             if direct:
                 node = self._grow(tree, direct.pop(0), np.inf)

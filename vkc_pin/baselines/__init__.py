@@ -1,5 +1,5 @@
 """What the virtual kinematic chain is compared with: planners that treat base and arm one after the other."""
 
-from vkc_pin.baselines.separate import METHODS, RETRIES, plan_separately
+from vkc_pin.baselines.separate import BASELINES, RETRIES, plan_separately
 
-__all__ = ["METHODS", "RETRIES", "plan_separately"]
+__all__ = ["BASELINES", "RETRIES", "plan_separately"]

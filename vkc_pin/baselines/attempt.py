@@ -18,9 +18,10 @@ from vkc_pin.baselines.following import follow
 from vkc_pin.baselines.postures import at_home, postures, through
 from vkc_pin.goal import compile_task
 from vkc_pin.initialization import Seed, initialize
+from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.knots import Knots, smooth
-from vkc_pin.one_problem import TIMES
 from vkc_pin.options import Options
+from vkc_pin.outcome import TIMES
 from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.scene import Scene
 from vkc_pin.solver import SOLVED_RATE_TOLERANCE, solve
@@ -45,11 +46,20 @@ class Attempt:
     """One try; collects the motion stage by stage.
 
     Attributes:
-        times: What it spent on the parts of `one_problem.TIMES` [s].
+        times: What it spent on the parts of `outcome.TIMES` [s].
         build_time: On symbolic programs that were built for the first time [s].
     """
 
-    def __init__(self, scene: Scene, options: Options, *, refine: bool, seed: Sequence[int], deadline: float = np.inf) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        options: Options,
+        *,
+        refine: bool,
+        seed: Sequence[int],
+        deadline: float = np.inf,
+        interrupt: Interrupt = NEVER,
+    ) -> None:
         """Prepare a try.
 
         Args:
@@ -58,8 +68,9 @@ class Attempt:
             refine: Whether arm and object are moved out of collision at each waypoint (B2).
             seed: Of the random numbers.
             deadline: Value of `time.perf_counter()` after which no stage is begun.
+            interrupt: Ends it with what there is.
         """
-        self.scene, self.options, self.refine, self.deadline = scene, options, refine, deadline
+        self.scene, self.options, self.refine, self.deadline, self.interrupt = scene, options, refine, deadline, interrupt
         self.rng = np.random.default_rng(seed)
         self.parts: list[Trajectory] = []
         self.times = dict.fromkeys([*TIMES, "following"], 0.0)
@@ -68,23 +79,21 @@ class Attempt:
     def run(self, steps: Sequence[Doable]) -> tuple[Trajectory, float, str]:
         """Return the motion, how many stages it came through (infinite: all), and why no further."""
         try:
-            try:
-                for step in steps:
-                    if isinstance(step, Actuate):
-                        self._actuate(step)
-                    elif isinstance(step, Place):
-                        self._place(step)
-                    else:
-                        self._go(step)
-            except KeyboardInterrupt:
-                raise FailedError("interrupted") from None
+            for step in steps:
+                if isinstance(step, Actuate):
+                    self._actuate(step)
+                elif isinstance(step, Place):
+                    self._place(step)
+                else:
+                    self._go(step)
         except FailedError as error:
             came = len(self.parts) + error.came
             parts = [*self.parts, *error.parts]
             if not parts:
                 problem = self._problem([self._here()])
                 parts = [as_trajectory(problem, problem.still, problem.timing_for(problem.still).dt)]
-            return join(parts, pause=self.options.grasp_time), came, error.cause
+            cause = "interrupted" if self.interrupt.pressed else error.cause
+            return join(parts, pause=self.options.grasp_time), came, cause
         return join(self.parts, pause=self.options.grasp_time), np.inf, ""
 
     def _actuate(self, step: Actuate) -> None:
@@ -130,7 +139,7 @@ class Attempt:
             self._withdraw(way)
             stage()
 
-        self._first(postures(self._problem([self._here()])), held, failure)
+        self._first(postures(self._problem([self._here()]), self.interrupt), held, failure)
 
     def _first(
         self, choices: Iterable[NDArray[np.float64]], stage: Callable[[NDArray[np.float64]], None], failure: FailedError
@@ -144,6 +153,8 @@ class Attempt:
                 stage(choice)
                 return
             except FailedError as error:
+                if self.interrupt.pressed:
+                    raise
                 error.parts = [*self.parts[len(before) :], *error.parts]
                 failure = max(failure, error, key=lambda one: one.came)
                 self.scene, self.parts = scene, before
@@ -152,7 +163,7 @@ class Attempt:
     def _poses(self, problem: TrajectoryProblem) -> NDArray[np.float64]:
         """Return configurations for the end of a problem, the nearest first."""
         began = time.perf_counter()
-        poses = base_poses(problem, problem.segments, problem.start, self.rng)
+        poses = base_poses(problem, problem.segments, problem.start, self.rng, self.interrupt)
         self.times["initialization"] += time.perf_counter() - began
         if not len(poses):
             raise FailedError("no base pose")
@@ -185,7 +196,11 @@ class Attempt:
         lower[:, arm] = upper[:, arm] = problem.start[arm]
         problem = problem.with_bounds(lower, upper)
         bare = at_home(problem) and not self.scene.held and len(goals) == 1
-        seeds = initialize(problem, "astar", self._seed()) if bare else BaseWays(problem, whole=True).seeds(problem, goals)
+        seeds = (
+            initialize(problem, "astar", self._seed(), interrupt=self.interrupt)
+            if bare
+            else BaseWays(problem, whole=True, interrupt=self.interrupt).seeds(problem, goals)
+        )
         self._take(problem, *self._solve(problem, seeds, "no base path"))
 
     def _reach(self, steps: Sequence[Step], pose: NDArray[np.float64]) -> None:
@@ -197,20 +212,20 @@ class Attempt:
         if phase.lowered:  # from above
             above = Approach(Knots(problem, self.rng)).away(last, phase)[::-1]
             seeds = [Seed("from above", through(problem, np.vstack([above, last])))] * (len(above) > 0) + seeds
-        more = initialize(problem, "interpolated", self._seed())
+        more = initialize(problem, "interpolated", self._seed(), interrupt=self.interrupt)
         self._take(problem, *self._solve(problem, itertools.chain(seeds, more), "arm does not reach"))
 
     def _move(self, step: Actuate) -> None:
         """Move the object's joints: the base goes to the nearest pose to which the arm can follow."""
         problem = self._problem([step], replace(self.options, move_waypoints=FINER * self.options.move_waypoints))
-        ways, failure = BaseWays(problem), FailedError("no base path")
+        ways, failure = BaseWays(problem, interrupt=self.interrupt), FailedError("no base path")
         for pose in self._poses(problem)[:_ENDS]:
             base = self._path(problem, ways, pose[:3])
             if base is None:
                 continue
             self._in_time(failure)
             began = time.perf_counter()
-            followed = follow(problem, base, self.rng, refine=self.refine)
+            followed = follow(problem, base, self.rng, refine=self.refine, interrupt=self.interrupt)
             rates = problem.rates(followed.z)
             timing = problem.timing_for(followed.z).stretched(*rates)
             self.times["following"] += time.perf_counter() - began
@@ -222,12 +237,16 @@ class Attempt:
             if not cause:
                 self._take(problem, followed.z, timing.dt)
                 return
+            if cause == "interrupted":
+                raise FailedError(cause)
             if not failure.parts or followed.share > failure.share:
                 failure = FailedError(cause, as_trajectory(problem, followed.z, timing.dt), followed.share)
         raise failure
 
     def _in_time(self, failure: FailedError) -> None:
-        """Raise the error of what has failed so far if time is up."""
+        """Raise the error of what has failed so far if time is up, and one of its own after Ctrl-C."""
+        if self.interrupt.pressed:
+            raise FailedError("interrupted")
         if time.perf_counter() > self.deadline:
             failure.cause = failure.cause if failure.parts else "time limit"
             raise failure
@@ -265,15 +284,13 @@ class Attempt:
         failure = FailedError(cause)
         for seed in seeds:
             self._in_time(failure)
-            solution = solve(problem, seed.z, rounds=_ROUNDS, deadline=self.deadline)
+            solution = solve(problem, seed.z, rounds=_ROUNDS, deadline=self.deadline, interrupt=self.interrupt)
             self.build_time += problem.transcription.take_build_time()
             self.iterations += solution.iterations
             for key, value in solution.timings.items():
                 self.times[key] += value
             if solution.converged:
                 return solution.z, solution.dt
-            if solution.status == "interrupted":
-                raise KeyboardInterrupt
             if solution.status == "time limit":
                 raise FailedError("time limit", as_trajectory(problem, solution.z, solution.dt))
             if not failure.parts:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.knots import SCATTER, Knots
 from vkc_pin.problem import TrajectoryProblem
 
@@ -17,7 +18,11 @@ TRIES = 20_000
 
 
 def base_poses(
-    problem: TrajectoryProblem, waypoint: int, near: NDArray[np.float64], rng: np.random.Generator
+    problem: TrajectoryProblem,
+    waypoint: int,
+    near: NDArray[np.float64],
+    rng: np.random.Generator,
+    interrupt: Interrupt = NEVER,
 ) -> NDArray[np.float64]:
     """Return configurations, the nearest first, that are what must hold at a waypoint and are free of collision.
 
@@ -29,6 +34,7 @@ def base_poses(
         waypoint: The waypoint.
         near: The configuration that they should be near, shape (n,): a metre of the base counts as three radians of a joint.
         rng: Draws the seeds.
+        interrupt: Ends the search, with what was found.
 
     Returns:
         Configurations, shape (K, n); none if none is found.
@@ -39,7 +45,7 @@ def base_poses(
         z, solved = knots.knot(np.tile(near, (SCATTER, 1)), waypoint, "scatter")
         z = z[solved]
         found.extend(z[knots.depth(z, waypoint) <= 0.0] if len(z) else [])
-        if len(found) >= ENOUGH:
+        if len(found) >= ENOUGH or interrupt.pressed:
             break
     z = np.array(found[:ENOUGH]).reshape(-1, problem.chain.size)
     return z[np.argsort(np.abs(z - near) @ knots.weights, kind="stable")]

@@ -13,6 +13,7 @@ from vkc_pin.base_body import Shape
 from vkc_pin.base_grid import HEADINGS, BaseGrid, fine_cells
 from vkc_pin.base_path import along, shortest_path
 from vkc_pin.initialization import Seed
+from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.obstacles import FLOOR
 from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.steps import GoTo
@@ -29,13 +30,15 @@ class BaseWays:
         grid: Where the base fits.
     """
 
-    def __init__(self, problem: TrajectoryProblem, *, whole: bool = False) -> None:
+    def __init__(self, problem: TrajectoryProblem, *, whole: bool = False, interrupt: Interrupt = NEVER) -> None:
         """Look at the floor.
 
         Args:
             problem: Whose ways they are.
             whole: The arm counts as well, as it is at the start, with what it holds; otherwise the bare base alone.
+            interrupt: Ends a search, as if there were no way.
         """
+        self.interrupt = interrupt
         chain, part = problem.chain, problem.contacts.phases[-1]
         self.omni = chain.robot.base == "omni"
         shapes, robot = part.shapes, range(len(chain.robot.collision.geometryObjects))
@@ -78,9 +81,9 @@ class BaseWays:
             places = max(_STEPS, int(np.ceil(np.hypot(*(goal - start)[:2]) / _STEP)))
             if all(self.grid.clear(*pose) for pose in np.linspace(start, goal, places)):
                 return np.asarray(start + u * u * (3.0 - 2.0 * u) * (goal - start))
-        path = shortest_path(self.grid, start.tolist(), goals)
+        path = shortest_path(self.grid, start.tolist(), goals, interrupt=self.interrupt)
         if path is None:
-            path = shortest_path(self.finer, start.tolist(), goals)
+            path = shortest_path(self.finer, start.tolist(), goals, interrupt=self.interrupt)
         return None if path is None else along(path, steps)
 
     def seeds(self, problem: TrajectoryProblem, goals: NDArray[np.float64]) -> Iterator[Seed]:

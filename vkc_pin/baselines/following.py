@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from vkc_pin.baselines.arm_kinematics import ArmKinematics
 from vkc_pin.baselines.refining import CLEAR, refined
+from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.knots import Knots
 from vkc_pin.problem import TrajectoryProblem
 
@@ -27,7 +28,7 @@ class Followed:
     Attributes:
         z: z_1..z_N, shape (N, n); if it failed, all stands still from there on, in what was nearest to working.
         share: Share of the waypoints up to which it worked.
-        cause: "", "no inverse kinematics", or "collision" if all there is is not free.
+        cause: "", "no inverse kinematics", "collision" if all there is is not free, or "interrupted".
     """
 
     z: NDArray[np.float64]
@@ -35,7 +36,14 @@ class Followed:
     cause: str
 
 
-def follow(problem: TrajectoryProblem, base: NDArray[np.float64], rng: np.random.Generator, *, refine: bool) -> Followed:
+def follow(
+    problem: TrajectoryProblem,
+    base: NDArray[np.float64],
+    rng: np.random.Generator,
+    *,
+    refine: bool,
+    interrupt: Interrupt = NEVER,
+) -> Followed:
     """Find the arm for every waypoint from the one before.
 
     Args:
@@ -44,6 +52,7 @@ def follow(problem: TrajectoryProblem, base: NDArray[np.float64], rng: np.random
         rng: Draws seeds.
         refine: Move arm and object at each waypoint out of collision (B2), instead of taking the object where the time law has
             it and the arm as inverse kinematics finds it (B1).
+        interrupt: Ends it at the waypoint that it has come to, as if it had failed there.
     """
     knots = Knots(problem, rng)
     z = knots.objects.copy()
@@ -54,6 +63,8 @@ def follow(problem: TrajectoryProblem, base: NDArray[np.float64], rng: np.random
         z[row, arm.kinematics.columns] = before[arm.kinematics.columns]
         found, cause = arm.at(z[row], row + 1)
         z[row] = found
+        if interrupt.pressed and not cause:
+            cause = "interrupted"
         if cause:
             z[row:] = found
             return Followed(z, row / len(z), cause)

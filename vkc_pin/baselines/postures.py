@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vkc_pin.approach import Approach
+from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.knots import Knots, smooth
 from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.routes import Routes
@@ -18,7 +19,7 @@ __all__ = ["at_home", "postures", "through"]
 _SAME = 1e-6  # [rad]
 
 
-def postures(problem: TrajectoryProblem) -> Iterator[NDArray[np.float64]]:
+def postures(problem: TrajectoryProblem, interrupt: Interrupt = NEVER) -> Iterator[NDArray[np.float64]]:
     """Yield configurations, shape (n,), in which the base may drive away from where it is, and the ones that lead to them.
 
     Each is a way for the arm while the base stands, shape (K, n), and ends in what the base then drives in: nothing to do (K =
@@ -27,6 +28,7 @@ def postures(problem: TrajectoryProblem) -> Iterator[NDArray[np.float64]]:
 
     Args:
         problem: Lets go of what stands fixed in the world and carries the rest along.
+        interrupt: Ends the search for an arm drawn in.
     """
     knots, robot = Knots(problem, np.random.default_rng(0)), problem.chain.robot  # nothing is drawn
 
@@ -42,7 +44,7 @@ def postures(problem: TrajectoryProblem) -> Iterator[NDArray[np.float64]]:
     ways += [] if at_home(problem) else [np.vstack([away, home])]
     yield from filter(is_free, ways)
     drawn_in = home.copy()
-    drawn_in[3 : robot.coordinates.size] = Routes(problem).compact(0)  # looked for only if nothing else will do
+    drawn_in[3 : robot.coordinates.size] = Routes(problem, interrupt).compact(0)  # looked for only if nothing else will do
     yield from filter(is_free, [np.vstack([ways[-1], drawn_in])])
 
 

@@ -34,18 +34,20 @@ import numpy as np
 from vkc_pin.baselines.attempt import Attempt, Doable
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.goal import compile_task
+from vkc_pin.interrupt import interruptible
 from vkc_pin.options import Options
+from vkc_pin.outcome import outcome, spent
 from vkc_pin.plan import Plan
-from vkc_pin.planner import check_arguments
 from vkc_pin.report import Report
 from vkc_pin.scene import Scene
+from vkc_pin.settings import check_arguments
 from vkc_pin.steps import Step
 from vkc_pin.trajectory import Trajectory
 from vkc_pin.validation import validate
 
-__all__ = ["METHODS", "RETRIES", "plan_separately"]
+__all__ = ["BASELINES", "RETRIES", "plan_separately"]
 
-METHODS = ("B1", "B2")
+BASELINES = ("B1", "B2")
 RETRIES = 5
 """How often all is tried."""
 
@@ -82,8 +84,8 @@ def plan_separately(
     """
     options = Options() if options is None else options
     check_arguments(scene, options, time_limit, seed)
-    if method not in METHODS:
-        raise UnknownNameError("method", str(method), METHODS, field="method")
+    if method not in BASELINES:
+        raise UnknownNameError("method", str(method), BASELINES, field="method")
     if not isinstance(retries, int) or isinstance(retries, bool) or retries < 1:
         raise InputError("out of range", field="retries", expected="a whole number of at least 1", got=repr(retries))
     task = compile_task(scene, steps, options)
@@ -93,40 +95,26 @@ def plan_separately(
             expected = "Actuate, Place or GoTo"
             raise InputError("the baselines know no such step", field=f"steps[{number}]", expected=expected, got=repr(step))
         actions.append(step)
-    began, spent, built = time.perf_counter(), Counter[str](), 0.0
-    best: tuple[float, str, int, Trajectory, Report] | None = None
-    for number in range(retries):
-        deadline = np.inf if time_limit is None else began + built + time_limit
-        attempt = Attempt(scene, options, refine=method == "B2", seed=[int(seed), number], deadline=deadline)
-        trajectory, came, cause = attempt.run(actions)
-        checked = time.perf_counter()
-        report = validate(scene, task.steps, trajectory, options)
-        attempt.times["validation"] += time.perf_counter() - checked
-        status = "success" if report.ok else cause or "rejected"
-        built += attempt.build_time
-        spent.update({"iterations": attempt.iterations, **{f"time_{key}": value for key, value in attempt.times.items()}})
-        if best is None or status in ("success", "interrupted") or came > best[0]:
-            best = came, status, number, trajectory, report
-        if status in ("success", "interrupted") or time.perf_counter() > deadline:
-            break
+    with interruptible() as interrupt:
+        began, times, iterations, built = time.perf_counter(), Counter[str](), 0, 0.0
+        best: tuple[float, str, int, Trajectory, Report] | None = None
+        for number in range(retries):
+            deadline = np.inf if time_limit is None else began + built + time_limit
+            random = [int(seed), number]
+            attempt = Attempt(scene, options, refine=method == "B2", seed=random, deadline=deadline, interrupt=interrupt)
+            trajectory, came, cause = attempt.run(actions)
+            checked = time.perf_counter()
+            report = validate(scene, task.steps, trajectory, options)
+            attempt.times["validation"] += time.perf_counter() - checked
+            status = "success" if report.ok else cause or "rejected"
+            built, iterations = built + attempt.build_time, iterations + attempt.iterations
+            times.update(attempt.times)
+            if best is None or status in ("success", "interrupted") or came > best[0]:
+                best = came, status, number, trajectory, report
+            if status in ("success", "interrupted") or time.perf_counter() > deadline:
+                break
     assert best is not None
     _, status, tried, trajectory, report = best
-    return Plan(
-        scene=scene,
-        steps=task.steps,
-        options=options,
-        trajectory=trajectory,
-        validation=report,
-        status=status,
-        metrics={
-            "planning_time": time.perf_counter() - began - built,
-            "build_time": built,
-            **{key: float(value) for key, value in spent.items()},
-            **trajectory.metrics(),
-            "clearance": report.clearance,
-            "closure_error": report.closure_error,
-            "rounds": float(number + 1),
-        },
-        seed=int(seed),
-        initialization=f"{method}, try {tried + 1}",
-    )
+    took = spent(time.perf_counter() - began - built, built, iterations=iterations, rounds=number + 1, times=times)
+    name = f"{method}, try {tried + 1}"
+    return outcome(scene, task.steps, options, trajectory, report, status, took=took, seed=int(seed), initialization=name)

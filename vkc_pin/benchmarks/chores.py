@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.benchmarks import experiment
-from vkc_pin.benchmarks.record import distribution, trial
-from vkc_pin.benchmarks.tables import decimal, failures, foot, markdown
+from vkc_pin.benchmarks.harness import runner
+from vkc_pin.benchmarks.harness.record import distribution, trial
+from vkc_pin.benchmarks.harness.tables import decimal, failures, foot, markdown
 from vkc_pin.chore import plan_chore
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.plan import Plan
@@ -107,7 +107,7 @@ def run(
         solve: What plans a trial.
 
     Returns:
-        {"meta": ..., "trials": [...]}; see `experiment.run`.
+        {"meta": ..., "trials": [...]}; see `runner.run`.
 
     Raises:
         UnknownNameError: There is no such chore.
@@ -129,7 +129,7 @@ def run(
             specs.append({"key": f"{chore}/{number:04d}", "chore": chore, "number": number, "base": base, "seed": seed})
     settings = {"benchmark": "chores", "seed": seed, "starts": trials, "chores": chores}
     settings |= {"window": WINDOW, "time_limit": TIME_LIMIT, "steps": {name: _steps(name) for name in chores}}
-    result = experiment.run(specs, functools.partial(_record, solve=solve), out, settings=settings, jobs=jobs, progress=progress)
+    result = runner.run(specs, functools.partial(_record, solve=solve), out, settings=settings, jobs=jobs, progress=progress)
     write_atomically(Path(out) / "table.md", report(result).encode())
     return result
 

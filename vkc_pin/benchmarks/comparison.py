@@ -14,12 +14,11 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from vkc_pin.baselines import METHODS as APART
-from vkc_pin.baselines import RETRIES, plan_separately
-from vkc_pin.benchmarks import experiment
-from vkc_pin.benchmarks.charts import motions_chart
+from vkc_pin.baselines import BASELINES, RETRIES, plan_separately
 from vkc_pin.benchmarks.comparison_report import report
-from vkc_pin.benchmarks.record import trial
+from vkc_pin.benchmarks.harness import runner
+from vkc_pin.benchmarks.harness.charts import motions_chart
+from vkc_pin.benchmarks.harness.record import trial
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.plan import Plan
 from vkc_pin.planner import plan
@@ -28,9 +27,9 @@ from vkc_pin.steps import Actuate, GoTo, Place, Step, as_placement
 from vkc_pin.trajectory import Trajectory
 from vkc_pin.writing import write_atomically
 
-__all__ = ["METHODS", "TIME_LIMIT", "Comparison", "Solve", "Task", "peaks"]
+__all__ = ["COMPARED_PLANNERS", "TIME_LIMIT", "Assignment", "Comparison", "Solve", "peaks"]
 
-METHODS = (*APART, "VKC")
+COMPARED_PLANNERS = (*BASELINES, "VKC")
 TIME_LIMIT = 20.0  # [s] of planning
 
 Solve = Callable[[Scene, Mapping[str, Any]], Plan]
@@ -40,7 +39,7 @@ Draw = Callable[[Sequence[Mapping[str, Any]], Path, Mapping[str, str], Sequence[
 
 
 @dataclass(frozen=True)
-class Task:
+class Assignment:
     """What is to be done.
 
     Attributes:
@@ -59,7 +58,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Comparison:
-    """An experiment that compares `METHODS`.
+    """An experiment that compares `COMPARED_PLANNERS`.
 
     Attributes:
         benchmark: Its name on the command line.
@@ -70,7 +69,7 @@ class Comparison:
 
     benchmark: str
     title: str
-    tasks: Mapping[str, Task]
+    tasks: Mapping[str, Assignment]
     draw: Draw
 
     def plan_trial(self, scene: Scene, spec: Mapping[str, Any]) -> Plan:
@@ -106,10 +105,10 @@ class Comparison:
         trials: int,
         seed: int,
         out: str | Path,
-        solve: Solve,
+        solve: Solve | None = None,
         jobs: int = 1,
         tasks: Sequence[str] | None = None,
-        methods: Sequence[str] = METHODS,
+        methods: Sequence[str] = COMPARED_PLANNERS,
         save_failures: bool = False,
         progress: bool = True,
     ) -> dict[str, Any]:
@@ -122,15 +121,15 @@ class Comparison:
             trials: Number of random starts per task, at least 1.
             seed: Of the starts and of planning.
             out: The folder; if it has trials of the same settings already, they are not run again.
-            solve: What plans a trial.
+            solve: What plans a trial; None: `plan_trial`.
             jobs: Number of processes.
             tasks: Some of the tasks; None: all.
-            methods: Some of `METHODS`.
+            methods: Some of `COMPARED_PLANNERS`.
             save_failures: Save the plan of every failure; those that ran before without this are planned once more.
             progress: Whether to show progress bars.
 
         Returns:
-            {"meta": ..., "trials": [...]}; see `experiment.run`. A trial's `scene` is its task's name.
+            {"meta": ..., "trials": [...]}; see `runner.run`. A trial's `scene` is its task's name.
 
         Raises:
             UnknownNameError: There is no such task or method.
@@ -138,7 +137,7 @@ class Comparison:
             KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
         """
         tasks = _chosen("task", list(self.tasks) if tasks is None else tasks, list(self.tasks))
-        methods = _chosen("method", methods, METHODS)
+        methods = _chosen("method", methods, COMPARED_PLANNERS)
         if trials < 1:
             raise InputError("out of range", field="trials", expected="at least 1", got=trials)
         specs, out = self.specify(trials=trials, seed=seed, tasks=tasks, methods=methods), Path(out)
@@ -153,9 +152,9 @@ class Comparison:
             "time_limit": TIME_LIMIT,
             "retries": RETRIES,
         }
-        trials_of = _Trials(self.tasks, out, solve)
+        trials_of = _Trials(self.tasks, out, solve or self.plan_trial)
         function = functools.partial(trials_of.record, save_failures=save_failures)
-        result = experiment.run(specs, function, out, settings=settings, jobs=jobs, progress=progress)
+        result = runner.run(specs, function, out, settings=settings, jobs=jobs, progress=progress)
         saved = trials_of.saved(result["trials"], specs, again=save_failures, progress=progress)
         names = {name: self.tasks[name].name for name in tasks}
         pictures = self.draw(result["trials"], out, names, methods) + trials_of.motions(result["trials"], specs)
@@ -201,7 +200,7 @@ class _Trials:
         solve: What plans a trial.
     """
 
-    tasks: Mapping[str, Task]
+    tasks: Mapping[str, Assignment]
     out: Path
     solve: Solve
 

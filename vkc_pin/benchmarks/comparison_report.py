@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.benchmarks.tables import (
+from vkc_pin.benchmarks.harness.tables import (
     EFFORTS,
     common,
     decimal,

@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 from tqdm import tqdm
 
-from vkc_pin.benchmarks.record import distribution, meta, peak_memory, trial
+from vkc_pin.benchmarks.harness.record import distribution, meta, peak_memory, trial
 from vkc_pin.options import Options
 from vkc_pin.plan import Plan
 from vkc_pin.planner import plan

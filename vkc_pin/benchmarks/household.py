@@ -8,13 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.benchmarks.charts import means_chart, success_chart
-from vkc_pin.benchmarks.comparison import METHODS, Comparison, Solve, Task
-from vkc_pin.plan import Plan
+from vkc_pin.benchmarks.comparison import COMPARED_PLANNERS, Assignment, Comparison
+from vkc_pin.benchmarks.harness.charts import means_chart, success_chart
 from vkc_pin.scene import Scene
 from vkc_pin.steps import Actuate, GoTo, Place
 
-__all__ = ["METHODS", "TABLE_TOP", "TASKS", "on_the_coffee_table", "plan_trial", "run"]
+__all__ = ["COMPARED_PLANNERS", "TABLE_TOP", "TASKS", "on_the_coffee_table", "plan_trial", "run"]
 
 TABLE_TOP = ((2.5, 3.0), (-1.9, -0.9))
 """The coffee table's plate in the scene `household`: x and y, lowest and highest [m]."""
@@ -29,23 +28,23 @@ def on_the_coffee_table(scene: Scene, rng: np.random.Generator) -> dict[str, lis
 
 
 TASKS = {
-    "cup": Task(
+    "cup": Assignment(
         "household", (Place("cup", (-0.6, -1.6, 0.751)),), "carry a cup to the dining table", scatter=on_the_coffee_table
     ),
-    "door": Task(
+    "door": Assignment(
         "household",
         (Actuate("door", {"hinge": 1.52}, attachment="handle_free"), GoTo(1.6, 2.5)),
         "push a narrow door open and drive through",
     ),
-    "drawer": Task("household", (Actuate("drawer", {"slide": 0.22}),), "pull a low drawer open in a corner"),
-    "dishwasher": Task("household", (Actuate("dishwasher", {"rack": 0.5}),), "pull a dishwasher's rack out"),
-    "refrigerator": Task("household", (Actuate("refrigerator", {"hinge": 1.57}),), "pull a refrigerator open"),
-    "cabinet": Task("household", (Actuate("cabinet", {"hinge": 0.4}),), "pull a cabinet open behind a chair"),
+    "drawer": Assignment("household", (Actuate("drawer", {"slide": 0.22}),), "pull a low drawer open in a corner"),
+    "dishwasher": Assignment("household", (Actuate("dishwasher", {"rack": 0.5}),), "pull a dishwasher's rack out"),
+    "refrigerator": Assignment("household", (Actuate("refrigerator", {"hinge": 1.57}),), "pull a refrigerator open"),
+    "cabinet": Assignment("household", (Actuate("cabinet", {"hinge": 0.4}),), "pull a cabinet open behind a chair"),
 }
 
 
 def _draw(records: Sequence[Mapping[str, Any]], out: Path, tasks: Mapping[str, str], methods: Sequence[str]) -> list[str]:
-    """Draw success, efforts and planning time, one chart each over all tasks."""
+    """Draw success.png, base_effort.png, arm_effort.png and planning_time.png, each with all tasks and methods."""
     shown = {task: task for task in tasks}
     success_chart(records, out / "success.png", shown, methods, title="Success")
     for field, label, shared in (
@@ -65,27 +64,4 @@ def _draw(records: Sequence[Mapping[str, Any]], out: Path, tasks: Mapping[str, s
 
 COMPARISON = Comparison("household", "Six tasks in a home", TASKS, _draw)
 
-
-def plan_trial(scene: Scene, spec: Mapping[str, Any]) -> Plan:
-    """Plan the task of one trial; see `Comparison.plan_trial`."""
-    return COMPARISON.plan_trial(scene, spec)
-
-
-def run(
-    *,
-    trials: int,
-    seed: int,
-    out: str | Path,
-    jobs: int = 1,
-    tasks: Sequence[str] = tuple(TASKS),
-    methods: Sequence[str] = METHODS,
-    save_failures: bool = False,
-    progress: bool = True,
-    solve: Solve = plan_trial,
-) -> dict[str, Any]:
-    """Run the experiment, or what is left of it, and write its results to `out`; see `Comparison.run`.
-
-    The charts are success.png, base_effort.png, arm_effort.png and planning_time.png, each with all tasks and methods.
-    """
-    how: dict[str, Any] = {"jobs": jobs, "tasks": tasks, "methods": methods, "save_failures": save_failures}
-    return COMPARISON.run(trials=trials, seed=seed, out=out, solve=solve, progress=progress, **how)
+plan_trial, run = COMPARISON.plan_trial, COMPARISON.run

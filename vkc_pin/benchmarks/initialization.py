@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.benchmarks import experiment
-from vkc_pin.benchmarks.charts import success_chart
-from vkc_pin.benchmarks.record import trial
-from vkc_pin.benchmarks.tables import comparison_table, foot, methods_table
+from vkc_pin.benchmarks.harness import runner
+from vkc_pin.benchmarks.harness.charts import success_chart
+from vkc_pin.benchmarks.harness.record import trial
+from vkc_pin.benchmarks.harness.tables import comparison_table, foot, methods_table
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.plan import Plan
 from vkc_pin.planner import plan
@@ -24,10 +24,10 @@ from vkc_pin.scene import Scene, load_scene
 from vkc_pin.steps import Grasp, Touch
 from vkc_pin.writing import write_atomically
 
-__all__ = ["METHODS", "SCENES", "STEPWISE", "TARGET", "plan_trial", "report", "run", "specify"]
+__all__ = ["COMPARED_INITIALIZATIONS", "SCENES", "STEPWISE", "TARGET", "plan_trial", "report", "run", "specify"]
 
 SCENES = ("init_1", "init_2", "init_3")
-METHODS = ("stationary", "interpolated", "astar", "auto")
+COMPARED_INITIALIZATIONS = ("stationary", "interpolated", "astar", "auto")
 STEPWISE = "step after step"
 """The method that plans the steps one after the other, initialised as by "auto"."""
 TARGET = (-1.0, 3.897, 0.1)
@@ -86,7 +86,7 @@ def run(
     out: str | Path,
     jobs: int = 1,
     scenes: Sequence[str] = SCENES,
-    methods: Sequence[str] = METHODS,
+    methods: Sequence[str] = COMPARED_INITIALIZATIONS,
     progress: bool = True,
     solve: Solve = plan_trial,
 ) -> dict[str, Any]:
@@ -99,12 +99,12 @@ def run(
         out: The folder; if it has trials of the same settings already, they are not run again.
         jobs: Number of processes.
         scenes: Some of `SCENES`.
-        methods: Some of `METHODS`.
+        methods: Some of `COMPARED_INITIALIZATIONS`.
         progress: Whether to show a progress bar.
         solve: What plans a trial; another one may be given for other tasks, and then scenes may be any.
 
     Returns:
-        {"meta": ..., "trials": [...]}; see `experiment.run`.
+        {"meta": ..., "trials": [...]}; see `runner.run`.
 
     Raises:
         UnknownNameError: There is no such scene or method.
@@ -113,7 +113,7 @@ def run(
     """
     scenes, methods = tuple(dict.fromkeys(scenes)), tuple(dict.fromkeys(methods))
     known = SCENES if solve is plan_trial else scenes
-    for kind, names, choices in (("scene", scenes, known), ("method", methods, METHODS)):
+    for kind, names, choices in (("scene", scenes, known), ("method", methods, COMPARED_INITIALIZATIONS)):
         for name in names:
             if name not in choices:
                 raise UnknownNameError(kind, name, choices, field=f"{kind}s")
@@ -132,7 +132,7 @@ def run(
         "perturbation": PERTURBATION,
     }
     function = functools.partial(_record, solve=solve)
-    result = experiment.run(trials, function, out, settings=settings, jobs=jobs, progress=progress)
+    result = runner.run(trials, function, out, settings=settings, jobs=jobs, progress=progress)
     write_atomically(Path(out) / "table.md", report(result).encode())
     title = f"Success by initialisation, {starts} starts{f', {repeats} trials from each' if repeats > 1 else ''}"
     success_chart(result["trials"], Path(out) / "success.png", _shown(scenes), methods, title=title)

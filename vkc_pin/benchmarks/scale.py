@@ -5,22 +5,25 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vkc_pin.benchmarks import experiment
-from vkc_pin.benchmarks.record import distribution, trial
-from vkc_pin.benchmarks.scale_chart import scale_chart
-from vkc_pin.benchmarks.tables import TIMES, decimal, foot, markdown, quartiles
+from vkc_pin.benchmarks.harness import runner
+from vkc_pin.benchmarks.harness.record import distribution, trial
+from vkc_pin.benchmarks.harness.tables import TIMES, decimal, foot, markdown, quartiles
 from vkc_pin.errors import InputError
 from vkc_pin.plan import Plan
 from vkc_pin.planner import plan
 from vkc_pin.scene import Scene, load_scene
 from vkc_pin.steps import Actuate
+from vkc_pin.style import COLOURS, new_figure, save_figure, styled
 from vkc_pin.writing import write_atomically
 
-__all__ = ["COUNTS", "crowded", "report", "run", "specify"]
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["COUNTS", "crowded", "report", "run", "scale_chart", "specify"]
 
 COUNTS = (10, 30, 100, 300, 1000)
 FEW = 30
@@ -101,7 +104,7 @@ def run(
         progress: Whether to show a progress bar.
 
     Returns:
-        {"meta": ..., "trials": [...]}, each trial with its number of `obstacles`; see `experiment.run`.
+        {"meta": ..., "trials": [...]}, each trial with its number of `obstacles`; see `runner.run`.
 
     Raises:
         InputError: A number of obstacles is less than 1, or `out` has trials of other settings.
@@ -112,7 +115,7 @@ def run(
         raise InputError("out of range", field="counts", expected="numbers of at least 1", got=counts)
     trials = specify(starts=starts, seed=seed, counts=counts)
     settings = {"benchmark": "scale", "seed": seed, "starts": starts, "counts": counts, "time_limit": TIME_LIMIT}
-    result = experiment.run(trials, _record, out, settings=settings, jobs=jobs, progress=progress)
+    result = runner.run(trials, _record, out, settings=settings, jobs=jobs, progress=progress)
     write_atomically(Path(out) / "table.md", report(result).encode())
     scale_chart(result["trials"], Path(out) / "scale.png", title="Opening the door among more and more obstacles")
     return result
@@ -144,6 +147,49 @@ def report(result: Mapping[str, Any]) -> str:
         "![Planning time](scale.png)",
     ]
     return "\n\n".join([*parts, foot(about)]) + "\n"
+
+
+def scale_chart(records: Sequence[Mapping[str, Any]], path: str | Path | None, *, title: str = "") -> Figure:
+    """Draw planning time against the number of obstacles, and what it is spent on: medians, and quartiles of the whole.
+
+    Args:
+        records: Records as `record.trial` makes them, with `obstacles`; those without a planning time are left out.
+        path: The file to write, .png, .svg or .pdf; None writes nothing.
+        title: Written above.
+
+    Returns:
+        The figure.
+    """
+    records = [record for record in records if record.get("planning_time") is not None]
+    counts = sorted({int(record["obstacles"]) for record in records})
+    rows = [[record for record in records if record["obstacles"] == count] for count in counts]
+
+    def medians(*fields: str) -> list[float]:
+        """Return, for each number of obstacles, the median of the first field less the others."""
+        return [float(np.median([record[fields[0]] - sum(record[f] for f in fields[1:]) for record in own])) for own in rows]
+
+    low, middle, high = np.array([quartiles([record["planning_time"] for record in own]) for own in rows]).reshape(-1, 3).T
+    parts = {name: medians(field) for field, name in TIMES.items()} | {"setting up": medians("planning_time", *TIMES)}
+    with styled():
+        figure = new_figure(6.4, 4.0)
+        axes = figure.subplots()
+        colours = [*COLOURS[: len(TIMES)], "0.7"]
+        axes.stackplot(counts, *parts.values(), labels=[*parts], colors=colours, alpha=0.55)
+        error = [middle - low, high - middle]
+        axes.errorbar(counts, middle, error, color="0.15", marker="o", markersize=4.0, capsize=2.5, label="planning time")
+        for count, height, value in zip(counts, high, middle, strict=True):
+            axes.annotate(f"{value:.2f}", (count, height), (0, 5), textcoords="offset points", ha="center", fontsize=8)
+        axes.set_xscale("log")
+        axes.set_xticks(counts, [str(count) for count in counts])
+        axes.minorticks_off()
+        axes.set_ylim(0.0, 1.15 * float(high.max(initial=0.0)) or 1.0)
+        axes.set_xlabel("obstacles")
+        axes.set_ylabel("planning time, median and quartiles [s]")
+        axes.set_title(title, fontsize=10)
+        figure.legend(loc="outside right upper")
+        if path is not None:
+            save_figure(figure, Path(path))
+    return figure
 
 
 def _record(spec: dict[str, Any]) -> dict[str, Any]:

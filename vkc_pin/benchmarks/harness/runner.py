@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from vkc_pin.benchmarks.record import meta, peak_memory
-from vkc_pin.benchmarks.tables import to_csv
+from vkc_pin.benchmarks.harness.record import meta, peak_memory
+from vkc_pin.benchmarks.harness.tables import to_csv
 from vkc_pin.errors import InputError, VkcError
-from vkc_pin.resources import folder
+from vkc_pin.resources import folder, package_folder
 from vkc_pin.writing import write_atomically
 
 __all__ = ["Function", "run"]
@@ -32,7 +32,7 @@ Function = Callable[[dict[str, Any]], Mapping[str, Any] | Sequence[Mapping[str, 
 """What runs one trial: takes its specification, returns its record, or several."""
 
 # What shows results has no part in them: a table may be written anew after a change there.
-_NO_PART = ("cli.py", "cli_bench.py", "benchmarks/")
+_NO_PART = ("cli.py", "benchmarks/")
 _DESCRIPTIONS = (".yaml", ".urdf", ".srdf")
 
 
@@ -187,9 +187,7 @@ def _plain(value: Any) -> Any:
 
 def _sources() -> str:
     """Return a digest of all that planning depends on here: the package's sources, scenes and robots."""
-    import vkc_pin
-
-    package, digest = Path(vkc_pin.__file__).parent, hashlib.sha256()
+    package, digest = package_folder(), hashlib.sha256()
     named = {path.relative_to(package).as_posix(): path for suffix in ("py", "cpp") for path in package.rglob(f"*.{suffix}")}
     named = {name: path for name, path in named.items() if not name.startswith(_NO_PART)}
     for kind in ("scenes", "robots"):

@@ -101,7 +101,7 @@ def _bench_initialization(arguments: argparse.Namespace) -> int:
         starts=arguments.starts,
         repeats=arguments.repeats,
         scenes=arguments.scenes or initialization.SCENES,
-        methods=arguments.methods or initialization.METHODS,
+        methods=arguments.methods or initialization.COMPARED_INITIALIZATIONS,
     )
 
 
@@ -124,7 +124,7 @@ def _comparison(arguments: argparse.Namespace, experiment: Any) -> int:
         experiment.run,
         trials=arguments.trials,
         tasks=arguments.tasks or tuple(experiment.TASKS),
-        methods=arguments.methods or experiment.METHODS,
+        methods=arguments.methods or experiment.COMPARED_PLANNERS,
         save_failures=arguments.save_failures,
     )
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vkc_pin.benchmarks.tables import common, mean_and_deviation, quartiles, wilson
+from vkc_pin.benchmarks.harness.tables import common, mean_and_deviation, quartiles, wilson
 from vkc_pin.plan import Plan
 from vkc_pin.style import COLOURS, new_figure, save_figure, shade_phases, styled
 

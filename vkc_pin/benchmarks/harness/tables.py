@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.benchmarks.record import distribution
+from vkc_pin.benchmarks.harness.record import distribution
 
 __all__ = [
     "EFFORTS",
@@ -64,14 +64,14 @@ def markdown(head: Sequence[str], rows: Iterable[Sequence[str]], *, text: int = 
     return "\n".join("| " + " | ".join(str(cell).replace("|", "\\|") for cell in row) + " |" for row in (head, rule, *rows))
 
 
-def wilson(good: int, number: int, z: float = 1.959964) -> tuple[float, float]:
-    """Return Wilson's interval of a success rate, by default the one of 95 % confidence; (0, 1) for no trials."""
+def wilson(good: int, number: int) -> tuple[float, float]:
+    """Return Wilson's interval of a success rate, with 95 % confidence; (0, 1) for no trials."""
     if number == 0:
         return 0.0, 1.0
-    rate, spread = good / number, z * z / number
-    centre = (rate + spread / 2.0) / (1.0 + spread)
-    half = z * np.sqrt(rate * (1.0 - rate) / number + spread / (4.0 * number)) / (1.0 + spread)
-    return float(max(centre - half, 0.0)), float(min(centre + half, 1.0))
+    from scipy.stats import binomtest
+
+    interval = binomtest(good, number).proportion_ci(method="wilson")
+    return float(interval.low), float(interval.high)
 
 
 def quartiles(values: Sequence[float]) -> tuple[float, float, float]:

@@ -10,9 +10,8 @@ import pytest
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks.initialization import TARGET
-from vkc_pin.initialization import Seed
 from vkc_pin.one_problem import OneProblem, Settings
-from vkc_pin.pieces import seed_of
+from vkc_pin.seed import Seed, seed_of
 from vkc_pin.step_by_step import scene_after, stages
 from vkc_pin.world import World
 

@@ -6,9 +6,9 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 
 from vkc_pin.one_problem import OneProblem, Settings
-from vkc_pin.pieces import seed_of
 from vkc_pin.plan import Plan
 from vkc_pin.scene import Scene
+from vkc_pin.seed import seed_of
 from vkc_pin.step_by_step import joined, stages, summed
 from vkc_pin.steps import Step
 

@@ -26,9 +26,7 @@ def grasp() -> tuple[vkc.TrajectoryProblem, np.ndarray]:
 
 
 def approach(*, stands: bool) -> Approach:
-    made = Approach(Knots(grasp()[0], np.random.default_rng(0)))
-    made.stands = stands
-    return made
+    return Approach(Knots(grasp()[0], np.random.default_rng(0)), stands=stands)
 
 
 def back(z: np.ndarray, near: np.ndarray) -> np.ndarray:

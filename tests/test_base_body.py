@@ -8,7 +8,7 @@ from base_scenes import BLINK, MARGIN, arm, at, between, chassis, clutter, dista
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.base_body import FAN, Body, Shape, Standing, outline
+from vkc_pin.base_body import FAN, Body, Shape, Standing, hull_points
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -118,7 +118,7 @@ def test_outlines_are_inside_and_outside(shape: coal.CollisionGeometry, seed: in
     rng = np.random.default_rng(seed)
     placement = pin.SE3(pin.Quaternion(rng.normal(size=4)).normalized().matrix(), rng.uniform(-1.0, 1.0, 3))
     where = coal.Transform3s(placement.rotation, placement.translation)
-    (inner, nothing), (outer, radius) = (outline(shape, placement, outer=side) for side in (False, True))
+    (inner, nothing), (outer, radius) = (hull_points(shape, placement, outer=side) for side in (False, True))
     assert nothing == 0.0
     for u in FAN[:: int(rng.integers(1, 8))]:
         normal = np.array([*u, 0.0])

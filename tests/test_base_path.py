@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from vkc_pin.base_body import Shape
 from vkc_pin.base_grid import BaseGrid
-from vkc_pin.base_path import BasePath, along, shortest_path
+from vkc_pin.base_path import BasePath, poses_along, shortest_path
 from vkc_pin.base_ways import BACKWARDS, SIDEWAYS, TURNING
 from vkc_pin.errors import InputError
 
@@ -125,7 +125,7 @@ def test_to_turn_in_place_and_to_stay() -> None:
     np.testing.assert_allclose(turned.poses, [[0.0, 0.0, 3.0], [0.0, 0.0, 2 * np.pi - 3.0]])
     np.testing.assert_array_equal(stayed.poses, [[0.0, 0.0, 3.0], [0.0, 0.0, 3.0]])
     assert stayed.cost == 0.0
-    np.testing.assert_array_equal(along(stayed, 3), [[0.0, 0.0, 3.0]] * 3)
+    np.testing.assert_array_equal(poses_along(stayed, 3), [[0.0, 0.0, 3.0]] * 3)
 
 
 def test_a_gap_that_only_fits_lengthwise() -> None:
@@ -133,7 +133,7 @@ def test_a_gap_that_only_fits_lengthwise() -> None:
     path = find(standing, start, goals)
     assert path is not None
     check(path, np.array(start), np.array(goals), chassis(), [], standing)
-    waypoints = along(path, 400)
+    waypoints = poses_along(path, 400)
     inside = waypoints[np.abs(waypoints[:, 0]) < 0.2]
     assert len(inside) > 5
     assert np.all(np.abs(np.sin(inside[:, 2])) < 0.5)
@@ -256,7 +256,7 @@ def test_smoothing_leaves_few_turns(around_the_block: BasePath) -> None:
 @pytest.mark.parametrize("steps", [1, 7, 40])
 def test_waypoints_along_a_path(around_the_block: BasePath, steps: int) -> None:
     path = around_the_block
-    waypoints = along(path, steps)
+    waypoints = poses_along(path, steps)
     assert waypoints.shape == (steps, 3)
     np.testing.assert_array_equal(waypoints[-1], path.poses[-1])
     # Each is on the path, further along than the one before.
@@ -277,9 +277,9 @@ def test_waypoints_along_a_path(around_the_block: BasePath, steps: int) -> None:
 def test_turning_takes_waypoints() -> None:
     path = find([], [0.0, 0.0, 0.0], [[1.0, 0.0, 3.0]])
     assert path is not None
-    waypoints = along(path, 50)
+    waypoints = poses_along(path, 50)
     assert np.sum(waypoints[:, 0] > 1.0 - 1e-9) > 20
-    assert np.sum(along(path, 50, turning=0.01)[:, 0] > 1.0 - 1e-9) < 12
+    assert np.sum(poses_along(path, 50, turning=0.01)[:, 0] > 1.0 - 1e-9) < 12
 
 
 @pytest.mark.parametrize(
@@ -301,7 +301,7 @@ def test_bad_input(start: list[float], goals: list[list[float]], costs: list[flo
 
 def test_no_waypoints(around_the_block: BasePath) -> None:
     with pytest.raises(InputError, match="steps"):
-        along(around_the_block, 0)
+        poses_along(around_the_block, 0)
 
 
 def test_a_search_is_quick() -> None:

@@ -198,25 +198,25 @@ def stay(scene: vkc.Scene) -> vkc.TrajectoryProblem:
     return vkc.build(scene, [vkc.GoTo(*scene.start[:3].tolist())], options=OPTIONS)
 
 
-def drawn_in(scene: vkc.Scene) -> np.ndarray:
+def folded(scene: vkc.Scene) -> np.ndarray:
     """Return the arm of the second baseline posture of an arm at home: as narrow as it becomes."""
-    return Routes(stay(scene)).compact(0)
+    return Routes(stay(scene)).folded_arm(0)
 
 
-def test_an_arm_at_home_stays_there_or_is_drawn_in() -> None:
+def test_an_arm_at_home_stays_there_or_is_folded() -> None:
     scene = drawer_scene()
     first, second = postures(stay(scene))
     assert len(first) == 0
-    np.testing.assert_allclose(second, [[*scene.start[:3], *drawn_in(scene)]], atol=1e-12)
+    np.testing.assert_allclose(second, [[*scene.start[:3], *folded(scene)]], atol=1e-12)
     assert np.abs(second[0, 3:] - scene.robot.home).max() > 0.5
 
 
-def test_another_arm_may_stay_or_go_home_and_be_drawn_in() -> None:
+def test_another_arm_may_stay_or_go_home_and_be_folded() -> None:
     scene = open_scene().with_start(arm=np.array([0.0, -1.2, 1.0, 0.2, 1.5, 0.0]))
     first, second, third = postures(stay(scene))
     assert len(first) == 0
     np.testing.assert_allclose(second, [[*scene.start[:3], *scene.robot.home]], atol=1e-12)
-    np.testing.assert_allclose(third, [*second, [*scene.start[:3], *drawn_in(scene)]], atol=1e-12)
+    np.testing.assert_allclose(third, [*second, [*scene.start[:3], *folded(scene)]], atol=1e-12)
 
 
 def test_a_hand_goes_straight_back_from_what_it_lets_go_of() -> None:

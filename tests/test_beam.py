@@ -179,8 +179,8 @@ def test_a_grasp_is_nearest_to_its_straight_way_so_many_waypoints_before() -> No
 @pytest.mark.parametrize("careful", [False, True])
 def test_a_careful_search_counts_what_is_hit_before_a_grasp(careful: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of four grasps one is blocked, one has a blocked way, one has none; and at other waypoints nothing changes."""
-    search, grasp = beam(), int(problem().ends[0])
-    search.careful, before = careful, search.approaches[grasp]
+    search, grasp = Beam(Knots(problem(), np.random.default_rng(0)), careful=careful), int(problem().ends[0])
+    before = search.approaches[grasp]
     depths = {grasp: np.array([0.01, 0.0, 0.0, 0.0]), before: np.array([0.02, 0.0, 0.0])}
     z, found = np.tile(problem().start, (4, 1)), np.ones(4, bool)
     z[:, 4] += np.arange(4)
@@ -205,8 +205,7 @@ def test_before_a_careful_grasp_nothing_is_hit() -> None:
     p = vkc.build(scene, [vkc.Grasp("door", "handle_free"), vkc.Actuate("door", {"hinge": 0.0})])
     grasp, routes, shares = int(p.ends[0]), Routes(p), []
     for careful in (False, True):
-        search = Beam(Knots(p, np.random.default_rng(0)), routes)
-        search.careful = careful
+        search = Beam(Knots(p, np.random.default_rng(0)), routes, careful=careful)
         found = search.search(thorough=True, backwards=True)
         before, held = search.approaches[grasp], found.paths[found.trouble == 0.0, found.at.index(grasp)]
         assert len(held), "every path is blocked"

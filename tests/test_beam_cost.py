@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from small_problems import SHORT, door_scene
 
 import vkc_pin as vkc
-from vkc_pin.beam import Beam
+from vkc_pin.beam import Beam, _Mode
 from vkc_pin.knots import Knots
 
 
@@ -29,7 +29,7 @@ class Ways:
     """Routes twice as long as straight ones."""
 
     def distances(
-        self, phase: int, first: NDArray[np.float64], last: NDArray[np.float64], *, drawn_in: bool
+        self, phase: int, first: NDArray[np.float64], last: NDArray[np.float64], *, folded: bool
     ) -> NDArray[np.float64]:
         return np.asarray(2.0 * np.linalg.norm(last[:, :2] - first[:, :2], axis=1))
 
@@ -58,9 +58,8 @@ def scattered(monkeypatch: pytest.MonkeyPatch, share: float) -> int:
 
     monkeypatch.setattr(search.knots, "knot", counted)
     monkeypatch.setattr(search.knots, "depth", depth)
-    search.width = 24
     grasp = int(search.problem.ends[0])
-    search._continue(search.problem.start[None, None], np.zeros(1), grasp, 0, thorough=False)
+    search._continue(search.problem.start[None, None], np.zeros(1), grasp, 0, _Mode(thorough=False, backwards=False))
     return draws.count("scatter")
 
 
@@ -80,7 +79,7 @@ def test_where_some_are_free_none_are_pushed(monkeypatch: pytest.MonkeyPatch, ho
     z, bad = np.tile(search.problem.start, (96, 1)), np.where(np.arange(96) < free, 0.0, 50.0)
     paths, parents = search.problem.start[None, None], np.zeros(96, int)
     knot = int(search.problem.ends[-1 if holding else 0])
-    _, after, _ = search._pushed(paths, np.zeros(1), parents, z, bad, knot, 2 if holding else 0)
+    _, after, _ = search._pushed(paths, np.zeros(1), parents, z, bad, knot, 2 if holding else 0, width=40)
     assert bool(called) == pushed
     assert len(after) == 96 + sum(called)
 

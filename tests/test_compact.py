@@ -1,4 +1,4 @@
-"""The arm that is drawn in: narrower than at home, free, and the same every time."""
+"""The folded arm: narrower than at home, free, and the same every time."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import pytest
 
 import vkc_pin as vkc
 from vkc_pin import compact
-from vkc_pin.compact import compact_arm
+from vkc_pin.compact import folded_arm
+from vkc_pin.knots import depth
 
 TASKS = {  # scene and steps, in the last phase of which something is carried
     "nothing": ("household", [vkc.GoTo(1.0, 0.5)]),
@@ -60,7 +61,7 @@ def reach(load: str, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("load", TASKS)
 def test_it_is_much_narrower_than_at_home(load: str) -> None:
     p = problem(load)
-    arm = compact_arm(p, len(p.task.phases) - 1, resting(load))
+    arm = folded_arm(p, len(p.task.phases) - 1, resting(load))
     low, high = reach(load, with_arm(load, arm))
     low_home, high_home = reach(load, resting(load))
     assert max(high[1], -low[1]) < 0.7 * max(high_home[1], -low_home[1])
@@ -73,7 +74,7 @@ def test_it_is_much_narrower_than_at_home(load: str) -> None:
 def test_it_keeps_within_limits_and_away_from_itself(load: str) -> None:
     p = problem(load)
     chain, robot = p.chain, p.chain.robot
-    z = with_arm(load, compact_arm(p, len(p.task.phases) - 1, resting(load)))
+    z = with_arm(load, folded_arm(p, len(p.task.phases) - 1, resting(load)))
     assert np.all((z >= chain.lower) & (z <= chain.upper))
     data, shapes = robot.model.createData(), robot.collision.createData()
     q = robot.coordinates.q(z[: robot.coordinates.size])
@@ -85,11 +86,20 @@ def test_it_keeps_within_limits_and_away_from_itself(load: str) -> None:
     assert p.contacts.evaluate(z[None], last, reach=p.options.dist_safe).violation() == 0.0
 
 
+def test_what_stands_does_not_count() -> None:
+    """The base is in the wall between the rooms."""
+    p = problem("nothing")
+    z = resting("nothing")
+    z[:2] = 0.0, 1.25
+    assert depth(p, z[None], 1)[0] > 0.1
+    assert depth(p, z[None], 1, standing=False)[0] == 0.0
+
+
 def test_it_is_the_same_every_time() -> None:
     p = problem("stick")
-    np.testing.assert_array_equal(compact_arm(p, 1, resting("stick")), compact_arm(p, 1, resting("stick")))
+    np.testing.assert_array_equal(folded_arm(p, 1, resting("stick")), folded_arm(p, 1, resting("stick")))
 
 
 def test_where_nothing_is_free_the_arm_stays_at_home(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compact._Body, "free", lambda _, z, count: z[:0])
-    np.testing.assert_array_equal(compact_arm(problem("nothing"), 0, resting("nothing")), problem("nothing").chain.robot.home)
+    np.testing.assert_array_equal(folded_arm(problem("nothing"), 0, resting("nothing")), problem("nothing").chain.robot.home)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.coordinates import Coordinates
+from vkc_pin.coordinates import Coordinates, wrapped
 from vkc_pin.errors import InputError, UnknownNameError
 
 FREE = ("thing_x", "thing_y", "thing_z", "thing_qx", "thing_qy", "thing_qz", "thing_qw")
@@ -133,3 +133,9 @@ def test_what_does_not_fit() -> None:
     with pytest.raises(InputError, match="not supported") as caught:
         Coordinates(ball)
     assert (caught.value.field, caught.value.got) == ("ball", "JointModelSpherical")
+
+
+@given(st.floats(-50.0, 50.0))
+def test_wrapped_angles(angle: float) -> None:
+    assert -np.pi <= wrapped(angle) <= np.pi
+    assert np.exp(1j * wrapped(angle)) == pytest.approx(np.exp(1j * angle), abs=1e-9)

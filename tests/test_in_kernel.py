@@ -62,7 +62,7 @@ def test_progress_is_one_line_that_is_written_over(jupyter: Kernel) -> None:
 @pytest.mark.parametrize(
     ("where", "code"),
     [
-        ("seeds", "vkc_pin.initialization._Seeds, '_search'"),
+        ("seeds", "vkc_pin.initialization._SeedSearch, '_search'"),
         ("solver", "vkc_pin.solver._Loop, 'run_ipopt'"),
         ("validation", "vkc_pin.one_problem, 'validate'"),
         ("building", "vkc_pin.one_problem, 'TrajectoryProblem'"),

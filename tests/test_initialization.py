@@ -17,8 +17,9 @@ from small_problems import SHORT, door_scene
 import vkc_pin as vkc
 from vkc_pin import initialization, joining
 from vkc_pin.beam import Beam, Found
-from vkc_pin.initialization import _POOR, HOPELESS, INITIALIZATIONS, Seed, _in_turn, initialize
+from vkc_pin.initialization import _COLLIDING, _POOR, INITIALIZATIONS, _in_turn, initialize
 from vkc_pin.knots import scatter
+from vkc_pin.seed import Seed
 
 OPENED = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20)
 
@@ -165,11 +166,11 @@ class Looked:
 
     def __init__(self, straight: list[float], around: list[float], trees: list[float]) -> None:
         self.said: list[str] = []
-        self.shortfalls: dict[str, float] = {}  # as they are yielded
+        self.races: dict[str, bool] = {}  # as they are yielded
         kinds = {"s": straight, "a": around, "t": trees}
         for seed in _in_turn(*(self._seeds(kind, shortfalls) for kind, shortfalls in kinds.items())):
             self.said.append(seed.name.upper())
-            self.shortfalls[seed.name] = seed.shortfall
+            self.races[seed.name] = seed.races
 
     def _seeds(self, kind: str, shortfalls: list[float]) -> Iterator[Seed]:
         for number, shortfall in enumerate(shortfalls):
@@ -177,7 +178,7 @@ class Looked:
             yield Seed(f"{kind}{number}", np.zeros((1, 1)), shortfall)
 
 
-FINE, POOR, LOST = 0.9 * _POOR, 1.1 * _POOR, 1.1 * HOPELESS
+FINE, POOR, LOST = 0.9 * _POOR, 1.1 * _POOR, 1.1 * _COLLIDING
 
 
 @pytest.mark.parametrize(
@@ -219,10 +220,10 @@ def test_straight_around_and_trees_take_turns(
 
 
 @pytest.mark.parametrize(
-    ("straight", "around", "trees", "hopeless"),
+    ("straight", "around", "trees", "aside"),
     [
         ([POOR], [POOR], [0.0], "s0 a0"),
-        ([POOR], [POOR], [LOST], "s0 a0"),  # t0 is as it is
+        ([POOR], [POOR], [LOST], "s0 a0"),  # t0 is as it was
         ([POOR], [], [0.0, 0.0], "s0"),
         ([POOR, POOR], [POOR, 0.0], [0.0], "s0 a0"),  # the next have others beside them
         ([POOR], [POOR], [], ""),  # trees found nothing: these are all there is
@@ -230,19 +231,18 @@ def test_straight_around_and_trees_take_turns(
         ([FINE], [POOR], [0.0], ""),
     ],
 )
-def test_beside_what_trees_find_what_hits_things_is_hopeless(
-    straight: list[float], around: list[float], trees: list[float], hopeless: str
+def test_beside_what_trees_find_what_hits_things_does_not_race(
+    straight: list[float], around: list[float], trees: list[float], aside: str
 ) -> None:
     """So that the solver does not begin with it."""
-    given = {
-        f"{kind}{k}": short for kind, all_ in zip("sat", (straight, around, trees), strict=True) for k, short in enumerate(all_)
-    }
-    yielded = Looked(straight, around, trees).shortfalls
-    assert yielded.keys() == given.keys()
-    for name in hopeless.split():
-        assert yielded[name] > HOPELESS
-    kept = given.keys() - set(hopeless.split())
-    assert {name: yielded[name] for name in kept} == {name: given[name] for name in kept}
+    given = [f"{kind}{k}" for kind, all_ in zip("sat", (straight, around, trees), strict=True) for k in range(len(all_))]
+    assert Looked(straight, around, trees).races == {name: name not in aside.split() for name in given}
+
+
+@pytest.mark.parametrize("collides", [False, True])
+def test_a_seed_that_collides_nearly_everywhere_does_not_race(collides: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(initialization, "_COLLIDING", -1.0 if collides else np.inf)
+    assert [found.races for found in initialize(problem(), "interpolated", 0)] == [not collides]
 
 
 @given(*(st.lists(st.sampled_from([0.0, FINE, POOR, LOST, np.nan]), max_size=5) for _ in range(3)))
@@ -430,7 +430,7 @@ def test_in_turn_trees_make_two_seeds_at_least(count: int, monkeypatch: pytest.M
         asked[one.method] = most
         return iter([])
 
-    monkeypatch.setattr(initialization._Seeds, "seeds", seeds)
+    monkeypatch.setattr(initialization._SeedSearch, "seeds", seeds)
     assert list(initialize(problem(), "auto", 0, count=count)) == []
     assert asked == {"interpolated": count, "astar": count, "rrt": max(count, 2)}
     assert list(initialize(problem(), "rrt", 0, count=count)) == []

@@ -18,7 +18,7 @@ import vkc_pin as vkc
 from vkc_pin import joining
 from vkc_pin.approach import Approach
 from vkc_pin.beam import Beam
-from vkc_pin.joining import Around, Joiner, Trees, Ways
+from vkc_pin.joining import DrivenPaths, Joiner, Paths, RrtPaths
 from vkc_pin.knots import Knots, smooth
 from vkc_pin.routes import Routes
 from vkc_pin.trees import TRIES
@@ -38,13 +38,13 @@ def door() -> tuple[vkc.TrajectoryProblem, np.ndarray, tuple[int, ...]]:
     return p, found.paths[best], tuple(found.at)
 
 
-def joiner(p: vkc.TrajectoryProblem, ways: Ways | None = None) -> Joiner:
+def joiner(p: vkc.TrajectoryProblem, paths: Paths | None = None) -> Joiner:
     knots = Knots(p, np.random.default_rng(0))
-    return Joiner(knots, Approach(knots), ways)
+    return Joiner(knots, Approach(knots), paths)
 
 
-def trees(p: vkc.TrajectoryProblem, seed: int = 0) -> Trees:
-    return Trees(Knots(p, np.random.default_rng(seed)), Routes(p))
+def trees(p: vkc.TrajectoryProblem, seed: int = 0) -> RrtPaths:
+    return RrtPaths(Knots(p, np.random.default_rng(seed)), Routes(p))
 
 
 class Say:
@@ -55,7 +55,7 @@ class Say:
         self.asked: list[tuple[int, np.ndarray, np.ndarray, int, bool]] = []
         self.turns: list[bool] = []  # whether headings may end whole turns further
 
-    def way(
+    def path(
         self, phase: int, first: np.ndarray, last: np.ndarray, steps: int, *, turns: bool, reaches: bool
     ) -> np.ndarray | None:
         self.asked.append((phase, first.copy(), last.copy(), steps, reaches))
@@ -157,7 +157,7 @@ def test_a_way_may_end_whole_turns_further_unless_the_goal_says_how_far_to_turn(
 
 
 def test_after_a_phase_whose_arm_ends_elsewhere_the_next_begins_there() -> None:
-    """Where nothing is to be reached the arm may stay drawn in."""
+    """Where nothing is to be reached the arm may stay folded."""
     p = vkc.build(hall(), [vkc.GoTo(2.0, 1.0, 0.5), vkc.GoTo(0.0, 1.0, 0.5)])
 
     def lifting(first: np.ndarray, last: np.ndarray, steps: int) -> np.ndarray:
@@ -237,7 +237,7 @@ def test_a_careful_way_leaves_out_what_hits_something(
 def test_only_trees_are_careful() -> None:
     p, _, _ = door()
     assert trees(p).careful
-    assert not Around(Routes(p)).careful
+    assert not DrivenPaths(Routes(p)).careful
 
 
 # --- around, and with base and arm ---------------------------------------------------------------------------------------
@@ -247,9 +247,9 @@ def test_around_is_the_way_of_the_base_with_a_straight_arm() -> None:
     p = walled(1.6)
     routes, end = Routes(p), at(p, (4.0, 1.5, 0.0))
     end[3:] += 0.2
-    z = joiner(p, Around(routes)).join(np.array([p.start, end]), [0, p.segments])
+    z = joiner(p, DrivenPaths(routes)).join(np.array([p.start, end]), [0, p.segments])
     assert z is not None
-    expected = routes.way(0, p.start[:3], end[:3], p.segments)
+    expected = routes.path(0, p.start[:3], end[:3], p.segments)
     assert expected is not None
     assert abs(expected[-1, 2]) < 1e-9, "no whole turns here"
     np.testing.assert_allclose(z[:, :3], expected, atol=1e-9)
@@ -262,18 +262,18 @@ class Winding:
     def __init__(self, turns: int) -> None:
         self.turns = turns
 
-    def way(self, phase: int, start: np.ndarray, goal: np.ndarray, steps: int) -> np.ndarray:
+    def path(self, phase: int, start: np.ndarray, goal: np.ndarray, steps: int) -> np.ndarray:
         end = goal + np.array([0.0, 0.0, self.turns * 2 * np.pi])
         return np.asarray(start + np.outer(np.arange(1, steps + 1) / steps, end - start))
 
 
 @pytest.mark.parametrize("wound", [-1, 0, 1, 2])
 def test_around_unwinds_where_the_goal_says_how_far_to_turn(wound: int) -> None:
-    ways = Around(Winding(wound))  # type: ignore[arg-type]
+    ways = DrivenPaths(Winding(wound))  # type: ignore[arg-type]
     first, last, share = np.zeros(ROBOT), np.zeros(ROBOT), np.arange(1, 21) / 20
     last[:3] = 2.0, 1.0, 0.5
     for turns, yaw in ((True, 0.5 + wound * 2 * np.pi), (False, 0.5)):
-        way = ways.way(0, first, last, 20, turns=turns, reaches=True)
+        way = ways.path(0, first, last, 20, turns=turns, reaches=True)
         assert way is not None
         np.testing.assert_allclose(way, np.outer(share, [2.0, 1.0, yaw]), atol=1e-9)
 
@@ -281,7 +281,7 @@ def test_around_unwinds_where_the_goal_says_how_far_to_turn(wound: int) -> None:
 def test_trees_lead_base_and_arm_through_a_narrow_gate() -> None:
     p = gated(NARROW)
     ends = np.array([p.start, at(p, GOAL)])
-    assert joiner(p, Around(Routes(p))).join(ends, [0, p.segments]) is None
+    assert joiner(p, DrivenPaths(Routes(p))).join(ends, [0, p.segments]) is None
     straight = joiner(p).join(ends, [0, p.segments])
     z = joiner(p, trees(p)).join(ends, [0, p.segments])
     assert straight is not None
@@ -300,11 +300,11 @@ def test_with_what_is_to_be_reached_the_arm_of_a_tree_ends_there() -> None:
     end[4] += 0.1
     grown = trees(p)
     for reaches in (True, False):
-        way = grown.way(0, p.start, end, 30, turns=True, reaches=reaches)
+        way = grown.path(0, p.start, end, 30, turns=True, reaches=reaches)
         assert way is not None
         assert way.shape == (30, ROBOT)
         np.testing.assert_allclose(way[-1, :3], GOAL, atol=1e-9)  # there is no reason to turn round
-        allowed = [end[3:], p.start[3:], p.chain.robot.home, grown.routes.compact(0)][: 1 if reaches else None]
+        allowed = [end[3:], p.start[3:], p.chain.robot.home, grown.routes.folded_arm(0)][: 1 if reaches else None]
         assert min(np.abs(way[-1, 3:] - arm).max() for arm in allowed) < 1e-9
 
 
@@ -315,7 +315,7 @@ def test_trees_turn_as_far_as_the_goal_says_where_there_is_room(wound: int, seed
     p = gated(NARROW)
     end = at(p, GOAL)
     end[2] += wound * 2 * np.pi
-    way = trees(p, seed).way(0, p.start, end, 60, turns=False, reaches=True)
+    way = trees(p, seed).path(0, p.start, end, 60, turns=False, reaches=True)
     assert way is not None
     np.testing.assert_allclose(way[-1], end, atol=1e-9)
     z = np.tile(p.start, (60, 1))
@@ -344,8 +344,8 @@ def test_trees_that_failed_try_less_until_they_succeed_again(monkeypatch: pytest
     monkeypatch.setattr(joining, "connect", connect)
     for number, phase in enumerate([0, 0, 1, 0, 0, 0, 0, 0]):
         monkeypatch.setattr(ways.routes, "guide", lambda *_: np.zeros((2, 3)))
-        monkeypatch.setattr(ways.routes, "compact", lambda _: p.start[3:ROBOT])
-        way = ways.way(phase, p.start, at(p, GOAL), 5, turns=True, reaches=True)
+        monkeypatch.setattr(ways.routes, "folded_arm", lambda _: p.start[3:ROBOT])
+        way = ways.path(phase, p.start, at(p, GOAL), 5, turns=True, reaches=True)
         assert (way is not None) == (number == 5)
     assert tries == [TRIES, TRIES // 2, TRIES, TRIES // 4, TRIES // 8, TRIES // 8, TRIES, TRIES // 2]
 
@@ -359,7 +359,7 @@ def test_trees_of_a_fixed_base_move_the_arm_alone(monkeypatch: pytest.MonkeyPatc
     p = vkc.build(hall(base="fixed", obstacles=[beam]), [vkc.Reach((0.6, 0.35, 0.9, 0.0, np.pi / 2, 0.0))])
     first, last = p.start.copy(), p.start.copy()
     first[3:6], last[3:6] = (0.57, -1.2, -1.2), (2.57, -1.2, -1.2)
-    way = trees(p).way(0, first, last, 60, turns=False, reaches=True)
+    way = trees(p).path(0, first, last, 60, turns=False, reaches=True)
     assert way is not None
     np.testing.assert_array_equal(way[:, :3], np.tile(first[:3], (60, 1)))
     np.testing.assert_allclose(way[-1], last, atol=1e-12)

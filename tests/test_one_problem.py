@@ -17,10 +17,10 @@ from small_problems import door_scene
 import vkc_pin as vkc
 from vkc_pin import one_problem as module
 from vkc_pin.goal import compile_task
-from vkc_pin.initialization import HOPELESS, Seed
 from vkc_pin.interrupt import Interrupt
 from vkc_pin.one_problem import OneProblem
 from vkc_pin.outcome import TIMES
+from vkc_pin.seed import Seed
 from vkc_pin.settings import Settings
 from vkc_pin.solution import Iteration, Resume, Solution
 
@@ -37,7 +37,7 @@ class Race:
         heights: Of the seeds.
         after: Of what one round leads to, and the solver's status.
         finally_: Of what all rounds lead to, and the status.
-        shortfalls: Of the seeds.
+        aside: The seeds that do not race.
         stuck: The seeds from which the solver gets stuck, when it has no patience.
         events: What happened: "b" a seed was asked for, "b1" it was given one round, "b*" all of them, "b*!" at a higher penalty.
         radii: How far planes were to be believed at first, each time; None: as usual.
@@ -52,13 +52,13 @@ class Race:
         *,
         after: dict[str, Answer] | None = None,
         finally_: dict[str, Answer] | None = None,
-        shortfalls: Sequence[float] = (),
+        aside: str = "",
         amounts: Sequence[float] = (),
         stuck: str = "",
     ) -> None:
         self.heights, self.after, self.finally_ = heights, after or {}, finally_ or {}
         self.stuck = stuck
-        self.shortfalls, self.amounts = shortfalls or [0.0] * len(heights), iter(amounts or [1.0] * 20)
+        self.aside, self.amounts = aside, iter(amounts or [1.0] * 20)
         self.events: list[str] = []
         self.given: list[np.ndarray] = []
         self.radii: list[np.ndarray | None] = []
@@ -82,9 +82,9 @@ class Race:
         return z
 
     def initialize(self, problem: vkc.TrajectoryProblem, *_: Any, **__: Any) -> Iterator[Seed]:
-        for name, height, shortfall in zip(NAMES, self.heights, self.shortfalls, strict=False):
+        for name, height in zip(NAMES, self.heights, strict=False):
             self.note(name)
-            yield Seed(name, self.z(problem, name, height), shortfall)
+            yield Seed(name, self.z(problem, name, height), races=name not in self.aside)
 
     def radius(self, problem: vkc.TrajectoryProblem, name: str) -> np.ndarray:
         """Return how far planes are believed after a round, as the solver says; another for every seed."""
@@ -163,7 +163,7 @@ def test_the_seed_that_looks_best_after_a_round_goes_first(
 
 
 @pytest.mark.parametrize(
-    ("heights", "hopeless", "expected"),
+    ("heights", "aside", "expected"),
     [
         ([1.0, 3.0, 2.0, 4.0], "a", "a b b1 c c1 c* b* a* d d*"),
         ([1.0, 2.0, 3.0], "ab", "a b c c1 c* a* b*"),
@@ -171,19 +171,10 @@ def test_the_seed_that_looks_best_after_a_round_goes_first(
         ([2.0, 1.0], "b", "a a1 b a* b*"),
     ],
 )
-def test_hopeless_seeds_go_last_and_do_not_race(
-    heights: list[float], hopeless: str, expected: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    shortfalls = [HOPELESS * (1.01 if name in hopeless else 0.99) for name in NAMES[: len(heights)]]
-    race = Race(monkeypatch, heights, shortfalls=shortfalls)
+def test_seeds_that_do_not_race_go_last(heights: list[float], aside: str, expected: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    race = Race(monkeypatch, heights, aside=aside)
     race.run()
     assert race.events == expected.split()
-
-
-def test_a_seed_that_nobody_looked_at_races(monkeypatch: pytest.MonkeyPatch) -> None:
-    race = Race(monkeypatch, [2.0, 1.0], shortfalls=[float("nan")] * 2)
-    race.run()
-    assert race.events == ["a", "a1", "b", "b1", "b*", "a*"]
 
 
 def test_the_first_success_ends_it_and_goes_on_from_the_race(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -197,7 +188,7 @@ def test_the_first_success_ends_it_and_goes_on_from_the_race(monkeypatch: pytest
 
 def test_raced_seeds_go_on_with_the_trust_region_that_they_had(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each with its own; those that did not race, and those of the race itself, begin as usual."""
-    race = Race(monkeypatch, [3.0, 2.0, 4.0, 1.0], shortfalls=[0.0, 0.0, 2 * HOPELESS, 0.0])
+    race = Race(monkeypatch, [3.0, 2.0, 4.0, 1.0], aside="c")
     race.run()
     assert race.events == ["a", "a1", "b", "b1", "c", "b*", "a*", "c*", "d", "d*"]
     radii = dict(zip([event for event in race.events if len(event) == 2], race.radii, strict=True))

@@ -13,7 +13,7 @@ def test_the_way_leads_through_the_gap() -> None:
     problem = walled(1.6)
     routes, start = Routes(problem), problem.start[:3]
     goal = np.array([4.0, 1.5, 0.0])
-    way = routes.way(0, start, goal, 40)
+    way = routes.path(0, start, goal, 40)
     assert way is not None
     assert way.shape == (40, 3)
     np.testing.assert_allclose(way[-1, :2], goal[:2], atol=1e-9)
@@ -25,7 +25,7 @@ def test_the_way_leads_through_the_gap() -> None:
 
 def test_no_way_is_said() -> None:
     problem = walled(0.0)
-    assert Routes(problem).way(0, problem.start[:3], np.array([4.0, 1.5, 0.0]), 40) is None
+    assert Routes(problem).path(0, problem.start[:3], np.array([4.0, 1.5, 0.0]), 40) is None
     notes: list[str] = []
     assert list(initialize(problem, "astar", 0, notes=notes)) == []
     assert len(notes) == 1
@@ -52,46 +52,46 @@ def test_the_seed_drives_the_way_and_the_heading_follows_it() -> None:
 
 
 @pytest.mark.parametrize("width", [NARROW, TIGHT])
-def test_with_the_arm_drawn_in_there_is_a_way_through_a_narrow_gate(width: float) -> None:
+def test_with_the_arm_folded_there_is_a_way_through_a_narrow_gate(width: float) -> None:
     problem = gated(width)
     routes, start, goal = Routes(problem), problem.start[:3], np.array(GOAL)
-    home, drawn_in = (routes.distances(0, start[None], goal[None], drawn_in=each)[0] for each in (False, True))
+    home, folded = (routes.distances(0, start[None], goal[None], folded=each)[0] for each in (False, True))
     straight = np.hypot(*(goal - start)[:2])
     assert np.isinf(home)
-    assert straight <= drawn_in < 1.1 * straight
-    assert routes.way(0, start, goal, 40) is None
+    assert straight <= folded < 1.1 * straight
+    assert routes.path(0, start, goal, 40) is None
     guide = routes.guide(0, start, goal, 40)
     assert guide is not None
     assert guide.shape == (40, 3)
     np.testing.assert_allclose(guide[-1], goal, atol=1e-9)
     through = np.array([[np.interp(2.0, guide[:, 0], guide[:, 1])]])
     assert abs(through) < 0.03, "it is as wide as the base and a hand"
-    # Nothing but the arm is in the way: with it drawn in the base hits nothing all along.
+    # Nothing but the arm is in the way: with it folded the base hits nothing all along.
     z = np.tile(problem.start, (len(guide), 1))
-    z[:, :3], z[:, 3:] = guide, routes.compact(0)
+    z[:, :3], z[:, 3:] = guide, routes.folded_arm(0)
     assert problem.contacts.evaluate(z, np.ones(len(z), int), reach=0.1).clearance() > 0.0
 
 
 def test_a_gate_too_narrow_for_the_base_has_no_way() -> None:
     problem = gated(0.64)
     routes, start, goal = Routes(problem), problem.start[:3], np.array(GOAL)
-    assert np.isinf(routes.distances(0, start[None], goal[None], drawn_in=True)[0])
+    assert np.isinf(routes.distances(0, start[None], goal[None], folded=True)[0])
     assert routes.guide(0, start, goal, 40) is None
 
 
 def test_the_grids_are_kept_apart() -> None:
     routes = Routes(gated(NARROW))
-    home, drawn_in = routes.grid(0), routes.grid(0, drawn_in=True)
+    home, folded = routes.grid(0), routes.grid(0, folded=True)
     assert home is routes.grid(0)
-    assert drawn_in is routes.grid(0, drawn_in=True)
-    assert drawn_in is not home
-    assert np.all(drawn_in.step < home.step)
+    assert folded is routes.grid(0, folded=True)
+    assert folded is not home
+    assert np.all(folded.step < home.step)
 
 
 def test_where_the_arm_at_home_fits_the_guide_is_the_usual_way() -> None:
     problem = walled(1.6)
     routes, start, goal = Routes(problem), problem.start[:3], np.array([4.0, 1.5, 0.0])
-    guide, way = routes.guide(0, start, goal, 40), routes.way(0, start, goal, 40)
+    guide, way = routes.guide(0, start, goal, 40), routes.path(0, start, goal, 40)
     assert guide is not None
     assert way is not None
     np.testing.assert_allclose(guide, way, atol=1e-9)
@@ -103,7 +103,7 @@ def test_a_guide_ends_beside_a_goal_that_is_blocked(gap: float) -> None:
     problem = walled(gap)
     routes, start = Routes(problem), problem.start[:3]
     near = np.array([1.5, 1.5, 0.0])  # the base's front would be in the wall
-    assert routes.way(0, start, near, 40) is None
+    assert routes.path(0, start, near, 40) is None
     guide = routes.guide(0, start, near, 40)
     assert guide is not None
     off = np.abs(guide[-1] - near)
@@ -120,12 +120,12 @@ def test_a_guide_to_what_is_far_inside_something_does_not_exist() -> None:
     assert Routes(problem).guide(0, problem.start[:3], block, 40) is None
 
 
-def test_the_arm_is_drawn_in_once_for_what_is_held() -> None:
+def test_the_arm_is_folded_once_for_what_is_held() -> None:
     """With nothing in the hand in the first phase, and the cup in the second, of another width."""
     problem = vkc.build(vkc.load_scene("household"), [vkc.Grasp("cup"), vkc.GoTo(1.0, 0.5)])
     routes = Routes(problem)
-    empty, cup = routes.compact(0), routes.compact(1)
-    assert empty is routes.compact(0)
-    assert cup is routes.compact(1)
+    empty, cup = routes.folded_arm(0), routes.folded_arm(1)
+    assert empty is routes.folded_arm(0)
+    assert cup is routes.folded_arm(1)
     assert empty.shape == cup.shape == (6,)
     assert not np.array_equal(empty, cup)

@@ -11,9 +11,8 @@ import pytest
 import vkc_pin as vkc
 from vkc_pin.benchmarks.initialization import TARGET
 from vkc_pin.goal import compile_task
-from vkc_pin.initialization import Seed
 from vkc_pin.one_problem import OneProblem
-from vkc_pin.pieces import seed_of
+from vkc_pin.seed import Seed, seed_of
 from vkc_pin.settings import Settings
 from vkc_pin.stepwise import stages
 from vkc_pin.world import World, scene_after

@@ -27,12 +27,12 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 @cache
 def gate() -> tuple[vkc.TrajectoryProblem, np.ndarray, np.ndarray]:
-    """Return a problem in which only an arm that is drawn in fits through, a way of the base, and postures."""
+    """Return a problem in which only a folded arm fits through, a path of the base, and postures."""
     problem = gated(TIGHT)
     routes = Routes(problem)
     guide = routes.guide(0, problem.start[:3], np.array(GOAL), 80)
     assert guide is not None
-    return problem, guide, np.array([problem.start[3:], routes.compact(0)])
+    return problem, guide, np.array([problem.start[3:], routes.folded_arm(0)])
 
 
 def through(seed: int, ends: np.ndarray | None = None, *, tries: int = trees.TRIES) -> np.ndarray | None:
@@ -213,7 +213,7 @@ def test_runs_are_the_free_parts_of_the_way_with_each_arm() -> None:
             covered[begin:end] += 1
         np.testing.assert_array_equal(covered, free.astype(int))
         through_gate.append(any(run[0, 0] < 1.0 and run[-1, 0] > 3.0 for run in own))
-    assert through_gate == [False, True], "the arm has to be drawn in"
+    assert through_gate == [False, True], "the arm has to be folded"
     assert sum(map(len, all_)) < 2 * len(guide)
 
 

@@ -28,13 +28,13 @@ class Approach:
     A way is the tool's: back along its approach for what it grasps or lets go of, up for what is lifted or put down, back along
     the frame's z axis for what a frame touches.
 
-    Attributes:
+    Args:
+        knots: Of the problem.
         stands: Whether the base stands still meanwhile, as long as the arm alone can do it: in narrow places it has no room.
     """
 
-    def __init__(self, knots: Knots) -> None:
-        self.knots, self.problem, self.chain = knots, knots.problem, knots.chain
-        self.stands = False
+    def __init__(self, knots: Knots, *, stands: bool = False) -> None:
+        self.knots, self.problem, self.chain, self.stands = knots, knots.problem, knots.chain, stands
         joint, local = self.chain.frame(self.chain.robot.tool_frame)
         self.joint, self.local = joint, local
         self.solver = _tool_solver(self.chain.model.saveToString(), joint, local.homogeneous.tobytes())

@@ -17,7 +17,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-__all__ = ["FAN", "Body", "Shape", "Standing", "outline"]
+__all__ = ["FAN", "Body", "Shape", "Standing", "hull_points"]
 
 Shape = tuple[coal.CollisionGeometry, pin.SE3]
 """A convex shape and where it is."""
@@ -53,7 +53,7 @@ class Standing:
         self.shapes = [(shape, _transform(placement)) for shape, placement in shapes]
         self.support, self.height = np.empty((len(shapes), len(FAN))), np.empty((len(shapes), 2))
         for s, (shape, placement) in enumerate(shapes):
-            points, radius = outline(shape, placement, outer=True)
+            points, radius = hull_points(shape, placement, outer=True)
             self.support[s] = (points[:, :2] @ FAN.T).max(axis=0) + radius
             self.height[s] = points[:, 2].min() - radius, points[:, 2].max() + radius
         self.extent = self.support[:, _AXES].copy()
@@ -69,7 +69,7 @@ class Body:
     def __init__(self, shapes: Sequence[Shape], world: Standing, margin: float) -> None:
         self.world, self.margin = world, margin
         self.shapes = [(shape, _transform(placement)) for shape, placement in shapes]
-        outlines = [outline(shape, placement, outer=True) for shape, placement in shapes]
+        outlines = [hull_points(shape, placement, outer=True) for shape, placement in shapes]
         radius = np.array([radius for _, radius in outlines])
         low = np.array([points[:, 2].min() for points, _ in outlines]) - radius
         high = np.array([points[:, 2].max() for points, _ in outlines]) + radius
@@ -237,7 +237,7 @@ def _transform(placement: pin.SE3) -> coal.Transform3s:
     return coal.Transform3s(placement.rotation, placement.translation)
 
 
-def outline(shape: coal.CollisionGeometry, placement: pin.SE3, *, outer: bool) -> tuple[NDArray[np.float64], float]:
+def hull_points(shape: coal.CollisionGeometry, placement: pin.SE3, *, outer: bool) -> tuple[NDArray[np.float64], float]:
     """Return points, shape (n, 3) [m], and a radius around them: their hull contains a shape or, if not `outer`, is inside it."""
     rim = np.column_stack([np.cos(_RIM), np.sin(_RIM), np.zeros(len(_RIM))]) / (np.cos(_RIM[1] / 2) if outer else 1.0)
     radius = shape.getSweptSphereRadius() if outer else 0.0

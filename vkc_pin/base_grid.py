@@ -206,7 +206,7 @@ class BaseGrid:
     # -- distances ------------------------------------------------------------------------------------------------------
 
     def distances(self, start: ArrayLike) -> NDArray[np.float64]:
-        """Return how far the base drives at least from a place [m] to every cell, shape (cells, cells) [m]; infinite: no way.
+        """Return how far the base drives at least from a place [m] to every cell, shape (cells, cells) [m]; infinite: no path.
 
         Turns are free, and only what surely blocks the base is in the way.
         """
@@ -234,7 +234,7 @@ class BaseGrid:
         """Return how far it is at least to every cell, shape (W, cells, cells) [m], if turns are free.
 
         Args:
-            entries: W times the cells, as i·cells + j, where the way begins, and what it costs to be there [m].
+            entries: W times the cells, as i·cells + j, where the path begins, and what it costs to be there [m].
             stuck: Where the base cannot be at a heading, shape (cells, cells, HEADINGS).
         """
         from scipy.sparse import csr_array

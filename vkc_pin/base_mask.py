@@ -16,7 +16,7 @@ import coal
 import numpy as np
 from numpy.typing import NDArray
 
-from vkc_pin.base_body import FAN, Shape, outline
+from vkc_pin.base_body import FAN, Shape, hull_points
 
 __all__ = ["Lattice", "stuck"]
 
@@ -81,7 +81,7 @@ def stuck(
 def _solids(shapes: Sequence[Shape]) -> list[_Solid]:
     solids = []
     for shape, placement in shapes:
-        points, _ = outline(shape, placement, outer=False)
+        points, _ = hull_points(shape, placement, outer=False)
         if len(points) and np.ptp(points[:, 2]) > _FLAT:
             prism = isinstance(shape, coal.Box | coal.Cylinder) and bool(abs(placement.rotation[2, 2]) > 1.0 - 1e-9)
             key = points.tobytes() + bytes([prism])
@@ -169,9 +169,9 @@ def _support_of(
         ],
         axis=-1,
     )
-    way, offset = beyond - touched, corner - touched
-    share = np.clip(np.sum(offset * way, axis=-1) / np.maximum(np.sum(way * way, axis=-1), 1e-12), 0.0, 1.0)
-    return support, np.linalg.norm(offset - share[..., None] * way, axis=-1).max(axis=2)
+    edge, offset = beyond - touched, corner - touched
+    share = np.clip(np.sum(offset * edge, axis=-1) / np.maximum(np.sum(edge * edge, axis=-1), 1e-12), 0.0, 1.0)
+    return support, np.linalg.norm(offset - share[..., None] * edge, axis=-1).max(axis=2)
 
 
 def _fill(

@@ -15,15 +15,15 @@ from vkc_pin.base_ways import TURNING, Drive, Ground, wrapped
 from vkc_pin.errors import InputError
 from vkc_pin.interrupt import NEVER, Interrupt
 
-__all__ = ["BasePath", "along", "shortest_path"]
+__all__ = ["BasePath", "poses_along", "shortest_path"]
 
-_KNOT = 0.5  # [m] between places where the way may be shortened
+_KNOT = 0.5  # [m] between places where the path may be shortened
 _SAME = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class BasePath:
-    """A way of the base: straight drives, forwards or backwards, with turns in place between them.
+    """A path of the base: straight drives, forwards or backwards, with turns in place between them.
 
     Attributes:
         poses: x, y [m] and yaw [rad, continuous] where a drive or turn begins or ends; from the start to the goal, shape (K, 3).
@@ -46,7 +46,7 @@ def shortest_path(
     smooth: bool = True,
     interrupt: Interrupt = NEVER,
 ) -> BasePath | None:
-    """Return the cheapest way from the start to one of the goals, or None if there is none.
+    """Return the cheapest path from the start to one of the goals, or None if there is none.
 
     A blocked start can be left; goals that are blocked are not reached. Nothing here is random.
 
@@ -54,9 +54,9 @@ def shortest_path(
         grid: Where the base fits.
         start: x, y, yaw [m, rad].
         goals: The same for each goal, shape (G, 3).
-        costs: What reaching each goal costs beside the way, shape (G,) [m]; None: nothing.
-        smooth: Shorten the way over the grid where it turns more often than needed.
-        interrupt: Ends the search, as if there were no way.
+        costs: What reaching each goal costs beside the path, shape (G,) [m]; None: nothing.
+        smooth: Shorten the path over the grid where it turns more often than needed.
+        interrupt: Ends the search, as if there were no path.
 
     Raises:
         InputError: Shapes do not fit, or a number is not finite.
@@ -80,7 +80,7 @@ def shortest_path(
     return _assembled(ground, drives, yaw, goal, float(extra[goal]))
 
 
-def along(path: BasePath, steps: int, *, turning: float = 0.5) -> NDArray[np.float64]:
+def poses_along(path: BasePath, steps: int, *, turning: float = 0.5) -> NDArray[np.float64]:
     """Return `steps` poses along a path, without its start, the last at its goal: slow at both ends, shape (steps, 3) [m, rad].
 
     Args:
@@ -100,7 +100,7 @@ def along(path: BasePath, steps: int, *, turning: float = 0.5) -> NDArray[np.flo
 
 
 def _shortened(ground: Ground, drives: list[Drive], last: float) -> tuple[list[Drive], float]:
-    """Return drives, and the yaw at the goal, that go straight between places on the way where that is free and cheaper."""
+    """Return drives, and the yaw at the goal, that go straight between places on the path where that is free and cheaper."""
     forced = 0 if ground.leaving is None else 1  # the first drive leaves what the base stands in
     result, yaw = drives[:forced], drives[0].yaw if forced else float(ground.start[2])
     rest = []
@@ -110,7 +110,7 @@ def _shortened(ground: Ground, drives: list[Drive], last: float) -> tuple[list[D
     while rest:
         yaws = np.array([yaw, *(drive.yaw for drive in rest), last])
         turns = TURNING * np.abs(np.diff(yaws))
-        # Up to the end of each drive, turned as the way goes on there.
+        # Up to the end of each drive, turned as the path goes on there.
         cost = turns[0] + np.cumsum([drive.cost for drive in rest] + turns[1:])
         best, low, high = None, 1, len(rest)
         tried = high

@@ -1,9 +1,9 @@
 """A* for the mobile base over cells and headings.
 
-A move is asked for only when the search is about to take it. The heuristic is what the way from the start costs, with headings
+A move is asked for only when the search is about to take it. The heuristic is what the path from the start costs, with headings
 and turns, if nothing were in the way but what is known to be blocked; SciPy finds it for all cells and headings at once. It is
-admissible and consistent, since what turns out to be blocked only makes ways longer. After surprises it is found again, with what
-has been learned.
+admissible and consistent, since what turns out to be blocked only makes paths longer. After surprises it is found again, with
+what has been learned.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vkc_pin.base_grid import HEADINGS
-from vkc_pin.base_task import AHEAD, BACK, BEGIN, DIRECT, END, LEFT, RIGHT, Step, Task
+from vkc_pin.base_task import AHEAD, BACK, BEGIN, DIRECT, END, LEFT, RIGHT, Move, Query
 from vkc_pin.base_ways import BACKWARDS, TURNING, UNIT, Drive, Ground, wrapped
 from vkc_pin.interrupt import NEVER, Interrupt
 
@@ -23,36 +23,36 @@ __all__ = ["cheapest"]
 _OPPOSITE = [BACK, AHEAD, RIGHT, LEFT]
 _KINDS = (AHEAD, BACK, LEFT, RIGHT)
 
-_Entry = tuple[float, float, int, int, int, Step]  # cost in all, cost up to the node, tie-break, node, the next one, step
+_Entry = tuple[float, float, int, int, int, Move]  # cost in all, cost up to the node, tie-break, node, the next one, move
 
-# By how much [m] ways may be longer than what is known to be needed, and the number of cells to look at, one try after the other.
+# By how much [m] paths may be longer than what is known to be needed, and how many cells are looked at, one try after the other.
 _WIDER = ((1.0, 1000), (1.0, 2000), (3.0, 4000), (np.inf, 0))
-_CURVES = 0.13  # by what share ways are longer, mostly, because of turns on the way
+_CURVES = 0.13  # by what share paths are longer, mostly, because of turns
 _PATIENCE = 8e-3  # share of all nodes that are looked at, after a surprise, before the heuristic is found again
 
 
 def cheapest(
     ground: Ground, extra: NDArray[np.float64], interrupt: Interrupt = NEVER
 ) -> tuple[float, int, list[Drive], float] | None:
-    """Return the cheapest way to a goal that is not blocked, or None if there is none.
+    """Return the cheapest path to a goal that is not blocked, or None if there is none.
 
     Args:
         ground: Where the base may move, from where to where.
-        extra: What reaching each goal costs beside the way, shape (G,) [m].
-        interrupt: Ends the search, as if there were no way.
+        extra: What reaching each goal costs beside the path, shape (G,) [m].
+        interrupt: Ends the search, as if there were no path.
 
     Returns:
         The cost [m], the goal, the drives up to it, with continuous yaws, and the yaw at the goal.
     """
-    task = Task(ground, extra)
-    if not task.ends:
+    query = Query(ground, extra)
+    if not query.ends:
         return None
-    # What the way costs at least up to every cell, and from it on.
+    # What the path costs at least up to every cell, and from it on.
     count = ground.grid.cells**2
     first, last = np.full(count, np.inf), np.full(count, np.inf)
-    np.minimum.at(first, task.starts.cell, task.starts.cost * UNIT)
-    for goal, ways in task.ends.items():
-        np.minimum.at(last, ways.cell, ways.cost * UNIT + extra[goal])
+    np.minimum.at(first, query.starts.cell, query.starts.cost * UNIT)
+    for goal, ends in query.ends.items():
+        np.minimum.at(last, ends.cell, ends.cost * UNIT + extra[goal])
     entries = [(np.flatnonzero(np.isfinite(cost)), cost[np.isfinite(cost)]) for cost in (first, last)]
     before, after = ground.grid.spread(entries, ground.stuck)
     least = np.sort(before + after, axis=None)
@@ -60,16 +60,16 @@ def cheapest(
     for longer, cells in _WIDER:
         if found is None and cost < np.inf:
             bound = max(cost + longer, float(least[min(cells, count - 1)]))
-            cost, found = _Round(task, before, after, bound).run(interrupt)
+            cost, found = _Round(query, before, after, bound).run(interrupt)
     return None if found is None else (cost, *found)
 
 
 class _Round:
     """A* over some of the cells, from the goals back to the start: dead ends are mostly around goals, and small."""
 
-    def __init__(self, task: Task, before: NDArray[np.float64], after: NDArray[np.float64], bound: float) -> None:
-        """Look at the cells over which a way may cost less than `bound` [m], given what it costs at least up to and from it."""
-        self.task, self.ground, self.bound = task, task.ground, bound / UNIT
+    def __init__(self, query: Query, before: NDArray[np.float64], after: NDArray[np.float64], bound: float) -> None:
+        """Look at the cells over which a path may cost less than `bound` [m], given what it costs at least up to and from it."""
+        self.query, self.ground, self.bound = query, query.ground, bound / UNIT
         grid = self.ground.grid
         cells = np.isfinite(before + after) & (before + after <= bound)
         i, j = np.nonzero(cells)
@@ -95,7 +95,7 @@ class _Round:
         ]
         self.targets = np.full((self.start + 2, 4), self.nowhere, np.int32)
         self.targets[: self.start] = np.stack(leads, axis=-1).reshape(-1, 4)
-        for cell, h, kind in task.shut:
+        for cell, h, kind in query.shut:
             self._shut(int(self.node[cell, h]), kind)
         left = wrapped(np.roll(grid.yaws, -1) - grid.yaws)
         costs = [grid.lengths, BACKWARDS * grid.lengths, TURNING * left, TURNING * np.roll(left, 1)]
@@ -109,7 +109,7 @@ class _Round:
         from scipy.sparse import csr_array
         from scipy.sparse.csgraph import dijkstra
 
-        starts, closed = self.task.starts, self.task.closed
+        starts, closed = self.query.starts, self.query.closed
         self.begin.clear()
         for k, (node, cost) in enumerate(zip(self.node[starts.cell, starts.heading].tolist(), starts.cost.tolist(), strict=True)):
             if node != self.nowhere and (BEGIN, 0, k) not in closed:
@@ -118,7 +118,7 @@ class _Round:
         weights = np.broadcast_to(self.costs, (len(self.cell), HEADINGS, 4)).reshape(-1)
         graph = csr_array(
             (
-                np.concatenate([weights, [min(ways)[0] for ways in self.begin.values()]]),
+                np.concatenate([weights, [min(moves)[0] for moves in self.begin.values()]]),
                 np.concatenate([self.targets[: self.start].reshape(-1), first]),
                 np.concatenate([np.arange(0, edges + 1, 4), [edges + len(first)] * 2]).astype(np.int32),
             ),
@@ -126,13 +126,13 @@ class _Round:
         )
         self.passed = dijkstra(graph, indices=self.start)
         self.passed[self.nowhere] = np.inf
-        # No way through these is good enough; the next time they are left out.
+        # No path through these is good enough; the next time they are left out.
         self.targets[: self.start][self.passed[: self.start] + self.after > self.bound + 0.5] = self.nowhere
 
     def run(self, interrupt: Interrupt) -> tuple[float, tuple[int, list[Drive], float] | None]:
-        """Return the cheapest way, its goal, drives and the yaw at the goal, after its cost [m].
+        """Return the goal of the cheapest path, its drives and the yaw at the goal, after its cost [m].
 
-        If no way costs less than the bound, None, after what all ways cost at least; infinite: there is none.
+        If no path costs less than the bound, None, after what all paths cost at least; infinite: there is none.
         """
         queue, leads, surprised, count = self._endings(), dict[int, _Entry](), -1, 0
         # By the heading at their end: turning right from it costs what turning left to it does.
@@ -141,10 +141,10 @@ class _Round:
             if interrupt.pressed:
                 return np.inf, None
             entry = heapq.heappop(queue)
-            total, passed, _, node, _, step = entry
+            total, passed, _, node, _, move = entry
             if total > self.bound:
                 return total * UNIT, None
-            if node in leads or step in self.task.closed:
+            if node in leads or move in self.query.closed:
                 continue
             if not self._free(entry):
                 self._learn(entry)
@@ -165,18 +165,18 @@ class _Round:
                 if before < np.inf and source not in leads:
                     count += 1
                     heapq.heappush(queue, (spent + cost + before, before, -count, source, node, (kind, 0, 0)))
-            for cost, way in self.begin.get(node, ()):
+            for cost, number in self.begin.get(node, ()):
                 count += 1
-                heapq.heappush(queue, (spent + cost, 0.0, -count, self.start, node, (BEGIN, 0, way)))
+                heapq.heappush(queue, (spent + cost, 0.0, -count, self.start, node, (BEGIN, 0, number)))
         return self.bound * UNIT, None
 
     def _endings(self) -> list[_Entry]:
-        """Return the ways to the goals from cells around them, and straight from the start, as a heap."""
-        task, queue, number = self.task, list[_Entry](), 0
-        for goal, ways in task.ends.items():
-            nodes, extra = self.node[ways.cell, ways.heading], round(task.extra[goal] / UNIT)
+        """Return the moves to the goals from cells around them, and straight from the start, as a heap."""
+        query, queue, number = self.query, list[_Entry](), 0
+        for goal, ends in query.ends.items():
+            nodes, extra = self.node[ends.cell, ends.heading], round(query.extra[goal] / UNIT)
             passed = self.passed[nodes]
-            total = ways.cost + extra + passed
+            total = ends.cost + extra + passed
             some, beyond = np.flatnonzero(total <= self.bound), np.flatnonzero((total > self.bound) & (total < np.inf))
             some = np.append(some, beyond[np.argsort(total[beyond], kind="stable")[:1]])  # only the least is ever looked at
             columns = (values.tolist() for values in (some, nodes[some], total[some], passed[some]))
@@ -195,11 +195,11 @@ class _Round:
         return queue
 
     def _free(self, entry: _Entry) -> bool:
-        """Return whether the step of an entry is free all along."""
-        _, _, _, node, after, step = entry
-        grid, kind = self.ground.grid, step[0]
+        """Return whether the move of an entry is free all along."""
+        _, _, _, node, after, move = entry
+        grid, kind = self.ground.grid, move[0]
         if kind not in _KINDS:
-            return self.task.free(step, float(grid.yaws[node % HEADINGS]))
+            return self.query.free(move, float(grid.yaws[node % HEADINGS]))
         # Backwards, and to the right, the same move is taken from its other end.
         first, second = (node, after) if kind in (AHEAD, LEFT) else (after, node)
         index, heading = divmod(first, HEADINGS)
@@ -213,16 +213,17 @@ class _Round:
         return self.ground.driven(Drive(*ends, float(grid.yaws[heading])))
 
     def _learn(self, entry: _Entry) -> None:
-        """Take out a step that is not free, and what is blocked around it."""
-        _, _, _, node, _, step = entry
-        if step[0] not in _KINDS:
-            self.task.close(step)
-            if step[0] == BEGIN:
-                self.begin = {n: [w for w in ways if (BEGIN, 0, w[1]) not in self.task.closed] for n, ways in self.begin.items()}
+        """Take out a move that is not free, and what is blocked around it."""
+        _, _, _, node, _, move = entry
+        kind, closed = move[0], self.query.closed
+        if kind not in _KINDS:
+            self.query.close(move)
+            if kind == BEGIN:
+                self.begin = {n: [m for m in moves if (BEGIN, 0, m[1]) not in closed] for n, moves in self.begin.items()}
             return
         index, heading = divmod(node, HEADINGS)
-        self.task.shut.add((self.cell[index], heading, step[0]))
-        self._shut(node, step[0])
+        self.query.shut.add((self.cell[index], heading, kind))
+        self._shut(node, kind)
         neighbours = [*self.targets[node].tolist(), *self._beside(index, heading)]
         if self._blocked(node):  # then its neighbours may well be, too
             for neighbour in neighbours:
@@ -257,21 +258,23 @@ class _Round:
 
     def _trace(self, leads: dict[int, _Entry]) -> tuple[int, list[Drive], float]:
         """Return the goal, the drives up to it, and the yaw there."""
-        task, ground, yaws = self.task, self.ground, self.ground.grid.yaws
+        query, ground, yaws = self.query, self.ground, self.ground.grid.yaws
         drives: list[Drive] = []
         yaw, node, before = float(ground.start[2]), self.start, -1
         while True:
-            _, _, _, _, after, (kind, goal, way) = leads[node]
+            _, _, _, _, after, (kind, goal, number) = leads[node]
             if kind in (LEFT, RIGHT):
                 yaw += float(wrapped(yaws[after % HEADINGS] - yaws[node % HEADINGS]))
             elif kind in (AHEAD, BACK):
                 ends = [ground.center(self.cell[n // HEADINGS]) for n in (node, after)]
                 drives.append(Drive(drives.pop().a if kind == before else ends[0], ends[1], yaw))
             else:
-                direct = ground.direct(goal, way) if kind == DIRECT else None
-                step = ground.begin(task.starts, way) if kind == BEGIN else direct or ground.end(task.ends[goal], way, goal, yaw)
-                drives.append(step[0])
-                yaw = step[1]
+                if kind == BEGIN:
+                    drive, yaw = ground.begin(query.starts, number)
+                else:
+                    direct = ground.direct(goal, number) if kind == DIRECT else None
+                    drive, yaw = direct or ground.end(query.ends[goal], number, goal, yaw)
+                drives.append(drive)
             if after < 0:
                 return goal, drives, yaw
             node, before = after, kind

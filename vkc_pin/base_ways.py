@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from vkc_pin.base_grid import BaseGrid
 
-__all__ = ["BACKWARDS", "SIDEWAYS", "TURNING", "UNIT", "Drive", "Ground", "Ways", "wrapped"]
+__all__ = ["BACKWARDS", "SIDEWAYS", "TURNING", "UNIT", "Connections", "Drive", "Ground", "wrapped"]
 
 TURNING = 0.3
 """What turning costs beside driving [m/rad]."""
@@ -23,10 +23,10 @@ BACKWARDS = 1.2
 SIDEWAYS = 5.0
 """What a metre costs on which the base slides instead of turning, near the start or a goal where it has no room to turn [m]."""
 UNIT = 1e-6
-"""Costs on the grid are whole numbers of this [m], so that equal ways cost exactly the same."""
+"""Costs on the grid are whole numbers of this [m], so that equal paths cost exactly the same."""
 
-_ENTRY = 0.6  # [m] from the start, and from the goals, to the cells where the way over the grid begins and ends
-_CELL = 0.1  # [m]: where cells are smaller, so is the way to them
+_ENTRY = 0.6  # [m] from the start, and from the goals, to the cells where the path over the grid begins and ends
+_CELL = 0.1  # [m]: where cells are smaller, so is the distance to them
 _LEAVE = 1.0  # [m]: so far a blocked start may be left in one go, if it overlaps something
 _AWAY = 10.0  # what a metre costs on which the base leaves what it overlaps
 _TRY = np.pi / 16  # [rad] of turning, tried step by step
@@ -56,8 +56,8 @@ class Drive:
 
 
 @dataclass(frozen=True, eq=False)
-class Ways:
-    """Ways between a pose and cells around it: turn, drive or slide straight, turn; arrays over the ways.
+class Connections:
+    """Of a pose with cells around it: turn, drive or slide straight, turn; arrays over the connections.
 
     Attributes:
         cell: As i·cells + j.
@@ -71,9 +71,9 @@ class Ways:
     yaw: NDArray[np.float64]
     cost: NDArray[np.int_]
 
-    def select(self, which: NDArray[np.bool_]) -> Ways:
-        """Return some of the ways."""
-        return Ways(self.cell[which], self.heading[which], self.yaw[which], self.cost[which])
+    def select(self, which: NDArray[np.bool_]) -> Connections:
+        """Return some of them."""
+        return Connections(self.cell[which], self.heading[which], self.yaw[which], self.cost[which])
 
 
 class Ground:
@@ -136,9 +136,9 @@ class Ground:
 
     def _outside(self, drive: Drive) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
         """Yield the parts of a drive that are not near the start or a goal."""
-        way, from_place = drive.b - drive.a, drive.a - self._places
-        # |a + t·way − place|² = near², a quadratic in t.
-        square, mixed = float(way @ way), from_place @ way
+        along, from_place = drive.b - drive.a, drive.a - self._places
+        # |a + t·along − place|² = near², a quadratic in t.
+        square, mixed = float(along @ along), from_place @ along
         rest = (from_place**2).sum(axis=1) - self.grid.near**2
         if square < _SAME**2:
             if np.all(rest > 0.0):
@@ -150,23 +150,23 @@ class Ground:
         done = 0.0
         for begin, end in [*inside, (1.0, np.inf)]:
             if done < min(begin, 1.0):
-                yield drive.a + done * way, drive.a + min(begin, 1.0) * way
+                yield drive.a + done * along, drive.a + min(begin, 1.0) * along
             done = max(done, end)
 
     # -- between poses and cells --------------------------------------------------------------------------------------------
 
-    def starts(self) -> Ways:
-        """Return the ways from the start to the cells around it."""
-        ways = self._ways(self.start, 1.0, _LEAVE if self.haste > 1.0 else _ENTRY, self.haste)
+    def starts(self) -> Connections:
+        """Return the connections from the start to the cells around it."""
+        found = self._connections(self.start, 1.0, _LEAVE if self.haste > 1.0 else _ENTRY, self.haste)
         # A search from the goals would find out last, after it has looked everywhere else.
-        return ways.select(self.turnable(self.start, ways, self.leaving))
+        return found.select(self.turnable(self.start, found, self.leaving))
 
-    def ends(self, goal: int) -> Ways:
-        """Return the ways to a goal from the cells around it."""
-        return self._ways(self.goals[goal], -1.0, _ENTRY, 1.0)
+    def ends(self, goal: int) -> Connections:
+        """Return the connections to a goal from the cells around it."""
+        return self._connections(self.goals[goal], -1.0, _ENTRY, 1.0)
 
-    def _ways(self, pose: NDArray[np.float64], sign: float, radius: float, haste: float) -> Ways:
-        """Return the ways from a pose (`sign` 1), or to it (-1), within a radius [m], where a metre costs `haste`."""
+    def _connections(self, pose: NDArray[np.float64], sign: float, radius: float, haste: float) -> Connections:
+        """Return those from a pose (`sign` 1), or to it (-1), within a radius [m], where a metre costs `haste`."""
         grid = self.grid
         step = float(grid.step.max())
         cells = grid.around(float(pose[0]), float(pose[1]), max(radius * min(1.0, step / _CELL), 1.5 * step))
@@ -177,29 +177,32 @@ class Ground:
         heading = np.abs(wrapped(yaw[:, None] - grid.yaws)).argmin(axis=1)
         turned = np.abs(wrapped(yaw - pose[2])) + np.abs(wrapped(yaw - grid.yaws[heading]))
         cost = haste * np.concatenate([length, BACKWARDS * length, SIDEWAYS * length]) + TURNING * turned
-        ways = Ways(np.tile(cells @ [grid.cells, 1], 3), heading, yaw, np.rint(cost / UNIT).astype(int))
-        return ways.select(~self.stuck.reshape(-1, len(grid.yaws))[ways.cell, heading])
+        found = Connections(np.tile(cells @ [grid.cells, 1], 3), heading, yaw, np.rint(cost / UNIT).astype(int))
+        return found.select(~self.stuck.reshape(-1, len(grid.yaws))[found.cell, heading])
 
-    def turnable(self, pose: NDArray[np.float64], ways: Ways, margins: NDArray[np.float64] | None = None) -> NDArray[np.bool_]:
-        """Return for which ways the base can turn at the pose between its yaw and theirs, up to a few degrees more."""
+    def turnable(
+        self, pose: NDArray[np.float64], connections: Connections, margins: NDArray[np.float64] | None = None
+    ) -> NDArray[np.bool_]:
+        """Return for which connections the base can turn at the pose between its yaw and theirs, up to a few degrees more."""
         limits = []
         for side in (1.0, -1.0):
             turned = 0.0
             while turned < np.pi and self.turned(pose[:2], pose[2] + side * turned, pose[2] + side * (turned + _TRY), margins):
                 turned += _TRY
             limits.append(turned + _TRY)
-        turn = wrapped(ways.yaw - pose[2])
+        turn = wrapped(connections.yaw - pose[2])
         return (turn < limits[0]) & (turn > -limits[1])
 
-    def begin(self, ways: Ways, way: int) -> tuple[Drive, float]:
-        """Return the drive of a way from the start, and the yaw in its cell."""
-        drive = Drive(self.start[:2], self.center(ways.cell[way]), float(self.start[2] + wrapped(ways.yaw[way] - self.start[2])))
-        return drive, float(drive.yaw + wrapped(self.grid.yaws[ways.heading[way]] - drive.yaw))
+    def begin(self, connections: Connections, number: int) -> tuple[Drive, float]:
+        """Return the drive of a connection from the start, and the yaw in its cell."""
+        yaw = float(self.start[2] + wrapped(connections.yaw[number] - self.start[2]))
+        drive = Drive(self.start[:2], self.center(connections.cell[number]), yaw)
+        return drive, float(drive.yaw + wrapped(self.grid.yaws[connections.heading[number]] - drive.yaw))
 
-    def end(self, ways: Ways, way: int, goal: int, yaw: float) -> tuple[Drive, float]:
-        """Return the drive of a way to a goal from its cell, where the base has a yaw, and the yaw at the goal."""
+    def end(self, connections: Connections, number: int, goal: int, yaw: float) -> tuple[Drive, float]:
+        """Return the drive of a connection to a goal from its cell, where the base has a yaw, and the yaw at the goal."""
         pose = self.goals[goal]
-        drive = Drive(self.center(ways.cell[way]), pose[:2], float(yaw + wrapped(ways.yaw[way] - yaw)))
+        drive = Drive(self.center(connections.cell[number]), pose[:2], float(yaw + wrapped(connections.yaw[number] - yaw)))
         return drive, float(drive.yaw + wrapped(pose[2] - drive.yaw))
 
     def direct(self, goal: int, how: int) -> tuple[Drive, float] | None:

@@ -44,22 +44,34 @@ class Found(NamedTuple):
     at: list[int]
 
 
+class _Mode(NamedTuple):
+    """How a search goes on; see `Beam.search`."""
+
+    thorough: bool
+    backwards: bool
+
+    @property
+    def width(self) -> int:
+        """How many configurations are kept at a knot."""
+        return _BEAM if self.thorough else _QUICK_BEAM
+
+
 class Beam:
     """Searches a problem's knots.
 
     Args:
         knots: Where configurations come from.
-        routes: The ways that the base would drive; None: as if it drove straight.
+        routes: The paths that the base would drive; None: as if it drove straight.
+        careful: Whether grasps count as free only if the straight way to them is free, too, and paths of the base are those with
+            the arm folded: for narrow places.
         interrupt: Ends a search.
-
-    Attributes:
-        careful: Whether grasps count as free only if the straight way to them is free, too, and ways of the base are those with
-            the arm drawn in: for narrow places.
     """
 
-    def __init__(self, knots: Knots, routes: Routes | None = None, interrupt: Interrupt = NEVER) -> None:
-        self.knots, self.problem, self.routes, self.interrupt = knots, knots.problem, routes, interrupt
-        self.width, self.backwards, self.careful = _BEAM, False, False
+    def __init__(
+        self, knots: Knots, routes: Routes | None = None, *, careful: bool = False, interrupt: Interrupt = NEVER
+    ) -> None:
+        self.knots, self.problem, self.routes, self.careful = knots, knots.problem, routes, careful
+        self.interrupt = interrupt
         self.approaches = {
             int(end): approach_at(int(end) - phase.segments, int(end), self.problem.options)
             for phase, end in zip(self.problem.task.phases, self.problem.ends, strict=True)
@@ -76,7 +88,7 @@ class Beam:
         """
         # A hand that chooses where to grasp, and then does not give way, chooses before it moves anything.
         backwards = backwards and not any(self._closed_at(grasp + 1) for _, grasp, _ in self.problem.choices)
-        self.width, self.backwards = _BEAM if thorough else _QUICK_BEAM, backwards
+        mode = _Mode(thorough, backwards)
         problem = self.problem
         found = Found(problem.start[None, None, :], np.zeros(1), np.zeros(1), [0])
         closed = [problem.closed(phase) for phase in problem.task.phases]
@@ -87,12 +99,12 @@ class Beam:
                 last += 1
             knots, before = self._knots(number, last), found.paths.shape[1]
             if last > number:
-                found = self._go_back(found, knots, number, thorough=thorough)
+                found = self._go_back(found, knots, number, mode)
             else:
                 for knot in knots:
                     if self.interrupt.pressed:
-                        break
-                    found = self._go_on(found, knot, number, thorough=thorough)
+                        return None
+                    found = self._go_on(found, knot, number, mode)
             if self.interrupt.pressed:
                 return None
             if not closed[number] and self.routes is None:
@@ -120,35 +132,35 @@ class Beam:
             knots += np.linspace(begin, end, pieces + 1).round().astype(int)[1:].tolist()
         return knots
 
-    def _go_on(self, found: Found, knot: int, phase: int, *, thorough: bool) -> Found:
+    def _go_on(self, found: Found, knot: int, phase: int, mode: _Mode) -> Found:
         """Return the cheapest paths to the next knot, to which something of a phase leads."""
-        parents, z, bad = self._continue(found.paths, found.cost, knot, phase, thorough=thorough)
+        parents, z, bad = self._continue(found.paths, found.cost, knot, phase, mode)
         total = found.cost[parents] + self._way(found.paths[parents, -1], z, phase) + bad
-        best = self._kept(total, bad, knot)
+        best = self._kept(total, bad, knot, mode.width)
         paths = np.concatenate([found.paths[parents[best]], z[best, None]], axis=1)
         return Found(paths, total[best], (found.trouble[parents] + bad)[best], [*found.at, knot])
 
-    def _kept(self, total: NDArray[np.float64], bad: NDArray[np.float64], knot: int) -> NDArray[np.int_]:
+    def _kept(self, total: NDArray[np.float64], bad: NDArray[np.float64], knot: int, width: int) -> NDArray[np.int_]:
         """Return which continuations to keep: the cheapest and, where a hand chooses how to grasp, some of the other free ones.
 
         What is cheap to grasp may be what cannot be put where it is to be.
         """
         order = np.argsort(total, kind="stable")
         if all(knot != grasp for _, grasp, _ in self.problem.choices):
-            return order[: self.width]
-        cheap, rest = order[: self.width], order[self.width :]
+            return order[:width]
+        cheap, rest = order[:width], order[width:]
         rest = rest[bad[rest] <= 0.0]
-        others = rest[np.linspace(0, len(rest) - 1, min(self.width // _OTHERS, len(rest))).astype(int)]
+        others = rest[np.linspace(0, len(rest) - 1, min(width // _OTHERS, len(rest))).astype(int)]
         return np.concatenate([cheap, others])
 
-    def _go_back(self, found: Found, knots: list[int], phase: int, *, thorough: bool) -> Found:
+    def _go_back(self, found: Found, knots: list[int], phase: int, mode: _Mode) -> Found:
         """Return the cheapest paths through knots, of which all but the first are while something fixed is held after a phase."""
         known = found.paths.shape[1]
-        found = self._go_on(found, knots[-1], phase, thorough=thorough)
+        found = self._go_on(found, knots[-1], phase, mode)
         for knot in knots[-2::-1]:
             if self.interrupt.pressed:
                 break
-            found = self._go_on(found, knot, phase + 1, thorough=thorough)
+            found = self._go_on(found, knot, phase + 1, mode)
         paths = np.concatenate([found.paths[:, :known], found.paths[:, : known - 1 : -1]], axis=1)
         start, grasp, end = paths[:, known - 1], paths[:, known], paths[:, -1]
         cost = found.cost + self._way(start, grasp, phase) - self._way(start, end, phase)
@@ -160,39 +172,41 @@ class Beam:
         weights[:2] *= _DRIVING
         way = np.abs(last - first) * weights
         if self.routes is not None and not self.problem.closed(self.problem.task.phases[phase]):
-            distances = self.routes.distances(phase, first[:, :3], last[:, :3], drawn_in=self.careful)
+            distances = self.routes.distances(phase, first[:, :3], last[:, :3], folded=self.careful)
             way[:, 0], way[:, 1] = weights[0] * distances, 0.0
             np.minimum(way, _NOT_FOUND, out=way)  # where there is no way, others come first
         return np.asarray(way.sum(axis=1))
 
     def _continue(
-        self, paths: NDArray[np.float64], cost: NDArray[np.float64], waypoint: int, phase: int, *, thorough: bool
+        self, paths: NDArray[np.float64], cost: NDArray[np.float64], waypoint: int, phase: int, mode: _Mode
     ) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64]]:
         """Return continuations of `paths` to a waypoint: which path each goes on from, where to, and what is wrong there."""
         knots = self.knots
         if not self.problem.closed(self.problem.task.phases[phase]):
             draws = []
             for _ in range(_DRAWS):
-                parents = np.arange(SCATTER if thorough else SCATTER // 2) % len(paths)
+                parents = np.arange(SCATTER if mode.thorough else SCATTER // 2) % len(paths)
                 z, found = knots.knot(paths[parents, -1], waypoint, "scatter")
                 price = cost[parents] + self._way(paths[parents, -1], z, phase)
-                draws.append(self._cheapest(price, parents, z, found, waypoint))
+                draws.append(self._cheapest(price, parents, z, found, waypoint, mode.width))
                 if sum(np.count_nonzero(bad == 0) for _, _, bad in draws) >= _ENOUGH:
                     break
             parents, z, bad = (np.concatenate(parts) for parts in zip(*draws, strict=True))
-            return self._pushed(paths, cost, parents, z, bad, waypoint, phase)
+            return self._pushed(paths, cost, parents, z, bad, waypoint, phase, mode.width)
         parents = np.arange(len(paths))
         z, found = knots.knot(paths[:, -1], waypoint, "track")
-        if not thorough:
+        if not mode.thorough:
             bad = self._bad(z, found, waypoint)
             if np.count_nonzero(bad == 0) >= _EASY * len(paths):
                 return parents, z, bad
-        more = np.arange(self.width * _CHILDREN - len(paths)) % len(paths)
+        more = np.arange(mode.width * _CHILDREN - len(paths)) % len(paths)
         shaken, also = knots.knot(paths[more, -1], waypoint, "shake")
         parents, z, found = np.concatenate([parents, more]), np.concatenate([z, shaken]), np.concatenate([found, also])
         price = cost[parents] + self._way(paths[parents, -1], z, phase)
-        parents, z, bad = self._cheapest(price, parents, z, found, waypoint)
-        return self._pushed(paths, cost, parents, z, bad, waypoint, phase) if self.backwards else (parents, z, bad)
+        parents, z, bad = self._cheapest(price, parents, z, found, waypoint, mode.width)
+        if not mode.backwards:
+            return parents, z, bad
+        return self._pushed(paths, cost, parents, z, bad, waypoint, phase, mode.width)
 
     def _pushed(
         self,
@@ -203,12 +217,13 @@ class Beam:
         bad: NDArray[np.float64],
         waypoint: int,
         phase: int,
+        width: int,
     ) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64]]:
         """Return continuations and, if few of them are free, the best of them pushed out of what they are in."""
         if np.count_nonzero(bad == 0) >= (_FEW if self._closed_at(waypoint) else _ENOUGH):
             return parents, z, bad
         price = cost[parents] + self._way(paths[parents, -1], z, phase) + bad
-        best = np.argsort(price, kind="stable")[: 2 * self.width]
+        best = np.argsort(price, kind="stable")[: 2 * width]
         pushed = self.knots.clear(z[best], waypoint)
         more = self._bad(pushed, np.ones(len(pushed), bool), waypoint)
         return np.concatenate([parents, parents[best]]), np.concatenate([z, pushed]), np.concatenate([bad, more])
@@ -220,13 +235,14 @@ class Beam:
         z: NDArray[np.float64],
         found: NDArray[np.bool_],
         waypoint: int,
+        width: int,
     ) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64]]:
         """Return continuations, the cheapest first; what the beam cannot keep anyway need not be looked at."""
         order = np.argsort(price + _NOT_FOUND * ~found, kind="stable")
         parents, z, found = parents[order], z[order], found[order]
-        half = min(2 * self.width, len(z))
+        half = min(2 * width, len(z))
         bad = self._bad(z[:half], found[:half], waypoint)
-        if np.count_nonzero(bad == 0) >= self.width:
+        if np.count_nonzero(bad == 0) >= width:
             return parents[:half], z[:half], bad
         return parents, z, np.concatenate([bad, self._bad(z[half:], found[half:], waypoint)])
 

@@ -82,7 +82,7 @@ class PhaseGeometry:
         return numbers[numbers >= 0]
 
     def maybe_within(
-        self, reach: float, rotations: NDArray[np.float64], translations: NDArray[np.float64]
+        self, reach: float, rotations: NDArray[np.float64], translations: NDArray[np.float64], *, standing: bool = True
     ) -> tuple[NDArray[np.int_], NDArray[np.int_], NDArray[np.float64]]:
         """Return (configuration, pair) of all pairs that bounding volumes cannot prove to be `reach` [m] apart, in this order.
 
@@ -93,17 +93,19 @@ class PhaseGeometry:
             reach: [m].
             rotations: Of all joints in the world, shape (W, J, 3, 3).
             translations: Of all joints in the world, shape (W, J, 3) [m].
+            standing: Whether what stands in the world counts, too; otherwise only pairs of which both move.
         """
         boxes = len(self._groups[1]) * (len(self.joint) - self._moving_count)
         step = max(1, min(_ROWS, _AT_ONCE // max(boxes, 1)))
-        parts = [self._near(reach, rotations[w : w + step], translations[w : w + step]) for w in range(0, len(rotations), step)]
+        starts = range(0, len(rotations), step)
+        parts = [self._near(reach, rotations[w : w + step], translations[w : w + step], standing) for w in starts]
         if len(parts) == 1:
             return parts[0]
         at = np.concatenate([w + number * step for number, (w, _, _) in enumerate(parts)])
         return at, np.concatenate([k for _, k, _ in parts]), np.concatenate([gaps for _, _, gaps in parts])
 
     def _near(
-        self, reach: float, rotations: NDArray[np.float64], translations: NDArray[np.float64]
+        self, reach: float, rotations: NDArray[np.float64], translations: NDArray[np.float64], standing: bool
     ) -> tuple[NDArray[np.int_], NDArray[np.int_], NDArray[np.float64]]:
         """Return the same as `maybe_within`. From here on the axes of the world come first: that is several times as fast."""
         moving, joint = slice(self._moving_count), self.joint[: self._moving_count]
@@ -111,7 +113,8 @@ class PhaseGeometry:
         turns = _products(carried, self._turn[:, :, None, moving])
         centers = _turned(carried, self._local[:, None, moving]) + translations.transpose(2, 0, 1).take(joint, axis=2)
         moves = self._moving_within(reach, centers)
-        stands = self._standing_within(reach, centers, turns)
+        none = np.zeros(0, int), np.zeros(0, int)
+        stands = self._standing_within(reach, centers, turns) if standing else none
         w, k = (np.concatenate(parts) for parts in zip(moves, stands, strict=True))
         gaps = self._gaps(w, k, len(moves[0]), centers, turns)
         near = np.flatnonzero(gaps < reach)

@@ -10,15 +10,14 @@ from dataclasses import dataclass
 from vkc_pin.actions import actions_of, foresee
 from vkc_pin.errors import InputError
 from vkc_pin.goal import compile_task
-from vkc_pin.initialization import Seed
 from vkc_pin.one_problem import OneProblem
 from vkc_pin.options import Options
 from vkc_pin.outcome import joined
-from vkc_pin.pieces import Piece, seed_of
 from vkc_pin.plan import Plan
 from vkc_pin.planner import guarded
 from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.scene import Scene
+from vkc_pin.seed import PhaseWaypoints, Seed, seed_of
 from vkc_pin.settings import Settings, settings_for
 from vkc_pin.solution import Iteration
 from vkc_pin.steps import Step
@@ -34,7 +33,7 @@ _TRIES = 4  # searches, from different random numbers, for a motion of what is i
 _ROUNDS = 16  # of the solver from one seed: what takes more has mostly run into a dead end, and other seeds are at hand
 _BACK = 3  # how often, in all, what has been decided is given up since what follows cannot be done
 _FINER = 1.6  # times as many waypoints in every search but the first
-_NOTHING = Piece((), (), (), "")
+_NOTHING = PhaseWaypoints((), (), (), "")
 _STOPPED = ("interrupted", "time limit")
 _FINAL = (*_STOPPED, "infeasible")
 
@@ -111,7 +110,7 @@ class _Part:
     """
 
     plan: Plan | None
-    piece: Piece
+    piece: PhaseWaypoints
     after: Scene
     rests: bool = True
     fine: bool = False
@@ -251,7 +250,7 @@ class _Chore:
                 steps = self._steps(number, number + 1)
                 seed = ahead[number].piece.seed if number in ahead else one.initialization  # where it came from at first
                 part = dataclasses.replace(plan, scene=scene, steps=steps, trajectory=trajectory, initialization=seed)
-                piece = Piece(whole.phases[begin:end], whole.names, whole.waypoints[begin:end], seed)
+                piece = PhaseWaypoints(whole.phases[begin:end], whole.names, whole.waypoints[begin:end], seed)
                 ends = one.problem.ends
                 rests = end == len(ends) or ends[end - 1] in one.problem.transcription.structure.rests
                 scene = scene_after(scene, trajectory, task.after)

@@ -1,26 +1,25 @@
-"""The arm drawn in over the base with what it carries, for passages that are too narrow for the robot as it is."""
+"""The arm folded over the base with what it carries, for passages that are too narrow for the robot as it is."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vkc_pin.base_body import outline
+from vkc_pin.base_body import hull_points
 from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.knots import depth
 from vkc_pin.problem import TrajectoryProblem
 
-__all__ = ["compact_arm"]
+__all__ = ["folded_arm"]
 
 _DRAWN, _ROUNDS = 256, 8  # configurations looked at in a round
 _KEPT, _LOOKED = 8, 32  # free ones from which the next round begins; how many are looked at in one go for them
 _SPREAD, _SHRINKS = 0.5, 0.7  # [m] and [rad] around these at first, and how that changes from round to round
 _OVERHANG, _HEIGHT, _TURN = 0.3, 0.2, 0.01  # metres of width that one before or behind the base, one up, or a radian is worth
 _LOW = 0.1  # [m] over the floor, at least
-_AWAY = 100.0  # [m] from the arena, where nothing stands
 
 
-def compact_arm(
+def folded_arm(
     problem: TrajectoryProblem, phase: int, resting: NDArray[np.float64], interrupt: Interrupt = NEVER
 ) -> NDArray[np.float64]:
     """Return the arm, shape (m - 3,) [m] and [rad], with which the robot is narrow: the best that a random search finds.
@@ -71,7 +70,7 @@ class _Body:
         moving += [i for hold in problem.task.phases[phase].held for i in self.chain.held_geometries[hold]]
         points: dict[int, list[NDArray[np.float64]]] = {1: [np.zeros((1, 3))]}
         for i in moving:
-            corners, radius = outline(shapes[i].geometry, shapes[i].placement, outer=True)
+            corners, radius = hull_points(shapes[i].geometry, shapes[i].placement, outer=True)
             corners = np.concatenate([corners - radius, corners + radius]) if radius else corners
             points.setdefault(shapes[i].parentJoint, []).append(corners)
         base = np.concatenate(points.pop(1))
@@ -79,7 +78,7 @@ class _Body:
         self.points = {joint: np.concatenate(corners).T for joint, corners in points.items()}
 
     def price(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return how far what is carried reaches, weighted as in `compact_arm`, shape (B,) [m]."""
+        """Return how far what is carried reaches, weighted as in `folded_arm`, shape (B,) [m]."""
         rotations, translations = self.chain.joint_placements(z)
         turned = rotations[0, 1].T @ rotations
         moved = (translations - translations[0, 1]) @ rotations[0, 1]
@@ -95,9 +94,7 @@ class _Body:
         found = z[:0]
         for begin in range(0, len(z), _LOOKED):
             part = z[begin : begin + _LOOKED]
-            away = part.copy()
-            away[:, 0] = self.problem.scene.arena[1] + _AWAY
-            found = np.concatenate([found, part[depth(self.problem, away, self.waypoint) <= 0.0]])
+            found = np.concatenate([found, part[depth(self.problem, part, self.waypoint, standing=False) <= 0.0]])
             if len(found) >= count:
                 break
         return found[:count]

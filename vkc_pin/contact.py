@@ -127,7 +127,13 @@ class ContactModel:
         return int(self.first_waypoint[phase]) + 1
 
     def evaluate(
-        self, z: NDArray[np.float64], waypoints: NDArray[np.int_], *, reach: float, nearest: int | None = None
+        self,
+        z: NDArray[np.float64],
+        waypoints: NDArray[np.int_],
+        *,
+        reach: float,
+        nearest: int | None = None,
+        standing: bool = True,
     ) -> Contacts:
         """Return the pairs closer than `reach` [m].
 
@@ -136,6 +142,7 @@ class ContactModel:
             waypoints: For each, the waypoint whose phase it belongs to, shape (W,).
             reach: Pairs further apart are left out.
             nearest: How many of them to return per configuration, those that fall shortest of their margins; None: all.
+            standing: Whether what stands in the world counts, too; otherwise only pairs of which both move.
         """
         q = self.chain.coordinates.q(z)
         rotations, translations = self.placements(z)
@@ -144,7 +151,7 @@ class ContactModel:
         vectors: list[NDArray[np.float64]] = []
         for number in set(phase_of.tolist()):
             part, inside = self.phases[number], np.flatnonzero(phase_of == number)
-            at, pairs, bounds = part.maybe_within(reach, rotations[inside], translations[inside])
+            at, pairs, bounds = part.maybe_within(reach, rotations[inside], translations[inside], standing=standing)
             margins = part.margins_at(pairs, waypoints[inside[at]])
             least = bounds - margins
             order = np.lexsort((pairs, least, at))

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vkc_pin.errors import InputError, UnknownNameError
 
-__all__ = ["Coordinates"]
+__all__ = ["Coordinates", "wrapped"]
 
 _UNBOUNDED = ("JointModelRUBX", "JointModelRUBY", "JointModelRUBZ", "JointModelRevoluteUnboundedUnaligned")
 
@@ -129,3 +129,8 @@ class Coordinates:
         if name not in self.names:
             raise UnknownNameError("coordinate", name, self.names)
         return self.names.index(name)
+
+
+def wrapped(angle: Any) -> Any:
+    """Return an angle, or an array of them, between -π and π [rad]."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi

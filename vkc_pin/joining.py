@@ -1,4 +1,4 @@
-"""From configurations at a few waypoints to all of them: straight, along a way of the base, or along one of base and arm."""
+"""From configurations at a few waypoints to all of them: straight, along a path of the base, or along one of base and arm."""
 
 from __future__ import annotations
 
@@ -15,47 +15,47 @@ from vkc_pin.routes import Routes
 from vkc_pin.task import Phase
 from vkc_pin.trees import TRIES, connect, spread
 
-__all__ = ["Around", "Joiner", "Trees", "Ways"]
+__all__ = ["DrivenPaths", "Joiner", "Paths", "RrtPaths"]
 
 _LEAST = 8  # part of the usual tries that trees have at least, however often they failed before
 
 
-class Ways(Protocol):
-    """Finds ways of the robot where nothing fixed is held."""
+class Paths(Protocol):
+    """Finds paths of the robot where nothing fixed is held."""
 
     careful: bool
     """Whether configurations on the straight ways in and out are left out where they hit something."""
 
-    def way(
+    def path(
         self, phase: int, first: NDArray[np.float64], last: NDArray[np.float64], steps: int, *, turns: bool, reaches: bool
     ) -> NDArray[np.float64] | None:
         """Return `steps` rows from `first` to `last`, both (n,), of the robot's first coordinates, shape (steps, c).
 
         The last row is as `last`, but with `turns` the heading may end whole turns further, and without `reaches` the arm may end
-        elsewhere. None if there is no way.
+        elsewhere. None if there is no path.
         """
 
 
-class Around:
-    """The base along the shortest way around what stands there; the arm straight."""
+class DrivenPaths:
+    """The base along the shortest path around what stands there; the arm straight."""
 
     careful = False
 
     def __init__(self, routes: Routes) -> None:
         self.routes = routes
 
-    def way(
+    def path(
         self, phase: int, first: NDArray[np.float64], last: NDArray[np.float64], steps: int, *, turns: bool, reaches: bool
     ) -> NDArray[np.float64] | None:
-        """See `Ways`."""
-        way = self.routes.way(phase, first[:3], last[:3], steps)
-        if way is not None and not turns:
-            way[:, 2] -= (way[-1, 2] - last[2]) * np.arange(1, steps + 1) / steps
-        return way
+        """See `Paths`."""
+        path = self.routes.path(phase, first[:3], last[:3], steps)
+        if path is not None and not turns:
+            path[:, 2] -= (path[-1, 2] - last[2]) * np.arange(1, steps + 1) / steps
+        return path
 
 
-class Trees:
-    """Base and arm along a way that two random trees find, guided by one of the base."""
+class RrtPaths:
+    """Base and arm along a path that two random trees find, guided by one of the base."""
 
     careful = True
 
@@ -63,10 +63,10 @@ class Trees:
         self.knots, self.problem, self.routes, self.interrupt = knots, knots.problem, routes, interrupt
         self.failed: Counter[int] = Counter()  # how often in a row in each phase
 
-    def way(
+    def path(
         self, phase: int, first: NDArray[np.float64], last: NDArray[np.float64], steps: int, *, turns: bool, reaches: bool
     ) -> NDArray[np.float64] | None:
-        """See `Ways`."""
+        """See `Paths`."""
         problem, size = self.problem, self.knots.robot
         poses, last = first[None, :3], last.copy()
         if problem.chain.robot.base != "fixed":
@@ -79,7 +79,7 @@ class Trees:
             else:
                 guide[:, 2] -= turned  # the trees find where there is room to turn
             poses = guide
-        arms = [first[3:size], last[3:size], problem.chain.robot.home, self.routes.compact(phase)]
+        arms = [first[3:size], last[3:size], problem.chain.robot.home, self.routes.folded_arm(phase)]
         ends = np.tile(last[:size], (1 if reaches else len(arms), 1))
         if not reaches:
             ends[:, 3:] = arms
@@ -96,21 +96,21 @@ class Joiner:
     Args:
         knots: Of the problem.
         approach: The straight ways in and out.
-        ways: The others, where nothing fixed is held; None: straight, too.
+        paths: The others, where nothing fixed is held; None: straight, too.
     """
 
-    def __init__(self, knots: Knots, approach: Approach, ways: Ways | None) -> None:
-        self.knots, self.problem, self.approach, self.ways = knots, knots.problem, approach, ways
+    def __init__(self, knots: Knots, approach: Approach, paths: Paths | None) -> None:
+        self.knots, self.problem, self.approach, self.paths = knots, knots.problem, approach, paths
         self.blocked: list[str] = []
-        """A line for every phase in which there was no way."""
+        """A line for every phase in which there was no path."""
 
-    def join(self, path: NDArray[np.float64], at: list[int]) -> NDArray[np.float64] | None:
-        """Return waypoints through `path`, shape (K, n), at waypoints `at`; where something fixed is held, closed.
+    def join(self, through: NDArray[np.float64], at: list[int]) -> NDArray[np.float64] | None:
+        """Return waypoints through configurations, shape (K, n), at waypoints `at`; where something fixed is held, closed.
 
-        None if there is no way somewhere.
+        None if there is no path somewhere.
         """
         problem, size = self.problem, self.problem.chain.size
-        z, knots = np.empty((problem.segments, size)), path.copy()
+        z, knots = np.empty((problem.segments, size)), through.copy()
         begin, previous = 0, None
         for number, (phase, end) in enumerate(zip(problem.task.phases, problem.ends.tolist(), strict=True)):
             inside = [k for k, waypoint in enumerate(at) if begin <= waypoint <= end]
@@ -123,7 +123,7 @@ class Joiner:
         return problem.clip(z)
 
     def _straight(self, z: NDArray[np.float64], through: NDArray[np.float64], when: list[int]) -> None:
-        """Fill rows of z, shape (steps, n), with straight ways through configurations, `when` counted from the row before z."""
+        """Fill rows of z, shape (steps, n), with straight lines through configurations, `when` counted from the row before z."""
         s = np.concatenate([[0.0], smooth(len(z))])
         for column in range(z.shape[1]):
             z[:, column] = np.interp(s[1:], s[when], through[:, column])
@@ -131,29 +131,29 @@ class Joiner:
     def _open(
         self, z: NDArray[np.float64], knots: NDArray[np.float64], inside: list[int], number: int, previous: Phase | None
     ) -> bool:
-        """Fill the rows of a phase in which nothing fixed is held; turn the knots that follow as the way ends. False: no way."""
+        """Fill the rows of a phase in which nothing fixed is held; turn the knots that follow as that ends. False: no path."""
         problem, phase = self.problem, self.problem.task.phases[number]
         end = int(problem.ends[number])
-        through, when, leave, arrive = self._ways(knots[inside], number, previous, len(z))
-        way = None
-        if self.ways is not None:
+        through, when, leave, arrive = self._via(knots[inside], number, previous, len(z))
+        path = None
+        if self.paths is not None:
             steps = when[arrive] - when[leave]
             reaches = self.knots.pose_at(end) is not None
             turns = problem.lower[end - 1, 2] < problem.upper[end - 1, 2]  # unless the goal says how far to turn
-            way = self.ways.way(number, through[leave], through[arrive], steps, turns=turns, reaches=reaches)
-            if way is None:
+            path = self.paths.path(number, through[leave], through[arrive], steps, turns=turns, reaches=reaches)
+            if path is None:
                 self._note(phase, through[leave], through[arrive])
                 return False
-            turned = way[-1, 2] - through[arrive, 2]  # what follows goes on from there
+            turned = path[-1, 2] - through[arrive, 2]  # what follows goes on from there
             through[arrive:, 2] += turned
             knots[inside[-1] :, 2] += turned
         self._straight(z, through, when)
-        if way is not None:
-            z[when[leave] : when[arrive], : way.shape[1]] = way
-            knots[inside[-1], : way.shape[1]] = z[-1, : way.shape[1]]
+        if path is not None:
+            z[when[leave] : when[arrive], : path.shape[1]] = path
+            knots[inside[-1], : path.shape[1]] = z[-1, : path.shape[1]]
         return True
 
-    def _ways(
+    def _via(
         self, ends: NDArray[np.float64], number: int, previous: Phase | None, segments: int
     ) -> tuple[NDArray[np.float64], list[int], int, int]:
         """Return configurations to go through from start to end of a phase, `ends`, shape (2, n), and when, counted from 0.
@@ -163,7 +163,7 @@ class Joiner:
         phase = self.problem.task.phases[number]
         first = self.approach.after(ends[0], phase, previous)
         last = self.approach.before(ends[1], phase)
-        if self.ways is not None and self.ways.careful:
+        if self.paths is not None and self.paths.careful:
             waypoint = self.problem.contacts.inside(number)
             first, last = (part[: len(part) if self._free(part, waypoint) else 0] for part in (first, last))
         steps = self.problem.options.approach_waypoints
@@ -188,7 +188,7 @@ class Joiner:
                 z[rows], _ = solver.solve(z[rows], target, lower=lower, upper=upper, weights=self.knots.weights, iterations=6)
 
     def _note(self, phase: Phase, first: NDArray[np.float64], last: NDArray[np.float64]) -> None:
-        """Note, once a phase, that there is no way between two configurations, shape (n,)."""
+        """Note, once a phase, that there is no path between two configurations, shape (n,)."""
         problem = f"{phase.name}: found no way for the base"
         if not any(note.startswith(problem) for note in self.blocked):
             self.blocked.append(f"{problem} from ({first[0]:.2f}, {first[1]:.2f}) to ({last[0]:.2f}, {last[1]:.2f})")

@@ -212,9 +212,13 @@ class Knots:
         return _row_by_row(self.known.depths, lambda rows, at: depth(self.problem, rows, at), z, waypoint)
 
 
-def depth(problem: TrajectoryProblem, z: NDArray[np.float64], waypoint: int) -> NDArray[np.float64]:
-    """Return how far configurations at a waypoint, shape (B, n), fall short of their margins [m], shape (B,)."""
-    contacts = problem.contacts.evaluate(z, np.full(len(z), waypoint), reach=problem.options.dist_safe, nearest=1)
+def depth(problem: TrajectoryProblem, z: NDArray[np.float64], waypoint: int, *, standing: bool = True) -> NDArray[np.float64]:
+    """Return how far configurations at a waypoint, shape (B, n), fall short of their margins [m], shape (B,).
+
+    Without `standing` only from the robot itself and what it carries.
+    """
+    waypoints, reach = np.full(len(z), waypoint), problem.options.dist_safe
+    contacts = problem.contacts.evaluate(z, waypoints, reach=reach, nearest=1, standing=standing)
     return contacts.shortfall(len(z))
 
 

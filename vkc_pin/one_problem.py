@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vkc_pin.diagnosis import explain, impossible
-from vkc_pin.initialization import HOPELESS, Seed, initialize
+from vkc_pin.initialization import initialize
 from vkc_pin.outcome import TIMES, outcome, spent
-from vkc_pin.pieces import Piece
 from vkc_pin.plan import Plan
 from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.report import Report
 from vkc_pin.scene import Scene
+from vkc_pin.seed import PhaseWaypoints, Seed
 from vkc_pin.settings import Settings
 from vkc_pin.solution import Iteration, Solution
 from vkc_pin.solver import solve
@@ -103,12 +103,12 @@ class OneProblem:
         build_time += problem.transcription.take_build_time()
         return self._plan(best, status, time.perf_counter() - began - build_time, build_time)
 
-    def piece(self) -> Piece:
+    def piece(self) -> PhaseWaypoints:
         """Return the best waypoints, once `run` has ended, for problems of more phases to start from."""
         phases = tuple(phase.key for phase in self.task.phases)
         path, ends = self.problem.waypoints(self.z), [0, *self.problem.ends.tolist()]
         waypoints = tuple(path[first : last + 1] for first, last in itertools.pairwise(ends))
-        return Piece(phases, self.problem.chain.names, waypoints, self.initialization)
+        return PhaseWaypoints(phases, self.problem.chain.names, waypoints, self.initialization)
 
     def _try_seeds(
         self, problem: TrajectoryProblem, seeds: Iterator[Seed], deadline: float, *, searched: bool
@@ -187,7 +187,7 @@ class OneProblem:
         if not self.settings.rough and any(phase.grasps for phase in problem.task.phases[:-1]):
             scored: list[tuple[float, int, Seed]] = []
             for number, seed in enumerate(itertools.islice(seeds, _RACING)):
-                if seed.shortfall > HOPELESS:  # a round would not tell
+                if not seed.races:  # a round would not tell
                     scored.append((np.inf, number, seed))
                     continue
                 solution = self._solve(problem, seed, deadline, rounds=1)

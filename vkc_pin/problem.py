@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from vkc_pin.chain import VirtualKinematicChain, consolidate
 from vkc_pin.contact import ContactModel, Contacts
+from vkc_pin.coordinates import wrapped
 from vkc_pin.goal import compile_task
 from vkc_pin.options import Options
 from vkc_pin.pose import ROW_BOUNDS, target_vector
@@ -148,7 +149,7 @@ class TrajectoryProblem:
             if phase.base is not None:
                 for column, goal in enumerate(phase.base):
                     if goal is not None:
-                        turn = (goal - self.start[2] + np.pi) % (2 * np.pi) - np.pi  # to the nearest of the equal headings
+                        turn = wrapped(goal - self.start[2])  # to the nearest of the equal headings
                         lower[end - 1, column] = upper[end - 1, column] = self.start[2] + turn if column == 2 else goal
             begin = end
         for hold in self.scene.holds:  # until it is let go of, what is clamped stays where it is

@@ -8,9 +8,9 @@ from collections.abc import Mapping, Sequence
 from vkc_pin.goal import compile_task
 from vkc_pin.one_problem import OneProblem
 from vkc_pin.outcome import charged, joined
-from vkc_pin.pieces import seed_of
 from vkc_pin.plan import Plan
 from vkc_pin.scene import Scene
+from vkc_pin.seed import seed_of
 from vkc_pin.settings import Settings
 from vkc_pin.task import Task
 from vkc_pin.world import scene_after

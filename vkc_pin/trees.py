@@ -1,7 +1,7 @@
-"""A way of base and arm together from one configuration to another, by two random trees that grow towards each other.
+"""A path of base and arm together from one configuration to another, by two random trees that grow towards each other.
 
-RRT-Connect (Kuffner and LaValle, ICRA 2000) in the robot's coordinates. The base is drawn near a way that it could drive, the arm
-near postures it is likely to need there, so that narrow passages are found soon.
+RRT-Connect (Kuffner and LaValle, ICRA 2000) in the robot's coordinates. The base is drawn near a path that it could drive, the
+arm near postures it is likely to need there, so that narrow passages are found soon.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ __all__ = ["TRIES", "connect", "spread"]
 TRIES = 1500
 """How often a tree may grow until they meet."""
 
-_BASE = 2.0  # radians of the arm that a metre of the base's way counts as much as
+_BASE = 2.0  # radians of the arm that a metre of the base's path counts as much as
 _STEP = 0.15  # [rad] between configurations that are looked at
 _EXTENT = 1.0  # [rad] by which a tree grows at most towards what is drawn
 _CHUNK = 6  # configurations looked at in one go: what lies behind the first that is blocked is of no use
 _GRAZE = 0.8  # share of a margin that may be missing: the solver pushes that apart
-_RUNS = 0.4  # share of tries in which a tree is to reach a free part of the way
-_GUIDED, _SHAKEN = 0.7, 0.4  # shares of bases drawn on the way, not around its ends, and of arms drawn around what is likely
+_RUNS = 0.4  # share of tries in which a tree is to reach a free part of the base's path
+_GUIDED, _SHAKEN = 0.7, 0.4  # shares of bases drawn on its path, not around its ends, and of arms drawn around what is likely
 _BESIDE, _AROUND, _WILD = (0.1, 0.1, 0.15), (0.4, 0.4, 0.5), 0.6  # standard deviations [m, m, rad] and [rad]
-_SHORTCUTS = 60  # how often it is tried to go straight between places on the way
+_SHORTCUTS = 60  # how often it is tried to go straight between places on the path
 
 
 def connect(
@@ -48,9 +48,9 @@ def connect(
     Args:
         problem: Whose robot and phase it is.
         phase: In which nothing fixed is held.
-        first: Where the way begins, shape (n,); what is not the robot stays so.
+        first: Where the path begins, shape (n,); what is not the robot stays so.
         ends: Where it may end, shape (E, m).
-        poses: x, y [m] and yaw [rad] on a way that the base may take, shape (P, 3).
+        poses: x, y [m] and yaw [rad] on a path that the base may take, shape (P, 3).
         arms: Postures that are likely to be needed, shape (A, m - 3) [m] and [rad].
         rng: Random numbers.
         tries: How often a tree may grow.
@@ -92,7 +92,7 @@ class _Search:
         self.lower, self.upper = limits.T
 
     def run(self, ends: NDArray[np.float64], tries: int, interrupt: Interrupt) -> NDArray[np.float64] | None:
-        """Return the way to one of `ends`."""
+        """Return the path to one of `ends`."""
         start = self.first[: self.size]
         short = self._depth(ends)
         ends = ends[short <= max(self.allowed, short.min())]
@@ -118,7 +118,7 @@ class _Search:
 
     @cached_property
     def runs(self) -> list[NDArray[np.float64]]:
-        """The parts of the way that are free with each of the arms, each shape (R, m)."""
+        """The parts of the base's path that are free with each of the arms, each shape (R, m)."""
         runs = []
         for arm in self.arms:
             rows = np.clip(np.column_stack([self.poses, np.tile(arm, (len(self.poses), 1))]), self.lower, self.upper)
@@ -134,7 +134,7 @@ class _Search:
         return runs
 
     def _grow_to_run(self, tree: _Tree) -> int | None:
-        """Let a tree grow towards a free part of the way, and take in all of it if it gets there."""
+        """Let a tree grow towards a free part of the base's path, and take in all of it if it gets there."""
         number = int(self.rng.choice([k for k in range(len(self.runs)) if k not in tree.runs]))
         rows = self.runs[number]
         at = int(self.rng.integers(len(rows)))
@@ -148,7 +148,7 @@ class _Search:
         return node
 
     def _draw(self, start: NDArray[np.float64], ends: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return a configuration near the way, or near its beginning or end."""
+        """Return a configuration near the base's path, or near its beginning or end."""
         rng, goal = self.rng, np.empty(self.size)
         if rng.random() < _GUIDED:
             goal[:3] = self.poses[rng.integers(len(self.poses))] + rng.random() * rng.normal(size=3) * _BESIDE
@@ -175,7 +175,7 @@ class _Search:
         return tree.add(goal if reached == 1.0 else start + reached * (goal - start), near)
 
     def _along(self, a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-        """Return what share of the straight way from `a` to `b`, both (m,), is free."""
+        """Return what share of the straight line from `a` to `b`, both (m,), is free."""
         count = max(1, int(np.ceil(np.abs((b - a) * self.weights).max() / _STEP)))
         s = np.arange(1, count + 1) / count
         for begin in range(0, count, _CHUNK):
@@ -211,16 +211,24 @@ class _Tree:
     """Configurations, each with the one it was reached from."""
 
     def __init__(self, roots: NDArray[np.float64], weights: NDArray[np.float64]) -> None:
-        self.nodes, self.parents, self.weights = roots.copy(), [-1] * len(roots), weights
+        self._rows, self.parents, self.weights = roots.copy(), [-1] * len(roots), weights  # rows: those in use, and spare ones
         self.runs: set[int] = set()
+
+    @property
+    def nodes(self) -> NDArray[np.float64]:
+        """The configurations, shape (K, m)."""
+        return self._rows[: len(self.parents)]
 
     def nearest(self, goal: NDArray[np.float64]) -> int:
         return int(np.argmin(np.linalg.norm((self.nodes - goal) * self.weights, axis=1)))
 
     def add(self, node: NDArray[np.float64], parent: int) -> int:
-        self.nodes = np.concatenate([self.nodes, node[None]])
+        number = len(self.parents)
+        if number == len(self._rows):
+            self._rows = np.concatenate([self._rows, np.empty_like(self._rows)])
+        self._rows[number] = node
         self.parents.append(parent)
-        return len(self.parents) - 1
+        return number
 
     def path(self, node: int) -> NDArray[np.float64]:
         """Return the configurations from the root to a node, shape (K, m)."""

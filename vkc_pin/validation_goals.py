@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
+from vkc_pin.coordinates import wrapped
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.options import Options
 from vkc_pin.report import Violation
@@ -222,7 +223,7 @@ def _misses(samples: Samples, step: Step, end: int, options: Options) -> list[Mi
         distance = float(np.hypot(x - step.x, y - step.y))
         expect("base", distance, "m", f"{distance:.4f} m from the place to go to")
         if step.yaw is not None:
-            turn = float(abs((yaw - step.yaw + np.pi) % (2 * np.pi) - np.pi))
+            turn = float(abs(wrapped(yaw - step.yaw)))
             expect("base heading", turn, "rad", f"turned {turn:.4f} rad from the heading asked for")
     return misses
 

@@ -17,13 +17,14 @@ from vkc_pin.baselines.failure import FailedError
 from vkc_pin.baselines.following import follow
 from vkc_pin.baselines.postures import at_home, postures, through
 from vkc_pin.goal import compile_task
-from vkc_pin.initialization import Seed, initialize
+from vkc_pin.initialization import initialize
 from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.knots import Knots, smooth
 from vkc_pin.options import Options
 from vkc_pin.outcome import TIMES
 from vkc_pin.problem import TrajectoryProblem
 from vkc_pin.scene import Scene
+from vkc_pin.seed import Seed
 from vkc_pin.solver import SOLVED_RATE_TOLERANCE, solve
 from vkc_pin.steps import Actuate, GoTo, Grasp, Place, Step
 from vkc_pin.trajectory import Trajectory, join

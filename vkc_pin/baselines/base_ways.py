@@ -6,16 +6,16 @@ import functools
 from collections.abc import Iterator
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import NDArray
 
-from vkc_pin.base_body import Shape
 from vkc_pin.base_grid import HEADINGS, BaseGrid, fine_cells
-from vkc_pin.base_path import along, shortest_path
-from vkc_pin.initialization import Seed
+from vkc_pin.base_path import poses_along, shortest_path
+from vkc_pin.coordinates import wrapped
 from vkc_pin.interrupt import NEVER, Interrupt
-from vkc_pin.obstacles import FLOOR
+from vkc_pin.knots import smooth
 from vkc_pin.problem import TrajectoryProblem
+from vkc_pin.routes import grid_shapes
+from vkc_pin.seed import Seed
 from vkc_pin.steps import GoTo
 
 __all__ = ["BaseWays", "headings"]
@@ -39,22 +39,11 @@ class BaseWays:
             interrupt: Ends a search, as if there were no way.
         """
         self.interrupt = interrupt
-        chain, part = problem.chain, problem.contacts.phases[-1]
-        self.omni = chain.robot.base == "omni"
-        shapes, robot = part.shapes, range(len(chain.robot.collision.geometryObjects))
-        own = [i for i in robot if shapes[i].parentJoint == 1]
-        if whole:
-            own = [*robot, *(i for hold in problem.task.phases[-1].held for i in chain.held_geometries[hold])]
+        self.omni = problem.chain.robot.base == "omni"
         z = problem.start.copy()
         z[:3] = 0.0
-        rotations, translations = chain.joint_placements(z[None])
-        carriers = [pin.SE3(*placement) for placement in zip(rotations[0], translations[0], strict=True)]
-        base: list[Shape] = [(shapes[i].geometry, carriers[shapes[i].parentJoint] * shapes[i].placement) for i in own]
-        standing: list[Shape] = [
-            (shape.geometry, shape.placement)
-            for shape, label in zip(shapes, part.labels, strict=True)
-            if shape.parentJoint == 0 and label != FLOOR
-        ]
+        moving, standing = grid_shapes(problem, len(problem.task.phases) - 1, z)
+        base = [shape for joint, shape in moving if whole or joint == 1]
         arena, margin = problem.scene.arena, problem.options.dist_safe
         self.grid = BaseGrid(base, [], standing, arena, margin)
         # Without margins where an optimisation follows: it restores them.
@@ -75,16 +64,15 @@ class BaseWays:
                 to which the way is the shortest.
             steps: How many poses.
         """
-        u = np.arange(1, steps + 1)[:, None] / steps
         goals = np.atleast_2d(goals)
         for goal in goals if self.omni else ():
             places = max(_STEPS, int(np.ceil(np.hypot(*(goal - start)[:2]) / _STEP)))
             if all(self.grid.clear(*pose) for pose in np.linspace(start, goal, places)):
-                return np.asarray(start + u * u * (3.0 - 2.0 * u) * (goal - start))
+                return np.asarray(start + smooth(steps)[:, None] * (goal - start))
         path = shortest_path(self.grid, start.tolist(), goals, interrupt=self.interrupt)
         if path is None:
             path = shortest_path(self.finer, start.tolist(), goals, interrupt=self.interrupt)
-        return None if path is None else along(path, steps)
+        return None if path is None else poses_along(path, steps)
 
     def seeds(self, problem: TrajectoryProblem, goals: NDArray[np.float64]) -> Iterator[Seed]:
         """Yield the way from a problem's start to one of `goals`, shape (G, 3), the arm at rest, if there is one."""
@@ -98,6 +86,6 @@ class BaseWays:
 def headings(step: GoTo, yaw: float) -> NDArray[np.float64]:
     """Return the poses in which a step may end, shape (G, 3): one, or one per heading, those nearest to `yaw` [rad] first."""
     turns = np.linspace(0.0, 2.0 * np.pi, HEADINGS, endpoint=False) if step.yaw is None else np.array([step.yaw - yaw])
-    turns = (turns + np.pi) % (2.0 * np.pi) - np.pi
+    turns = wrapped(turns)
     turns = turns[np.argsort(np.abs(turns), kind="stable")]
     return np.column_stack([np.tile([step.x, step.y], (len(turns), 1)), yaw + turns])

@@ -1,4 +1,4 @@
-"""How the arm is held while the base drives alone: as it is, a little off what it took or let go of, at home, or drawn in."""
+"""How the arm is held while the base drives alone: as it is, a little off what it took or let go of, at home, or folded."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def postures(problem: TrajectoryProblem, interrupt: Interrupt = NEVER) -> Iterat
     """Yield configurations, shape (n,), in which the base may drive away from where it is, and the ones that lead to them.
 
     Each is a way for the arm while the base stands, shape (K, n), and ends in what the base then drives in: nothing to do (K =
-    0), back from what it lets go of, or up with what it carries, from there to home, and from there drawn in, for narrow
+    0), back from what it lets go of, or up with what it carries, from there to home, and from there folded, for narrow
     passages. Those that are not free are left out.
 
     Args:
@@ -43,9 +43,9 @@ def postures(problem: TrajectoryProblem, interrupt: Interrupt = NEVER) -> Iterat
     ways += [away] if len(away) else []
     ways += [] if at_home(problem) else [np.vstack([away, home])]
     yield from filter(is_free, ways)
-    drawn_in = home.copy()
-    drawn_in[3 : robot.coordinates.size] = Routes(problem, interrupt).compact(0)  # looked for only if nothing else will do
-    yield from filter(is_free, [np.vstack([ways[-1], drawn_in])])
+    folded = home.copy()
+    folded[3 : robot.coordinates.size] = Routes(problem, interrupt).folded_arm(0)  # looked for only if nothing else will do
+    yield from filter(is_free, [np.vstack([ways[-1], folded])])
 
 
 def at_home(problem: TrajectoryProblem) -> bool:

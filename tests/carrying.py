@@ -11,8 +11,8 @@ import numpy as np
 import pinocchio as pin
 from drives import DT, hall
 
-from vkc_pin.articulation import load_object
 from vkc_pin.geometry import PlacedObject
+from vkc_pin.object_file import load_object
 from vkc_pin.scene import Scene
 from vkc_pin.trajectory import PhaseSpan, Trajectory
 

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.articulation import load_object
 from vkc_pin.geometry import clearance, placed_shapes, standing_geometry
+from vkc_pin.object_file import load_object
 from vkc_pin.robot import Robot
 from vkc_pin.scene import START_CLEARANCE, Scene, load_scene
 

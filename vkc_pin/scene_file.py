@@ -13,12 +13,12 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from vkc_pin import scene_schema as schema
-from vkc_pin.articulation import load_object
 from vkc_pin.assembly import clean
 from vkc_pin.documents import Document, check
 from vkc_pin.geometry import PlacedObject, copy_shape, within_limits
 from vkc_pin.hold import holds_of
 from vkc_pin.in_hand import check_holds
+from vkc_pin.object_file import load_object
 from vkc_pin.scene import FLOOR, Scene
 from vkc_pin.starts import StartRegion, start_limits
 from vkc_pin.urdf import load_urdf
@@ -83,7 +83,7 @@ def build_scene(document: Document, folder: Path) -> Scene:
 
 
 def _robot(document: Document, item: schema.RobotSchema, folder: Path) -> Robot:
-    from vkc_pin.robot import load_robot
+    from vkc_pin.robot_file import load_robot
 
     by_path = item.name.endswith((".urdf", ".yaml", ".yml")) or "/" in item.name
     short = isinstance(document.value(("robot",)), str)  # robot: husky_ur5e

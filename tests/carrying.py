@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 from drives import DT, hall
 
-from vkc_pin.articulation import load_object
+from vkc_pin.object_file import load_object
 from vkc_pin.placed import PlacedObject
 from vkc_pin.scene import Scene
 from vkc_pin.trajectory import PhaseSpan, Trajectory

@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.articulation import ArticulatedObject, Attachment, Freedom, load_object
+from vkc_pin.articulation import ArticulatedObject, Attachment, Freedom
 from vkc_pin.broadphase import PhaseGeometry
+from vkc_pin.object_file import load_object
 from vkc_pin.options import Options
 from vkc_pin.placed import PlacedObject
 from vkc_pin.scene import Scene, load_scene

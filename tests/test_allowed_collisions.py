@@ -6,7 +6,8 @@ import pytest
 
 from vkc_pin import resources
 from vkc_pin.allowed_collisions import sample_allowed_pairs, write_srdf
-from vkc_pin.robot import Robot, load_robot
+from vkc_pin.robot import Robot
+from vkc_pin.robot_file import load_robot
 from vkc_pin.srdf import read_srdf
 
 SRDF = resources.folder("robots") / "husky_ur5e" / "husky_ur5e.srdf"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import re
 import tempfile
 from pathlib import Path
 
@@ -15,10 +16,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from vkc_pin.articulation import DEFAULT_ACCELERATION, DEFAULT_VELOCITY, ArticulatedObject, invert, load_object
+from vkc_pin.articulation import DEFAULT_ACCELERATION, DEFAULT_VELOCITY, ArticulatedObject
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.geometry import clearance, placed_shapes
+from vkc_pin.inversion import invert
+from vkc_pin.object_file import load_object
 from vkc_pin.placed import PlacedObject, standing_geometry
+from vkc_pin.urdf import load_urdf
 
 KINDS = ("revolute", "continuous", "prismatic", "fixed")
 AXES = ("1 0 0", "0 1 0", "0 0 1", "-1 0 0", "0 0 -1", "0.6 0 0.8", "1 -2 3")
@@ -366,6 +370,58 @@ def test_wrong_urdfs_are_refused(urdf: str, message: str) -> None:
         load_text(urdf, BASE)
     assert message in str(caught.value)
     assert Path(str(caught.value.file)).name == "thing.urdf"
+
+
+@pytest.mark.parametrize(
+    ("shape", "problem"),
+    [
+        ('<box size="nan 5.8 2"/>', "3 numbers"),
+        ('<box size="1 2"/>', "3 numbers"),
+        ('<box size="1,5 2 3"/>', "3 numbers"),
+        ("<box/>", "3 numbers"),
+        ('<box size="1 -2 3"/>', "sizes above 0"),
+        ('<sphere radius="0"/>', "sizes above 0"),
+        ('<cylinder radius="0.1"/>', "1 numbers"),
+        ('<cone radius="0.1" length="1"/>', "box, sphere, cylinder, capsule or mesh"),
+        ('<mesh filename="none.obj"/>', "none.obj"),
+        ("", "<geometry> with a shape"),
+    ],
+)
+@pytest.mark.parametrize("kind", ["visual", "collision"])
+def test_wrong_shapes_are_refused(kind: str, shape: str, problem: str) -> None:
+    good = f"<collision><geometry>{SHAPES[0]}</geometry></collision>"
+    wrong = f'<link name="panel">{good}<{kind}><geometry>{shape}</geometry></{kind}></link>'
+    with pytest.raises(InputError, match=re.escape(problem)) as caught:
+        load_text(URDF.replace('<link name="panel"/>', wrong), BASE)
+    assert Path(str(caught.value.file)).name == "thing.urdf"
+    if "mesh" not in shape:
+        assert str(caught.value.field).startswith("panel_")
+
+
+def test_shapes_stand_where_pinocchio_has_them(tmp_path: Path) -> None:
+    rng, shapes = np.random.default_rng(0), ""
+    for xyz, rpy in zip(rng.uniform(-1.0, 1.0, (20, 3)).tolist(), rng.uniform(-3.0, 3.0, (20, 3)).tolist(), strict=True):
+        origin = f'<origin xyz="{" ".join(map(str, xyz))}" rpy="{" ".join(map(str, rpy))}"/>'
+        shapes += f"<collision>{origin}<geometry>{SHAPES[0]}</geometry></collision>"
+    file = tmp_path / "thing.urdf"
+    file.write_text(URDF.replace('<link name="panel"/>', f'<link name="panel">{shapes}</link>'))
+    tree = load_urdf(file)
+    theirs = pin.buildGeomFromUrdfString(tree.model, file.read_text(), pin.GeometryType.COLLISION).geometryObjects
+    assert [s.name for s in tree.collision.geometryObjects] == [s.name for s in theirs]
+    for ours, other in zip(tree.collision.geometryObjects, theirs, strict=True):
+        np.testing.assert_allclose(ours.placement.homogeneous, other.placement.homogeneous, rtol=0.0, atol=1e-15)
+        assert (ours.parentJoint, ours.parentFrame) == (other.parentJoint, other.parentFrame)
+
+
+def test_capsules_and_colours_of_an_object() -> None:
+    capsule = '<geometry><capsule radius="0.1" length="0.4"/></geometry>'
+    red = '<material name="red"><color rgba="1 0 0 1"/></material>'
+    panel = f'<link name="panel"><collision>{capsule}</collision><visual>{capsule}{red}</visual><visual>{capsule}</visual></link>'
+    thing = load_text(URDF.replace('<link name="panel"/>', panel), BASE)
+    (solid,) = (shape.geometry for shape in thing.collision.geometryObjects)
+    assert (solid.radius, solid.halfLength) == (0.1, 0.2)
+    assert [tuple(shape.meshColor) for shape in thing.visual.geometryObjects] == [(1.0, 0.0, 0.0, 1.0), (0.9, 0.9, 0.9, 1.0)]
+    assert [shape.overrideMaterial for shape in thing.visual.geometryObjects] == [True, False]
 
 
 @pytest.mark.parametrize("filename", ["wedge.obj", "package://things/wedge.obj"])

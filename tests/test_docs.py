@@ -18,7 +18,7 @@ import yaml
 import vkc_pin as vkc
 from vkc_pin.cli import _parser
 from vkc_pin.documents import Document, check
-from vkc_pin.object_schema import AttachmentSchema, LatchSchema, ObjectSchema
+from vkc_pin.object_file import AttachmentSchema, LatchSchema, ObjectSchema
 from vkc_pin.report import Violation
 from vkc_pin.robot_schema import BaseSchema, RobotSchema
 from vkc_pin.scene_schema import COLOURS, ObstacleSchema, PlacedObjectSchema, SceneRobotSchema, SceneSchema, StartSchema

@@ -11,9 +11,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from vkc_pin.articulation import ArticulatedObject, Freedom, invert, load_object
+from vkc_pin.articulation import ArticulatedObject, Freedom
 from vkc_pin.geometry import clearance, link_name, placed_shapes
 from vkc_pin.inverse_kinematics import PoseSolver
+from vkc_pin.inversion import invert
+from vkc_pin.object_file import load_object
 from vkc_pin.obstacles import FLOOR
 from vkc_pin.placed import PlacedObject, standing_geometry
 from vkc_pin.pose import PoseRow

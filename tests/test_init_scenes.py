@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.articulation import load_object
 from vkc_pin.geometry import clearance, placed_shapes
+from vkc_pin.object_file import load_object
 from vkc_pin.placed import standing_geometry
 from vkc_pin.robot import Robot
 from vkc_pin.scene import Scene, load_scene

@@ -16,7 +16,7 @@ from vkc_pin.goal import LATCH_MARGIN
 from vkc_pin.hold import Hold
 from vkc_pin.options import Options
 from vkc_pin.problem import TrajectoryProblem, build
-from vkc_pin.robot import load_robot
+from vkc_pin.robot_file import load_robot
 from vkc_pin.scene import load_scene
 from vkc_pin.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
 from vkc_pin.unfold import as_trajectory

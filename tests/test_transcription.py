@@ -18,7 +18,7 @@ from vkc_pin import transcription as module
 from vkc_pin import waypoint as kinds
 from vkc_pin.options import Options
 from vkc_pin.problem import TrajectoryProblem, build
-from vkc_pin.robot import load_robot
+from vkc_pin.robot_file import load_robot
 from vkc_pin.scene import Scene
 from vkc_pin.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
 from vkc_pin.waypoint import Structure, waypoint_functions

@@ -1,12 +1,11 @@
-"""Finds the pairs of a robot's links that need no collision check, by sampling, and writes them as an SRDF."""
+"""Collision pairs of a robot's links: finds those that need no check by sampling, and writes them as an SRDF."""
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
-import os
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
 from xml.sax.saxutils import quoteattr
 
 import coal
@@ -14,16 +13,33 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from vkc_pin.robot import Robot
+from vkc_pin.robot import Robot
+from vkc_pin.writing import write_atomically
 
 Pair = tuple[str, str]
 
-__all__ = ["sample_allowed_pairs", "write_srdf"]
+__all__ = ["sample_allowed_pairs", "with_collision_pairs", "write_srdf"]
 
 _SAMPLES = 20_000
 _FAR = 0.05  # [m]: links that come no closer in any sample are not driven together
 _STARTS, _STEPS = 4, 200  # how often and in how many steps the others are
+
+
+def with_collision_pairs(robot: Robot, allowed: Collection[Pair]) -> Robot:
+    """Return `robot` with those of its links that move against each other as collision pairs, less the `allowed` ones.
+
+    Args:
+        robot: The robot; its own collision pairs play no part.
+        allowed: Pairs of links that may touch, each sorted.
+    """
+    collision, shapes = pin.GeometryModel(), robot.collision.geometryObjects
+    for shape in shapes:
+        collision.addGeometryObject(shape)
+    for first, second in itertools.combinations(range(len(shapes)), 2):
+        links = tuple(sorted((robot.link_of(first), robot.link_of(second))))
+        if shapes[first].parentJoint != shapes[second].parentJoint and links not in allowed:
+            collision.addCollisionPair(pin.CollisionPair(first, second))
+    return dataclasses.replace(robot, collision=collision)
 
 
 def sample_allowed_pairs(robot: Robot, *, samples: int = _SAMPLES, seed: int = 0) -> dict[tuple[str, str], str]:
@@ -87,7 +103,6 @@ def write_srdf(robot: Robot, path: str | Path, *, samples: int = _SAMPLES, seed:
     Returns:
         The file.
     """
-    file = Path(path)
     lines = [
         '<?xml version="1.0"?>',
         f"<!-- Written by `vkc-pin srdf`: {samples} samples, seed {seed}. Adjacent: a joint connects the links. Always: they",
@@ -108,13 +123,7 @@ def write_srdf(robot: Robot, path: str | Path, *, samples: int = _SAMPLES, seed:
         ),
         "</robot>",
     ]
-    draft = file.with_name(f".{file.name}.{os.getpid()}")
-    try:
-        draft.write_text("\n".join(lines) + "\n", encoding="utf-8")
-        draft.replace(file)
-    finally:
-        draft.unlink(missing_ok=True)
-    return file
+    return write_atomically(path, ("\n".join(lines) + "\n").encode())
 
 
 class _Distances:

@@ -1,43 +1,109 @@
-"""Articulated objects: what can be grasped and moved (a door, a drawer, a stick), and how to re-root them.
+"""Articulated objects: what can be grasped and moved (a door, a drawer, a stick).
 
-An object is a URDF tree plus named attachments (where a tool takes hold of it) and latches. `invert` turns it round:
-the tree then starts at the link that is held and ends at the link that stands in the world, so that it can be hung on
-the end of a robot.
+An object is a URDF tree plus named attachments (where a tool takes hold of it, and what freedom that leaves) and latches.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from vkc_pin.assembly import clean
-from vkc_pin.attachment import Attachment, Freedom
 from vkc_pin.coordinates import Coordinates
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.resources import find
 
-__all__ = [
-    "DEFAULT_ACCELERATION",
-    "DEFAULT_VELOCITY",
-    "ArticulatedObject",
-    "Attachment",
-    "Freedom",
-    "InvertedTree",
-    "Latch",
-    "invert",
-    "load_object",
-]
+__all__ = ["DEFAULT_ACCELERATION", "DEFAULT_VELOCITY", "ArticulatedObject", "Attachment", "Freedom", "Latch"]
 
 DEFAULT_VELOCITY = 1.0
 """Velocity limit [rad/s] or [m/s] of an object's joint whose URDF states none (a continuous joint without limits)."""
 DEFAULT_ACCELERATION = 2.0
 """Acceleration limit [rad/s²] or [m/s²] of an object's joint whose description states none: URDF has no such field."""
+
+
+@dataclass(frozen=True, eq=False)
+class Freedom:
+    """One coordinate of a grasp: how the hand may turn or slide in it.
+
+    Attributes:
+        suffix: What follows the attachment's name in the coordinate's; empty if it is the only one.
+        kind: "revolute" or "prismatic".
+        axis: Unit axis in the tool frame (after the freedoms before this one), shape (3,).
+        lower, upper: Limits, [rad] or [m].
+    """
+
+    suffix: str
+    kind: str
+    axis: NDArray[np.float64]
+    lower: float
+    upper: float
+
+    def motion(self, value: float) -> pin.SE3:
+        """Return the motion at `value`, [rad] or [m]."""
+        if self.kind == "revolute":
+            return pin.SE3(pin.exp3(self.axis * value), np.zeros(3))
+        return pin.SE3(np.eye(3), self.axis * value)
+
+
+@dataclass(frozen=True, eq=False)
+class Attachment:
+    """A place where a tool can take hold of a link, and the freedom that this kind of grasp leaves.
+
+    While grasped, the tool frame expressed in the frame of `link` is `placement · J(v) · offset`, with J(v) the motion
+    of the virtual joint at the values v and offset a translation by `-standoff` along the tool's z axis. The tool's z
+    axis points out of the palm (the direction of approach), its x axis along the direction in which the fingers close.
+
+    Attributes:
+        name: Its name in the object.
+        link: The link that is held.
+        placement: The tool frame in the link's frame at v = 0, were there no standoff: the virtual joint's centre.
+        joint: "fixed" (no freedom), "revolute", "prismatic", "cylindrical" (slides along an axis and turns about it)
+            or "spherical" (turns about x, then y, then z).
+        freedoms: The virtual joint's coordinates, J(v) being the product of their motions in this order.
+        standoff: How far before the joint's centre the tool stops, along its approach [m].
+        firm: Whether the hand clamps: v is chosen when grasping, and stays while the object is held.
+    """
+
+    name: str
+    link: str
+    placement: pin.SE3
+    joint: str = "fixed"
+    freedoms: tuple[Freedom, ...] = ()
+    standoff: float = 0.0
+    firm: bool = False
+
+    @property
+    def coordinates(self) -> tuple[str, ...]:
+        """Names, in the object, of the virtual joint's coordinates, in the order of `freedoms`."""
+        return tuple(self.name + freedom.suffix for freedom in self.freedoms)
+
+    @property
+    def offset(self) -> pin.SE3:
+        """The tool frame in the frame of the virtual joint's moving side."""
+        return pin.SE3(np.eye(3), np.array([0.0, 0.0, -self.standoff]))
+
+    def motion(self, values: ArrayLike = ()) -> pin.SE3:
+        """Return J(v) · offset at the values v, shape (k,), in the order of `freedoms`, [rad] or [m].
+
+        Raises:
+            InputError: There are not as many values as freedoms.
+        """
+        given = np.asarray(values, float)
+        if given.shape != (len(self.freedoms),):
+            raise InputError(
+                "wrong number of values", field=self.name, expected=f"{len(self.freedoms)}, one a freedom", got=given
+            )
+        placement = pin.SE3.Identity()
+        for freedom, value in zip(self.freedoms, given, strict=True):
+            placement = placement * freedom.motion(float(value))
+        return placement * self.offset
+
+    def tool(self, values: ArrayLike = ()) -> pin.SE3:
+        """Return the tool frame in the frame of `link`, placement · J(v) · offset, at the values v; see `motion`."""
+        return self.placement * self.motion(values)
 
 
 @dataclass(frozen=True)
@@ -113,153 +179,15 @@ class ArticulatedObject:
             raise UnknownNameError(f"attachment of {self.name}", name, self.attachments)
         return self.attachments[name]
 
+    def link_frame(self, link: str) -> int:
+        """Return the index in `model` of the frame of `link`. Raises `UnknownNameError` if there is none."""
+        if link not in self.links:
+            raise UnknownNameError(f"link of {self.name}", link, self.links)
+        return int(self.model.getFrameId(link, pin.FrameType.BODY))
+
     def link_placement(self, link: str, state: ArrayLike) -> pin.SE3:
         """Return the placement of `link` in the base link's frame at the joint values `state`, shape (n,)."""
-        frame = self.model.frames[_body_frame(self, link)]
+        frame = self.model.frames[self.link_frame(link)]
         data = self.model.createData()
         pin.forwardKinematics(self.model, data, self.coordinates.q(state))
         return data.oMi[frame.parentJoint] * frame.placement
-
-
-@dataclass(frozen=True, eq=False)
-class InvertedTree:
-    """An object re-rooted at one of its links: `model`'s universe frame is that link's frame.
-
-    Attributes:
-        model: The joints on the path from the link to the base link, each with its name, coordinate and limits; a body
-            frame for every link of the object, by its name.
-        collision, visual: The object's geometry, with its names, on the bodies of `model`.
-        coordinates: The minimal coordinates of `model`.
-        link: The link that is now the root.
-        base_link: The object's base link, a body frame of `model`.
-    """
-
-    model: pin.Model
-    collision: pin.GeometryModel
-    visual: pin.GeometryModel
-    coordinates: Coordinates
-    link: str
-    base_link: str
-
-
-def load_object(name_or_path: str | Path) -> ArticulatedObject:
-    """Load an articulated object: by the name of a description in `scenes/objects`, or by the path of one (.yaml).
-
-    Raises:
-        UnknownNameError: There is no such object, or its description names a field, link or joint that does not exist.
-        InputError: The description or its URDF is wrong.
-    """
-    from vkc_pin.object_file import read_object
-
-    text = str(name_or_path)
-    by_path = isinstance(name_or_path, Path) or text.endswith((".yaml", ".yml")) or "/" in text
-    file = Path(name_or_path) if by_path else find("scenes", "objects/*.yaml", text, what="object")
-    return read_object(file)
-
-
-def _body_frame(obj: ArticulatedObject, link: str) -> int:
-    if link not in obj.links:
-        raise UnknownNameError(f"link of {obj.name}", link, obj.links)
-    return int(obj.model.getFrameId(link, pin.FrameType.BODY))
-
-
-def invert(obj: ArticulatedObject, link: str, state: ArrayLike) -> InvertedTree:
-    """Re-root `obj` at `link`.
-
-    With placement P and motion J(q) of a joint, parent → child is P·J(q), so child → parent is J(q)⁻¹·P⁻¹. For revolute
-    and prismatic joints J(q)⁻¹ is the same joint with the axis negated. The axis is then turned into z by a constant
-    rotation R, J(q)⁻¹ = R·J_z(q)·R⁻¹, which goes into the placements around it: every joint of the result is one of
-    Pinocchio's z-aligned joints, whose symbolic expressions are the shortest.
-
-    Args:
-        obj: The object.
-        link: The link that becomes the root.
-        state: Joint values, shape (n,), [rad] or [m]. Joints beside the path from `link` to the base link are locked at
-            these; the values of those on the path do not matter.
-
-    Raises:
-        UnknownNameError: The object has no such link.
-        InputError: `state` has the wrong size, or a joint on the path cannot be inverted.
-    """
-    source = obj.model
-    root = source.frames[_body_frame(obj, link)]
-    data = source.createData()
-    pin.forwardKinematics(source, data, obj.coordinates.q(state))
-    path = [root.parentJoint]  # from the link's joint down to the universe
-    while path[-1] != 0:
-        path.append(source.parents[path[-1]])
-
-    model = pin.Model()
-    model.name = obj.name
-    # For every joint of the path: the joint of the new model that carries its body, and the body's placement there.
-    carrier: dict[int, tuple[int, pin.SE3]] = {path[0]: (0, root.placement.inverse())}
-    for child, parent in pairwise(path):
-        new_parent, body = carrier[child]
-        joint, axis = _z_aligned(source, data, child)
-        turn = pin.SE3(_z_to(-axis), np.zeros(3))
-        q, v = source.joints[child].idx_q, source.joints[child].idx_v
-        nq = source.joints[child].nq
-        index = model.addJoint(
-            new_parent,
-            joint,
-            clean(body * turn),
-            source.names[child],
-            source.effortLimit[v : v + 1],
-            source.velocityLimit[v : v + 1],
-            source.lowerPositionLimit[q : q + nq],
-            source.upperPositionLimit[q : q + nq],
-        )
-        carrier[parent] = (index, turn.inverse() * source.jointPlacements[child].inverse())
-
-    def place(joint: int, placement: pin.SE3) -> tuple[int, pin.SE3]:
-        """Return the new joint that carries `placement`, given on the old `joint`, and the placement on the new one."""
-        anchor = joint
-        while anchor not in carrier:
-            anchor = source.parents[anchor]
-        new, body = carrier[anchor]
-        return new, clean(body * data.oMi[anchor].actInv(data.oMi[joint]) * placement)
-
-    for joint in range(source.njoints):
-        if source.inertias[joint].mass > 0.0:
-            new, placement = place(joint, pin.SE3.Identity())
-            model.appendBodyToJoint(new, source.inertias[joint], placement)
-    frames: dict[int, int] = {}
-    for index, frame in enumerate(source.frames):
-        if frame.type == pin.FrameType.BODY:
-            new, placement = place(frame.parentJoint, frame.placement)
-            frames[index] = model.addFrame(pin.Frame(frame.name, new, 0, placement, pin.FrameType.BODY), False)
-
-    def carry(geometry: pin.GeometryModel) -> pin.GeometryModel:
-        carried = pin.GeometryModel()
-        for shape in geometry.geometryObjects:
-            copy = pin.GeometryObject(shape)
-            copy.parentJoint, copy.placement = place(shape.parentJoint, shape.placement)
-            copy.parentFrame = frames[shape.parentFrame]
-            carried.addGeometryObject(copy)
-        return carried
-
-    return InvertedTree(model, carry(obj.collision), carry(obj.visual), Coordinates(model), link, obj.base_link)
-
-
-def _z_aligned(model: pin.Model, data: pin.Data, index: int) -> tuple[pin.JointModel, NDArray[np.float64]]:
-    """Return the joint of the same kind about or along z, and the unit axis of joint `index` in its own frame."""
-    kind = model.joints[index].shortname().removeprefix("JointModel")
-    subspace = np.array(data.joints[index].S, float).ravel()  # linear part, then angular part
-    if kind in ("RX", "RY", "RZ", "RevoluteUnaligned"):
-        return pin.JointModelRZ(), subspace[3:]
-    if kind in ("RUBX", "RUBY", "RUBZ", "RevoluteUnboundedUnaligned"):
-        return pin.JointModelRUBZ(), subspace[3:]
-    if kind in ("PX", "PY", "PZ", "PrismaticUnaligned"):
-        return pin.JointModelPZ(), subspace[:3]
-    raise InputError(
-        "this joint cannot be inverted", field=model.names[index], expected="a revolute, continuous or prismatic joint", got=kind
-    )
-
-
-def _z_to(axis: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a rotation, shape (3, 3), that turns z into the unit vector `axis`, with as many zeros as possible."""
-    others = np.eye(3)
-    x = others[int(np.argmin(np.abs(axis)))]
-    x = x - axis * (axis @ x)
-    x = x / np.linalg.norm(x)
-    return np.column_stack([x, np.cross(axis, x), axis])

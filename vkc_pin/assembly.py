@@ -12,7 +12,7 @@ from collections.abc import Iterable
 import numpy as np
 import pinocchio as pin
 
-__all__ = ["clean", "graft", "graft_geometry"]
+__all__ = ["add_joint", "clean", "graft", "graft_geometry"]
 
 
 def clean(placement: pin.SE3, tolerance: float = 1e-12) -> pin.SE3:
@@ -23,6 +23,38 @@ def clean(placement: pin.SE3, tolerance: float = 1e-12) -> pin.SE3:
     for sign in (-1.0, 1.0):
         rotation[np.abs(rotation - sign) < tolerance] = sign
     return pin.SE3(rotation, translation)
+
+
+def add_joint(
+    model: pin.Model, parent: int, joint: pin.JointModel, placement: pin.SE3, *, like: tuple[pin.Model, int], prefix: str = ""
+) -> int:
+    """Add `joint` to `model` with the name and limits that a joint of another model has.
+
+    Args:
+        model: Changed in place.
+        parent: The joint of `model` that carries it.
+        joint: With as many coordinates as the other joint.
+        placement: In the frame of `parent`.
+        like: The other model, and the joint's index there.
+        prefix: Put before the name.
+
+    Returns:
+        Its index in `model`.
+    """
+    source, index = like
+    twin = source.joints[index]
+    q, v = slice(twin.idx_q, twin.idx_q + twin.nq), slice(twin.idx_v, twin.idx_v + twin.nv)
+    added = model.addJoint(
+        parent,
+        joint,
+        placement,
+        prefix + source.names[index],
+        source.effortLimit[v],
+        source.velocityLimit[v],
+        source.lowerPositionLimit[q],
+        source.upperPositionLimit[q],
+    )
+    return int(added)
 
 
 def graft(model: pin.Model, tree: pin.Model, *, parent: int, placement: pin.SE3, prefix: str = "") -> list[int]:
@@ -44,17 +76,7 @@ def graft(model: pin.Model, tree: pin.Model, *, parent: int, placement: pin.SE3,
     for index in range(1, tree.njoints):
         joint, above = tree.joints[index], tree.parents[index]
         local = tree.jointPlacements[index] if above else placement * tree.jointPlacements[index]
-        iq, iv = slice(joint.idx_q, joint.idx_q + joint.nq), slice(joint.idx_v, joint.idx_v + joint.nv)
-        added = model.addJoint(
-            joints[above],
-            joint,
-            clean(local),
-            prefix + tree.names[index],
-            tree.effortLimit[iv],
-            tree.velocityLimit[iv],
-            tree.lowerPositionLimit[iq],
-            tree.upperPositionLimit[iq],
-        )
+        added = add_joint(model, joints[above], joint, clean(local), like=(tree, index), prefix=prefix)
         model.appendBodyToJoint(added, tree.inertias[index], pin.SE3.Identity())
         joints.append(added)
     bodies = {frame.name for frame in tree.frames if frame.type == pin.FrameType.BODY}

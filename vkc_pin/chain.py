@@ -12,12 +12,13 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from vkc_pin import cpin
-from vkc_pin.articulation import Attachment, invert
+from vkc_pin.articulation import Attachment
 from vkc_pin.assembly import clean, graft, graft_geometry
 from vkc_pin.batch import BatchFunction
 from vkc_pin.coordinates import Coordinates
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.hold import Hold, holds_of
+from vkc_pin.inversion import invert
 from vkc_pin.placed import PlacedObject
 from vkc_pin.robot import Robot
 from vkc_pin.scene import Scene

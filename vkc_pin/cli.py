@@ -142,7 +142,7 @@ def _view(arguments: argparse.Namespace) -> int:
 
 def _srdf(arguments: argparse.Namespace) -> int:
     from vkc_pin.allowed_collisions import write_srdf
-    from vkc_pin.robot import load_robot
+    from vkc_pin.robot_file import load_robot
 
     written = write_srdf(load_robot(arguments.robot), arguments.output, samples=arguments.samples, seed=arguments.seed)
     sys.stdout.write(f"wrote {written}\n")

@@ -1,8 +1,9 @@
-"""YAML description files: read safely, checked against a schema, with errors that name file, line and field."""
+"""Description files: YAML read safely and checked against a schema, with errors that name file, line and field; and XML."""
 
 from __future__ import annotations
 
 import re
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -14,7 +15,7 @@ import yaml
 
 from vkc_pin.errors import InputError, UnknownNameError
 
-__all__ = ["Document", "check", "field_name", "read_yaml"]
+__all__ = ["Document", "check", "field_name", "read_text", "read_xml", "read_yaml"]
 
 Key = str | int
 T = TypeVar("T", bound=pydantic.BaseModel)
@@ -86,13 +87,41 @@ class Document:
         except UnknownNameError as error:
             if error.file is not None:
                 raise
-            kind = re.match(r"there is no (.*?) '", error.problem)
-            raise self.unknown(path, kind[1] if kind else "name", error.name, error.choices) from error
+            raise self.unknown(path, error.kind, error.name, error.choices) from error
         except InputError as error:
             if error.file is not None:
                 raise
             where = f"{error.field}: " if error.field else ""
             raise self.error(path, where + error.problem, expected=error.expected, got=error.got) from error
+
+
+def read_text(file: str | Path, kind: str) -> str:
+    """Return what a text file of a `kind` ("YAML", "URDF", "SRDF") says.
+
+    Raises:
+        InputError: It does not exist, cannot be read, or is not encoded in UTF-8.
+    """
+    try:
+        return Path(file).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"cannot read the {kind}", file=file, expected=f"an existing {kind} file", got=reason) from error
+
+
+def read_xml(file: str | Path, kind: str) -> tuple[str, ElementTree.Element]:
+    """Return what a URDF or SRDF file (`kind`) says, as text and as its element <robot>.
+
+    Raises:
+        InputError: It cannot be read, is no XML, or is about something else than a robot.
+    """
+    text = read_text(file, kind)
+    try:
+        root = ElementTree.fromstring(text.encode())
+    except ElementTree.ParseError as error:
+        raise InputError(f"not valid XML: {error}", file=file, line=error.position[0]) from error
+    if root.tag != "robot":
+        raise InputError(f"this is no {kind}", file=file, expected="an element <robot>", got=f"<{root.tag}>")
+    return text, root
 
 
 def read_yaml(file: str | Path) -> Document:
@@ -102,12 +131,7 @@ def read_yaml(file: str | Path) -> Document:
         InputError: The file does not exist, is no valid YAML, or holds a key twice.
     """
     path = Path(file)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            "cannot read the file", file=path, expected="an existing YAML file", got=getattr(error, "strerror", None) or error
-        ) from error
+    text = read_text(path, "YAML")
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)(text)  # the first is ten times as fast, and not everywhere
     lines: dict[tuple[Key, ...], int] = {}
     try:

@@ -54,7 +54,7 @@ class InputError(VkcError, ValueError):
 
 
 class UnknownNameError(InputError):
-    """A name that does not exist; `choices` are those that do, `nearest` the one that resembles it most."""
+    """A name of some `kind` that does not exist; `choices` are those that do, `nearest` the one that resembles it most."""
 
     def __init__(
         self,
@@ -66,7 +66,7 @@ class UnknownNameError(InputError):
         line: int | None = None,
         field: str | None = None,
     ) -> None:
-        self.name, self.choices = name, tuple(str(c) for c in choices)
+        self.kind, self.name, self.choices = kind, name, tuple(str(c) for c in choices)
         self.nearest = nearest_name(name, self.choices)
         listed = ", ".join(self.choices[:12]) + (", ..." if len(self.choices) > 12 else "")
         hint = f"; did you mean '{self.nearest}'?" if self.nearest else ""

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vkc_pin.errors import InputError
+from vkc_pin.hulls import outer_hull
 
 if TYPE_CHECKING:
     import trimesh
@@ -113,8 +114,6 @@ def convex_hull(points: ArrayLike) -> coal.Convex:
     except (QhullError, ValueError, IndexError) as error:
         raise InputError("the mesh has no convex hull: it is flat", expected="points that span a volume") from error
     if np.bincount(np.asarray(hull.faces).ravel()).max() > _NEIGHBOURS:  # the tip of a finely meshed cone, a fine disc
-        from vkc_pin.convexify import outer_hull
-
         hull = outer_hull(hull.vertices, vertices=60)
     shape = coal.Convex(_points(hull.vertices), _triangles(hull.faces))
     corners = np.asarray(shape.points())[_indices(shape)]

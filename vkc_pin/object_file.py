@@ -1,26 +1,118 @@
-"""Reads the description file of an articulated object and builds the object."""
+"""Reads the description file of an articulated object: what it may contain, and the object it comes to."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import pinocchio as pin
+from pydantic import AfterValidator, Field, model_validator
 
 from vkc_pin.articulation import DEFAULT_ACCELERATION, DEFAULT_VELOCITY, ArticulatedObject, Attachment, Freedom, Latch
 from vkc_pin.assembly import clean
 from vkc_pin.coordinates import Coordinates
 from vkc_pin.documents import Document, check, read_yaml
 from vkc_pin.errors import InputError
-from vkc_pin.object_schema import AttachmentSchema, ObjectSchema
+from vkc_pin.fields import JointSchema, Name, NotNegative, Number, Positive, Schema, Vector3, count, fail
+from vkc_pin.resources import find
 from vkc_pin.urdf import load_urdf
 
-__all__ = ["read_object"]
+__all__ = ["AttachmentSchema", "LatchSchema", "ObjectSchema", "load_object"]
 
 
-def read_object(file: Path) -> ArticulatedObject:
-    """Read the description `file` (YAML); see `vkc_pin.articulation.load_object`, which is its public face."""
+def _direction(value: tuple[float, float, float]) -> tuple[float, float, float]:
+    if np.linalg.norm(value) < 1e-6:
+        raise fail("a direction cannot be zero", "a vector of some length")
+    return value
+
+
+def _around_zero(value: tuple[float, float]) -> tuple[float, float]:
+    if not value[0] <= 0.0 <= value[1]:
+        raise fail("the limits do not contain 0", "limits [lower <= 0, upper >= 0]")
+    return value
+
+
+def _some(value: tuple[Any, ...]) -> tuple[Any, ...]:
+    if not value:
+        raise fail("nothing in the list", "at least one")
+    return value
+
+
+Limits = Annotated[tuple[Number, Number], count(2), AfterValidator(_around_zero)]
+Direction = Annotated[Vector3, AfterValidator(_direction)]
+
+
+class AttachmentSchema(Schema):
+    """Where and how a tool takes hold of a link; see `vkc_pin.articulation.Attachment`."""
+
+    name: Name
+    link: str
+    position: Vector3 = (0.0, 0.0, 0.0)
+    rpy: Vector3 | None = None
+    approach: Direction | None = None
+    closing: Direction | None = None
+    joint: Literal["fixed", "revolute", "prismatic", "cylindrical", "spherical"] = "fixed"
+    axis: Direction | None = None
+    limits: Limits | None = None
+    turn: Limits | None = None
+    standoff: NotNegative = 0.0
+    firm: bool | None = None  # not stated: as the object is free or not
+
+    @model_validator(mode="after")
+    def _consistent(self) -> AttachmentSchema:
+        if (self.approach is None) != (self.closing is None) or (self.rpy is not None and self.approach is not None):
+            raise fail("the tool's direction is not clear", "either rpy, or approach and closing")
+        if self.approach is not None and self.closing is not None and abs(np.dot(self.approach, self.closing)) > 1e-9:
+            raise fail("approach and closing are not perpendicular", "two perpendicular directions")
+        has_axis = self.joint in ("revolute", "prismatic", "cylindrical")
+        if has_axis != (self.axis is not None):
+            raise fail("axis and joint do not fit", "an axis with joint revolute, prismatic or cylindrical, and only there")
+        if has_axis and self.limits is None:
+            raise fail("limits missing", "limits [lower, upper] of the grasp's joint")
+        if self.joint == "fixed" and self.limits is not None:
+            raise fail("a fixed grasp has no limits", "no limits, or another joint")
+        if (self.joint == "cylindrical") != (self.turn is not None):
+            raise fail("turn and joint do not fit", "turn [lower, upper] with joint cylindrical, and only there")
+        return self
+
+
+class LatchSchema(Schema):
+    """A joint held until another one is moved; see `vkc_pin.articulation.Latch`."""
+
+    joint: str
+    held_at: Number = 0.0
+    released_by: str
+    threshold: Number
+    engaged_within: Positive
+
+
+class ObjectSchema(Schema):
+    """A description file of an articulated object."""
+
+    urdf: str
+    free: bool = False
+    joints: Mapping[str, JointSchema] = Field(default_factory=dict)
+    attachments: Annotated[tuple[AttachmentSchema, ...], AfterValidator(_some)]
+    latches: tuple[LatchSchema, ...] = ()
+
+
+def load_object(name_or_path: str | Path) -> ArticulatedObject:
+    """Load an articulated object: by the name of a description in `scenes/objects`, or by the path of one (.yaml).
+
+    Raises:
+        UnknownNameError: There is no such object, or its description names a field, link or joint that does not exist.
+        InputError: The description or its URDF is wrong.
+    """
+    text = str(name_or_path)
+    by_path = isinstance(name_or_path, Path) or text.endswith((".yaml", ".yml")) or "/" in text
+    file = Path(name_or_path) if by_path else find("scenes", "objects/*.yaml", text, what="object")
+    return _read(file)
+
+
+def _read(file: Path) -> ArticulatedObject:
     document = read_yaml(file)
     schema = check(document, ObjectSchema)
     urdf = file.parent / schema.urdf

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import importlib.util
 from pathlib import Path
+
+import pinocchio as pin
 
 from vkc_pin.errors import UnknownNameError
 
-__all__ = ["available", "find", "folder", "package_folder"]
+__all__ = ["available", "example_robot_data", "find", "folder", "package_folder"]
 
 
 def package_folder() -> Path:
@@ -36,3 +39,15 @@ def find(kind: str, pattern: str, name: str, *, what: str) -> Path:
     if name not in found:
         raise UnknownNameError(what, name, found)
     return found[name]
+
+
+def example_robot_data() -> Path | None:
+    """Return the folder of example-robot-data (in the wheels of cmeel: cmeel.prefix/share), or None."""
+    prefixes = [Path(pin.__file__).resolve().parents[4]]
+    spec = importlib.util.find_spec("cmeel")
+    if spec is not None and spec.origin is not None:
+        prefixes.append(Path(spec.origin).resolve().parents[1] / "cmeel.prefix")
+    for prefix in prefixes:
+        if (prefix / "share" / "example-robot-data" / "robots").is_dir():
+            return prefix / "share" / "example-robot-data"
+    return None

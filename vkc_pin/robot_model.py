@@ -1,27 +1,38 @@
-"""Builds the Pinocchio model of a robot: planar base, the joints on the way to the tool, everything else locked."""
+"""Builds the Pinocchio model of a robot: planar base, the joints on the way to the tool, all else locked; and its shapes."""
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Mapping
 
+import coal
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from vkc_pin.assembly import clean
+from vkc_pin.assembly import add_joint, clean
 from vkc_pin.errors import InputError
-from vkc_pin.robot_files import RobotFile
+from vkc_pin.urdf import Shape, UrdfFile
 
-__all__ = ["default_tool_frame", "full_model", "planned_model", "rest_positions", "within_limits"]
+__all__ = [
+    "collision_geometry",
+    "default_tool_frame",
+    "full_model",
+    "nearest_position",
+    "planned_model",
+    "rest_positions",
+    "visual_geometry",
+]
 
 ROOT = "base"  # the name of the planar joint
 _ROUNDING = 1e-9  # [m] and of a rotation: URDFs write quarter turns with nine digits; exact ones make lean expressions
 _FINGER = 7  # joints in the longest finger of a hand
 _ARM = 4  # joints, at least, that carry a hand
+_DETAIL = 0.0015  # of displayed meshes, [m]
+_GREY = (0.6, 0.6, 0.62, 1.0)
 
 
-def full_model(file: RobotFile) -> pin.Model:
+def full_model(file: UrdfFile) -> pin.Model:
     """Return the model of all joints of `file` on a planar joint.
 
     Raises:
@@ -34,7 +45,7 @@ def full_model(file: RobotFile) -> pin.Model:
 
 
 def planned_model(
-    full: pin.Model, file: RobotFile, tool_frame: str, rest: Mapping[str, float], locked: Mapping[str, float]
+    full: pin.Model, file: UrdfFile, tool_frame: str, rest: Mapping[str, float], locked: Mapping[str, float]
 ) -> pin.Model:
     """Return `full` with all joints locked but those on the way to `tool_frame`.
 
@@ -63,7 +74,7 @@ def planned_model(
     return _reduced(full, {1, *planned}, configuration(full, {**rest, **locked}))
 
 
-def rest_positions(full: pin.Model, file: RobotFile, given: Mapping[str, float]) -> dict[str, float]:
+def rest_positions(full: pin.Model, file: UrdfFile, given: Mapping[str, float]) -> dict[str, float]:
     """Return for each joint of 1 degree of freedom where it rests, [m] or [rad].
 
     That is what `given` says, else 0, or the middle of the limits where 0 lies outside them. A joint that mimics another
@@ -81,7 +92,7 @@ def rest_positions(full: pin.Model, file: RobotFile, given: Mapping[str, float])
     return rest
 
 
-def within_limits(model: pin.Model, joint: str, position: float) -> float:
+def nearest_position(model: pin.Model, joint: str, position: float) -> float:
     """Return `position` [m] or [rad] of a joint, turned by 2π or else moved to the nearest limit if it lies outside."""
     moving = model.joints[model.getJointId(joint)]
     if moving.nq == 2:
@@ -104,7 +115,7 @@ def configuration(model: pin.Model, positions: Mapping[str, float]) -> NDArray[n
     return q
 
 
-def default_tool_frame(full: pin.Model, file: RobotFile) -> str:
+def default_tool_frame(full: pin.Model, file: UrdfFile) -> str:
     """Return the last frame of the longest chain of joints, before it branches into fingers."""
     mimics = _mimics(file.root)
     children: dict[int, list[int]] = {j: [] for j in range(full.njoints)}
@@ -122,6 +133,43 @@ def default_tool_frame(full: pin.Model, file: RobotFile) -> str:
     return str([frame.name for frame in full.frames if frame.parentJoint == joint and frame.name != full.names[joint]][-1])
 
 
+def collision_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
+    """Return the collision shapes of `file` on the joints of `model`, named `<link>_<k>`, meshes as their convex hulls.
+
+    Raises:
+        InputError: A shape is not understood, a mesh cannot be read or is flat, or there is no shape.
+    """
+    geometry = pin.GeometryModel()
+    for shape in file.shapes("collision"):
+        _add(geometry, model, shape, shape.name, shape.solid(), _GREY)
+    if len(geometry.geometryObjects) == 0:
+        raise InputError("nothing of this robot can collide", file=file.path, expected="<collision> elements", got="none")
+    return geometry
+
+
+def visual_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
+    """Return what `file` looks like on the joints of `model`: one shape per colour, light enough for a web page.
+
+    The shapes hold triangles (`coal.BVHModelOBBRSS`) and `meshColor`; `meshPath` is empty, so that viewers draw what is
+    here and load no file themselves.
+
+    Raises:
+        InputError: A shape is not understood, or a mesh cannot be read.
+    """
+    from vkc_pin.meshes import load_parts, to_bvh
+
+    geometry = pin.GeometryModel()
+    for shape in file.shapes("visual"):
+        if shape.file is None:
+            _add(geometry, model, shape, shape.name, shape.solid(), shape.colour or _GREY)
+            continue
+        parts = load_parts(shape.file, shape.size, detail=_DETAIL)
+        for k, part in enumerate(parts):
+            name = shape.name if len(parts) == 1 else f"{shape.name}_{k}"
+            _add(geometry, model, shape, name, to_bvh(part), shape.colour or part.colour or _GREY)
+    return geometry
+
+
 def _reduced(full: pin.Model, planned: Collection[int], q: NDArray[np.float64]) -> pin.Model:
     """Return `full` with the joints that are not `planned` locked at `q`.
 
@@ -136,17 +184,7 @@ def _reduced(full: pin.Model, planned: Collection[int], q: NDArray[np.float64]) 
     for j in range(1, full.njoints):
         joint, (parent, placement) = full.joints[j], placed[full.parents[j]]
         if j in planned:
-            i, v = slice(joint.idx_q, joint.idx_q + joint.nq), slice(joint.idx_v, joint.idx_v + joint.nv)
-            index = model.addJoint(
-                parent,
-                joint,
-                clean(placement * full.jointPlacements[j], _ROUNDING),
-                full.names[j],
-                full.effortLimit[v],
-                full.velocityLimit[v],
-                full.lowerPositionLimit[i],
-                full.upperPositionLimit[i],
-            )
+            index = add_joint(model, parent, joint, clean(placement * full.jointPlacements[j], _ROUNDING), like=(full, j))
             placed[j] = (index, pin.SE3.Identity())
         else:
             placed[j] = (parent, placement * data.liMi[j])
@@ -186,3 +224,18 @@ def _mimics(root: ElementTree.Element) -> dict[str, tuple[str, float, float]]:
                 float(mimic.get("offset", "0")),
             )
     return found
+
+
+def _add(
+    geometry: pin.GeometryModel,
+    model: pin.Model,
+    shape: Shape,
+    name: str,
+    solid: coal.CollisionGeometry,
+    colour: tuple[float, ...],
+) -> None:
+    frame = model.getFrameId(shape.link, pin.FrameType.BODY)
+    parent = model.frames[frame]
+    added = pin.GeometryObject(name, parent.parentJoint, frame, clean(parent.placement * shape.placement), solid)
+    added.meshColor = np.array(colour)
+    geometry.addGeometryObject(added)

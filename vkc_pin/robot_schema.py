@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field
 
 from vkc_pin.documents import Document, check, read_yaml
 from vkc_pin.errors import InputError
-from vkc_pin.object_schema import JointSchema, Number, Positive, Schema, fail
+from vkc_pin.fields import JointSchema, Number, Positive, Schema, fail
 
 __all__ = ["BaseSchema", "RobotSchema", "python_packages", "read_robot"]
 

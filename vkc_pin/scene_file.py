@@ -12,11 +12,11 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from vkc_pin import scene_schema as schema
-from vkc_pin.articulation import load_object
 from vkc_pin.assembly import clean
 from vkc_pin.documents import Document, check
 from vkc_pin.geometry import within_limits
 from vkc_pin.hold import check_holds, holds_of
+from vkc_pin.object_file import load_object
 from vkc_pin.obstacles import FLOOR, floor_shape, obstacle_shapes
 from vkc_pin.placed import PlacedObject
 from vkc_pin.starts import StartRegion, start_limits
@@ -81,7 +81,7 @@ def scene_fields(document: Document, folder: Path) -> dict[str, Any]:
 
 
 def _robot(document: Document, item: schema.SceneRobotSchema, folder: Path) -> Robot:
-    from vkc_pin.robot import load_robot
+    from vkc_pin.robot_file import load_robot
 
     by_path = item.name.endswith((".urdf", ".yaml", ".yml")) or "/" in item.name
     short = isinstance(document.value(("robot",)), str)  # robot: husky_ur5e

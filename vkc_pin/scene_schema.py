@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from vkc_pin.object_schema import Name, Number, Positive, Schema, Vector3, count, fail
+from vkc_pin.fields import Name, Number, Positive, Schema, Vector3, count, fail
 
 __all__ = [
     "COLOURS",

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
-from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.documents import read_xml
+from vkc_pin.errors import UnknownNameError
 
 __all__ = ["Srdf", "read_srdf"]
 
@@ -47,17 +47,7 @@ def read_srdf(path: str | Path, *, links: Collection[str]) -> Srdf:
         UnknownNameError: It names a link that the robot does not have.
     """
     file = Path(path)
-    try:
-        text = file.read_text(encoding="utf-8")
-        root = ElementTree.fromstring(text.encode())
-    except ElementTree.ParseError as error:
-        raise InputError(f"not valid XML: {error}", file=file, line=error.position[0]) from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            "cannot read the SRDF", file=file, expected="an existing SRDF file", got=getattr(error, "strerror", None) or error
-        ) from error
-    if root.tag != "robot":
-        raise InputError("not an SRDF", file=file, expected="an element <robot>", got=f"<{root.tag}>")
+    text, root = read_xml(file, "SRDF")
     allowed = {}
     for element in root.iter("disable_collisions"):
         pair = [element.get(key, "") for key in ("link1", "link2")]

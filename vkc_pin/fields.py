@@ -1,0 +1,71 @@
+"""Types of the values that description files of robots, objects and scenes have in common."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic_core import PydanticCustomError
+
+__all__ = ["JointSchema", "Name", "NotNegative", "Number", "Positive", "Schema", "Vector3", "count", "fail"]
+
+
+def fail(problem: str, expected: str) -> PydanticCustomError:
+    """Return (not raise) the error of a validator: what is wrong and what would be right."""
+    return PydanticCustomError("vkc", "{problem}", {"problem": problem, "expected": expected})
+
+
+def _number(value: Any) -> Any:
+    if isinstance(value, bool):  # YAML turns yes, no, on, off into booleans, and pydantic those into 1 and 0
+        raise fail("wrong value", "a number")
+    return value
+
+
+def _name(value: str) -> str:
+    if not value or value != value.strip() or "." in value or "/" in value:
+        raise fail("not a name", "text without '.', '/' or spaces around it")
+    return value
+
+
+def count(number: int) -> BeforeValidator:
+    """Return the validator that wants a list of `number` values: pydantic alone would not say how many it expected."""
+
+    def counted(value: Any) -> Any:
+        if not isinstance(value, list | tuple):
+            raise fail("wrong value", f"a list of {number} values")
+        if len(value) != number:
+            raise fail("wrong number of values", f"{number} values")
+        return value
+
+    return BeforeValidator(counted)
+
+
+Number = Annotated[float, BeforeValidator(_number), Field(allow_inf_nan=False)]
+Positive = Annotated[Number, Field(gt=0.0)]
+NotNegative = Annotated[Number, Field(ge=0.0)]
+Vector3 = Annotated[tuple[Number, Number, Number], count(3)]
+Name = Annotated[str, AfterValidator(_name)]
+
+
+class Schema(BaseModel):
+    """Base of all schemas: immutable, and an unknown field is an error that knows the valid ones."""
+
+    model_config = ConfigDict(frozen=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known_fields(cls, data: Any) -> Any:
+        if isinstance(data, dict):
+            for key in data:
+                if key not in cls.model_fields:
+                    raise PydanticCustomError(
+                        "unknown_field", "unknown field", {"name": str(key), "choices": list(cls.model_fields)}
+                    )
+        return data
+
+
+class JointSchema(Schema):
+    """What a URDF cannot say about a joint: [m/s] and [m/s²], or [rad/s] and [rad/s²]."""
+
+    velocity: Positive | None = None
+    acceleration: Positive | None = None

@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 
 import vkc_pin as vkc
-from vkc_pin import drawing, visualization
 from vkc_pin.benchmarks import chores
-from vkc_pin.viewpoint import Viewpoint
+from vkc_pin.visualization import drawing
+from vkc_pin.visualization import viewer as visualization
+from vkc_pin.visualization.camera import Viewpoint
 
 ROOT = Path(__file__).parent.parent
 IMAGES = ROOT / "docs" / "images"

@@ -11,10 +11,10 @@ import numpy as np
 import pinocchio as pin
 from drives import DT, hall
 
-from vkc_pin.object_file import load_object
-from vkc_pin.placed import PlacedObject
-from vkc_pin.scene import Scene
-from vkc_pin.trajectory import PhaseSpan, Trajectory
+from vkc_pin.models.object_file import load_object
+from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.scene.placed import PlacedObject
+from vkc_pin.scene.scene import Scene
 
 STICK = pin.SE3(np.eye(3), np.array([0.8, 0.0, 0.55]))  # along y, its tip to the left; its discs stand 0.05 below
 TOP = 0.5  # [m] of the table

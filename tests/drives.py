@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.scene import Scene
-from vkc_pin.trajectory import PhaseSpan, Trajectory
+from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.scene.scene import Scene
 
 DT = 0.25  # [s]
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.options import Options
-from vkc_pin.plan import Plan
-from vkc_pin.report import Report, Violation
-from vkc_pin.scene import Scene, load_scene
-from vkc_pin.steps import Actuate
-from vkc_pin.trajectory import PhaseSpan, Trajectory
+from vkc_pin.planning.plan import Plan
+from vkc_pin.scene.scene import Scene, load_scene
+from vkc_pin.task.steps import Actuate
+from vkc_pin.validation.report import Report, Violation
 
 HINGE = 1.2
 

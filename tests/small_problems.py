@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.articulation import ArticulatedObject, Attachment, Freedom
-from vkc_pin.broadphase import PhaseGeometry
-from vkc_pin.object_file import load_object
+from vkc_pin.chain.broadphase import PhaseGeometry
+from vkc_pin.models.articulation import ArticulatedObject, Attachment, Freedom
+from vkc_pin.models.object_file import load_object
 from vkc_pin.options import Options
-from vkc_pin.placed import PlacedObject
-from vkc_pin.scene import Scene, load_scene
+from vkc_pin.scene.placed import PlacedObject
+from vkc_pin.scene.scene import Scene, load_scene
 
 SHORT = Options(reach_waypoints=5, turn_waypoints=3, move_waypoints=4)
 

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from vkc_pin import resources
-from vkc_pin.allowed_collisions import sample_allowed_pairs, write_srdf
-from vkc_pin.robot import Robot
-from vkc_pin.robot_file import load_robot
-from vkc_pin.srdf import read_srdf
+from vkc_pin.files import resources
+from vkc_pin.files.srdf import read_srdf
+from vkc_pin.models.robot import Robot
+from vkc_pin.models.robot_file import load_robot
+from vkc_pin.models.self_collisions import sample_allowed_pairs, write_srdf
 
 SRDF = resources.folder("robots") / "husky_ur5e" / "husky_ur5e.srdf"
 

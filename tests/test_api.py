@@ -13,7 +13,7 @@ import vkc_pin as vkc
 
 ROOT = Path(__file__).resolve().parent.parent
 # Compiled, a bare folder, and a process of its own.
-SCRIPTS = ("vkc_pin.cpin._cpin", "vkc_pin.benchmarks", "vkc_pin.viewer_server")
+SCRIPTS = ("vkc_pin.cpin._cpin", "vkc_pin.benchmarks", "vkc_pin.visualization.server")
 MODULES = [name for _, name, _ in pkgutil.walk_packages(vkc.__path__, "vkc_pin.") if name not in SCRIPTS]
 
 

@@ -10,9 +10,9 @@ import pytest
 from small_problems import door_scene
 
 import vkc_pin as vkc
-from vkc_pin.approach import Approach
-from vkc_pin.beam import Beam
-from vkc_pin.knots import Knots
+from vkc_pin.seeds.approach import Approach
+from vkc_pin.seeds.beam import Beam
+from vkc_pin.seeds.knots import Knots
 
 FEW = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20)
 

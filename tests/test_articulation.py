@@ -16,13 +16,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from vkc_pin.articulation import DEFAULT_ACCELERATION, DEFAULT_VELOCITY, ArticulatedObject
+from vkc_pin.chain.inversion import invert
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.geometry import clearance, placed_shapes
-from vkc_pin.inversion import invert
-from vkc_pin.object_file import load_object
-from vkc_pin.placed import PlacedObject, standing_geometry
-from vkc_pin.urdf import load_urdf
+from vkc_pin.files.urdf import load_urdf
+from vkc_pin.models.articulation import DEFAULT_ACCELERATION, DEFAULT_VELOCITY, ArticulatedObject
+from vkc_pin.models.object_file import load_object
+from vkc_pin.models.shapes import clearance, placed_shapes
+from vkc_pin.scene.placed import PlacedObject, standing_geometry
 
 KINDS = ("revolute", "continuous", "prismatic", "fixed")
 AXES = ("1 0 0", "0 1 0", "0 0 1", "-1 0 0", "0 0 -1", "0.6 0 0.8", "1 -2 3")

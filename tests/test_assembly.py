@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.assembly import clean, graft, graft_geometry
-from vkc_pin.coordinates import Coordinates
+from vkc_pin.models.coordinates import Coordinates
+from vkc_pin.models.grafting import clean, graft, graft_geometry
 
 KINDS = (
     pin.JointModelRX,

@@ -8,7 +8,7 @@ from base_scenes import BLINK, MARGIN, arm, at, between, chassis, clutter, dista
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.base_body import FAN, Body, Shape, Standing, hull_points
+from vkc_pin.driving.body import FAN, Body, Shape, Standing, hull_points
 
 SEEDS = st.integers(0, 2**32 - 1)
 

@@ -7,8 +7,8 @@ from base_scenes import BLINK, HALL, MARGIN, arm, at, between, chassis, clutter,
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from vkc_pin.base_body import Shape
-from vkc_pin.base_grid import HEADINGS, BaseGrid
+from vkc_pin.driving.body import Shape
+from vkc_pin.driving.grid import HEADINGS, BaseGrid
 from vkc_pin.errors import InputError
 
 STANDING = [*furniture(), *clutter(2, 20)]

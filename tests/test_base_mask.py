@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from base_scenes import HALL, MARGIN, arm, at, chassis, clutter, distance, furniture, wedge
 
-from vkc_pin.base_body import Shape
-from vkc_pin.base_grid import BaseGrid
-from vkc_pin.base_mask import Lattice, stuck
+from vkc_pin.driving.blocked import Lattice, stuck
+from vkc_pin.driving.body import Shape
+from vkc_pin.driving.grid import BaseGrid
 
 CARRIED = [*arm(), (wedge(), at(0.4, 0.4, 0.6, 0.4)), (coal.Box(0.05, 1.4, 0.05), at(0.3, 0.0, 0.8))]
 SCENES = {

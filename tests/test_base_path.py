@@ -11,10 +11,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from vkc_pin.base_body import Shape
-from vkc_pin.base_grid import BaseGrid
-from vkc_pin.base_path import BasePath, poses_along, shortest_path
-from vkc_pin.base_ways import BACKWARDS, SIDEWAYS, TURNING
+from vkc_pin.driving.body import Shape
+from vkc_pin.driving.grid import BaseGrid
+from vkc_pin.driving.ground import BACKWARDS, SIDEWAYS, TURNING
+from vkc_pin.driving.path import BasePath, poses_along, shortest_path
 from vkc_pin.errors import InputError
 
 NEAR = 1.0

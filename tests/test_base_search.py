@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from vkc_pin.base_body import Shape
-from vkc_pin.base_grid import HEADINGS, BaseGrid
-from vkc_pin.base_search import cheapest
-from vkc_pin.base_ways import BACKWARDS, SIDEWAYS, TURNING, Ground, wrapped
+from vkc_pin.driving.body import Shape
+from vkc_pin.driving.grid import HEADINGS, BaseGrid
+from vkc_pin.driving.ground import BACKWARDS, SIDEWAYS, TURNING, Ground, wrapped
+from vkc_pin.driving.search import cheapest
 
 CELLS, ROOM = 13, (-2.0, 2.0, -2.0, 2.0)
 ENTRY = 0.6  # [m] between start or goal and the cells from which the way over the grid goes on

@@ -7,9 +7,9 @@ from base_scenes import HALL, MARGIN, at, chassis
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vkc_pin.base_body import Shape
-from vkc_pin.base_grid import BaseGrid
-from vkc_pin.base_ways import BACKWARDS, SIDEWAYS, TURNING, UNIT, Drive, Ground, wrapped
+from vkc_pin.driving.body import Shape
+from vkc_pin.driving.grid import BaseGrid
+from vkc_pin.driving.ground import BACKWARDS, SIDEWAYS, TURNING, UNIT, Drive, Ground, wrapped
 
 START = np.array([0.0, 0.0, 0.0])
 

@@ -10,14 +10,14 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from vkc_pin.geometry import clearance, link_name, placed_shapes
-from vkc_pin.inverse_kinematics import PoseSolver
-from vkc_pin.obstacles import FLOOR
-from vkc_pin.placed import PlacedObject, standing_geometry
-from vkc_pin.pose import PoseRow
-from vkc_pin.robot import Robot
-from vkc_pin.scene import Scene, load_scene
-from vkc_pin.starts import START_CLEARANCE
+from vkc_pin.chain.inverse_kinematics import PoseSolver
+from vkc_pin.chain.pose import PoseRow
+from vkc_pin.models.robot import Robot
+from vkc_pin.models.shapes import clearance, link_name, placed_shapes
+from vkc_pin.scene.obstacles import FLOOR
+from vkc_pin.scene.placed import PlacedObject, standing_geometry
+from vkc_pin.scene.scene import Scene, load_scene
+from vkc_pin.scene.start import START_CLEARANCE
 
 SCENES = ("corridor_door", "aisle_drawer")
 GOALS = {"corridor_door": ("door", {"hinge": 1.5}), "aisle_drawer": ("drawer", {"slide": 0.6})}

@@ -11,8 +11,8 @@ from small_problems import door_scene
 
 import vkc_pin as vkc
 from vkc_pin.baselines.arm_kinematics import ArmKinematics
-from vkc_pin.baselines.base_poses import base_poses
-from vkc_pin.knots import Knots
+from vkc_pin.baselines.poses import base_poses
+from vkc_pin.seeds.knots import Knots
 
 SLIDE = {"slide": 0.3}
 EXACT = 1.01e-6  # [m] and [rad]

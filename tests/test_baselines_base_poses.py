@@ -11,8 +11,8 @@ from drawers import SHORT, changed, drawer_scene, handle, holding, off, spare, w
 
 import vkc_pin as vkc
 from vkc_pin.baselines import base_poses as module
-from vkc_pin.baselines.base_poses import base_poses
-from vkc_pin.knots import SCATTER, Knots
+from vkc_pin.baselines.poses import base_poses
+from vkc_pin.seeds.knots import SCATTER, Knots
 
 
 def reaching(scene: vkc.Scene, attachment: str = "handle") -> vkc.TrajectoryProblem:

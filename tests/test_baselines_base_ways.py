@@ -15,11 +15,11 @@ from drives import hall
 from small_problems import door_scene
 
 import vkc_pin as vkc
-from vkc_pin.base_path import shortest_path
-from vkc_pin.baselines.base_ways import BaseWays, headings
-from vkc_pin.geometry import placed_shapes
-from vkc_pin.obstacles import FLOOR
-from vkc_pin.placed import standing_geometry
+from vkc_pin.baselines.ways import BaseWays, headings
+from vkc_pin.driving.path import shortest_path
+from vkc_pin.models.shapes import placed_shapes
+from vkc_pin.scene.obstacles import FLOOR
+from vkc_pin.scene.placed import standing_geometry
 
 START, BESIDE = np.array([-1.5, 1.5, 0.0]), np.array([0.5, 1.0, 0.8])
 AISLE = np.array([1.0, -1.4, 0.0])  # behind the post

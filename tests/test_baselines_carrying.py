@@ -17,8 +17,8 @@ from vkc_pin.baselines import BASELINES, attempt, base_poses, plan_separately
 from vkc_pin.baselines.attempt import Attempt
 from vkc_pin.baselines.failure import FailedError
 from vkc_pin.baselines.postures import postures
-from vkc_pin.routes import Routes
-from vkc_pin.world import World
+from vkc_pin.motion.world import World
+from vkc_pin.seeds.routes import Routes
 
 OPTIONS = vkc.Options(reach_waypoints=20, move_waypoints=15)
 CUP, THERE = (1.5, 0.1, 0.501), (-0.2, 1.7, 0.701)  # on a table before the robot, and on one to its left

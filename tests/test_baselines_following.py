@@ -11,7 +11,7 @@ from drawers import SHORT, handle, holding, off, spare, with_boxes
 import vkc_pin as vkc
 from vkc_pin.baselines import following as module
 from vkc_pin.baselines.following import SEEDS, Followed, follow
-from vkc_pin.knots import Knots, smooth
+from vkc_pin.seeds.knots import Knots, smooth
 
 STILL = 0.0
 ROUNDING = 1e-6  # [m]

@@ -14,9 +14,9 @@ from small_problems import all_pairs
 import vkc_pin as vkc
 from vkc_pin.baselines import refining as module
 from vkc_pin.baselines.arm_kinematics import ArmKinematics
-from vkc_pin.baselines.base_poses import base_poses
+from vkc_pin.baselines.poses import base_poses
 from vkc_pin.baselines.refining import refined
-from vkc_pin.knots import Knots
+from vkc_pin.seeds.knots import Knots
 
 HALF, ROUNDING = 4, 1e-6  # a waypoint; [m]
 TILT, SLIDE = -2, -1  # columns

@@ -21,10 +21,10 @@ from small_problems import door_scene
 import vkc_pin as vkc
 from vkc_pin.baselines import BASELINES, attempt, base_poses, plan_separately, separate
 from vkc_pin.baselines.attempt import FINER
-from vkc_pin.baselines.base_ways import BaseWays
 from vkc_pin.baselines.following import Followed, follow
-from vkc_pin.outcome import TIMES
-from vkc_pin.unfold import as_trajectory
+from vkc_pin.baselines.ways import BaseWays
+from vkc_pin.planning.outcome import TIMES
+from vkc_pin.solver.to_trajectory import as_trajectory
 
 ROOT = Path(__file__).resolve().parent.parent
 PULL = vkc.Actuate("drawer", {"slide": 0.3})

@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from vkc_pin.batch import _KEPT, BatchFunction
+from vkc_pin.cpin.batch import _KEPT, BatchFunction
 
 
 def make() -> ca.Function:

@@ -12,10 +12,10 @@ from small_problems import door_scene, with_attachment, with_objects
 from test_initialization import hand_off_the_handle
 
 import vkc_pin as vkc
-from vkc_pin import beam as module
-from vkc_pin.beam import Beam, Found
-from vkc_pin.knots import Knots
-from vkc_pin.routes import Routes
+from vkc_pin.seeds import beam as module
+from vkc_pin.seeds.beam import Beam, Found
+from vkc_pin.seeds.knots import Knots
+from vkc_pin.seeds.routes import Routes
 
 FEW = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20)
 OPEN = vkc.Actuate("door", {"hinge": 1.2})

@@ -6,8 +6,8 @@ from numpy.typing import NDArray
 from small_problems import SHORT, door_scene
 
 import vkc_pin as vkc
-from vkc_pin.beam import Beam, _Mode
-from vkc_pin.knots import Knots
+from vkc_pin.seeds.beam import Beam, _Mode
+from vkc_pin.seeds.knots import Knots
 
 
 def beam(seed: int = 0) -> Beam:

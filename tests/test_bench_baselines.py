@@ -20,8 +20,8 @@ from vkc_pin.benchmarks.comparison_report import report
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.cli import main
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.report import Report, Violation
-from vkc_pin.trajectory import PhaseSpan, Trajectory
+from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.validation.report import Report, Violation
 
 GOOD = {"B1": {2, 3}, "B2": {1, 2}, "VKC": {0, 1, 2}}
 """Method → the starts from which `solve` has it succeed."""

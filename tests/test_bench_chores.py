@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.actions import actions_of, foresee
 from vkc_pin.benchmarks import chores
 from vkc_pin.cli import main
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.task.actions import actions_of, foresee
 
 
 @pytest.mark.parametrize(("name", "number", "actions"), [("home", 18, 10), ("fetch", 10, 6)])

@@ -21,9 +21,9 @@ from vkc_pin.benchmarks.comparison import placed
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.household import COMPARED_PLANNERS, COMPARISON, TABLE_TOP, TASKS, on_the_coffee_table
 from vkc_pin.cli import main
-from vkc_pin.geometry import clearance, placed_shapes
-from vkc_pin.placed import standing_geometry
-from vkc_pin.report import Report, Violation
+from vkc_pin.models.shapes import clearance, placed_shapes
+from vkc_pin.scene.placed import standing_geometry
+from vkc_pin.validation.report import Report, Violation
 
 GOOD = {("cup", "B1"): {0}, ("cup", "B2"): {0, 1}, ("door", "B2"): {1}}
 """(task, method) → the starts from which `solve` has it succeed; VKC always does."""

@@ -16,7 +16,7 @@ from vkc_pin.benchmarks import initialization
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.initialization import COMPARED_INITIALIZATIONS, STEPWISE, TARGET
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.report import Report, Violation
+from vkc_pin.validation.report import Report, Violation
 
 BLAME = Violation("closure", "stick", 3, 1.0, 0.01, "m", "10 mm off")
 

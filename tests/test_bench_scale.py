@@ -16,7 +16,7 @@ from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.scale import COUNTS, crowded
 from vkc_pin.cli import main
 from vkc_pin.errors import InputError
-from vkc_pin.report import Report, Violation
+from vkc_pin.validation.report import Report, Violation
 
 BLAME = Violation("penetration", "forearm_link – thing_7", 3, 1.0, 0.01, "m", "overlap by 10 mm")
 TIMES = {"initialization": 0.3, "coal": 0.1, "casadi": 0.2, "ipopt": 0.15, "validation": 0.05}

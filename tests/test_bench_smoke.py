@@ -13,10 +13,10 @@ import pytest
 from vkc_pin.benchmarks import comparison
 from vkc_pin.benchmarks.initialization import TARGET
 from vkc_pin.cli import main
-from vkc_pin.plan import Plan
-from vkc_pin.scene import load_scene
-from vkc_pin.validation import validate
-from vkc_pin.world import World
+from vkc_pin.motion.world import World
+from vkc_pin.planning.plan import Plan
+from vkc_pin.scene.scene import load_scene
+from vkc_pin.validation.validate import validate
 
 FIELDS = {
     *("key", "scene", "method", "number", "repeat", "perturbation", "start", "seed", "success", "status", "planning_time"),

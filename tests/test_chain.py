@@ -11,12 +11,12 @@ import pytest
 from carrying import room
 from small_problems import CABINET_STATE, door_scene, full_scene, random_configurations, with_attachment, with_objects
 
-from vkc_pin.chain import VIRTUAL_ACCELERATION, VIRTUAL_VELOCITY, VirtualKinematicChain, consolidate
+from vkc_pin.chain.chain import VIRTUAL_ACCELERATION, VIRTUAL_VELOCITY, VirtualKinematicChain, consolidate
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.hold import Hold
-from vkc_pin.placed import standing_geometry
-from vkc_pin.scene import Scene
-from vkc_pin.world import World
+from vkc_pin.motion.world import World
+from vkc_pin.scene.hold import Hold
+from vkc_pin.scene.placed import standing_geometry
+from vkc_pin.scene.scene import Scene
 
 GRASPS = [
     {"door": "handle"},

@@ -12,8 +12,8 @@ from matplotlib.patches import StepPatch
 from vkc_pin.benchmarks.harness.charts import criteria_chart, means_chart, motions_chart, success_chart
 from vkc_pin.benchmarks.harness.tables import TIMES, wilson
 from vkc_pin.benchmarks.scale import scale_chart
-from vkc_pin.plan import Plan
-from vkc_pin.report import Report
+from vkc_pin.planning.plan import Plan
+from vkc_pin.validation.report import Report
 
 SCENES = {"a": "easy", "b": "hard"}
 RATES = {("a", "one"): (4, 4), ("a", "two"): (3, 4), ("b", "one"): (1, 4), ("b", "two"): (0, 4)}

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin import chore
-from vkc_pin.actions import actions_of
 from vkc_pin.benchmarks.initialization import TARGET
-from vkc_pin.chore import _Chore, _cut
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.one_problem import OneProblem
-from vkc_pin.world import World
+from vkc_pin.motion.world import World
+from vkc_pin.planning import chore
+from vkc_pin.planning.chore import _Chore, _cut
+from vkc_pin.planning.one_problem import OneProblem
+from vkc_pin.task.actions import actions_of
 
 A, G, P = vkc.Actuate, vkc.Grasp, vkc.Place
 TABLE = (-3.0, 1.3, 1.051)  # on the bar table

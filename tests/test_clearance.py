@@ -6,9 +6,9 @@ import pinocchio as pin
 import pytest
 from fake_plan import fake_plan
 
-from vkc_pin.clearance import ClearanceCurve, clearance_curves
-from vkc_pin.plan import Plan
-from vkc_pin.world import World
+from vkc_pin.motion.world import World
+from vkc_pin.planning.plan import Plan
+from vkc_pin.validation.clearance import ClearanceCurve, clearance_curves
 
 TIMES = np.linspace(0.0, 6.0, 13)
 

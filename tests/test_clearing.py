@@ -10,9 +10,9 @@ import pytest
 from small_problems import door_scene
 
 import vkc_pin as vkc
-from vkc_pin import clearing
-from vkc_pin.clearing import clear_out
-from vkc_pin.knots import Knots, Known
+from vkc_pin.seeds import clearing
+from vkc_pin.seeds.clearing import clear_out
+from vkc_pin.seeds.knots import Knots, Known
 
 
 def drawn(steps: list[vkc.Grasp | vkc.Actuate | vkc.Touch], scene: vkc.Scene) -> tuple[vkc.TrajectoryProblem, Knots]:
@@ -176,7 +176,7 @@ def test_searches_that_share_what_they_know_find_what_they_would_alone(monkeypat
         raise AssertionError("asked again")
 
     for name in ("depth", "clear_out"):
-        monkeypatch.setattr(f"vkc_pin.knots.{name}", refuse)
+        monkeypatch.setattr(f"vkc_pin.seeds.knots.{name}", refuse)
     again = found(Knots(problem, np.random.default_rng(0), known))
     assert not np.array_equal(alone[0][:8], alone[0][8:])
     for one, other, third in zip(alone, first, again, strict=True):

@@ -9,9 +9,9 @@ import pinocchio as pin
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin import compact
-from vkc_pin.compact import folded_arm
-from vkc_pin.knots import depth
+from vkc_pin.seeds import folded_arm as compact
+from vkc_pin.seeds.folded_arm import folded_arm
+from vkc_pin.seeds.knots import depth
 
 TASKS = {  # scene and steps, in the last phase of which something is carried
     "nothing": ("household", [vkc.GoTo(1.0, 0.5)]),

@@ -12,15 +12,15 @@ import pinocchio as pin
 import pytest
 from small_problems import SHORT, all_pairs, cabinet, door_scene, full_scene, random_configurations
 
-from vkc_pin.contact import Contacts
+from vkc_pin.chain.contacts import Contacts
 from vkc_pin.errors import InputError
-from vkc_pin.geometry import link_name
-from vkc_pin.hold import Hold
-from vkc_pin.obstacles import FLOOR
+from vkc_pin.models.shapes import link_name
 from vkc_pin.options import Options
-from vkc_pin.problem import TrajectoryProblem, build
-from vkc_pin.scene import Scene
-from vkc_pin.steps import Actuate, GoTo, Grasp, Reach, Step
+from vkc_pin.program.problem import TrajectoryProblem, build
+from vkc_pin.scene.hold import Hold
+from vkc_pin.scene.obstacles import FLOOR
+from vkc_pin.scene.scene import Scene
+from vkc_pin.task.steps import Actuate, GoTo, Grasp, Reach, Step
 
 CURVED = {"Cylinder", "Cone", "Capsule", "Sphere", "Ellipsoid"}
 COAL = 5e-6  # [m] by which two answers of coal can differ: it starts from where it ended before
@@ -313,8 +313,8 @@ def test_contacts_do_not_depend_on_how_many_configurations_are_looked_at_at_once
     waypoints = problem.ends[np.arange(len(z)) % 4]
     at_once = problem.contacts.evaluate(z, waypoints, reach=0.3, nearest=4)
     assert np.all(np.diff(at_once.waypoint) >= 0)
-    monkeypatch.setattr("vkc_pin.contact._ROWS", 50)
-    monkeypatch.setattr("vkc_pin.broadphase._ROWS", 7)
+    monkeypatch.setattr("vkc_pin.chain.contacts._ROWS", 50)
+    monkeypatch.setattr("vkc_pin.chain.broadphase._ROWS", 7)
     in_portions = problem.contacts.evaluate(z, waypoints, reach=0.3, nearest=4)
     for one, other in zip(at_once.arrays(), in_portions.arrays(), strict=True):
         np.testing.assert_array_equal(one, other)

@@ -11,11 +11,11 @@ import pytest
 from carrying import BALL, STICK, lifted, room, stand, table
 from small_problems import SHORT, random_configurations
 
-from vkc_pin.obstacles import FLOOR
-from vkc_pin.placed import standing_geometry
-from vkc_pin.problem import TrajectoryProblem, build
-from vkc_pin.scene import Scene
-from vkc_pin.steps import GoTo, Grasp, Place, Reach, Release
+from vkc_pin.program.problem import TrajectoryProblem, build
+from vkc_pin.scene.obstacles import FLOOR
+from vkc_pin.scene.placed import standing_geometry
+from vkc_pin.scene.scene import Scene
+from vkc_pin.task.steps import GoTo, Grasp, Place, Reach, Release
 
 COAL = 5e-6  # [m] by which two answers of coal can differ: it starts from where it ended before
 MARGIN, CLOSE = SHORT.dist_safe, SHORT.grasp_clearance

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from vkc_pin.hulls import outer_hull
+from vkc_pin.files.hulls import outer_hull
 
 ROOT = Path(__file__).resolve().parents[1]
 ROBOT = ROOT / "robots" / "husky_ur5e"

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.coordinates import Coordinates, wrapped
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.models.coordinates import Coordinates, wrapped
 
 FREE = ("thing_x", "thing_y", "thing_z", "thing_qx", "thing_qy", "thing_qz", "thing_qw")
 

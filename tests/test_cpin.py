@@ -14,9 +14,9 @@ import pinocchio as pin
 import pytest
 
 from vkc_pin import cpin
-from vkc_pin.coordinates import Coordinates
 from vkc_pin.cpin import compiled, upstream
 from vkc_pin.errors import BuildError, InputError, UnknownNameError
+from vkc_pin.models.coordinates import Coordinates
 
 TOLERANCE = 1e-12
 AXIS = np.array([0.36, -0.48, 0.8])

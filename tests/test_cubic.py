@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.interpolate import PchipInterpolator
 
-from vkc_pin.ros import along, rates
+from vkc_pin.motion.ros import along, rates
 
 COLUMNS = arrays(float, st.tuples(st.integers(2, 8), st.integers(1, 3)), elements=st.floats(-10.0, 10.0))
 

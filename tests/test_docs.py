@@ -17,11 +17,11 @@ import yaml
 
 import vkc_pin as vkc
 from vkc_pin.cli import _parser
-from vkc_pin.documents import Document, check
-from vkc_pin.object_file import AttachmentSchema, LatchSchema, ObjectSchema
-from vkc_pin.report import Violation
-from vkc_pin.robot_schema import BaseSchema, RobotSchema
-from vkc_pin.scene_schema import COLOURS, ObstacleSchema, PlacedObjectSchema, SceneRobotSchema, SceneSchema, StartSchema
+from vkc_pin.files.documents import Document, check
+from vkc_pin.models.object_file import AttachmentSchema, LatchSchema, ObjectSchema
+from vkc_pin.models.robot_schema import BaseSchema, RobotSchema
+from vkc_pin.scene.scene_schema import COLOURS, ObstacleSchema, PlacedObjectSchema, SceneRobotSchema, SceneSchema, StartSchema
+from vkc_pin.validation.report import Violation
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

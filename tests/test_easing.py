@@ -11,11 +11,11 @@ import pytest
 from carrying import STICK, TOP, above, box, lifted, moved_base, reaching, room, table, tool_at
 from small_problems import SHORT
 
-from vkc_pin.easing import NEAR, SHARE
-from vkc_pin.obstacles import FLOOR
-from vkc_pin.problem import TrajectoryProblem, build
-from vkc_pin.scene import Scene
-from vkc_pin.steps import GoTo, Grasp, Place, Reach, Step, Touch
+from vkc_pin.chain.margins import NEAR, SHARE
+from vkc_pin.program.problem import TrajectoryProblem, build
+from vkc_pin.scene.obstacles import FLOOR
+from vkc_pin.scene.scene import Scene
+from vkc_pin.task.steps import GoTo, Grasp, Place, Reach, Step, Touch
 
 GAP = 4e-3  # [m] of what the stick lies on
 LONG = dataclasses.replace(SHORT, reach_waypoints=2 * NEAR + 3)

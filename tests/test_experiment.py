@@ -281,7 +281,7 @@ def test_progress(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
 
 
 def test_sources_are_those_that_planning_depends_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from vkc_pin.resources import folder
+    from vkc_pin.files.resources import folder
 
     for name in ("__init__.py", "planner.py", "cli.py", "benchmarks/tables.py", "scenes/a.yaml", "scenes/notes.txt"):
         (tmp_path / name).parent.mkdir(exist_ok=True)

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 import vkc_pin as vkc
 from vkc_pin import cli
-from vkc_pin.plan import Plan
-from vkc_pin.trajectory import PhaseSpan, Trajectory
-from vkc_pin.world import units_of
+from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.motion.world import units_of
+from vkc_pin.planning.plan import Plan
 
 FILES = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60, deadline=None)
 ROBOT = ("base_x", "base_y", "base_yaw", "lift", "elbow")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from vkc_pin.errors import UnknownNameError
-from vkc_pin.formula import ROUNDING, Formula, State
+from vkc_pin.task.formula import ROUNDING, Formula, State
 
 FRAMES, COORDINATES = ("tool", "cup.cup"), ("elbow_joint", "door.hinge")
 DT = 0.25

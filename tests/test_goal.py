@@ -12,13 +12,13 @@ import pytest
 from small_problems import CABINET_STATE, door_scene, full_scene
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.goal import LATCH_MARGIN, compile_task
-from vkc_pin.hold import Hold
-from vkc_pin.lookup import path_joints
 from vkc_pin.options import Options
-from vkc_pin.scene import Scene
-from vkc_pin.steps import Actuate, GoTo, Grasp, Reach, Release, Step
-from vkc_pin.task import Task
+from vkc_pin.scene.hold import Hold
+from vkc_pin.scene.scene import Scene
+from vkc_pin.task.compiler import LATCH_MARGIN, compile_task
+from vkc_pin.task.lookup import path_joints
+from vkc_pin.task.phases import Task
+from vkc_pin.task.steps import Actuate, GoTo, Grasp, Reach, Release, Step
 
 OPTIONS = Options(reach_waypoints=10, turn_waypoints=3, move_waypoints=7)
 OPEN = Actuate("door", {"hinge": 1.2})

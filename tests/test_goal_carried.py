@@ -13,12 +13,12 @@ from carrying import BALL, STICK, room, with_object
 from small_problems import full_scene, with_objects
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.goal import compile_task
-from vkc_pin.hold import Hold
 from vkc_pin.options import Options
-from vkc_pin.scene import Scene
-from vkc_pin.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
-from vkc_pin.task import Phase, Task
+from vkc_pin.scene.hold import Hold
+from vkc_pin.scene.scene import Scene
+from vkc_pin.task.compiler import compile_task
+from vkc_pin.task.phases import Phase, Task
+from vkc_pin.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
 
 OPTIONS = Options(reach_waypoints=10, turn_waypoints=3, move_waypoints=7)
 GRIP = Hold("stick", "grip")

@@ -7,7 +7,7 @@ import itertools
 import pytest
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.hold import Hold, as_mappings, holds_of
+from vkc_pin.scene.hold import Hold, as_mappings, holds_of
 
 STICK = Hold("stick", "grip")
 BALL = Hold("ball", "pull", STICK, "tip")

@@ -11,18 +11,18 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from vkc_pin.articulation import ArticulatedObject, Freedom
-from vkc_pin.geometry import clearance, link_name, placed_shapes
-from vkc_pin.inverse_kinematics import PoseSolver
-from vkc_pin.inversion import invert
-from vkc_pin.object_file import load_object
-from vkc_pin.obstacles import FLOOR
-from vkc_pin.placed import PlacedObject, standing_geometry
-from vkc_pin.pose import PoseRow
-from vkc_pin.resources import folder
-from vkc_pin.robot import Robot
-from vkc_pin.scene import Scene, load_scene
-from vkc_pin.starts import START_CLEARANCE
+from vkc_pin.chain.inverse_kinematics import PoseSolver
+from vkc_pin.chain.inversion import invert
+from vkc_pin.chain.pose import PoseRow
+from vkc_pin.files.resources import folder
+from vkc_pin.models.articulation import ArticulatedObject, Freedom
+from vkc_pin.models.object_file import load_object
+from vkc_pin.models.robot import Robot
+from vkc_pin.models.shapes import clearance, link_name, placed_shapes
+from vkc_pin.scene.obstacles import FLOOR
+from vkc_pin.scene.placed import PlacedObject, standing_geometry
+from vkc_pin.scene.scene import Scene, load_scene
+from vkc_pin.scene.start import START_CLEARANCE
 
 DIST_SAFE, GRASP_CLEARANCE = 0.02, 0.005  # [m], the planner's
 JOINTS = {  # joint → upper limit, velocity and acceleration; all start at 0

@@ -38,7 +38,7 @@ def test_show_is_part_of_the_notebook(jupyter: Kernel) -> None:
 
 
 def test_the_value_of_a_cell_is_an_overview(jupyter: Kernel) -> None:
-    jupyter.run("from vkc_pin.outcome import joined\nfrom vkc_pin.settings import Settings")
+    jupyter.run("from vkc_pin.planning.outcome import joined\nfrom vkc_pin.planning.settings import Settings")
     jupyter.run("plan = joined(scene, steps, Settings('auto', vkc.Options()), [])")
     for code, text in (("plan", "FAILED, interrupted"), ("scene", "obstacles")):
         (output,) = jupyter.run(code)
@@ -62,17 +62,17 @@ def test_progress_is_one_line_that_is_written_over(jupyter: Kernel) -> None:
 @pytest.mark.parametrize(
     ("where", "code"),
     [
-        ("seeds", "vkc_pin.initialization._SeedSearch, '_search'"),
-        ("solver", "vkc_pin.solver._Loop, 'run_ipopt'"),
-        ("validation", "vkc_pin.one_problem, 'validate'"),
-        ("building", "vkc_pin.one_problem, 'TrajectoryProblem'"),
+        ("seeds", "vkc_pin.seeds.initialization._SeedSearch, '_search'"),
+        ("solver", "vkc_pin.solver.loop._Loop, 'run_ipopt'"),
+        ("validation", "vkc_pin.planning.one_problem, 'validate'"),
+        ("building", "vkc_pin.planning.one_problem, 'TrajectoryProblem'"),
     ],
 )
 def test_an_interrupted_cell_leaves_a_plan(jupyter: Kernel, where: str, code: str) -> None:
     """The kernel is interrupted once planning has come to a place where it stays for a while."""
     slow = f"""
 import time, importlib
-import vkc_pin.initialization, vkc_pin.solver, vkc_pin.one_problem
+import vkc_pin.seeds.initialization, vkc_pin.solver.loop, vkc_pin.planning.one_problem
 owner, name = {code}
 original = getattr(owner, name)
 def slow(*arguments, **options):

@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 from small_problems import SHORT, door_scene
 
 import vkc_pin as vkc
-from vkc_pin import initialization, joining
-from vkc_pin.beam import Beam, Found
-from vkc_pin.initialization import _COLLIDING, _POOR, INITIALIZATIONS, _in_turn, initialize
-from vkc_pin.knots import scatter
-from vkc_pin.seed import Seed
+from vkc_pin.seeds import initialization, joining
+from vkc_pin.seeds.beam import Beam, Found
+from vkc_pin.seeds.initialization import _COLLIDING, _POOR, INITIALIZATIONS, _in_turn, initialize
+from vkc_pin.seeds.knots import scatter
+from vkc_pin.seeds.seed import Seed
 
 OPENED = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20)
 

@@ -7,8 +7,8 @@ from carrying import room, stand
 from small_problems import SHORT
 
 import vkc_pin as vkc
-from vkc_pin.inspection import patterns, planes, sizes
-from vkc_pin.problem import TrajectoryProblem
+from vkc_pin.program.inspection import patterns, planes, sizes
+from vkc_pin.program.problem import TrajectoryProblem
 
 
 @pytest.fixture(scope="module")

@@ -7,9 +7,9 @@ import pinocchio as pin
 import pytest
 from small_problems import door_scene, full_scene, random_configurations
 
-from vkc_pin.chain import VirtualKinematicChain, consolidate
-from vkc_pin.inverse_kinematics import PoseSolver
-from vkc_pin.pose import PoseRow
+from vkc_pin.chain.chain import VirtualKinematicChain, consolidate
+from vkc_pin.chain.inverse_kinematics import PoseSolver
+from vkc_pin.chain.pose import PoseRow
 
 GRASPS = [{}, {"door": "handle"}, {"cabinet": "ball"}]
 

@@ -15,13 +15,13 @@ from small_problems import door_scene
 from test_initialization import hand_off_the_handle
 
 import vkc_pin as vkc
-from vkc_pin import joining
-from vkc_pin.approach import Approach
-from vkc_pin.beam import Beam
-from vkc_pin.joining import DrivenPaths, Joiner, Paths, RrtPaths
-from vkc_pin.knots import Knots, smooth
-from vkc_pin.routes import Routes
-from vkc_pin.trees import TRIES
+from vkc_pin.seeds import joining
+from vkc_pin.seeds.approach import Approach
+from vkc_pin.seeds.beam import Beam
+from vkc_pin.seeds.joining import DrivenPaths, Joiner, Paths, RrtPaths
+from vkc_pin.seeds.knots import Knots, smooth
+from vkc_pin.seeds.routes import Routes
+from vkc_pin.seeds.rrt import TRIES
 
 FEW = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20)
 OPEN = vkc.Actuate("door", {"hinge": 1.2})

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from vkc_pin.errors import InputError
-from vkc_pin.meshes import convex_hull, load_convex, load_mesh, load_parts, to_bvh
+from vkc_pin.files.meshes import convex_hull, load_convex, load_mesh, load_parts, to_bvh
 
 # Two cubes of edge 1, one metre apart; in an OBJ file the indices go on counting through all objects.
 FACES = np.array([[1, 2, 4, 3], [5, 7, 8, 6], [1, 5, 6, 2], [3, 4, 8, 7], [1, 3, 7, 5], [2, 6, 8, 4]])

@@ -10,8 +10,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from vkc_pin.deadline import Monitor
 from vkc_pin.interrupt import Interrupt, interruptible
+from vkc_pin.program.deadline import Monitor
 
 
 @pytest.fixture(autouse=True)

@@ -5,9 +5,9 @@ import pinocchio as pin
 import pytest
 from fake_plan import fake_plan
 
-from vkc_pin.motion import Motion, key_times, sample_motion
-from vkc_pin.plan import Plan
-from vkc_pin.world import World
+from vkc_pin.motion.placements import Motion, key_times, sample_motion
+from vkc_pin.motion.world import World
+from vkc_pin.planning.plan import Plan
 
 
 @pytest.fixture(scope="module")

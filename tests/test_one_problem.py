@@ -15,14 +15,14 @@ from drives import hall
 from small_problems import door_scene
 
 import vkc_pin as vkc
-from vkc_pin import one_problem as module
-from vkc_pin.goal import compile_task
 from vkc_pin.interrupt import Interrupt
-from vkc_pin.one_problem import OneProblem
-from vkc_pin.outcome import TIMES
-from vkc_pin.seed import Seed
-from vkc_pin.settings import Settings
-from vkc_pin.solution import Iteration, Resume, Solution
+from vkc_pin.planning import one_problem as module
+from vkc_pin.planning.one_problem import OneProblem
+from vkc_pin.planning.outcome import TIMES
+from vkc_pin.planning.settings import Settings
+from vkc_pin.seeds.seed import Seed
+from vkc_pin.solver.solution import Iteration, Resume, Solution
+from vkc_pin.task.compiler import compile_task
 
 PULL = [vkc.Actuate("drawer", {"slide": 0.3})]
 NAMES, MARK = "abcdef", 1e-6

@@ -4,9 +4,9 @@ import pytest
 from carrying import room, table
 
 import vkc_pin as vkc
-from vkc_pin.outcome import joined, spent
-from vkc_pin.plan import Plan
-from vkc_pin.settings import Settings
+from vkc_pin.planning.outcome import joined, spent
+from vkc_pin.planning.plan import Plan
+from vkc_pin.planning.settings import Settings
 
 
 @pytest.mark.parametrize("name", ["door", "household", "init_3"])

@@ -14,8 +14,8 @@ import pytest
 from fake_plan import fake_plan
 
 import vkc_pin as vkc
-from vkc_pin.plan import Plan
-from vkc_pin.report import Report
+from vkc_pin.planning.plan import Plan
+from vkc_pin.validation.report import Report
 
 ROOT = Path(__file__).resolve().parent.parent
 

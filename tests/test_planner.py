@@ -19,8 +19,8 @@ from carrying import BALL, STICK, lifted, room, stand, table, tool_at
 from drives import hall
 
 import vkc_pin as vkc
-from vkc_pin.resources import folder
-from vkc_pin.world import World
+from vkc_pin.files.resources import folder
+from vkc_pin.motion.world import World
 
 ROOT = Path(__file__).resolve().parent.parent
 HINGE = 1.2

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from fake_plan import fake_plan
 
-from vkc_pin import plotting
 from vkc_pin.errors import InputError
-from vkc_pin.plan import Plan
+from vkc_pin.planning.plan import Plan
+from vkc_pin.plotting import plots as plotting
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +121,7 @@ def test_what_cannot_be_plotted(plan: Plan, tmp_path: Path) -> None:
 
 def test_importing_it_loads_neither_matplotlib_nor_meshcat() -> None:
     heavy = ("matplotlib", "meshcat", "trimesh")
-    code = f"import sys, vkc_pin.plotting, vkc_pin.visualization; print([m for m in {heavy} if m in sys.modules])"
+    code = f"import sys, vkc_pin.plotting.plots, vkc_pin.visualization.viewer; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 

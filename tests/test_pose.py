@@ -7,7 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from vkc_pin.pose import ROW_BOUNDS, pose_residual, pose_rows, target_vector
+from vkc_pin.chain.pose import ROW_BOUNDS, pose_residual, pose_rows, target_vector
 
 _R, _p, _target = ca.SX.sym("R", 3, 3), ca.SX.sym("p", 3), ca.SX.sym("W", 12)
 RESIDUAL = ca.Function("residual", [_R, _p, _target], [pose_residual("pose", _R, _p, _target)])

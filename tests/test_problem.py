@@ -12,14 +12,14 @@ from carrying import STICK, lifted, room, stand, table
 from small_problems import SHORT, door_scene, full_scene, random_configurations
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.goal import LATCH_MARGIN
-from vkc_pin.hold import Hold
+from vkc_pin.models.robot_file import load_robot
 from vkc_pin.options import Options
-from vkc_pin.problem import TrajectoryProblem, build
-from vkc_pin.robot_file import load_robot
-from vkc_pin.scene import load_scene
-from vkc_pin.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
-from vkc_pin.unfold import as_trajectory
+from vkc_pin.program.problem import TrajectoryProblem, build
+from vkc_pin.scene.hold import Hold
+from vkc_pin.scene.scene import load_scene
+from vkc_pin.solver.to_trajectory import as_trajectory
+from vkc_pin.task.compiler import LATCH_MARGIN
+from vkc_pin.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
 
 POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array([0.4, 0.2, 0.9]))
 HANDLE = Hold("door", "handle")

@@ -16,9 +16,9 @@ import pytest
 from drives import hall
 
 import vkc_pin as vkc
-from vkc_pin import one_problem
-from vkc_pin import progress as module
-from vkc_pin.progress import Progress, shown
+from vkc_pin.planning import one_problem
+from vkc_pin.planning import progress as module
+from vkc_pin.planning.progress import Progress, shown
 
 ROOT = Path(__file__).resolve().parent.parent
 

@@ -7,8 +7,8 @@ import pytest
 from drives import hall, moved, through
 
 import vkc_pin as vkc
-from vkc_pin.problem import TrajectoryProblem, build
-from vkc_pin.refinement import CLOSE, KEEP, collisions_between, merge
+from vkc_pin.program.problem import TrajectoryProblem, build
+from vkc_pin.solver.between import CLOSE, KEEP, collisions_between, merge
 
 ARM = [np.pi, -1.2, 1.9, -0.7, np.pi / 2, 0.0]  # stretched out ahead of the base
 WIDTH = 2.0  # [m] the base drives sideways
@@ -46,7 +46,7 @@ def test_a_thin_obstacle_between_waypoints(monkeypatch: pytest.MonkeyPatch) -> N
     assert free
     assert nothing.violation() == 0.0
     nothing = nothing.select(np.zeros(0, int))
-    monkeypatch.setattr("vkc_pin.solver.collisions_between", lambda problem, z: (nothing, True))
+    monkeypatch.setattr("vkc_pin.solver.loop.collisions_between", lambda problem, z: (nothing, True))
     blind = vkc.plan(scene, steps, options=FEW, initialization="interpolated")
     assert not blind.success
     assert blind.status == "rejected"  # the solver was content, validation was not

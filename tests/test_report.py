@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 
-from vkc_pin.report import Report, Violation
+from vkc_pin.validation.report import Report, Violation
 
 ONE = Violation("limit", "elbow_joint", 4, 1.0, 0.05, "rad", "3.2 rad is outside")
 TWO = Violation("penetration", "forearm_link – sofa", 7, 1.9, 0.01, "m", "overlap by 10.0 mm")

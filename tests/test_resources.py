@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from vkc_pin.errors import UnknownNameError
-from vkc_pin.resources import available, find, folder
+from vkc_pin.files.resources import available, find, folder
 
 
 def test_what_travels_with_the_package() -> None:
@@ -35,7 +35,7 @@ def test_an_installed_package_has_them_inside(tmp_path: Path, monkeypatch: pytes
     inside = tmp_path / "site-packages" / "vkc_pin"
     (inside / "scenes").mkdir(parents=True)
     (inside / "scenes" / "own.yaml").write_text("")
-    monkeypatch.setattr("vkc_pin.resources.__file__", str(inside / "resources.py"))
+    monkeypatch.setattr("vkc_pin.files.resources.__file__", str(inside / "resources.py"))
     assert folder("scenes") == inside / "scenes"
     assert list(available("scenes", "*.yaml")) == ["own"]
     assert folder("robots") == inside.parent / "robots"  # a source tree has them beside the package

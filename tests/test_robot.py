@@ -10,11 +10,11 @@ import pinocchio as pin
 import pytest
 import trimesh
 
-from vkc_pin import resources
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.robot import Robot
-from vkc_pin.robot_file import load_robot
-from vkc_pin.scene import Scene
+from vkc_pin.files import resources
+from vkc_pin.models.robot import Robot
+from vkc_pin.models.robot_file import load_robot
+from vkc_pin.scene.scene import Scene
 
 FOLDER = resources.folder("robots") / "husky_ur5e"
 ARM = ["shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", "wrist_1_joint", "wrist_2_joint", "wrist_3_joint"]

@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vkc_pin.room import Room
-from vkc_pin.scene import Scene, load_scene
+from vkc_pin.scene.scene import Scene, load_scene
+from vkc_pin.visualization.room import Room
 
 
 @pytest.fixture(scope="module")

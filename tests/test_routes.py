@@ -5,8 +5,8 @@ import pytest
 from gates import GOAL, NARROW, TIGHT, gated, walled
 
 import vkc_pin as vkc
-from vkc_pin.initialization import initialize
-from vkc_pin.routes import Routes
+from vkc_pin.seeds.initialization import initialize
+from vkc_pin.seeds.routes import Routes
 
 
 def test_the_way_leads_through_the_gap() -> None:

@@ -18,27 +18,28 @@ from hypothesis import strategies as st
 from small_problems import SHORT, all_pairs, random_configurations
 from test_validation_pairs import brute_force, pair_names, wander, whirl
 
-from vkc_pin import easing, geometry
-from vkc_pin.base_body import Body
 from vkc_pin.benchmarks.scale import crowded
-from vkc_pin.broadphase import PhaseGeometry
-from vkc_pin.clearance import clearance_curves
-from vkc_pin.contact import ContactModel
-from vkc_pin.geometry import clearance, shape_distance
-from vkc_pin.obstacles import FLOOR
-from vkc_pin.placed import standing_geometry
-from vkc_pin.plan import Plan
-from vkc_pin.planner import plan
-from vkc_pin.problem import TrajectoryProblem, build
-from vkc_pin.scene import Scene
-from vkc_pin.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step
-from vkc_pin.trajectory import Trajectory
-from vkc_pin.validation_contacts import may_touch
-from vkc_pin.validation_distances import Placed
-from vkc_pin.validation_motion import ways
-from vkc_pin.validation_pairs import PairTable
-from vkc_pin.validation_samples import Samples
-from vkc_pin.world import World
+from vkc_pin.chain import margins as easing
+from vkc_pin.chain.broadphase import PhaseGeometry
+from vkc_pin.chain.contacts import ContactModel
+from vkc_pin.driving.body import Body
+from vkc_pin.models import shapes as geometry
+from vkc_pin.models.shapes import clearance, shape_distance
+from vkc_pin.motion.trajectory import Trajectory
+from vkc_pin.motion.world import World
+from vkc_pin.planning.plan import Plan
+from vkc_pin.planning.planner import plan
+from vkc_pin.program.problem import TrajectoryProblem, build
+from vkc_pin.scene.obstacles import FLOOR
+from vkc_pin.scene.placed import standing_geometry
+from vkc_pin.scene.scene import Scene
+from vkc_pin.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step
+from vkc_pin.validation.clearance import clearance_curves
+from vkc_pin.validation.distances import Placed
+from vkc_pin.validation.pairs import PairTable
+from vkc_pin.validation.samples import Samples
+from vkc_pin.validation.touching import may_touch
+from vkc_pin.validation.travel import ways
 
 SEEDS = st.integers(0, 2**32 - 1)
 POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array([0.4, 0.2, 0.9]))

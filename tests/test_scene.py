@@ -11,12 +11,12 @@ import pinocchio as pin
 import pytest
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.geometry import clearance, placed_shapes
-from vkc_pin.obstacles import FLOOR
-from vkc_pin.placed import standing_geometry
-from vkc_pin.resources import folder
-from vkc_pin.scene import Scene, load_scene
-from vkc_pin.starts import START_CLEARANCE
+from vkc_pin.files.resources import folder
+from vkc_pin.models.shapes import clearance, placed_shapes
+from vkc_pin.scene.obstacles import FLOOR
+from vkc_pin.scene.placed import standing_geometry
+from vkc_pin.scene.scene import Scene, load_scene
+from vkc_pin.scene.start import START_CLEARANCE
 
 TINY = """\
 robot: husky_ur5e

@@ -13,7 +13,7 @@ import pytest
 from carrying import tool_at
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.scene import Scene, load_scene
+from vkc_pin.scene.scene import Scene, load_scene
 
 HALL = """\
 robot: husky_ur5e

@@ -12,10 +12,11 @@ from drives import hall, moved, through
 from small_problems import door_scene
 
 import vkc_pin as vkc
-from vkc_pin import solver, trust_region
-from vkc_pin.initialization import initialize
-from vkc_pin.solver import Solution, solve
-from vkc_pin.timing import Timing
+from vkc_pin.program.timing import Timing
+from vkc_pin.seeds.initialization import initialize
+from vkc_pin.solver import loop as solver
+from vkc_pin.solver import trust_region
+from vkc_pin.solver.loop import Solution, solve
 
 FEW = vkc.Options(reach_waypoints=20, max_outer=12)
 PILLAR = {"name": "pillar", "type": "cylinder", "radius": 0.15, "length": 1.6, "position": [1.6, 0.05, 0.8]}

@@ -3,7 +3,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from vkc_pin.sparse import assemble, sparse, unit
+from vkc_pin.program.sparse import assemble, sparse, unit
 
 
 def test_parts_go_to_their_places_and_add_up_where_they_meet() -> None:

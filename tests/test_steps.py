@@ -11,7 +11,7 @@ import pytest
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.steps import (
+from vkc_pin.task.steps import (
     STEPS,
     Actuate,
     GoTo,

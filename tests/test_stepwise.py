@@ -14,17 +14,17 @@ from drives import hall
 from small_problems import full_scene
 
 import vkc_pin as vkc
-from vkc_pin import stepwise as module
-from vkc_pin.goal import compile_task
-from vkc_pin.hold import Hold
+from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.motion.world import scene_after
 from vkc_pin.options import Options
-from vkc_pin.outcome import TIMES
-from vkc_pin.scene import Scene
-from vkc_pin.settings import Settings
-from vkc_pin.steps import GoTo
-from vkc_pin.task import Task
-from vkc_pin.trajectory import PhaseSpan, Trajectory
-from vkc_pin.world import scene_after
+from vkc_pin.planning import stepwise as module
+from vkc_pin.planning.outcome import TIMES
+from vkc_pin.planning.settings import Settings
+from vkc_pin.scene.hold import Hold
+from vkc_pin.scene.scene import Scene
+from vkc_pin.task.compiler import compile_task
+from vkc_pin.task.phases import Task
+from vkc_pin.task.steps import GoTo
 
 
 def ending(scene: Scene, base: list[float], arm: np.ndarray, **objects: float) -> Trajectory:

@@ -13,9 +13,9 @@ from carrying import room, stand, table
 from small_problems import full_scene, random_configurations
 
 import vkc_pin as vkc
-from vkc_pin.task import Phase
-from vkc_pin.term_rows import TermProgram
-from vkc_pin.terms import Constraint, Cost
+from vkc_pin.program.term_rows import TermProgram
+from vkc_pin.task.phases import Phase
+from vkc_pin.task.terms import Constraint, Cost
 
 OPTIONS = vkc.Options(reach_waypoints=3, turn_waypoints=2, move_waypoints=3, contact_slots=2)
 QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes"}

@@ -12,7 +12,7 @@ from carrying import room, table
 from drives import hall
 
 import vkc_pin as vkc
-from vkc_pin.terms import check_active, term_from_dict, term_to_dict, traced
+from vkc_pin.task.terms import check_active, term_from_dict, term_to_dict, traced
 
 PERSON = np.array([1.0, 2.0, 1.0])
 SHORT = vkc.Options(reach_waypoints=3)

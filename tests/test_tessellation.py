@@ -7,10 +7,10 @@ import pytest
 import trimesh
 
 from vkc_pin.errors import InputError
-from vkc_pin.geometry import triangles
-from vkc_pin.meshes import MeshPart, to_bvh
-from vkc_pin.tessellation import Solid, box_solid, coarse, merge_solids, shade, to_solid, tube
-from vkc_pin.top_view import outline
+from vkc_pin.files.meshes import MeshPart, to_bvh
+from vkc_pin.models.shapes import triangles
+from vkc_pin.plotting.top_view import outline
+from vkc_pin.visualization.solids import Solid, box_solid, coarse, merge_solids, shade, to_solid, tube
 
 
 def as_mesh(solid: Solid) -> trimesh.Trimesh:
@@ -45,7 +45,7 @@ def test_surface_of_every_shape(shape: coal.CollisionGeometry, volume: float, si
 
 
 def test_convex_shapes() -> None:
-    from vkc_pin.meshes import convex_hull
+    from vkc_pin.files.meshes import convex_hull
 
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 2) for z in (0, 3)], float)
     assert trimesh.Trimesh(*triangles(convex_hull(corners))).volume == pytest.approx(6.0)

@@ -10,12 +10,12 @@ import pytest
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks.initialization import TARGET
-from vkc_pin.goal import compile_task
-from vkc_pin.one_problem import OneProblem
-from vkc_pin.seed import Seed, seed_of
-from vkc_pin.settings import Settings
-from vkc_pin.stepwise import stages
-from vkc_pin.world import World, scene_after
+from vkc_pin.motion.world import World, scene_after
+from vkc_pin.planning.one_problem import OneProblem
+from vkc_pin.planning.settings import Settings
+from vkc_pin.planning.stepwise import stages
+from vkc_pin.seeds.seed import Seed, seed_of
+from vkc_pin.task.compiler import compile_task
 
 
 @cache
@@ -133,7 +133,7 @@ def test_a_perturbation_that_is_none(bad: object) -> None:
 
 
 def test_a_perturbed_seed_is_another_one_and_the_same_again() -> None:
-    from vkc_pin.initialization import initialize
+    from vkc_pin.seeds.initialization import initialize
 
     problem = vkc.build(start(), [vkc.GoTo(1.0, -4.0, 0.0)])
     plain, one, same, other = (

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.trajectory import PhaseSpan, Trajectory, filled, join
+from vkc_pin.motion.trajectory import PhaseSpan, Trajectory, filled, join
 
 NAMES = ("base_x", "base_y", "base_yaw", "shoulder", "elbow", "door.hinge")
 ROWS = np.array(

@@ -14,14 +14,14 @@ import pytest
 from carrying import room, stand, table
 from small_problems import door_scene, full_scene, random_configurations
 
-from vkc_pin import transcription as module
-from vkc_pin import waypoint as kinds
+from vkc_pin.models.robot_file import load_robot
 from vkc_pin.options import Options
-from vkc_pin.problem import TrajectoryProblem, build
-from vkc_pin.robot_file import load_robot
-from vkc_pin.scene import Scene
-from vkc_pin.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
-from vkc_pin.waypoint import Structure, waypoint_functions
+from vkc_pin.program import transcription as module
+from vkc_pin.program import waypoint as kinds
+from vkc_pin.program.problem import TrajectoryProblem, build
+from vkc_pin.program.waypoint import Structure, waypoint_functions
+from vkc_pin.scene.scene import Scene
+from vkc_pin.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
 
 OPTIONS = Options(reach_waypoints=3, turn_waypoints=2, move_waypoints=3, contact_slots=2)
 QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes"}

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as some
 
 import vkc_pin as vkc
-from vkc_pin import trees
-from vkc_pin.routes import Routes
-from vkc_pin.trees import connect, spread
+from vkc_pin.seeds import rrt as trees
+from vkc_pin.seeds.routes import Routes
+from vkc_pin.seeds.rrt import connect, spread
 
 SIZE = 9  # x, y and yaw of the base, six joints of the arm
 METRE = np.array([2.0, 2.0, *np.ones(SIZE - 2)])  # how much each coordinate counts

@@ -9,10 +9,10 @@ import pytest
 from carrying import STICK, lifted, room, stand, table
 from small_problems import SHORT, door_scene, random_configurations
 
-from vkc_pin.problem import TrajectoryProblem, build
-from vkc_pin.steps import Actuate, GoTo, Grasp, Place, Release, Step
-from vkc_pin.trajectory import Trajectory
-from vkc_pin.unfold import as_trajectory
+from vkc_pin.motion.trajectory import Trajectory
+from vkc_pin.program.problem import TrajectoryProblem, build
+from vkc_pin.solver.to_trajectory import as_trajectory
+from vkc_pin.task.steps import Actuate, GoTo, Grasp, Place, Release, Step
 
 ASIDE = lifted(STICK, [0.0, 0.5, 0.0])
 

@@ -12,15 +12,15 @@ import pytest
 from drives import DT, hall, moved, of_rows, through, with_positions
 
 import vkc_pin as vkc
-from vkc_pin.articulation import Attachment
-from vkc_pin.clearance import clearance_curves
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.models.articulation import Attachment
+from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.options import Options
-from vkc_pin.placed import PlacedObject
-from vkc_pin.report import Report, Violation
-from vkc_pin.scene import Scene
-from vkc_pin.trajectory import PhaseSpan, Trajectory
-from vkc_pin.validation import validate
+from vkc_pin.scene.placed import PlacedObject
+from vkc_pin.scene.scene import Scene
+from vkc_pin.validation.clearance import clearance_curves
+from vkc_pin.validation.report import Report, Violation
+from vkc_pin.validation.validate import validate
 
 WRIST = "wrist_3_joint"
 

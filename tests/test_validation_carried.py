@@ -30,10 +30,10 @@ from carrying import (
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.report import Report, Violation
-from vkc_pin.scene import Scene
-from vkc_pin.trajectory import PhaseSpan, Trajectory
-from vkc_pin.validation import validate
+from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.scene.scene import Scene
+from vkc_pin.validation.report import Report, Violation
+from vkc_pin.validation.validate import validate
 
 ASIDE = lifted(STICK, [0.0, 0.5, 0.0])
 PLACED = vkc.Place("stick", ASIDE)

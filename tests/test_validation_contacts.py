@@ -10,12 +10,12 @@ from carrying import BALL, STICK, TOP, Script, above, box, lifted, moved_base, r
 from drives import of_rows
 from small_problems import door_scene, full_scene
 
-from vkc_pin.obstacles import FLOOR
-from vkc_pin.scene import Scene
-from vkc_pin.steps import Actuate, Grasp, Place, Step, Touch
-from vkc_pin.trajectory import PhaseSpan, Trajectory
-from vkc_pin.validation_contacts import CONTACT, may_touch
-from vkc_pin.world import World
+from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.motion.world import World
+from vkc_pin.scene.obstacles import FLOOR
+from vkc_pin.scene.scene import Scene
+from vkc_pin.task.steps import Actuate, Grasp, Place, Step, Touch
+from vkc_pin.validation.touching import CONTACT, may_touch
 
 HANDS = set(door_scene().robot.touch_links)
 

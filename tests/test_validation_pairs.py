@@ -13,15 +13,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_problems import door_scene, full_scene
 
-from vkc_pin import validation_pairs
-from vkc_pin.obstacles import FLOOR
-from vkc_pin.scene import Scene
-from vkc_pin.trajectory import PhaseSpan, Trajectory
-from vkc_pin.validation_contacts import may_touch
-from vkc_pin.validation_motion import ways
-from vkc_pin.validation_pairs import Hit, PairTable
-from vkc_pin.validation_samples import Samples
-from vkc_pin.world import World
+from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.motion.world import World
+from vkc_pin.scene.obstacles import FLOOR
+from vkc_pin.scene.scene import Scene
+from vkc_pin.validation import pairs as validation_pairs
+from vkc_pin.validation.pairs import Hit, PairTable
+from vkc_pin.validation.samples import Samples
+from vkc_pin.validation.touching import may_touch
+from vkc_pin.validation.travel import ways
 
 
 @pytest.fixture(scope="module")

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from small_problems import full_scene, with_objects
 
-from vkc_pin.scene import Scene
-from vkc_pin.trajectory import PhaseSpan, Trajectory
-from vkc_pin.validation_samples import ANGLE_STEP, LENGTH_STEP, Samples
+from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.scene.scene import Scene
+from vkc_pin.validation.samples import ANGLE_STEP, LENGTH_STEP, Samples
 
 VIRTUAL = {
     "grip": (),

@@ -12,7 +12,7 @@ from carrying import STICK, TOP, carried_over, room, table
 from drives import DT, hall, moved, of_rows, through
 
 import vkc_pin as vkc
-from vkc_pin.validation_terms import BETWEEN
+from vkc_pin.validation.own_terms import BETWEEN
 
 START = hall().start
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vkc_pin.viewpoint import FIELD_OF_VIEW, choose_viewpoint
+from vkc_pin.visualization.camera import FIELD_OF_VIEW, choose_viewpoint
 
 MOTION = np.array([[x, y, z] for x in np.linspace(-1, 3, 9) for y in (-0.5, 0.5) for z in (0.0, 1.5)])
 

@@ -21,11 +21,11 @@ import pytest
 import umsgpack
 from fake_plan import HINGE, fake_plan
 
-from vkc_pin import visualization
 from vkc_pin.errors import InputError
-from vkc_pin.plan import Plan
-from vkc_pin.scene import load_scene
-from vkc_pin.world import World
+from vkc_pin.motion.world import World
+from vkc_pin.planning.plan import Plan
+from vkc_pin.scene.scene import load_scene
+from vkc_pin.visualization import viewer as visualization
 
 needs_chromium = pytest.mark.skipif(browser.CHROMIUM is None, reason="Chromium is not installed")
 
@@ -239,7 +239,7 @@ def test_page_says_what_the_motion_is(page: Path, plan: Plan) -> None:
 def test_page_is_written_whole_or_not_at_all(plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     target = tmp_path / "door.html"
     target.write_text("before")
-    monkeypatch.setattr("vkc_pin.page._packed", lambda data: 1 / 0)
+    monkeypatch.setattr("vkc_pin.visualization.page._packed", lambda data: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         visualization.to_html(plan, target)
     assert [file.name for file in tmp_path.iterdir()] == ["door.html"]
@@ -247,7 +247,7 @@ def test_page_is_written_whole_or_not_at_all(plan: Plan, tmp_path: Path, monkeyp
 
 
 def test_names_cannot_break_out_of_the_page() -> None:
-    from vkc_pin.page import Recorder, render_page
+    from vkc_pin.visualization.page import Recorder, render_page
 
     text = render_page(Recorder(), title="<b>%FILM%", film={"headline": "</script><b>"})
     assert "<b>" not in text
@@ -306,7 +306,7 @@ def test_server_serves_the_motion(viewer: Any, plan: Plan) -> None:
 def test_animate_into_a_viewer_of_ones_own(plan: Plan) -> None:
     import meshcat
 
-    from vkc_pin.page import Recorder
+    from vkc_pin.visualization.page import Recorder
 
     recorder = Recorder()
     mine = meshcat.Visualizer(window=recorder)["mine"]

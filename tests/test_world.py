@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_problems import full_scene, random_configurations
 
-from vkc_pin.placed import standing_geometry
-from vkc_pin.trajectory import PhaseSpan, Trajectory
-from vkc_pin.world import World
+from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.motion.world import World
+from vkc_pin.scene.placed import standing_geometry
 
 
 @pytest.fixture(scope="module")

@@ -28,9 +28,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vkc_pin.errors import InputError
-from vkc_pin.scene import Scene
-from vkc_pin.trajectory import Trajectory
-from vkc_pin.world import World, as_numbers
+from vkc_pin.motion.trajectory import Trajectory
+from vkc_pin.motion.world import World, as_numbers
+from vkc_pin.scene.scene import Scene
 
 TIP = pin.SE3(pin.utils.rotate("x", -np.pi / 2), np.array([0.0, 0.25, 0.0]))  # in the stick
 PULL = (np.pi / 2, 0.0, 0.0)  # how the ball lies on the tip that comes from the right

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from vkc_pin.writing import write_atomically
+from vkc_pin.files.writing import write_atomically
 
 
 def test_it_makes_the_folder_and_replaces_what_was_there(tmp_path: Path) -> None:

@@ -1,28 +1,34 @@
 """Whole-body planning for mobile manipulators on virtual kinematic chains."""
 
-from vkc_pin import cards as _cards  # noqa: F401 - registers what notebooks show of a scene
-from vkc_pin.articulation import ArticulatedObject, Attachment, Freedom, Latch
-from vkc_pin.chain import VirtualKinematicChain, consolidate
-from vkc_pin.chore import plan_chore
+from importlib.metadata import PackageNotFoundError, version
+
+from vkc_pin.chain.chain import VirtualKinematicChain, consolidate
+from vkc_pin.chain.inversion import invert
 from vkc_pin.errors import BuildError, InputError, UnknownNameError, VkcError
-from vkc_pin.formula import State
-from vkc_pin.inversion import invert
-from vkc_pin.object_file import load_object
+from vkc_pin.models.articulation import ArticulatedObject, Attachment, Freedom, Latch
+from vkc_pin.models.object_file import load_object
+from vkc_pin.models.robot import Robot
+from vkc_pin.models.robot_file import load_robot
+from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.options import Options
-from vkc_pin.placed import PlacedObject
-from vkc_pin.plan import Plan
-from vkc_pin.planner import plan
-from vkc_pin.problem import TrajectoryProblem, build
-from vkc_pin.report import Report, Violation
-from vkc_pin.robot import Robot
-from vkc_pin.robot_file import load_robot
-from vkc_pin.scene import Scene, load_scene
-from vkc_pin.solution import Iteration
-from vkc_pin.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Touch
-from vkc_pin.terms import Constraint, Cost
-from vkc_pin.trajectory import PhaseSpan, Trajectory
-from vkc_pin.validation import validate
-from vkc_pin.version import __version__
+from vkc_pin.planning.chore import plan_chore
+from vkc_pin.planning.plan import Plan
+from vkc_pin.planning.planner import plan
+from vkc_pin.plotting import cards as _cards  # noqa: F401 - registers what notebooks show of a scene
+from vkc_pin.program.problem import TrajectoryProblem, build
+from vkc_pin.scene.placed import PlacedObject
+from vkc_pin.scene.scene import Scene, load_scene
+from vkc_pin.solver.solution import Iteration
+from vkc_pin.task.formula import State
+from vkc_pin.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Touch
+from vkc_pin.task.terms import Constraint, Cost
+from vkc_pin.validation.report import Report, Violation
+from vkc_pin.validation.validate import validate
+
+try:
+    __version__ = version("vkc-pin")
+except PackageNotFoundError:  # a source tree that was never installed
+    __version__ = "0+unknown"
 
 __all__ = [
     "Actuate",

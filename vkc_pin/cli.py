@@ -12,7 +12,7 @@ from typing import Any
 
 from vkc_pin.benchmarks.commands import EXIT_OK, add_bench, natural, positive
 from vkc_pin.errors import InputError, VkcError
-from vkc_pin.tables import GROUPS
+from vkc_pin.motion.tables import GROUPS
 
 __all__ = ["main"]
 
@@ -25,7 +25,7 @@ def parse_settings(settings: Sequence[str]) -> list[Any]:
     Raises:
         InputError: A text is not of that form.
     """
-    from vkc_pin.steps import Actuate
+    from vkc_pin.task.steps import Actuate
 
     grouped: list[tuple[str, dict[str, float]]] = []
     for text in settings:
@@ -87,7 +87,7 @@ def _plan(arguments: argparse.Namespace) -> int:
 
 
 def _write_ros(plan: Any, path: str, **options: Any) -> None:
-    from vkc_pin.writing import write_atomically
+    from vkc_pin.files.writing import write_atomically
 
     write_atomically(path, (json.dumps(plan.to_ros(**options)) + "\n").encode("utf-8"))
 
@@ -117,7 +117,7 @@ def _export(arguments: argparse.Namespace) -> int:
 
 def _check(arguments: argparse.Namespace) -> int:
     import vkc_pin as vkc
-    from vkc_pin.validation import validate
+    from vkc_pin.validation.validate import validate
 
     plan = vkc.Plan.load(arguments.plan)
     report = validate(plan.scene, plan.steps, plan.trajectory, plan.options, plan.terms)
@@ -127,7 +127,7 @@ def _check(arguments: argparse.Namespace) -> int:
 
 def _view(arguments: argparse.Namespace) -> int:
     import vkc_pin as vkc
-    from vkc_pin import visualization
+    from vkc_pin.visualization import viewer as visualization
 
     shown: Any = vkc.Plan.load(arguments.what) if str(arguments.what).endswith(".npz") else vkc.load_scene(arguments.what)
     if arguments.html:
@@ -141,8 +141,8 @@ def _view(arguments: argparse.Namespace) -> int:
 
 
 def _srdf(arguments: argparse.Namespace) -> int:
-    from vkc_pin.allowed_collisions import write_srdf
-    from vkc_pin.robot_file import load_robot
+    from vkc_pin.models.robot_file import load_robot
+    from vkc_pin.models.self_collisions import write_srdf
 
     written = write_srdf(load_robot(arguments.robot), arguments.output, samples=arguments.samples, seed=arguments.seed)
     sys.stdout.write(f"wrote {written}\n")
@@ -150,7 +150,7 @@ def _srdf(arguments: argparse.Namespace) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    from vkc_pin.version import __version__
+    from vkc_pin import __version__
 
     parser = argparse.ArgumentParser(prog="vkc-pin", description="Whole-body planning on virtual kinematic chains.")
     parser.add_argument("--version", action="version", version=__version__)

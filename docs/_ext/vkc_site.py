@@ -79,7 +79,7 @@ def skip(app: Sphinx, what: str, name: str, thing: Any, skipped: bool, options: 
 
 
 def resolve(app: Sphinx, env: BuildEnvironment, node: addnodes.pending_xref, content: nodes.Node) -> nodes.Node | None:
-    """Find own names by their last part: a class is documented as `vkc_pin.Plan` and lives in `vkc_pin.plan`."""
+    """Find own names by their last part: a class is documented as `vkc_pin.Plan` and lives in `vkc_pin.planning.plan`."""
     if node.get("refdomain") != "py":
         return None
     target = str(node["reftarget"])

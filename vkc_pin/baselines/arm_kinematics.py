@@ -11,8 +11,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from vkc_pin.knots import Knots
-from vkc_pin.problem import TrajectoryProblem
+from vkc_pin.program.problem import TrajectoryProblem
+from vkc_pin.seeds.knots import Knots
 
 __all__ = ["QP", "ArmKinematics"]
 

@@ -10,27 +10,27 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vkc_pin.approach import Approach
-from vkc_pin.baselines.base_poses import base_poses
-from vkc_pin.baselines.base_ways import BaseWays, headings
 from vkc_pin.baselines.failure import FailedError
 from vkc_pin.baselines.following import follow
+from vkc_pin.baselines.poses import base_poses
 from vkc_pin.baselines.postures import at_home, postures, through
-from vkc_pin.goal import compile_task
-from vkc_pin.initialization import initialize
+from vkc_pin.baselines.ways import BaseWays, headings
 from vkc_pin.interrupt import NEVER, Interrupt
-from vkc_pin.knots import Knots, smooth
+from vkc_pin.motion.trajectory import Trajectory, join
+from vkc_pin.motion.world import scene_after
 from vkc_pin.options import Options
-from vkc_pin.outcome import TIMES
-from vkc_pin.problem import TrajectoryProblem
-from vkc_pin.scene import Scene
-from vkc_pin.seed import Seed
-from vkc_pin.solver import SOLVED_RATE_TOLERANCE, solve
-from vkc_pin.steps import Actuate, GoTo, Grasp, Place, Step
-from vkc_pin.trajectory import Trajectory, join
-from vkc_pin.trust_region import CLOSE_ENOUGH
-from vkc_pin.unfold import as_trajectory
-from vkc_pin.world import scene_after
+from vkc_pin.planning.outcome import TIMES
+from vkc_pin.program.problem import TrajectoryProblem
+from vkc_pin.scene.scene import Scene
+from vkc_pin.seeds.approach import Approach
+from vkc_pin.seeds.initialization import initialize
+from vkc_pin.seeds.knots import Knots, smooth
+from vkc_pin.seeds.seed import Seed
+from vkc_pin.solver.loop import SOLVED_RATE_TOLERANCE, solve
+from vkc_pin.solver.to_trajectory import as_trajectory
+from vkc_pin.solver.trust_region import CLOSE_ENOUGH
+from vkc_pin.task.compiler import compile_task
+from vkc_pin.task.steps import Actuate, GoTo, Grasp, Place, Step
 
 __all__ = ["FINER", "Attempt", "Doable"]
 

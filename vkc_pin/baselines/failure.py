@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from vkc_pin.trajectory import Trajectory
+from vkc_pin.motion.trajectory import Trajectory
 
 __all__ = ["FailedError"]
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from vkc_pin.baselines.arm_kinematics import ArmKinematics
 from vkc_pin.baselines.refining import CLEAR, refined
 from vkc_pin.interrupt import NEVER, Interrupt
-from vkc_pin.knots import Knots
-from vkc_pin.problem import TrajectoryProblem
+from vkc_pin.program.problem import TrajectoryProblem
+from vkc_pin.seeds.knots import Knots
 
 __all__ = ["Followed", "follow"]
 

@@ -7,12 +7,12 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from vkc_pin.approach import Approach
 from vkc_pin.interrupt import NEVER, Interrupt
-from vkc_pin.knots import Knots, smooth
-from vkc_pin.problem import TrajectoryProblem
-from vkc_pin.routes import Routes
-from vkc_pin.trust_region import CLOSE_ENOUGH
+from vkc_pin.program.problem import TrajectoryProblem
+from vkc_pin.seeds.approach import Approach
+from vkc_pin.seeds.knots import Knots, smooth
+from vkc_pin.seeds.routes import Routes
+from vkc_pin.solver.trust_region import CLOSE_ENOUGH
 
 __all__ = ["at_home", "postures", "through"]
 

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vkc_pin.baselines.arm_kinematics import QP
-from vkc_pin.knots import Knots
-from vkc_pin.problem import TrajectoryProblem
+from vkc_pin.program.problem import TrajectoryProblem
+from vkc_pin.seeds.knots import Knots
 
 __all__ = ["CLEAR", "refined"]
 

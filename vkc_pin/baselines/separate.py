@@ -33,17 +33,17 @@ import numpy as np
 
 from vkc_pin.baselines.attempt import Attempt, Doable
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.goal import compile_task
 from vkc_pin.interrupt import interruptible
+from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.options import Options
-from vkc_pin.outcome import outcome, spent
-from vkc_pin.plan import Plan
-from vkc_pin.report import Report
-from vkc_pin.scene import Scene
-from vkc_pin.settings import check_arguments
-from vkc_pin.steps import Step
-from vkc_pin.trajectory import Trajectory
-from vkc_pin.validation import validate
+from vkc_pin.planning.outcome import outcome, spent
+from vkc_pin.planning.plan import Plan
+from vkc_pin.planning.settings import check_arguments
+from vkc_pin.scene.scene import Scene
+from vkc_pin.task.compiler import compile_task
+from vkc_pin.task.steps import Step
+from vkc_pin.validation.report import Report
+from vkc_pin.validation.validate import validate
 
 __all__ = ["BASELINES", "RETRIES", "plan_separately"]
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from vkc_pin.benchmarks.comparison import COMPARED_PLANNERS, Assignment, Comparison
 from vkc_pin.benchmarks.harness.charts import criteria_chart
-from vkc_pin.steps import Actuate
+from vkc_pin.task.steps import Actuate
 
 __all__ = ["COMPARED_PLANNERS", "TASKS", "plan_trial", "run"]
 

@@ -13,12 +13,12 @@ import numpy as np
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.record import distribution, trial
 from vkc_pin.benchmarks.harness.tables import decimal, failures, foot, markdown
-from vkc_pin.chore import plan_chore
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.plan import Plan
-from vkc_pin.scene import Scene, load_scene
-from vkc_pin.steps import Actuate, Grasp, Place, Step
-from vkc_pin.writing import write_atomically
+from vkc_pin.files.writing import write_atomically
+from vkc_pin.planning.chore import plan_chore
+from vkc_pin.planning.plan import Plan
+from vkc_pin.scene.scene import Scene, load_scene
+from vkc_pin.task.steps import Actuate, Grasp, Place, Step
 
 __all__ = ["CHORES", "fetch", "home", "plan_trial", "report", "run"]
 

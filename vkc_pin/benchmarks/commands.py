@@ -85,7 +85,7 @@ def _bench_door(arguments: argparse.Namespace) -> int:
     result = door.run(trials=arguments.trials, seed=arguments.seed, progress=not arguments.quiet)
     sys.stdout.write(door.table(result) + "\n")
     if arguments.json:
-        from vkc_pin.writing import write_atomically
+        from vkc_pin.files.writing import write_atomically
 
         write_atomically(arguments.json, (json.dumps(result, indent=1) + "\n").encode())
         sys.stdout.write(f"wrote {arguments.json}\n")

@@ -20,12 +20,12 @@ from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.charts import motions_chart
 from vkc_pin.benchmarks.harness.record import trial
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.plan import Plan
-from vkc_pin.planner import plan
-from vkc_pin.scene import Scene, load_scene
-from vkc_pin.steps import Actuate, GoTo, Place, Step, as_placement
-from vkc_pin.trajectory import Trajectory
-from vkc_pin.writing import write_atomically
+from vkc_pin.files.writing import write_atomically
+from vkc_pin.motion.trajectory import Trajectory
+from vkc_pin.planning.plan import Plan
+from vkc_pin.planning.planner import plan
+from vkc_pin.scene.scene import Scene, load_scene
+from vkc_pin.task.steps import Actuate, GoTo, Place, Step, as_placement
 
 __all__ = ["COMPARED_PLANNERS", "TIME_LIMIT", "Assignment", "Comparison", "Solve", "peaks"]
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from vkc_pin.benchmarks.comparison import COMPARED_PLANNERS, Assignment, Comparison
 from vkc_pin.benchmarks.harness.charts import means_chart, success_chart
-from vkc_pin.scene import Scene
-from vkc_pin.steps import Actuate, GoTo, Place
+from vkc_pin.scene.scene import Scene
+from vkc_pin.task.steps import Actuate, GoTo, Place
 
 __all__ = ["COMPARED_PLANNERS", "TABLE_TOP", "TASKS", "on_the_coffee_table", "plan_trial", "run"]
 

@@ -18,11 +18,11 @@ from vkc_pin.benchmarks.harness.charts import success_chart
 from vkc_pin.benchmarks.harness.record import trial
 from vkc_pin.benchmarks.harness.tables import comparison_table, foot, methods_table
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.plan import Plan
-from vkc_pin.planner import plan
-from vkc_pin.scene import Scene, load_scene
-from vkc_pin.steps import Grasp, Touch
-from vkc_pin.writing import write_atomically
+from vkc_pin.files.writing import write_atomically
+from vkc_pin.planning.plan import Plan
+from vkc_pin.planning.planner import plan
+from vkc_pin.scene.scene import Scene, load_scene
+from vkc_pin.task.steps import Grasp, Touch
 
 __all__ = ["COMPARED_INITIALIZATIONS", "SCENES", "STEPWISE", "TARGET", "plan_trial", "report", "run", "specify"]
 

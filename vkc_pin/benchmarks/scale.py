@@ -13,12 +13,12 @@ from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.record import distribution, trial
 from vkc_pin.benchmarks.harness.tables import TIMES, decimal, foot, markdown, quartiles
 from vkc_pin.errors import InputError
-from vkc_pin.plan import Plan
-from vkc_pin.planner import plan
-from vkc_pin.scene import Scene, load_scene
-from vkc_pin.steps import Actuate
-from vkc_pin.style import COLOURS, new_figure, save_figure, styled
-from vkc_pin.writing import write_atomically
+from vkc_pin.files.writing import write_atomically
+from vkc_pin.planning.plan import Plan
+from vkc_pin.planning.planner import plan
+from vkc_pin.plotting.style import COLOURS, new_figure, save_figure, styled
+from vkc_pin.scene.scene import Scene, load_scene
+from vkc_pin.task.steps import Actuate
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vkc_pin.benchmarks.harness.tables import common, mean_and_deviation, quartiles, wilson
-from vkc_pin.plan import Plan
-from vkc_pin.style import COLOURS, new_figure, save_figure, shade_phases, styled
+from vkc_pin.planning.plan import Plan
+from vkc_pin.plotting.style import COLOURS, new_figure, save_figure, shade_phases, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.plan import Plan
+from vkc_pin.planning.plan import Plan
 
 __all__ = ["distribution", "meta", "peak_memory", "trial"]
 

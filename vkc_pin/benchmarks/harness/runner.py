@@ -23,8 +23,8 @@ from tqdm import tqdm
 from vkc_pin.benchmarks.harness.record import meta, peak_memory
 from vkc_pin.benchmarks.harness.tables import to_csv
 from vkc_pin.errors import InputError, VkcError
-from vkc_pin.resources import folder, package_folder
-from vkc_pin.writing import write_atomically
+from vkc_pin.files.resources import folder, package_folder
+from vkc_pin.files.writing import write_atomically
 
 __all__ = ["Function", "run"]
 

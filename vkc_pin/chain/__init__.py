@@ -1,0 +1,1 @@
+"""The virtual kinematic chain: its kinematics, and what it can hit."""

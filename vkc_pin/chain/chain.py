@@ -1,0 +1,272 @@
+"""The virtual kinematic chain: virtual base, robot, and the objects it handles, inverted, in one Pinocchio model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import casadi
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from vkc_pin import cpin
+from vkc_pin.chain.inversion import invert
+from vkc_pin.cpin.batch import BatchFunction
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.models.articulation import Attachment
+from vkc_pin.models.coordinates import Coordinates
+from vkc_pin.models.grafting import clean, graft, graft_geometry
+from vkc_pin.models.robot import Robot
+from vkc_pin.scene.hold import Hold, holds_of
+from vkc_pin.scene.placed import PlacedObject
+from vkc_pin.scene.scene import Scene
+
+__all__ = ["Closure", "VirtualKinematicChain", "consolidate"]
+
+VIRTUAL_VELOCITY = 1.0  # [rad/s] or [m/s], of the hand in a grasp that leaves it a freedom
+VIRTUAL_ACCELERATION = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Closure:
+    """h_chain of eq. 2: where the base link of a held object must stay, or a free one is when it is grasped.
+
+    Attributes:
+        joint: The joint of the chain that carries the object's base link.
+        local: Placement of the base link in that joint's frame.
+        target: Placement of the base link in the world.
+    """
+
+    joint: int
+    local: pin.SE3
+    target: pin.SE3
+
+
+@dataclass(frozen=True, eq=False)
+class VirtualKinematicChain:
+    """C^V: one model of everything that moves together.
+
+    Attributes:
+        robot: The robot at its root.
+        model: `pinocchio.Model`; joint 1 is the planar virtual base, then the arm, then per grasp the virtual joint
+            of the attachment and the object's joints from the attachable link to its base, inverted.
+        coordinates: Minimal coordinates z of `model`.
+        names: Their names, shape (n,); objects' as `<object>.<joint>`, virtual joints' as `<object>.<attachment>`.
+        lower, upper, velocity, acceleration: Limits, shape (n,), SI units.
+        collision: Collision geometry of the robot (first, in the robot's order) and of what moves of the objects.
+        held_geometries: Hold → indices in `collision` of the object's geometry that moves when it is held.
+        closures: Hold → where the object's base link is on the chain, and where it stands in the world.
+        virtual: Hold → names of the coordinates of its attachment's virtual joint.
+        added: Hold → names of all coordinates that come with it: these, and the joints of the object that it moves.
+        prefixes: Hold → what the object's frames and joints begin with in `model`.
+    """
+
+    robot: Robot
+    model: pin.Model
+    coordinates: Coordinates
+    names: tuple[str, ...]
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    acceleration: NDArray[np.float64]
+    collision: pin.GeometryModel
+    held_geometries: Mapping[Hold, tuple[int, ...]]
+    closures: Mapping[Hold, Closure]
+    virtual: Mapping[Hold, tuple[str, ...]]
+    added: Mapping[Hold, tuple[str, ...]]
+    prefixes: Mapping[Hold, str]
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates n."""
+        return len(self.names)
+
+    def joint_placements(self, z: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return rotations, shape (W, J, 3, 3), and translations, shape (W, J, 3) [m], of all joints in the world.
+
+        Args:
+            z: Configurations, shape (W, n). Joint 0, the world, is among the J.
+        """
+        batch, joints = len(z), self.model.njoints
+        (columns,) = self._kinematics(z)
+        columns = columns.reshape(batch, joints - 1, 12)
+        rotations, translations = np.zeros((batch, joints, 3, 3)), np.zeros((batch, joints, 3))
+        rotations[:, 0] = np.eye(3)
+        rotations[:, 1:] = columns[..., :9].reshape(batch, joints - 1, 3, 3).swapaxes(2, 3)
+        translations[:, 1:] = columns[..., 9:]
+        return rotations, translations
+
+    @cached_property
+    def _kinematics(self) -> BatchFunction:
+        return _placements(self.model.saveToString())
+
+    @cached_property
+    def carries(self) -> NDArray[np.bool_]:
+        """Whether joint j moves when joint k does, shape (J, J)."""
+        joints = range(self.model.njoints)
+        return np.array([[k in self.model.supports[j] for k in joints] for j in joints])
+
+    @cached_property
+    def motions(self) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+        """How joints move: for each coordinate its joint, and how that moves linearly and about which axis, in its frame.
+
+        Shapes (n,), (n, 3) and (n, 3). The last array, shape (n,), says where the linear motion is along the world's axes: x and
+        y of a planar joint.
+        """
+        data, owner = self.model.createData(), np.array(self.coordinates.joints)
+        pin.forwardKinematics(self.model, data, pin.neutral(self.model))
+        linear, angular, fixed = np.zeros((len(owner), 3)), np.zeros((len(owner), 3)), np.zeros(len(owner), bool)
+        for column, joint in enumerate(self.coordinates.joints):
+            if str(self.model.joints[joint].shortname()) == "JointModelPlanar":
+                part = column - self.coordinates.joints.index(joint)
+                fixed[column] = part < 2
+                (linear if part < 2 else angular)[column, part] = 1.0
+            else:
+                motion = np.asarray(data.joints[joint].S, float).ravel()
+                linear[column], angular[column] = motion[:3], motion[3:]
+        return owner, linear, angular, fixed
+
+    def point_jacobians(
+        self, z: NDArray[np.float64], which: NDArray[np.int_], joint: NDArray[np.int_], point: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return how points that are fixed in joints' frames move, shape (C, 3, n).
+
+        Args:
+            z: Configurations, shape (B, n).
+            which: The configuration of each point, shape (C,).
+            joint: The joint that carries it, shape (C,); 0 stands still.
+            point: Where it is in the world, shape (C, 3) [m].
+        """
+        owner, linear, angular, fixed = self.motions
+        rotations, translations = self.joint_placements(z)
+        axes = rotations[:, owner]
+        turned = np.where(fixed[:, None], linear, np.einsum("bnij,nj->bni", axes, linear))[which]
+        about = np.einsum("bnij,nj->bni", axes, angular)[which]
+        moved = turned + np.cross(about, point[:, None] - translations[:, owner][which])
+        return np.asarray((moved * self.carries[joint][:, owner, None]).swapaxes(1, 2))
+
+    def index(self, name: str) -> int:
+        """Return the position of coordinate `name` in z. Raises `UnknownNameError` if there is none."""
+        if name not in self.names:
+            raise UnknownNameError("coordinate", name, self.names)
+        return self.names.index(name)
+
+    def holder(self, hold: Hold) -> tuple[int, pin.SE3]:
+        """Return the joint that carries the frame which holds something, and the frame's placement there."""
+        return self.frame(self.robot.tool_frame) if hold.by is None else self.frame(str(hold.link), hold.by)
+
+    def frame(self, name: str, hold: Hold | None = None) -> tuple[int, pin.SE3]:
+        """Return the joint that carries a frame, and the frame's placement there: the robot's, or a link of what is held."""
+        frame = self.model.frames[self.model.getFrameId(name if hold is None else self.prefixes[hold] + name)]
+        return frame.parentJoint, pin.SE3(frame.placement)
+
+
+def _virtual_joints(attachment: Attachment, owner: str) -> list[tuple[str, pin.JointModel, float, float]]:
+    """Return the joints of J(v)⁻¹, tool to object: each joint's axis is negated, and their order reversed."""
+    models = {"revolute": pin.JointModelRevoluteUnaligned, "prismatic": pin.JointModelPrismaticUnaligned}
+    joints = [
+        (f"{owner}.{name}", models[freedom.kind](-freedom.axis), freedom.lower, freedom.upper)
+        for name, freedom in zip(attachment.coordinates, attachment.freedoms, strict=True)
+    ]
+    return joints[::-1]
+
+
+def consolidate(scene: Scene, holds: Iterable[Hold] | Mapping[str, str]) -> VirtualKinematicChain:
+    """Merge the scene's robot with the objects it holds into one model (section III of the paper).
+
+    Args:
+        scene: Robot, objects and where they stand.
+        holds: What is held at any time, each after the hold it depends on; or object → attachment, all by the tool.
+            Several become branches of one tree; only what is held at a waypoint, and stands fixed, is closed there.
+
+    Returns:
+        The chain. Branches of an object beside the path from grasp to base are fixed at their present state.
+
+    Raises:
+        UnknownNameError: The scene has no such object, or the object no such attachment.
+        InputError: A grasp that leaves a freedom is called like a joint of its object.
+    """
+    robot, holds = scene.robot, holds_of(holds, {}) if isinstance(holds, Mapping) else tuple(holds)
+    model, collision = pin.Model(robot.model), pin.GeometryModel()
+    graft_geometry(collision, robot.collision.geometryObjects, joints=list(range(model.njoints)), placement=pin.SE3.Identity())
+    names = list(robot.coordinates.names)
+    limits = [list(robot.lower), list(robot.upper), list(robot.velocity), list(robot.acceleration)]
+    held_geometries, closures, virtual, with_hold = {}, {}, {}, {}
+    prefixes: dict[Hold, str] = {}
+    for hold in holds:
+        name = hold.object
+        if name not in scene.objects:
+            raise UnknownNameError("object", name, scene.objects, field="grasps")
+        placed = scene.objects[name]
+        attachment = placed.object.attachment(hold.attachment)
+        # Pinocchio finds a frame only by a name that no other has: the second branch of an object needs another prefix.
+        prefix = prefixes[hold] = name + "'" * sum(other.object == name for other in prefixes) + "."
+        holder = robot.tool_frame if hold.by is None else f"{prefixes[hold.by]}{hold.link}"
+        tool = model.frames[model.getFrameId(holder)]
+        parent, placement = tool.parentJoint, tool.placement * attachment.offset.inverse()
+        added = []
+        for joint_name, joint, low, high in _virtual_joints(attachment, name):
+            own = [np.array([value]) for value in (np.inf, VIRTUAL_VELOCITY, low, high)]
+            parent = model.addJoint(parent, joint, clean(placement), joint_name, *own)
+            placement = pin.SE3.Identity()
+            added.append(joint_name)
+            for row, value in zip(limits, (low, high, VIRTUAL_VELOCITY, VIRTUAL_ACCELERATION), strict=True):
+                row.append(value)
+        virtual[hold] = tuple(added)
+        tree = invert(placed.object, attachment.link, placed.state)
+        placement = clean(placement * attachment.placement.inverse())
+        joints = graft(model, tree.model, parent=parent, placement=placement, prefix=prefix)
+        names += added
+        for joint_name in tree.model.names[1:]:
+            names.append(f"{name}.{joint_name}")
+            index = placed.object.coordinates.names.index(joint_name)
+            stated = (placed.object.lower, placed.object.upper, placed.object.velocity, placed.object.acceleration)
+            for row, values in zip(limits, stated, strict=True):
+                row.append(float(values[index]))
+        with_hold[hold] = (*added, *(f"{name}.{joint_name}" for joint_name in tree.model.names[1:]))
+        base = model.frames[model.getFrameId(f"{prefix}{placed.object.base_link}")]
+        moving = list(tree.collision.geometryObjects)
+        if not placed.object.free:
+            # What the joints in hand do not move (a door's frame, another door in it) stands in the world, closed or not.
+            moving = [shape for shape in moving if joints[shape.parentJoint] != base.parentJoint]
+        held_geometries[hold] = tuple(graft_geometry(collision, moving, joints=joints, placement=placement, prefix=prefix))
+        closures[hold] = Closure(base.parentJoint, pin.SE3(base.placement), _base_target(placed))
+    for joint_name in names:
+        if names.count(joint_name) > 1:
+            problem = "two grasps, or an attachment and a joint of its object, share a name"
+            raise InputError(problem, field=joint_name, expected="different names")
+    lower, upper, velocity, acceleration = (np.array(row, float) for row in limits)
+    return VirtualKinematicChain(
+        robot=robot,
+        model=model,
+        coordinates=Coordinates(model),
+        names=tuple(names),
+        lower=lower,
+        upper=upper,
+        velocity=velocity,
+        acceleration=acceleration,
+        collision=collision,
+        held_geometries=held_geometries,
+        closures=closures,
+        virtual=virtual,
+        added=with_hold,
+        prefixes=prefixes,
+    )
+
+
+def _base_target(placed: PlacedObject) -> pin.SE3:
+    base = placed.object.model.frames[placed.object.model.getFrameId(placed.object.base_link, pin.FrameType.BODY)]
+    return placed.placement * base.placement
+
+
+@lru_cache(maxsize=16)
+def _placements(model_text: str) -> BatchFunction:
+    """Return z → (12·(J − 1),): by columns R and t of every joint's placement in the world, built once per model."""
+    model = pin.Model()
+    model.loadFromString(model_text)
+    coordinates = Coordinates(model)
+    z = casadi.SX.sym("z", coordinates.size)
+    placements = cpin.joint_placements(model)(coordinates.q_symbolic(z))
+    return BatchFunction(casadi.Function("placements", [z], [casadi.densify(placements)], {"cse": True}))

@@ -1,0 +1,224 @@
+"""Signed distances of collision pairs (coal) and witness planes.
+
+For a pair (A, B) coal gives the witness points a, b and the normal n of the signed distance d = n·(b − a). With a
+fixed in A's body, b in B's and n in the world, n·(b(z) − a(z)) is smooth in z, and its value and gradient equal the
+signed distance's at the linearisation point. It is linear in the placements of the joints, C·vec(M(z)) − R.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from bisect import insort
+from dataclasses import dataclass
+from typing import Any
+
+import coal
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from vkc_pin.chain.chain import VirtualKinematicChain
+from vkc_pin.chain.collision_pairs import phase_geometries
+from vkc_pin.chain.narrowphase import Distances
+from vkc_pin.options import Options
+from vkc_pin.scene.placed import standing_geometry
+from vkc_pin.scene.scene import Scene
+from vkc_pin.task.phases import Task
+
+__all__ = ["ContactModel", "Contacts"]
+
+_ROUNDING = 1e-6  # [m] of coal
+_ROWS = 256  # configurations whose kinematics are computed at once
+
+
+@dataclass(frozen=True, eq=False)
+class Contacts:
+    """Close pairs at waypoints; arrays over C contacts, nearest first within a waypoint.
+
+    Attributes:
+        waypoint: Row of the configurations it belongs to, shape (C,).
+        pair: Geometry indices, shape (C, 2).
+        distance: Signed distance [m], shape (C,).
+        margin: Clearance the pair must keep [m], shape (C,).
+        normal: From the first to the second, world frame, shape (C, 3).
+        first, second: Witness points in the world, shape (C, 3) [m].
+    """
+
+    waypoint: NDArray[np.int_]
+    pair: NDArray[np.int_]
+    distance: NDArray[np.float64]
+    margin: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    first: NDArray[np.float64]
+    second: NDArray[np.float64]
+
+    def arrays(self) -> tuple[NDArray[Any], ...]:
+        """Return its arrays in the order of the attributes."""
+        return (self.waypoint, self.pair, self.distance, self.margin, self.normal, self.first, self.second)
+
+    def select(self, index: NDArray[np.int_]) -> Contacts:
+        """Return the contacts at `index`, in that order."""
+        return Contacts(*(array[index] for array in self.arrays()))
+
+    def violation(self) -> float:
+        """Return by how much the worst pair falls short of its margin [m]; 0 if none does."""
+        return float(max(0.0, np.max(self.margin - self.distance, initial=0.0)))
+
+    def shortfall(self, segments: int) -> NDArray[np.float64]:
+        """Return by how much the worst pair of each of `segments` configurations falls short [m], shape (segments,)."""
+        worst = np.zeros(segments)
+        np.maximum.at(worst, self.waypoint, self.margin - self.distance)
+        return worst
+
+    def clearance(self) -> float:
+        """Return the smallest distance [m]; infinite if nothing is close."""
+        return float(np.min(self.distance, initial=np.inf))
+
+
+class ContactModel:
+    """What can collide with what in each phase of a task, and how close it is.
+
+    Attributes:
+        phases: Geometry and pairs per phase.
+        first_waypoint: Waypoint at which each phase starts.
+    """
+
+    def __init__(self, scene: Scene, chain: VirtualKinematicChain, task: Task, options: Options) -> None:
+        self.scene, self.chain, self.task = scene, chain, task
+        self.data = chain.model.createData()
+        self.first_waypoint = np.concatenate([[0], np.cumsum([phase.segments for phase in task.phases])])
+        self._placed = pin.GeometryData(chain.collision)
+        self.phases = phase_geometries(scene, chain, task, options)
+        self._distances = [Distances(part.shapes, self._placed.oMg) for part in self.phases]
+        # Beyond the chain's own geometries everything stands in the world.
+        own = [shape.parentJoint for shape in chain.collision.geometryObjects]
+        self._joints = np.array(own + [0] * (max(len(part.labels) for part in self.phases) - len(own)))
+
+    def settled(self, z: NDArray[np.float64]) -> ContactModel:
+        """Return the same, where what the motion z_1..z_N, shape (N, n), leaves behind stands where that motion leaves it.
+
+        Before, it stands where the task says, which is only nearly there where the motion chooses the place itself.
+        """
+        if not any(phase.left for phase in self.task.phases):
+            return self
+        view = copy.copy(self)
+        view.phases, view._distances = list(self.phases), list(self._distances)
+        for number, phase in enumerate(self.task.phases):
+            where: dict[int, pin.SE3] = {}
+            for name, (hold, before) in phase.left.items():
+                closure = self.chain.closures[hold]
+                rotations, translations = self.chain.joint_placements(z[[self.first_waypoint[before + 1] - 1]])
+                carrier = pin.SE3(rotations[0, closure.joint], translations[0, closure.joint])
+                placed = dataclasses.replace(self.scene.objects[name], placement=carrier * closure.local)
+                shapes = zip(self.phases[number].left[name], standing_geometry(placed), strict=True)
+                where |= {index: shape.placement for index, shape in shapes}
+            if where:
+                view.phases[number] = self.phases[number].placed(where)
+                view._distances[number] = self._distances[number].placed(where)
+        return view
+
+    def phase_of(self, waypoint: int) -> int:
+        """Return the phase whose geometry holds at `waypoint`: at a boundary the earlier, before the grasp."""
+        return max(0, int(np.searchsorted(self.first_waypoint, waypoint)) - 1)
+
+    def inside(self, phase: int) -> int:
+        """Return a waypoint at which a phase's geometry holds."""
+        return int(self.first_waypoint[phase]) + 1
+
+    def evaluate(
+        self,
+        z: NDArray[np.float64],
+        waypoints: NDArray[np.int_],
+        *,
+        reach: float,
+        nearest: int | None = None,
+        standing: bool = True,
+    ) -> Contacts:
+        """Return the pairs closer than `reach` [m].
+
+        Args:
+            z: Configurations, shape (W, n).
+            waypoints: For each, the waypoint whose phase it belongs to, shape (W,).
+            reach: Pairs further apart are left out.
+            nearest: How many of them to return per configuration, those that fall shortest of their margins; None: all.
+            standing: Whether what stands in the world counts, too; otherwise only pairs of which both move.
+        """
+        q = self.chain.coordinates.q(z)
+        rotations, translations = self.placements(z)
+        phase_of = np.maximum(np.searchsorted(self.first_waypoint, waypoints) - 1, 0)
+        rows: list[tuple[float, ...]] = []
+        vectors: list[NDArray[np.float64]] = []
+        for number in set(phase_of.tolist()):
+            part, inside = self.phases[number], np.flatnonzero(phase_of == number)
+            at, pairs, bounds = part.maybe_within(reach, rotations[inside], translations[inside], standing=standing)
+            margins = part.margins_at(pairs, waypoints[inside[at]])
+            least = bounds - margins
+            order = np.lexsort((pairs, least, at))
+            columns = (pairs, *part.pairs[pairs].T, margins, least)
+            pair, first, second, margin, bound = (column[order].tolist() for column in columns)
+            edges = np.searchsorted(at, np.arange(len(inside) + 1)).tolist()
+            for row, begin, end in zip(inside.tolist(), edges[:-1], edges[1:], strict=True):
+                if begin == end:
+                    continue
+                pin.updateGeometryPlacements(self.chain.model, self.data, self.chain.collision, self._placed, q[row])
+                asked = self._distances[number].moved()
+                found: list[tuple[float, float, int, int, coal.DistanceResult]] = []
+                for i in range(begin, end):
+                    if nearest is not None and len(found) >= nearest and bound[i] > found[nearest - 1][0] + _ROUNDING:
+                        break  # neither this one nor any after it is among the nearest
+                    result = asked.of(first[i], second[i])
+                    distance = result.min_distance
+                    if distance < reach:
+                        insort(found, (distance - margin[i], distance, pair[i], i, result))
+                for _, distance, _, i, result in found[:nearest]:
+                    rows.append((row, first[i], second[i], distance, margin[i]))
+                    vectors += (result.normal.copy(), result.getNearestPoint1(), result.getNearestPoint2())
+        table = np.array(rows, float).reshape(len(rows), 5)
+        order = np.argsort(table[:, 0], kind="stable")
+        table, stacked = table[order], np.array(vectors, float).reshape(len(rows), 3, 3)[order]
+        index = table[:, :3].astype(int)
+        return Contacts(index[:, 0], index[:, 1:], table[:, 3], table[:, 4], stacked[:, 0], stacked[:, 1], stacked[:, 2])
+
+    def placements(self, z: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the same as the chain's `joint_placements`; in portions of one size, as CasADi prepares for each size anew."""
+        parts = [self.chain.joint_placements(z[row : row + _ROWS]) for row in range(0, max(len(z), 1), _ROWS)]
+        return np.concatenate([rotations for rotations, _ in parts]), np.concatenate([moves for _, moves in parts])
+
+    def joints_of(self, geometries: NDArray[np.int_]) -> NDArray[np.int_]:
+        """Return the joints of the chain that carry `geometries`; 0 for what stands in the world."""
+        return self._joints[geometries]
+
+    def gradients(self, z: NDArray[np.float64], contacts: Contacts) -> NDArray[np.float64]:
+        """Return the gradients of the distances of contacts at configurations `z`, shape (B, n): n·(∂b − ∂a), shape (C, n)."""
+        joints = self.joints_of(contacts.pair)
+        which, points = np.tile(contacts.waypoint, 2), np.concatenate([contacts.first, contacts.second])
+        first, second = np.split(self.chain.point_jacobians(z, which, joints.T.ravel(), points), 2)
+        return np.asarray(np.einsum("ci,cij->cj", contacts.normal, second - first))
+
+    def planes(
+        self, z: NDArray[np.float64], contacts: Contacts, *, slots: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the coefficients C, shape (W, slots, 12·joints), and offsets R, shape (W, slots), of the nearest contacts.
+
+        C·vec(M(z)) − R ≥ 0 says that a contact keeps its margin; M are the placements of all joints (see `cpin`). Slots
+        that nothing needs have C = 0, R = −1.
+        """
+        joints = self.chain.model.njoints - 1
+        coefficients = np.zeros((len(z), slots, joints, 4, 3))  # per joint the columns of R, then t
+        offsets = np.full((len(z), slots), -1.0)
+        order = np.arange(len(contacts.waypoint)) - np.searchsorted(contacts.waypoint, contacts.waypoint)
+        keep = np.flatnonzero(order < slots)
+        row, slot, normal = contacts.waypoint[keep], order[keep], contacts.normal[keep]
+        offset = contacts.margin[keep].copy()
+        rotations, translations = self.chain.joint_placements(z)
+        for column, points, sign in ((0, contacts.first[keep], -1.0), (1, contacts.second[keep], 1.0)):
+            joint = self._joints[contacts.pair[keep, column]]
+            still = joint == 0
+            offset[still] -= sign * np.einsum("ci,ci->c", normal[still], points[still])
+            r, s, j, n = row[~still], slot[~still], joint[~still], normal[~still]
+            local = np.einsum("cij,ci->cj", rotations[r, j], points[~still] - translations[r, j])
+            coefficients[r, s, j - 1, :3] += sign * local[:, :, None] * n[:, None, :]
+            coefficients[r, s, j - 1, 3] += sign * n
+        offsets[row, slot] = offset
+        return coefficients.reshape(len(z), slots, 12 * joints), offsets

@@ -1,0 +1,106 @@
+"""Inverse kinematics of the whole chain for many seeds at once: damped Gauss-Newton on mapped CasADi functions."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from vkc_pin import cpin
+from vkc_pin.chain.pose import PoseRow, pose_residual, target_vector
+from vkc_pin.cpin.batch import BatchFunction
+from vkc_pin.models.coordinates import Coordinates
+
+__all__ = ["PoseSolver"]
+
+
+class PoseSolver:
+    """Brings one frame of a model to placements, for a batch of configurations.
+
+    Attributes:
+        size: Number of coordinates n.
+        rows: Number of residuals m: 6 of a pose, 5 of an upright place, 3 of a point; see `pose`.
+    """
+
+    def __init__(self, model: pin.Model, pose: PoseRow) -> None:
+        coordinates = Coordinates(model)
+        self.size = coordinates.size
+        z, target = ca.SX.sym("z", self.size), ca.SX.sym("W", 12)
+        placements = cpin.joint_placements(model)(coordinates.q_symbolic(z))
+        residual = pose_residual(pose.kind, *pose.placement(placements), target)
+        self.rows = int(residual.numel())
+        jacobian = ca.densify(ca.jacobian(residual, z))
+        self._function = BatchFunction(ca.Function("pose", [z, target], [ca.densify(residual), jacobian], {"cse": True}))
+
+    def evaluate(self, z: NDArray[np.float64], target: pin.SE3) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return residuals, shape (B, m) ([m], [rad]), and their Jacobians, shape (B, m, n), at `z`, shape (B, n)."""
+        residual, jacobian = self._function(z, target_vector(target))
+        return residual, jacobian.reshape(len(z), self.size, self.rows).swapaxes(1, 2)
+
+    def solve(
+        self,
+        z: NDArray[np.float64],
+        target: pin.SE3,
+        *,
+        lower: NDArray[np.float64],
+        upper: NDArray[np.float64],
+        weights: NDArray[np.float64],
+        iterations: int = 12,
+        tolerance: float = 1e-6,
+        max_step: float = 0.5,
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Return configurations that satisfy the pose within limits, near the given ones, and which of them do.
+
+        Args:
+            z: Seeds, shape (B, n).
+            target: Placement of the frame in the world.
+            lower: Lower limits, shape (n,) or (B, n).
+            upper: Upper limits, shape (n,) or (B, n); a coordinate whose limits are equal stays there.
+            weights: What moving a coordinate costs, shape (n,).
+            iterations: At most so many steps.
+            tolerance: Largest residual of a solution, [m] and [rad].
+            max_step: Longest step in one coordinate.
+
+        Returns:
+            Configurations, shape (B, n), and a mask, shape (B,).
+        """
+        z = np.clip(z, lower, upper)
+        lower, upper = np.broadcast_to(lower, z.shape), np.broadcast_to(upper, z.shape)
+        error = np.empty(len(z))
+        at = np.arange(len(z))  # what is not solved yet
+        for remaining in range(iterations, -1, -1):
+            residual, jacobian = self.evaluate(z[at], target)
+            error[at] = np.abs(residual).max(axis=1)
+            still = error[at] >= tolerance
+            at, residual, jacobian = at[still], residual[still], jacobian[still]
+            if not len(at) or not remaining:
+                break
+            z[at] += _step(z[at], residual, jacobian, lower[at], upper[at], weights, max_step)
+            np.clip(z, lower, upper, out=z)
+        return z, error < tolerance
+
+
+def _step(
+    z: NDArray[np.float64],
+    residual: NDArray[np.float64],
+    jacobian: NDArray[np.float64],
+    lower: NDArray[np.float64],
+    upper: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    longest: float,
+) -> NDArray[np.float64]:
+    """Return damped Gauss-Newton steps, shape (B, n); a coordinate that one pushes beyond its limit is taken out, once."""
+    free = upper - lower > 1e-9
+    damping = 1e-8 + 1e-3 * np.minimum(1.0, np.sum(residual**2, axis=1))
+    step = np.zeros_like(z)
+    for _ in range(2):
+        scaled = jacobian * (free / weights)[:, None, :]
+        system = scaled @ jacobian.transpose(0, 2, 1) + damping[:, None, None] * np.eye(residual.shape[1])
+        step = -np.einsum("bij,bi->bj", scaled, np.linalg.solve(system, residual[..., None])[..., 0])
+        step *= np.minimum(1.0, longest / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12))
+        blocked = free & ((z + step < lower - 1e-12) | (z + step > upper + 1e-12))
+        if not blocked.any():
+            break
+        free &= ~blocked
+    return step

@@ -1,0 +1,265 @@
+"""Where the mobile base fits: the arena's floor as cells and headings, with the real shapes of the base and what it carries."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vkc_pin.driving.blocked import Lattice, stuck
+from vkc_pin.driving.body import FAN, Body, Shape, Standing
+from vkc_pin.errors import InputError
+
+__all__ = ["HEADINGS", "BaseGrid", "fine_cells"]
+
+HEADINGS = 16
+"""Directions of travel: to the eight neighbours of a cell and, between these, a knight's move away."""
+
+_MOVES = np.array([(1, 0), (2, 1), (1, 1), (1, 2), (0, 1), (-1, 2), (-1, 1), (-2, 1)])
+_MOVES = np.concatenate([_MOVES, -_MOVES])  # by heading, in cells
+_CELLS, _FINEST = 100, 250  # along a side; at most
+_ROOM = 0.5  # [m] beyond which more room makes no difference
+
+
+def fine_cells(arena: Sequence[float], margin: float) -> int:
+    """Return along how many cells a grid has one in the middle of any passage with room for the margins [m], within reason."""
+    size = max(arena[1] - arena[0], arena[3] - arena[2])
+    return int(np.clip(np.ceil(size / (2.0 * margin)), _CELLS, _FINEST))
+
+
+class BaseGrid:
+    """The floor of an arena in cells and headings, and where on it the base fits with what it carries.
+
+    Attributes:
+        cells: Number of cells along each side.
+        origin: Centre of cell (0, 0) in the world, shape (2,) [m].
+        step: Size of a cell, shape (2,) [m].
+        moves: Cells from one to the next when driving forwards at each heading, shape (HEADINGS, 2).
+        yaws: The headings, ascending from 0, shape (HEADINGS,) [rad].
+        lengths: Of the moves, shape (HEADINGS,) [m].
+        near: Radius around the start and goals of a search in which only the base counts [m].
+        base, carried: The shapes of either, which can be asked about a drive or a turn on their own.
+        stuck: Where the base surely hits something, shape (cells, cells, HEADINGS).
+        stuck_carrying: Where what is carried surely does, shape (cells, cells, HEADINGS).
+    """
+
+    def __init__(
+        self,
+        base: Sequence[Shape],
+        carried: Sequence[Shape],
+        standing: Sequence[Shape],
+        arena: Sequence[float],
+        margin: float,
+        *,
+        cells: int = _CELLS,
+        near: float = 1.0,
+    ) -> None:
+        """Look at every cell once, without asking coal.
+
+        Args:
+            base: Convex shapes of the chassis, placed in the base's frame.
+            carried: Convex shapes of the arm, and of what it holds, as they are carried; placed in the base's frame.
+            standing: Convex obstacles without the floor, placed in the world.
+            arena: x_min, x_max, y_min, y_max [m]; the base's origin stays inside.
+            margin: Clearance to keep [m].
+            cells: Number of cells along each side.
+            near: Radius around the start and goals of a search in which only `base` counts: there the arm reaches in and out [m].
+
+        Raises:
+            InputError: The arena is empty, or a number is out of range.
+        """
+        low, high = np.array(arena[::2], float), np.array(arena[1::2], float)
+        if not (len(arena) == 4 and np.all(np.isfinite(arena)) and np.all(high > low)):
+            raise InputError("the arena is empty", field="arena", expected="x_min < x_max and y_min < y_max", got=list(arena))
+        for field, value, least in (("margin", margin, 0.0), ("near", near, 0.0), ("cells", cells, 2)):
+            if not (np.isfinite(value) and value >= least):
+                raise InputError("out of range", field=field, expected=f"at least {least:g}", got=value)
+        self.cells, self.near, self.margin = int(cells), float(near), float(margin)
+        self.step = (high - low) / cells
+        self.origin = low + self.step / 2
+        self.moves = _MOVES
+        self.yaws = np.arctan2(_MOVES[:, 1] * self.step[1], _MOVES[:, 0] * self.step[0]) % (2 * np.pi)
+        self.lengths = np.hypot(*(_MOVES * self.step).T)
+        world = Standing(standing)
+        self.base, self.carried = Body(base, world, margin), Body(carried, world, margin)
+        lattice = Lattice(self.origin, self.step, self.cells, self.yaws)
+        self.stuck, self.stuck_carrying = stuck(base, carried, standing, lattice, margin)
+        self._edges: dict[tuple[int, int, int, bool, bool], bool] = {}
+
+    # -- places ---------------------------------------------------------------------------------------------------------
+
+    def center(self, i: int, j: int) -> tuple[float, float]:
+        """Return the world position of a cell's centre [m]."""
+        return float(self.origin[0] + i * self.step[0]), float(self.origin[1] + j * self.step[1])
+
+    def around(self, x: float, y: float, radius: float) -> NDArray[np.int_]:
+        """Return the cells whose centres are within `radius` [m] of a place, shape (C, 2)."""
+        low = np.maximum(np.ceil((np.array([x, y]) - radius - self.origin) / self.step), 0).astype(int)
+        high = np.minimum(np.floor((np.array([x, y]) + radius - self.origin) / self.step), self.cells - 1).astype(int) + 1
+        i, j = (grid.ravel() for grid in np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]), indexing="ij"))
+        inside = np.hypot(self.origin[0] + i * self.step[0] - x, self.origin[1] + j * self.step[1] - y) <= radius
+        return np.column_stack([i[inside], j[inside]])
+
+    # -- what is free ---------------------------------------------------------------------------------------------------
+
+    def free(self, i: int, j: int, heading: int, *, reaching: bool = False) -> bool:
+        """Return whether everything keeps its margin in a cell at a heading, 0 to HEADINGS - 1; `reaching` as in `clear`."""
+        room = (self._room[0][i][j], self._room[1][i][j])
+        if room[0] >= 0.0 and (reaching or room[1] >= 0.0):
+            return True
+        return self.clear(*self.center(i, j), float(self.yaws[heading]), reaching=reaching)
+
+    def clear(self, x: float, y: float, yaw: float, *, reaching: bool = False) -> bool:
+        """Return whether everything keeps its margin at a pose in the world.
+
+        Args:
+            x: [m].
+            y: [m].
+            yaw: [rad].
+            reaching: The arm is about to reach out or back: only the base counts.
+        """
+        return self.driven((x, y), (x, y), yaw, reaching=reaching)
+
+    def driven(
+        self,
+        a: ArrayLike,
+        b: ArrayLike,
+        yaw: float,
+        *,
+        reaching: bool = False,
+        margins: NDArray[np.float64] | None = None,
+    ) -> bool:
+        """Return whether everything keeps its margin all along a straight line.
+
+        Args:
+            a: Its beginning in the world, shape (2,) [m].
+            b: Its end.
+            yaw: [rad], the same everywhere.
+            reaching: As in `clear`.
+            margins: Of the base from each of `standing`, if it differs [m].
+        """
+        begin, end = np.asarray(a, float), np.asarray(b, float)
+        return self.base.driven(begin, end, yaw, margins) and (reaching or self.carried.driven(begin, end, yaw))
+
+    def turned(
+        self, at: ArrayLike, start: float, end: float, *, reaching: bool = False, margins: NDArray[np.float64] | None = None
+    ) -> bool:
+        """Return whether everything keeps its margin while the base turns from one yaw to the other at a place [m], [rad]."""
+        place = np.asarray(at, float)
+        return self.base.turned(place, start, end, margins) and (reaching or self.carried.turned(place, start, end))
+
+    def leaving(self, x: float, y: float, yaw: float) -> NDArray[np.float64] | None:
+        """Return the margins the base can keep when it leaves a blocked pose, None if the pose is not blocked.
+
+        It comes no closer to what it is too close to; what it overlaps does not count.
+
+        Returns:
+            Margin from each of `standing`, shape (S,) [m]; -inf: none.
+        """
+        return None if self.clear(x, y, yaw, reaching=True) else self.base.leaving(np.array([x, y]), yaw)
+
+    def forward(self, i: int, j: int, heading: int, *, reaching: bool = False) -> bool:
+        """Return whether the move at `heading` from a cell is free all along; remembered."""
+        key = (i, j, heading, True, reaching)
+        if key not in self._edges:
+            k, m = i + int(self.moves[heading, 0]), j + int(self.moves[heading, 1])
+            enough = self.lengths[heading]
+            room = [rows[i][j] + rows[k][m] for rows in self._room]
+            self._edges[key] = (room[0] >= enough and (reaching or room[1] >= enough)) or self.driven(
+                self.center(i, j), self.center(k, m), float(self.yaws[heading]), reaching=reaching
+            )
+        return self._edges[key]
+
+    def left(self, i: int, j: int, heading: int, *, reaching: bool = False) -> bool:
+        """Return whether turning in a cell from `heading` to the next is free all along; remembered."""
+        key = (i, j, heading, False, reaching)
+        if key not in self._edges:
+            room = (self._room[0][i][j], self._room[1][i][j])
+            end = float(self.yaws[heading + 1]) if heading + 1 < HEADINGS else 2 * np.pi
+            self._edges[key] = (room[0] >= 0.0 and (reaching or room[1] >= 0.0)) or self.turned(
+                self.center(i, j), float(self.yaws[heading]), end, reaching=reaching
+            )
+        return self._edges[key]
+
+    # -- bounds for all cells ---------------------------------------------------------------------------------------------
+
+    @cached_property
+    def _room(self) -> list[list[list[float]]]:
+        """How far every cell is at least from where base, or carried, can hit something at some heading [m]."""
+        x, y = (self.origin[axis] + self.step[axis] * np.arange(self.cells) for axis in (0, 1))
+        along_x, along_y = np.outer(x, FAN[:, 0]), np.outer(y, FAN[:, 1])
+        bodies = (self.base, self.carried)
+        rooms = (np.full((self.cells, self.cells), _ROOM), np.full((self.cells, self.cells), _ROOM))
+        for s, support in enumerate(self.base.world.support):
+            reach = max(float(body.span[s]) for body in bodies) + _ROOM
+            if reach < 0.0:  # nothing can hit it
+                continue
+            rows = slice(*np.searchsorted(x, [-support[16] - reach, support[0] + reach]))
+            columns = slice(*np.searchsorted(y, [-support[24] - reach, support[8] + reach]))
+            distance = (along_x[rows, None] + (along_y[columns] - support)).max(axis=2)
+            for body, room in zip(bodies, rooms, strict=True):
+                np.minimum(room[rows, columns], distance - body.span[s], out=room[rows, columns])
+        return [room.tolist() for room in rooms]
+
+    # -- distances ------------------------------------------------------------------------------------------------------
+
+    def distances(self, start: ArrayLike) -> NDArray[np.float64]:
+        """Return how far the base drives at least from a place [m] to every cell, shape (cells, cells) [m]; infinite: no path.
+
+        Turns are free, and only what surely blocks the base is in the way.
+        """
+        return self.distances_from(np.asarray(start, float)[None, :2])[0]
+
+    def distances_from(self, starts: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return `distances` for each of `starts`, shape (W, 2) [m]: shape (W, cells, cells) [m].
+
+        Each start takes about a millisecond on 100 x 100 cells; for many of them, a grid of fewer cells will do.
+        """
+        blocked = np.asarray(self.stuck.all(axis=2))
+        entries: list[tuple[NDArray[np.int_], NDArray[np.float64]]] = []
+        for x, y in np.asarray(starts, float):
+            for radius in (2.5 * float(self.step.max()), 2.0 * _ROOM, np.inf):
+                cells = self.around(x, y, radius)
+                cells = cells[~blocked[cells[:, 0], cells[:, 1]]]
+                if len(cells):
+                    break
+            entries.append((self.cells * cells[:, 0] + cells[:, 1], np.hypot(*(self.origin + cells * self.step - (x, y)).T)))
+        return self.spread(entries, self.stuck)
+
+    def spread(
+        self, entries: Sequence[tuple[NDArray[np.int_], NDArray[np.float64]]], stuck: NDArray[np.bool_]
+    ) -> NDArray[np.float64]:
+        """Return how far it is at least to every cell, shape (W, cells, cells) [m], if turns are free.
+
+        Args:
+            entries: W times the cells, as i·cells + j, where the path begins, and what it costs to be there [m].
+            stuck: Where the base cannot be at a heading, shape (cells, cells, HEADINGS).
+        """
+        from scipy.sparse import csr_array
+        from scipy.sparse.csgraph import dijkstra
+
+        count, size = self.cells**2, self.cells**2 + len(entries)
+        number = np.arange(count, dtype=np.int32).reshape(self.cells, self.cells)
+        targets = np.full((self.cells, self.cells, HEADINGS), -1, np.int32)
+        for heading, (di, dj) in enumerate(self.moves):
+            here, there = (
+                (slice(max(0, s * di), self.cells + min(0, s * di)), slice(max(0, s * dj), self.cells + min(0, s * dj)))
+                for s in (-1, 1)
+            )
+            # Forwards at the heading or backwards at the opposite one.
+            ahead, back = stuck[:, :, heading], stuck[:, :, heading - HEADINGS // 2]
+            never = (ahead[here] | ahead[there]) & (back[here] | back[there])
+            targets[(*here, heading)] = np.where(never, -1, number[there])
+        usable = targets.reshape(-1, HEADINGS) >= 0
+        ends = np.cumsum([*usable.sum(axis=1), *(len(cells) for cells, _ in entries)])
+        graph = csr_array(
+            (
+                np.concatenate([np.broadcast_to(self.lengths, usable.shape)[usable], *(cost for _, cost in entries)]),
+                np.concatenate([targets[targets >= 0], *(cells for cells, _ in entries)]).astype(np.int32),
+                np.concatenate([[0], ends]).astype(np.int32),
+            ),
+            shape=(size, size),
+        )
+        return dijkstra(graph, indices=np.arange(count, size))[:, :count].reshape(len(entries), self.cells, self.cells)

@@ -1,0 +1,1 @@
+"""Descriptions and meshes: reads them, and writes files whole; knows no robot."""

@@ -1,0 +1,232 @@
+"""Reads mesh files and turns them into coal shapes, and checks that coal holds what the file holds.
+
+Meshes are read with trimesh: coal 3.0.3's own reader restarts the triangle indices at every object of an OBJ file, and
+what it makes of such a file collides where nothing is. Only COLLADA files (`.dae`), for which trimesh would need
+another package, are read by coal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import coal
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vkc_pin.errors import InputError
+from vkc_pin.files.hulls import outer_hull
+
+if TYPE_CHECKING:
+    import trimesh
+
+__all__ = ["MeshPart", "convex_hull", "load_convex", "load_mesh", "load_parts", "to_bvh"]
+
+_NEIGHBOURS = 255  # coal's corners have no more
+_TOLERANCE = 1e-6  # how far, relatively, coal's volume and area may be from trimesh's
+
+
+@dataclass(frozen=True, eq=False)
+class MeshPart:
+    """The part of a mesh that has one colour.
+
+    Attributes:
+        vertices: Shape (n, 3), [m].
+        faces: Shape (m, 3), indices of vertices.
+        colour: Red, green, blue, opacity in [0, 1], or None if the file names none.
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
+    colour: tuple[float, float, float, float] | None = None
+
+
+def load_mesh(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0)) -> trimesh.Trimesh:
+    """Read a mesh file as one mesh.
+
+    Args:
+        path: OBJ, STL, PLY, OFF, glTF or COLLADA file.
+        scale: One factor per axis, or one for all, from the file's unit to [m].
+
+    Returns:
+        The mesh of all the file's objects together, in the file's frame, [m].
+
+    Raises:
+        InputError: The file does not exist, cannot be read, or holds no triangle.
+    """
+    import trimesh
+
+    file = Path(path)
+    factors = _factors(file, scale)
+    if not file.is_file():
+        raise InputError("there is no such mesh", file=file, expected="a mesh file")
+    if file.suffix.lower() == ".dae":
+        vertices, faces = _read_with_coal(file)
+        mesh = trimesh.Trimesh(vertices, faces)
+    else:
+        try:
+            mesh = trimesh.load_mesh(file, force="mesh", skip_materials=True)
+            if isinstance(mesh, trimesh.Scene):
+                mesh = mesh.to_mesh()
+        except Exception as error:  # every format's reader raises what it likes
+            raise InputError(
+                f"cannot read the mesh: {error}", file=file, expected="an OBJ, STL, PLY, OFF, glTF or COLLADA file"
+            ) from error
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+        raise InputError("the mesh is empty", file=file, expected="at least one triangle")
+    if not np.isfinite(mesh.vertices).all():
+        raise InputError("the mesh has vertices that are no numbers", file=file, expected="finite coordinates")
+    mesh.apply_transform(np.diag([*factors, 1.0]))
+    return mesh
+
+
+def load_convex(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0)) -> coal.Convex:
+    """Return the convex hull of a mesh file as a coal shape, in the file's frame, [m].
+
+    Args:
+        path: The mesh file, see `load_mesh`.
+        scale: One factor per axis, or one for all, from the file's unit to [m].
+
+    Raises:
+        InputError: The mesh cannot be read, is empty or flat, or coal does not hold what the file holds.
+    """
+    try:
+        return convex_hull(load_mesh(path, scale).vertices)
+    except InputError as error:
+        if error.file is not None:
+            raise
+        raise InputError(error.problem, file=path, expected=error.expected, got=error.got) from error
+
+
+def convex_hull(points: ArrayLike) -> coal.Convex:
+    """Return the convex hull of `points`, shape (n, 3), [m], as a coal shape.
+
+    Raises:
+        InputError: The points lie in one plane, or coal's volume or area is not that of the hull.
+    """
+    import trimesh
+    from scipy.spatial import QhullError
+
+    try:
+        hull = trimesh.convex.convex_hull(np.asarray(points, float))
+    except (QhullError, ValueError, IndexError) as error:
+        raise InputError("the mesh has no convex hull: it is flat", expected="points that span a volume") from error
+    if np.bincount(np.asarray(hull.faces).ravel()).max() > _NEIGHBOURS:  # the tip of a finely meshed cone, a fine disc
+        hull = outer_hull(hull.vertices, vertices=60)
+    shape = coal.Convex(_points(hull.vertices), _triangles(hull.faces))
+    corners = np.asarray(shape.points())[_indices(shape)]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2.0
+    for what, held, wanted in (("volume", shape.computeVolume(), hull.volume), ("area", area, hull.area)):
+        if not abs(held - wanted) <= _TOLERANCE * abs(wanted) or wanted <= 0.0:
+            raise InputError(f"coal does not hold this hull: wrong {what}", expected=wanted, got=held)
+    shape.computeLocalAABB()
+    return shape
+
+
+def load_parts(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0), *, detail: float = 0.0) -> list[MeshPart]:
+    """Read a mesh file for display: one part for each of its colours, those of textures averaged.
+
+    Args:
+        path: The mesh file, see `load_mesh`.
+        scale: One factor per axis, or one for all, from the file's unit to [m].
+        detail: Vertices closer together than about this [m] become one; 0 keeps the file's own triangles. The mesh
+            that a maker publishes often has screws and bevels that make a page heavy and that nobody sees.
+
+    Raises:
+        InputError: As `load_mesh`.
+    """
+    import trimesh
+
+    file = Path(path)
+    if file.suffix.lower() != ".obj" or not file.is_file():
+        whole = load_mesh(file, scale)
+        return [_coarser(MeshPart(np.asarray(whole.vertices), np.asarray(whole.faces)), detail)]
+    factors = _factors(file, scale)
+    try:
+        scene = trimesh.load_scene(file, process=False, group_material=True, split_object=False)
+    except Exception as error:
+        raise InputError(f"cannot read the mesh: {error}", file=file, expected="an OBJ file") from error
+    parts = [
+        MeshPart(np.asarray(mesh.vertices) * factors, np.asarray(mesh.faces), _colour(mesh))
+        for mesh in scene.geometry.values()
+        if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)
+    ]
+    if not parts:
+        raise InputError("the mesh is empty", file=file, expected="at least one triangle")
+    return [_coarser(part, detail) for part in parts]
+
+
+def to_bvh(part: MeshPart) -> coal.BVHModelOBBRSS:
+    """Return the triangles of `part` as a coal shape, for display."""
+    shape = coal.BVHModelOBBRSS()
+    shape.beginModel(len(part.faces), len(part.vertices))
+    shape.addVertices(np.asarray(part.vertices, float))
+    shape.addTriangles(np.asarray(part.faces, np.int32))
+    shape.endModel()
+    return shape
+
+
+def _factors(file: Path, scale: ArrayLike) -> NDArray[np.float64]:
+    factors = np.asarray(scale, float)
+    if factors.shape not in ((), (1,), (3,)) or not (np.isfinite(factors).all() and (factors != 0.0).all()):
+        raise InputError("wrong scale of a mesh", file=file, field="scale", expected="3 finite numbers other than 0", got=scale)
+    return np.broadcast_to(factors, (3,)).astype(float)
+
+
+def _points(points: ArrayLike) -> Any:
+    vector = coal.StdVec_Vec3s()
+    for point in np.asarray(points, float):
+        vector.append(point)
+    return vector
+
+
+def _triangles(faces: Iterable[Sequence[int]]) -> Any:
+    vector = coal.StdVec_Triangle()
+    for face in faces:
+        vector.append(coal.Triangle(int(face[0]), int(face[1]), int(face[2])))
+    return vector
+
+
+def _indices(shape: coal.Convex) -> NDArray[np.int64]:
+    triangles = (shape.polygons(k) for k in range(shape.num_polygons))
+    return np.array([[triangle[i] for i in range(3)] for triangle in triangles], int)
+
+
+def _read_with_coal(file: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    try:
+        shape = coal.MeshLoader().load(str(file), np.ones(3))
+    except (RuntimeError, ValueError) as error:
+        raise InputError(f"cannot read the mesh: {error}", file=file, expected="a COLLADA file") from error
+    triangles = (shape.tri_indices(k) for k in range(shape.num_tris))
+    return np.array(shape.vertices()), np.array([[triangle[i] for i in range(3)] for triangle in triangles], int).reshape(-1, 3)
+
+
+def _colour(mesh: trimesh.Trimesh) -> tuple[float, float, float, float] | None:
+    material = getattr(mesh.visual, "material", None)
+    if material is None:
+        return None
+    image = getattr(material, "image", None)
+    if image is not None:
+        rgb = np.asarray(image.convert("RGB"), float).reshape(-1, 3).mean(axis=0)
+        return (*(rgb / 255.0).tolist(), 1.0)
+    rgba = np.asarray(material.main_color, float) / 255.0
+    return (float(rgba[0]), float(rgba[1]), float(rgba[2]), float(rgba[3]))
+
+
+def _coarser(part: MeshPart, detail: float) -> MeshPart:
+    """Merge the vertices of each cell of a grid of width `detail` into their mean; drop triangles without area."""
+    if detail <= 0.0:
+        return part
+    cells = np.round(part.vertices / detail).astype(np.int64)
+    _, group, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    group = group.reshape(-1)
+    means = np.zeros((len(count), 3))
+    np.add.at(means, group, part.vertices)
+    faces = group[part.faces]
+    faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
+    if len(faces) == 0:
+        return part
+    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    return MeshPart(means / count[:, None], faces[np.sort(first)], part.colour)

@@ -1,0 +1,53 @@
+"""Finds the robots and scenes that travel with the package, installed or in a source tree."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import pinocchio as pin
+
+from vkc_pin.errors import UnknownNameError
+
+__all__ = ["available", "example_robot_data", "find", "folder", "package_folder"]
+
+
+def package_folder() -> Path:
+    """Return the folder of the package's sources."""
+    return Path(__file__).resolve().parents[1]
+
+
+def folder(kind: str) -> Path:
+    """Return the folder of `kind` ("robots" or "scenes"): inside the installed package, else beside it."""
+    package = package_folder()
+    inside = package / kind
+    return inside if inside.is_dir() else package.parent / kind
+
+
+def available(kind: str, pattern: str) -> dict[str, Path]:
+    """Return name → path of what `folder(kind)` holds, by glob `pattern` (the name is the file's or folder's stem)."""
+    return {path.stem: path for path in sorted(folder(kind).glob(pattern))}
+
+
+def find(kind: str, pattern: str, name: str, *, what: str) -> Path:
+    """Return the path of `name` among `available(kind, pattern)`.
+
+    Raises:
+        UnknownNameError: There is none; `what` ("robot", "scene") names the kind in the message.
+    """
+    found = available(kind, pattern)
+    if name not in found:
+        raise UnknownNameError(what, name, found)
+    return found[name]
+
+
+def example_robot_data() -> Path | None:
+    """Return the folder of example-robot-data (in the wheels of cmeel: cmeel.prefix/share), or None."""
+    prefixes = [Path(pin.__file__).resolve().parents[4]]
+    spec = importlib.util.find_spec("cmeel")
+    if spec is not None and spec.origin is not None:
+        prefixes.append(Path(spec.origin).resolve().parents[1] / "cmeel.prefix")
+    for prefix in prefixes:
+        if (prefix / "share" / "example-robot-data" / "robots").is_dir():
+            return prefix / "share" / "example-robot-data"
+    return None

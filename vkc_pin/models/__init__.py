@@ -1,0 +1,1 @@
+"""Robots and articulated objects as Pinocchio models with shapes and limits."""

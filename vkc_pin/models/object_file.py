@@ -1,0 +1,214 @@
+"""Reads the description file of an articulated object: what it may contain, and the object it comes to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import pinocchio as pin
+from pydantic import AfterValidator, Field, model_validator
+
+from vkc_pin.errors import InputError
+from vkc_pin.files.documents import Document, check, read_yaml
+from vkc_pin.files.fields import JointSchema, Name, NotNegative, Number, Positive, Schema, Vector3, count, fail
+from vkc_pin.files.resources import find
+from vkc_pin.files.urdf import load_urdf
+from vkc_pin.models.articulation import DEFAULT_ACCELERATION, DEFAULT_VELOCITY, ArticulatedObject, Attachment, Freedom, Latch
+from vkc_pin.models.coordinates import Coordinates
+from vkc_pin.models.grafting import clean
+
+__all__ = ["AttachmentSchema", "LatchSchema", "ObjectSchema", "load_object"]
+
+
+def _direction(value: tuple[float, float, float]) -> tuple[float, float, float]:
+    if np.linalg.norm(value) < 1e-6:
+        raise fail("a direction cannot be zero", "a vector of some length")
+    return value
+
+
+def _around_zero(value: tuple[float, float]) -> tuple[float, float]:
+    if not value[0] <= 0.0 <= value[1]:
+        raise fail("the limits do not contain 0", "limits [lower <= 0, upper >= 0]")
+    return value
+
+
+def _some(value: tuple[Any, ...]) -> tuple[Any, ...]:
+    if not value:
+        raise fail("nothing in the list", "at least one")
+    return value
+
+
+Limits = Annotated[tuple[Number, Number], count(2), AfterValidator(_around_zero)]
+Direction = Annotated[Vector3, AfterValidator(_direction)]
+
+
+class AttachmentSchema(Schema):
+    """Where and how a tool takes hold of a link; see `vkc_pin.models.articulation.Attachment`."""
+
+    name: Name
+    link: str
+    position: Vector3 = (0.0, 0.0, 0.0)
+    rpy: Vector3 | None = None
+    approach: Direction | None = None
+    closing: Direction | None = None
+    joint: Literal["fixed", "revolute", "prismatic", "cylindrical", "spherical"] = "fixed"
+    axis: Direction | None = None
+    limits: Limits | None = None
+    turn: Limits | None = None
+    standoff: NotNegative = 0.0
+    firm: bool | None = None  # not stated: as the object is free or not
+
+    @model_validator(mode="after")
+    def _consistent(self) -> AttachmentSchema:
+        if (self.approach is None) != (self.closing is None) or (self.rpy is not None and self.approach is not None):
+            raise fail("the tool's direction is not clear", "either rpy, or approach and closing")
+        if self.approach is not None and self.closing is not None and abs(np.dot(self.approach, self.closing)) > 1e-9:
+            raise fail("approach and closing are not perpendicular", "two perpendicular directions")
+        has_axis = self.joint in ("revolute", "prismatic", "cylindrical")
+        if has_axis != (self.axis is not None):
+            raise fail("axis and joint do not fit", "an axis with joint revolute, prismatic or cylindrical, and only there")
+        if has_axis and self.limits is None:
+            raise fail("limits missing", "limits [lower, upper] of the grasp's joint")
+        if self.joint == "fixed" and self.limits is not None:
+            raise fail("a fixed grasp has no limits", "no limits, or another joint")
+        if (self.joint == "cylindrical") != (self.turn is not None):
+            raise fail("turn and joint do not fit", "turn [lower, upper] with joint cylindrical, and only there")
+        return self
+
+
+class LatchSchema(Schema):
+    """A joint held until another one is moved; see `vkc_pin.models.articulation.Latch`."""
+
+    joint: str
+    held_at: Number = 0.0
+    released_by: str
+    threshold: Number
+    engaged_within: Positive
+
+
+class ObjectSchema(Schema):
+    """A description file of an articulated object."""
+
+    urdf: str
+    free: bool = False
+    joints: Mapping[str, JointSchema] = Field(default_factory=dict)
+    attachments: Annotated[tuple[AttachmentSchema, ...], AfterValidator(_some)]
+    latches: tuple[LatchSchema, ...] = ()
+
+
+def load_object(name_or_path: str | Path) -> ArticulatedObject:
+    """Load an articulated object: by the name of a description in `scenes/objects`, or by the path of one (.yaml).
+
+    Raises:
+        UnknownNameError: There is no such object, or its description names a field, link or joint that does not exist.
+        InputError: The description or its URDF is wrong.
+    """
+    text = str(name_or_path)
+    by_path = isinstance(name_or_path, Path) or text.endswith((".yaml", ".yml")) or "/" in text
+    file = Path(name_or_path) if by_path else find("scenes", "objects/*.yaml", text, what="object")
+    return _read(file)
+
+
+def _read(file: Path) -> ArticulatedObject:
+    document = read_yaml(file)
+    schema = check(document, ObjectSchema)
+    urdf = file.parent / schema.urdf
+    with document.at(("urdf",)):
+        tree = load_urdf(urdf)
+        coordinates = Coordinates(tree.model)
+    names, links = coordinates.names, [frame.name for frame in tree.model.frames if frame.type == pin.FrameType.BODY]
+    velocity, acceleration = coordinates.velocity.copy(), np.full(coordinates.size, DEFAULT_ACCELERATION)
+    velocity[np.isinf(velocity)] = DEFAULT_VELOCITY
+    for joint, limits in schema.joints.items():
+        if joint not in names:
+            raise document.unknown(("joints", joint), "joint", joint, names)
+        index = coordinates.index(joint)
+        velocity[index] = limits.velocity or velocity[index]
+        acceleration[index] = limits.acceleration or acceleration[index]
+    if not (velocity > 0.0).all():
+        slow = names[int(np.argmin(velocity))]
+        raise InputError(
+            "a joint without velocity cannot move", file=urdf, field=f"{slow}.limit.velocity", expected="> 0", got=velocity.min()
+        )
+    attachments: dict[str, Attachment] = {}
+    for index, item in enumerate(schema.attachments):
+        if item.link not in links:
+            raise document.unknown(("attachments", index, "link"), "link", item.link, links)
+        if item.name in attachments:
+            raise document.error(("attachments", index, "name"), "this name is taken", expected="a new name", got=item.name)
+        attachment = _attachment(item, firm=schema.free)
+        taken = {name for other in attachments.values() for name in other.coordinates}.intersection(attachment.coordinates)
+        if taken:  # "grip_slide" beside a "grip" that slides
+            raise document.error(
+                ("attachments", index, "name"), "its coordinate's name is taken", expected="a new name", got=", ".join(taken)
+            )
+        attachments[item.name] = attachment
+    return ArticulatedObject(
+        name=file.stem,
+        urdf=urdf,
+        model=tree.model,
+        collision=tree.collision,
+        visual=tree.visual,
+        coordinates=coordinates,
+        lower=coordinates.lower,
+        upper=coordinates.upper,
+        velocity=velocity,
+        acceleration=acceleration,
+        attachments=MappingProxyType(attachments),
+        latches=_latches(document, schema, coordinates),
+        base_link=links[0],
+        free=schema.free,
+    )
+
+
+def _attachment(item: AttachmentSchema, *, firm: bool) -> Attachment:
+    """Return the attachment; `firm` holds where its description does not say."""
+    if item.approach is not None and item.closing is not None:
+        z, x = (np.array(v) / np.linalg.norm(v) for v in (item.approach, item.closing))
+        rotation = np.column_stack([x, np.cross(z, x), z])
+    else:
+        rotation = pin.rpy.rpyToMatrix(*(item.rpy or (0.0, 0.0, 0.0)))
+    return Attachment(
+        name=item.name,
+        link=item.link,
+        placement=clean(pin.SE3(rotation, np.array(item.position))),
+        joint=item.joint,
+        freedoms=_freedoms(item),
+        standoff=item.standoff,
+        firm=firm if item.firm is None else item.firm,
+    )
+
+
+def _freedoms(item: AttachmentSchema) -> tuple[Freedom, ...]:
+    if item.joint == "spherical":
+        limits = item.limits or (-np.pi, np.pi)
+        return tuple(Freedom(f"_{name}", "revolute", axis, *limits) for name, axis in zip("xyz", np.eye(3), strict=True))
+    if item.axis is None or item.limits is None:  # a fixed grasp, as the schema says
+        return ()
+    axis = np.array(item.axis) / np.linalg.norm(item.axis)
+    if item.turn is not None:
+        return Freedom("_slide", "prismatic", axis, *item.limits), Freedom("_turn", "revolute", axis, *item.turn)
+    return (Freedom("", item.joint, axis, *item.limits),)
+
+
+def _latches(document: Document, schema: ObjectSchema, coordinates: Coordinates) -> tuple[Latch, ...]:
+    latches = []
+    for number, item in enumerate(schema.latches):
+        at = ("latches", number)
+        for role, joint, value in (("joint", item.joint, item.held_at), ("released_by", item.released_by, item.threshold)):
+            if joint not in coordinates.names:
+                raise document.unknown((*at, role), "joint", joint, coordinates.names)
+            index = coordinates.index(joint)
+            lower, upper = coordinates.lower[index], coordinates.upper[index]
+            if not lower <= value <= upper:
+                what = "held_at" if role == "joint" else "threshold"
+                raise document.error((*at, what), f"outside the limits of {joint}", expected=f"{lower:g} to {upper:g}", got=value)
+        if item.joint == item.released_by:
+            raise document.error(
+                (*at, "released_by"), "a joint cannot release itself", expected="another joint", got=item.released_by
+            )
+        latches.append(Latch(item.joint, item.held_at, item.released_by, item.threshold, item.engaged_within))
+    return tuple(latches)

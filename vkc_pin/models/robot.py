@@ -1,0 +1,78 @@
+"""Robots: a URDF on a planar virtual base, with limits, a tool frame and convex collision geometry."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from vkc_pin.files.urdf import UrdfFile
+from vkc_pin.models.coordinates import Coordinates
+from vkc_pin.models.robot_model import visual_geometry
+from vkc_pin.models.shapes import link_name
+
+__all__ = ["Base", "Robot"]
+
+Base = Literal["omni", "differential", "fixed"]
+
+
+@dataclass(frozen=True, eq=False)
+class Robot:
+    """A mobile manipulator.
+
+    The coordinates z are (base_x, base_y, base_yaw, arm joints), [m] and [rad]; n is their number.
+
+    Attributes:
+        name: The robot's name.
+        urdf: The URDF file it was read from.
+        model: Joint 1, named "base", is planar; the planned joints follow. All other joints of the URDF are locked.
+        collision: Convex shapes named `<link>_<k>`; the collision pairs are those that the robot must keep apart.
+        coordinates: The minimal coordinates of `model`.
+        lower, upper: Position limits, shape (n,), infinite for the yaw and for continuous joints.
+        velocity, acceleration: Limits, shape (n,).
+        home: Where the arm rests, shape (n − 3,).
+        tool_frame: The frame of `model` that grasps: z is the approach direction, x the one in which fingers close.
+        base: How the base moves: "omni" any way, "differential" forwards and round, "fixed" not at all.
+        touch_links: The links that may touch what is grasped.
+    """
+
+    name: str
+    urdf: Path
+    model: pin.Model
+    collision: pin.GeometryModel
+    coordinates: Coordinates
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    acceleration: NDArray[np.float64]
+    home: NDArray[np.float64]
+    tool_frame: str
+    base: Base
+    touch_links: tuple[str, ...] = ()
+    file: UrdfFile = field(repr=False, kw_only=True)
+
+    @cached_property
+    def visual(self) -> pin.GeometryModel:
+        """What the robot looks like; read when first asked for, since meshes for display are large.
+
+        Raises:
+            InputError: A mesh cannot be read.
+        """
+        return visual_geometry(self.model, self.file)
+
+    def __repr__(self) -> str:
+        return f"<Robot {self.name}: {len(self.home)} joints on a base that is {self.base}, tool frame {self.tool_frame}>"
+
+    def link_of(self, geometry: int) -> str:
+        """Return the name of the link that shape number `geometry` of `collision` belongs to."""
+        return link_name(self.collision.geometryObjects[geometry].name)
+
+    @property
+    def links(self) -> tuple[str, ...]:
+        """The links that have collision geometry, each once."""
+        return tuple(dict.fromkeys(link_name(shape.name) for shape in self.collision.geometryObjects))

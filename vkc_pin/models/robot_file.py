@@ -1,0 +1,260 @@
+"""Reads a robot from its files: a URDF, a robot.yaml that says what a URDF cannot, and an SRDF."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.files import resources
+from vkc_pin.files.documents import Document
+from vkc_pin.files.srdf import Srdf, read_srdf
+from vkc_pin.files.urdf import UrdfFile, read_urdf
+from vkc_pin.models.coordinates import Coordinates
+from vkc_pin.models.robot import Base, Robot
+from vkc_pin.models.robot_model import (
+    collision_geometry,
+    default_tool_frame,
+    full_model,
+    nearest_position,
+    planned_model,
+    rest_positions,
+)
+from vkc_pin.models.robot_schema import RobotSchema, python_packages, read_robot
+from vkc_pin.models.self_collisions import sample_allowed_pairs, with_collision_pairs
+
+__all__ = ["find_robot", "known_robots", "load_robot"]
+
+_BASES = ("omni", "differential", "fixed")
+_PAIRS = ("srdf", "sampled", "all")
+_VELOCITY, _ACCELERATION = np.pi, 1.4  # of joints for which no file names one, [rad/s] and [rad/s²], or [m/s] and [m/s²]
+_SAMPLES = 1000  # to find allowed pairs when a robot without an SRDF is loaded
+# Names under which example-robot-data loads URDF files called otherwise.
+_ALIASES = {"anymal_kinova": "anymal-kinova", "asr_twodof": "TwoDofs", "b1_z1": "b1-z1", "hyq": "hyq_no_sensors", "solo8": "solo"}
+
+
+def known_robots() -> dict[str, Path]:
+    """Return the names `load_robot` knows and their files: those in robots/, then those of example-robot-data."""
+    known = {path.parent.name: path for path in sorted(resources.folder("robots").glob("*/robot.yaml"))}
+    folder = resources.example_robot_data()
+    if folder is not None:
+        files = sorted(folder.glob("robots/*/*/*.urdf"))
+        stems = {file.stem: file for file in reversed(files)}
+        for stem, file in stems.items():
+            known.setdefault(stem, file)
+            known.setdefault(stem.removesuffix("_robot"), file)
+        for name, stem in _ALIASES.items():
+            if stem in stems:
+                known.setdefault(name, stems[stem])
+    return known
+
+
+def find_robot(name: str) -> Path:
+    """Return the robot.yaml or URDF file of a robot.
+
+    Args:
+        name: A name of `known_robots`, or the path of a URDF file, of a robot.yaml, or of a folder that holds one.
+
+    Raises:
+        UnknownNameError: It is neither.
+    """
+    path = Path(name)
+    if path.suffix.lower() in (".urdf", ".yaml", ".yml") or len(path.parts) != 1:
+        file = path / "robot.yaml" if path.is_dir() else path
+        if not file.is_file():
+            raise InputError("there is no such robot", file=file, expected="a URDF file, a robot.yaml, or a robot's name")
+        return file
+    known = known_robots()
+    if name not in known:
+        raise UnknownNameError("robot", name, known)
+    return known[name]
+
+
+def load_robot(
+    name: str | Path,
+    *,
+    base: Base = "omni",
+    tool_frame: str | None = None,
+    locked_joints: Mapping[str, float] | None = None,
+    home: Mapping[str, float] | None = None,
+    srdf: str | Path | None = None,
+    pairs: Literal["srdf", "sampled", "all"] = "srdf",
+    packages: Mapping[str, str | Path] | None = None,
+) -> Robot:
+    """Load a robot and put it on a planar virtual base.
+
+    The joints on the way from the root to the tool frame are planned. All others (wheels, heads, other arms, fingers) are
+    locked, as are joints that mimic others and joints of a type other than revolute, continuous and prismatic.
+
+    Limits come from the URDF and from a `robot.yaml` beside it. Where neither names a velocity or an acceleration they
+    are π rad/s (m/s) and 1.4 rad/s² (m/s²) for joints, 1 m/s, 2 rad/s, 3 m/s² and 6 rad/s² for the base, ±20 m.
+
+    Pairs of links that may touch come from the SRDF. Without one they are adjacent links and those that sampling
+    finds always, or never, in collision (`vkc_pin.models.self_collisions`).
+
+    Args:
+        name: A robot in robots/, one of example-robot-data ("panda", "tiago", "ur5"), or the path of a URDF.
+        base: "omni", "differential" (the planner keeps it from moving sideways) or "fixed" (its limits are 0).
+        tool_frame: The frame that grasps; by default that of robot.yaml, else the last frame of the longest chain.
+        locked_joints: More joints to lock, and where, [m] or [rad]; joints locked anyway rest at 0 or the nearest limit.
+        home: Where joints rest, [m] or [rad]; by default what robot.yaml says, else a group state of the SRDF that
+            covers all planned joints (one called home if there is one), else 0, or the middle if 0 is outside the limits.
+        srdf: File of allowed collisions; by default the one robot.yaml names, or the one beside the URDF.
+        pairs: Where the allowed pairs come from: "srdf"; "sampled" whether there is an SRDF or not; "all" makes every pair
+            of links that move against each other a collision pair, even adjacent ones, to look at the geometry itself.
+        packages: Folders for `package://` addresses; others are looked for around the file.
+
+    Raises:
+        UnknownNameError: There is no such robot, frame, joint or link; the error names the nearest one.
+        InputError: A file or value is wrong, no joint would be planned, or nothing could collide.
+    """
+    for value, field, choices, kind in ((base, "base", _BASES, "kind of base"), (pairs, "pairs", _PAIRS, "source of pairs")):
+        if value not in choices:
+            raise InputError(f"wrong {kind}", field=field, expected=" or ".join(choices), got=value)
+    files = _read(name, packages or {})
+    urdf, settings = files.urdf, files.settings
+    beside = Path(srdf) if srdf is not None else files.srdf()
+    semantics = read_srdf(beside, links=urdf.links) if beside is not None and pairs == "srdf" else None
+
+    full = full_model(urdf)
+    tool = tool_frame if tool_frame is not None else settings.tool_frame or default_tool_frame(full, urdf)
+    if tool not in (frames := dict.fromkeys(frame.name for frame in full.frames)):
+        raise UnknownNameError("frame", tool, frames, file=urdf.path, field="tool_frame")
+    locked = {**settings.locked_joints, **(locked_joints or {})}
+    given = {**settings.home, **(home or {}), **locked}
+    rest = rest_positions(full, urdf, given)
+    files.check_names(rest)
+    for joint in given:
+        if joint not in rest:
+            field = "home" if joint in (home or {}) else "locked_joints"
+            raise UnknownNameError("joint", joint, rest, file=urdf.path, field=field)
+    model = planned_model(full, urdf, tool, rest, locked)
+    coordinates, lower, upper, velocity, acceleration = _limits(model, settings, base)
+    robot = Robot(
+        name=files.name,
+        urdf=urdf.path,
+        model=model,
+        collision=collision_geometry(model, urdf),
+        coordinates=coordinates,
+        lower=lower,
+        upper=upper,
+        velocity=velocity,
+        acceleration=acceleration,
+        home=_home(files, model, {**rest, **_state(model, semantics, given)}, lower[3:], upper[3:]),
+        tool_frame=tool,
+        base=base,
+        touch_links=settings.touch_links,
+        file=urdf,
+    )
+    stated = () if pairs == "all" else None if semantics is None else semantics.allowed
+    robot = with_collision_pairs(robot, sample_allowed_pairs(robot, samples=_SAMPLES) if stated is None else stated)
+    if len(robot.collision.collisionPairs) == 0 and stated is not None:
+        expected = "<collision> elements, and an SRDF that fits"
+        raise InputError("no pair of links is left that could collide", file=robot.urdf, expected=expected)
+    return robot
+
+
+@dataclass(frozen=True, eq=False)
+class _Files:
+    """A robot's files: `source`, its robot.yaml or else its URDF; what the first says; and the URDF."""
+
+    source: Path
+    settings: RobotSchema
+    document: Document
+    urdf: UrdfFile
+
+    @property
+    def name(self) -> str:
+        """The robot's name: that of its folder or its file."""
+        return self.source.resolve().parent.name if self.source.name == "robot.yaml" else self.source.stem
+
+    def srdf(self) -> Path | None:
+        """Return the SRDF that belongs to the URDF: named in robot.yaml, or found by its name."""
+        if self.settings.srdf is not None:
+            return self.source.parent / self.settings.srdf
+        path = self.urdf.path
+        stems = (path.stem, path.stem.removesuffix("_robot"))
+        places = [folder / f"{stem}.srdf" for stem in stems for folder in (path.parent, path.parent.parent / "srdf")]
+        return next((place for place in places if place.is_file()), None)
+
+    def check_names(self, joints: Collection[str]) -> None:
+        """Check that the joints and links that robot.yaml names exist. Raises `UnknownNameError` if one does not."""
+        settings = self.settings
+        for key, named in (("home", settings.home), ("locked_joints", settings.locked_joints), ("joints", settings.joints)):
+            for joint in named:
+                if joint not in joints:
+                    raise self.document.unknown((key, joint), "joint", joint, joints)
+        for link in settings.touch_links:
+            if link not in self.urdf.links:
+                raise self.document.unknown(("touch_links",), "link", link, self.urdf.links)
+
+
+def _read(name: str | Path, packages: Mapping[str, str | Path]) -> _Files:
+    """Find and read a robot's URDF, and the robot.yaml that belongs to it if there is one."""
+    source = find_robot(str(name))
+    document = Document({})
+    settings = RobotSchema(urdf=source.name)
+    if source.suffix != ".yaml" and (source.parent / "robot.yaml").is_file():
+        beside, _ = read_robot(source.parent / "robot.yaml")
+        source = source.parent / "robot.yaml" if beside.urdf == source.name else source
+    if source.suffix == ".yaml":
+        settings, document = read_robot(source)
+    folders = {key: Path(folder) for key, folder in packages.items()}
+    folders = {**python_packages(tuple(p for p in settings.packages if p not in folders), document), **folders}
+    return _Files(source, settings, document, read_urdf(source.parent / settings.urdf, folders))
+
+
+def _state(model: pin.Model, semantics: Srdf | None, given: Collection[str]) -> dict[str, float]:
+    """Return where an SRDF says that planned joints rest, those `given` otherwise left out."""
+    arm = list(model.names)[2:]
+    state = {} if semantics is None else semantics.state(arm)
+    return {joint: nearest_position(model, joint, state[joint]) for joint in arm if joint in state and joint not in given}
+
+
+def _home(
+    files: _Files, model: pin.Model, rest: Mapping[str, float], lower: NDArray[np.float64], upper: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return where the planned joints rest, shape (n − 3,). Raises `InputError` if one rests outside its limits."""
+    arm = list(model.names)[2:]
+    home = np.array([rest[joint] for joint in arm])
+    if (outside := np.flatnonzero((home < lower - 1e-9) | (home > upper + 1e-9))).size:
+        k = int(outside[0])
+        raise InputError(
+            "rests outside its limits",
+            file=files.document.file or files.urdf.path,
+            field=f"home.{arm[k]}",
+            expected=f"between {lower[k]:g} and {upper[k]:g}",
+            got=home[k],
+        )
+    return home
+
+
+def _limits(
+    model: pin.Model, settings: RobotSchema, base: Base
+) -> tuple[Coordinates, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Write the limits into `model` and return its coordinates with (lower, upper, velocity, acceleration), shape (n,) each."""
+    low, high = np.array(settings.base.position).T if base != "fixed" else (np.zeros(2), np.zeros(2))
+    position_low, position_high, velocity = model.lowerPositionLimit, model.upperPositionLimit, model.velocityLimit
+    position_low[:2], position_high[:2], velocity[:3] = low, high, settings.base.velocity
+    acceleration = np.full(model.nv, _ACCELERATION)
+    acceleration[:3] = settings.base.acceleration
+    for j in range(2, model.njoints):
+        v, named = model.joints[j].idx_v, settings.joints.get(model.names[j])
+        if named is not None and named.velocity is not None:
+            velocity[v] = named.velocity
+        elif not 0.0 < velocity[v] < 1e3:  # Pinocchio's value for a joint without limit is the largest number
+            velocity[v] = _VELOCITY
+        if named is not None and named.acceleration is not None:
+            acceleration[v] = named.acceleration
+    model.lowerPositionLimit, model.upperPositionLimit, model.velocityLimit = position_low, position_high, velocity
+    coordinates = Coordinates(model)
+    lower, upper = coordinates.lower.copy(), coordinates.upper.copy()
+    if base == "fixed":
+        lower[:3] = upper[:3] = 0.0
+    return coordinates, lower, upper, coordinates.velocity.copy(), acceleration

@@ -1,0 +1,241 @@
+"""Builds the Pinocchio model of a robot: planar base, the joints on the way to the tool, all else locked; and its shapes."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Collection, Mapping
+
+import coal
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from vkc_pin.errors import InputError
+from vkc_pin.files.urdf import Shape, UrdfFile
+from vkc_pin.models.grafting import add_joint, clean
+
+__all__ = [
+    "collision_geometry",
+    "default_tool_frame",
+    "full_model",
+    "nearest_position",
+    "planned_model",
+    "rest_positions",
+    "visual_geometry",
+]
+
+ROOT = "base"  # the name of the planar joint
+_ROUNDING = 1e-9  # [m] and of a rotation: URDFs write quarter turns with nine digits; exact ones make lean expressions
+_FINGER = 7  # joints in the longest finger of a hand
+_ARM = 4  # joints, at least, that carry a hand
+_DETAIL = 0.0015  # of displayed meshes, [m]
+_GREY = (0.6, 0.6, 0.62, 1.0)
+
+
+def full_model(file: UrdfFile) -> pin.Model:
+    """Return the model of all joints of `file` on a planar joint.
+
+    Raises:
+        InputError: It is no valid URDF.
+    """
+    try:
+        return pin.buildModelFromXML(file.text, pin.JointModelPlanar(), ROOT)
+    except (ValueError, RuntimeError) as error:
+        raise InputError(f"not a valid URDF: {error}", file=file.path) from error
+
+
+def planned_model(
+    full: pin.Model, file: UrdfFile, tool_frame: str, rest: Mapping[str, float], locked: Mapping[str, float]
+) -> pin.Model:
+    """Return `full` with all joints locked but those on the way to `tool_frame`.
+
+    Args:
+        full: See `full_model`.
+        file: Its file.
+        tool_frame: A frame of it.
+        rest: Where each joint is locked, [m] or [rad]; see `rest_positions`.
+        locked: Joints to lock though they are on the way, and where.
+
+    Raises:
+        InputError: No joint is left.
+    """
+    way = _way(full, full.frames[_frame(full, tool_frame)].parentJoint)
+    planned = [
+        j for j in way if full.names[j] in rest and full.names[j] not in locked and full.names[j] not in _mimics(file.root)
+    ]
+    if not planned:
+        raise InputError(
+            "no joint moves this frame",
+            file=file.path,
+            field="tool_frame",
+            expected="a frame at the end of an arm",
+            got=tool_frame,
+        )
+    return _reduced(full, {1, *planned}, configuration(full, {**rest, **locked}))
+
+
+def rest_positions(full: pin.Model, file: UrdfFile, given: Mapping[str, float]) -> dict[str, float]:
+    """Return for each joint of 1 degree of freedom where it rests, [m] or [rad].
+
+    That is what `given` says, else 0, or the middle of the limits where 0 lies outside them. A joint that mimics another
+    follows it.
+    """
+    rest = {}
+    for j in range(2, full.njoints):
+        if full.joints[j].nv == 1:
+            i = full.joints[j].idx_q
+            low, high = (-np.inf, np.inf) if full.joints[j].nq == 2 else (full.lowerPositionLimit[i], full.upperPositionLimit[i])
+            rest[full.names[j]] = float(given.get(full.names[j], 0.0 if low <= 0.0 <= high else 0.5 * (low + high)))
+    for name, (master, factor, offset) in _mimics(file.root).items():
+        if name in rest and master in rest and name not in given:
+            rest[name] = factor * rest[master] + offset
+    return rest
+
+
+def nearest_position(model: pin.Model, joint: str, position: float) -> float:
+    """Return `position` [m] or [rad] of a joint, turned by 2π or else moved to the nearest limit if it lies outside."""
+    moving = model.joints[model.getJointId(joint)]
+    if moving.nq == 2:
+        return position
+    low, high = model.lowerPositionLimit[moving.idx_q], model.upperPositionLimit[moving.idx_q]
+    turns = () if "JointModelP" in moving.shortname() else (2.0 * np.pi, -2.0 * np.pi)
+    for turn in (0.0, *turns):
+        if low <= position + turn <= high:
+            return float(position + turn)
+    return float(np.clip(position, low, high))
+
+
+def configuration(model: pin.Model, positions: Mapping[str, float]) -> NDArray[np.float64]:
+    """Return the configuration, shape (nq,), with joints at `positions`; those not named are neutral."""
+    q: NDArray[np.float64] = pin.neutral(model)
+    for j in range(1, model.njoints):
+        joint, value = model.joints[j], positions.get(model.names[j])
+        if value is not None and joint.nv == 1:
+            q[joint.idx_q : joint.idx_q + joint.nq] = value if joint.nq == 1 else (np.cos(value), np.sin(value))
+    return q
+
+
+def default_tool_frame(full: pin.Model, file: UrdfFile) -> str:
+    """Return the last frame of the longest chain of joints, before it branches into fingers."""
+    mimics = _mimics(file.root)
+    children: dict[int, list[int]] = {j: [] for j in range(full.njoints)}
+    depth = np.zeros(full.njoints, int)
+    for j in range(full.njoints - 1, 1, -1):
+        children[full.parents[j]].insert(0, j)
+        counts = full.joints[j].nv == 1 and full.names[j] not in mimics
+        depth[full.parents[j]] = max(depth[full.parents[j]], depth[j] + counts)
+    joint, above = 1, 0
+    while children[joint]:
+        hand = len(children[joint]) > 1 and depth[joint] <= _FINGER
+        if hand and above >= _ARM:
+            break
+        joint, above = max(children[joint], key=lambda j: depth[j] + (full.joints[j].nv == 1)), above + 1
+    return str([frame.name for frame in full.frames if frame.parentJoint == joint and frame.name != full.names[joint]][-1])
+
+
+def collision_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
+    """Return the collision shapes of `file` on the joints of `model`, named `<link>_<k>`, meshes as their convex hulls.
+
+    Raises:
+        InputError: A shape is not understood, a mesh cannot be read or is flat, or there is no shape.
+    """
+    geometry = pin.GeometryModel()
+    for shape in file.shapes("collision"):
+        _add(geometry, model, shape, shape.name, shape.solid(), _GREY)
+    if len(geometry.geometryObjects) == 0:
+        raise InputError("nothing of this robot can collide", file=file.path, expected="<collision> elements", got="none")
+    return geometry
+
+
+def visual_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
+    """Return what `file` looks like on the joints of `model`: one shape per colour, light enough for a web page.
+
+    The shapes hold triangles (`coal.BVHModelOBBRSS`) and `meshColor`; `meshPath` is empty, so that viewers draw what is
+    here and load no file themselves.
+
+    Raises:
+        InputError: A shape is not understood, or a mesh cannot be read.
+    """
+    from vkc_pin.files.meshes import load_parts, to_bvh
+
+    geometry = pin.GeometryModel()
+    for shape in file.shapes("visual"):
+        if shape.file is None:
+            _add(geometry, model, shape, shape.name, shape.solid(), shape.colour or _GREY)
+            continue
+        parts = load_parts(shape.file, shape.size, detail=_DETAIL)
+        for k, part in enumerate(parts):
+            name = shape.name if len(parts) == 1 else f"{shape.name}_{k}"
+            _add(geometry, model, shape, name, to_bvh(part), shape.colour or part.colour or _GREY)
+    return geometry
+
+
+def _reduced(full: pin.Model, planned: Collection[int], q: NDArray[np.float64]) -> pin.Model:
+    """Return `full` with the joints that are not `planned` locked at `q`.
+
+    `pinocchio.buildReducedModel` refuses models in which a link is called like a joint, as many are. Here, the frame of
+    such a joint is left out, so that every frame's name is the only one.
+    """
+    data = full.createData()
+    pin.forwardKinematics(full, data, q)
+    model = pin.Model()
+    model.name = full.name
+    placed = {0: (0, pin.SE3.Identity())}
+    for j in range(1, full.njoints):
+        joint, (parent, placement) = full.joints[j], placed[full.parents[j]]
+        if j in planned:
+            index = add_joint(model, parent, joint, clean(placement * full.jointPlacements[j], _ROUNDING), like=(full, j))
+            placed[j] = (index, pin.SE3.Identity())
+        else:
+            placed[j] = (parent, placement * data.liMi[j])
+        model.appendBodyToJoint(placed[j][0], full.inertias[j], placed[j][1])
+    links = {frame.name for frame in full.frames if frame.type == pin.FrameType.BODY}
+    for frame in full.frames[1:]:
+        if frame.type == pin.FrameType.BODY or frame.name not in links:
+            parent, placement = placed[frame.parentJoint]
+            model.addFrame(pin.Frame(frame.name, parent, 0, clean(placement * frame.placement), frame.type))
+    return model
+
+
+def _way(model: pin.Model, joint: int) -> list[int]:
+    """Return the joints from the root to `joint`, the planar one left out."""
+    way = []
+    while joint > 1:
+        way.append(joint)
+        joint = model.parents[joint]
+    return way[::-1]
+
+
+def _frame(model: pin.Model, name: str) -> int:
+    """Return the frame called `name`, that of a link before that of a joint."""
+    found = [i for i, frame in enumerate(model.frames) if frame.name == name]
+    return next((i for i in found if model.frames[i].type == pin.FrameType.BODY), found[0])
+
+
+def _mimics(root: ElementTree.Element) -> dict[str, tuple[str, float, float]]:
+    """Return joint → (the joint it follows, factor, offset)."""
+    found = {}
+    for joint in root.findall("joint"):
+        mimic = joint.find("mimic")
+        if mimic is not None:
+            found[joint.get("name", "")] = (
+                mimic.get("joint", ""),
+                float(mimic.get("multiplier", "1")),
+                float(mimic.get("offset", "0")),
+            )
+    return found
+
+
+def _add(
+    geometry: pin.GeometryModel,
+    model: pin.Model,
+    shape: Shape,
+    name: str,
+    solid: coal.CollisionGeometry,
+    colour: tuple[float, ...],
+) -> None:
+    frame = model.getFrameId(shape.link, pin.FrameType.BODY)
+    parent = model.frames[frame]
+    added = pin.GeometryObject(name, parent.parentJoint, frame, clean(parent.placement * shape.placement), solid)
+    added.meshColor = np.array(colour)
+    geometry.addGeometryObject(added)

@@ -1,0 +1,77 @@
+"""What a robot.yaml may contain: what a URDF cannot say about a robot."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import AfterValidator, Field
+
+from vkc_pin.errors import InputError
+from vkc_pin.files.documents import Document, check, read_yaml
+from vkc_pin.files.fields import JointSchema, Number, Positive, Schema, fail
+
+__all__ = ["BaseSchema", "RobotSchema", "python_packages", "read_robot"]
+
+
+def _ordered(value: tuple[float, float]) -> tuple[float, float]:
+    if value[0] > value[1]:
+        raise fail("lower limit above the upper one", "[lower, upper]")
+    return value
+
+
+Limits = Annotated[tuple[Number, Number], AfterValidator(_ordered)]
+
+
+class BaseSchema(Schema):
+    """The planar base: x and y in [m], yaw in [rad]; velocities and accelerations per x, y, yaw."""
+
+    position: tuple[Limits, Limits] = ((-20.0, 20.0), (-20.0, 20.0))
+    velocity: tuple[Positive, Positive, Positive] = (1.0, 1.0, 2.0)
+    acceleration: tuple[Positive, Positive, Positive] = (3.0, 3.0, 6.0)
+
+
+class RobotSchema(Schema):
+    """A robot.yaml beside a URDF; every field but `urdf` may be left out."""
+
+    urdf: str
+    srdf: str | None = None
+    packages: tuple[str, ...] = ()
+    tool_frame: str | None = None
+    touch_links: tuple[str, ...] = ()
+    base: BaseSchema = BaseSchema()
+    home: dict[str, Number] = Field(default_factory=dict)
+    locked_joints: dict[str, Number] = Field(default_factory=dict)
+    joints: dict[str, JointSchema] = Field(default_factory=dict)
+
+
+def read_robot(file: Path) -> tuple[RobotSchema, Document]:
+    """Read a robot.yaml.
+
+    Raises:
+        InputError: It cannot be read, or a field of it is wrong; the error names file, line and field.
+    """
+    document = read_yaml(file)
+    if not isinstance(document.data, dict):
+        raise InputError("not a robot", file=file, expected="fields (name: value)", got=type(document.data).__name__)
+    return check(document, RobotSchema), document
+
+
+def python_packages(names: tuple[str, ...], document: Document) -> dict[str, Path]:
+    """Return the folders of installed Python packages, without importing them.
+
+    Raises:
+        InputError: One is not installed.
+    """
+    folders = {}
+    for index, name in enumerate(names):
+        spec = importlib.util.find_spec(name) if name.isidentifier() else None
+        if spec is None or not spec.submodule_search_locations:
+            raise document.error(
+                ("packages", index),
+                "the Python package with the robot's meshes is not installed",
+                expected=f"pip install {name.replace('_', '-')}",
+            )
+        folders[name] = Path(next(iter(spec.submodule_search_locations)))
+    return folders

@@ -1,0 +1,154 @@
+"""Collision shapes: their names, surfaces, boxes, and the distances between them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import coal
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from vkc_pin.errors import InputError
+from vkc_pin.models.grafting import clean
+
+__all__ = [
+    "LIMIT_SLACK",
+    "bounding_box",
+    "clearance",
+    "copy_shape",
+    "link_name",
+    "own_name",
+    "placed_shapes",
+    "shape_distance",
+    "triangles",
+    "within_limits",
+    "world_box",
+]
+
+LIMIT_SLACK = 1e-6
+"""Joint values up to this far outside their limits, [rad] or [m], count as rounding and are moved to the limit."""
+_SEGMENTS = 28  # of a circle
+
+
+def within_limits(value: float, lower: float, upper: float, field: str | None) -> float:
+    """Return `value`, moved to the limit if it is outside by rounding only. Raises `InputError` if it is further out."""
+    if not np.isfinite(value):
+        raise InputError("not a finite number", field=field, expected="a finite number", got=value)
+    if not lower - LIMIT_SLACK <= value <= upper + LIMIT_SLACK:
+        raise InputError("outside the joint's limits", field=field, expected=f"{lower:g} to {upper:g}", got=f"{value:g}")
+    return float(min(max(value, lower), upper))
+
+
+def copy_shape(shape: pin.GeometryObject, name: str, placement: pin.SE3) -> pin.GeometryObject:
+    """Return a copy of `shape` that stands still at `placement` in the world frame."""
+    copy = pin.GeometryObject(shape)
+    copy.name, copy.parentJoint, copy.parentFrame, copy.placement = name, 0, 0, clean(placement)
+    return copy
+
+
+def link_name(shape_name: str) -> str:
+    """Return the name of the link that a shape belongs to: Pinocchio calls its shapes `<link>_<number>`."""
+    return shape_name.rpartition("_")[0]
+
+
+def own_name(shape_name: str) -> str:
+    """Return the name in its object of a shape that is called `<object>.<own name>`."""
+    return shape_name.partition(".")[2]
+
+
+def placed_shapes(shapes: Iterable[pin.GeometryObject]) -> list[tuple[coal.CollisionGeometry, pin.SE3]]:
+    """Return (shape, placement) for shapes that stand in the world, for `clearance`."""
+    return [(shape.geometry, shape.placement) for shape in shapes]
+
+
+def clearance(
+    first: Iterable[tuple[coal.CollisionGeometry, pin.SE3]],
+    second: Iterable[tuple[coal.CollisionGeometry, pin.SE3]],
+    *,
+    reach: float = np.inf,
+) -> float:
+    """Return the smallest signed distance [m] between two groups of shapes with their placements in the world frame.
+
+    Args:
+        first: One group; a negative distance is a penetration depth.
+        second: The other group.
+        reach: Distances above this do not matter [m]: the result is then some number ≥ `reach`.
+    """
+    nearest, request, others = reach, coal.DistanceRequest(), list(second)
+    boxes = np.array([world_box(shape, placement) for shape, placement in others]).reshape(-1, 2, 3)
+    for shape, placement in first:
+        low, high = world_box(shape, placement)
+        # Moved apart by as much as their boxes overlap, shapes are separate: a bound also where it is negative.
+        gaps = np.maximum(boxes[:, 0] - high, low - boxes[:, 1]).max(axis=1)
+        transform = coal.Transform3s(placement.rotation, placement.translation)
+        for k in np.argsort(gaps, kind="stable").tolist():
+            if gaps[k] >= nearest:
+                break
+            other, where = others[k]
+            there = coal.Transform3s(where.rotation, where.translation)
+            nearest = min(nearest, coal.distance(shape, transform, other, there, request, coal.DistanceResult()))
+    return float(nearest)
+
+
+def shape_distance(
+    first: coal.CollisionGeometry, first_placement: pin.SE3, second: coal.CollisionGeometry, second_placement: pin.SE3
+) -> float:
+    """Return the signed distance [m] between two shapes at placements in one frame."""
+    a, b = (coal.Transform3s(where.rotation, where.translation) for where in (first_placement, second_placement))
+    return float(coal.distance(first, a, second, b, coal.DistanceRequest(), coal.DistanceResult()))
+
+
+def triangles(shape: coal.CollisionGeometry) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return the surface of a coal shape in its own frame: vertices, shape (n, 3) [m], and faces, shape (m, 3).
+
+    Raises:
+        InputError: The shape has no surface of finite size (a plane or half-space).
+    """
+    import trimesh.creation as make
+
+    if isinstance(shape, coal.Box):
+        mesh = make.box(extents=2.0 * np.asarray(shape.halfSide))
+    elif isinstance(shape, coal.Sphere):
+        mesh = make.uv_sphere(radius=shape.radius, count=(_SEGMENTS // 2, _SEGMENTS))
+    elif isinstance(shape, coal.Ellipsoid):
+        mesh = make.uv_sphere(radius=1.0, count=(_SEGMENTS // 2, _SEGMENTS))
+        mesh.apply_transform(np.diag([*np.asarray(shape.radii), 1.0]))
+    elif isinstance(shape, coal.Cylinder):
+        mesh = make.cylinder(radius=shape.radius, height=2.0 * shape.halfLength, sections=_SEGMENTS)
+    elif isinstance(shape, coal.Cone):
+        mesh = make.cone(radius=shape.radius, height=2.0 * shape.halfLength, sections=_SEGMENTS)
+        mesh.apply_translation([0.0, 0.0, -shape.halfLength])
+    elif isinstance(shape, coal.Capsule):
+        length = 2.0 * shape.halfLength
+        mesh = make.capsule(height=length, radius=shape.radius, count=(_SEGMENTS, _SEGMENTS))
+        mesh.apply_translation([0.0, 0.0, -(mesh.bounds[0, 2] + mesh.bounds[1, 2]) / 2.0])
+    elif isinstance(shape, coal.BVHModelBase):
+        faces = [shape.tri_indices(k) for k in range(shape.num_tris)]
+        return np.array(shape.vertices(), float), _indices(faces)
+    elif isinstance(shape, coal.Convex):
+        return np.array(shape.points(), float), _indices([shape.polygons(k) for k in range(shape.num_polygons)])
+    else:
+        raise InputError("this shape cannot be drawn", expected="a solid or a mesh", got=type(shape).__name__)
+    return np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
+
+
+def bounding_box(shape: pin.GeometryObject) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return centre and half extents of a shape's bounding box in its own frame."""
+    shape.geometry.computeLocalAABB()
+    box = shape.geometry.aabb_local
+    return np.asarray(box.center(), float), np.array([box.width(), box.height(), box.depth()]) / 2
+
+
+def world_box(shape: coal.CollisionGeometry, placement: pin.SE3) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the lower and upper corner, shape (3,) each [m], of a box along the world's axes around a shape."""
+    shape.computeLocalAABB()
+    box = shape.aabb_local
+    centre = placement.act(np.asarray(box.center(), float))
+    extent = np.abs(placement.rotation) @ np.array([box.width(), box.height(), box.depth()]) / 2
+    return centre - extent, centre + extent
+
+
+def _indices(items: list[Any]) -> NDArray[np.int64]:
+    return np.array([(item[0], item[1], item[2]) for item in items], np.int64).reshape(-1, 3)

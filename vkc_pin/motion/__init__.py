@@ -1,0 +1,1 @@
+"""Motions over time, the scene along them, and both as files."""

@@ -1,0 +1,185 @@
+"""Motions as plain data with the fields of ROS' trajectory_msgs/JointTrajectory, and back.
+
+A motion is plain data here, of the shape that `Trajectory.to_dict` returns. Times are seconds, positions metres and radians; the
+base is three coordinates, x, y and yaw in the world frame.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vkc_pin.errors import InputError
+from vkc_pin.motion.tables import chosen_columns, one_phase, read_json, size_of_robot
+
+__all__ = ["along", "from_ros", "rates", "to_ros"]
+
+_NANO = 1_000_000_000
+
+
+def to_ros(
+    motion: Mapping[str, Any],
+    *,
+    joints: str | Sequence[str] = "robot",
+    rate: float | None = None,
+    smooth: bool = True,
+    derivatives: int = 2,
+    frame: str = "world",
+    stamp: float = 0.0,
+) -> dict[str, Any]:
+    """Return a motion as plain data with the fields of ROS' `trajectory_msgs/JointTrajectory`, e.g. for JSON.
+
+    Velocities are those of monotone cubics through the waypoints: along these no coordinate leaves the range between two
+    neighbouring waypoints, and what rests between two of them stays at rest. What was validated is the motion that is linear
+    between waypoints; `from_ros` makes one of the points that can be validated as well.
+
+    Args:
+        motion: What to convert.
+        joints: One of `GROUPS`, or names of coordinates in the order wanted. The joints of objects are not in it unless asked
+            for: no motor moves them.
+        rate: Points a second, and one at the end [Hz]; None: the waypoints themselves.
+        smooth: Whether points at a rate are on the cubics; otherwise they are on the straight lines between waypoints, where
+            velocities jump.
+        derivatives: 0: positions only; 1: velocities as well; 2: accelerations as well.
+        frame: `header.frame_id`, the frame of the base's coordinates.
+        stamp: `header.stamp` [s]; in ROS, zero means at once.
+
+    Returns:
+        `header`, `joint_names` and `points`, each with `positions` [m, rad], `velocities` [m/s, rad/s], `accelerations` [m/s²,
+        rad/s²], `effort` (empty) and `time_from_start` in `sec` and `nanosec`.
+
+    Raises:
+        UnknownNameError: There is no such group or coordinate.
+        InputError: `rate`, `derivatives` or `stamp` is out of range.
+    """
+    if derivatives not in (0, 1, 2):
+        raise InputError("out of range", field="derivatives", expected="0, 1 or 2", got=repr(derivatives))
+    if not (isinstance(stamp, int | float) and 0.0 <= stamp < 2.0**31):
+        raise InputError("out of range", field="stamp", expected="seconds, at least 0", got=repr(stamp))
+    columns = chosen_columns(motion, joints)
+    times, positions = np.array(motion["times"], float), np.array(motion["positions"], float)[:, columns]
+    times = times - times[0]
+    velocities, accelerations = rates(times, positions)
+    if rate is not None:
+        if not (isinstance(rate, int | float) and 0.0 < rate < math.inf):
+            raise InputError("out of range", field="rate", expected="points a second, more than 0", got=repr(rate))
+        moments = np.append(np.arange(math.ceil(times[-1] * rate - 1e-6)) / rate, times[-1])
+        if smooth:
+            positions, velocities, accelerations = along(times, positions, velocities, moments)
+        else:
+            positions = np.stack([np.interp(moments, times, column) for column in positions.T], axis=-1)
+            velocities, accelerations = rates(moments, positions)
+        times = moments
+    empty: list[list[float]] = [[] for _ in times]
+    points = zip(
+        times.tolist(),
+        positions.tolist(),
+        velocities.tolist() if derivatives > 0 else empty,
+        accelerations.tolist() if derivatives > 1 else empty,
+        strict=True,
+    )
+    return {
+        "header": {"stamp": _duration(stamp), "frame_id": frame},
+        "joint_names": [motion["names"][k] for k in columns],
+        "points": [
+            {"positions": p, "velocities": v, "accelerations": a, "effort": [], "time_from_start": _duration(t)}
+            for t, p, v, a in points
+        ],
+    }
+
+
+def from_ros(
+    message: Mapping[str, Any] | str | Path, *, like: Mapping[str, Any] | None = None, robot_size: int | None = None
+) -> dict[str, Any]:
+    """Return the motion in data with the fields of `trajectory_msgs/JointTrajectory`; times to 1 ns.
+
+    Args:
+        message: The data, or a JSON file with them. All of the robot's coordinates must be in them, the base's first.
+        like: A motion whose phases and number of robot coordinates it takes; a phase ends at the point that is next in time to
+            where it ended. None: all of it is one phase in which nothing is held.
+        robot_size: How many of the coordinates are the robot's, if there is no `like`; None: those before the first with a dot.
+
+    Raises:
+        InputError: Something is missing or does not fit; the error names the field.
+    """
+    file = None if isinstance(message, Mapping) else Path(message)
+    data = message if isinstance(message, Mapping) else read_json(message)
+    names = _field(data, "joint_names", list, file, "")
+    times: list[float] = []
+    rows: list[list[float]] = []
+    for k, point in enumerate(_field(data, "points", list, file, "")):
+        where = f"points[{k}]."
+        row = _field(point, "positions", list, file, where)
+        if len(row) != len(names):
+            raise InputError("wrong number of values", file=file, field=where + "positions", expected=len(names), got=len(row))
+        for number, value in enumerate(row):
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                field = f"{where}positions[{number}]"
+                raise InputError("not a number", file=file, field=field, expected="a number", got=repr(value))
+        since = _field(point, "time_from_start", dict, file, where)
+        sec, nanosec = (_field(since, key, int, file, f"{where}time_from_start.") for key in ("sec", "nanosec"))
+        rows.append(row)
+        times.append(sec + nanosec / _NANO)
+    size = size_of_robot(names) if robot_size is None else robot_size
+    phases = [one_phase(len(rows))] if len(rows) > 1 else []
+    if like is not None:
+        size, began = like["robot_size"], np.array(like["times"], float)
+        edges = (began - began[0])[[0, *(phase["last"] for phase in like["phases"])]]
+        at = np.abs(np.asarray(times)[:, None] - edges).argmin(axis=0).tolist() if times else []
+        ends = zip(like["phases"], at, at[1:], strict=False)
+        phases = [{**phase, "first": first, "last": last} for phase, first, last in ends]
+    return {"names": [str(name) for name in names], "times": times, "positions": rows, "robot_size": size, "phases": phases}
+
+
+def rates(times: NDArray[np.float64], positions: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return velocities and accelerations at waypoints, shape (T, n) each; it rests before the first and after the last.
+
+    Velocities are those of SciPy's monotone cubics, but for the ends. Where a coordinate turns round, its velocity is zero; where
+    it rests before or after, its acceleration is zero as well.
+    """
+    from scipy.interpolate import PchipInterpolator
+
+    steps = np.diff(times)[:, None]
+    slopes = np.diff(positions, axis=0) / steps
+    velocities, accelerations = np.zeros_like(positions), np.zeros_like(positions)
+    with np.errstate(over="ignore"):  # the reciprocal of a slope next to nothing
+        velocities[1:-1] = PchipInterpolator(times, positions)(times[1:-1], 1)
+    before, after = slopes[:-1], slopes[1:]
+    moves = (before != 0.0) & (after != 0.0)
+    accelerations[1:-1] = np.where(moves, 2.0 * (after - before) / (steps[1:] + steps[:-1]), 0.0)
+    return velocities, accelerations
+
+
+def along(
+    times: NDArray[np.float64], positions: NDArray[np.float64], velocities: NDArray[np.float64], moments: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return positions, velocities and accelerations at `moments` on the cubics through waypoints with these velocities."""
+    from scipy.interpolate import CubicHermiteSpline
+
+    cubics = CubicHermiteSpline(times, positions, velocities)
+    at = np.clip(np.searchsorted(times, moments, side="right") - 1, 0, len(times) - 2)
+    low, high = np.minimum(positions[at], positions[at + 1]), np.maximum(positions[at], positions[at + 1])
+    place = np.clip(cubics(moments), low, high)  # against rounding
+    place[moments >= times[-1]] = positions[-1]
+    return place, cubics(moments, 1), cubics(moments, 2)
+
+
+def _duration(seconds: float) -> dict[str, int]:
+    sec, nanosec = divmod(round(seconds * _NANO), _NANO)
+    return {"sec": sec, "nanosec": nanosec}
+
+
+def _field(data: Any, key: str, kind: type, file: Path | None, where: str) -> Any:
+    """Return a field of a message."""
+    expected = {list: "a list", dict: "an object", int: "a whole number"}[kind]
+    if not isinstance(data, Mapping) or key not in data:
+        raise InputError("this is missing from a JointTrajectory", file=file, field=where + key, expected=expected)
+    value = data[key]
+    if not isinstance(value, Mapping if kind is dict else kind) or isinstance(value, bool):
+        raise InputError("wrong kind of value", file=file, field=where + key, expected=expected, got=repr(value)[:60])
+    return value

@@ -1,0 +1,199 @@
+"""Motions as tables (CSV) and as JSON, for other programs, and back.
+
+A motion is plain data here, of the shape that `Trajectory.to_dict` returns. Times are seconds, positions metres and radians; the
+base is three coordinates, x, y and yaw in the world frame.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.files.writing import write_atomically
+
+__all__ = [
+    "GROUPS",
+    "chosen_columns",
+    "one_phase",
+    "read_csv",
+    "read_json",
+    "size_of_robot",
+    "write_csv",
+    "write_json",
+]
+
+GROUPS = ("all", "robot", "base", "arm", "objects")
+"""What can be asked for instead of names: everything, base and arm, the base, the arm, or what no motor of the robot moves."""
+_TIME, _PHASES = "time", ("phase", "phase_name", "held")  # the first column of a table, and the last ones
+
+
+def write_csv(
+    motion: Mapping[str, Any], path: str | Path, *, joints: str | Sequence[str] = "all", units: Mapping[str, str] | None = None
+) -> Path:
+    """Write a table, a line a waypoint, whole or not at all; return the path.
+
+    The first line names the columns, with units in brackets where they are known: `time [s]`, `base_x [m]`, `base_y [m]`,
+    `base_yaw [rad]`, the arm's joints, the objects' joints, then `phase` (counted from 1), `phase_name` and `held`, as JSON. A
+    waypoint between two phases is in the earlier one. Numbers have as many digits as it takes to read back the very same.
+
+    Args:
+        motion: What to write.
+        path: The file.
+        joints: One of `GROUPS`, or names of coordinates in the order wanted.
+        units: Coordinate → unit, "m" or "rad"; those of the base need not be given.
+
+    Raises:
+        UnknownNameError: There is no such group or coordinate.
+    """
+    columns, phases = chosen_columns(motion, joints), motion["phases"]
+    x, y, yaw = motion["names"][:3]
+    known = {x: "m", y: "m", yaw: "rad", **({} if units is None else units)}
+    lines: list[str] = []
+    table = csv.writer(SimpleNamespace(write=lines.append))  # its lines end with "\r\n", so it puts either of them in quotes
+    names = [motion["names"][k] for k in columns]
+    table.writerow([f"{_TIME} [s]", *(f"{name} [{known[name]}]" if name in known else name for name in names), *_PHASES])
+    number = 0
+    for k, (moment, row) in enumerate(zip(motion["times"], motion["positions"], strict=True)):
+        number += k > phases[number]["last"]
+        phase = phases[number]
+        held = {name: [at, phase["by"][name]] if name in phase["by"] else at for name, at in phase["held"].items()}
+        values = [repr(float(row[column])) for column in columns]
+        table.writerow([repr(float(moment)), *values, number + 1, phase["name"], json.dumps(held)])
+    return write_atomically(path, "".join(line.removesuffix("\r\n") + "\n" for line in lines).encode("utf-8"))
+
+
+def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, Any]:
+    """Return the motion in a table: what `write_csv` wrote with all of the robot's coordinates in it, or one like it.
+
+    Args:
+        path: The file. Without the columns `phase`, `phase_name` and `held`, all of it is one phase in which nothing is held.
+        robot_size: How many of the coordinates are the robot's; None: those before the first with a dot in its name.
+
+    Raises:
+        InputError: The file is missing, or something in it does not fit; the error names line and column.
+    """
+    path = Path(path)
+    reader = csv.reader(io.StringIO(_text(path), newline=""))
+    header = [re.sub(r" \[(s|m|rad)\]$", "", name) for name in next(reader, [])]
+    if not header:
+        raise InputError("an empty file", file=path, expected="a table with a line of names")
+    if header[0] != _TIME:
+        raise InputError("not a table of waypoints", file=path, line=1, field="first column", expected=_TIME, got=repr(header[0]))
+    told = tuple(header[-3:]) == _PHASES
+    names = header[1 : -3 if told else None]
+    rows: list[list[float]] = []
+    phases: list[dict[str, Any]] = []
+    for cells in reader:
+        number = reader.line_num
+        if not cells:
+            continue
+        if len(cells) != len(header):
+            raise InputError("wrong number of columns", file=path, line=number, expected=len(header), got=len(cells))
+        rows.append([_number(cell, path, number, name) for cell, name in zip(cells, [_TIME, *names], strict=False)])
+        if told:
+            _add_phase(phases, cells[-3:], len(rows) - 1, path, number)
+    if not told and len(rows) > 1:
+        phases = [one_phase(len(rows))]
+    return {
+        "names": names,
+        "times": [row[0] for row in rows],
+        "positions": [row[1:] for row in rows],
+        "robot_size": size_of_robot(names) if robot_size is None else robot_size,
+        "phases": phases,
+    }
+
+
+def write_json(motion: Mapping[str, Any], path: str | Path) -> Path:
+    """Write a motion as JSON, whole or not at all; return the path."""
+    return write_atomically(path, (json.dumps(motion, indent=1) + "\n").encode("utf-8"))
+
+
+def read_json(path: str | Path) -> Any:
+    """Return what a JSON file holds.
+
+    Raises:
+        InputError: The file is missing or is no JSON; the error names the line.
+    """
+    path = Path(path)
+    try:
+        return json.loads(_text(path))
+    except json.JSONDecodeError as error:
+        raise InputError("not JSON", file=path, line=error.lineno, got=error.msg) from None
+
+
+def chosen_columns(motion: Mapping[str, Any], joints: str | Sequence[str]) -> list[int]:
+    """Return which of a motion's coordinates are meant by one of `GROUPS`, or by names in the order wanted.
+
+    Raises:
+        UnknownNameError: There is no such group or coordinate.
+        InputError: A name occurs twice.
+    """
+    known, robot, size = motion["names"], motion["robot_size"], len(motion["names"])
+    groups = {"all": (0, size), "robot": (0, robot), "base": (0, 3), "arm": (3, robot), "objects": (robot, size)}
+    if isinstance(joints, str):
+        if joints not in groups:
+            raise UnknownNameError("group of joints", joints, GROUPS, field="joints")
+        return list(range(*groups[joints]))
+    names = list(joints)
+    for k, name in enumerate(names):
+        if name not in known:
+            raise UnknownNameError("coordinate", str(name), known, field=f"joints[{k}]")
+        if name in names[:k]:
+            raise InputError("a name occurs twice", field=f"joints[{k}]", got=name)
+    return [known.index(name) for name in names]
+
+
+def size_of_robot(names: Sequence[str]) -> int:
+    """Return how many coordinates are the robot's, if nobody says so: those before the first with a dot in its name."""
+    return next((k for k, name in enumerate(names) if "." in str(name)), len(names))
+
+
+def one_phase(waypoints: int) -> dict[str, Any]:
+    """Return the phase that all of a motion is in if nobody says otherwise; nothing is held in it."""
+    return {"name": "motion", "first": 0, "last": waypoints - 1, "held": {}, "by": {}}
+
+
+def _text(path: Path) -> str:
+    if not path.is_file():
+        raise InputError("no such file", file=path)
+    try:
+        return path.read_bytes().decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError("not text", file=path, expected="UTF-8", got=str(error)) from None
+
+
+def _number(cell: str, path: Path, line: int, column: str) -> float:
+    try:
+        value = float(cell)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise InputError("not a number", file=path, line=line, field=column, expected="a finite number", got=repr(cell))
+    return value
+
+
+def _add_phase(phases: list[dict[str, Any]], cells: Sequence[str], row: int, path: Path, line: int) -> None:
+    """Take the last cells of a line: the phase's number, its name, and what is held in it."""
+    number, name, held = cells
+    expected = f"{len(phases)} or {len(phases) + 1}" if phases else "1"
+    if number not in expected.split(" or "):
+        raise InputError("not the next phase", file=path, line=line, field="phase", expected=expected, got=repr(number))
+    if int(number) == len(phases):
+        phases[-1]["last"] = row
+        return
+    try:
+        found = json.loads(held)
+        at = {thing: where if isinstance(where, str) else where[0] for thing, where in found.items()}
+        by = {thing: where[1] for thing, where in found.items() if not isinstance(where, str)}
+    except (ValueError, AttributeError, TypeError, LookupError):
+        wanted = 'JSON such as {"door": "handle"}'
+        raise InputError("not what is held", file=path, line=line, field="held", expected=wanted, got=repr(held)) from None
+    phases.append({"name": name, "first": max(row - 1, 0), "last": row, "held": at, "by": by})

@@ -1,0 +1,297 @@
+"""Trajectory: waypoints of robot and objects over time, linear in the coordinates between them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vkc_pin.errors import InputError, UnknownNameError
+
+__all__ = ["PhaseSpan", "Trajectory", "filled", "join"]
+
+
+@dataclass(frozen=True)
+class PhaseSpan:
+    """A stretch of a trajectory in which the same things are held.
+
+    Attributes:
+        name: What happens in it, e.g. "reach door.handle".
+        first, last: Its waypoints; `last` is the next phase's `first`.
+        held: Object → attachment, for all that is held in it.
+        by: Object → "<object>.<link>", for what is held through another object that is held.
+    """
+
+    name: str
+    first: int
+    last: int
+    held: Mapping[str, str] = field(default_factory=dict)
+    by: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Waypoints over time.
+
+    Attributes:
+        names: The coordinates' names, n of them: base x, y, yaw, arm joints, then `<object>.<joint>`.
+        times: Of the waypoints, shape (T,), increasing [s].
+        positions: Shape (T, n), [m] and [rad]; angles are not wrapped, so that they interpolate.
+        phases: Which stretch of it does what; each begins where the one before ends, and together they cover it all.
+        robot_size: How many of the coordinates are the robot's (3 for the base, then the arm).
+
+    Raises:
+        InputError: Names that occur twice, numbers that are not finite, shapes that do not fit, times that do not increase,
+            or phases that leave a gap.
+    """
+
+    names: tuple[str, ...]
+    times: NDArray[np.float64]
+    positions: NDArray[np.float64]
+    phases: tuple[PhaseSpan, ...]
+    robot_size: int
+
+    def __post_init__(self) -> None:
+        names, phases = tuple(self.names), tuple(self.phases)
+        times, positions = _numbers(self.times, "times"), _numbers(self.positions, "positions")
+        if (twice := next((name for name in names if names.count(name) > 1), None)) is not None:
+            raise InputError("a name occurs twice", field="Trajectory.names", got=twice)
+        if times.ndim != 1 or len(times) < 2 or not np.all(np.diff(times) > 0):
+            raise InputError("times do not increase", field="Trajectory.times", expected="at least 2 increasing numbers")
+        shape = (len(times), len(names))
+        if positions.shape != shape:
+            raise InputError("wrong shape", field="Trajectory.positions", expected=shape, got=positions.shape)
+        if not 3 <= self.robot_size <= len(names):
+            raise InputError("out of range", field="Trajectory.robot_size", expected=f"3 to {len(names)}", got=self.robot_size)
+        edges = [0, *(phase.last for phase in phases)]
+        if edges[-1] != len(times) - 1 or any(
+            phase.first != before or phase.last <= before for phase, before in zip(phases, edges, strict=False)
+        ):
+            raise InputError(
+                "phases do not follow one another from the first waypoint to the last",
+                field="Trajectory.phases",
+                expected=f"0 to {len(times) - 1}",
+                got=", ".join(f"{phase.first} to {phase.last}" for phase in phases) or "none",
+            )
+        for array in (times, positions):
+            array.setflags(write=False)
+        for key, value in (("names", names), ("times", times), ("positions", positions), ("phases", phases)):
+            object.__setattr__(self, key, value)
+
+    def at(self, time: ArrayLike) -> NDArray[np.float64]:
+        """Return the positions, shape (..., n), at `time` [s], shape (...,); outside the motion, its first or last."""
+        time = np.asarray(time, float)
+        columns = [np.interp(time, self.times, column) for column in self.positions.T]
+        return np.stack(columns, axis=-1)
+
+    def column(self, name: str) -> NDArray[np.float64]:
+        """Return one coordinate over the waypoints, shape (T,).
+
+        Raises:
+            UnknownNameError: There is no such coordinate.
+        """
+        if name not in self.names:
+            raise UnknownNameError("coordinate", name, self.names)
+        return np.array(self.positions[:, self.names.index(name)])
+
+    def velocities(self) -> NDArray[np.float64]:
+        """Return the velocity of every segment, shape (T − 1, n), [m/s] and [rad/s]."""
+        steps = np.diff(self.positions, axis=0) / np.diff(self.times)[:, None]
+        return np.asarray(steps)
+
+    def accelerations(self) -> NDArray[np.float64]:
+        """Return the acceleration at every waypoint, shape (T, n), [m/s²] and [rad/s²].
+
+        It is the velocity step there over the shorter of the two segments' durations; the motion starts and ends at rest.
+        """
+        durations = np.diff(self.times)
+        velocity = np.vstack([np.zeros(len(self.names)), self.velocities(), np.zeros(len(self.names))])
+        spans = np.concatenate([durations[:1], np.minimum(durations[1:], durations[:-1]), durations[-1:]])
+        return np.asarray(np.diff(velocity, axis=0) / spans[:, None])
+
+    def base_effort(self) -> float:
+        """Return the distance the base travels over the floor, Σ √(δx² + δy²) [m]."""
+        return float(np.linalg.norm(np.diff(self.positions[:, :2], axis=0), axis=1).sum())
+
+    def base_effort_l1(self) -> float:
+        """Return Σ |δx| + |δy| [m], which the method's authors log."""
+        return float(np.abs(np.diff(self.positions[:, :2], axis=0)).sum())
+
+    def arm_effort(self) -> float:
+        """Return the sum of the arm joints' absolute displacements, Σ |δq_arm| [rad]."""
+        return float(np.abs(np.diff(self.positions[:, 3 : self.robot_size], axis=0)).sum())
+
+    def metrics(self) -> dict[str, float]:
+        """Return duration [s], base_effort and base_effort_l1 [m], and arm_effort [rad]."""
+        return {
+            "duration": float(self.times[-1] - self.times[0]),
+            "base_effort": self.base_effort(),
+            "base_effort_l1": self.base_effort_l1(),
+            "arm_effort": self.arm_effort(),
+        }
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data of it, e.g. for JSON."""
+        return {
+            "names": list(self.names),
+            "times": self.times.tolist(),
+            "positions": self.positions.tolist(),
+            "robot_size": self.robot_size,
+            "phases": [{**vars(p), "held": dict(p.held), "by": dict(p.by)} for p in self.phases],
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Trajectory:
+        """Return the trajectory that `to_dict` made `data` of.
+
+        Raises:
+            InputError: Something is missing from it or does not fit.
+        """
+        try:
+            phases = tuple(
+                PhaseSpan(p["name"], int(p["first"]), int(p["last"]), dict(p["held"]), dict(p.get("by", {})))
+                for p in data["phases"]
+            )
+            return cls(tuple(data["names"]), data["times"], data["positions"], phases, int(data["robot_size"]))
+        except KeyError as error:
+            raise InputError("this is missing from a trajectory", field=str(error.args[0])) from None
+
+    def to_csv(self, path: str | Path, **options: Any) -> Path:
+        """Write a table with a line a waypoint: times [s], positions [m] and [rad], phases; see `tables.write_csv`."""
+        from vkc_pin.motion import tables
+
+        return tables.write_csv(self.to_dict(), path, **options)
+
+    def to_json(self, path: str | Path) -> Path:
+        """Write `to_dict` as JSON, whole or not at all; return the path."""
+        from vkc_pin.motion import tables
+
+        return tables.write_json(self.to_dict(), path)
+
+    def to_ros(self, **options: Any) -> dict[str, Any]:
+        """Return plain data with the fields of ROS' `trajectory_msgs/JointTrajectory`; see `ros.to_ros`."""
+        from vkc_pin.motion import ros
+
+        return ros.to_ros(self.to_dict(), **options)
+
+    @classmethod
+    def from_csv(cls, path: str | Path, **options: Any) -> Trajectory:
+        """Return the trajectory in a table such as `to_csv` writes; see `tables.read_csv`.
+
+        Raises:
+            InputError: The file is missing, or something in it does not fit; the error names line and column.
+        """
+        from vkc_pin.motion import tables
+
+        return cls._read(tables.read_csv(path, **options), path)
+
+    @classmethod
+    def from_json(cls, path: str | Path) -> Trajectory:
+        """Return the trajectory in a file that `to_json`, `Plan.to_json` or `vkc-pin plan --json` wrote.
+
+        Raises:
+            InputError: The file is missing, is no JSON, or something in it does not fit; the error names line or field.
+        """
+        from vkc_pin.motion import tables
+
+        data = tables.read_json(path)
+        if isinstance(data, dict) and "trajectory" in data:
+            return cls._read(data["trajectory"], path, "trajectory")
+        return cls._read(data, path)
+
+    @classmethod
+    def from_ros(
+        cls, message: Mapping[str, Any] | str | Path, *, like: Trajectory | None = None, robot_size: int | None = None
+    ) -> Trajectory:
+        """Return the trajectory of data such as `to_ros` returns, or of a JSON file with them; see `ros.from_ros`.
+
+        Raises:
+            InputError: Something is missing or does not fit; the error names the field.
+        """
+        from vkc_pin.motion import ros
+
+        data = ros.from_ros(message, like=None if like is None else like.to_dict(), robot_size=robot_size)
+        return cls._read(data, None if isinstance(message, Mapping) else message)
+
+    @classmethod
+    def _read(cls, data: Any, file: str | Path | None, inside: str = "") -> Trajectory:
+        """Return the trajectory that a file holds, in its field `inside`; what is wrong with it is the file's fault."""
+        try:
+            if not isinstance(data, Mapping):
+                raise InputError("not a trajectory", expected="an object", got=type(data).__name__)
+            return cls.from_dict(data)
+        except InputError as error:
+            field = ".".join(part for part in (inside, error.field) if part) or None
+            raise InputError(error.problem, file=file, field=field, expected=error.expected, got=error.got) from error
+        except (TypeError, ValueError, AttributeError, LookupError) as error:
+            expected, got = "what Trajectory.to_dict returns", str(error)
+            raise InputError("not a trajectory", file=file, field=inside or None, expected=expected, got=got) from error
+
+
+def join(parts: Sequence[Trajectory], *, pause: float) -> Trajectory:
+    """Return motions one after the other as one.
+
+    Args:
+        parts: Each begins where the one before it ends. A coordinate that a part does not have keeps its value there.
+        pause: How long the robot waits between two parts where the hand closes or opens [s].
+
+    Raises:
+        InputError: There is none, or one does not begin where the one before it ends.
+    """
+    if not parts:
+        raise InputError("nothing to join", field="parts", expected="at least one trajectory")
+    robot = parts[0].robot_size
+    names = list(dict.fromkeys(name for part in parts for name in part.names))
+    rows: list[NDArray[np.float64]] = []
+    times: list[float] = []
+    phases: list[PhaseSpan] = []
+    for number, part in enumerate(parts):
+        values = np.full((len(part.times), len(names)), np.nan)
+        values[:, [names.index(name) for name in part.names]] = part.positions
+        start, shift = 0.0 if not times else times[-1], 0
+        if number:
+            apart = np.abs(values[0, :robot] - rows[-1][:robot]).max()
+            if not apart <= 1e-6:
+                where = f"parts[{number}]"
+                raise InputError("a motion does not begin where the one before it ends", field=where, got=f"{apart:g} apart")
+            before, after = phases[-1], part.phases[0]
+            shift = len(rows) - 1
+            if (before.held, before.by) != (after.held, after.by):
+                rows.append(values[0])
+                times.append(start + pause)
+                start, shift = start + pause, shift + 1
+        rows += list(values[1:] if number else values)
+        times += (start + (part.times[1:] if number else part.times) - part.times[0]).tolist()
+        for k, phase in enumerate(part.phases):
+            first = phases[-1].last if phases else 0
+            phases.append(replace(phase, first=first if k == 0 else phase.first + shift, last=phase.last + shift))
+    return Trajectory(tuple(names), np.array(times), filled(np.array(rows)), tuple(phases), robot)
+
+
+def filled(table: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return waypoints, shape (T, n), with what is not known (NaN) as it was last, or else as it will be next.
+
+    A coordinate that is known nowhere stays so.
+    """
+    table = table.copy()
+    for column in table.T:
+        known = np.flatnonzero(~np.isnan(column))
+        if len(known):
+            column[:] = column[known[np.maximum(np.searchsorted(known, np.arange(len(column)), side="right") - 1, 0)]]
+    return table
+
+
+def _numbers(values: Any, name: str) -> NDArray[np.float64]:
+    """Return a copy of an array of finite numbers."""
+    try:
+        array = np.array(values, float)
+    except (TypeError, ValueError):
+        raise InputError("not numbers", field=f"Trajectory.{name}", expected="an array of numbers", got=repr(values)) from None
+    if not np.isfinite(array).all():
+        where = np.argwhere(~np.isfinite(array))[0].tolist()
+        raise InputError("not finite", field=f"Trajectory.{name}{where}", expected="finite numbers", got=array[tuple(where)])
+    return array

@@ -1,0 +1,253 @@
+"""The scene as one plain tree, nothing inverted: robot and objects side by side, rooted in the world.
+
+Validation, pictures and plots use it; being built without the chain, it can catch the chain's mistakes. A free object has
+a free joint: it stands where it was left, and moves rigidly with the hand from where it was when the hand closed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from vkc_pin.models.coordinates import Coordinates
+from vkc_pin.models.grafting import graft, graft_geometry
+from vkc_pin.models.shapes import link_name
+from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.scene.hold import Hold, as_mappings, holds_of
+from vkc_pin.scene.placed import PlacedObject
+from vkc_pin.scene.scene import Scene
+
+__all__ = ["FREE_JOINT", "World", "as_numbers", "scene_after", "units_of"]
+
+FREE_JOINT = "placement"
+"""A free object's placement in the world is the joint `<object>.placement`."""
+
+
+class World:
+    """A scene's robot, objects and obstacles in one `pinocchio.Model`.
+
+    Attributes:
+        model: Robot (joint 1 is the planar base), then every object's own tree; joints of objects are `<object>.<joint>`,
+            the free joint of one that can be carried `<object>.placement`, frames `<object>.<link>`.
+        coordinates: Its minimal coordinates, n of them: the robot's, then the objects'.
+        bodies: Collision geometry of robot and objects.
+        shapes: These shapes, then those of the obstacles, which stand in the world (parent joint 0).
+        collision, visual: All geometry in one, put together when first asked for; what stands still has parent joint 0.
+        collision_labels, visual_labels: For each geometry, the link or obstacle it belongs to, e.g. "forearm_link",
+            "door.panel", "sofa".
+        start: The scene's start and the objects' placements and states, shape (n,).
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        robot = scene.robot
+        self.scene = scene
+        self.model = pin.Model(robot.model)
+        self._joints = {name: self._plant(placed) for name, placed in scene.objects.items()}
+        objects = {name: placed.object.collision for name, placed in scene.objects.items()}
+        self.bodies = self._geometry(robot.collision, objects)
+        self.shapes = (*self.bodies.geometryObjects, *scene.obstacles.geometryObjects)
+        self.collision_labels = [*(link_name(shape.name) for shape in self.bodies.geometryObjects), *scene.obstacle_labels]
+        self.coordinates = Coordinates(self.model)
+        states = [
+            np.concatenate([as_numbers(placed.placement) if placed.object.free else [], placed.state])
+            for placed in scene.objects.values()
+        ]
+        self.start: NDArray[np.float64] = np.concatenate([np.asarray(scene.start), *states])
+
+    def _plant(self, placed: PlacedObject) -> list[int]:
+        """Add an object's tree to the model; return its joints there."""
+        parent, placement, prefix = 0, placed.placement, f"{placed.name}."
+        if placed.object.free:
+            parent = self.model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), prefix + FREE_JOINT)
+            placement = pin.SE3.Identity()
+        return graft(self.model, placed.object.model, parent=parent, placement=placement, prefix=prefix)
+
+    @cached_property
+    def collision(self) -> pin.GeometryModel:
+        """What collides, as one; with many obstacles that takes a while, as Pinocchio's models take quadratic time to grow."""
+        geometry = self.bodies.copy()
+        graft_geometry(geometry, self.scene.obstacles.geometryObjects, joints=[0], placement=pin.SE3.Identity())
+        return geometry
+
+    @cached_property
+    def visual(self) -> pin.GeometryModel:
+        """What to draw; put together when first asked for, since meshes for display are large."""
+        objects = {name: placed.object.visual for name, placed in self.scene.objects.items()}
+        geometry = self._geometry(self.scene.robot.visual, objects)
+        graft_geometry(geometry, self.scene.obstacle_visual.geometryObjects, joints=[0], placement=pin.SE3.Identity())
+        return geometry
+
+    @cached_property
+    def visual_labels(self) -> list[str]:
+        """For each geometry of `visual`, the link or obstacle it belongs to."""
+        links = {str(frame.name) for frame in self.model.frames if frame.type == pin.FrameType.BODY}
+        shapes = list(self.visual.geometryObjects)
+        moving = len(shapes) - len(self.scene.obstacle_visual.geometryObjects)
+        labels = []
+        for shape in shapes[:moving]:
+            label = link_name(shape.name)
+            while label not in links and "_" in label:  # a mesh of several parts is `<link>_<number>_<part>`
+                label = label.rpartition("_")[0]
+            labels.append(label)
+        return labels + [shape.name for shape in shapes[moving:]]
+
+    def _geometry(self, robot: pin.GeometryModel, objects: Mapping[str, pin.GeometryModel]) -> pin.GeometryModel:
+        """Return the shapes of robot and objects, in this order."""
+        geometry, here = pin.GeometryModel(), pin.SE3.Identity()
+        graft_geometry(geometry, robot.geometryObjects, joints=list(range(self.scene.robot.model.njoints)), placement=here)
+        for name, source in objects.items():
+            placed = self.scene.objects[name]
+            where = here if placed.object.free else placed.placement
+            graft_geometry(geometry, source.geometryObjects, joints=self._joints[name], placement=where, prefix=f"{name}.")
+        return geometry
+
+    def positions(self, trajectory: Trajectory, times: ArrayLike | None = None) -> NDArray[np.float64]:
+        """Return minimal coordinates, shape (K, n), of the world along `trajectory`.
+
+        Args:
+            trajectory: A motion in this scene; what it does not name stays as it is at the start, unless it is carried.
+            times: [s], shape (K,), in increasing order; None takes the waypoints.
+        """
+        times = trajectory.times if times is None else np.asarray(times, float)
+        values = trajectory.at(times)
+        rows = np.tile(self.start, (len(values), 1))
+        index: Mapping[str, int] = {name: i for i, name in enumerate(self.coordinates.names)}
+        for column, name in enumerate(trajectory.names):
+            if name in index:  # virtual joints of grasps belong to no body
+                rows[:, index[name]] = values[:, column]
+        self._carry(trajectory, times, rows)
+        return rows
+
+    def _carry(self, trajectory: Trajectory, times: NDArray[np.float64], rows: NDArray[np.float64]) -> None:
+        """Write into `rows` where free objects are: with whatever holds them, from where they were when it took hold."""
+        where = {name: placed.placement for name, placed in self.scene.objects.items() if placed.object.free}
+        if not where:
+            return
+        for number, phase in enumerate(trajectory.phases):
+            begin, end = float(trajectory.times[phase.first]), float(trajectory.times[phase.last])
+            last = number == len(trajectory.phases) - 1
+            now = np.flatnonzero(((times > begin) | (number == 0)) & ((times <= end) | last))
+            asked = np.clip(np.concatenate([[begin], times[now], [end]]), begin, end)
+            found = self._carried(trajectory, phase, asked, where)
+            for name, placements in found.items():
+                rows[now, self.placement_columns(name)] = np.reshape([as_numbers(p) for p in placements[1:-1]], (-1, 7))
+                where[name] = placements[-1]
+            for name in where.keys() - found.keys():
+                rows[now, self.placement_columns(name)] = as_numbers(where[name])
+        for name in where:  # of the two quaternions of one orientation the nearer, so that rows can be interpolated
+            columns = self.placement_columns(name)
+            turns = rows[:, columns][:, 3:]
+            flips = np.concatenate([[1.0], np.sign(np.einsum("kc,kc->k", turns[1:], turns[:-1]))])
+            rows[:, columns.start + 3 : columns.stop] = turns * np.cumprod(np.where(flips == 0.0, 1.0, flips))[:, None]
+
+    def _carried(
+        self, trajectory: Trajectory, phase: PhaseSpan, times: NDArray[np.float64], where: Mapping[str, pin.SE3]
+    ) -> dict[str, list[pin.SE3]]:
+        """Return the placements at `times` of all free objects held in a phase, which are at `where` at the first of these."""
+        values, robot = trajectory.at(times), self.scene.robot
+        data = robot.model.createData()
+        tool = robot.model.getFrameId(robot.tool_frame)
+        tools: list[pin.SE3] = []
+        found: dict[str, list[pin.SE3]] = {}
+        for hold in holds_of(phase.held, phase.by):
+            placed = self.scene.objects[hold.object]
+            if not placed.object.free:
+                continue
+            if hold.by is None:
+                for q in robot.coordinates.q(values[:, : trajectory.robot_size]) if not tools else ():
+                    pin.forwardKinematics(robot.model, data, q)
+                    tools.append(pin.updateFramePlacement(robot.model, data, tool).copy())
+                holders = tools
+            else:
+                carrier = self.scene.objects[hold.by.object]
+                link = carrier.object.link_placement(str(hold.link), carrier.state)
+                holders = [placement * link for placement in found[hold.by.object]]
+            attachment = placed.object.attachment(hold.attachment)
+            grasped = placed.object.link_placement(attachment.link, placed.state)
+            names = [f"{hold.object}.{name}" for name in attachment.coordinates]
+            freedom = values[:, [trajectory.names.index(name) for name in names]]
+            still = attachment.tool(freedom[0]) if not np.ptp(freedom, axis=0).any() else None
+            ideal = [
+                holder * (grasped * (still if still is not None else attachment.tool(row))).inverse()
+                for holder, row in zip(holders, freedom, strict=True)
+            ]
+            offset = ideal[0].inverse() * where[hold.object]  # the hand may close a hair beside the attachment
+            found[hold.object] = [placement * offset for placement in ideal]
+        return found
+
+    def joints_of(self, name: str) -> list[int]:
+        """Return the joints of the model that are an object's, with its free joint."""
+        return [joint for joint in self._joints[name] if joint]
+
+    def placement(self, name: str, row: NDArray[np.float64]) -> pin.SE3:
+        """Return where the base link of a free object is, of the world's coordinates, shape (n,)."""
+        numbers = row[self.placement_columns(name)].copy()
+        numbers[3:] /= np.linalg.norm(numbers[3:])
+        return pin.XYZQUATToSE3(numbers)
+
+    def placement_columns(self, name: str) -> slice:
+        """Return which of the coordinates are the placement of a free object."""
+        first = self.coordinates.index(f"{name}.{FREE_JOINT}_x")
+        return slice(first, first + 7)
+
+
+def as_numbers(placement: pin.SE3) -> NDArray[np.float64]:
+    """Return a placement as a free joint's seven coordinates."""
+    return np.asarray(pin.SE3ToXYZQUAT(placement), float)
+
+
+def scene_after(scene: Scene, trajectory: Trajectory, holds: Sequence[Hold]) -> Scene:
+    """Return the scene at the end of a motion: where robot and objects are, and what is held.
+
+    Args:
+        scene: The scene at its start.
+        trajectory: The motion.
+        holds: What is held at its end.
+    """
+    last = dict(zip(trajectory.names, trajectory.positions[-1].tolist(), strict=True))
+
+    def end(coordinate: str, lower: float, upper: float) -> float:
+        return float(np.clip(last[coordinate], lower, upper))
+
+    robot = np.clip(trajectory.positions[-1, : trajectory.robot_size], scene.robot.lower, scene.robot.upper)
+    robot[:2] = np.clip(robot[:2], scene.arena[::2], scene.arena[1::2])
+    after = scene.with_held({}).with_start(base=robot[:3], arm=robot[3:])
+    world = World(scene)
+    (row,) = world.positions(trajectory, trajectory.times[-1:])
+    for name, placed in scene.objects.items():
+        thing = placed.object
+        if thing.free:
+            after = after.with_placement(name, world.placement(name, row))
+        joints = zip(thing.coordinates.names, thing.lower, thing.upper, strict=True)
+        state = {joint: end(f"{name}.{joint}", low, high) for joint, low, high in joints if f"{name}.{joint}" in last}
+        if state:
+            after = after.with_state(name, state)
+    at: dict[str, list[float]] = {}
+    for hold in holds:
+        attachment = scene.objects[hold.object].object.attachment(hold.attachment)
+        if attachment.freedoms:
+            freedoms = zip(attachment.coordinates, attachment.freedoms, strict=True)
+            at[hold.object] = [end(f"{hold.object}.{name}", freedom.lower, freedom.upper) for name, freedom in freedoms]
+    held, by = as_mappings(holds)
+    return after.with_held(held, by=by, at=at)
+
+
+def units_of(scene: Scene) -> dict[str, str]:
+    """Return coordinate → "m" or "rad" of everything that can move in a scene: robot, objects, and the freedoms of grasps."""
+    units: dict[str, str] = {}
+    things = [("", scene.robot.model, scene.robot.coordinates)]
+    things += [(f"{name}.", placed.object.model, placed.object.coordinates) for name, placed in scene.objects.items()]
+    for prefix, model, coordinates in things:
+        for name, joint in zip(coordinates.names, coordinates.joints, strict=True):
+            kind = str(model.joints[joint].shortname()).removeprefix("JointModel")
+            metres = kind in ("PX", "PY", "PZ", "PrismaticUnaligned") or (kind == "Planar" and not name.endswith("_yaw"))
+            units[prefix + name] = "m" if metres else "rad"
+    for owner, placed in scene.objects.items():
+        for attachment in placed.object.attachments.values():
+            for name, freedom in zip(attachment.coordinates, attachment.freedoms, strict=True):
+                units[f"{owner}.{name}"] = "m" if freedom.kind == "prismatic" else "rad"
+    return units

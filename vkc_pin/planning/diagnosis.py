@@ -1,0 +1,102 @@
+"""Why a task cannot be done: what no motion could change, and what stands in the way of every goal configuration."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vkc_pin.interrupt import NEVER, Interrupt
+from vkc_pin.program.problem import TrajectoryProblem
+from vkc_pin.seeds.knots import depth, scatter
+from vkc_pin.validation.report import Violation
+
+__all__ = ["explain", "impossible"]
+
+_DRAWS = 4  # times 192 random configurations before a goal counts as blocked
+
+
+def impossible(problem: TrajectoryProblem) -> list[Violation]:
+    """Return what is wrong before anything moves: a start in collision, a hand off what it holds, goals beyond limits."""
+    found = []
+    contacts = problem.contacts.evaluate(problem.start[None], np.array([0]), reach=0.0)
+    for (first, second), distance in zip(contacts.pair, contacts.distance, strict=True):
+        labels = problem.contacts.phases[0].labels
+        subject = f"{labels[first]} – {labels[second]}"
+        found.append(Violation("start", subject, 0, 0.0, -distance, "m", f"overlap by {-1e3 * distance:.1f} mm at the start"))
+    for goal, solver in zip(problem.pose_goals, problem.transcription.pose_solvers, strict=True):
+        if goal.kind == "closure" and goal.object in problem.scene.held and 1 in goal.row.waypoints:
+            error = float(np.abs(solver.evaluate(problem.start[None], goal.target)[0]).max())
+            if error > problem.options.closure_position:
+                detail = f"it is held at the start, but the hand is {error:.4f} m or rad from its attachment"
+                found.append(Violation("closure", goal.about, 0, 0.0, error, "m", detail))
+    dt = problem.timing_for(problem.still).dt
+    for phase, end in zip(problem.task.phases, problem.ends, strict=True):
+        waypoint, time = int(end), float(dt[:end].sum())
+        goals = dict(phase.values)
+        if phase.base is not None:
+            goals |= {n: v for n, v in zip(problem.chain.names[:2], phase.base[:2], strict=True) if v is not None}
+        for name, value in goals.items():
+            lower, upper = problem.limits(name)
+            beyond = max(lower - value, value - upper)
+            if beyond > 1e-9:
+                detail = f"{value:g} is beyond the limits {lower:g} to {upper:g} by {beyond:.4g}"
+                found.append(Violation("goal", name, waypoint, time, beyond, problem.unit(name), detail))
+    return found
+
+
+def explain(problem: TrajectoryProblem, seed: int, interrupt: Interrupt = NEVER) -> list[str]:
+    """Return, for every goal that no free configuration was found for, the nearest miss or what collides with what.
+
+    Args:
+        problem: What could not be solved.
+        seed: Of the random configurations tried.
+        interrupt: Ends the search, with what was found out.
+    """
+    lines = []
+    for phase, end in zip(problem.task.phases, problem.ends, strict=True):
+        tried = _try(problem, int(end), np.random.default_rng(seed), interrupt)
+        if interrupt.pressed:
+            break
+        if tried is None:
+            continue
+        z, residual = tried
+        if residual.min() > 1e-4:
+            nearest = int(np.argmin(residual))
+            lines.append(
+                f"{phase.name}: out of reach, none of {len(z)} configurations tried gets there; "
+                f"the nearest stays {residual[nearest]:.3f} m or rad short"
+            )
+            continue
+        reached = z[residual < 1e-4]
+        contacts = problem.contacts.evaluate(reached, np.full(len(reached), int(end)), reach=problem.options.dist_safe)
+        shortfall = contacts.shortfall(len(reached))
+        if shortfall.min() > 0.0:
+            best = int(np.argmin(shortfall))
+            worst = int(np.flatnonzero(contacts.waypoint == best)[0])
+            labels = problem.contacts.phases[problem.contacts.phase_of(int(end))].labels
+            first, second = contacts.pair[worst]
+            lines.append(
+                f"{phase.name}: all {len(reached)} configurations found there are blocked; in the least blocked one "
+                f"{labels[first]} – {labels[second]} {_gap(contacts.distance[worst])}"
+            )
+    return lines
+
+
+def _try(
+    problem: TrajectoryProblem, waypoint: int, rng: np.random.Generator, interrupt: Interrupt
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Return what `scatter` does, drawn again and again until something is free, up to `_DRAWS` times."""
+    found: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
+    for _ in range(_DRAWS):
+        tried = scatter(problem, waypoint, rng)
+        if tried is None:
+            return None
+        found.append(tried)
+        z = tried[0][tried[1] < 1e-4]
+        if interrupt.pressed or (len(z) and depth(problem, z, waypoint).min() <= 0.0):
+            break
+    return np.concatenate([z for z, _ in found]), np.concatenate([residual for _, residual in found])
+
+
+def _gap(distance: float) -> str:
+    return f"overlap by {-1e3 * distance:.1f} mm" if distance < 0 else f"are only {1e3 * distance:.1f} mm apart"

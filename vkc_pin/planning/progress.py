@@ -1,0 +1,126 @@
+"""One line that says how far planning has come, and changes in its place: in a notebook, or in a terminal."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any, TextIO
+
+from vkc_pin.errors import InputError
+from vkc_pin.notebook import in_notebook
+
+if TYPE_CHECKING:
+    from vkc_pin.planning.plan import Plan
+    from vkc_pin.solver.solution import Iteration
+
+__all__ = ["Progress", "shown"]
+
+_PAUSE = 0.1  # [s] between two changes of the line
+
+
+class Progress:
+    """The line. It says nothing if nobody shows it.
+
+    Attributes:
+        write: Shows a text instead of the one before; the second argument is whether it is the last.
+    """
+
+    def __init__(self, write: Callable[[str, bool], None] | None = None) -> None:
+        self.write = write
+        self._part = self._what = self._doing = ""
+        self._began = time.perf_counter()
+        self._changed = -float("inf")
+        self._ended = write is None
+
+    def part(self, first: int, count: int, total: int) -> None:
+        """Tell which of many steps are planned next: `count` from number `first`, counted from 1, of `total`."""
+        self._part = f"step {first} of {total}" if count == 1 else f"steps {first} to {first + count - 1} of {total}"
+
+    def begin(self, phases: Sequence[str]) -> None:
+        """Tell what the motion does that is planned next."""
+        self._what = ", ".join(phases)
+        self.doing("preparing")
+
+    def doing(self, text: str) -> None:
+        """Tell what is being done."""
+        self._doing = text
+        self._show(always=True)
+
+    def __call__(self, row: Iteration) -> None:
+        """Take a round of the solver."""
+        missing = "clear" if row.shortfall <= 0.0 else f"{1e3 * row.shortfall:.1f} mm missing"
+        self._doing = f"round {row.round}, {missing}, objective {row.objective:.3g}"
+        self._show()
+
+    def end(self, plan: Plan) -> None:
+        """Leave one line on what came out."""
+        m, name = plan.metrics, plan.scene.name
+        result = "success" if plan.success else f"FAILED, {plan.status}"
+        took = f"base {m['base_effort']:.2f} m, arm {m['arm_effort']:.2f} rad, planned in {m['planning_time']:.2f} s"
+        self._last(f"{name}: {result} — {took}")
+
+    def stop(self) -> None:
+        """Leave one line that says that nothing came out, unless there is a last line already."""
+        self._last(f"stopped after {time.perf_counter() - self._began:.1f} s")
+
+    def _show(self, *, always: bool = False) -> None:
+        now = time.perf_counter()
+        if not self._ended and self.write is not None and (always or now - self._changed >= _PAUSE):
+            self._changed = now
+            passed = f"{now - self._began:.0f} s"
+            self.write(" · ".join(filter(None, [passed, self._part, self._doing, self._what])), False)
+
+    def _last(self, text: str) -> None:
+        if not self._ended and self.write is not None:
+            self._ended = True
+            self.write(text, True)
+
+
+@contextlib.contextmanager
+def shown(progress: object) -> Iterator[Progress]:
+    """Yield the line, and see to it that one is left whatever happens.
+
+    Args:
+        progress: Whether to show it: in a notebook in the cell's output, in a terminal as a line of standard error; where
+            neither is there, as in a pipe, nothing is shown.
+
+    Raises:
+        InputError: `progress` is neither True nor False.
+    """
+    if not isinstance(progress, bool):
+        raise InputError("wrong kind of argument", field="progress", expected="True or False", got=repr(progress))
+    line = Progress(_screen() if progress else None)
+    try:
+        yield line
+    finally:
+        line.stop()
+
+
+def _screen() -> Callable[[str, bool], None] | None:
+    """Return what shows a line here; None if there is nowhere to show it."""
+    if in_notebook():
+        return _Line(sys.stdout, None)
+    if sys.stderr is not None and sys.stderr.isatty():
+        return _Line(sys.stderr, shutil.get_terminal_size().columns - 1)  # a longer one would go over two lines, and stay
+    return None
+
+
+class _Line:
+    """A bar of tqdm's that is all text: there is no telling how much is left to do."""
+
+    def __init__(self, stream: TextIO, width: int | None) -> None:
+        self.stream, self.width = stream, width
+        self.bar: Any = None
+
+    def __call__(self, text: str, last: bool) -> None:
+        if self.bar is None:
+            from tqdm import tqdm  # not tqdm.auto, which has no words in a notebook without ipywidgets but a warning
+
+            # Asked for its size, a terminal that has none, as some do, would be shown nothing.
+            self.bar = tqdm(file=self.stream, bar_format="{desc}", ncols=self.width or 80, nrows=20)
+        self.bar.set_description_str(text[: self.width])
+        if last:
+            self.bar.close()

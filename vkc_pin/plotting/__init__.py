@@ -1,0 +1,5 @@
+"""Plots with matplotlib, views from above, and what a notebook shows of a scene or a plan."""
+
+from vkc_pin.plotting.plots import plot, plot_clearance, plot_joints, plot_top_view
+
+__all__ = ["plot", "plot_clearance", "plot_joints", "plot_top_view"]

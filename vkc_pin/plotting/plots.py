@@ -1,0 +1,184 @@
+"""Plots of a plan with matplotlib: joints over time, clearance over time, and the motion from above.
+
+Figures are made without pyplot, so nothing depends on a screen or is kept open.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vkc_pin.errors import InputError
+from vkc_pin.motion.world import World
+from vkc_pin.plotting.style import COLOURS, new_figure, save_figure, shade_phases, styled
+from vkc_pin.plotting.top_view import draw_top_view
+from vkc_pin.validation.report import Judged
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, FigureBase
+
+__all__ = ["plot", "plot_clearance", "plot_joints", "plot_top_view"]
+
+_SUFFIXES = (".png", ".svg", ".pdf")
+_SAMPLES = 240  # of the clearance
+_SHOWN = 0.30  # [m]: clearance above this is of no interest
+
+
+def plot(plan: Judged, path: str | Path | None = None) -> Figure | dict[str, Figure]:
+    """Draw joint positions and velocities, clearance, and a top view.
+
+    Args:
+        plan: What to draw.
+        path: A folder (made if need be) that gets `joints.png`, `clearance.png` and `top_view.png`; or a file ending with
+            .png, .svg or .pdf that gets all in one figure; None writes nothing. Files are written whole or not at all.
+
+    Returns:
+        With a folder the figures by name, otherwise the one figure.
+
+    Raises:
+        InputError: Not a plan, or the folder's name is that of a file.
+    """
+    if not isinstance(plan, Judged):
+        raise InputError("this cannot be plotted", field="plan", expected="a Plan", got=type(plan).__name__)
+    target = None if path is None else Path(path)
+    if target is None or target.suffix.lower() in _SUFFIXES:
+        figure = _combined(plan)
+        if target is not None:
+            save_figure(figure, target)
+        return figure
+    if target.is_file():
+        expected = f"a folder, or a name ending with {', '.join(_SUFFIXES)}"
+        raise InputError("this is a file", field="path", file=target, expected=expected)
+    figures = {"joints": plot_joints(plan), "clearance": plot_clearance(plan), "top_view": plot_top_view(plan)}
+    for name, figure in figures.items():
+        save_figure(figure, target / f"{name}.png")
+    return figures
+
+
+def plot_joints(plan: Judged) -> Figure:
+    """Return a figure of positions and velocities over time, a row each for base, arm and objects, with velocity limits."""
+    with styled():
+        figure = new_figure(12.0, 2.5 * len(_groups(plan)) + 0.4)
+        _draw_joints(figure, plan)
+    return figure
+
+
+def plot_clearance(plan: Judged) -> Figure:
+    """Return a figure of the smallest distances over time; the legend names the closest pairs."""
+    with styled():
+        figure = new_figure(9.0, 4.2)
+        _draw_clearance(figure, plan)
+    return figure
+
+
+def plot_top_view(plan: Judged) -> Figure:
+    """Return a figure of the motion from above: obstacles, objects, the base at several times, paths of base and tool."""
+    x_min, x_max, y_min, y_max = plan.scene.arena
+    with styled():
+        figure = new_figure(9.0, float(np.clip(9.0 * (y_max - y_min) / (x_max - x_min) + 0.7, 4.0, 10.0)))
+        draw_top_view(figure, World(plan.scene), plan.trajectory)
+    return figure
+
+
+def _combined(plan: Judged) -> Figure:
+    with styled():
+        figure = new_figure(14.0, 11.0)
+        parts: Any = figure.subfigures(2, 1, height_ratios=(1.15, 1.0))
+        upper, lower = parts
+        _draw_joints(upper, plan)
+        left, right = lower.subfigures(1, 2, width_ratios=(1.0, 1.25))
+        _draw_clearance(left, plan)
+        draw_top_view(right, World(plan.scene), plan.trajectory)
+        figure.suptitle(f"{plan.scene.name}: {'success' if plan.success else 'FAILED, ' + plan.status}", fontweight="bold")
+    return figure
+
+
+def _groups(plan: Judged) -> dict[str, list[int]]:
+    """Return the columns of the trajectory by what they belong to."""
+    names, robot = plan.trajectory.names, plan.trajectory.robot_size
+    groups = {"base": list(range(3)), "arm": list(range(3, robot)), "object": list(range(robot, len(names)))}
+    return {name: columns for name, columns in groups.items() if columns}
+
+
+def _limit(plan: Judged, name: str) -> float:
+    """Return a coordinate's velocity limit; infinite for the virtual joints of grasps, which have none."""
+    robot, (owner, _, joint) = plan.scene.robot, name.partition(".")
+    if name in robot.coordinates.names:
+        return float(robot.velocity[robot.coordinates.names.index(name)])
+    placed = plan.scene.objects.get(owner)
+    if placed is None or joint not in placed.object.coordinates.names:
+        return float("inf")
+    return float(placed.object.velocity[placed.object.coordinates.names.index(joint)])
+
+
+def _draw_joints(figure: FigureBase, plan: Judged) -> None:
+    groups, trajectory = _groups(plan), plan.trajectory
+    rows: Any = figure.subplots(len(groups), 2, sharex=True, squeeze=False)
+    velocities = trajectory.velocities()
+    units = {"base": "m, rad", "arm": "rad", "object": "rad, m"}
+    for (position, velocity), (group, columns) in zip(rows, groups.items(), strict=True):
+        limits = []
+        for k, column in enumerate(columns):
+            name, colour = trajectory.names[column], COLOURS[k % len(COLOURS)]
+            position.plot(trajectory.times, trajectory.positions[:, column], color=colour, label=name.removesuffix("_joint"))
+            velocity.stairs(velocities[:, column], trajectory.times, baseline=None, color=colour, linewidth=1.3)
+            limits.append(_limit(plan, name))
+        for limit in sorted(set(filter(np.isfinite, limits))):
+            same = [k for k, other in enumerate(limits) if other == limit]
+            colour = COLOURS[same[0] % len(COLOURS)] if len(same) == 1 else "0.35"
+            for sign in (-1.0, 1.0):
+                velocity.axhline(sign * limit, color=colour, linestyle=(0, (5, 3)), linewidth=0.9)
+        unit = units[group]
+        position.set_ylabel(f"{group} position [{unit}]")
+        velocity.set_ylabel(f"{group} velocity [{', '.join(f'{u}/s' for u in unit.split(', '))}]")
+        velocity.plot([], [], color="0.35", linestyle=(0, (5, 3)), linewidth=0.9, label="limit")
+        handles = [*position.get_legend_handles_labels()[0], *velocity.get_legend_handles_labels()[0][-1:]]
+        velocity.legend(handles=handles, loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7.5)
+    for axes in rows.ravel():
+        shade_phases(axes, plan.trajectory)
+        axes.margins(x=0.0)
+    for axes in rows[0]:
+        _name_phases(axes, plan)
+    for axes in rows[-1]:
+        axes.set_xlabel("time [s]")
+
+
+def _draw_clearance(figure: FigureBase, plan: Judged) -> None:
+    from vkc_pin.validation.clearance import clearance_curves
+
+    axes, trajectory = figure.subplots(), plan.trajectory
+    times = np.unique(np.concatenate([np.linspace(trajectory.times[0], trajectory.times[-1], _SAMPLES), trajectory.times]))
+    safe = plan.options.dist_safe
+    lowest = 0.0
+    for k, curve in enumerate(clearance_curves(plan.scene, trajectory, times, dist_safe=safe)):
+        distance, when, pair = curve.closest()
+        touching = "grasps" in curve.name
+        colour = "0.6" if touching else COLOURS[k % len(COLOURS)]
+        label = f"{curve.name}: {1e3 * distance:.0f} mm, {pair}, {when:.1f} s"
+        style = ":" if touching else "-"
+        axes.plot(curve.times, 1e3 * curve.distances, color=colour, linestyle=style, linewidth=1.5, label=label)
+        if distance < _SHOWN:
+            axes.plot([when], [1e3 * distance], "o", color=colour, markersize=4.5)
+        lowest = min(lowest, distance)
+    axes.axhline(1e3 * safe, color="0.35", linestyle=(0, (5, 3)), linewidth=0.9, label=f"asked for: {1e3 * safe:.0f} mm")
+    if lowest < 0.0:
+        axes.axhspan(1e3 * lowest * 1.1, 0.0, color="#d1495b", alpha=0.12, linewidth=0.0)
+    axes.set_ylim(1e3 * lowest * 1.1, 1e3 * _SHOWN)
+    axes.margins(x=0.0)
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel("clearance [mm]")
+    shade_phases(axes, plan.trajectory)
+    _name_phases(axes, plan)
+    figure.legend(loc="outside lower center", fontsize=7.5, title="closest pairs", title_fontsize=8)
+
+
+def _name_phases(axes: Axes, plan: Judged) -> None:
+    """Write the phases' names above, as far as they have room; on two levels, so that neighbours do not meet."""
+    times = plan.trajectory.times
+    for k, phase in enumerate(plan.trajectory.phases):
+        middle = (times[phase.first] + times[phase.last]) / 2.0
+        x = float(np.clip((middle - times[0]) / (times[-1] - times[0]), 0.12, 0.88))
+        axes.text(x, 1.02 + 0.09 * (k % 2), phase.name, transform=axes.transAxes, ha="center", fontsize=7.5, color="0.35")

@@ -1,0 +1,122 @@
+"""What a program looks like, and what its witness planes say: for people who want to see it before it is solved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vkc_pin.chain.contacts import ContactModel
+from vkc_pin.program.problem import TrajectoryProblem
+
+__all__ = ["Plane", "patterns", "planes", "sizes"]
+
+_FURTHER = 0.3  # [m]: pairs that much further apart than a plane's are not asked for
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """The witness plane of a pair at a waypoint: what the program knows of the pair's distance (eqs. 6 and 7).
+
+    Attributes:
+        problem: The program.
+        contacts: What can collide with what along the motion that the plane belongs to.
+        waypoint: Counted from 1.
+        names: The two links or obstacles.
+        pair: Their geometries, shape (2,).
+        distance: Of the pair, from coal [m].
+        margin: The clearance that is asked for [m].
+        coefficients, offset: C, shape (12·joints,), and R: C·vec(M(z)) − R ≥ 0 says that the pair keeps its margin.
+        gradient: Of the plane's value, as the solver has it, shape (n,), [m/m] or [m/rad].
+    """
+
+    problem: TrajectoryProblem
+    contacts: ContactModel
+    waypoint: int
+    names: tuple[str, str]
+    pair: NDArray[np.int_]
+    distance: float
+    margin: float
+    coefficients: NDArray[np.float64]
+    offset: float
+    gradient: NDArray[np.float64]
+
+    def values(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the distance that the plane takes the pair to have, shape (W,) [m], at z, shape (W, n)."""
+        rotations, translations = self.problem.chain.joint_placements(z)
+        columns = np.concatenate([rotations[:, 1:].swapaxes(2, 3), translations[:, 1:, None]], axis=2)
+        return np.asarray(self.margin + columns.reshape(len(z), -1) @ self.coefficients - self.offset)
+
+    def distances(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the pair's distance from coal, shape (W,) [m], at z, shape (W, n); NaN where it is far from this one."""
+        reach = max(self.distance, 0.0) + _FURTHER
+        found = self.contacts.evaluate(z, np.full(len(z), self.waypoint), reach=reach)
+        mine, distances = (found.pair == self.pair).all(axis=1), np.full(len(z), np.nan)
+        distances[found.waypoint[mine]] = found.distance[mine]
+        return distances
+
+
+def planes(problem: TrajectoryProblem, z: NDArray[np.float64], waypoint: int) -> list[Plane]:
+    """Return the witness planes at a waypoint, those of the pairs that fall shortest of their margins, worst first.
+
+    Args:
+        problem: The program.
+        z: z_1..z_N, shape (N, n).
+        waypoint: Counted from 1.
+    """
+    t, labels = problem.transcription, problem.contacts.phases[problem.contacts.phase_of(waypoint)].labels
+    model = problem.contacts.settled(z)
+    waypoints = np.arange(1, problem.segments + 1)
+    contacts = model.evaluate(z, waypoints, reach=problem.options.contact_reach, nearest=t.slots)
+    coefficients, offsets = model.planes(z, contacts, slots=t.slots)
+    x = np.column_stack([z, np.zeros(len(z))]).ravel()
+    dt, targets = problem.timing_for(z).dt, problem.target_matrix()
+    parameters = t.parameter_vector(problem.start, coefficients, offsets, targets, problem.options.penalty, dt)
+    _, jacobian = t.rows_at(x, parameters)
+    columns = (waypoint - 1) * (t.n + 1) + np.arange(t.n)
+    return [
+        Plane(
+            problem=problem,
+            contacts=model,
+            waypoint=waypoint,
+            names=(labels[contacts.pair[k, 0]], labels[contacts.pair[k, 1]]),
+            pair=contacts.pair[k],
+            distance=float(contacts.distance[k]),
+            margin=float(contacts.margin[k]),
+            coefficients=coefficients[waypoint - 1, slot],
+            offset=float(offsets[waypoint - 1, slot]),
+            gradient=jacobian[int(t.slot_rows[waypoint - 1, slot])].toarray().ravel()[columns],
+        )
+        for slot, k in enumerate(np.flatnonzero(contacts.waypoint == waypoint - 1))
+    ]
+
+
+def sizes(problem: TrajectoryProblem) -> dict[str, int]:
+    """Return how many variables and rows of each kind there are.
+
+    The rows of velocity and acceleration are not among those of the program unless it turns out to need them.
+    """
+    t, (first, second) = problem.transcription, problem.rates(problem.still)
+    fixed = int((problem.lower == problem.upper).sum())
+    found = {
+        "variables: coordinates": problem.lower.size - fixed,
+        "variables: coordinates, fixed by bounds": fixed,
+        "variables: slacks": t.segments,
+    }
+    for goal, at in zip(problem.pose_goals, t.pose_rows, strict=True):
+        kind = f"rows: {goal.name}"
+        found[kind] = found.get(kind, 0) + sum(len(rows) for rows in at.values())
+    found["rows: witness planes"] = t.slot_rows.size
+    found["rows: rolling"] = len(t.base_rows)
+    found["rows: clamped freedoms"] = sum(last - first for _, first, last in t.structure.clamped)
+    found["rows: own constraints"] = len(problem.term_numbers.rows)
+    found["only if needed: velocities"] = first.size
+    found["only if needed: accelerations"] = second.size
+    return found
+
+
+def patterns(problem: TrajectoryProblem) -> tuple[Any, Any]:
+    """Return where the rows' Jacobian and the Lagrangian's Hessian can differ from zero, as sparse matrices (SciPy)."""
+    return problem.transcription.patterns()

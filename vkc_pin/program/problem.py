@@ -1,0 +1,300 @@
+"""TrajectoryProblem: one task in one scene as a nonlinear program (eqs. 1 to 7), over one or many phases."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vkc_pin.chain.chain import VirtualKinematicChain, consolidate
+from vkc_pin.chain.contacts import ContactModel, Contacts
+from vkc_pin.chain.pose import ROW_BOUNDS, target_vector
+from vkc_pin.models.coordinates import wrapped
+from vkc_pin.options import Options
+from vkc_pin.program.pose_goals import pose_goals
+from vkc_pin.program.term_places import TermNumbers, term_goals
+from vkc_pin.program.term_rows import TermRow
+from vkc_pin.program.timing import Timing, runs_between, time_for
+from vkc_pin.program.transcription import transcribe
+from vkc_pin.program.waypoint import Structure
+from vkc_pin.scene.scene import Scene
+from vkc_pin.task.compiler import compile_task
+from vkc_pin.task.phases import Phase, Task, stretches
+from vkc_pin.task.steps import Step
+from vkc_pin.task.terms import Term, check_active, traced
+
+__all__ = ["TrajectoryProblem", "build"]
+
+_CHOICE_WEIGHT = 1e-3  # of coordinates that are chosen when grasping and do not move: only keeps the problem regular
+
+
+class TrajectoryProblem:
+    """A task in a scene, ready to be solved. Nothing about it changes: how long steps take is a motion's own, see `timing_for`.
+
+    Attributes:
+        scene, task, options: What it was made of.
+        chain: The virtual kinematic chain, n coordinates.
+        contacts: What can collide with what.
+        transcription: The symbolic program, shared between problems of one structure.
+        start: z_0, shape (n,).
+        lower, upper: Bounds of z_1..z_N, shape (N, n): joint limits (eq. 4), what stands still, joint goals.
+        pose_goals: Which frames must be where (eqs. 2 and 3), one per `transcription.structure.poses`.
+        targets: Their placements.
+        terms: The user's own constraints and costs that count here, one per `transcription.structure.terms`.
+        term_numbers: Their values along a motion.
+    """
+
+    def __init__(self, scene: Scene, task: Task, options: Options, terms: Sequence[Term] = ()) -> None:
+        self.scene, self.task, self.options = scene, task, options
+        self.chain: VirtualKinematicChain = consolidate(scene, task.holds)
+        self.contacts = ContactModel(scene, self.chain, task, options)
+        self.ends = np.cumsum([phase.segments for phase in task.phases])
+        self.pose_goals = pose_goals(scene, self.chain, task, options)
+        self.targets = tuple(goal.target for goal in self.pose_goals)
+        rows, self.terms = term_goals(scene, self.chain, task, terms)
+        self.transcription = transcribe(self._structure(rows))
+        self.start = self._start()
+        self.lower, self.upper = self._bounds()
+        _freeze(self.start, self.lower, self.upper)
+        self.term_numbers = TermNumbers(self.terms, self.transcription, self.start)
+        self.term_numbers.check(self.still, np.full(self.segments, options.dt))
+
+    def with_bounds(self, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> TrajectoryProblem:
+        """Return the same problem with other bounds of z_1..z_N, shape (N, n)."""
+        other = copy.copy(self)
+        other.lower, other.upper = lower.copy(), upper.copy()
+        _freeze(other.lower, other.upper)
+        return other
+
+    @property
+    def segments(self) -> int:
+        """N, the number of waypoints after the start."""
+        return int(self.ends[-1])
+
+    @property
+    def still(self) -> NDArray[np.float64]:
+        """z_1..z_N where nothing moves, shape (N, n)."""
+        return np.tile(self.start, (self.segments, 1))
+
+    def _structure(self, terms: tuple[TermRow, ...]) -> Structure:
+        o, robot = self.options, self.chain.robot.coordinates.size
+        weights = np.full(self.chain.size, o.velocity_weight_object)
+        weights[:robot], weights[:2] = o.velocity_weight_arm, o.velocity_weight_base
+        weights[2] = o.velocity_weight_heading
+        # From the straight way to the grasp on: there the hand must already be where it will close.
+        starts = np.concatenate([[0], self.ends[:-1]])
+        begin = {int(end): int(start) for start, end in zip(starts, self.ends, strict=True)}
+        clamped = tuple(
+            (column, max(grasp - o.approach_waypoints, begin[grasp] + 1), last) for column, grasp, last in self.choices
+        )
+        weights[[column for column, _, _ in clamped]] = _CHOICE_WEIGHT
+        acceleration = weights * o.acceleration_weight / o.dt**2
+        velocity = np.tile(weights, (self.segments, 1))
+        for phase, first, last in zip(self.task.phases, starts, self.ends, strict=True):
+            if self.closed(phase):
+                velocity[first:last, :2] *= o.velocity_weight_holding
+        # The robot stands still while its gripper closes or opens.
+        phases = zip(self.ends[:-1], self.task.phases[:-1], self.task.phases[1:], strict=True)
+        rests = tuple(int(end) for end, phase, after in phases if phase.grasps or after.leaves)
+        differential = self.chain.robot.base == "differential"
+        poses = tuple(goal.row for goal in self.pose_goals)
+        return Structure(
+            self.chain.model, self.segments, poses, o.contact_slots, velocity, acceleration, rests, differential, clamped, terms
+        )
+
+    @cached_property
+    def choices(self) -> tuple[tuple[int, int, int], ...]:
+        """Column, waypoint of the grasp and last waypoint of the hold, for what is chosen when a hand clamps."""
+        found = []
+        for hold, names in self.chain.virtual.items():
+            attachment = self.scene.objects[hold.object].object.attachments[hold.attachment]
+            for number, phase in enumerate(self.task.phases):
+                if not attachment.firm or hold not in phase.grasps:
+                    continue
+                last = number
+                while last + 1 < len(self.task.phases) and hold in self.task.phases[last + 1].held:
+                    last += 1
+                found += [(self.chain.index(name), int(self.ends[number]), int(self.ends[last])) for name in names]
+        return tuple(found)
+
+    def _start(self) -> NDArray[np.float64]:
+        start = np.zeros(self.chain.size)
+        start[: len(self.scene.start)] = self.scene.start
+        for name, value in self.task.state.items():
+            start[self.chain.index(name)] = value
+        for hold in self.scene.holds:
+            names = self.scene.objects[hold.object].object.attachment(hold.attachment).coordinates
+            for name, value in zip(names, self.scene.held_at.get(hold.object, ()), strict=False):
+                start[self.chain.index(f"{hold.object}.{name}")] = value
+        return start
+
+    def _bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        lower, upper = np.tile(self.chain.lower, (self.segments, 1)), np.tile(self.chain.upper, (self.segments, 1))
+        for column, name in enumerate(self.chain.names[:3]):
+            lower[:, column], upper[:, column] = self.limits(name)
+        begin = 0
+        for phase, end in zip(self.task.phases, self.ends, strict=True):
+            inside = slice(begin, end)  # row t belongs to waypoint t + 1
+            for name, value in phase.before.items():
+                column = self.chain.index(name)
+                low, high = phase.ranges.get(name, (value, value))
+                lower[inside, column], upper[inside, column] = low, high
+            for name, value in phase.values.items():
+                column = self.chain.index(name)
+                nearest = np.clip(value, self.chain.lower[column], self.chain.upper[column])
+                lower[end - 1, column] = upper[end - 1, column] = nearest
+            if phase.base is not None:
+                for column, goal in enumerate(phase.base):
+                    if goal is not None:
+                        turn = wrapped(goal - self.start[2])  # to the nearest of the equal headings
+                        lower[end - 1, column] = upper[end - 1, column] = self.start[2] + turn if column == 2 else goal
+            begin = end
+        for hold in self.scene.holds:  # until it is let go of, what is clamped stays where it is
+            if self.scene.objects[hold.object].object.attachments[hold.attachment].firm:
+                held = [hold in phase.held for phase in self.task.phases]
+                until = int(self.ends[(held.index(False) if False in held else len(held)) - 1]) if held[0] else 0
+                for column in map(self.chain.index, self.chain.virtual[hold]):
+                    lower[:until, column] = upper[:until, column] = self.start[column]
+        return lower, upper
+
+    def timing_for(self, z: NDArray[np.float64]) -> Timing:
+        """Return how long steps take where z_1..z_N, shape (N, n), is the seed; see `time_for`. Terms may ask for more time."""
+        structure, limits = self.transcription.structure, (self.chain.velocity, self.chain.acceleration)
+        runs = runs_between(structure.rests, self.segments)
+        dt = time_for(self.waypoints(z), self.options.dt, runs, limits)
+        if structure.timed:
+            dt = self.term_numbers.slower(z, dt, runs)
+        return Timing(dt, dt, runs, limits)
+
+    def closed(self, phase: Phase) -> bool:
+        """Return whether something that stands fixed in the world is held in a phase: then the chain is closed."""
+        return any(not self.scene.objects[hold.object].object.free for hold in phase.held)
+
+    def limits(self, name: str) -> tuple[float, float]:
+        """Return the position limits of a coordinate; the base's end at the arena's edge, a fixed one's where it stands."""
+        column = self.chain.index(name)
+        if column < 3 and self.chain.robot.base == "fixed":
+            return float(self.start[column]), float(self.start[column])
+        lower, upper = float(self.chain.lower[column]), float(self.chain.upper[column])
+        if column < 2:
+            lower, upper = max(lower, self.scene.arena[2 * column]), min(upper, self.scene.arena[2 * column + 1])
+        return lower, upper
+
+    def unit(self, name: str) -> str:
+        """Return "m" or "rad", the unit of a coordinate."""
+        kind = str(self.chain.model.joints[self.chain.coordinates.joints[self.chain.index(name)]].shortname())
+        planar = kind == "JointModelPlanar" and not name.endswith("_yaw")
+        return "m" if planar or "Prismatic" in kind or kind in ("JointModelPX", "JointModelPY", "JointModelPZ") else "rad"
+
+    def waypoints(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return `z`, shape (N, n), with the start before it, shape (N + 1, n)."""
+        return np.vstack([self.start, z])
+
+    def clip(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return `z` with every coordinate within its bounds."""
+        return np.clip(z, self.lower, self.upper)
+
+    def evaluate_contacts(self, z: NDArray[np.float64], *, reach: float, nearest: int | None = None) -> Contacts:
+        """Return the pairs closer than `reach` [m] at z_1..z_N, shape (N, n); at most `nearest` a waypoint."""
+        return self.contacts.settled(z).evaluate(z, np.arange(1, self.segments + 1), reach=reach, nearest=nearest)
+
+    def rates(self, z: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the steps δz, shape (N, n), and their differences δδz, shape (N + 1 + rests, n); see `Transcription`."""
+        t = self.transcription
+        first = t.first @ z + np.outer(t.start_first, self.start)
+        return first, t.second @ z + np.outer(t.start_second, self.start)
+
+    def objective(self, z: NDArray[np.float64], dt: NDArray[np.float64]) -> float:
+        """Return f of eq. 1, and the user's own costs, at z_1..z_N, shape (N, n), in steps that take dt, shape (N,) [s]."""
+        structure = self.transcription.structure
+        first, second = self.rates(z)
+        efforts = np.sum(first**2 * structure.weights_velocity) + np.sum(second**2 @ structure.weights_acceleration)
+        return float(efforts) + self.term_numbers.cost(z, dt)
+
+    def pose_error(self, z: NDArray[np.float64]) -> float:
+        """Return the largest residual of closure, goals and rolling, [m] or [rad], at z_1..z_N, shape (N, n)."""
+        errors = [0.0]
+        for goal, solver in zip(self.pose_goals, self.transcription.pose_solvers, strict=True):
+            if goal.row.waypoints:
+                residual, _ = solver.evaluate(z[np.array(goal.row.waypoints) - 1], goal.target)
+                errors.append(float(np.abs(residual).max()))
+        return max(*errors, self.slip(z))
+
+    def row_error(self, z: NDArray[np.float64], dt: NDArray[np.float64]) -> float:
+        """Return `pose_error`, or how much the user's own constraints are violated if that is more; see `TermNumbers.error`."""
+        return max(self.pose_error(z), self.term_numbers.error(z, dt))
+
+    def slip(self, z: NDArray[np.float64]) -> float:
+        """Return how far a differential base slips sideways in the worst step of z_1..z_N, shape (N, n) [m]; 0 for others."""
+        if not self.transcription.structure.differential:
+            return 0.0
+        path = self.waypoints(z)[:, :3]
+        step = np.diff(path, axis=0)
+        heading = path[:-1, 2] + step[:, 2] / 2
+        return float(np.abs(np.cos(heading) * step[:, 1] - np.sin(heading) * step[:, 0]).max())
+
+    def drift(self, z: NDArray[np.float64]) -> float:
+        """Return how far grasps drift half-way between waypoints at most, relative to what `Options` allow."""
+        path, worst = self.waypoints(z), 0.0
+        between = (path[1:] + path[:-1]) / 2
+        allowed = np.array([self.options.closure_position, self.options.closure_angle])
+        for goal, solver in zip(self.pose_goals, self.transcription.pose_solvers, strict=True):
+            held = np.array([t - 1 for t in goal.row.waypoints if t - 1 in goal.row.waypoints], int)
+            if len(held):
+                residual, _ = solver.evaluate(between[held], goal.target)
+                amounts = np.linalg.norm(residual.reshape(len(held), 2, 3), axis=2)
+                worst = max(worst, float((amounts / allowed).max()))
+        return worst
+
+    def row_bounds(self, timing: Timing | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the bounds of the program's rows, and with a timing those of its rates; shapes (rows,) and (rows,)."""
+        t, terms = self.transcription, self.term_numbers
+        lower, upper = np.zeros(t.rows), np.zeros(t.rows)
+        upper[t.slot_rows] = np.inf
+        for pose, at in zip(t.structure.poses, t.pose_rows, strict=True):
+            for rows in at.values():
+                lower[rows], upper[rows] = ROW_BOUNDS[pose.kind]
+        lower[terms.rows], upper[terms.rows] = terms.lower, terms.upper
+        if timing is not None:
+            rates = np.concatenate([timing.velocity.ravel(), timing.acceleration.ravel()])
+            lower, upper = np.concatenate([lower, -rates]), np.concatenate([upper, rates])
+        return lower, upper
+
+    def target_matrix(self) -> NDArray[np.float64]:
+        """Return the pose targets as parameters, shape (poses, 12)."""
+        return np.array([target_vector(t) for t in self.targets]).reshape(-1, 12)
+
+    def __repr__(self) -> str:
+        t, time = self.transcription, self.timing_for(self.still).dt.sum()
+        return (
+            f"<TrajectoryProblem {' → '.join(p.name for p in self.task.phases)}: {self.segments} steps in {time:g} s, "
+            f"{t.size} variables, {t.rows} rows, {sum(len(p.pairs) for p in self.contacts.phases)} collision pairs>"
+        )
+
+
+def _freeze(*arrays: NDArray[np.float64]) -> None:
+    for array in arrays:
+        array.flags.writeable = False
+
+
+def build(
+    scene: Scene, steps: Sequence[Step], *, options: Options | None = None, terms: Sequence[Term] = ()
+) -> TrajectoryProblem:
+    """Return the nonlinear program of `steps` in `scene`, to look at before solving.
+
+    Args:
+        scene: Robot, objects and obstacles.
+        steps: What should change in the world.
+        options: How to plan.
+        terms: Own constraints and costs.
+
+    Raises:
+        InputError: The steps or terms name something that is not there, or ask for what cannot be done.
+    """
+    options = options or Options()
+    task, terms = compile_task(scene, steps, options), traced(scene, terms)
+    check_active(terms, stretches(task))
+    return TrajectoryProblem(scene, task, options, terms)

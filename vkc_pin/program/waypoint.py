@@ -1,0 +1,155 @@
+"""The constraint rows of one waypoint, as SX functions: small, exact to second order, mapped over the waypoints."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from vkc_pin import cpin
+from vkc_pin.chain.pose import PoseRow, pose_rows
+from vkc_pin.models.coordinates import Coordinates
+from vkc_pin.program.term_rows import TermRow
+
+__all__ = ["Structure", "WaypointFunctions", "waypoint_functions"]
+
+_KEPT = 48  # kinds of waypoints kept for reuse
+_functions: OrderedDict[tuple[Any, ...], WaypointFunctions] = OrderedDict()
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """What a symbolic program depends on.
+
+    Attributes:
+        model: The chain.
+        segments: N, the number of waypoints after the start.
+        poses: Frames that must be somewhere.
+        slots: K, witness planes per waypoint.
+        weights_velocity: Of eq. 1, on the squared differences, shape (N, n).
+        weights_acceleration: The same for second differences, per coordinate, shape (n,).
+        rests: Waypoints inside the motion at which it comes to rest, as it does at start and end.
+        differential: Whether the base must not slip sideways.
+        clamped: (column, first, last): coordinates that keep their value from waypoint `first` to `last`, as a hand does
+            that clamps.
+        terms: The user's own constraints and costs.
+    """
+
+    model: pin.Model
+    segments: int
+    poses: tuple[PoseRow, ...]
+    slots: int
+    weights_velocity: NDArray[np.float64]
+    weights_acceleration: NDArray[np.float64]
+    rests: tuple[int, ...] = ()
+    differential: bool = False
+    clamped: tuple[tuple[int, int, int], ...] = ()
+    terms: tuple[TermRow, ...] = ()
+
+    @property
+    def timed(self) -> bool:
+        """Whether the time of a step counts."""
+        return any(term.formula.timed for term in self.terms)
+
+    @property
+    def key(self) -> tuple[Any, ...]:
+        """Equal for structures that share one program."""
+        poses = tuple((*_key(pose), pose.waypoints) for pose in self.poses)
+        weights = (self.weights_velocity.tobytes(), self.weights_acceleration.tobytes())
+        others = (self.rests, self.differential, self.clamped, self.terms)
+        return (self.model.saveToString(), self.segments, poses, self.slots, *weights, *others)
+
+
+def _key(pose: PoseRow) -> tuple[Any, ...]:
+    """Equal for poses that are asked for with the same rows."""
+    return pose.joint, pose.local.homogeneous.round(12).tobytes(), pose.kind, pose.shift
+
+
+def waypoint_functions(model: pin.Model, slots: int, poses: tuple[PoseRow, ...]) -> WaypointFunctions:
+    """Return the functions of one kind of waypoint, built if they are not there already."""
+    key = (model.saveToString(), slots, *(_key(pose) for pose in poses))
+    if key not in _functions:
+        _functions[key] = WaypointFunctions(model, slots, poses)
+        while len(_functions) > _KEPT:
+            _functions.popitem(last=False)
+    _functions.move_to_end(key)
+    return _functions[key]
+
+
+class WaypointFunctions:
+    """The SX functions of one kind of waypoint: a model, so many witness planes, and which poses it must satisfy."""
+
+    def __init__(self, model: pin.Model, slots: int, poses: tuple[PoseRow, ...]) -> None:
+        coordinates = Coordinates(model)
+        n, joints = coordinates.size, model.njoints - 1
+        z, s = ca.SX.sym("z", n), ca.SX.sym("s")
+        planes, offsets = ca.SX.sym("C", slots, 12 * joints), ca.SX.sym("R", slots)
+        targets = ca.SX.sym("W", 12, max(len(poses), 1))
+        placements = cpin.joint_placements(model)(coordinates.q_symbolic(z))
+        stacked = ca.vec(placements)
+        # Every row is linear in the placements: rows = L·vec(M) + const, so one sweep of the kinematics serves them all.
+        parts = []
+        for k, pose in enumerate(poses):
+            parts.append(pose_rows(pose.kind, *pose.placement(placements), targets[:, k]))
+        pose_values = ca.vertcat(*parts) if parts else ca.SX(0, 1)
+        self.pose_rows = [pose.rows for pose in poses]
+        self.rows = slots + sum(self.pose_rows)
+        rows = ca.vertcat(planes @ stacked - offsets + s, pose_values)
+        multipliers = ca.SX.sym("lam", self.rows)
+        pose_jacobian = ca.jacobian(pose_values, z)
+        jacobian = ca.vertcat(
+            ca.horzcat(_slopes(model, coordinates, z, placements, planes), ca.SX.ones(slots, 1)),
+            ca.horzcat(pose_jacobian, ca.SX(pose_values.numel(), 1)),
+        )
+        w = ca.SX.sym("w", 12 * joints)
+        hessian = ca.triu(ca.hessian(ca.dot(w, stacked) + ca.dot(multipliers[slots:], pose_values), z)[0])
+        inner = ca.Function("inner", [z, targets, w, multipliers], [hessian])
+        hessian = inner(z, targets, planes.T @ multipliers[:slots], multipliers)
+        inputs = [z, s, ca.vec(planes), offsets, ca.vec(targets)]
+        options = {"cse": True}
+        self.value = ca.Function("g", inputs, [rows], options)
+        self.jacobian = ca.Function("rows_jacobian", inputs, [ca.vertcat(*jacobian.nonzeros())], options)
+        self.jacobian_pattern = jacobian.sparsity().get_triplet()
+        self.hessian = ca.Function("lagrangian_hessian", [*inputs, multipliers], [ca.vertcat(*hessian.nonzeros())], options)
+        self.hessian_pattern = hessian.sparsity().get_triplet()
+
+
+def _slopes(model: pin.Model, coordinates: Coordinates, z: Any, placements: Any, planes: Any) -> Any:
+    """Return the derivatives of planes·vec(M(z)), shape (K, n), with respect to z.
+
+    A coordinate of a joint turns and shifts all that this joint carries by one twist (ω, v): dR = ω × R, dt = ω × t + v. So a
+    plane's derivative is m·ω + f·v, where m = Σ (Σ_c R_c × C_c + t × C_t) and f = Σ C_t add up over what the joint carries: a
+    fraction of the work of multiplying with the derivatives of all placements.
+    """
+    forces: list[Any] = []
+    moments: list[Any] = []
+    for joint in range(model.njoints - 1):
+        block, placement = planes[:, 12 * joint : 12 * joint + 12], placements[:, joint]
+        columns = [(placement[3 * c : 3 * c + 3], block[:, 3 * c : 3 * c + 3]) for c in range(4)]
+        forces.append(block[:, 9:])
+        moments.append(sum(_cross_rows(point, force) for point, force in columns))
+    for joint in reversed(range(model.njoints - 1)):
+        parent = model.parents[joint + 1] - 1
+        if parent >= 0:
+            forces[parent] += forces[joint]
+            moments[parent] += moments[joint]
+    slopes = []
+    for column, joint in enumerate(coordinates.joints):
+        placement = placements[:, joint - 1]
+        change = ca.jacobian(placement, z[column])
+        turns = [ca.cross(placement[3 * c : 3 * c + 3], change[3 * c : 3 * c + 3]) for c in range(3)]
+        omega = sum(turns, ca.SX(3, 1)) / 2
+        speed = change[9:] - ca.cross(omega, placement[9:])
+        slopes.append(moments[joint - 1] @ omega + forces[joint - 1] @ speed)
+    return ca.horzcat(*slopes)
+
+
+def _cross_rows(point: Any, rows: Any) -> Any:
+    """Return point × row of each of the K `rows`, shape (K, 3)."""
+    x, y, z = point[0], point[1], point[2]
+    return ca.horzcat(y * rows[:, 2] - z * rows[:, 1], z * rows[:, 0] - x * rows[:, 2], x * rows[:, 1] - y * rows[:, 0])

@@ -1,0 +1,76 @@
+"""Placed objects: articulated objects, each with where it stands in the world and the values of its joints."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from vkc_pin.errors import UnknownNameError
+from vkc_pin.models.articulation import ArticulatedObject
+from vkc_pin.models.shapes import copy_shape, within_limits
+
+__all__ = ["PlacedObject", "standing_geometry"]
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedObject:
+    """An articulated object that stands in the world (or is held).
+
+    Attributes:
+        name: Its name in the scene.
+        object: What it is.
+        placement: Its base link in the world frame.
+        state: Its joint values, shape (n,), [rad] or [m], in the order of `object.coordinates.names`.
+    """
+
+    name: str
+    object: ArticulatedObject
+    placement: pin.SE3
+    state: NDArray[np.float64]
+
+    def __repr__(self) -> str:
+        state = ", ".join(f"{n}={v:.4g}" for n, v in zip(self.object.coordinates.names, self.state, strict=True))
+        return f"<PlacedObject {self.name}: {self.object.name}{f', {state}' if state else ''}>"
+
+    def with_state(self, values: Mapping[str, float]) -> PlacedObject:
+        """Return the object with joints at `values`, by joint name, [rad] or [m]; the other joints stay.
+
+        Raises:
+            UnknownNameError: It has no such joint.
+            InputError: A value is not finite or outside the joint's limits.
+        """
+        state, coordinates = self.state.copy(), self.object.coordinates
+        for joint, value in values.items():
+            if joint not in coordinates.names:
+                raise UnknownNameError(f"joint of {self.name}", joint, coordinates.names, field=f"{self.name}.{joint}")
+            index = coordinates.index(joint)
+            state[index] = within_limits(value, self.object.lower[index], self.object.upper[index], f"{self.name}.{joint}")
+        return dataclasses.replace(self, state=state)
+
+    def link_placement(self, link: str) -> pin.SE3:
+        """Return the placement of `link` in the world frame. Raises `UnknownNameError` if there is none."""
+        return self.placement * self.object.link_placement(link, self.state)
+
+
+def standing_geometry(placed: PlacedObject, *, visual: bool = False) -> list[pin.GeometryObject]:
+    """Return copies of an object's shapes where they stand: parent joint 0, placements in the world frame.
+
+    Args:
+        placed: The object.
+        visual: Return what to draw instead of what collides.
+
+    Returns:
+        The shapes in the object's own order, with their names in the object (`<link>_<number>`).
+    """
+    model, geometry = placed.object.model, placed.object.visual if visual else placed.object.collision
+    data = model.createData()
+    pin.forwardKinematics(model, data, placed.object.coordinates.q(placed.state))
+    return [
+        copy_shape(shape, shape.name, placed.placement * data.oMi[shape.parentJoint] * shape.placement)
+        for shape in geometry.geometryObjects
+    ]

@@ -1,0 +1,298 @@
+"""Scenes: a robot, where it starts, and the obstacles and articulated objects around it."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.files.resources import find
+from vkc_pin.models.shapes import clearance, placed_shapes, within_limits
+from vkc_pin.notebook import card
+from vkc_pin.scene.hold import Hold, check_holds, holds_of, in_hand
+from vkc_pin.scene.obstacles import FLOOR
+from vkc_pin.scene.placed import PlacedObject, standing_geometry
+from vkc_pin.scene.start import START_CLEARANCE, StartRegion, start_limits
+
+if TYPE_CHECKING:
+    from vkc_pin.models.robot import Robot
+
+__all__ = ["Scene", "load_scene"]
+
+_TRIES = 2000  # random starts that may be in the way of something
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A robot and the world around it; immutable, the `with_` methods return changed copies.
+
+    Attributes:
+        name: Its name.
+        file: The file it came from, if any.
+        folder: The folder that relative paths in `document` start from.
+        robot: The robot.
+        start: Where it starts: base x, y [m], yaw [rad], then the arm joints [rad], shape (n,).
+        objects: Name → articulated object. One that is free and held stands where the robot's hand holds it.
+        obstacles: What does not move, as convex shapes: parent joint 0, placement in the world frame, colour set. An
+            obstacle of one shape has its name, one of several shapes `<name>_<number>`. The floor is among them.
+        obstacle_labels: For each of these shapes, the name of its obstacle (`FLOOR` for the floor).
+        obstacle_names: The obstacles' names in the order of the file, without the floor.
+        obstacle_visual: What to draw of the obstacles, without the floor.
+        floor: Whether there is a floor at z = 0.
+        arena: The floor that belongs to the scene: (x_min, x_max, y_min, y_max) [m].
+        start_region: Where `sample_start` draws from, if the scene says so.
+        held: Object → attachment of what the robot holds at the start.
+        held_by: Object → "<object>.<link>", for what it holds through another thing that it holds.
+        held_at: Object → values of its attachment's freedoms, [m] and [rad]; zero where nothing is said.
+        document: The scene as plain data, from which `from_document` builds it again; not to be changed, as scenes share parts.
+    """
+
+    name: str
+    file: Path | None
+    folder: Path
+    robot: Robot
+    start: NDArray[np.float64]
+    objects: Mapping[str, PlacedObject]
+    obstacles: pin.GeometryModel
+    obstacle_labels: tuple[str, ...]
+    obstacle_names: tuple[str, ...]
+    obstacle_visual: pin.GeometryModel
+    floor: bool
+    arena: tuple[float, float, float, float]
+    start_region: StartRegion | None
+    held: Mapping[str, str]
+    document: dict[str, Any]
+    held_by: Mapping[str, str] = field(default_factory=dict)
+    held_at: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return (
+            f"<Scene {self.name}: {self.robot.name}, objects {', '.join(self.objects) or 'none'}, "
+            f"{len(self.obstacle_names)} obstacles>"
+        )
+
+    def _repr_html_(self) -> str:
+        return card(self)
+
+    @property
+    def holds(self) -> tuple[Hold, ...]:
+        """What the robot holds at the start, each after the hold it depends on."""
+        return holds_of(self.held, self.held_by)
+
+    @staticmethod
+    def from_document(document: Mapping[str, Any], folder: str | Path = ".") -> Scene:
+        """Build a scene from plain data (see `Scene.document` and the scene files).
+
+        Args:
+            document: Dictionaries, lists, text and numbers.
+            folder: The folder that relative paths in it start from.
+
+        Raises:
+            InputError: It does not fit; `UnknownNameError` where a name does not exist.
+        """
+        from vkc_pin.files.documents import Document
+        from vkc_pin.scene.scene_file import scene_fields
+
+        fields = scene_fields(Document(copy.deepcopy(dict(document))), Path(folder))
+        return Scene(**fields).with_held_objects_in_the_hand()
+
+    def with_start(self, base: ArrayLike | None = None, arm: ArrayLike | None = None) -> Scene:
+        """Return the scene with another start.
+
+        Args:
+            base: x, y [m] and yaw [rad] in the world frame, shape (3,); None keeps it.
+            arm: Arm joints [rad], shape (n - 3,); None keeps them.
+
+        Raises:
+            InputError: Wrong size, a value that is not finite, outside a joint's limits or outside the arena.
+        """
+        start, names = self.start.copy(), self.robot.coordinates.names
+        for part_name, values, part in (("base", base, slice(0, 3)), ("arm", arm, slice(3, None))):
+            if values is None:
+                continue
+            given = np.asarray(values, float)
+            if given.shape != start[part].shape:
+                raise InputError("wrong number of values", field=part_name, expected=start[part].shape, got=given.shape)
+            lower, upper = (limits[part] for limits in start_limits(self.robot))
+            start[part] = [
+                within_limits(value, low, high, f"{part_name}.{name}")
+                for value, low, high, name in zip(given, lower, upper, names[part], strict=True)
+            ]
+        for value, low, high, name in zip(start[:2], self.arena[::2], self.arena[1::2], names[:2], strict=True):
+            if not low <= value <= high:
+                raise InputError("outside the arena", field=f"base.{name}", expected=f"{low:g} to {high:g}", got=f"{value:g}")
+        document = self._document_with_own("start")
+        document["start"]["base"] = start[:3].tolist()
+        if arm is not None:
+            document["start"]["arm"] = start[3:].tolist()
+        changed = dataclasses.replace(self, start=start, document=document)
+        return changed.with_held_objects_in_the_hand()
+
+    def with_state(self, name: str, values: Mapping[str, float]) -> Scene:
+        """Return the scene with joints of object `name` at `values`, by joint name, [rad] or [m].
+
+        Raises:
+            UnknownNameError: There is no such object, or it has no such joint.
+            InputError: A value is not finite or outside the joint's limits.
+        """
+        if name not in self.objects:
+            raise UnknownNameError("object", name, self.objects)
+        placed = self.objects[name].with_state(values)
+        document = self._document_with_own("objects")
+        (entry,) = (item for item in document["objects"] if item["name"] == name)
+        state = zip(placed.object.coordinates.names, placed.state.tolist(), strict=True)
+        entry["state"] = dict(state)
+        changed = dataclasses.replace(self, objects=MappingProxyType({**self.objects, name: placed}), document=document)
+        return changed.with_held_objects_in_the_hand()
+
+    def with_placement(self, name: str, placement: pin.SE3) -> Scene:
+        """Return the scene with object `name` at `placement` (of its base link, in the world frame).
+
+        Raises:
+            UnknownNameError: There is no such object.
+        """
+        if name not in self.objects:
+            raise UnknownNameError("object", name, self.objects)
+        document = self._document_with_own("objects")
+        _write_placement(document, name, placement)
+        placed = dataclasses.replace(self.objects[name], placement=pin.SE3(placement))
+        changed = dataclasses.replace(self, objects=MappingProxyType({**self.objects, name: placed}), document=document)
+        return changed.with_held_objects_in_the_hand()
+
+    def with_held(
+        self,
+        held: Mapping[str, str],
+        *,
+        by: Mapping[str, str] | None = None,
+        at: Mapping[str, Sequence[float]] | None = None,
+    ) -> Scene:
+        """Return the scene with the robot holding objects at the start.
+
+        Args:
+            held: Object → attachment.
+            by: Object → "<object>.<link>", for what is held through another object of `held`.
+            at: Object → values of its attachment's freedoms, [m] and [rad]; zero where nothing is said.
+
+        Raises:
+            UnknownNameError: There is no such object, attachment or link.
+            InputError: Values that do not fit the attachment's freedoms, or objects that hold each other.
+        """
+        by = {} if by is None else by
+        values = {name: tuple(float(value) for value in row) for name, row in ({} if at is None else at).items()}
+        check_holds(self.objects, held, by, values)
+        document = self._document_with_own("start", "objects")
+        document["start"]["held"] = {
+            name: {"attachment": attachment}
+            | ({"by": by[name]} if name in by else {})
+            | ({"at": list(values[name])} if name in values else {})
+            for name, attachment in held.items()
+        }
+        for name in self.held.keys() - held.keys():  # it stays where the hand had it
+            if self.objects[name].object.free:
+                _write_placement(document, name, self.objects[name].placement)
+        changed = dataclasses.replace(
+            self,
+            held=MappingProxyType(dict(held)),
+            held_by=MappingProxyType(dict(by)),
+            held_at=MappingProxyType(values),
+            document=document,
+        )
+        return changed.with_held_objects_in_the_hand()
+
+    def _document_with_own(self, *parts: str) -> dict[str, Any]:
+        """Return the document with copies of some of its parts, which may be changed; the others it shares."""
+        return {**self.document, **{part: copy.deepcopy(self.document[part]) for part in parts if part in self.document}}
+
+    def with_held_objects_in_the_hand(self) -> Scene:
+        """Return the scene with every free object that is held placed where the robot holds it at the start."""
+        objects = in_hand(self.objects, self.tool_placement, self.held, self.held_by, self.held_at)
+        return dataclasses.replace(self, objects=objects)
+
+    def tool_placement(self) -> pin.SE3:
+        """Return the placement of the robot's tool frame in the world frame at the start."""
+        model = self.robot.model
+        data = model.createData()
+        pin.framesForwardKinematics(model, data, self.robot.coordinates.q(self.start))
+        return data.oMf[model.getFrameId(self.robot.tool_frame)].copy()
+
+    def start_clearance(self, *, reach: float = np.inf) -> float:
+        """Return the smallest distance [m] at the start between the robot, with what it carries, and the world.
+
+        The floor does not count, nor do the robot's distances to itself and to what it holds.
+
+        Args:
+            reach: Distances above this do not matter [m]: the result is then some number ≥ `reach`.
+        """
+        model, geometry = self.robot.model, self.robot.collision
+        data, shapes = model.createData(), geometry.createData()
+        pin.updateGeometryPlacements(model, data, geometry, shapes, self.robot.coordinates.q(self.start))
+        moving = [(shape.geometry, where) for shape, where in zip(geometry.geometryObjects, shapes.oMg, strict=True)]
+        standing = [
+            shape for shape, label in zip(self.obstacles.geometryObjects, self.obstacle_labels, strict=True) if label != FLOOR
+        ]
+        for name, placed in self.objects.items():
+            if name not in self.held:
+                standing += standing_geometry(placed)
+            elif placed.object.free:
+                moving += placed_shapes(standing_geometry(placed))
+        return clearance(moving, placed_shapes(standing), reach=reach)
+
+    def sample_start(self, rng: np.random.Generator) -> Scene:
+        """Return the scene with the base at a random place of its start region, clear of everything.
+
+        The base's x, y and heading are uniform in the region; places where `start_clearance` is below
+        `START_CLEARANCE` are drawn again.
+
+        Args:
+            rng: Where the random numbers come from; the same state gives the same start.
+
+        Raises:
+            InputError: The scene has no start region, the robot holds something that stands fixed in the world, or no
+                free place was found.
+        """
+        region, file = self.start_region, self.file
+        if region is None:
+            raise InputError("the scene has no start region", file=file, field="start_region", expected="x and y intervals")
+        for name in self.held:
+            if not self.objects[name].object.free:
+                raise InputError("the robot cannot start elsewhere while it holds this", file=file, field=f"start.held.{name}")
+        for base in itertools.islice(region.draws(rng), _TRIES):
+            there = self.with_start(base=base)
+            if there.start_clearance(reach=START_CLEARANCE) >= START_CLEARANCE:
+                return there
+        problem = f"no free place for the robot in {_TRIES} tries"
+        raise InputError(problem, file=file, field="start_region", expected=f"a clearance of {START_CLEARANCE} m somewhere")
+
+
+def _write_placement(document: dict[str, Any], name: str, placement: pin.SE3) -> None:
+    """Let object `name` stand at `placement` in a scene's document."""
+    (entry,) = (item for item in document["objects"] if item["name"] == name)
+    entry.pop("yaw", None)
+    entry["position"] = np.asarray(placement.translation).tolist()
+    entry["rpy"] = np.asarray(pin.rpy.matrixToRpy(placement.rotation)).tolist()
+
+
+def load_scene(name_or_path: str | Path) -> Scene:
+    """Load a scene: by the name of a file in `scenes`, or by the path of a scene file (.yaml).
+
+    Raises:
+        UnknownNameError: There is no such scene, or it names something that does not exist.
+        InputError: Something in the file is wrong; the error says what, in which file, line and field.
+    """
+    from vkc_pin.files.documents import read_yaml
+    from vkc_pin.scene.scene_file import scene_fields
+
+    text = str(name_or_path)
+    by_path = isinstance(name_or_path, Path) or text.endswith((".yaml", ".yml")) or "/" in text
+    file = Path(name_or_path) if by_path else find("scenes", "*.yaml", text, what="scene")
+    return Scene(**scene_fields(read_yaml(file), file.parent)).with_held_objects_in_the_hand()

@@ -1,0 +1,228 @@
+"""What a scene file may contain. Lengths in metres, angles in radians, world frame with z up and the floor at z = 0."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+
+from vkc_pin.files.fields import Name, Number, Positive, Schema, Vector3, count, fail
+
+__all__ = [
+    "COLOURS",
+    "BoxSchema",
+    "CapsuleSchema",
+    "CylinderSchema",
+    "HeldSchema",
+    "MeshSchema",
+    "ObstacleSchema",
+    "PlacedObjectSchema",
+    "SceneRobotSchema",
+    "SceneSchema",
+    "SphereSchema",
+    "StartSchema",
+    "UrdfSchema",
+]
+
+COLOURS: dict[str, tuple[float, float, float]] = {
+    "black": (0.13, 0.13, 0.14),
+    "blue": (0.27, 0.42, 0.60),
+    "brown": (0.45, 0.31, 0.20),
+    "concrete": (0.72, 0.71, 0.69),
+    "cream": (0.93, 0.89, 0.80),
+    "green": (0.29, 0.50, 0.29),
+    "grey": (0.55, 0.56, 0.58),
+    "oak": (0.76, 0.60, 0.42),
+    "orange": (0.87, 0.53, 0.24),
+    "red": (0.72, 0.25, 0.22),
+    "steel": (0.66, 0.68, 0.71),
+    "teal": (0.24, 0.52, 0.52),
+    "terracotta": (0.74, 0.44, 0.32),
+    "wall": (0.90, 0.89, 0.86),
+    "walnut": (0.38, 0.26, 0.18),
+    "white": (0.95, 0.95, 0.94),
+    "yellow": (0.93, 0.79, 0.36),
+}
+
+
+def _colour(value: Any) -> Any:
+    if isinstance(value, str):
+        if value not in COLOURS:
+            raise fail(f"unknown colour '{value}'", f"one of {', '.join(COLOURS)}, or [red, green, blue] from 0 to 1")
+        return (*COLOURS[value], 1.0)
+    if isinstance(value, list | tuple) and len(value) == 3:
+        return (*value, 1.0)
+    return value
+
+
+def _triple(value: Any) -> Any:
+    return (value, value, value) if isinstance(value, int | float) and not isinstance(value, bool) else value
+
+
+def _named(value: Any) -> Any:
+    return {"name": value} if isinstance(value, str) else value
+
+
+def _attached(value: Any) -> Any:
+    return {"attachment": value} if isinstance(value, str) else value
+
+
+def _arm(value: Any) -> Any:
+    if isinstance(value, str) and value != "home":
+        raise fail(f"unknown arm configuration '{value}'", "home, or a list of joint values [rad]")
+    if not isinstance(value, str | list | tuple):
+        raise fail("wrong value", "home, or a list of joint values [rad]")
+    return None if value == "home" else value
+
+
+def _heading(value: Any) -> Any:
+    if isinstance(value, str) and value != "any":
+        raise fail(f"unknown heading '{value}'", "any, or [lowest, highest]")
+    return None if value == "any" else value
+
+
+def _ordered(value: tuple[float, float] | None) -> tuple[float, float] | None:
+    if value is not None and value[0] > value[1]:
+        raise fail("the interval is empty", "[lowest, highest]")
+    return value
+
+
+Fraction = Annotated[Number, Field(ge=0.0, le=1.0)]
+Size = Annotated[tuple[Positive, Positive, Positive], count(3)]
+Colour = Annotated[tuple[Fraction, Fraction, Fraction, Fraction], count(4), BeforeValidator(_colour)]
+Interval = Annotated[tuple[Number, Number], count(2), AfterValidator(_ordered)]
+Scale = Annotated[Size, BeforeValidator(_triple)]
+
+
+class PoseSchema(Schema):
+    """Where something stands: position [m], and orientation as roll, pitch, yaw [rad] or as yaw alone."""
+
+    position: Vector3
+    rpy: Vector3 | None = None
+    yaw: Number | None = None
+
+    @model_validator(mode="after")
+    def _one_orientation(self) -> PoseSchema:
+        if self.rpy is not None and self.yaw is not None:
+            raise fail("two orientations", "either rpy or yaw")
+        return self
+
+
+class ShapeSchema(PoseSchema):
+    """What all obstacles have."""
+
+    name: Name
+    colour: Colour = (*COLOURS["grey"], 1.0)
+
+
+class BoxSchema(ShapeSchema):
+    """A box; `position` is its centre, `size` its edge lengths along its x, y, z axes."""
+
+    type: Literal["box"]
+    size: Size
+
+
+class SphereSchema(ShapeSchema):
+    """A sphere; `position` is its centre."""
+
+    type: Literal["sphere"]
+    radius: Positive
+
+
+class CylinderSchema(ShapeSchema):
+    """A cylinder along its z axis; `position` is its centre."""
+
+    type: Literal["cylinder"]
+    radius: Positive
+    length: Positive
+
+
+class CapsuleSchema(ShapeSchema):
+    """A cylinder of `length` along its z axis with a half sphere at either end; `position` is its centre."""
+
+    type: Literal["capsule"]
+    radius: Positive
+    length: Positive
+
+
+class MeshSchema(ShapeSchema):
+    """A mesh file, which collides as its convex hull; `position` is the origin of its coordinates."""
+
+    type: Literal["mesh"]
+    file: str
+    scale: Scale = (1.0, 1.0, 1.0)
+
+
+class UrdfSchema(PoseSchema):
+    """A URDF whose joints stay at their neutral position; its own colours, unless `colour` replaces them."""
+
+    name: Name
+    colour: Colour | None = None
+    type: Literal["urdf"]
+    file: str
+
+
+ObstacleSchema = Annotated[
+    BoxSchema | SphereSchema | CylinderSchema | CapsuleSchema | MeshSchema | UrdfSchema, Field(discriminator="type")
+]
+
+
+class PlacedObjectSchema(PoseSchema):
+    """An articulated object: `type` names its description or its file, `state` its joint values (others are 0)."""
+
+    name: Name
+    type: str
+    state: Mapping[str, Number] = Field(default_factory=dict)
+
+
+class SceneRobotSchema(Schema):
+    """A robot by its name, or by the path of its URDF."""
+
+    name: str
+    base: Literal["omni", "differential", "fixed"] = "omni"
+    tool_frame: str | None = None
+
+
+class HeldSchema(Schema):
+    """How an object is held: at which attachment, through what, and at what values of the attachment's freedoms."""
+
+    attachment: str
+    by: str | None = None
+    at: tuple[Number, ...] | None = None
+
+
+class StartSchema(Schema):
+    """Where the robot starts: base [x, y, yaw], arm joints [rad], and object → attachment (or more) of what it holds."""
+
+    base: Vector3
+    arm: Annotated[tuple[Number, ...] | None, BeforeValidator(_arm)] = None
+    held: Mapping[str, Annotated[HeldSchema, BeforeValidator(_attached)]] = Field(default_factory=dict)
+
+
+class ArenaSchema(Schema):
+    """The floor that belongs to the scene, an interval in x and one in y."""
+
+    x: Interval = (-5.0, 5.0)
+    y: Interval = (-5.0, 5.0)
+
+
+class RegionSchema(Schema):
+    """Where random starts of the base are drawn from; `yaw` is any heading or an interval."""
+
+    x: Interval
+    y: Interval
+    yaw: Annotated[Interval | None, BeforeValidator(_heading)] = None
+
+
+class SceneSchema(Schema):
+    """A scene file."""
+
+    name: Name | None = None
+    robot: Annotated[SceneRobotSchema, BeforeValidator(_named)]
+    start: StartSchema
+    arena: ArenaSchema = ArenaSchema()
+    start_region: RegionSchema | None = None
+    floor: bool = True
+    obstacles: tuple[ObstacleSchema, ...] = ()
+    objects: tuple[PlacedObjectSchema, ...] = ()

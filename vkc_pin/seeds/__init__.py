@@ -1,0 +1,1 @@
+"""Trajectories for the solver to start from."""

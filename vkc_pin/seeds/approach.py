@@ -1,0 +1,114 @@
+"""Straight ways in and out: a hand nears what it grasps, and a stick what it touches, from where there is room."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from vkc_pin.chain.inverse_kinematics import PoseSolver
+from vkc_pin.chain.pose import PoseRow
+from vkc_pin.seeds.knots import Knots
+from vkc_pin.task.phases import Phase
+
+__all__ = ["Approach"]
+
+LIFT = 0.1  # [m] to lift or lower what is carried
+_REACH = (0.1, 0.2, 0.3, 0.4, 0.5)  # [m] from what is touched, on the way to it
+_SHARES = (0.25, 0.5, 0.75, 1.0)  # of a way, from each to the next
+_TOLERANCE = 1e-4  # [m] and [rad]
+
+
+class Approach:
+    """Finds configurations on straight ways to and from the ends of a problem's phases.
+
+    A way is the tool's: back along its approach for what it grasps or lets go of, up for what is lifted or put down, back along
+    the frame's z axis for what a frame touches.
+
+    Args:
+        knots: Of the problem.
+        stands: Whether the base stands still meanwhile, as long as the arm alone can do it: in narrow places it has no room.
+    """
+
+    def __init__(self, knots: Knots, *, stands: bool = False) -> None:
+        self.knots, self.problem, self.chain, self.stands = knots, knots.problem, knots.chain, stands
+        joint, local = self.chain.frame(self.chain.robot.tool_frame)
+        self.joint, self.local = joint, local
+        self.solver = _tool_solver(self.chain.model.saveToString(), joint, local.homogeneous.tobytes())
+
+    def before(self, z: NDArray[np.float64], phase: Phase) -> NDArray[np.float64]:
+        """Return configurations on the way to `z`, shape (n,), the end of a phase: shape (K, n), the last is the nearest."""
+        if phase.grasps:
+            return self._way(z, -self._ahead(z, self.chain.holder(phase.grasps[0])), [self.problem.options.approach])
+        if phase.lowered:
+            return self._way(z, np.array([0.0, 0.0, 1.0]), [LIFT])
+        for goal in phase.frames:
+            if goal.touches:
+                return self._way(z, -self._ahead(z, self.chain.frame(goal.frame, goal.hold)), _REACH)[::-1]
+        return np.empty((0, len(z)))
+
+    def after(self, z: NDArray[np.float64], phase: Phase, before: Phase | None) -> NDArray[np.float64]:
+        """Return configurations on the way from `z`, shape (n,), the start of a phase: shape (K, n), the first is the nearest."""
+        if phase.leaves:
+            return self._way(z, -self._ahead(z, self.chain.holder(phase.leaves[0])), [self.problem.options.approach])
+        if phase.lifted:
+            return self._way(z, np.array([0.0, 0.0, 1.0]), [LIFT])
+        for goal in before.frames if before else ():
+            if goal.touches:
+                return self._way(z, -self._ahead(z, self.chain.frame(goal.frame, goal.hold)), _REACH)
+        return np.empty((0, len(z)))
+
+    def away(self, z: NDArray[np.float64], phase: Phase) -> NDArray[np.float64]:
+        """Return configurations on the way from `z`, shape (n,), the base where it is: shape (K, n), the last is the farthest.
+
+        The hand goes back from what a phase lets go of at its start, or up with what is carried in it.
+        """
+        if phase.leaves:
+            direction, length = -self._ahead(z, self.chain.holder(phase.leaves[0])), self.problem.options.approach
+        elif phase.held:
+            direction, length = np.array([0.0, 0.0, 1.0]), LIFT
+        else:
+            return np.empty((0, len(z)))
+        return self._way(z, direction, [share * length for share in _SHARES], drives=False)
+
+    def _ahead(self, z: NDArray[np.float64], frame: tuple[int, pin.SE3]) -> NDArray[np.float64]:
+        """Return the direction of a frame's z axis in the world, at `z`: in it a hand nears what it grasps."""
+        joint, local = frame
+        rotations, _ = self.chain.joint_placements(z[None])
+        return np.asarray((rotations[0, joint] @ local.rotation)[:, 2])
+
+    def _way(
+        self, z: NDArray[np.float64], direction: NDArray[np.float64], lengths: Sequence[float], *, drives: bool = True
+    ) -> NDArray[np.float64]:
+        """Return configurations with the tool `lengths` [m] along `direction` from where `z` has it, as far as there are."""
+        rotations, translations = self.chain.joint_placements(z[None])
+        carrier = pin.SE3(rotations[0, self.joint], translations[0, self.joint])
+        tool = carrier * self.local
+        lower, upper = z.copy(), z.copy()  # only the robot moves
+        for column, name in enumerate(self.chain.names[: self.knots.robot]):
+            if drives or column > 2:
+                lower[column], upper[column] = self.problem.limits(name)
+        standing = np.concatenate([z[:3], lower[3:]]), np.concatenate([z[:3], upper[3:]])
+        weights, found = self.knots.weights, list[NDArray[np.float64]]()
+        for length in lengths:
+            target = pin.SE3(tool.rotation, tool.translation + length * direction)
+            start = (found[-1] if found else z)[None]
+            for low, high in (standing, (lower, upper)) if self.stands else ((lower, upper),):
+                near, ok = self.solver.solve(start, target, lower=low, upper=high, weights=weights, tolerance=_TOLERANCE)
+                if ok[0]:
+                    break
+            else:
+                break
+            found.append(near[0])
+        return np.array(found).reshape(len(found), len(z))
+
+
+@lru_cache(maxsize=16)
+def _tool_solver(model_text: str, joint: int, local: bytes) -> PoseSolver:
+    """Return the inverse kinematics of the tool, built once per model."""
+    model = pin.Model()
+    model.loadFromString(model_text)
+    return PoseSolver(model, PoseRow(joint, pin.SE3(np.frombuffer(local).reshape(4, 4)), ()))

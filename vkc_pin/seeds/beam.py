@@ -1,0 +1,272 @@
+"""Beam search: from knot to knot along a task, keeping the cheapest ways, on the closure's manifold where something is held."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vkc_pin.interrupt import NEVER, Interrupt
+from vkc_pin.program.pose_goals import approach_at
+from vkc_pin.seeds.knots import SCATTER, Knots
+from vkc_pin.seeds.routes import Routes
+
+__all__ = ["Beam", "Found"]
+
+_DRAWS, _ENOUGH = 6, 60  # how often random seeds are drawn until so many are free: good grasps are rare
+_OTHERS = 3  # where a hand chooses how to grasp, so many times fewer of the others are kept than of the cheap ones
+_FEW = 12  # free configurations at a knot with which none are pushed out of collisions
+_BEAM, _QUICK_BEAM, _CHILDREN = 40, 24, 4  # configurations kept per knot, and tried from each for the next
+_SPACING = 4  # waypoints between knots along a phase in which something is held
+_APPROACH = 6  # configurations looked at on the way to a grasp
+_EASY = 0.5  # share of the beam that must go on freely for a knot to be easy
+_COLLISION, _DEPTH = 10.0, 300.0  # what a collision costs, and a metre of its depth, beside radians of motion
+_NOT_FOUND = 1e3
+_TOLERABLE = 60.0  # what the solver may be left to push apart: a graze or two
+_JUMP = 0.5  # [m] of the base from knot to knot while something fixed is held: through something, no doubt
+_DRIVING = 2.0  # how many times more than in `Knots.weights` the base's way counts: on it hangs which side is gone to
+
+
+class Found(NamedTuple):
+    """What a search found.
+
+    Attributes:
+        paths: Configurations at the knots, shape (B, knots, n), the start first.
+        cost: What each costs, shape (B,).
+        trouble: How much of that is for collisions, shape (B,).
+        at: The knots' waypoints.
+    """
+
+    paths: NDArray[np.float64]
+    cost: NDArray[np.float64]
+    trouble: NDArray[np.float64]
+    at: list[int]
+
+
+class _Mode(NamedTuple):
+    """How a search goes on; see `Beam.search`."""
+
+    thorough: bool
+    backwards: bool
+
+    @property
+    def width(self) -> int:
+        """How many configurations are kept at a knot."""
+        return _BEAM if self.thorough else _QUICK_BEAM
+
+
+class Beam:
+    """Searches a problem's knots.
+
+    Args:
+        knots: Where configurations come from.
+        routes: The paths that the base would drive; None: as if it drove straight.
+        careful: Whether grasps count as free only if the straight way to them is free, too, and paths of the base are those with
+            the arm folded: for narrow places.
+        interrupt: Ends a search.
+    """
+
+    def __init__(
+        self, knots: Knots, routes: Routes | None = None, *, careful: bool = False, interrupt: Interrupt = NEVER
+    ) -> None:
+        self.knots, self.problem, self.routes, self.careful = knots, knots.problem, routes, careful
+        self.interrupt = interrupt
+        self.approaches = {
+            int(end): approach_at(int(end) - phase.segments, int(end), self.problem.options)
+            for phase, end in zip(self.problem.task.phases, self.problem.ends, strict=True)
+            if phase.grasps
+        }
+
+    def search(self, *, thorough: bool, backwards: bool = False) -> Found | None:
+        """Go from knot to knot, keeping the cheapest paths; None if that was interrupted.
+
+        Args:
+            thorough: Keep more, and shake the arms at every knot at which something fixed is held.
+            backwards: Where something fixed is held, begin where it is let go of, and go back to where it is grasped: a way may
+                be wide at its end only, and hardly anything that is free at its beginning leads there.
+        """
+        # A hand that chooses where to grasp, and then does not give way, chooses before it moves anything.
+        backwards = backwards and not any(self._closed_at(grasp + 1) for _, grasp, _ in self.problem.choices)
+        mode = _Mode(thorough, backwards)
+        problem = self.problem
+        found = Found(problem.start[None, None, :], np.zeros(1), np.zeros(1), [0])
+        closed = [problem.closed(phase) for phase in problem.task.phases]
+        number = begin = 0
+        while number < len(closed):
+            last = number
+            while backwards and not closed[number] and closed[last + 1 : last + 2] == [True]:
+                last += 1
+            knots, before = self._knots(number, last), found.paths.shape[1]
+            if last > number:
+                found = self._go_back(found, knots, number, mode)
+            else:
+                for knot in knots:
+                    if self.interrupt.pressed:
+                        return None
+                    found = self._go_on(found, knot, number, mode)
+            if self.interrupt.pressed:
+                return None
+            if not closed[number] and self.routes is None:
+                ends = found.paths[:, before - 1], found.paths[:, before]
+                found = found._replace(cost=found.cost + self._approach(*ends, begin, int(problem.ends[number])))
+            number, begin = last + 1, int(problem.ends[last])
+        return found
+
+    def tolerable(self, found: Found) -> bool:
+        """Return whether the cheapest path hits little and, if ways of the base count, never jumps while something is held."""
+        best = int(np.argmin(found.cost))
+        held = [self._closed_at(knot) for knot in found.at[1:]]
+        jumps = np.abs(np.diff(found.paths[best, :, :2], axis=0)).max(axis=1) > _JUMP
+        return bool(found.trouble[best] <= _TOLERABLE and (self.routes is None or not np.any(jumps & held)))
+
+    def _closed_at(self, waypoint: int) -> bool:
+        return self.problem.closed(self.problem.task.phases[self.problem.contacts.phase_of(waypoint)])
+
+    def _knots(self, first: int, last: int) -> list[int]:
+        """Return the waypoints of the knots of some phases."""
+        problem, knots = self.problem, list[int]()
+        for number in range(first, last + 1):
+            begin, end = int(problem.ends[number - 1]) if number else 0, int(problem.ends[number])
+            pieces = max(1, round((end - begin) / _SPACING)) if problem.closed(problem.task.phases[number]) else 1
+            knots += np.linspace(begin, end, pieces + 1).round().astype(int)[1:].tolist()
+        return knots
+
+    def _go_on(self, found: Found, knot: int, phase: int, mode: _Mode) -> Found:
+        """Return the cheapest paths to the next knot, to which something of a phase leads."""
+        parents, z, bad = self._continue(found.paths, found.cost, knot, phase, mode)
+        total = found.cost[parents] + self._way(found.paths[parents, -1], z, phase) + bad
+        best = self._kept(total, bad, knot, mode.width)
+        paths = np.concatenate([found.paths[parents[best]], z[best, None]], axis=1)
+        return Found(paths, total[best], (found.trouble[parents] + bad)[best], [*found.at, knot])
+
+    def _kept(self, total: NDArray[np.float64], bad: NDArray[np.float64], knot: int, width: int) -> NDArray[np.int_]:
+        """Return which continuations to keep: the cheapest and, where a hand chooses how to grasp, some of the other free ones.
+
+        What is cheap to grasp may be what cannot be put where it is to be.
+        """
+        order = np.argsort(total, kind="stable")
+        if all(knot != grasp for _, grasp, _ in self.problem.choices):
+            return order[:width]
+        cheap, rest = order[:width], order[width:]
+        rest = rest[bad[rest] <= 0.0]
+        others = rest[np.linspace(0, len(rest) - 1, min(width // _OTHERS, len(rest))).astype(int)]
+        return np.concatenate([cheap, others])
+
+    def _go_back(self, found: Found, knots: list[int], phase: int, mode: _Mode) -> Found:
+        """Return the cheapest paths through knots, of which all but the first are while something fixed is held after a phase."""
+        known = found.paths.shape[1]
+        found = self._go_on(found, knots[-1], phase, mode)
+        for knot in knots[-2::-1]:
+            if self.interrupt.pressed:
+                break
+            found = self._go_on(found, knot, phase + 1, mode)
+        paths = np.concatenate([found.paths[:, :known], found.paths[:, : known - 1 : -1]], axis=1)
+        start, grasp, end = paths[:, known - 1], paths[:, known], paths[:, -1]
+        cost = found.cost + self._way(start, grasp, phase) - self._way(start, end, phase)
+        return Found(paths, cost, found.trouble, [*found.at[:known], *knots])
+
+    def _way(self, first: NDArray[np.float64], last: NDArray[np.float64], phase: int) -> NDArray[np.float64]:
+        """Return what it costs to go from `first` to `last`, both (B, n), in a phase, shape (B,)."""
+        weights = self.knots.weights.copy()
+        weights[:2] *= _DRIVING
+        way = np.abs(last - first) * weights
+        if self.routes is not None and not self.problem.closed(self.problem.task.phases[phase]):
+            distances = self.routes.distances(phase, first[:, :3], last[:, :3], folded=self.careful)
+            way[:, 0], way[:, 1] = weights[0] * distances, 0.0
+            np.minimum(way, _NOT_FOUND, out=way)  # where there is no way, others come first
+        return np.asarray(way.sum(axis=1))
+
+    def _continue(
+        self, paths: NDArray[np.float64], cost: NDArray[np.float64], waypoint: int, phase: int, mode: _Mode
+    ) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64]]:
+        """Return continuations of `paths` to a waypoint: which path each goes on from, where to, and what is wrong there."""
+        knots = self.knots
+        if not self.problem.closed(self.problem.task.phases[phase]):
+            draws = []
+            for _ in range(_DRAWS):
+                parents = np.arange(SCATTER if mode.thorough else SCATTER // 2) % len(paths)
+                z, found = knots.knot(paths[parents, -1], waypoint, "scatter")
+                price = cost[parents] + self._way(paths[parents, -1], z, phase)
+                draws.append(self._cheapest(price, parents, z, found, waypoint, mode.width))
+                if sum(np.count_nonzero(bad == 0) for _, _, bad in draws) >= _ENOUGH:
+                    break
+            parents, z, bad = (np.concatenate(parts) for parts in zip(*draws, strict=True))
+            return self._pushed(paths, cost, parents, z, bad, waypoint, phase, mode.width)
+        parents = np.arange(len(paths))
+        z, found = knots.knot(paths[:, -1], waypoint, "track")
+        if not mode.thorough:
+            bad = self._bad(z, found, waypoint)
+            if np.count_nonzero(bad == 0) >= _EASY * len(paths):
+                return parents, z, bad
+        more = np.arange(mode.width * _CHILDREN - len(paths)) % len(paths)
+        shaken, also = knots.knot(paths[more, -1], waypoint, "shake")
+        parents, z, found = np.concatenate([parents, more]), np.concatenate([z, shaken]), np.concatenate([found, also])
+        price = cost[parents] + self._way(paths[parents, -1], z, phase)
+        parents, z, bad = self._cheapest(price, parents, z, found, waypoint, mode.width)
+        if not mode.backwards:
+            return parents, z, bad
+        return self._pushed(paths, cost, parents, z, bad, waypoint, phase, mode.width)
+
+    def _pushed(
+        self,
+        paths: NDArray[np.float64],
+        cost: NDArray[np.float64],
+        parents: NDArray[np.int_],
+        z: NDArray[np.float64],
+        bad: NDArray[np.float64],
+        waypoint: int,
+        phase: int,
+        width: int,
+    ) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64]]:
+        """Return continuations and, if few of them are free, the best of them pushed out of what they are in."""
+        if np.count_nonzero(bad == 0) >= (_FEW if self._closed_at(waypoint) else _ENOUGH):
+            return parents, z, bad
+        price = cost[parents] + self._way(paths[parents, -1], z, phase) + bad
+        best = np.argsort(price, kind="stable")[: 2 * width]
+        pushed = self.knots.clear(z[best], waypoint)
+        more = self._bad(pushed, np.ones(len(pushed), bool), waypoint)
+        return np.concatenate([parents, parents[best]]), np.concatenate([z, pushed]), np.concatenate([bad, more])
+
+    def _cheapest(
+        self,
+        price: NDArray[np.float64],
+        parents: NDArray[np.int_],
+        z: NDArray[np.float64],
+        found: NDArray[np.bool_],
+        waypoint: int,
+        width: int,
+    ) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64]]:
+        """Return continuations, the cheapest first; what the beam cannot keep anyway need not be looked at."""
+        order = np.argsort(price + _NOT_FOUND * ~found, kind="stable")
+        parents, z, found = parents[order], z[order], found[order]
+        half = min(2 * width, len(z))
+        bad = self._bad(z[:half], found[:half], waypoint)
+        if np.count_nonzero(bad == 0) >= width:
+            return parents[:half], z[:half], bad
+        return parents, z, np.concatenate([bad, self._bad(z[half:], found[half:], waypoint)])
+
+    def _bad(self, z: NDArray[np.float64], found: NDArray[np.bool_], waypoint: int) -> NDArray[np.float64]:
+        """Return what is wrong with configurations at a waypoint, as a cost, shape (B,)."""
+        bad = np.full(len(z), _NOT_FOUND)
+        if found.any():
+            depth = self.knots.depth(z[found], waypoint)
+            bad[found] = _hits(depth)
+            if self.careful and waypoint in self.approaches and (depth <= 0).any():
+                free = np.flatnonzero(found)[depth <= 0]
+                at = self.approaches[waypoint]
+                near, reached = self.knots.knot(z[free], at, "track")
+                bad[free] += _hits(self.knots.depth(near, at)) + _NOT_FOUND * ~reached
+        return bad
+
+    def _approach(self, first: NDArray[np.float64], last: NDArray[np.float64], begin: int, end: int) -> NDArray[np.float64]:
+        """Return what the straight ways from `first` to `last`, both (B, n), cost in collisions, shape (B,)."""
+        s = np.arange(1, _APPROACH) / _APPROACH
+        between = first[:, None] + s[:, None] * (last - first)[:, None]
+        depth = self.knots.depth(between.reshape(-1, between.shape[-1]), min(begin + 1, end))
+        return np.asarray(np.sum(np.where(depth > 0, 1.0 + _DEPTH / _APPROACH * depth, 0.0).reshape(len(first), -1), axis=1))
+
+
+def _hits(depth: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return what collisions of some depth [m] cost, shape (B,)."""
+    return np.where(depth > 0, _COLLISION + _DEPTH * depth, 0.0)

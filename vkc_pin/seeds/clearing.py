@@ -1,0 +1,79 @@
+"""Pushes single configurations out of collision while what must hold there goes on holding, many at once."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from vkc_pin.chain.contacts import Contacts
+from vkc_pin.chain.inverse_kinematics import PoseSolver
+from vkc_pin.program.problem import TrajectoryProblem
+
+__all__ = ["clear_out"]
+
+_ROUNDS = 10
+_ROWS = 6  # contacts of a configuration that are looked at in one round
+_SPARE = 1e-2  # [m] further than the margin
+_LONGEST = 0.25  # [m] and [rad], of one round's step in one coordinate
+_DAMPING = 3e-4
+
+
+def clear_out(
+    problem: TrajectoryProblem,
+    z: NDArray[np.float64],
+    waypoint: int,
+    solver: PoseSolver,
+    target: pin.SE3,
+    *,
+    lower: NDArray[np.float64],
+    upper: NDArray[np.float64],
+    weights: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return configurations that are further from collision than `z`, as far as a few damped Gauss-Newton steps get them.
+
+    Each step asks for the residuals of the pose to vanish and for the contacts that fall short of their margins to keep them,
+    linearised: with the witness points fixed in their bodies the gradient of a distance d = n·(b − a) is n·(∂b − ∂a).
+
+    Args:
+        problem: Whose contacts count.
+        z: Configurations that satisfy the pose, shape (B, n).
+        waypoint: The waypoint they are for.
+        solver: Of the pose.
+        target: Of the pose.
+        lower: Limits, shape (B, n).
+        upper: Limits, shape (B, n).
+        weights: What moving a coordinate costs, shape (n,).
+    """
+    z, done = z.copy(), np.zeros(len(z), bool)
+    free = (upper - lower > 1e-9) / weights
+    for _ in range(_ROUNDS):
+        at = np.flatnonzero(~done)
+        if not len(at):
+            break
+        reach = problem.options.dist_safe + _SPARE
+        contacts = problem.contacts.evaluate(z[at], np.full(len(at), waypoint), reach=reach, nearest=_ROWS)
+        short = contacts.shortfall(len(at))
+        residual, pose_rows = solver.evaluate(z[at], target)
+        done[at] = (short <= 0.0) & (np.abs(residual).max(axis=1) < 1e-4)
+        rows, wanted = _contact_rows(problem, z[at], contacts)
+        jacobian = np.concatenate([pose_rows, rows], axis=1)
+        wanted = np.concatenate([-residual, wanted], axis=1)
+        scaled = jacobian * free[at][:, None, :]
+        system = scaled @ jacobian.transpose(0, 2, 1) + _DAMPING * np.eye(jacobian.shape[1])
+        step = np.einsum("bij,bi->bj", scaled, np.linalg.solve(system, wanted[..., None])[..., 0])
+        step *= np.minimum(1.0, _LONGEST / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12))
+        step[done[at]] = 0.0
+        z[at] = np.clip(z[at] + step, lower[at], upper[at])
+    return z
+
+
+def _contact_rows(
+    problem: TrajectoryProblem, z: NDArray[np.float64], contacts: Contacts
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return gradients of the nearest distances, shape (B, rows, n), and by how much they should grow, shape (B, rows) [m]."""
+    order = np.arange(len(contacts.waypoint)) - np.searchsorted(contacts.waypoint, contacts.waypoint)
+    rows, wanted = np.zeros((len(z), _ROWS, z.shape[1])), np.zeros((len(z), _ROWS))
+    rows[contacts.waypoint, order] = problem.contacts.gradients(z, contacts)
+    wanted[contacts.waypoint, order] = np.maximum(contacts.margin + _SPARE - contacts.distance, 0.0)
+    return rows, wanted

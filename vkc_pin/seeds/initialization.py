@@ -1,0 +1,276 @@
+"""Seeds for the solver: stationary, or through configurations the planner finds itself, straight or around what is in the way."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import islice
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vkc_pin.interrupt import NEVER, Interrupt
+from vkc_pin.program.problem import TrajectoryProblem
+from vkc_pin.seeds.approach import Approach
+from vkc_pin.seeds.beam import Beam, Found
+from vkc_pin.seeds.joining import DrivenPaths, Joiner, RrtPaths
+from vkc_pin.seeds.knots import Knots, Known, follow_objects
+from vkc_pin.seeds.routes import Routes
+from vkc_pin.seeds.seed import Seed
+
+__all__ = ["INITIALIZATIONS", "initialize"]
+
+INITIALIZATIONS = ("auto", "interpolated", "astar", "rrt", "stationary")
+# Shortfalls of a seed, summed over its waypoints [m]: nobody looks for a better one; trees are asked; others come first.
+_FREE, _POOR, _COLLIDING = 0.05, 0.5, 2.0
+_LOOKED, _GROWN = 8, 4  # paths whose seeds are compared; paths along which trees grow
+_HIT = 1e4  # cost that lets paths with knots in collision come last
+_WAVES = 6  # half waves of a perturbation over the whole motion
+_DIFFERENT = 0.1  # [m] and [rad] by which the base must differ somewhere between two seeds
+_ELSEWHERE, _DEARER = 0.5, 1.4  # by so much in a second seed of one search, which may cost so much more than the cheapest
+
+
+def initialize(
+    problem: TrajectoryProblem,
+    method: str,
+    seed: int,
+    *,
+    count: int = 1,
+    perturbation: float = 0.0,
+    notes: list[str] | None = None,
+    interrupt: Interrupt = NEVER,
+) -> Iterator[Seed]:
+    """Yield up to `count` seeds of each kind, best first; each is looked for when it is asked for.
+
+    Args:
+        problem: What is to be solved.
+        method: "stationary": the robot stays at its start, only the objects' joints go to their goals. "interpolated":
+            straight to a configuration at each goal, found by inverse kinematics from random seeds; where something fixed is
+            held, the seed follows its motion. "astar": to such configurations, the base along the shortest way around what
+            stands there, heading along it. "rrt": to such configurations, base and arm together along what two random trees find.
+            "auto": these three in turn, the last first where the others hit things.
+        seed: Of the random numbers.
+        count: How many different seeds to return.
+        perturbation: Standard deviation of what is added to the robot's coordinates, smoothly over time, [m] and [rad].
+        notes: Gets a line for every phase in which there is no way for the base.
+        interrupt: Ends the search; there are no more seeds then.
+    """
+    said: list[str] = [] if notes is None else notes
+    if method == "stationary":
+        seeds = iter([Seed(method, follow_objects(problem, np.tile(problem.start, (problem.segments, 1))))])
+    else:
+        shared = _Shared(problem, seed, said, Routes(problem, interrupt), Known(), interrupt)
+        if method == "auto":
+            around = _AStar(shared)
+            trees = _Rrt(shared, around)
+            seeds = _in_turn(_Interpolated(shared).seeds(count), around.seeds(count), trees.seeds(max(count, 2)))
+        else:
+            seeds = _SEARCHES[method](shared).seeds(count)
+    rng = np.random.default_rng([seed, 1])
+    for item in seeds:
+        yield replace(item, z=_perturbed(problem, item.z, perturbation, rng)) if perturbation else item
+
+
+def _in_turn(straight: Iterator[Seed], around: Iterator[Seed], trees: Iterator[Seed]) -> Iterator[Seed]:
+    """Yield from all in turn, first what goes straight, unless that collides everywhere.
+
+    Where what goes straight hits things, and so does what goes around, or does not get there, base and arm are looked for
+    together; that comes first then, and the others do not race it.
+    """
+    for seed in straight:
+        other = next(around, None) if seed.shortfall > _POOR else None
+        if seed.shortfall > _POOR and (other is None or other.shortfall > _POOR):
+            poor = sorted([seed] if other is None else [seed, other], key=lambda one: one.shortfall)
+            for good in trees:
+                yield good
+                poor = [replace(one, races=False) for one in poor]
+            yield from poor
+        elif other is not None and seed.shortfall > _COLLIDING:
+            yield other
+            yield seed
+        else:
+            yield seed
+            yield from islice(around, 1) if other is None else [other]
+    yield from around
+    yield from trees
+
+
+def _perturbed(
+    problem: TrajectoryProblem, z: NDArray[np.float64], deviation: float, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Return a seed with smooth noise on the robot's coordinates: half waves in time, of decreasing amplitude."""
+    robot, waves = problem.chain.robot.coordinates.size, np.arange(1, _WAVES + 1)
+    shape = np.sin(np.pi * np.outer(np.arange(1, len(z) + 1) / (len(z) + 1), waves)) / waves
+    noise = shape @ rng.normal(0.0, deviation, (len(waves), robot)) / np.sqrt(np.sum(0.5 / waves**2))
+    z = z.copy()
+    z[:, :robot] += noise
+    return problem.clip(z)
+
+
+@dataclass(frozen=True, eq=False)
+class _Shared:
+    """What the searches for seeds of one problem have in common: also the paths of the base, and what was found out."""
+
+    problem: TrajectoryProblem
+    seed: int
+    notes: list[str]
+    routes: Routes
+    known: Known
+    interrupt: Interrupt
+
+    @property
+    def driven(self) -> Routes | None:
+        """The paths of the base; None if it is fixed."""
+        return self.routes if self.problem.chain.robot.base != "fixed" else None
+
+    def knots(self) -> Knots:
+        """Return where configurations come from, with random numbers of its own."""
+        return Knots(self.problem, np.random.default_rng(self.seed), self.known)
+
+
+class _SeedSearch:
+    """Joins the knots of the cheapest paths.
+
+    Attributes:
+        method: Its name among `INITIALIZATIONS`.
+        enough: Shortfalls with which nobody looks for a better seed, summed over waypoints [m].
+        found: What its last search found, if that is any good.
+    """
+
+    method: ClassVar[str]
+    enough: ClassVar[float] = _FREE
+
+    def __init__(self, shared: _Shared, beam: Beam, joiner: Joiner) -> None:
+        self.problem, self.notes, self.beam, self.joiner = shared.problem, shared.notes, beam, joiner
+        self.interrupt = shared.interrupt
+        self.found: Found | None = None
+
+    def seeds(self, count: int) -> Iterator[Seed]:
+        """Yield seeds through the cheapest paths of knots: of one quick search if that is any good, then of thorough ones."""
+        given: list[NDArray[np.float64]] = []
+        for attempt in range(count + 1):
+            if self.interrupt.pressed:
+                return
+            found = self._search(attempt)
+            if found is None:
+                continue
+            order = self._order(found)
+            cheap = order[found.cost[order] <= _DEARER * found.cost[order[0]]]
+            for apart, some in ((_DIFFERENT, order), (_ELSEWHERE, cheap)):
+                new = [k for k in some if all(_distance(found.paths[k], other) > apart for other in given)]
+                best = self._best(found.paths, new, found.at)
+                if best is None:  # nor elsewhere: that is some of the same
+                    break
+                index, z, short = best
+                given.append(found.paths[index])
+                name = self.method if len(given) == 1 else f"{self.method} {len(given)}"
+                yield Seed(name, z, short, races=short <= _COLLIDING)
+                if len(given) == count:
+                    return
+
+    def _search(self, attempt: int) -> Found | None:
+        """Return what a search finds: a quick one, None if it is no good, then thorough ones."""
+        found = self.beam.search(thorough=attempt > 0)
+        if found is None:
+            return None
+        self.found = found if self.beam.tolerable(found) else None
+        return self.found if attempt == 0 else found
+
+    def _order(self, found: Found) -> NDArray[np.int_]:
+        """Return the paths in the order in which they are to be joined."""
+        return np.argsort(found.cost, kind="stable")
+
+    def _tried(self, paths: NDArray[np.float64], candidates: list[int]) -> list[int]:
+        """Return of candidates those of which one is to become a seed."""
+        return candidates[:_LOOKED]
+
+    def _best(
+        self, paths: NDArray[np.float64], candidates: list[int], at: list[int]
+    ) -> tuple[int, NDArray[np.float64], float] | None:
+        """Return the path, of the cheapest, whose seed has the least l1 merit, that seed and its shortfall.
+
+        The first that falls short of next to nothing will do. None if no path of the robot leads through any of them.
+        """
+        best, least = None, np.inf
+        for index in self._tried(paths, candidates):
+            z = self.joiner.join(paths[index], at)
+            if self.interrupt.pressed:  # what was not found may be there all the same
+                return None
+            self.notes += [line for line in self.joiner.blocked if line not in self.notes]
+            if z is None:
+                continue
+            contacts = self.problem.evaluate_contacts(z, reach=self.problem.options.dist_safe, nearest=1)
+            short = float(contacts.shortfall(len(z)).sum())
+            merit = self.problem.objective(z, self.problem.timing_for(z).dt) + self.problem.options.penalty * short
+            if merit < least:
+                best, least = (index, z, short), merit
+            if short < self.enough:
+                break
+        return best
+
+
+class _Interpolated(_SeedSearch):
+    """Straight from knot to knot."""
+
+    method = "interpolated"
+
+    def __init__(self, shared: _Shared) -> None:
+        knots = shared.knots()
+        super().__init__(shared, Beam(knots, interrupt=shared.interrupt), Joiner(knots, Approach(knots), None))
+
+
+class _AStar(_SeedSearch):
+    """The base along the shortest path around what stands there, the arm straight."""
+
+    method = "astar"
+
+    def __init__(self, shared: _Shared) -> None:
+        knots, routes = shared.knots(), shared.driven
+        paths = None if routes is None else DrivenPaths(routes)
+        super().__init__(shared, Beam(knots, routes, interrupt=shared.interrupt), Joiner(knots, Approach(knots), paths))
+
+
+class _Rrt(_SeedSearch):
+    """Base and arm together along what two random trees find; slow, so the first seed that is nearly free will do.
+
+    Args:
+        shared: Problem, random numbers, notes.
+        around: Its search comes first, if what that found hits nothing.
+    """
+
+    method = "rrt"
+    enough = _POOR
+
+    def __init__(self, shared: _Shared, around: _AStar | None = None) -> None:
+        knots = shared.knots()
+        beam = Beam(knots, shared.driven, careful=True, interrupt=shared.interrupt)
+        trees = RrtPaths(knots, shared.routes, shared.interrupt)
+        super().__init__(shared, beam, Joiner(knots, Approach(knots, stands=True), trees))
+        self.around = around
+
+    def _search(self, attempt: int) -> Found | None:
+        """Return what a search finds, None if it is no good: a quick one, then thorough ones, every other backwards."""
+        found = self.around.found if attempt == 0 and self.around is not None else None
+        if found is None or found.trouble.min() > 0:
+            found = self.beam.search(thorough=attempt > 0, backwards=attempt % 2 == 1)
+        return found if found is not None and self.beam.tolerable(found) else None
+
+    def _order(self, found: Found) -> NDArray[np.int_]:
+        return np.argsort(found.cost + _HIT * (found.trouble > 0), kind="stable")
+
+    def _tried(self, paths: NDArray[np.float64], candidates: list[int]) -> list[int]:
+        """Return a few candidates of which no two are alike: where no path leads to one, hardly one leads to the other."""
+        kept: list[int] = []
+        for index in candidates:
+            if all(_distance(paths[index], paths[other]) > _DIFFERENT for other in kept):
+                kept.append(index)
+        return kept[:_GROWN]
+
+
+_SEARCHES: dict[str, type[_Interpolated | _AStar | _Rrt]] = {search.method: search for search in (_Interpolated, _AStar, _Rrt)}
+
+
+def _distance(path: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    """Return by how much the base differs somewhere between two paths, both (K, n) [m] or [rad]."""
+    return float(np.abs(path - other)[:, :3].max())

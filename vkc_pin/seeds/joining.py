@@ -1,0 +1,194 @@
+"""From configurations at a few waypoints to all of them: straight, along a path of the base, or along one of base and arm."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vkc_pin.interrupt import NEVER, Interrupt
+from vkc_pin.seeds.approach import Approach
+from vkc_pin.seeds.knots import Knots, smooth
+from vkc_pin.seeds.routes import Routes
+from vkc_pin.seeds.rrt import TRIES, connect, spread
+from vkc_pin.task.phases import Phase
+
+__all__ = ["DrivenPaths", "Joiner", "Paths", "RrtPaths"]
+
+_LEAST = 8  # part of the usual tries that trees have at least, however often they failed before
+
+
+class Paths(Protocol):
+    """Finds paths of the robot where nothing fixed is held."""
+
+    careful: bool
+    """Whether configurations on the straight ways in and out are left out where they hit something."""
+
+    def path(
+        self, phase: int, first: NDArray[np.float64], last: NDArray[np.float64], steps: int, *, turns: bool, reaches: bool
+    ) -> NDArray[np.float64] | None:
+        """Return `steps` rows from `first` to `last`, both (n,), of the robot's first coordinates, shape (steps, c).
+
+        The last row is as `last`, but with `turns` the heading may end whole turns further, and without `reaches` the arm may end
+        elsewhere. None if there is no path.
+        """
+
+
+class DrivenPaths:
+    """The base along the shortest path around what stands there; the arm straight."""
+
+    careful = False
+
+    def __init__(self, routes: Routes) -> None:
+        self.routes = routes
+
+    def path(
+        self, phase: int, first: NDArray[np.float64], last: NDArray[np.float64], steps: int, *, turns: bool, reaches: bool
+    ) -> NDArray[np.float64] | None:
+        """See `Paths`."""
+        path = self.routes.path(phase, first[:3], last[:3], steps)
+        if path is not None and not turns:
+            path[:, 2] -= (path[-1, 2] - last[2]) * np.arange(1, steps + 1) / steps
+        return path
+
+
+class RrtPaths:
+    """Base and arm along a path that two random trees find, guided by one of the base."""
+
+    careful = True
+
+    def __init__(self, knots: Knots, routes: Routes, interrupt: Interrupt = NEVER) -> None:
+        self.knots, self.problem, self.routes, self.interrupt = knots, knots.problem, routes, interrupt
+        self.failed: Counter[int] = Counter()  # how often in a row in each phase
+
+    def path(
+        self, phase: int, first: NDArray[np.float64], last: NDArray[np.float64], steps: int, *, turns: bool, reaches: bool
+    ) -> NDArray[np.float64] | None:
+        """See `Paths`."""
+        problem, size = self.problem, self.knots.robot
+        poses, last = first[None, :3], last.copy()
+        if problem.chain.robot.base != "fixed":
+            guide = self.routes.guide(phase, first[:3], last[:3], 2 * steps)
+            if guide is None:
+                return None
+            turned = 2 * np.pi * np.rint((guide[-1, 2] - last[2]) / (2 * np.pi))
+            if turns:
+                last[2] += turned
+            else:
+                guide[:, 2] -= turned  # the trees find where there is room to turn
+            poses = guide
+        arms = [first[3:size], last[3:size], problem.chain.robot.home, self.routes.folded_arm(phase)]
+        ends = np.tile(last[:size], (1 if reaches else len(arms), 1))
+        if not reaches:
+            ends[:, 3:] = arms
+        tries = max(TRIES // 2 ** self.failed[phase], TRIES // _LEAST)  # what failed before is likely to fail again
+        given = {"poses": poses, "arms": np.array(arms), "rng": self.knots.rng, "tries": tries, "interrupt": self.interrupt}
+        path = connect(problem, phase, first, ends, **given)
+        self.failed[phase] = 0 if path is not None else self.failed[phase] + 1
+        return None if path is None else spread(path, steps)
+
+
+class Joiner:
+    """Joins knots of a problem.
+
+    Args:
+        knots: Of the problem.
+        approach: The straight ways in and out.
+        paths: The others, where nothing fixed is held; None: straight, too.
+    """
+
+    def __init__(self, knots: Knots, approach: Approach, paths: Paths | None) -> None:
+        self.knots, self.problem, self.approach, self.paths = knots, knots.problem, approach, paths
+        self.blocked: list[str] = []
+        """A line for every phase in which there was no path."""
+
+    def join(self, through: NDArray[np.float64], at: list[int]) -> NDArray[np.float64] | None:
+        """Return waypoints through configurations, shape (K, n), at waypoints `at`; where something fixed is held, closed.
+
+        None if there is no path somewhere.
+        """
+        problem, size = self.problem, self.problem.chain.size
+        z, knots = np.empty((problem.segments, size)), through.copy()
+        begin, previous = 0, None
+        for number, (phase, end) in enumerate(zip(problem.task.phases, problem.ends.tolist(), strict=True)):
+            inside = [k for k, waypoint in enumerate(at) if begin <= waypoint <= end]
+            if problem.closed(phase):
+                self._straight(z[begin:end], knots[inside], [at[k] - begin for k in inside])
+            elif not self._open(z[begin:end], knots, inside, number, previous):
+                return None
+            begin, previous = end, phase
+        self._close(z)
+        return problem.clip(z)
+
+    def _straight(self, z: NDArray[np.float64], through: NDArray[np.float64], when: list[int]) -> None:
+        """Fill rows of z, shape (steps, n), with straight lines through configurations, `when` counted from the row before z."""
+        s = np.concatenate([[0.0], smooth(len(z))])
+        for column in range(z.shape[1]):
+            z[:, column] = np.interp(s[1:], s[when], through[:, column])
+
+    def _open(
+        self, z: NDArray[np.float64], knots: NDArray[np.float64], inside: list[int], number: int, previous: Phase | None
+    ) -> bool:
+        """Fill the rows of a phase in which nothing fixed is held; turn the knots that follow as that ends. False: no path."""
+        problem, phase = self.problem, self.problem.task.phases[number]
+        end = int(problem.ends[number])
+        through, when, leave, arrive = self._via(knots[inside], number, previous, len(z))
+        path = None
+        if self.paths is not None:
+            steps = when[arrive] - when[leave]
+            reaches = self.knots.pose_at(end) is not None
+            turns = problem.lower[end - 1, 2] < problem.upper[end - 1, 2]  # unless the goal says how far to turn
+            path = self.paths.path(number, through[leave], through[arrive], steps, turns=turns, reaches=reaches)
+            if path is None:
+                self._note(phase, through[leave], through[arrive])
+                return False
+            turned = path[-1, 2] - through[arrive, 2]  # what follows goes on from there
+            through[arrive:, 2] += turned
+            knots[inside[-1] :, 2] += turned
+        self._straight(z, through, when)
+        if path is not None:
+            z[when[leave] : when[arrive], : path.shape[1]] = path
+            knots[inside[-1], : path.shape[1]] = z[-1, : path.shape[1]]
+        return True
+
+    def _via(
+        self, ends: NDArray[np.float64], number: int, previous: Phase | None, segments: int
+    ) -> tuple[NDArray[np.float64], list[int], int, int]:
+        """Return configurations to go through from start to end of a phase, `ends`, shape (2, n), and when, counted from 0.
+
+        The last two numbers say between which of them it is neither a straight way out nor one in.
+        """
+        phase = self.problem.task.phases[number]
+        first = self.approach.after(ends[0], phase, previous)
+        last = self.approach.before(ends[1], phase)
+        if self.paths is not None and self.paths.careful:
+            waypoint = self.problem.contacts.inside(number)
+            first, last = (part[: len(part) if self._free(part, waypoint) else 0] for part in (first, last))
+        steps = self.problem.options.approach_waypoints
+        spacing = max(1, min(steps, segments // (2 * max(len(first) + len(last), 1))))
+        when = [0, *(spacing * (1 + k) for k in range(len(first)))]
+        when += [*(segments - spacing * (len(last) - k) for k in range(len(last))), segments]
+        return np.vstack([ends[:1], first, last, ends[1:]]), when, len(first), len(first) + 1
+
+    def _free(self, z: NDArray[np.float64], waypoint: int) -> bool:
+        return not len(z) or bool(np.all(self.knots.depth(z, waypoint) < self.problem.options.dist_safe / 2))
+
+    def _close(self, z: NDArray[np.float64]) -> None:
+        """Move the objects' joints in z, shape (N, n), as they are driven, and the robot with what it holds."""
+        problem, driven = self.problem, self.knots.driven
+        z[:, driven] = self.knots.objects[:, driven]
+        for pose, row in enumerate(problem.transcription.structure.poses):
+            if len(row.waypoints) > 1:
+                rows = np.array(row.waypoints) - 1
+                lower, upper = problem.lower[rows].copy(), problem.upper[rows].copy()
+                lower[:, driven] = upper[:, driven] = self.knots.objects[np.ix_(rows, driven)]
+                solver, target = self.knots.solver(pose)
+                z[rows], _ = solver.solve(z[rows], target, lower=lower, upper=upper, weights=self.knots.weights, iterations=6)
+
+    def _note(self, phase: Phase, first: NDArray[np.float64], last: NDArray[np.float64]) -> None:
+        """Note, once a phase, that there is no path between two configurations, shape (n,)."""
+        problem = f"{phase.name}: found no way for the base"
+        if not any(note.startswith(problem) for note in self.blocked):
+            self.blocked.append(f"{problem} from ({first[0]:.2f}, {first[1]:.2f}) to ({last[0]:.2f}, {last[1]:.2f})")

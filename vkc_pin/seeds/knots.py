@@ -1,0 +1,265 @@
+"""Configurations that must hold at single waypoints: random ones, those next to others, and how far they are from free."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from vkc_pin.chain.inverse_kinematics import PoseSolver
+from vkc_pin.program.problem import TrajectoryProblem
+from vkc_pin.seeds.clearing import clear_out
+
+__all__ = ["CHOICE", "SCATTER", "Knots", "Known", "depth", "follow_objects", "scatter", "smooth"]
+
+SCATTER = 192  # random seeds for a configuration that nothing leads to
+CHOICE = 0.1  # what it costs to grasp elsewhere, beside radians of motion
+_ROUGH = 1e-4  # [m] and [rad], of knots; what is joined from them is exact
+
+
+class Known:
+    """What searches of one problem have found out: with the same random numbers they begin with the same configurations.
+
+    Attributes:
+        drawn: From the state of the random numbers, a waypoint and what configurations come from to these, which of them are what
+            must hold there, and the state that follows.
+        depths, cleared: From a waypoint and a configuration to how far that falls short, and to what it is when pushed.
+    """
+
+    def __init__(self) -> None:
+        self.drawn: dict[tuple[str, int, bytes], tuple[NDArray[np.float64], NDArray[np.bool_], Any]] = {}
+        self.depths: dict[tuple[int, bytes], NDArray[np.float64]] = {}
+        self.cleared: dict[tuple[int, bytes], NDArray[np.float64]] = {}
+
+
+_Found = dict[tuple[int, bytes], NDArray[np.float64]]
+
+
+def _row_by_row(
+    known: _Found,
+    find: Callable[[NDArray[np.float64], int], NDArray[np.float64]],
+    z: NDArray[np.float64],
+    waypoint: int,
+) -> NDArray[np.float64]:
+    """Return `find(z, waypoint)`, each row of which belongs to one of z; rows that are known are not asked for again."""
+    keys = [(waypoint, row.tobytes()) for row in z]
+    new = [k for k, key in enumerate(keys) if key not in known]
+    if len(new) == len(z):
+        found = find(z, waypoint)
+        known.update(zip(keys, found, strict=True))
+        return found
+    if new:
+        known.update(zip((keys[k] for k in new), find(z[new], waypoint), strict=True))
+    return np.array([known[key] for key in keys])
+
+
+class Knots:
+    """Draws configurations for waypoints of a problem.
+
+    Args:
+        problem: The problem.
+        rng: Random numbers.
+        known: What other searches of the problem have found out; None: nothing.
+
+    Attributes:
+        problem: The problem.
+        objects: The motion of the objects' joints, shape (N, n); the other columns are the start's.
+        driven: Which columns these joints are.
+        weights: What moving a coordinate costs, shape (n,).
+        robot: Number of the robot's coordinates.
+    """
+
+    def __init__(self, problem: TrajectoryProblem, rng: np.random.Generator, known: Known | None = None) -> None:
+        self.problem, self.rng, self.known = problem, rng, Known() if known is None else known
+        self.chain = problem.chain
+        self.robot = self.chain.robot.coordinates.size
+        self.weights = np.ones(self.chain.size)
+        self.weights[:3] = 3.0
+        self.weights[[column for column, _, _ in problem.choices]] = CHOICE
+        self.driven = np.array([self.chain.index(name) for name in problem.task.state], int)
+        self.objects = follow_objects(problem, np.tile(problem.start, (problem.segments, 1)))
+
+    def pose_at(self, waypoint: int) -> int | None:
+        """Return the pose that must hold at a waypoint, if any."""
+        poses = self.problem.transcription.structure.poses
+        return next((k for k, pose in enumerate(poses) if waypoint in pose.waypoints), None)
+
+    def solver(self, pose: int) -> tuple[PoseSolver, pin.SE3]:
+        """Return the inverse kinematics of a pose, and its target."""
+        return self.problem.transcription.pose_solvers[pose], self.problem.targets[pose]
+
+    def knot(self, before: NDArray[np.float64], waypoint: int, how: str) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Return configurations for a waypoint, shape (B, n), and which of them are what must hold there.
+
+        Args:
+            before: What they come from, shape (B, n).
+            waypoint: Where they are to be.
+            how: "scatter": from anywhere; "track": the nearest ones; "shake": from there with the arms shaken, so that the
+                search can leave a way that is closing.
+        """
+        if how != "scatter":
+            return self._knot(before, waypoint, how)
+        key = (str(self.rng.bit_generator.state), waypoint, before.tobytes())
+        if key not in self.known.drawn:
+            self.known.drawn[key] = (*self._knot(before, waypoint, how), self.rng.bit_generator.state)
+        z, found, self.rng.bit_generator.state = self.known.drawn[key]
+        return z.copy(), found.copy()
+
+    def _knot(self, before: NDArray[np.float64], waypoint: int, how: str) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        z = before.copy()
+        z[:, self.driven] = self.objects[waypoint - 1, self.driven]
+        lower, upper = self._limits(before, waypoint)
+        pose = self.pose_at(waypoint)
+        if pose is None:
+            return np.clip(z, lower, upper), np.ones(len(z), bool)
+        solver, target = self.solver(pose)
+        if how == "scatter":
+            self._choose(z, waypoint)
+            z = self._scatter(z, pose)
+        elif how == "shake":
+            z = self._shake(z, pose)
+        z, found = solver.solve(z, target, lower=lower, upper=upper, weights=self.weights, tolerance=_ROUGH)
+        if how == "scatter":
+            z = self._unwind(z, before, lower, upper)
+        return z, found
+
+    def clear(self, z: NDArray[np.float64], waypoint: int) -> NDArray[np.float64]:
+        """Return configurations for a waypoint, shape (B, n), pushed out of collision as far as that goes; see `clearing`."""
+        pose = self.pose_at(waypoint)
+        if pose is None:
+            return z
+        return _row_by_row(self.known.cleared, lambda rows, at: self._clear(rows, at, pose), z, waypoint)
+
+    def _clear(self, z: NDArray[np.float64], waypoint: int, pose: int) -> NDArray[np.float64]:
+        lower, upper = self._limits(z, waypoint)
+        solver, target = self.solver(pose)
+        weights = self.weights
+        pushed = clear_out(self.problem, z, waypoint, solver, target, lower=lower, upper=upper, weights=weights)
+        exact, _ = solver.solve(pushed, target, lower=lower, upper=upper, weights=weights, iterations=3, tolerance=_ROUGH)
+        return exact
+
+    def _limits(self, before: NDArray[np.float64], waypoint: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the limits of what comes from `before`, shape (B, n), at a waypoint: lower and upper, shape (B, n)."""
+        row = waypoint - 1
+        lower, upper = (np.tile(limits[row], (len(before), 1)) for limits in (self.problem.lower, self.problem.upper))
+        lower[:, self.driven] = upper[:, self.driven] = self.objects[row, self.driven]
+        for column, grasp, last in self.problem.choices:
+            if grasp < waypoint <= last:
+                lower[:, column] = upper[:, column] = before[:, column]
+        return lower, upper
+
+    def _choose(self, z: NDArray[np.float64], waypoint: int) -> None:
+        """Grasp anywhere: draw the freedoms of what is grasped at a waypoint, in place."""
+        problem = self.problem
+        for hold in problem.task.phases[int(np.searchsorted(problem.ends, waypoint))].grasps:
+            for column in map(self.chain.index, self.chain.virtual[hold]):
+                z[:, column] = self.rng.uniform(self.chain.lower[column], self.chain.upper[column], len(z))
+
+    def _scatter(self, z: NDArray[np.float64], pose: int) -> NDArray[np.float64]:
+        """Return arms near home, and every other near where it comes from, with the base under them as `pose` needs it."""
+        home = self.chain.robot.home
+        spread = self.rng.uniform(0.1, 1.0, (len(z), 1))
+        z = z.copy()
+        z[::2, 3 : self.robot] = home
+        z[:, 3 : self.robot] += spread * self.rng.normal(0.0, 1.0, (len(z), len(home)))
+        return self._stand(np.clip(z, self.problem.chain.lower, self.problem.chain.upper), pose)
+
+    def _shake(self, z: NDArray[np.float64], pose: int) -> NDArray[np.float64]:
+        spread = self.rng.uniform(0.05, 0.5, (len(z), 1))
+        z = z.copy()
+        z[:, 3 : self.robot] += spread * self.rng.normal(0.0, 1.0, (len(z), self.robot - 3))
+        return self._stand(np.clip(z, self.problem.chain.lower, self.problem.chain.upper), pose)
+
+    def _stand(self, z: NDArray[np.float64], pose: int) -> NDArray[np.float64]:
+        """Move the bases so that pose `pose` fits in place and heading; its height and tilt are left to the arm.
+
+        A base motion multiplies the frame's placement from the left, so the error T* T⁻¹, projected to the floor, is it.
+        """
+        row, target = self.problem.transcription.structure.poses[pose], self.problem.targets[pose]
+        rotations, translations = self.chain.joint_placements(z)
+        rotation = rotations[:, row.joint] @ row.local.rotation
+        translation = rotations[:, row.joint] @ row.local.translation + translations[:, row.joint]
+        error = np.einsum("ij,bkj->bik", target.rotation, rotation)
+        if row.kind == "pose":
+            turn = np.arctan2(error[:, 1, 0] - error[:, 0, 1], error[:, 0, 0] + error[:, 1, 1])
+        else:  # any heading will do
+            turn = self.rng.uniform(-np.pi, np.pi, len(z))
+        cos, sin = np.cos(turn), np.sin(turn)
+        planar = np.stack([np.stack([cos, -sin], axis=1), np.stack([sin, cos], axis=1)], axis=1)
+        z = z.copy()
+        z[:, :2] = target.translation[:2] + np.einsum("bij,bj->bi", planar, z[:, :2] - translation[:, :2])
+        z[:, 2] += turn
+        return z
+
+    def _unwind(
+        self, z: NDArray[np.float64], before: NDArray[np.float64], lower: NDArray[np.float64], upper: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Replace each revolute robot joint's angle by the equal one nearest to where it comes from."""
+        z = z.copy()
+        for column in range(2, self.robot):
+            if self.problem.unit(self.chain.names[column]) == "m":
+                continue
+            nearest = before[:, column] + (z[:, column] - before[:, column] + np.pi) % (2 * np.pi) - np.pi
+            inside = (nearest >= lower[:, column]) & (nearest <= upper[:, column])
+            z[:, column] = np.where(inside, nearest, z[:, column])
+        return z
+
+    def depth(self, z: NDArray[np.float64], waypoint: int) -> NDArray[np.float64]:
+        """Return how far each configuration falls short of its margins [m], shape (B,)."""
+        return _row_by_row(self.known.depths, lambda rows, at: depth(self.problem, rows, at), z, waypoint)
+
+
+def depth(problem: TrajectoryProblem, z: NDArray[np.float64], waypoint: int, *, standing: bool = True) -> NDArray[np.float64]:
+    """Return how far configurations at a waypoint, shape (B, n), fall short of their margins [m], shape (B,).
+
+    Without `standing` only from the robot itself and what it carries.
+    """
+    waypoints, reach = np.full(len(z), waypoint), problem.options.dist_safe
+    contacts = problem.contacts.evaluate(z, waypoints, reach=reach, nearest=1, standing=standing)
+    return contacts.shortfall(len(z))
+
+
+def scatter(
+    problem: TrajectoryProblem, waypoint: int, rng: np.random.Generator
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Return random configurations that try to be at the goal of `waypoint`, shape (B, n), and their residuals, shape (B,).
+
+    None if there is neither a pose to reach nor a place for the base there.
+    """
+    search = Knots(problem, rng)
+    pose, row = search.pose_at(waypoint), waypoint - 1
+    z = np.tile(problem.start, (SCATTER, 1))
+    if pose is not None:
+        z, found = search.knot(z, waypoint, "scatter")
+        pushed = z.copy()
+        pushed[found] = search.clear(z[found], waypoint)
+        solver, target = search.solver(pose)
+        before, after = (np.abs(solver.evaluate(rows, target)[0]).max(axis=1) for rows in (z, pushed))
+        kept = after < _ROUGH  # where being pushed did not cost what must hold there
+        return np.where(kept[:, None], pushed, z), np.where(kept, after, before)
+    if (problem.lower[row, :2] < problem.upper[row, :2]).any():
+        return None
+    z[:, 2:] += rng.normal(0.0, 1.0, z[:, 2:].shape)
+    return np.clip(z, problem.lower[row], problem.upper[row]), np.zeros(len(z))
+
+
+def smooth(steps: int) -> NDArray[np.float64]:
+    """Return s at 1/steps, ..., 1 of the profile that starts and ends at rest, 3s² − 2s³, shape (steps,)."""
+    s = np.arange(1, steps + 1) / steps
+    return s * s * (3.0 - 2.0 * s)
+
+
+def follow_objects(problem: TrajectoryProblem, z: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Let the objects' joints run to their goals phase by phase."""
+    begin, current = 0, problem.start.copy()
+    for phase, end in zip(problem.task.phases, problem.ends, strict=True):
+        for name in phase.before:
+            column = problem.chain.index(name)
+            goal = problem.lower[end - 1, column] if name in phase.values else current[column]
+            z[begin:end, column] = current[column] + (goal - current[column]) * smooth(end - begin)
+            current[column] = goal
+        begin = end
+    return problem.clip(z)

@@ -1,0 +1,146 @@
+"""Paths of the base for every phase of a problem: A* around what stands there, with what is carried."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from vkc_pin.driving.body import Shape
+from vkc_pin.driving.grid import BaseGrid, fine_cells
+from vkc_pin.driving.path import BasePath, poses_along, shortest_path
+from vkc_pin.interrupt import NEVER, Interrupt
+from vkc_pin.program.problem import TrajectoryProblem
+from vkc_pin.scene.hold import Hold
+from vkc_pin.scene.obstacles import FLOOR
+from vkc_pin.seeds.folded_arm import folded_arm
+
+__all__ = ["Routes", "grid_shapes"]
+
+_FOOT = 2  # the joint of the model that is the arm's first: joint 1 is the base
+_NEAR = 0.4  # [m] from the ends of a path: there the arm reaches in and out, and only the base counts
+_COARSE = 0.5  # [m]: starts closer together share their distances
+_BESIDE, _BESIDES = (0.4, 0.4, 0.6), 60  # how far from a goal a guide may end [m, m, rad], how many such places are tried,
+_DEARER = 3.0  # and what it costs for each metre or radian
+
+
+class Routes:
+    """The base's paths in each phase of a problem, looked for when they are asked for.
+
+    With the arm folded, the grid is one for narrow passages: cells are so small that one of them is in the middle of any
+    passage in which there is room for the margins, and there nothing but contact counts.
+    """
+
+    def __init__(self, problem: TrajectoryProblem, interrupt: Interrupt = NEVER) -> None:
+        self.problem, self.interrupt = problem, interrupt
+        self.arm = slice(3, problem.chain.robot.coordinates.size)
+        self._grids: dict[tuple[int, bool], BaseGrid] = {}
+        self._folded: dict[tuple[Hold, ...], NDArray[np.float64]] = {}
+        self._distances: dict[tuple[int, bool, int, int], NDArray[np.float64]] = {}
+        self._paths: dict[tuple[int, bytes, bytes], BasePath | None] = {}
+
+    def grid(self, phase: int, *, folded: bool = False) -> BaseGrid:
+        """Return where the base fits in a phase: near the ends of a path alone, elsewhere with arm and load.
+
+        Args:
+            phase: The phase.
+            folded: With the arm folded; otherwise it is at home.
+        """
+        key = (phase, folded)
+        if key not in self._grids:
+            z, arena, margin = self._resting(), self.problem.scene.arena, self.problem.options.dist_safe
+            if folded:
+                z[self.arm] = self.folded_arm(phase)
+            moving, standing = grid_shapes(self.problem, phase, z)
+            # Where the arm stands on the base it is always: a low base does not go under a table that the arm does not.
+            base = [shape for joint, shape in moving if joint <= _FOOT]
+            carried = [shape for joint, shape in moving if joint > _FOOT]
+            self._grids[key] = (
+                BaseGrid(base, carried, standing, arena, 0.0, near=_NEAR, cells=fine_cells(arena, margin))
+                if folded
+                else BaseGrid(base, carried, standing, arena, margin, near=_NEAR)
+            )
+        return self._grids[key]
+
+    def folded_arm(self, phase: int) -> NDArray[np.float64]:
+        """Return the arm folded with what is held in a phase, shape (m - 3,); see `compact.folded_arm`."""
+        held = self.problem.task.phases[phase].held
+        if held not in self._folded:
+            self._folded[held] = folded_arm(self.problem, phase, self._resting(), self.interrupt)
+        return self._folded[held]
+
+    def _resting(self) -> NDArray[np.float64]:
+        """Return the arm at home on a base at the origin, with grasps as near to 0 as they go, shape (n,)."""
+        chain, z = self.problem.chain, self.problem.start.copy()
+        z[:3], z[self.arm] = 0.0, chain.robot.home
+        for column in (chain.index(name) for names in chain.virtual.values() for name in names):
+            z[column] = np.clip(0.0, chain.lower[column], chain.upper[column])
+        return z
+
+    def distances(
+        self, phase: int, starts: NDArray[np.float64], goals: NDArray[np.float64], *, folded: bool = False
+    ) -> NDArray[np.float64]:
+        """Return how far it is at least from starts to goals, both (B, 3), one by one, shape (B,) [m]; infinite: no path."""
+        grid = self.grid(phase, folded=folded)
+        keys = [(phase, folded, *np.floor(start[:2] / _COARSE).astype(int).tolist()) for start in starts]
+        new = {key: start[:2] for key, start in zip(keys, starts, strict=True) if key not in self._distances}
+        if new:
+            self._distances |= dict(zip(new, grid.distances_from(np.array(list(new.values()))), strict=True))
+        cells = np.clip(np.floor((goals[:, :2] - grid.origin) / grid.step + 0.5).astype(int), 0, grid.cells - 1)
+        return np.array([self._distances[key][i, j] for key, (i, j) in zip(keys, cells, strict=True)])
+
+    def path(self, phase: int, start: NDArray[np.float64], goal: NDArray[np.float64], steps: int) -> NDArray[np.float64] | None:
+        """Return `steps` poses of the base from start to goal, both (3,), the last at the goal's place: shape (steps, 3).
+
+        The heading is continuous from the start's, and ends at one equal to the goal's. None if there is no path.
+        """
+        key = (phase, start.tobytes(), goal.tobytes())
+        if key not in self._paths:
+            self._paths[key] = shortest_path(self.grid(phase), start.tolist(), goal[None], interrupt=self.interrupt)
+        path = self._paths[key]
+        return None if path is None else poses_along(path, steps)
+
+    def guide(self, phase: int, start: NDArray[np.float64], goal: NDArray[np.float64], steps: int) -> NDArray[np.float64] | None:
+        """Return poses from a start to a goal, both (3,), or to next to it, on which the base fits, shape (steps, 3).
+
+        With the arm at home or, if there is no such path, with the arm folded. None if there is none either.
+        """
+        rng = np.random.default_rng(0)
+        beside = rng.normal(size=(_BESIDES, 3)) * rng.random((_BESIDES, 1)) * _BESIDE
+        beside[0] = 0.0
+        for folded in (False, True):
+            grid = self.grid(phase, folded=folded)  # the fine one only where it is needed
+            for places in (beside[:1], beside[1:]):
+                costs = _DEARER * np.abs(places).sum(axis=1)
+                path = shortest_path(grid, start.tolist(), goal + places, costs=costs, interrupt=self.interrupt)
+                if path is not None:
+                    return poses_along(path, steps)
+        return None
+
+
+def grid_shapes(problem: TrajectoryProblem, phase: int, z: NDArray[np.float64]) -> tuple[list[tuple[int, Shape]], list[Shape]]:
+    """Return what a grid of the base is made of: what rides on the base in a phase, and what stands in the world but the floor.
+
+    Args:
+        problem: Whose robot it is.
+        phase: In which it holds what it holds.
+        z: Its configuration with the base at the origin, shape (n,).
+
+    Returns:
+        Shapes in the base's frame, those of the robot first, each after the joint that carries it; shapes in the world.
+    """
+    chain, part = problem.chain, problem.contacts.phases[phase]
+    rotations, translations = chain.joint_placements(z[None])
+    robot = range(len(chain.robot.collision.geometryObjects))
+    held = [i for hold in problem.task.phases[phase].held for i in chain.held_geometries[hold]]
+    moving: list[tuple[int, Shape]] = []
+    for shape in (part.shapes[i] for i in [*robot, *held]):
+        joint = shape.parentJoint
+        carrier = pin.SE3(rotations[0, joint], translations[0, joint])
+        moving.append((joint, (shape.geometry, carrier * shape.placement)))
+    standing: list[Shape] = [
+        (shape.geometry, shape.placement)
+        for shape, label in zip(part.shapes, part.labels, strict=True)
+        if shape.parentJoint == 0 and label != FLOOR
+    ]
+    return moving, standing

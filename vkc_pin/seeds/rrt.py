@@ -1,0 +1,239 @@
+"""A path of base and arm together from one configuration to another, by two random trees that grow towards each other.
+
+RRT-Connect (Kuffner and LaValle, ICRA 2000) in the robot's coordinates. The base is drawn near a path that it could drive, the
+arm near postures it is likely to need there, so that narrow passages are found soon.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vkc_pin.interrupt import NEVER, Interrupt
+from vkc_pin.program.problem import TrajectoryProblem
+from vkc_pin.seeds.knots import depth, smooth
+
+__all__ = ["TRIES", "connect", "spread"]
+
+TRIES = 1500
+"""How often a tree may grow until they meet."""
+
+_BASE = 2.0  # radians of the arm that a metre of the base's path counts as much as
+_STEP = 0.15  # [rad] between configurations that are looked at
+_EXTENT = 1.0  # [rad] by which a tree grows at most towards what is drawn
+_CHUNK = 6  # configurations looked at in one go: what lies behind the first that is blocked is of no use
+_GRAZE = 0.8  # share of a margin that may be missing: the solver pushes that apart
+_RUNS = 0.4  # share of tries in which a tree is to reach a free part of the base's path
+_GUIDED, _SHAKEN = 0.7, 0.4  # shares of bases drawn on its path, not around its ends, and of arms drawn around what is likely
+_BESIDE, _AROUND, _WILD = (0.1, 0.1, 0.15), (0.4, 0.4, 0.5), 0.6  # standard deviations [m, m, rad] and [rad]
+_SHORTCUTS = 60  # how often it is tried to go straight between places on the path
+
+
+def connect(
+    problem: TrajectoryProblem,
+    phase: int,
+    first: NDArray[np.float64],
+    ends: NDArray[np.float64],
+    *,
+    poses: NDArray[np.float64],
+    arms: NDArray[np.float64],
+    rng: np.random.Generator,
+    tries: int = TRIES,
+    interrupt: Interrupt = NEVER,
+) -> NDArray[np.float64] | None:
+    """Return configurations of the robot, straight between which hardly anything is hit, shape (K, m), or None if none are found.
+
+    Args:
+        problem: Whose robot and phase it is.
+        phase: In which nothing fixed is held.
+        first: Where the path begins, shape (n,); what is not the robot stays so.
+        ends: Where it may end, shape (E, m).
+        poses: x, y [m] and yaw [rad] on a path that the base may take, shape (P, 3).
+        arms: Postures that are likely to be needed, shape (A, m - 3) [m] and [rad].
+        rng: Random numbers.
+        tries: How often a tree may grow.
+        interrupt: Ends the search.
+    """
+    return _Search(problem, phase, first, poses, arms, rng).run(ends, tries, interrupt)
+
+
+def spread(path: NDArray[np.float64], steps: int) -> NDArray[np.float64]:
+    """Return `steps` configurations along a path, shape (K, m), without its first: slow at both ends, shape (steps, m)."""
+    lengths = np.linalg.norm(np.diff(path, axis=0) * _weights(path.shape[1]), axis=1)
+    passed = np.concatenate([[0.0], np.cumsum(lengths + 1e-12)])
+    at = passed[-1] * smooth(steps)
+    return np.column_stack([np.interp(at, passed, column) for column in path.T])
+
+
+def _weights(size: int) -> NDArray[np.float64]:
+    weights = np.ones(size)
+    weights[:2] = _BASE
+    return weights
+
+
+class _Search:
+    def __init__(
+        self,
+        problem: TrajectoryProblem,
+        phase: int,
+        first: NDArray[np.float64],
+        poses: NDArray[np.float64],
+        arms: NDArray[np.float64],
+        rng: np.random.Generator,
+    ) -> None:
+        self.problem, self.first, self.poses, self.arms, self.rng = problem, first, poses, arms, rng
+        self.size = problem.chain.robot.coordinates.size
+        self.waypoint = problem.contacts.inside(phase)
+        self.allowed = _GRAZE * problem.options.dist_safe
+        self.weights = _weights(self.size)
+        limits = np.array([problem.limits(name) for name in problem.chain.names[: self.size]])
+        self.lower, self.upper = limits.T
+
+    def run(self, ends: NDArray[np.float64], tries: int, interrupt: Interrupt) -> NDArray[np.float64] | None:
+        """Return the path to one of `ends`."""
+        start = self.first[: self.size]
+        short = self._depth(ends)
+        ends = ends[short <= max(self.allowed, short.min())]
+        trees = _Tree(start[None], self.weights), _Tree(ends, self.weights)
+        direct = [*ends]
+        for number in range(tries):
+            if interrupt.pressed:
+                break
+            tree, other = (trees[0], trees[1]) if direct or number % 2 else (trees[1], trees[0])
+            if direct:
+                node = self._grow(tree, direct.pop(0), np.inf)
+            elif self.rng.random() < _RUNS and len(tree.runs) < len(self.runs):
+                node = self._grow_to_run(tree)
+            else:
+                node = self._grow(tree, self._draw(start, ends), _EXTENT)
+            if node is None:
+                continue
+            met = self._grow(other, tree.nodes[node], np.inf)
+            if met is not None and np.array_equal(other.nodes[met], tree.nodes[node]):
+                there, back = (node, met) if tree is trees[0] else (met, node)
+                return self._shortened(np.concatenate([trees[0].path(there), trees[1].path(back)[-2::-1]]))
+        return None
+
+    @cached_property
+    def runs(self) -> list[NDArray[np.float64]]:
+        """The parts of the base's path that are free with each of the arms, each shape (R, m)."""
+        runs = []
+        for arm in self.arms:
+            rows = np.clip(np.column_stack([self.poses, np.tile(arm, (len(self.poses), 1))]), self.lower, self.upper)
+            between = (rows[1:] + rows[:-1]) / 2
+            free = self._depth(np.concatenate([rows, between])) <= self.allowed
+            begin = None
+            for k in range(len(rows)):
+                if begin is None and free[k]:
+                    begin = k
+                if begin is not None and (k + 1 == len(rows) or not (free[len(rows) + k] and free[k + 1])):
+                    runs.append(rows[begin : k + 1])
+                    begin = None
+        return runs
+
+    def _grow_to_run(self, tree: _Tree) -> int | None:
+        """Let a tree grow towards a free part of the base's path, and take in all of it if it gets there."""
+        number = int(self.rng.choice([k for k in range(len(self.runs)) if k not in tree.runs]))
+        rows = self.runs[number]
+        at = int(self.rng.integers(len(rows)))
+        node = self._grow(tree, rows[at], np.inf)
+        if node is not None and np.array_equal(tree.nodes[node], rows[at]):
+            tree.runs.add(number)
+            for side in (rows[at + 1 :], rows[:at][::-1]):
+                parent = node
+                for row in side:
+                    parent = tree.add(row, parent)
+        return node
+
+    def _draw(self, start: NDArray[np.float64], ends: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return a configuration near the base's path, or near its beginning or end."""
+        rng, goal = self.rng, np.empty(self.size)
+        if rng.random() < _GUIDED:
+            goal[:3] = self.poses[rng.integers(len(self.poses))] + rng.random() * rng.normal(size=3) * _BESIDE
+        else:
+            end = start if rng.random() < 0.5 else ends[rng.integers(len(ends))]
+            goal[:3] = end[:3] + rng.random() * rng.normal(size=3) * _AROUND
+        goal[3:] = self.arms[rng.integers(len(self.arms))]
+        if rng.random() < _SHAKEN:
+            goal[3:] += rng.random() * _WILD * rng.normal(size=self.size - 3)
+        return np.clip(goal, self.lower, self.upper)
+
+    def _grow(self, tree: _Tree, goal: NDArray[np.float64], extent: float) -> int | None:
+        """Let a tree grow from its nearest node towards a configuration, as far as nothing is hit; return the new node."""
+        near = tree.nearest(goal)
+        start = tree.nodes[near]
+        far = float(np.abs((goal - start) * self.weights).max())
+        if far > extent:
+            goal = start + (goal - start) * (extent / far)
+        if far == 0.0:
+            return near
+        reached = self._along(start, goal)
+        if reached <= 0.0:
+            return None
+        return tree.add(goal if reached == 1.0 else start + reached * (goal - start), near)
+
+    def _along(self, a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+        """Return what share of the straight line from `a` to `b`, both (m,), is free."""
+        count = max(1, int(np.ceil(np.abs((b - a) * self.weights).max() / _STEP)))
+        s = np.arange(1, count + 1) / count
+        for begin in range(0, count, _CHUNK):
+            part = s[begin : begin + _CHUNK]
+            blocked = np.flatnonzero(self._depth(a + part[:, None] * (b - a)) > self.allowed)
+            if len(blocked):
+                return float(s[begin + blocked[0] - 1]) if begin + blocked[0] else 0.0
+        return 1.0
+
+    def _depth(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how far configurations of the robot, shape (B, m), fall short of their margins [m], shape (B,)."""
+        z = np.tile(self.first, (len(rows), 1))
+        z[:, : self.size] = rows
+        return depth(self.problem, z, self.waypoint)
+
+    def _shortened(self, path: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return a path that goes straight between random places on it where nothing is in the way."""
+        for _ in range(_SHORTCUTS):
+            if len(path) < 3:
+                break
+            passed = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0) * self.weights, axis=1))])
+            s, t = np.sort(self.rng.uniform(0.0, passed[-1], 2))
+            i, j = np.searchsorted(passed, [s, t], side="right") - 1
+            if i == j:
+                continue
+            a, b = (np.array([np.interp(at, passed, column) for column in path.T]) for at in (s, t))
+            if self._along(a, b) == 1.0:
+                path = np.concatenate([path[: i + 1], [a, b], path[j + 1 :]])
+        return path
+
+
+class _Tree:
+    """Configurations, each with the one it was reached from."""
+
+    def __init__(self, roots: NDArray[np.float64], weights: NDArray[np.float64]) -> None:
+        self._rows, self.parents, self.weights = roots.copy(), [-1] * len(roots), weights  # rows: those in use, and spare ones
+        self.runs: set[int] = set()
+
+    @property
+    def nodes(self) -> NDArray[np.float64]:
+        """The configurations, shape (K, m)."""
+        return self._rows[: len(self.parents)]
+
+    def nearest(self, goal: NDArray[np.float64]) -> int:
+        return int(np.argmin(np.linalg.norm((self.nodes - goal) * self.weights, axis=1)))
+
+    def add(self, node: NDArray[np.float64], parent: int) -> int:
+        number = len(self.parents)
+        if number == len(self._rows):
+            self._rows = np.concatenate([self._rows, np.empty_like(self._rows)])
+        self._rows[number] = node
+        self.parents.append(parent)
+        return number
+
+    def path(self, node: int) -> NDArray[np.float64]:
+        """Return the configurations from the root to a node, shape (K, m)."""
+        found = []
+        while node >= 0:
+            found.append(self.nodes[node])
+            node = self.parents[node]
+        return np.array(found[::-1])

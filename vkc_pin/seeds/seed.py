@@ -1,0 +1,85 @@
+"""Trajectories for the solver to start from, and what problems of some of the same phases hand on to them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vkc_pin.motion.trajectory import filled
+from vkc_pin.program.problem import TrajectoryProblem
+from vkc_pin.task.phases import PhaseKey
+
+__all__ = ["PhaseWaypoints", "Seed", "seed_of"]
+
+_NEAR = 0.2  # [m] and [rad] that planes are believed at first: what is nearly free already is improved in smaller steps
+
+
+@dataclass(frozen=True, eq=False)
+class Seed:
+    """A trajectory to start from.
+
+    Attributes:
+        name: The method, and the number of the try if it is not the first.
+        z: z_1..z_N, shape (N, n).
+        shortfall: By how much waypoints fall short of their clearances, summed [m]; NaN if nobody looked.
+        radius: How far the solver believes planes at first, shape (N,); None: as usual.
+        penalty: What clearance costs the solver at first; None: as usual.
+        races: Whether one round of the solver tells how good it is beside others; if not, others come first.
+    """
+
+    name: str
+    z: NDArray[np.float64]
+    shortfall: float = float("nan")
+    radius: NDArray[np.float64] | None = None
+    penalty: float | None = None
+    races: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class PhaseWaypoints:
+    """Waypoints of phases that follow one another.
+
+    Attributes:
+        phases: What happens in the phases.
+        names: Of the n coordinates.
+        waypoints: Their waypoints, for each phase, from its first, which is the last of the phase before, to its last.
+        seed: The name of the seed that led to them.
+    """
+
+    phases: tuple[PhaseKey, ...]
+    names: tuple[str, ...]
+    waypoints: tuple[NDArray[np.float64], ...]
+    seed: str
+
+
+def seed_of(problem: TrajectoryProblem, parts: Sequence[PhaseWaypoints]) -> Seed:
+    """Return the waypoints of `parts`, one after the other, as those of the whole problem, however many these are."""
+    chain = problem.chain
+    z = np.full((problem.segments, chain.size), np.nan)
+    begin = number = 0
+    for part in parts:
+        count = len(part.phases)
+        phases = problem.task.phases[number : number + count]
+        if part.phases != tuple(phase.key for phase in phases):
+            continue  # only to let go of something the robot stands still for a while; here that has no phase of its own
+        number += count
+        known = [k for k, name in enumerate(part.names) if name in chain.names]  # the rest belongs to what is held no more
+        columns = [chain.index(part.names[k]) for k in known]
+        for phase, waypoints in zip(phases, part.waypoints, strict=True):
+            z[begin : begin + phase.segments, columns] = _resampled(waypoints[:, known], phase.segments)
+            begin += phase.segments
+    z = filled(z)
+    z = np.where(np.isnan(z), problem.start, z)  # no part moves it
+    name = ", ".join(part.seed for part in parts) + ", then all at once"
+    return Seed(name, z, radius=np.full(problem.segments, _NEAR))
+
+
+def _resampled(waypoints: NDArray[np.float64], segments: int) -> NDArray[np.float64]:
+    """Return `segments` waypoints after the first along those given, shape (K, n)."""
+    if len(waypoints) == segments + 1:
+        return waypoints[1:]
+    at = np.linspace(0.0, len(waypoints) - 1, segments + 1)[1:]
+    return np.stack([np.interp(at, np.arange(len(waypoints)), column) for column in waypoints.T], axis=1)

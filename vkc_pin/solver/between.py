@@ -1,0 +1,93 @@
+"""Continuous refinement: what collides between two waypoints becomes planes at both of them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vkc_pin.chain.contacts import Contacts
+from vkc_pin.program.problem import TrajectoryProblem
+
+__all__ = ["collisions_between", "merge"]
+
+SPACING = 0.02  # [m] or [rad] between the states looked at first, in the coordinate that moves most
+CLOSE, FINER = 0.015, 8  # [m] where something is as close as that, so many times more states are looked at
+KEEP = 1e-2  # [m] clearance asked for between waypoints
+ENOUGH = 6e-4  # [m] clearance there that will do
+
+
+def collisions_between(problem: TrajectoryProblem, z: NDArray[np.float64]) -> tuple[Contacts, bool]:
+    """Return contacts at waypoints that stand for closeness inside the segments around them, and whether all is far enough.
+
+    At a sub-state (1 − s)·z_t + s·z_{t+1} with distance d < KEEP (or than the pair's margin, where that is less), the witness
+    points, fixed in their bodies, are carried to both waypoints. There n·(b − a) has some value v; asking for v + KEEP − d at
+    both lifts the sub-state by KEEP − d, to first order. Of each segment and pair only the deepest sub-state counts.
+
+    Args:
+        problem: The problem.
+        z: z_1..z_N, shape (N, n).
+
+    Returns:
+        Contacts at z_1..z_N, whose margin exceeds their distance by what is missing in between (or falls below it by what
+        is to spare: they guard against what is close already), and whether no sub-state is closer than `ENOUGH`.
+    """
+    path, contacts = problem.waypoints(z), problem.contacts.settled(z)
+    counts = np.maximum(np.ceil(np.abs(np.diff(path, axis=0)).max(axis=1) / SPACING).astype(int), 1)
+    segment = np.repeat(np.arange(len(z)), counts)
+    piece = np.arange(len(segment)) - np.searchsorted(segment, segment)
+    # The middles of the pieces first, and of pieces that something is close to the rest.
+    near = contacts.evaluate(*_states(path, segment, (piece + 0.5) / counts[segment]), reach=KEEP + CLOSE)
+    rows = np.unique(near.waypoint)
+    segment, begin, length = segment[rows], piece[rows] / counts[segment[rows]], 1 / counts[segment[rows]]
+    if not len(rows):
+        return _empty(), True
+    segment = np.repeat(segment, FINER)
+    s = (begin[:, None] + length[:, None] * (np.arange(FINER) + 0.5) / FINER).ravel()
+    states, waypoints = _states(path, segment, s)
+    found = _deepest(contacts.evaluate(states, waypoints, reach=KEEP + CLOSE), segment)
+    # A start that is close to something leaves it as it can: only what collides on the way counts.
+    found = found.select(np.flatnonzero((segment[found.waypoint] > 0) | (found.distance < 0)))
+    keep = np.minimum(KEEP, found.margin)
+    joints = contacts.joints_of(found.pair)
+    rotations, translations = contacts.placements(states[found.waypoint])
+    ends = problem.chain.joint_placements(path)
+    parts = []
+    for offset in (0, 1):
+        waypoint = segment[found.waypoint] + offset
+        points = []
+        for column, witness in ((0, found.first), (1, found.second)):
+            j, contact = joints[:, column], np.arange(len(joints))
+            local = np.einsum("cji,cj->ci", rotations[contact, j], witness - translations[contact, j])
+            points.append(np.einsum("cij,cj->ci", ends[0][waypoint, j], local) + ends[1][waypoint, j])
+        value = np.einsum("ci,ci->c", found.normal, points[1] - points[0])
+        inside = waypoint > 0  # the start cannot be moved
+        part = Contacts(waypoint - 1, found.pair, value, value + keep - found.distance, found.normal, points[0], points[1])
+        parts.append(part.select(np.flatnonzero(inside)))
+    return merge(*parts), bool(np.all(found.distance >= np.minimum(ENOUGH, keep)))
+
+
+def _states(
+    path: NDArray[np.float64], segment: NDArray[np.int_], s: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.int_]]:
+    """Return the states at 0 < s < 1 of segments, and the waypoints whose phases they belong to."""
+    share = s[:, None]
+    return (1 - share) * path[segment] + share * path[segment + 1], segment + 1
+
+
+def _deepest(found: Contacts, segment: NDArray[np.int_]) -> Contacts:
+    """Return the contact of smallest distance for each segment and pair."""
+    shapes = int(found.pair.max(initial=0)) + 1
+    keys = (segment[found.waypoint] * shapes + found.pair[:, 0]) * shapes + found.pair[:, 1]
+    order = np.lexsort((found.distance, keys))
+    return found.select(order[np.diff(keys[order], prepend=-1) > 0])
+
+
+def merge(*parts: Contacts) -> Contacts:
+    """Return all contacts of `parts`, per waypoint those first that fall shortest of their margins."""
+    joined = Contacts(*(np.concatenate(arrays) for arrays in zip(*(part.arrays() for part in parts), strict=True)))
+    return joined.select(np.lexsort((joined.distance - joined.margin, joined.waypoint)))
+
+
+def _empty() -> Contacts:
+    none, vectors = np.zeros(0), np.zeros((0, 3))
+    return Contacts(np.zeros(0, int), np.zeros((0, 2), int), none, none, vectors, vectors, vectors)

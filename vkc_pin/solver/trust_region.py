@@ -1,0 +1,122 @@
+"""Trials and the trust region: how far the witness planes are believed, and how that is learned from round to round."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vkc_pin.chain.contacts import Contacts
+
+__all__ = ["Trial", "TrustRegion", "judge"]
+
+BLOCK = 10  # waypoints that share a radius
+FIRST_RADIUS, RESTART_RADIUS, SETTLE_RADIUS, MIN_RADIUS, SHRINK = 0.5, 0.2, 0.05, 5e-3, 0.4  # [m] and [rad]
+NO_MATTER = 2e-3  # [m] of shortfall, summed over a block, that does not matter
+CLOSE_ENOUGH = 5e-4  # [m] shortfall of clearance at a waypoint that is none
+FAR = 1e-3  # [m] and [rad] of residuals at which a motion cannot be compared with one at which they vanish
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Where a round led, one Ipopt solve with fixed planes, and what is really there.
+
+    Attributes:
+        z: z_1..z_N, shape (N, n).
+        slack: What the planes let be missing of clearance at every waypoint, shape (N,) [m].
+        objective: f of eq. 1.
+        pose_error: Largest residual, see `TrajectoryProblem.row_error`.
+        contacts: What is close there.
+        shortfall: What is missing of clearance at every waypoint, shape (N,) [m].
+        clear: Whether all that was looked at is far enough from each other.
+        between: Whether that was done between waypoints, too.
+        rate: Largest excess over a limit on velocity or acceleration, relative to it.
+        step: The largest change of a coordinate at every waypoint, shape (N,).
+        satisfied: Whether Ipopt was.
+    """
+
+    z: NDArray[np.float64]
+    slack: NDArray[np.float64]
+    objective: float
+    pose_error: float
+    contacts: Contacts
+    shortfall: NDArray[np.float64]
+    clear: bool
+    between: bool
+    rate: float
+    step: NDArray[np.float64]
+    satisfied: bool
+
+
+class TrustRegion:
+    """How far waypoints may move in a round: the same for all of a block, so that trouble in one place does not hold up others.
+
+    Attributes:
+        radius: Of each waypoint, shape (N,) [m] and [rad].
+    """
+
+    def __init__(self, segments: int, radius: NDArray[np.float64] | None = None) -> None:
+        self.block = np.arange(segments) * max(1, round(segments / BLOCK)) // segments
+        self.radius = np.full(segments, FIRST_RADIUS) if radius is None else radius.copy()
+
+    def adapt(self, before: NDArray[np.float64], trial: Trial, accepted: bool, ratio: float) -> None:
+        """Widen blocks where what was promised came true, narrow those where it did not.
+
+        Args:
+            before: Shortfall of clearance at every waypoint before the round, shape (N,) [m].
+            trial: Where the round led.
+            accepted: Whether it goes on from there.
+            ratio: How much of the promised decrease of the merit came true.
+        """
+        blocks = int(self.block[-1]) + 1
+        promised, actual, worse = np.zeros(blocks), np.zeros(blocks), np.zeros(blocks, bool)
+        np.add.at(promised, self.block, before - trial.slack)
+        np.add.at(actual, self.block, before - trial.shortfall)
+        step = np.zeros(blocks)
+        np.maximum.at(step, self.block, trial.step)
+        worse = (promised - actual > NO_MATTER) & (actual < 0.25 * promised)
+        if not accepted and not worse.any():
+            worse[:] = True
+        good = (actual > 0.7 * promised - NO_MATTER) & accepted & (ratio > 0.25)
+        factor = np.where(worse, 0.0, np.where(good, 1.5, 1.0))
+        radius = np.array([self.radius[self.block == b][0] for b in range(blocks)])
+        radius = np.where(worse, SHRINK * np.minimum(radius, step), radius * factor)
+        self.radius = np.maximum(radius, 1e-6)[self.block]
+
+    def settle(self) -> None:
+        """Let waypoints move so little that planes are as good as distances."""
+        self.radius = np.minimum(self.radius, SETTLE_RADIUS)
+
+    def stuck(self, trial: Trial, shortfall: NDArray[np.float64]) -> bool:
+        """Return whether nothing moves any more where something is in the way."""
+        bad = shortfall > CLOSE_ENOUGH
+        if not bad.any():
+            bad[:] = True
+        return bool((np.minimum(self.radius, trial.step)[bad] < MIN_RADIUS).all())
+
+    def restart(self) -> None:
+        """Begin again, less boldly."""
+        self.radius = np.full(len(self.radius), RESTART_RADIUS)
+
+
+def judge(
+    trial: Trial, objective: float, shortfall: NDArray[np.float64], *, penalty: float, pose_error: float
+) -> tuple[bool, float]:
+    """Return whether to accept where a round led, and how much of the promised decrease of the ℓ1 merit came true.
+
+    Args:
+        trial: Where the round led.
+        objective: f of eq. 1 before it.
+        shortfall: Of clearance at every waypoint before it, shape (N,) [m].
+        penalty: What a metre of shortfall costs.
+        pose_error: Largest residual before it, [m] or [rad].
+    """
+    if pose_error > FAR:
+        return True, 0.5  # a seed off the closure's manifold cannot be compared with what is on it
+    merit = objective + penalty * float(shortfall.sum())
+    promised = merit - (trial.objective + penalty * float(trial.slack.sum()))
+    actual = merit - (trial.objective + penalty * float(trial.shortfall.sum()))
+    if promised < 1e-4 * max(1.0, abs(merit)):
+        return actual >= -1e-4 * max(1.0, abs(merit)), 0.5
+    return actual > 0.05 * promised, actual / promised

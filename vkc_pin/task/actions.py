@@ -1,0 +1,60 @@
+"""What a list of steps comes to before anything is planned: actions, and what cannot be done at its place."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from vkc_pin.options import Options
+from vkc_pin.scene.hold import as_mappings
+from vkc_pin.scene.scene import Scene
+from vkc_pin.task.compiler import compile_task, nothing_to_do
+from vkc_pin.task.phases import Task
+from vkc_pin.task.steps import Actuate, Grasp, Place, Release, Step, as_list
+
+__all__ = ["actions_of", "foresee"]
+
+
+def actions_of(steps: Sequence[Step]) -> list[tuple[Step, ...]]:
+    """Return steps by what is done together: a grasp with what comes of it, and letting go with what came before."""
+    actions: list[tuple[Step, ...]] = []
+    for step in steps:
+        last = actions[-1] if actions else ()
+        grasp = last[-1] if last and isinstance(last[-1], Grasp) else None
+        taken = grasp is not None and isinstance(step, Actuate | Place) and step.object == grasp.object
+        if last and (taken or isinstance(step, Release)):
+            actions[-1] = (*last, step)
+        else:
+            actions.append((step,))
+    return actions
+
+
+def foresee(scene: Scene, steps: Sequence[Step], options: Options) -> list[Task]:
+    """Check that every step can be done at its place, as far as that does not depend on motions; return what each asks for.
+
+    Raises:
+        InputError: It cannot; the error names the first such step.
+    """
+    tasks: list[Task] = []
+    for number, step in enumerate(as_list(steps)):
+        tasks.append(compile_task(scene, [step], options, nothing=True, first=number))
+        scene = _ideally_after(scene, tasks[-1])
+    if not any(task.phases for task in tasks):
+        raise nothing_to_do()
+    return tasks
+
+
+def _ideally_after(scene: Scene, task: Task) -> Scene:
+    """Return the scene in which a task ends if all goes as it says; what it leaves somewhere stands where it stood."""
+    scene = scene.with_held({})
+    for phase in task.phases:
+        for coordinate, value in phase.values.items():
+            name, _, joint = coordinate.partition(".")
+            thing = scene.objects[name].object
+            index = thing.coordinates.index(joint)
+            scene = scene.with_state(name, {joint: float(np.clip(value, thing.lower[index], thing.upper[index]))})
+        for hold, placement in phase.lowered.items():
+            scene = scene.with_placement(hold.object, placement)
+    held, by = as_mappings(task.after)
+    return scene.with_held(held, by=by)

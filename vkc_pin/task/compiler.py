@@ -1,0 +1,300 @@
+"""Turns steps into phases."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.options import Options
+from vkc_pin.scene.hold import Hold
+from vkc_pin.scene.placed import PlacedObject
+from vkc_pin.scene.scene import Scene
+from vkc_pin.task.lookup import attachment_of, check_link, joint_limits, path_joints, placed_object, robot_frame
+from vkc_pin.task.phases import FrameGoal, Mark, Phase, PhaseKind, Task
+from vkc_pin.task.steps import STEPS, Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch, as_list
+
+__all__ = ["compile_task", "nothing_to_do"]
+
+LATCH_MARGIN = 0.02  # [rad] or [m] past the threshold at which a latch lets go
+
+
+class _Compiler:
+    def __init__(self, scene: Scene, options: Options) -> None:
+        self.scene, self.options = scene, options
+        self.phases: list[Phase] = []
+        self.held: tuple[Hold, ...] = scene.holds
+        self.holds: list[Hold] = list(self.held)
+        self.initial: dict[str, float] = {}
+        self.state: dict[str, float] = {}
+        self.standing = {n: p.placement for n, p in scene.objects.items() if p.object.free and n not in scene.held}
+        self.left: dict[str, tuple[Hold, int]] = {}
+        for hold in self.held:
+            self._enter(scene.objects[hold.object], hold.attachment)
+
+    def _enter(self, placed: PlacedObject, attachment: str) -> None:
+        """Make the joints that a grasp can move coordinates of the task, with the values they have at its start."""
+        for joint in path_joints(placed, placed.object.attachments[attachment]):
+            value = float(placed.state[placed.object.coordinates.index(joint)])
+            self.initial.setdefault(f"{placed.name}.{joint}", value)
+            self.state.setdefault(f"{placed.name}.{joint}", value)
+
+    def _append(self, kind: PhaseKind, about: tuple[str, ...], segments: int, **details: Any) -> None:
+        last = self.phases[-1] if self.phases else None
+        before = (*last.held, *last.grasps) if last else self.scene.holds
+        leaves = tuple(hold for hold in before if hold not in self.held)
+        lifted = {hold: last.standing[hold.object] for hold in last.grasps if hold.object in last.standing} if last else {}
+        phase = Phase(
+            kind,
+            about,
+            segments,
+            held=self.held,
+            leaves=leaves,
+            before=dict(self.state),
+            standing=dict(self.standing),
+            left=dict(self.left),
+            lifted={hold: where for hold, where in lifted.items() if hold in self.held},
+            **details,
+        )
+        self.phases.append(phase)
+        for coordinate, value in phase.values.items():  # a goal beyond a limit is approached as far as it goes
+            lower, upper = joint_limits(self.scene.objects[coordinate.split(".", 1)[0]], coordinate)
+            self.state[coordinate] = min(max(value, lower), upper)
+
+    def _hold_of(self, name: str) -> Hold | None:
+        return next((hold for hold in self.held if hold.object == name), None)
+
+    def _let_go_of_fixed(self) -> None:
+        """Let go of what stands fixed in the world, which cannot come along."""
+        self.held = tuple(hold for hold in self.held if self.scene.objects[hold.object].object.free)
+
+    def grasp(self, name: str, attachment_name: str | None, where: str, by: str | None = None) -> Hold:
+        """Add the phase that takes hold of an object, unless it is held; return the hold."""
+        placed = placed_object(self.scene, name, f"{where}.object")
+        earlier = next((hold.attachment for hold in self.holds if hold.object == name and hold.frame == by), None)
+        attachment = attachment_of(placed, attachment_name or earlier, f"{where}.attachment")
+        through = self._through(by, name, f"{where}.by") if by is not None else None
+        hold = Hold(name, attachment.name, *(through or (None, None)))
+        if hold in self.held:
+            return hold
+        if (held := self._hold_of(name)) is not None and placed.object.free:
+            raise InputError(f"'{name}' is held already, as {held}", field=where, expected="Release or Place before")
+        if through is None:
+            self._let_go_of_fixed()
+            if self.held:
+                kind = "the robot has one hand, and it holds"
+                raise InputError(f"{kind} {self.held[0]}", field=f"{where}.object", expected="Place or Release before", got=name)
+        if not placed.object.free and through is not None:
+            raise InputError(f"'{name}' stands fixed in the world", field=f"{where}.by", expected="the hand itself", got=repr(by))
+        if not placed.object.free:
+            other = next((h for h in self.holds if h.object == name and h != hold), None)
+            if other is not None:
+                raise InputError(
+                    f"object '{name}' is grasped by two different attachments in one plan",
+                    field=f"{where}.attachment",
+                    expected=str(other).partition(".")[2],
+                    got=str(hold).partition(".")[2],
+                )
+        elif name in self.left:
+            raise InputError(
+                f"where '{name}' stands by then is known only after planning",
+                field=f"{where}.object",
+                expected="Place with a full pose before, or a second plan from where the first ends",
+            )
+        if hold not in self.holds:
+            self.holds.append(hold)
+        self._enter(placed, attachment.name)
+        about = (hold.object, hold.attachment, hold.frame or "")
+        self._append("grasp", about, self.options.reach_waypoints, grasps=(hold,))
+        self.held = (*self.held, hold)
+        self.standing.pop(name, None)
+        return hold
+
+    def _through(self, frame: str, name: str, where: str) -> tuple[Hold, str]:
+        """Return the hold and link of `frame`, "<object>.<link>", that object `name` is to be held through."""
+        owner, dot, link = str(frame).partition(".")
+        if not dot:
+            raise InputError("not a link of an object", field=where, expected="<object>.<link>, e.g. stick.tip", got=repr(frame))
+        placed = placed_object(self.scene, owner, where)
+        hold = self._hold_of(owner)
+        if hold is None or not placed.object.free:
+            held = ", ".join(str(h) for h in self.held if self.scene.objects[h.object].object.free) or "nothing"
+            problem = f"'{name}' cannot be grasped through '{owner}', which the robot does not carry"
+            raise InputError(problem, field=where, expected=f"a link of what it carries ({held})", got=repr(frame))
+        check_link(placed, link, where)
+        return hold, link
+
+    def actuate(self, step: Actuate, where: str) -> None:
+        placed = placed_object(self.scene, step.object, f"{where}.object")
+        names = placed.object.coordinates.names
+        for joint in step.joints:
+            if joint not in names:
+                raise UnknownNameError(f"joint of '{step.object}'", joint, names, field=f"{where}.joints")
+        if placed.object.free:
+            raise InputError(
+                f"'{step.object}' stands free: its joints are not driven by a hand",
+                field=f"{where}.object",
+                expected="a fixed object",
+            )
+        attachment = placed.object.attachments[self.grasp(step.object, step.attachment, where).attachment]
+        path = path_joints(placed, attachment)
+        for joint in step.joints:
+            if joint not in path:
+                raise InputError(
+                    f"joint '{joint}' does not move when '{step.object}' is held at '{attachment.name}'",
+                    field=f"{where}.joints",
+                    expected=f"one of {', '.join(path)}" if path else "an attachment that moves with it",
+                )
+        values = {f"{step.object}.{joint}": value for joint, value in step.joints.items()}
+        ranges = {coordinate: joint_limits(placed, coordinate) for coordinate in values}
+        after: dict[str, float] = {}  # what must wait until the latch is left behind
+        for latch in placed.object.latches:
+            held, release = f"{step.object}.{latch.joint}", f"{step.object}.{latch.released_by}"
+            if held not in values or values[held] == self.state[held]:
+                continue
+            if abs(self.state[held] - latch.held_at) > latch.engaged_within:
+                continue
+            if latch.released_by not in path:
+                if placed.state[names.index(latch.released_by)] >= latch.threshold:
+                    continue
+                raise InputError(
+                    f"'{latch.joint}' is latched, and '{latch.released_by}', which releases it, does not move when "
+                    f"'{step.object}' is held at '{attachment.name}'",
+                    field=f"{where}.attachment",
+                    expected=f"an attachment that moves '{latch.released_by}'",
+                )
+            lower, upper = joint_limits(placed, release)
+            turned = min(latch.threshold + LATCH_MARGIN, upper)
+            if self.state[release] < turned:
+                ranged, goal = {release: (lower, upper)}, {release: turned}
+                self._append("turn", (release,), self.options.turn_waypoints, ranges=ranged, values=goal)
+            if values.get(release, upper) < turned:
+                after[release] = values[release]
+            ranges[release] = (turned, upper)
+            values[release] = turned if release in after else values.get(release, turned)
+        self._append("move", tuple(values), self.options.move_waypoints, ranges=ranges, values=values)
+        if after:
+            limits = {release: joint_limits(placed, release) for release in after}
+            self._append("turn", tuple(after), self.options.turn_waypoints, ranges=limits, values=after)
+
+    def touch(self, step: Touch, where: str) -> None:
+        """Add the phase that brings a frame to its target, carrying on what is carried."""
+        owner, dot, link = str(step.frame).partition(".")
+        hold = None
+        if dot and owner in self.scene.objects:
+            placed = self.scene.objects[owner]
+            if not placed.object.free:
+                problem = f"'{owner}' stands fixed in the world and cannot be carried anywhere"
+                raise InputError(problem, field=f"{where}.frame", expected="a link of a free object, or a frame of the robot")
+            check_link(placed, link, f"{where}.frame")
+            hold = self._hold_of(owner) or self.grasp(owner, None, where)
+        elif dot and step.frame not in [f.name for f in self.scene.robot.model.frames]:
+            raise UnknownNameError("object", owner, self.scene.objects, field=f"{where}.frame")
+        else:
+            link = robot_frame(self.scene, step.frame, f"{where}.frame")
+        self._let_go_of_fixed()
+        point = not isinstance(step.target, pin.SE3)
+        target = pin.SE3(np.eye(3), np.array(step.target)) if point else step.target
+        goal = FrameGoal(link, target, "point" if point else "pose", hold, touches=True)
+        self._append("touch", (step.frame,), self.options.reach_waypoints, frames=(goal,))
+
+    def place(self, step: Place, where: str) -> None:
+        """Add the phases that bring an object to its place and leave it there."""
+        placed = placed_object(self.scene, step.object, f"{where}.object")
+        if not placed.object.free:
+            raise InputError(f"'{step.object}' stands fixed in the world", field=f"{where}.object", expected="a free object")
+        hold = self._hold_of(step.object) or self.grasp(step.object, step.attachment, where)
+        if step.attachment is not None and hold.attachment != step.attachment:
+            raise InputError("it is held elsewhere", field=f"{where}.attachment", expected=hold.attachment, got=step.attachment)
+        upright = not isinstance(step.pose, pin.SE3)
+        # As it stands; what is in the hand from the start stands with its z axis up.
+        stands = np.eye(3) if step.object in self.scene.held else placed.placement.rotation
+        pose = pin.SE3(stands, np.array(step.pose)) if upright else step.pose
+        goal = FrameGoal(placed.object.base_link, pose, "upright" if upright else "pose", hold)
+        self._append("place", (step.object,), self.options.reach_waypoints, frames=(goal,), lowered={hold: pose})
+        self._release(hold, pose)
+        if upright:
+            self.left[step.object] = (hold, len(self.phases) - 1)
+
+    def release(self, step: Release, where: str) -> None:
+        """Let go of one thing, or of everything."""
+        if not self.held:
+            raise InputError("the hand is empty", field=where, expected="something held", got=repr(step))
+        if step.object is not None and self._hold_of(step.object) is None:
+            held = [hold.object for hold in self.held]
+            raise UnknownNameError("held object", step.object, held, field=f"{where}.object")
+        if not self.phases:
+            self._append("stand", (), self.options.turn_waypoints)
+        for hold in reversed(self.held):
+            if hold in self.held and step.object in (None, hold.object):
+                placed = self.scene.objects[hold.object]
+                self._release(hold, placed.placement)
+                if placed.object.free:
+                    self.left[hold.object] = (hold, len(self.phases) - 1)
+
+    def _release(self, hold: Hold, where: pin.SE3) -> None:
+        """Take a hold, and what is held through it, out of the hand."""
+        for other in [h for h in self.held if h.by == hold]:
+            self._release(other, self.scene.objects[other.object].placement)
+            self.left[other.object] = (other, len(self.phases) - 1)
+        self.held = tuple(h for h in self.held if h != hold)
+        if self.scene.objects[hold.object].object.free:
+            self.standing[hold.object] = where
+
+    def add(self, step: Step, where: str) -> None:
+        if isinstance(step, Grasp):
+            self.grasp(step.object, step.attachment, where, step.by)
+        elif isinstance(step, Actuate):
+            self.actuate(step, where)
+        elif isinstance(step, Touch):
+            self.touch(step, where)
+        elif isinstance(step, Place):
+            self.place(step, where)
+        elif isinstance(step, Release):
+            self.release(step, where)
+        elif isinstance(step, Reach):
+            frame = robot_frame(self.scene, step.frame, f"{where}.frame")
+            self._let_go_of_fixed()
+            self._append("reach", (frame,), self.options.reach_waypoints, frames=(FrameGoal(frame, step.pose),))
+        elif isinstance(step, GoTo):
+            self._let_go_of_fixed()
+            self._append("go", (), self.options.reach_waypoints, base=(step.x, step.y, step.yaw))
+        else:
+            expected = ", ".join(kind.__name__ for kind in STEPS)
+            raise InputError("not a step", field=where, expected=expected, got=repr(step))
+
+
+def compile_task(scene: Scene, steps: Sequence[Step], options: Options, *, nothing: bool = False, first: int = 0) -> Task:
+    """Return the phases that bring about `steps`, beginning at the scene's start.
+
+    Args:
+        scene: Robot, objects and what is held at the start.
+        steps: What should change.
+        options: How many waypoints phases have.
+        nothing: Whether steps that change nothing are fine; there are no phases then.
+        first: The number of the first of `steps` in the user's list, for messages.
+
+    Raises:
+        InputError: No steps, an unknown object, joint, attachment or frame, a joint that cannot be moved that way, or a
+            hand that is asked to hold a second thing.
+    """
+    steps = as_list(steps)
+    compiler, marks = _Compiler(scene, options), list[Mark]()
+    for index, step in enumerate(steps, start=first):
+        compiler.add(step, f"steps[{index}]")
+        marks.append(Mark(len(compiler.phases), len(compiler.holds), len(compiler.initial), compiler.held))
+    if not compiler.phases and not nothing:
+        raise nothing_to_do()
+    # Objects that are grasped later stand as they are at the start until then.
+    phases = tuple(replace(phase, before={**compiler.initial, **phase.before}) for phase in compiler.phases)
+    return Task(steps, phases, tuple(compiler.holds), compiler.initial, compiler.held, tuple(marks))
+
+
+def nothing_to_do() -> InputError:
+    """Return the error for steps that change nothing."""
+    expected, got = "a step that changes something", "only what holds already"
+    return InputError("there is nothing to do", field="steps", expected=expected, got=got)

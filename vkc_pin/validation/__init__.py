@@ -1,0 +1,1 @@
+"""The independent check: is a motion right? Knows neither chain nor program."""

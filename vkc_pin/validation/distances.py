@@ -1,0 +1,155 @@
+"""How far a world's shapes are from each other at one configuration: lower bounds from boxes, and coal's own distances.
+
+Nothing of it is the planner's, so that what its culling overlooked would be found here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import coal
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from vkc_pin.models.shapes import bounding_box
+from vkc_pin.motion.world import World
+
+__all__ = ["Placed", "Solids"]
+
+POINT = 1e-4  # [m], radius of a point
+
+
+class Solids:
+    """The collision shapes of a world.
+
+    Attributes:
+        world: The world, with G shapes.
+        bodies: How many of these, the first, belong to the robot or an object; the others are obstacles.
+        center, half: Of a box around each in its own frame, centre and half extents, shape (G, 3) [m].
+    """
+
+    def __init__(self, world: World) -> None:
+        self.world, self.bodies = world, len(world.bodies.geometryObjects)
+        boxes = [bounding_box(shape) for shape in world.shapes]
+        self.center = np.array([center for center, _ in boxes]).reshape(-1, 3)
+        self.half = np.array([half for _, half in boxes]).reshape(-1, 3)
+        obstacles = slice(self.bodies, None)
+        self._obstacle_corners = self._corners([shape.placement for shape in world.shapes[obstacles]], obstacles)
+        self._obstacle_transforms: dict[int, coal.Transform3s] = {}
+        self._geometries = [shape.geometry for shape in world.shapes]
+        self._data = world.model.createData()
+        self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
+
+    def at(self, q: NDArray[np.float64]) -> Placed:
+        """Return the shapes as they are placed at Pinocchio's configuration `q` of the world."""
+        placed = pin.GeometryData(self.world.bodies)
+        pin.updateGeometryPlacements(self.world.model, self._data, self.world.bodies, placed, q)
+        return Placed(self, placed)
+
+    def corners(self, where: Sequence[pin.SE3]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return lower and upper corners of boxes along the world's axes around all shapes, shape (G, 3) each [m].
+
+        Args:
+            where: Placements of the shapes of robot and objects in the world.
+        """
+        bodies = self._corners(where, slice(self.bodies))
+        lower, upper = (np.concatenate(parts) for parts in zip(bodies, self._obstacle_corners, strict=True))
+        return lower, upper
+
+    def _corners(self, where: Sequence[pin.SE3], which: slice) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        rotation = np.array([placement.rotation for placement in where]).reshape(-1, 3, 3)
+        translation = np.array([placement.translation for placement in where]).reshape(-1, 3)
+        middle = (rotation @ self.center[which, :, None])[..., 0] + translation
+        extent = (np.abs(rotation) @ self.half[which, :, None])[..., 0]
+        return middle - extent, middle + extent
+
+    def obstacle_transform(self, shape: int) -> coal.Transform3s:
+        """Return where an obstacle is, for coal."""
+        known = self._obstacle_transforms.get(shape)
+        if known is None:
+            known = self._obstacle_transforms[shape] = _transform(self.world.shapes[shape].placement)
+        return known
+
+    def distance(
+        self, first: int | coal.CollisionGeometry, here: coal.Transform3s, second: int, there: coal.Transform3s
+    ) -> float:
+        """Return coal's signed distance of two shapes, or of anything else and a shape [m].
+
+        Nothing is kept from one distance to the next, which would change its last digits.
+        """
+        self._result.clear()
+        one = self._geometries[first] if isinstance(first, int) else first
+        return float(coal.distance(one, here, self._geometries[second], there, self._request, self._result))
+
+
+class Placed:
+    """The shapes at one configuration.
+
+    Args:
+        solids: The shapes.
+        placed: Where those of robot and objects are in the world.
+    """
+
+    def __init__(self, solids: Solids, placed: pin.GeometryData) -> None:
+        self._solids, self._where = solids, placed.oMg
+        self._transforms: dict[int, coal.Transform3s] = {}
+        self._known: dict[tuple[int, int], float] = {}
+
+    @cached_property
+    def corners(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Lower and upper corners of boxes along the world's axes around all shapes, shape (G, 3) each [m]."""
+        return self._solids.corners(list(self._where))
+
+    def bounds(self, pairs: NDArray[np.int_]) -> NDArray[np.float64]:
+        """Return lower bounds of the distances of pairs, shape (n, 2), shape (n,) [m]; -inf where the boxes overlap."""
+        lower, upper = self.corners
+        first, second = pairs.T
+        gaps = np.maximum(lower[second] - upper[first], lower[first] - upper[second])
+        outside = np.maximum(gaps, 0.0)
+        return np.where(gaps.max(axis=1) > 0.0, np.sqrt(np.einsum("ni,ni->n", outside, outside)), -np.inf)
+
+    def distance(self, first: int, second: int) -> float:
+        """Return coal's signed distance of two shapes [m]."""
+        key = (first, second)
+        known = self._known.get(key)
+        if known is None:
+            here, there = self._transform(first), self._transform(second)
+            known = self._known[key] = self._solids.distance(first, here, second, there)
+        return known
+
+    def distances(self, pairs: NDArray[np.int_]) -> NDArray[np.float64]:
+        """Return coal's signed distances of pairs, shape (n, 2), shape (n,) [m]."""
+        return np.array([self.distance(first, second) for first, second in pairs.tolist()], float)
+
+    def nearest(self, pairs: NDArray[np.int_]) -> tuple[int, float]:
+        """Return which of pairs, shape (n, 2), is nearest, and its distance [m]; only what may be is asked of coal."""
+        bounds = self.bounds(pairs)
+        best, least = -1, np.inf
+        for k in np.argsort(bounds, kind="stable").tolist():
+            if bounds[k] >= least:
+                break
+            distance = self.distance(*pairs[k].tolist())
+            if distance < least:
+                best, least = k, distance
+        return best, least
+
+    def around(self, point: NDArray[np.float64], reach: float) -> list[int]:
+        """Return the shapes that are closer than `reach` [m] to a point, shape (3,) [m]; a point has a size here, 0.1 mm."""
+        lower, upper = self.corners
+        near = np.flatnonzero(((lower - point < reach + POINT) & (point - upper < reach + POINT)).all(axis=1)).tolist()
+        ball, here = coal.Sphere(POINT), coal.Transform3s(np.eye(3), point)
+        return [i for i in near if self._solids.distance(ball, here, i, self._transform(i)) < reach]
+
+    def _transform(self, shape: int) -> coal.Transform3s:
+        if shape >= self._solids.bodies:
+            return self._solids.obstacle_transform(shape)
+        known = self._transforms.get(shape)
+        if known is None:
+            known = self._transforms[shape] = _transform(self._where[shape])
+        return known
+
+
+def _transform(placement: pin.SE3) -> coal.Transform3s:
+    return coal.Transform3s(placement.rotation, placement.translation)

@@ -1,0 +1,138 @@
+"""Report: what a check found, each violated constraint by name, place and amount; and what has one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+if TYPE_CHECKING:
+    from vkc_pin.motion.trajectory import Trajectory
+    from vkc_pin.options import Options
+    from vkc_pin.scene.scene import Scene
+
+__all__ = ["Judged", "Report", "Violation"]
+
+LISTED = 12  # violations that the text names; `violations` has them all
+
+
+@dataclass(frozen=True)
+class Violation:
+    """One constraint that does not hold.
+
+    Attributes:
+        constraint: "start", "limit", "velocity", "acceleration", "slip", "closure", "latch", "unheld", "slide", "goal",
+            "order", "clearance", "penetration" or "term", a constraint of the user's own.
+        subject: The coordinate, object, goal, term or pair of links it is about, e.g. "elbow_joint", "forearm_link – sofa".
+        waypoint: Counted from 0; between two waypoints the earlier.
+        time: [s].
+        amount: By how much it is violated, in `unit`.
+        unit: "m", "rad", "m/s", ...; empty for a term, whose unit is its own.
+        detail: One sentence for people.
+    """
+
+    constraint: str
+    subject: str
+    waypoint: int
+    time: float
+    amount: float
+    unit: str
+    detail: str
+
+    def __str__(self) -> str:
+        return f"{self.constraint} {self.subject}: {self.detail} (waypoint {self.waypoint}, {self.time:.2f} s)"
+
+
+@dataclass(frozen=True)
+class Report:
+    """What `validation` says of a motion.
+
+    Attributes:
+        violations: The worst of each constraint, subject and unit, in order of time; empty if the motion is right.
+        clearance: Smallest distance of any pair anywhere along the motion [m].
+        closure_error: Largest drift of a held object's base or of the grasp [m].
+        closure_angle: The same for orientation [rad].
+        states: How many configurations were looked at.
+        notes: What stands in the way of the task as a whole, if planning failed; one line each.
+    """
+
+    violations: tuple[Violation, ...] = ()
+    clearance: float = float("inf")
+    closure_error: float = 0.0
+    closure_angle: float = 0.0
+    states: int = 0
+    notes: tuple[str, ...] = field(default_factory=tuple)
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing is violated."""
+        return not self.violations
+
+    def lines(self) -> list[str]:
+        """Return it as lines of text."""
+        head = f"validation  {self.states} configurations checked: "
+        if self.ok:
+            return [head + "every constraint holds"]
+        return [
+            head + f"{len(self.violations)} constraint(s) violated",
+            *(f"  - {v}" for v in self.violations[:LISTED]),
+            *([f"  ... and {len(self.violations) - LISTED} more"] if len(self.violations) > LISTED else []),
+            *(f"  because {note}" for note in self.notes),
+        ]
+
+    def with_reasons(self, reasons: Sequence[Violation]) -> Report:
+        """Return the report of a motion that was never planned: only `reasons` are violated, the rest follows from them."""
+        return replace(self, violations=tuple(reasons))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data of it."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Report:
+        """Return the report that `to_dict` made `data` of."""
+        fields = dict(data)
+        fields["violations"] = tuple(Violation(**v) for v in fields["violations"])
+        fields["notes"] = tuple(fields["notes"])
+        return cls(**fields)
+
+
+@runtime_checkable
+class Judged(Protocol):
+    """A motion in a scene that was checked, such as a `Plan`: what pictures show."""
+
+    @property
+    def scene(self) -> Scene:
+        """Where it happens."""
+
+    @property
+    def options(self) -> Options:
+        """What the check was told, such as the clearance asked for."""
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The motion."""
+
+    @property
+    def validation(self) -> Report:
+        """What the check says of it."""
+
+    @property
+    def status(self) -> str:
+        """`success`, or why not."""
+
+    @property
+    def success(self) -> bool:
+        """Whether it does what was asked for and nothing is violated."""
+
+    @property
+    def metrics(self) -> Mapping[str, float]:
+        """Efforts, times and distances by name, as far as they are known."""
+
+    @property
+    def seed(self) -> int:
+        """Of the random numbers it came from."""
+
+    @property
+    def initialization(self) -> str:
+        """Which seed trajectory it came from."""

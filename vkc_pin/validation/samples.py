@@ -1,0 +1,174 @@
+"""A motion as `validation` looks at it: sampled densely, on the plain tree of robot and objects."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.models.articulation import Freedom
+from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.motion.world import World
+from vkc_pin.scene.scene import Scene
+
+__all__ = ["ANGLE_STEP", "LENGTH_STEP", "Samples"]
+
+LENGTH_STEP, ANGLE_STEP = 5e-3, 1e-2  # [m], [rad] between two configurations that are looked at
+
+
+class Samples:
+    """A motion in a scene, sampled at least every 5 mm of the base and of every sliding joint and every 0.01 rad of the rest.
+
+    Attributes:
+        scene, trajectory: What it was made of.
+        world: The scene as one plain tree.
+        times: When it is looked at, shape (S,) [s]; evenly spaced between two waypoints.
+        waypoint_rows: Which of these are the waypoints, shape (T,).
+        z: Minimal coordinates of the world, shape (S, n).
+        virtual: Coordinate → the freedom of a grasp that it is.
+
+    Raises:
+        UnknownNameError: The trajectory names a coordinate, object or attachment that the scene does not have.
+        InputError: It lacks coordinates of the robot, or of a grasp that leaves the hand a freedom.
+    """
+
+    def __init__(self, scene: Scene, trajectory: Trajectory) -> None:
+        self.scene, self.trajectory = scene, trajectory
+        self.world = World(scene)
+        self.virtual: dict[str, Freedom] = {
+            f"{owner}.{name}": freedom
+            for owner, placed in scene.objects.items()
+            for attachment in placed.object.attachments.values()
+            for name, freedom in zip(attachment.coordinates, attachment.freedoms, strict=True)
+        }
+        self._check_names()
+        self.times, self.waypoint_rows = self._sample()
+        self.z = self.world.positions(trajectory, self.times)
+
+    def _check_names(self) -> None:
+        names, robot = self.trajectory.names, self.scene.robot.coordinates.names
+        if names[: len(robot)] != robot or self.trajectory.robot_size != len(robot):
+            raise InputError("not this robot's coordinates", field="trajectory.names", expected=robot, got=names[: len(robot)])
+        known = [*self.world.coordinates.names, *self.virtual]
+        for name in names:
+            if name not in known:
+                raise UnknownNameError("coordinate", name, known, field="trajectory.names")
+        for number, phase in enumerate(self.trajectory.phases):
+            for owner, attachment in phase.held.items():
+                field = f"trajectory.phases[{number}].held"
+                if owner not in self.scene.objects:
+                    raise UnknownNameError("object", owner, self.scene.objects, field=field)
+                attachments = self.scene.objects[owner].object.attachments
+                if attachment not in attachments:
+                    raise UnknownNameError(f"attachment of '{owner}'", attachment, attachments, field=field)
+                if owner in phase.by:
+                    self.check_frame(phase.by[owner], field.replace("held", "by"))
+                for name in attachments[attachment].coordinates:
+                    if f"{owner}.{name}" not in names:
+                        raise InputError(
+                            "this grasp's coordinate is missing", field="trajectory.names", expected=f"{owner}.{name}"
+                        )
+
+    def check_frame(self, frame: str, field: str) -> None:
+        """Check that "<object>.<link>" exists. Raises `UnknownNameError` if it does not."""
+        owner, _, link = frame.partition(".")
+        if owner not in self.scene.objects:
+            raise UnknownNameError("object", owner, self.scene.objects, field=field)
+        item = self.scene.objects[owner].object
+        if not item.free:
+            raise InputError("it stands fixed in the world", field=field, expected="a link of a free object", got=frame)
+        if link not in item.links:
+            raise UnknownNameError(f"link of '{owner}'", link, item.links, field=field)
+
+    def _sample(self) -> tuple[NDArray[np.float64], NDArray[np.int_]]:
+        """Return the times to look at, and where among them the waypoints are."""
+        steps = np.abs(np.diff(self.trajectory.positions, axis=0))
+        units = np.array([LENGTH_STEP if self.is_length(name) else ANGLE_STEP for name in self.trajectory.names])
+        planar = np.linalg.norm(steps[:, :2], axis=1) / LENGTH_STEP
+        counts = np.maximum(1, np.ceil(np.maximum(planar, (steps / units).max(axis=1)) - 1e-9)).astype(int)
+        edges = itertools.pairwise(self.trajectory.times)
+        times = [np.linspace(a, b, n, endpoint=False) for (a, b), n in zip(edges, counts, strict=True)]
+        rows = np.concatenate([[0], np.cumsum(counts)])
+        return np.concatenate([*times, self.trajectory.times[-1:]]), rows
+
+    def is_length(self, name: str) -> bool:
+        """Return whether a coordinate is a length, [m], and not an angle, [rad]."""
+        if name in self.virtual:
+            return self.virtual[name].kind == "prismatic"
+        index = self.world.coordinates.index(name)
+        kind = str(self.world.model.joints[self.world.coordinates.joints[index]].shortname())
+        return index < 2 or (kind.startswith("JointModelP") and kind != "JointModelPlanar")
+
+    def unit(self, name: str) -> str:
+        """Return a coordinate's unit, "m" or "rad"."""
+        return "m" if self.is_length(name) else "rad"
+
+    def bounds(self, name: str) -> tuple[float, float, float, float]:
+        """Return lower, upper, velocity and acceleration limit of a coordinate of the trajectory."""
+        robot = self.scene.robot
+        if name in robot.coordinates.names:
+            i = robot.coordinates.index(name)
+            lower, upper = float(robot.lower[i]), float(robot.upper[i])
+            if i < 3 and robot.base == "fixed":  # wherever it stands
+                lower = upper = float(self.scene.start[i])
+            if i < 2:
+                lower, upper = max(lower, self.scene.arena[2 * i]), min(upper, self.scene.arena[2 * i + 1])
+            return lower, upper, float(robot.velocity[i]), float(robot.acceleration[i])
+        if name in self.virtual:
+            return self.virtual[name].lower, self.virtual[name].upper, np.inf, np.inf
+        owner, _, joint = name.partition(".")
+        item = self.scene.objects[owner].object
+        i = item.coordinates.index(joint)
+        return float(item.lower[i]), float(item.upper[i]), float(item.velocity[i]), float(item.acceleration[i])
+
+    def waypoint(self, row: int) -> int:
+        """Return the waypoint of a sample, between two the earlier."""
+        return int(np.searchsorted(self.waypoint_rows, row, side="right")) - 1
+
+    def rows(self, phase: PhaseSpan) -> NDArray[np.int_]:
+        """Return the samples of a phase, both ends among them."""
+        return np.arange(self.waypoint_rows[phase.first], self.waypoint_rows[phase.last] + 1)
+
+    def moved_by(self, held: Mapping[str, str]) -> set[str]:
+        """Return the coordinates of objects that a hand that holds them can move: those between base and attachment."""
+        model, names = self.world.model, set()
+        for owner, attachment in held.items():
+            link = self.scene.objects[owner].object.attachments[attachment].link
+            joint = model.frames[model.getFrameId(f"{owner}.{link}")].parentJoint
+            while joint:
+                names.add(str(model.names[joint]))
+                joint = model.parents[joint]
+        return names
+
+    def placements(self, rows: Iterable[int], frame: str) -> list[pin.SE3]:
+        """Return the placements of a frame in the world at some samples."""
+        model, data = self.world.model, self.world.model.createData()
+        index = model.getFrameId(frame)
+        found = []
+        for q in self.world.coordinates.q(self.z[np.asarray(rows)]):
+            pin.forwardKinematics(model, data, q)
+            found.append(pin.updateFramePlacement(model, data, index).copy())
+        return found
+
+    def grasp_errors(self, owner: str, name: str, rows: NDArray[np.int_], by: str | None = None) -> NDArray[np.float64]:
+        """Return how far the tool is from where attachment `name` has it, at some samples, shape (K, 2): [m] and [rad].
+
+        `by` is the frame that takes the tool's place, "<object>.<link>".
+        """
+        attachment = self.scene.objects[owner].object.attachments[name]
+        tools = self.placements(rows, by or self.scene.robot.tool_frame)
+        links = self.placements(rows, f"{owner}.{attachment.link}")
+        positions, own = self.trajectory.at(self.times[rows]), [f"{owner}.{suffix}" for suffix in attachment.coordinates]
+        values = np.zeros((len(rows), len(own)))
+        for column, coordinate in enumerate(own):
+            if coordinate in self.trajectory.names:
+                values[:, column] = positions[:, self.trajectory.names.index(coordinate)]
+        errors = np.empty((len(rows), 2))
+        for k, (tool, link) in enumerate(zip(tools, links, strict=True)):
+            offset = (link * attachment.tool(values[k])).actInv(tool)
+            errors[k] = np.linalg.norm(offset.translation), np.linalg.norm(pin.log3(offset.rotation))
+        return errors

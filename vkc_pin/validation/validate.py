@@ -1,0 +1,244 @@
+"""The independent check of a motion, continuous in time.
+
+It knows nothing of the optimiser: numeric Pinocchio on the plain tree of robot and objects side by side (`world`), coal
+on every pair that could come close, at most 5 mm and 0.01 rad apart there, closer where something could slip through.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from vkc_pin.motion.trajectory import Trajectory
+from vkc_pin.options import Options
+from vkc_pin.scene.scene import Scene
+from vkc_pin.task.steps import Step
+from vkc_pin.task.terms import Term, traced
+from vkc_pin.validation.goals import MOTION_TOLERANCE, check_goals, check_steps
+from vkc_pin.validation.own_terms import check_terms
+from vkc_pin.validation.pairs import PairTable
+from vkc_pin.validation.report import Report, Violation
+from vkc_pin.validation.samples import Samples
+from vkc_pin.validation.touching import may_touch
+
+__all__ = ["validate"]
+
+START_TOLERANCE = 1e-9  # [m] or [rad]
+LIMIT_TOLERANCE = 1e-5  # [m] or [rad]
+START_LIMIT_TOLERANCE = 1e-2  # [m] or [rad]: a start slightly outside its limits is where the robot is
+ACCEPTED_RATE_TOLERANCE = 1e-3  # excess over a limit, relative to it
+LATCH_TOLERANCE = 1e-4
+WAYPOINT_TOLERANCE = 1e-3  # [m] that clearance at a waypoint may fall short of dist_safe
+SLIP_TOLERANCE = 1e-4  # [m] per step
+
+
+def validate(
+    scene: Scene,
+    steps: Sequence[Step],
+    trajectory: Trajectory,
+    options: Options | None = None,
+    terms: Sequence[Term] = (),
+) -> Report:
+    """Check a motion against everything that was asked of it.
+
+    Args:
+        scene: Where it happens; its start is where the motion must start.
+        steps: What it must bring about, in this order.
+        trajectory: The motion, linear between waypoints.
+        options: Tolerances and dist_safe; `Options()` if left out.
+        terms: The user's own constraints; costs are nothing to check.
+
+    Returns:
+        Every violated constraint: start, limits, velocity, acceleration, slip of a differential base, closure, latches,
+        joints of objects that nobody holds, hands that slide on what they clamp, goals and their order, clearance at
+        waypoints and penetration anywhere, and own constraints.
+
+    Raises:
+        InputError: The trajectory is none of this scene's robot and objects, or a step or term names what is not there.
+    """
+    options = Options() if options is None else options
+    samples = Samples(scene, trajectory)
+    check_steps(samples, steps)
+    return _Check(samples, steps, options, traced(scene, terms)).report()
+
+
+class _Check:
+    def __init__(self, samples: Samples, steps: Sequence[Step], options: Options, terms: Sequence[Term]) -> None:
+        self.samples, self.steps, self.options, self.terms = samples, steps, options, terms
+        self.scene, self.trajectory = samples.scene, samples.trajectory
+        self.found: list[Violation] = []
+
+    def report(self) -> Report:
+        """Run every check."""
+        self._start()
+        self._limits()
+        self._rates()
+        self._slip()
+        self._unheld()
+        self._latches()
+        self.found += check_goals(self.samples, self.steps, self.options)
+        self.found += check_terms(self.samples, self.terms)
+        error, angle = self._closure()
+        self._slides()
+        clearance = self._clearance()
+        worst: dict[tuple[str, str, str], Violation] = {}
+        for violation in self.found:
+            key = (violation.constraint, violation.subject, violation.unit)
+            if key not in worst or worst[key].amount < violation.amount:
+                worst[key] = violation
+        for violation in self.found:  # what overlaps is also too close
+            if violation.constraint == "penetration":
+                worst.pop(("clearance", violation.subject, violation.unit), None)
+        ordered = tuple(sorted(worst.values(), key=lambda v: (v.time, v.constraint, v.subject, v.unit)))
+        return Report(ordered, clearance, error, angle, len(self.samples.times))
+
+    def _add(
+        self, constraint: str, subject: str, waypoint: int, amount: float, unit: str, detail: str, *, row: int | None = None
+    ) -> None:
+        if row is not None:
+            waypoint = self.samples.waypoint(row)
+        time = self.trajectory.times[waypoint] if row is None else self.samples.times[row]
+        self.found.append(Violation(constraint, subject, int(waypoint), float(time), float(amount), unit, detail))
+
+    def _start(self) -> None:
+        """The motion begins where the robot and the objects are."""
+        known = dict(zip(self.samples.world.coordinates.names, self.samples.world.start, strict=True))
+        for name, value in zip(self.trajectory.names, self.trajectory.positions[0], strict=True):
+            right, unit = known.get(name, value), self.samples.unit(name)
+            if not abs(value - right) <= START_TOLERANCE:
+                self._add("start", name, 0, abs(value - right), unit, f"{value:.6g} {unit} instead of {right:.6g} {unit}")
+
+    def _limits(self) -> None:
+        for name, column in zip(self.trajectory.names, self.trajectory.positions.T, strict=True):
+            lower, upper, _, _ = self.samples.bounds(name)
+            excess = np.maximum(lower - column, column - upper)
+            if excess[0] <= START_LIMIT_TOLERANCE:
+                excess[0] = 0.0
+            worst = int(np.argmax(excess))
+            if not excess[worst] <= LIMIT_TOLERANCE:
+                unit = self.samples.unit(name)
+                detail = f"{column[worst]:.4f} {unit} is outside {lower:.4f} to {upper:.4f} {unit} by {excess[worst]:.4f} {unit}"
+                self._add("limit", name, worst, excess[worst], unit, detail)
+
+    def _rates(self) -> None:
+        velocities, accelerations = self.trajectory.velocities(), self.trajectory.accelerations()
+        for i, name in enumerate(self.trajectory.names):
+            _, _, fastest, strongest = self.samples.bounds(name)
+            unit = self.samples.unit(name)
+            for kind, values, limit, per in (
+                ("velocity", velocities[:, i], fastest, "s"),
+                ("acceleration", accelerations[:, i], strongest, "s²"),
+            ):
+                worst = int(np.argmax(np.abs(values)))
+                value = abs(float(values[worst]))
+                if not value <= limit * (1 + ACCEPTED_RATE_TOLERANCE) + 1e-9:
+                    detail = f"{value:.3f} {unit}/{per} is more than {limit:.3f} {unit}/{per}"
+                    self._add(kind, name, worst, value - limit, f"{unit}/{per}", detail)
+
+    def _slip(self) -> None:
+        """A differential base does not move sideways, seen at the middle of each step."""
+        if self.scene.robot.base != "differential":
+            return
+        step = np.diff(self.trajectory.positions[:, :3], axis=0)
+        heading = self.trajectory.positions[:-1, 2] + step[:, 2] / 2
+        slip = np.abs(-np.sin(heading) * step[:, 0] + np.cos(heading) * step[:, 1])
+        worst = int(np.argmax(slip))
+        if not slip[worst] <= SLIP_TOLERANCE:
+            detail = f"the base slips sideways by {1e3 * slip[worst]:.2f} mm in a step"
+            self._add("slip", "base", worst, slip[worst], "m", detail)
+
+    def _unheld(self) -> None:
+        """What no hand moves does not move."""
+        for phase in self.trajectory.phases:
+            driven = self.samples.moved_by(phase.held)
+            for i, name in enumerate(self.trajectory.names):
+                if i < self.trajectory.robot_size or name in driven or name in self.samples.virtual:
+                    continue
+                column = self.trajectory.positions[phase.first : phase.last + 1, i]
+                moved = np.abs(column - column[0])
+                worst = int(np.argmax(moved))
+                if not moved[worst] <= MOTION_TOLERANCE:
+                    owner, unit = name.partition(".")[0], self.samples.unit(name)
+                    why = "where it is held, nothing drives it" if owner in phase.held else f"nobody holds {owner}"
+                    detail = f"moves by {moved[worst]:.4f} {unit} while {why}"
+                    self._add("unheld", name, phase.first + worst, moved[worst], unit, detail)
+
+    def _latches(self) -> None:
+        """A latched joint leaves where it is held only while the joint that releases it is far enough.
+
+        Between two samples both are linear in time, so the shortfall is largest where the joint starts to leave or where
+        the latch's reach ends.
+        """
+        z, names = self.samples.z, self.samples.world.coordinates
+        for owner, placed in self.scene.objects.items():
+            for latch in placed.object.latches:
+                name, release = f"{owner}.{latch.joint}", f"{owner}.{latch.released_by}"
+                off = z[:, names.index(name)] - latch.held_at
+                before, after = np.abs(off[:-1]), np.abs(off[1:])
+                crossed = off[:-1] * off[1:] < 0  # goes through where it is held, and leaves on the other side
+                begin = np.where(crossed, before / np.where(crossed, before + after, 1.0), 0.0)
+                reach = np.where(crossed, 0.0, before)
+                leaves = (after > reach + 1e-12) & (after > LATCH_TOLERANCE) & (reach <= latch.engaged_within)
+                share = (latch.engaged_within - reach) / np.where(leaves, after - reach, 1.0)
+                end = np.where(leaves, begin + np.clip(share, 0.0, 1.0) * (1 - begin), begin)
+                value, change = z[:-1, names.index(release)], np.diff(z[:, names.index(release)])
+                lowest = value + np.minimum(begin * change, end * change)
+                short = np.where(leaves, latch.threshold - lowest, 0.0)
+                row = int(np.argmax(short))
+                if not short[row] <= LATCH_TOLERANCE:
+                    detail = (
+                        f"leaves {latch.held_at:g} while {latch.released_by} is at {lowest[row]:.3f}, "
+                        f"{short[row]:.3f} short of {latch.threshold:g}"
+                    )
+                    self._add("latch", name, 0, short[row], self.samples.unit(release), detail, row=row)
+
+    def _closure(self) -> tuple[float, float]:
+        """The hand stays where it holds an object; return the largest drift, [m] and [rad]."""
+        largest = np.zeros(2)
+        for phase in self.trajectory.phases:
+            rows = self.samples.rows(phase)
+            for owner, attachment in phase.held.items():
+                errors = self.samples.grasp_errors(owner, attachment, rows, phase.by.get(owner))
+                largest = np.maximum(largest, errors.max(axis=0))
+                limits = (self.options.closure_position, self.options.closure_angle)
+                for column, limit, unit in zip(errors.T, limits, ("m", "rad"), strict=True):
+                    worst = int(np.argmax(column))
+                    if not column[worst] <= limit:
+                        detail = f"the grasp drifts by {1e3 * column[worst]:.3f} m{unit}, more than {1e3 * limit:g} m{unit}"
+                        self._add(
+                            "closure", f"{owner}.{attachment}", 0, column[worst] - limit, unit, detail, row=int(rows[worst])
+                        )
+        return float(largest[0]), float(largest[1])
+
+    def _slides(self) -> None:
+        """A hand that clamps does not slide or turn on what it holds."""
+        for phase in self.trajectory.phases:
+            for owner, attachment in phase.held.items():
+                grasp = self.scene.objects[owner].object.attachments[attachment]
+                for name in grasp.coordinates if grasp.firm else ():
+                    values = self.trajectory.column(f"{owner}.{name}")[phase.first : phase.last + 1]
+                    moved, unit = np.abs(values - values[0]), self.samples.unit(f"{owner}.{name}")
+                    worst = int(np.argmax(moved))
+                    if not moved[worst] <= MOTION_TOLERANCE:
+                        detail = f"the hand moves on '{owner}' by {moved[worst]:.4f} {unit} while it clamps it"
+                        self._add("slide", f"{owner}.{name}", phase.first + worst, moved[worst], unit, detail)
+
+    def _clearance(self) -> float:
+        """Nothing comes too close at a waypoint or penetrates anywhere; return the smallest distance [m].
+
+        The start is where the robot is: it may be close to something, but not inside.
+        """
+        samples, smallest = self.samples, np.inf
+        touching = may_touch(self.scene, samples.world, self.trajectory, self.steps, self.options.dist_safe)
+        pairs = PairTable(self.scene, samples.world, self.trajectory, self.options.dist_safe, touching=touching)
+        for hit in pairs.sweep(samples.z, samples.waypoint_rows):
+            smallest = min(smallest, hit.distance)
+            subject, millimetres = f"{hit.first} – {hit.second}", 1e3 * abs(hit.distance)
+            if hit.distance < -hit.contact:
+                self._add("penetration", subject, 0, -hit.distance, "m", f"overlap by {millimetres:.1f} mm", row=hit.row)
+            elif hit.at_waypoint and hit.row > 0 and hit.distance < hit.margin - WAYPOINT_TOLERANCE:
+                detail = f"are only {millimetres:.1f} mm apart, {1e3 * hit.margin:.0f} mm are asked for"
+                short = hit.margin - WAYPOINT_TOLERANCE - hit.distance
+                self._add("clearance", subject, 0, short, "m", detail, row=hit.row)
+        return float(smallest)

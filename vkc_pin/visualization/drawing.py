@@ -1,0 +1,285 @@
+"""Draws a scene and a motion in it with meshcat commands: what `visualization` shows and exports.
+
+Every joint is a node below its parent joint's node, so that the viewer's interpolation, joint by joint, follows the
+motion exactly, and only a few numbers per joint and key frame travel.
+"""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import meshcat
+import meshcat.animation as animation
+import meshcat.geometry as g
+import numpy as np
+import pinocchio as pin
+from meshcat.commands import SetAnimation
+from numpy.typing import NDArray
+
+from vkc_pin.models.robot import Robot
+from vkc_pin.motion.placements import Motion, sample_motion
+from vkc_pin.motion.trajectory import Trajectory
+from vkc_pin.motion.world import World
+from vkc_pin.scene.scene import Scene
+from vkc_pin.validation.report import Report
+from vkc_pin.visualization.camera import FIELD_OF_VIEW, Viewpoint, choose_viewpoint
+from vkc_pin.visualization.elements import Ghost, Sun, Triangles, Unshadow, hexadecimal, material, node_name, track
+from vkc_pin.visualization.room import Part, Room, drawn_parts
+from vkc_pin.visualization.solids import Solid, coarse, merge_solids, to_solid, tube
+
+__all__ = ["Drawing", "draw"]
+
+_START, _END = (0.22, 0.42, 0.78), (0.10, 0.60, 0.38)  # of the ghosts
+_TOOL, _BASE = (0.88, 0.20, 0.35), (0.16, 0.42, 0.72)  # of the paths
+_ALARM = (0.90, 0.05, 0.05)
+_ALARM_TIME = 0.4  # [s] that an offending link stays red before and after
+_GHOST_DETAIL = 0.007  # [m]
+_AXES = {"x": (0.86, 0.13, 0.13), "y": (0.13, 0.60, 0.16), "z": (0.11, 0.27, 0.90)}  # of frames
+_AXIS_LENGTH, _AXIS_RADIUS = 0.16, 0.007  # [m]
+_meshes: weakref.WeakKeyDictionary[Robot, list[Solid]] = weakref.WeakKeyDictionary()
+
+
+@dataclass(frozen=True, eq=False)
+class Item:
+    """One thing to draw: its path in the viewer's tree, joint, placement in the joint's frame, shape, colour and label."""
+
+    path: str
+    joint: int
+    placement: pin.SE3
+    solid: Solid
+    colour: tuple[float, ...]
+    label: str
+
+
+def draw(
+    viewer: meshcat.Visualizer,
+    scene: Scene,
+    trajectory: Trajectory | None = None,
+    report: Report | None = None,
+    *,
+    play: bool = True,
+    frames: Mapping[str, pin.SE3] | None = None,
+) -> None:
+    """Draw `scene`, and a motion in it, into a viewer, instead of what was there.
+
+    Args:
+        viewer: A meshcat viewer, or anything that takes its commands.
+        scene: What to draw, as it is at its start.
+        trajectory: The motion to animate; the start and the end appear as ghosts.
+        report: Links that it says come too close turn red at that time.
+        play: Start playing at once.
+        frames: Name → placement in the world of a frame to draw; it stays there, whatever moves.
+    """
+    Drawing(viewer, scene, trajectory, report).draw(play=play, frames=frames)
+
+
+class Drawing:
+    """A scene, and a motion, as meshcat commands."""
+
+    def __init__(
+        self, viewer: meshcat.Visualizer, scene: Scene, trajectory: Trajectory | None = None, report: Report | None = None
+    ) -> None:
+        self.viewer, self.scene, self.trajectory, self.report = viewer, scene, trajectory, report
+        self.world = World(scene)
+        self.motion: Motion = sample_motion(self.world, trajectory)
+        self.room = Room(scene)
+        self.nodes = self._nodes()
+        self.movers = self._movers()
+        self.items = [*self._robot_items(), *self._object_items()]
+        self.light: list[Solid | None] = []  # of what moves, for ghosts
+
+    def draw(self, *, play: bool = True, frames: Mapping[str, pin.SE3] | None = None) -> None:
+        """Send everything; see the function `draw`."""
+        self.viewer.delete()
+        self._surroundings()
+        for item in self.items:
+            opacity = item.colour[3] if len(item.colour) > 3 else 1.0
+            self._solid(Part(item.path, item.solid, item.colour, opacity, shadow=opacity >= 1.0))
+            self.viewer[item.path].set_transform(item.placement.homogeneous)
+        for joint in range(1, self.world.model.njoints):
+            self.viewer[self.nodes[joint]].set_transform(self.motion.local[joint][0].homogeneous)
+        for part in self.room.parts():
+            self._solid(replace(part, name=f"room/{part.name}"))
+        for name, points, grey in self.room.lines():
+            self._lines(f"room/{name}", points, grey)
+        self._frames(frames or {})
+        if self.trajectory is not None:
+            self._paths()
+            moving = np.any([*self.movers.values(), np.zeros(self.world.model.njoints, bool)], axis=0)
+            self.light = [coarse(item.solid, _GHOST_DETAIL) if moving[item.joint] else None for item in self.items]
+            self._ghosts("start", 0, _START)
+            self._ghosts("end", -1, _END)
+        self.viewer.window.send(SetAnimation(self._animation(), play=play, repetitions=1))
+
+    def viewpoint(self) -> Viewpoint:
+        """Return the camera's place: all of the motion is in the picture, and the objects it could be about."""
+        motion, around = self.motion, np.array([[x, y, 0.0] for x in (-0.6, 0.6) for y in (-0.6, 0.6)])
+        high = np.array([0.0, 0.0, 1.0])
+        points = [(motion.base[:, None] * (1.0 - high) + around).reshape(-1, 3), motion.base + high, motion.tool]
+        boxes = self.room.obstructions()
+        for item in self.items:
+            if item.path.startswith("objects"):
+                local = item.solid.moved(item.placement).vertices
+                for placement in motion.world[[0, len(motion.times) // 2, -1], item.joint]:
+                    points.append(local @ placement[:3, :3].T + placement[:3, 3])
+                    boxes.append((points[-1].min(axis=0), points[-1].max(axis=0), 0.3))
+        cloud = np.concatenate([p[:: max(1, len(p) // 60)] for p in points])
+        return choose_viewpoint(cloud, boxes)
+
+    def _nodes(self) -> list[str]:
+        """Return for every joint its path in the tree."""
+        model, nodes = self.world.model, ["robot"]
+        for j in range(1, model.njoints):
+            owner, _, rest = str(model.names[j]).partition(".")
+            placed = rest and owner in self.scene.objects
+            root = f"objects/{owner}" if placed else "robot"
+            above = nodes[model.parents[j]] if model.parents[j] else root
+            nodes.append(f"{above}/{node_name(rest if placed else str(model.names[j]))}")
+        return nodes
+
+    def _robot_items(self) -> list[Item]:
+        robot = self.scene.robot
+        if robot not in _meshes:
+            _meshes[robot] = [to_solid(shape.geometry) for shape in robot.visual.geometryObjects]
+        items = []
+        for shape, solid in zip(robot.visual.geometryObjects, _meshes[robot], strict=True):
+            link = str(robot.model.frames[shape.parentFrame].name)
+            path = f"{self.nodes[shape.parentJoint]}/{node_name(link)}/{node_name(shape.name)}"
+            items.append(Item(path, shape.parentJoint, shape.placement, solid, tuple(map(float, shape.meshColor)), link))
+        return items
+
+    def _object_items(self) -> list[Item]:
+        items: list[Item] = []
+        shapes, labels = list(self.world.visual.geometryObjects), self.world.visual_labels
+        first = len(self.scene.robot.visual.geometryObjects)
+        end = len(shapes) - len(self.scene.obstacle_visual.geometryObjects)
+        for shape, label in zip(shapes[first:end], labels[first:end], strict=True):
+            owner, _, link = label.partition(".")
+            root = self.nodes[shape.parentJoint] if shape.parentJoint else f"objects/{owner}"
+            for k, (solid, colour) in enumerate(drawn_parts(shape)):
+                name = node_name(shape.name.partition(".")[2]) + (f"_{k}" if k else "")
+                items.append(Item(f"{root}/{node_name(link)}/{name}", shape.parentJoint, shape.placement, solid, colour, label))
+        return items
+
+    def _solid(self, part: Part) -> None:
+        node = self.viewer[part.name]
+        node.set_object(Triangles(part.solid), material(part.colour, part.opacity, one_sided=part.one_sided))
+        if not part.shadow:
+            self.viewer.window.send(Unshadow(node.path))
+
+    def _lines(self, path: str, points: NDArray[np.float64], grey: float) -> None:
+        node = self.viewer[path]
+        thin = g.LineBasicMaterial(color=hexadecimal((grey, grey, grey)))
+        node.set_object(g.LineSegments(g.PointsGeometry(points.astype(np.float32).T), thin))
+        self.viewer.window.send(Unshadow(node.path))
+
+    def _frames(self, frames: Mapping[str, pin.SE3]) -> None:
+        """Draw axes, red, green and blue, in front of everything: frames of joints are inside of bodies."""
+        for name, placement in frames.items():
+            where = f"frames/{node_name(name)}"
+            for (axis, colour), end in zip(_AXES.items(), np.eye(3), strict=True):
+                solid = tube(np.stack([np.zeros(3), _AXIS_LENGTH * end]), _AXIS_RADIUS)
+                assert solid is not None
+                # Only what counts as translucent is drawn after the bodies.
+                seen = g.MeshBasicMaterial(color=hexadecimal(colour), transparent=True, depthTest=False)
+                node = self.viewer[f"{where}/{axis}"]
+                node.set_object(Triangles(solid), seen)
+                self.viewer.window.send(Unshadow(node.path))
+            self.viewer[where].set_transform(placement.homogeneous)
+
+    def _paths(self) -> None:
+        assert self.trajectory is not None
+        times = np.linspace(self.trajectory.times[0], self.trajectory.times[-1], max(2, int(20 * self.trajectory.times[-1])))
+        motion = sample_motion(self.world, self.trajectory, np.unique(np.concatenate([times, self.trajectory.times])))
+        for name, points, radius, colour in (
+            ("tool", motion.tool, 0.008, _TOOL),
+            ("base", motion.base * [1.0, 1.0, 0.0] + [0.0, 0.0, 0.006], 0.014, _BASE),
+        ):
+            solid = tube(points, radius)
+            if solid is not None:
+                node = self.viewer[f"paths/{name}"]
+                node.set_object(Triangles(solid), g.MeshBasicMaterial(color=hexadecimal(colour)))
+                self.viewer.window.send(Unshadow(node.path))
+
+    def _ghosts(self, name: str, row: int, colour: tuple[float, float, float]) -> None:
+        """Draw what moves as it is at `row`, the robot and every object for itself."""
+        for owner, joints in self.movers.items():
+            solids = [
+                light.moved(pin.SE3(self.motion.world[row, item.joint]) * item.placement)
+                for item, light in zip(self.items, self.light, strict=True)
+                if light is not None and joints[item.joint]
+            ]
+            if solids:
+                self.viewer[f"ghosts/{name}/{owner}"].set_object(Ghost(merge_solids(solids), colour))
+
+    def _movers(self) -> dict[str, NDArray[np.bool_]]:
+        """Return the joints that move in the world, of the robot and of every object: name → shape (joints,)."""
+        model, moves = self.world.model, self.motion.moving.copy()
+        owners: dict[str, NDArray[np.bool_]] = {}
+        for j in range(1, model.njoints):
+            moves[j] |= moves[model.parents[j]]
+            if moves[j]:
+                owner = self.nodes[j].split("/")[1] if self.nodes[j].startswith("objects/") else "robot"
+                owners.setdefault(owner, np.zeros(model.njoints, bool))[j] = True
+        return owners
+
+    def _surroundings(self) -> None:
+        """Camera, lights, background; meshcat's own grid and axes give way to the room's floor."""
+        view, place = self.viewpoint(), self.viewer
+        # meshcat's camera turns about the origin of its world, so the drawing moves there, not the camera.
+        place.set_transform(pin.SE3(np.eye(3), -view.target).homogeneous)
+        x, y, z = view.position - view.target
+        lens = place["/Cameras/default/rotated/<object>"]
+        lens.set_property("fov", FIELD_OF_VIEW)
+        lens.set_property("position", [float(x), float(z), float(-y)])
+        for name in ("/Grid", "/Axes", "/Lights/PointLightNegativeX", "/Lights/PointLightPositiveX", "/Lights/FillLight"):
+            place[name].set_property("visible", False)
+        place["/Lights/AmbientLight/<object>"].set_property("intensity", 0.62)
+        place["/Lights/Sun"].set_object(Sun(self.room.centre - view.target, self.room.reach, view.position - view.target))
+        place["/Background"].set_property("top_color", [0.93, 0.95, 0.97])
+        place["/Background"].set_property("bottom_color", [0.99, 0.99, 0.99])
+
+    def _animation(self) -> animation.Animation:
+        """Return the motion with one key frame per time, in seconds, since the frame rate is 1."""
+        movie = animation.Animation(default_framerate=1)
+        if self.trajectory is None:
+            return movie
+        times = (self.motion.times - self.motion.times[0]).tolist()
+        for j in np.flatnonzero(self.motion.moving):
+            local = self.motion.local[j]
+            quaternions = [pin.Quaternion(placement.rotation).coeffs().tolist() for placement in local]
+            tracks = [track("quaternion", "quaternion", times, quaternions)]
+            if np.ptp([placement.translation for placement in local], axis=0).max() > 1e-9:
+                tracks.append(track("position", "vector3", times, [placement.translation.tolist() for placement in local]))
+            self._clip(movie, self.nodes[j], tracks)
+        for name, row in (("start", 0), ("end", -1)):
+            for owner, joints in self.movers.items():
+                away = self.motion.away(joints, row).tolist()
+                self._clip(movie, f"ghosts/{name}/{owner}", [track("visible", "bool", times, away)])
+        for item in self.items:
+            moments = [v.time for v in self._collisions() if item.label in v.subject.split(" – ")]
+            if moments:
+                self._clip(movie, f"{item.path}/<object>", [self._alarm(item, moments)])
+        return movie
+
+    def _collisions(self) -> list[Any]:
+        found = self.report.violations if self.report is not None else ()
+        return [v for v in found if v.constraint in ("clearance", "penetration")]
+
+    def _alarm(self, item: Item, moments: list[float]) -> animation.AnimationTrack:
+        """Return a track that colours an item red around `moments` [s]."""
+        first, last = self.motion.times[0], self.motion.times[-1]
+        edges = {first, last}
+        for moment in moments:
+            edges |= {t for d in (_ALARM_TIME, _ALARM_TIME - 0.05) for t in (moment - d, moment + d) if first < t < last}
+        times = sorted(edges)
+        red = [any(abs(t - moment) < _ALARM_TIME - 0.02 for moment in moments) for t in times]
+        colours = [[float(c) for c in (_ALARM if alarm else item.colour[:3])] for alarm in red]
+        return track("material.color", "color", [float(t - first) for t in times], colours)
+
+    def _clip(self, movie: animation.Animation, path: str, tracks: list[animation.AnimationTrack]) -> None:
+        where = self.viewer[path].path
+        movie.clips[where] = animation.AnimationClip({track.name: track for track in tracks}, fps=1)

@@ -1,0 +1,159 @@
+"""How obstacles are drawn: furniture as it is, walls so that one can look into the room from outside."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from pathlib import Path
+
+import coal
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from vkc_pin.models.shapes import bounding_box
+from vkc_pin.scene.scene import Scene
+from vkc_pin.visualization.solids import Solid, box_solid, shade, to_solid
+
+__all__ = ["Part", "Room", "drawn_parts"]
+
+_THIN, _HIGH = 0.25, 2.0  # [m]: an upright box at most this thick that reaches at least this high is a wall
+_BEYOND = 0.35  # [m]: a wall with more of the arena than this behind it divides a room
+_VEIL, _DIVIDER = 0.07, 0.32  # opacities
+_FLOOR_COLOUR = (0.90, 0.89, 0.87)
+_DETAIL = 1e-3  # [m] of meshes
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Something to draw that does not move: name, triangles in the world frame, colour, opacity and who sees it.
+
+    Attributes:
+        shadow: Whether it casts a shadow.
+        one_sided: Whether it can be seen from its front only.
+    """
+
+    name: str
+    solid: Solid
+    colour: tuple[float, ...]
+    opacity: float = 1.0
+    shadow: bool = True
+    one_sided: bool = False
+
+
+class Room:
+    """The obstacles of a scene and its floor.
+
+    Attributes:
+        centre: Of the arena, at the floor, shape (3,) [m].
+        reach: Half of the arena's diagonal [m].
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        x_min, x_max, y_min, y_max = scene.arena
+        self.centre = np.array([(x_min + x_max) / 2.0, (y_min + y_max) / 2.0, 0.0])
+        self.reach = float(np.hypot(x_max - x_min, y_max - y_min)) / 2.0
+        self._walls: list[pin.GeometryObject] = []
+        self._furniture: list[pin.GeometryObject] = []
+        for shape in scene.obstacle_visual.geometryObjects:
+            (self._walls if _is_wall(shape) else self._furniture).append(shape)
+
+    def parts(self) -> list[Part]:
+        """Return what to draw."""
+        parts = []
+        if self.scene.floor:
+            x_min, x_max, y_min, y_max = self.scene.arena
+            floor = box_solid(np.array([x_min, y_min, -0.03]), np.array([x_max, y_max, 0.0]))
+            parts.append(Part("floor", floor, _FLOOR_COLOUR, shadow=False))
+        for shape in self._furniture:
+            drawn = drawn_parts(shape)
+            for k, (solid, colour) in enumerate(drawn):
+                name = f"{shape.name}/{k}" if len(drawn) > 1 else str(shape.name)
+                opacity = colour[3] if len(colour) > 3 else 1.0
+                parts.append(Part(name, solid.moved(shape.placement), colour, opacity, shadow=opacity >= 1.0))
+        for shape in self._walls:
+            parts += self._wall_parts(shape)
+        return parts
+
+    def lines(self) -> list[tuple[str, NDArray[np.float64], float]]:
+        """Return line segments, shape (2·k, 3) [m], with name and brightness: the floor's grid and the walls' edges."""
+        drawn = []
+        if self.scene.floor:
+            x_min, x_max, y_min, y_max = self.scene.arena
+            xs, ys = (np.arange(np.ceil(low / 0.5) * 0.5, high, 0.5) for low, high in ((x_min, x_max), (y_min, y_max)))
+            ends = [[(x, y_min), (x, y_max)] for x in xs] + [[(x_min, y), (x_max, y)] for y in ys]
+            flat = np.array(ends, float).reshape(-1, 2)
+            drawn.append(("grid", np.column_stack([flat, np.full(len(flat), 0.002)]), 0.78))
+        edges = [shape.placement.act(corner) for shape in self._walls for corner in _edges(shape)]
+        if edges:
+            drawn.append(("wall_edges", np.array(edges), 0.55))
+        return drawn
+
+    def obstructions(self) -> list[tuple[NDArray[np.float64], NDArray[np.float64], float]]:
+        """Return boxes that hide what is behind them: lower and upper corner, shape (3,) each [m], and opacity."""
+        boxes = []
+        for shape in [*self._walls, *self._furniture]:
+            center, half = bounding_box(shape)
+            corners = itertools.product(*zip(center - half, center + half, strict=True))
+            placed = np.array([shape.placement.act(np.array(corner)) for corner in corners])
+            wall = any(shape is other for other in self._walls)
+            opacity = (0.6 if self._divides(shape) else 0.0) if wall else 1.0
+            boxes.append((placed.min(axis=0), placed.max(axis=0), opacity))
+        return boxes
+
+    def _inside(self, shape: pin.GeometryObject) -> tuple[int, float]:
+        """Return the thin axis of a wall, in its own frame, and the sign of its side towards the middle of the arena."""
+        axis = int(np.argmin(np.asarray(shape.geometry.halfSide)[:2]))
+        towards = shape.placement.actInv(self.centre)[axis]
+        return axis, 1.0 if towards > 0.0 else -1.0
+
+    def _divides(self, shape: pin.GeometryObject) -> bool:
+        axis, sign = self._inside(shape)
+        behind = np.zeros(3)
+        behind[axis] = -sign * (float(shape.geometry.halfSide[axis]) + _BEYOND)
+        x, y, _ = shape.placement.act(behind)
+        x_min, x_max, y_min, y_max = self.scene.arena
+        return bool(x_min < x < x_max and y_min < y < y_max)
+
+    def _wall_parts(self, shape: pin.GeometryObject) -> list[Part]:
+        half, colour = np.asarray(shape.geometry.halfSide), tuple(map(float, shape.meshColor))
+
+        def part(name: str, opacity: float, sides: tuple[int, ...]) -> Part:
+            solid = box_solid(-half, half, sides).moved(shape.placement)
+            return Part(f"walls/{shape.name}/{name}", solid, colour, opacity, shadow=False, one_sided=True)
+
+        if self._divides(shape):
+            return [part("sides", _DIVIDER, (0, 1, 2, 3, 5))]
+        axis, sign = self._inside(shape)
+        inside = 2 * axis + (sign > 0)
+        return [part("inside", 1.0, (inside,)), part("outside", _VEIL, tuple(s for s in range(4) if s != inside))]
+
+
+def drawn_parts(shape: pin.GeometryObject) -> list[tuple[Solid, tuple[float, ...]]]:
+    """Return the solids, in the shape's own frame, and colours that a shape is drawn as: from its mesh file, if it has one."""
+    colour = tuple(float(c) for c in shape.meshColor)
+    if shape.meshPath and Path(shape.meshPath).is_file():
+        from vkc_pin.files.meshes import load_parts
+
+        parts = load_parts(shape.meshPath, np.asarray(shape.meshScale).ravel(), detail=_DETAIL)
+        own = bool(shape.overrideMaterial)
+        return [(shade(part.vertices, part.faces), colour if own else part.colour or colour) for part in parts]
+    return [(to_solid(shape.geometry), colour)]
+
+
+def _is_wall(shape: pin.GeometryObject) -> bool:
+    if not isinstance(shape.geometry, coal.Box):
+        return False
+    half = np.asarray(shape.geometry.halfSide)
+    top = shape.placement.translation[2] + half[2]
+    upright = abs(shape.placement.rotation[2, 2]) > 0.999
+    return bool(upright and 2.0 * half[:2].min() <= _THIN and top >= _HIGH and half[:2].max() > 2.0 * half[:2].min())
+
+
+def _edges(shape: pin.GeometryObject) -> NDArray[np.float64]:
+    """Return the twelve edges of a box, shape (24, 3) [m]."""
+    half = np.asarray(shape.geometry.halfSide)
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+    pairs = [(a, b) for a in range(8) for b in range(a) if np.abs(signs[a] - signs[b]).sum() == 2]
+    return np.asarray((signs * half)[np.array(pairs).ravel()])

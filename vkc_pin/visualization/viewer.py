@@ -1,0 +1,192 @@
+"""Shows scenes and plans with meshcat: in a notebook, in the browser, or as one self-contained web page."""
+
+from __future__ import annotations
+
+import atexit
+import html
+import os
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vkc_pin.errors import InputError, VkcError
+from vkc_pin.files.writing import write_atomically
+from vkc_pin.notebook import in_notebook
+from vkc_pin.scene.scene import Scene
+from vkc_pin.validation.report import Judged
+
+if TYPE_CHECKING:
+    import meshcat
+    import pinocchio as pin
+
+__all__ = ["animate", "open_viewer", "show", "to_html"]
+
+_server: tuple[subprocess.Popen[bytes], str, str] | None = None  # the process, its address for commands, and for browsers
+
+
+def show(
+    plan_or_scene: Judged | Scene,
+    *,
+    open_browser: bool | None = None,
+    height: int = 560,
+    frames: Mapping[str, pin.SE3] | None = None,
+) -> Any:
+    """Show a plan's motion, or a scene.
+
+    In a notebook the result is an inline view, with play, pause and a time slider, that is part of the notebook and
+    survives saving it. Elsewhere a server that only this machine can reach shows it in the browser.
+
+    Args:
+        plan_or_scene: What to show.
+        open_browser: Whether to open a browser window; None opens one where there is a screen. Not used in a notebook.
+        height: Of the inline view [pixels].
+        frames: Frames to draw, by name, with their placements in the world: x red, y green, z blue. They stand still.
+
+    Returns:
+        In a notebook an object that displays itself; elsewhere the `meshcat.Visualizer`. Its address is printed.
+
+    Raises:
+        InputError: Neither a plan nor a scene, or something that cannot be drawn.
+        VkcError: The server does not start.
+    """
+    scene, plan = _parts(plan_or_scene)
+    if in_notebook():
+        from IPython.display import HTML
+
+        page, name = html.escape(_page(scene, plan, frames)), html.escape(scene.name)
+        style = f"width: 100%; height: {int(height)}px; border: none"
+        display: Any = HTML
+        return display(f'<div><iframe srcdoc="{page}" style="{style}" title="{name}"></iframe></div>')
+    viewer = open_viewer()
+    _draw(viewer, scene, plan, frames=frames)
+    sys.stdout.write(f"meshcat shows it at {viewer.url()}\n")
+    if _has_screen() if open_browser is None else open_browser:
+        import webbrowser
+
+        webbrowser.open(viewer.url(), new=2)
+    return viewer
+
+
+def animate(plan: Judged, viewer: meshcat.Visualizer | None = None) -> meshcat.Visualizer:
+    """Put a motion into a meshcat viewer, whose controls have play, pause and a time slider in seconds.
+
+    Args:
+        plan: What to show.
+        viewer: Where; what it shows at its path is replaced. None takes the one of `open_viewer`.
+
+    Returns:
+        The viewer. Give its `jupyter_cell()` as a cell's result to see it in a notebook, or visit its `url()`.
+
+    Raises:
+        InputError: Not a plan, or something that cannot be drawn.
+    """
+    scene, known = _parts(plan)
+    if known is None:
+        raise InputError("nothing moves in it", field="plan", expected="a Plan", got=type(plan).__name__)
+    viewer = open_viewer() if viewer is None else viewer
+    _draw(viewer, scene, known)
+    return viewer
+
+
+def to_html(plan_or_scene: Judged | Scene, path: str | Path, *, frames: Mapping[str, pin.SE3] | None = None) -> Path:
+    """Write one self-contained web page with the motion, or the scene; it loads nothing from elsewhere.
+
+    The page plays the motion, with a time slider in seconds; `page.html#t=3.5` shows it at 3.5 s.
+
+    Args:
+        plan_or_scene: What to show.
+        path: The file to write, whole or not at all.
+        frames: Frames to draw; see `show`.
+
+    Returns:
+        The path.
+
+    Raises:
+        InputError: Neither a plan nor a scene, or something that cannot be drawn.
+    """
+    return write_atomically(path, _page(*_parts(plan_or_scene), frames).encode("utf-8"))
+
+
+def open_viewer() -> meshcat.Visualizer:
+    """Return a viewer on this process's own meshcat server, which is started when first needed and ends with the process.
+
+    The server listens on the loopback interface only. All viewers of a process are the same window.
+
+    Raises:
+        VkcError: The server does not start.
+    """
+    global _server
+    import contextlib
+
+    import meshcat
+
+    if _server is None or _server[0].poll() is not None:
+        _server = _start_server()
+    with contextlib.redirect_stdout(None):  # it would print its address
+        return meshcat.Visualizer(zmq_url=_server[1])
+
+
+def _start_server() -> tuple[subprocess.Popen[bytes], str, str]:
+    file = Path(__file__).with_name("viewer_server.py")
+    # -P: the folder of that file is no place to import from.
+    command = [sys.executable, "-P", "-u", str(file)]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    process = subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment, start_new_session=True
+    )
+    atexit.register(process.kill)
+    assert process.stdout is not None
+    addresses = [process.stdout.readline().decode().strip().partition("=")[2] for _ in range(2)]
+    if not all(addresses):
+        process.kill()
+        raise VkcError("meshcat's server does not start; is a port from 6000 and one from 7000 on free?")
+    return process, addresses[0], addresses[1]
+
+
+def _parts(plan_or_scene: Any) -> tuple[Scene, Judged | None]:
+    if isinstance(plan_or_scene, Scene):
+        return plan_or_scene, None
+    if isinstance(plan_or_scene, Judged):
+        return plan_or_scene.scene, plan_or_scene
+    got = type(plan_or_scene).__name__
+    raise InputError("this cannot be shown", field="plan_or_scene", expected="a Plan or a Scene", got=got)
+
+
+def _draw(
+    viewer: Any, scene: Scene, plan: Judged | None, *, play: bool = True, frames: Mapping[str, pin.SE3] | None = None
+) -> None:
+    from vkc_pin.visualization.drawing import draw
+
+    if plan is None:
+        draw(viewer, scene, frames=frames)
+    else:
+        draw(viewer, scene, plan.trajectory, plan.validation, play=play, frames=frames)
+
+
+def _page(scene: Scene, plan: Judged | None, frames: Mapping[str, pin.SE3] | None = None) -> str:
+    import meshcat
+
+    from vkc_pin.visualization.page import Recorder, render_page
+
+    recorder = Recorder()
+    _draw(meshcat.Visualizer(window=recorder), scene, plan, play=False, frames=frames)
+    return render_page(recorder, title=f"{scene.name} – vkc_pin", film=_film(scene, plan))
+
+
+def _film(scene: Scene, plan: Judged | None) -> dict[str, Any]:
+    """Return what the page's bar shows; see `page.render_page`."""
+    if plan is None:
+        return {"duration": 0.0, "phases": [], "notes": [], "headline": scene.name}
+    times = plan.trajectory.times - plan.trajectory.times[0]
+    return {
+        "duration": float(times[-1]),
+        "phases": [{"name": phase.name, "last": float(times[phase.last])} for phase in plan.trajectory.phases],
+        "notes": [{"text": f"{v.constraint}: {v.subject}", "time": v.time} for v in plan.validation.violations],
+        "headline": f"{scene.name}: {'success' if plan.success else 'FAILED, ' + plan.status}",
+    }
+
+
+def _has_screen() -> bool:
+    return sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -1,0 +1,157 @@
+"""Inverse kinematics of the arm alone, against numeric Pinocchio."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from helpers.drawers import SHORT, drawer_scene, handle, holding, off, open_scene
+from helpers.small_problems import door_scene
+
+import vkc_pin as vkc
+from vkc_pin.baselines.arm_kinematics import ArmKinematics
+from vkc_pin.baselines.poses import base_poses
+from vkc_pin.seeds.knots import Knots
+
+SLIDE = {"slide": 0.3}
+EXACT = 1.01e-6  # [m] and [rad]
+STILL = 0.0
+
+
+def built(attachment: str = "handle") -> tuple[vkc.TrajectoryProblem, ArmKinematics]:
+    problem = vkc.build(holding(attachment=attachment), [vkc.Actuate("drawer", SLIDE)], options=SHORT)
+    return problem, ArmKinematics(problem, Knots(problem, np.random.default_rng(0)))
+
+
+@cache
+def shared() -> tuple[vkc.TrajectoryProblem, ArmKinematics]:
+    return built()
+
+
+@pytest.mark.parametrize("waypoint", [1, 4, 8])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_hand_is_at_the_handle(waypoint: int, seed: int) -> None:
+    """From arms that are anywhere near, the base a little elsewhere: nothing but the arm moves."""
+    problem, arm = shared()
+    rng = np.random.default_rng(seed)
+    seeds = arm.knots.objects[waypoint - 1].copy()
+    seeds[:3] += rng.uniform(-0.05, 0.05, 3)
+    seeds[3:9] += rng.normal(0.0, 0.3, 6)
+    given = seeds.copy()
+    z, closed = arm.solve(seeds, waypoint)
+    np.testing.assert_array_equal(seeds, given)
+    assert closed
+    assert off(problem.scene, z, handle(z[-1])) <= EXACT
+    np.testing.assert_allclose(z[[0, 1, 2, 9]], given[[0, 1, 2, 9]], rtol=0.0, atol=STILL)
+    assert np.all((z >= problem.chain.lower - STILL) & (z <= problem.chain.upper + STILL))
+    assert np.abs(z - given).max() > 0.05
+
+
+def test_what_is_solved_stays() -> None:
+    problem, arm = shared()
+    start = problem.start.copy()
+    z, closed = arm.solve(start, 1)
+    again, also = arm.solve(z, 1)
+    assert closed
+    assert also
+    np.testing.assert_array_equal(again, z)
+
+
+def test_a_grasp_with_a_freedom_is_solved_for_too() -> None:
+    problem, arm = built("handle_free")
+    tilt, slide = (problem.chain.index(f"drawer.{name}") for name in ("handle_free", "slide"))
+    assert arm.columns.tolist() == [3, 4, 5, 6, 7, 8, tilt]
+    tilts = []
+    for waypoint in (2, 5, 8):
+        z, closed = arm.solve(arm.knots.objects[waypoint - 1], waypoint)
+        assert closed
+        assert off(problem.scene, z, handle(z[slide], tilt=z[tilt])) <= EXACT
+        tilts.append(z[tilt])
+    assert np.ptp(tilts) > 0.02
+    assert np.abs(tilts).max() <= 0.6
+
+
+def test_the_columns_of_a_robot_with_a_door() -> None:
+    """Hinge and knob are the object's, not the arm's."""
+    scene = door_scene()
+    rows = base_poses(
+        reach := vkc.build(scene, [vkc.Grasp("door")], options=SHORT), reach.segments, reach.start, np.random.default_rng(0)
+    )
+    held = scene.with_start(base=rows[0, :3], arm=rows[0, 3:9]).with_held({"door": "handle"})
+    problem = vkc.build(held, [vkc.Actuate("door", {"hinge": 0.3})], options=SHORT)
+    arm = ArmKinematics(problem, Knots(problem, np.random.default_rng(0)))
+    assert arm.columns.tolist() == [3, 4, 5, 6, 7, 8]
+    knob, hinge = problem.chain.index("door.knob"), problem.chain.index("door.hinge")
+    wanted = arm.knots.objects[4]
+    z, closed = arm.solve(wanted, 5)
+    assert closed
+    np.testing.assert_allclose(z[[knob, hinge]], wanted[[knob, hinge]], rtol=0.0, atol=STILL)
+    placed = scene.objects["door"].with_state({"hinge": z[hinge], "knob": z[knob]})
+    grasp = placed.object.attachment("handle")
+    assert off(scene, z, placed.link_placement(grasp.link) * grasp.placement) <= EXACT
+
+
+def test_where_nothing_is_held_there_is_nothing_to_solve() -> None:
+    """Only from where the hand comes straight to the handle does it have to be somewhere."""
+    problem = vkc.build(drawer_scene(), [vkc.Grasp("drawer")])
+    arm = ArmKinematics(problem, Knots(problem, np.random.default_rng(0)))
+    z, closed = arm.solve(problem.start, 1)
+    assert closed
+    np.testing.assert_array_equal(z, problem.start)
+    assert not arm.solve(problem.start, problem.segments)[1], "the handle is two metres away"
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_what_is_beyond_a_limit_is_not_reached(side: float) -> None:
+    """A limit of the shoulder is moved to one side of where it must be."""
+    problem, arm = built()
+    chain, pan = problem.chain, 3
+    free, closed = arm.solve(problem.start, 4)
+    assert closed
+    within, beyond = np.sort([free[pan] - side * 0.1, free[pan] - side * 0.6])
+    chain.lower[pan], chain.upper[pan] = within, beyond
+    start = problem.start.copy()
+    start[pan] = (within + beyond) / 2
+    z, closed = arm.solve(start, 4)
+    assert not closed
+    assert np.all((z >= chain.lower - STILL) & (z <= chain.upper + STILL))
+    assert off(problem.scene, z, handle(z[-1])) > 1e-3
+    # With just enough room it is.
+    chain.lower[pan], chain.upper[pan] = np.sort([free[pan] + side * 1e-4, free[pan] - side * 0.6])
+    z, closed = arm.solve(start, 4)
+    assert closed
+    np.testing.assert_allclose(z[3:9], free[3:9], atol=1e-4)
+
+
+def test_a_start_outside_its_limits_by_rounding() -> None:
+    problem, arm = built()
+    z, _ = arm.solve(problem.start, 4)
+    problem.chain.upper[5] = z[5] - 1e-8
+    assert arm.solve(z, 4)[1]
+
+
+def test_out_of_reach() -> None:
+    scene = open_scene()
+    problem = vkc.build(holding(scene), [vkc.Actuate("drawer", SLIDE)], options=SHORT)
+    arm = ArmKinematics(problem, Knots(problem, np.random.default_rng(0)))
+    away = problem.start.copy()
+    away[0] -= 1.5
+    z, closed = arm.solve(away, 4)
+    assert not closed
+    assert np.isfinite(z).all()
+    np.testing.assert_allclose(z[:3], away[:3], rtol=0.0, atol=STILL)
+
+
+@pytest.mark.parametrize("waypoint", [1, 4, 8])
+def test_nothing_but_the_arm_moves(waypoint: int) -> None:
+    problem = vkc.build(holding(), [vkc.Actuate("drawer", {"slide": 0.3})], options=SHORT)
+    arm = ArmKinematics(problem, Knots(problem, np.random.default_rng(0)))
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        given = arm.knots.objects[waypoint - 1].copy()
+        given[:3] += rng.uniform(-0.05, 0.05, 3)
+        given[3:9] += rng.normal(0.0, 0.3, 6)
+        z, _ = arm.solve(given, waypoint)
+        np.testing.assert_array_equal(z[[0, 1, 2, 9]], given[[0, 1, 2, 9]])
+        assert np.all((z >= problem.chain.lower) & (z <= problem.chain.upper))

@@ -1,0 +1,1 @@
+"""Scenes, plans and programs that several test files need."""

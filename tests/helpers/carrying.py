@@ -1,0 +1,209 @@
+"""A stick on a table, a ball on a stand, and motions with them in the hand that nobody planned."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from helpers.drives import DT, hall
+from vkc_pin.models.object_file import load_object
+from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.scene.placed import PlacedObject
+from vkc_pin.scene.scene import Scene
+
+STICK = pin.SE3(np.eye(3), np.array([0.8, 0.0, 0.55]))  # along y, its tip to the left; its discs stand 0.05 below
+TOP = 0.5  # [m] of the table
+BALL = pin.SE3(np.eye(3), np.array([0.8, 0.285, 0.7]))  # where the tip touches it when the stick is held at this height
+GUESS = np.array([0.0, 0.0, 0.0, 0.07, -1.69, -1.39, -1.63, 1.57, -1.5])  # the hand above the table, looking down
+UP = np.array([0.0, 0.0, 0.2])
+FREE = {"stick": STICK, "ball": BALL}
+
+
+def box(name: str, size: Sequence[float], position: Sequence[float]) -> dict[str, Any]:
+    return {"name": name, "type": "box", "size": list(size), "position": list(position)}
+
+
+def table(*, gap: float = 1e-3) -> dict[str, Any]:
+    """Return a table of 0.5 m x 2.4 m whose top is `gap` below the stick's discs."""
+    return box("table", [0.5, 2.4, 0.02], [0.8, 0.3, TOP - gap - 0.01])
+
+
+def stand(name: str = "stand", *, aside: float = 0.0, gap: float = 1e-3) -> dict[str, Any]:
+    """Return a post under the ball, or `aside` [m] along y from it, its top `gap` below it."""
+    return box(name, [0.06, 0.06, 0.5], [0.8, 0.285 + aside, 0.665 - gap - 0.25])
+
+
+def room(*obstacles: Mapping[str, Any], objects: Sequence[str] = ("stick",), base: str = "omni") -> Scene:
+    """Return a hall with obstacles and free objects in it; the robot's hand is 0.2 m above where it takes the stick."""
+    scene = hall(base=base, obstacles=obstacles)
+    document = {**scene.document, "objects": [{"name": n, "type": n, "position": _place(n)} for n in objects]}
+    scene = Scene.from_document(document)
+    return scene.with_start(arm=above(STICK)[3:]) if "stick" in objects else scene
+
+
+def _place(name: str) -> list[float]:
+    return [float(value) for value in FREE[name].translation]
+
+
+def lifted(placement: pin.SE3, shift: Sequence[float] | np.ndarray = UP) -> pin.SE3:
+    """Return `placement` moved by `shift` in the world [m]."""
+    return pin.SE3(placement.rotation, placement.translation + np.asarray(shift))
+
+
+def tool_at(object_at: pin.SE3, name: str = "stick", attachment: str = "grip", values: Sequence[float] = (0.0, 0.0)) -> pin.SE3:
+    """Return where the hand is that holds an object, whose base link is its only one, at `object_at`; by definition."""
+    grasp = load_object(name).attachment(attachment)
+    return object_at * grasp.placement * freedom(attachment, values) * pin.SE3(np.eye(3), np.array([0.0, 0.0, -grasp.standoff]))
+
+
+def freedom(attachment: str, values: Sequence[float]) -> pin.SE3:
+    """Return J(v) of the attachments of stick and ball, from their files."""
+    if attachment == "end":
+        return pin.SE3.Identity()
+    if len(values) == 2:  # slides along −y, and turns about it
+        slide, turn = values
+        return pin.SE3(pin.utils.rotate("y", -turn), np.array([0.0, -slide, 0.0]))
+    x, y, z = values
+    return pin.SE3(pin.utils.rotate("x", x) @ pin.utils.rotate("y", y) @ pin.utils.rotate("z", z), np.zeros(3))
+
+
+def reaching(tool: pin.SE3, guess: np.ndarray = GUESS) -> np.ndarray:
+    """Return the robot's coordinates, shape (9,), near `guess` and with its base there, at which the tool is at `tool`.
+
+    Newton steps on numeric Pinocchio, from `guess` and then from around it.
+    """
+    robot, rng = hall().robot, np.random.default_rng(0)
+    model, data = robot.model, robot.model.createData()
+    frame = model.getFrameId(robot.tool_frame)
+    found = []
+    for spread in (0.0, *np.linspace(0.1, 0.8, 40)):
+        z = np.array(guess)
+        z[3:] += spread * rng.normal(size=6)
+        for _ in range(60):
+            q = robot.coordinates.q(z)
+            pin.computeJointJacobians(model, data, q)
+            error = pin.log6(pin.updateFramePlacement(model, data, frame).actInv(tool)).vector
+            if np.abs(error).max() < 1e-13:
+                break
+            jacobian = pin.getFrameJacobian(model, data, frame, pin.LOCAL)[:, 3:]
+            step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + 1e-12 * np.eye(6), error)
+            z[3:] += step * min(1.0, 0.5 / np.abs(step).max())
+        if np.abs(error).max() < 1e-12 and (z >= robot.lower).all() and (z <= robot.upper).all():
+            found.append(z)
+            if not spread:
+                break
+    return min(found, key=lambda z: float(np.abs(z - guess).sum()))
+
+
+@cache
+def _above() -> np.ndarray:
+    return reaching(tool_at(lifted(STICK)))
+
+
+def above(stick: pin.SE3, **grasp: Any) -> np.ndarray:
+    """Return the robot's coordinates with the hand 0.2 m above where it takes the stick at `stick`."""
+    return reaching(tool_at(lifted(stick), **grasp), _above())
+
+
+@dataclasses.dataclass
+class Script:
+    """Writes a motion: what is held, and where the robot goes with it.
+
+    Attributes:
+        scene: Where it happens; it begins at the scene's start.
+        values: Coordinate of a grasp → value, from the first waypoint to the last.
+    """
+
+    scene: Scene
+    values: dict[str, float] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.rows = [np.array(self.scene.start)]
+        self.phases: list[PhaseSpan] = []
+        self.held, self.by = dict(self.scene.held), dict(self.scene.held_by)
+        for name, attachment in self.held.items():
+            freedoms = self.scene.objects[name].object.attachment(attachment).freedoms
+            self._set(name, attachment, self.scene.held_at.get(name, (0.0,) * len(freedoms)))
+
+    def _set(self, name: str, attachment: str, values: Sequence[float]) -> None:
+        grasp = self.scene.objects[name].object.attachment(attachment)
+        self.values |= {f"{name}.{c}": v for c, v in zip(grasp.coordinates, values, strict=True)}
+
+    def go(self, row: np.ndarray, *, steps: int = 20) -> Script:
+        """Go there from rest to rest."""
+        share = np.linspace(0.0, 1.0, steps + 1)[1:, None]
+        smooth, before = share**2 * (3.0 - 2.0 * share), self.rows[-1]
+        first = len(self.rows) - 1
+        self.rows += list(before + smooth * (row - before))
+        self.phases.append(PhaseSpan(f"phase {len(self.phases)}", first, len(self.rows) - 1, dict(self.held), dict(self.by)))
+        return self
+
+    def wait(self) -> Script:
+        """Stand still for two steps."""
+        return self.go(self.rows[-1], steps=2)
+
+    def take(self, name: str, attachment: str = "grip", values: Sequence[float] = (0.0, 0.0), by: str | None = None) -> Script:
+        """Close the hand, or whatever `by` is."""
+        self.held[name] = attachment
+        if by is not None:
+            self.by[name] = by
+        self._set(name, attachment, values)
+        return self
+
+    def let_go(self, *names: str) -> Script:
+        """Let go of some, or of all."""
+        for name in names or tuple(self.held):
+            del self.held[name]
+            self.by.pop(name, None)
+        return self
+
+    def motion(self, *, dt: float = DT, **columns: Sequence[float]) -> Trajectory:
+        """Return the motion; some coordinates of grasps may change over the waypoints as `columns` say."""
+        robot, shape = self.scene.robot.coordinates.names, len(self.rows)
+        extra = [np.full(shape, value) for value in self.values.values()]
+        rows = np.column_stack([np.array(self.rows), *extra])
+        names = (*robot, *self.values)
+        for name, column in columns.items():
+            rows[:, names.index(name.replace("__", "."))] = column
+        return Trajectory(names, dt * np.arange(shape), rows, tuple(self.phases), len(robot))
+
+
+def moved_base(row: np.ndarray, **values: float) -> np.ndarray:
+    """Return a row with the base further: x, y and yaw by name."""
+    out = np.array(row)
+    for name, value in values.items():
+        out[("x", "y", "yaw").index(name)] += value
+    return out
+
+
+def carried_over(scene: Scene, *, aside: float = 0.5, values: Sequence[float] = (0.0, 0.0), off: pin.SE3 | None = None) -> Script:
+    """Take the stick from the table, carry it `aside` [m] along y, put it down, let go of it and rise.
+
+    With `off` the hand closes that far beside the attachment, in the tool's frame.
+    """
+    off = pin.SE3.Identity() if off is None else off
+    up = reaching(tool_at(lifted(STICK), values=values) * off, _above())
+    down = reaching(tool_at(STICK, values=values) * off, up)
+    script = Script(scene).go(up).go(down).take("stick", values=values).go(up)
+    script.go(moved_base(up, y=aside)).go(moved_base(down, y=aside)).let_go()
+    return script.go(moved_base(up, y=aside))
+
+
+def with_object(scene: Scene, name: str, placement: pin.SE3) -> Scene:
+    """Return the scene with a free object elsewhere."""
+    placed: PlacedObject = dataclasses.replace(scene.objects[name], placement=placement)
+    return dataclasses.replace(scene, objects={**scene.objects, name: placed})
+
+
+def with_grasp(scene: Scene, name: str, attachment: str, **fields: Any) -> Scene:
+    """Return the scene with other fields of an object's attachment."""
+    placed = scene.objects[name]
+    attachments = {**placed.object.attachments}
+    attachments[attachment] = dataclasses.replace(attachments[attachment], **fields)
+    placed = dataclasses.replace(placed, object=dataclasses.replace(placed.object, attachments=attachments))
+    return dataclasses.replace(scene, objects={**scene.objects, name: placed})

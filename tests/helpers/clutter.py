@@ -1,0 +1,35 @@
+"""Random scenes full of obstacles of all kinds, sizes and tilts, in which culling has to be right."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from helpers.carrying import room
+from helpers.small_problems import door_scene
+from vkc_pin.scene.scene import Scene
+
+
+def things(seed: int, count: int) -> list[dict[str, Any]]:
+    """Return `count` random obstacles: near and far, from 1 cm to 3 m, turned anyhow."""
+    rng, obstacles = np.random.default_rng(seed), []
+    for number in range(count):
+        size = (10.0 ** rng.uniform(-2.0, 0.5, 3)).tolist()
+        thing: dict[str, Any] = {"name": f"thing_{number}", "position": rng.uniform([-3.0, -3.0, 0.0], [5.0, 3.0, 2.0]).tolist()}
+        thing["rpy"] = (rng.uniform(-np.pi, np.pi, 3) * rng.choice([0.0, 1.0], 3)).tolist()
+        kind = ("box", "sphere", "cylinder", "capsule")[number % 4]
+        fields = {"box": {"size": size}, "sphere": {"radius": size[0] / 2}}
+        obstacles.append({**thing, "type": kind, **fields.get(kind, {"radius": size[0] / 2, "length": size[1]})})
+    return obstacles
+
+
+def cluttered(seed: int, count: int) -> Scene:
+    """Return the door's scene with `count` random obstacles instead of its own."""
+    scene = door_scene()
+    return Scene.from_document({**scene.document, "obstacles": things(seed, count)}, scene.folder)
+
+
+def cluttered_room(seed: int, count: int) -> Scene:
+    """Return a hall with a stick and a ball that can be carried, among `count` random obstacles."""
+    return room(*things(seed, count), objects=("stick", "ball"))

@@ -1,0 +1,44 @@
+"""A hall with a wall across it: beside the wall, or through a gate in it, the base passes or does not."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+import vkc_pin as vkc
+from helpers.drives import hall
+
+NARROW = 0.73  # [m] the base is 0.67 wide and the arm at home 0.72; both want 0.02 on either side
+TIGHT = 0.70  # [m] here the arm at home does not fit, not even if it may graze
+GOAL = (4.0, 0.5, 0.0)
+
+
+def _across(obstacles: Sequence[dict[str, Any]], goal: Sequence[float]) -> vkc.TrajectoryProblem:
+    scene = hall(obstacles=obstacles)
+    document = {**scene.document, "arena": {"x": [-3.0, 6.0], "y": [-3.0, 3.0]}}
+    return vkc.build(vkc.Scene.from_document(document, scene.folder), [vkc.GoTo(*goal)])
+
+
+def walled(gap: float) -> vkc.TrajectoryProblem:
+    """Return the problem of driving past a wall across the hall that leaves a gap beside it [m]."""
+    wall = {"name": "wall", "type": "box", "size": [0.2, 6.0 - gap, 1.5], "position": [2.0, gap / 2, 0.75]}
+    return _across([wall], (4.0, 1.5, 0.0))
+
+
+def gated(width: float, *, height: float = 1.5) -> vkc.TrajectoryProblem:
+    """Return the problem of driving through a gate of some width [m] in a wall from side to side."""
+    size = (6.4 - width) / 2
+    return _across(
+        [
+            {"name": name, "type": "box", "size": [0.2, size, height], "position": [2.0, side * (size + width) / 2, height / 2]}
+            for name, side in (("left", 1.0), ("right", -1.0))
+        ],
+        GOAL,
+    )
+
+
+def at(problem: vkc.TrajectoryProblem, pose: Sequence[float]) -> np.ndarray:
+    """Return the problem's start with the base elsewhere, shape (n,)."""
+    return np.concatenate([pose, problem.start[3:]])

@@ -1,0 +1,61 @@
+"""Random motions, and distances of their pairs by brute force."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+
+from helpers.carrying import Script, room, table
+from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.scene.scene import Scene
+from vkc_pin.validation.pairs import PairTable
+
+
+def wander(scene: Scene, seed: int, *, size: float) -> Trajectory:
+    """Return a random motion of robot and door near the door, four waypoints; joints change by up to `size` a step."""
+    rng = np.random.default_rng(seed)
+    door = scene.objects["door"].object
+    first = np.concatenate([scene.start, [0.6, 0.3]])
+    first[:3] = rng.uniform([0.6, -0.8, -np.pi], [2.0, 0.8, np.pi])
+    first[3:9] += rng.uniform(-1.0, 1.0, 6)
+    rows = [first]
+    for _ in range(3):
+        rows.append(rows[-1] + size * rng.uniform(-1.0, 1.0, len(first)) * rng.choice([0.0, 0.1, 1.0], len(first)))
+    positions = np.array(rows)
+    positions[:, 9:] = np.clip(positions[:, 9:], door.lower, door.upper)
+    names = (*scene.robot.coordinates.names, "door.hinge", "door.knob")
+    return Trajectory(names, np.arange(4.0), positions, (PhaseSpan("all", 0, 3, {"door": "handle"}),), 9)
+
+
+def brute_force(table: PairTable, z: np.ndarray) -> np.ndarray:
+    """Return the distance of every pair at every configuration, shape (S, P), by Pinocchio and coal without culling."""
+    geometry = table.world.collision.copy()
+    for first, second in table.pairs.tolist():
+        geometry.addCollisionPair(pin.CollisionPair(first, second))
+    model, data, shapes = table.world.model, table.world.model.createData(), pin.GeometryData(geometry)
+    out = np.empty((len(z), len(table.pairs)))
+    for row, q in enumerate(table.world.coordinates.q(z)):
+        pin.updateGeometryPlacements(model, data, geometry, shapes, q)
+        pin.computeDistances(geometry, shapes)
+        out[row] = [result.min_distance for result in shapes.distanceResults]
+    return out
+
+
+def pair_names(table: PairTable, k: int) -> tuple[str, str]:
+    first, second = table.pairs[k]
+    return table.world.collision_labels[first], table.world.collision_labels[second]
+
+
+def whirl(seed: int, *, size: float, scene: Scene | None = None) -> tuple[Scene, Trajectory]:
+    """Return a random motion with a stick in the hand and a ball on its tip, five waypoints, in two phases."""
+    rng = np.random.default_rng(seed)
+    scene = room(table(), objects=("stick", "ball")) if scene is None else scene
+    scene = scene.with_held({"stick": "grip", "ball": "pull"}, by={"ball": "stick.tip"})
+    script = Script(scene)
+    for phase in range(2):
+        if phase:
+            script.let_go("ball")
+        there = np.array(script.rows[-1])
+        there += size * rng.uniform(-1.0, 1.0, len(there)) * rng.choice([0.0, 0.1, 1.0], len(there))
+        script.go(there, steps=2)
+    return scene, script.motion()

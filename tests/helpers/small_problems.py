@@ -1,0 +1,125 @@
+"""Scenes, grasps and short problems that several tests use."""
+
+from __future__ import annotations
+
+import dataclasses
+import tempfile
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.chain.broadphase import PhaseGeometry
+from vkc_pin.models.articulation import ArticulatedObject, Attachment, Freedom
+from vkc_pin.models.object_file import load_object
+from vkc_pin.options import Options
+from vkc_pin.scene.placed import PlacedObject
+from vkc_pin.scene.scene import Scene, load_scene
+
+SHORT = Options(reach_waypoints=5, turn_waypoints=3, move_waypoints=4)
+
+# A cabinet with a swinging arm on a slanted axis, on it a tray that slides, and beside the way two flaps.
+_CABINET = """
+<robot name="cabinet">
+  <link name="case"><collision><geometry><box size="0.5 0.5 0.5"/></geometry></collision></link>
+  <link name="arm"><collision><geometry><box size="0.3 0.05 0.05"/></geometry></collision></link>
+  <link name="tray">
+    <collision><origin xyz="0.1 0 0"/><geometry><box size="0.1 0.2 0.02"/></geometry></collision>
+    <collision><geometry><sphere radius="0.03"/></geometry></collision>
+  </link>
+  <link name="knob"/>
+  <link name="flap"><collision><geometry><sphere radius="0.02"/></geometry></collision></link>
+  <link name="lid"><collision><geometry><box size="0.5 0.5 0.01"/></geometry></collision></link>
+  <joint name="swing" type="revolute"><parent link="case"/><child link="arm"/><origin xyz="0.3 0.1 0.2" rpy="0.1 0.2 0.3"/>
+    <axis xyz="0.6 0 0.8"/><limit lower="-1" upper="2" velocity="1.5" effort="1"/></joint>
+  <joint name="slide" type="prismatic"><parent link="arm"/><child link="tray"/><origin xyz="0.2 0 0.1" rpy="0.4 0 0"/>
+    <axis xyz="0 -1 0"/><limit lower="0" upper="0.3" velocity="0.4" effort="1"/></joint>
+  <joint name="pin" type="fixed"><parent link="tray"/><child link="knob"/><origin xyz="0.15 0 0.05" rpy="0 0.3 0"/></joint>
+  <joint name="flap_hinge" type="revolute"><parent link="arm"/><child link="flap"/><origin xyz="0 0 0.2"/>
+    <axis xyz="1 0 0"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint>
+  <joint name="lid_hinge" type="revolute"><parent link="case"/><child link="lid"/><origin xyz="0 0 0.3"/>
+    <axis xyz="0 1 0"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint>
+</robot>"""
+_CABINET_FILE = """
+urdf: cabinet.urdf
+joints: {swing: {acceleration: 3.0}, slide: {acceleration: 0.7}}
+attachments:
+  - {name: grip, link: knob, position: [0.02, 0.01, 0.03], approach: [1, 0, 0], closing: [0, 0, 1]}
+"""
+CABINET_STATE = {"swing": 0.3, "slide": 0.1, "flap_hinge": 0.7, "lid_hinge": -0.4}
+
+
+@cache
+def door_scene() -> Scene:
+    return load_scene("door")
+
+
+@cache
+def cabinet() -> ArticulatedObject:
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "cabinet.urdf").write_text(_CABINET)
+        (Path(folder) / "cabinet.yaml").write_text(_CABINET_FILE)
+        return load_object(Path(folder) / "cabinet.yaml")
+
+
+def with_objects(scene: Scene, objects: Mapping[str, PlacedObject]) -> Scene:
+    """Return `scene` with `objects` added to its own, or in their place."""
+    return dataclasses.replace(scene, objects={**scene.objects, **objects})
+
+
+def with_attachment(placed: PlacedObject, attachment: Attachment) -> PlacedObject:
+    """Return `placed` with one more attachment."""
+    attachments = {**placed.object.attachments, attachment.name: attachment}
+    return dataclasses.replace(placed, object=dataclasses.replace(placed.object, attachments=attachments))
+
+
+@cache
+def full_scene() -> Scene:
+    """Return the door's room with a drawer and a cabinet in it too, all of which can be grasped in every way there is."""
+    scene, drawer = door_scene(), load_scene("drawer").objects["drawer"]
+    state = np.array([CABINET_STATE[name] for name in cabinet().coordinates.names])
+    case = PlacedObject("cabinet", cabinet(), pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, 0.8), np.array([-1.0, 1.2, 0.4])), state)
+    grip = cabinet().attachments["grip"]
+    axis = np.array([2.0, -1.0, 2.0]) / 3.0
+    turns = tuple(Freedom(f"_{name}", "revolute", unit, -0.7, 0.6) for name, unit in zip("xyz", np.eye(3), strict=True))
+    sleeve = (Freedom("_slide", "prismatic", axis, -0.05, 0.08), Freedom("_turn", "revolute", axis, -0.5, 0.9))
+    for freer in (
+        dataclasses.replace(grip, name="rail", joint="prismatic", freedoms=(Freedom("", "prismatic", axis, -0.05, 0.08),)),
+        dataclasses.replace(grip, name="bar", joint="revolute", freedoms=(Freedom("", "revolute", axis, -0.5, 0.9),)),
+        dataclasses.replace(grip, name="ball", joint="spherical", freedoms=turns),
+        dataclasses.replace(grip, name="sleeve", joint="cylindrical", freedoms=sleeve, standoff=0.02),
+        dataclasses.replace(grip, name="socket", joint="spherical", freedoms=turns, standoff=0.04),
+        dataclasses.replace(grip, name="spike", standoff=0.03),
+    ):
+        case = with_attachment(case, freer)
+    return with_objects(scene, {"drawer": drawer, "cabinet": case})
+
+
+def random_configurations(
+    lower: np.ndarray, upper: np.ndarray, count: int, rng: np.random.Generator, *, arena: float = 2.0
+) -> np.ndarray:
+    """Return configurations between limits, shape (count, n); the base within `arena` of the origin, at any heading."""
+    low, high = np.maximum(lower, -np.pi), np.minimum(upper, np.pi)
+    low[:2], high[:2] = -arena, arena
+    return rng.uniform(low, high, (count, len(low)))
+
+
+def all_pairs(part: PhaseGeometry) -> pin.GeometryModel:
+    """Return the geometry of a phase as Pinocchio's own, with every pair, to ask for all distances without culling."""
+    geometry = pin.GeometryModel()
+    for shape in part.shapes:
+        geometry.addGeometryObject(shape)
+    for first, second in part.pairs.tolist():
+        geometry.addCollisionPair(pin.CollisionPair(first, second))
+    return geometry
+
+
+def hand_off_the_handle(scene: Scene, row: np.ndarray, hinge: float, knob: float) -> float:
+    """Return the largest coordinate of the error between tool and grasp, [m] or [rad], by numeric Pinocchio."""
+    placed = scene.objects["door"].with_state({"hinge": hinge, "knob": knob})
+    attachment = placed.object.attachment("handle")
+    tool = dataclasses.replace(scene, start=row[:9]).tool_placement()
+    error = tool.inverse() * placed.link_placement(attachment.link) * attachment.placement
+    return float(np.abs(pin.log6(error).vector).max())

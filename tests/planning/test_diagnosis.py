@@ -1,0 +1,69 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.drives import hall
+from helpers.small_problems import SHORT, door_scene
+
+import vkc_pin as vkc
+from vkc_pin.planning.diagnosis import explain, impossible
+
+CRATE = {"name": "crate", "type": "box", "size": [0.6, 0.6, 0.4], "position": [1.5, 0.0, 0.2]}
+
+
+def problem(scene: vkc.Scene, *steps: vkc.steps.Step) -> vkc.TrajectoryProblem:
+    return vkc.build(scene, list(steps), options=SHORT)
+
+
+def test_nothing_is_wrong_with_the_demo() -> None:
+    demo = problem(door_scene(), vkc.Actuate("door", {"hinge": 1.2}))
+    assert impossible(demo) == []
+    assert explain(demo, 0) == []
+
+
+def test_goals_beyond_limits_of_every_kind() -> None:
+    drawer = problem(vkc.load_scene("drawer"), vkc.Actuate("drawer", {"slide": 0.6}))
+    (violation,) = impossible(drawer)
+    assert (violation.constraint, violation.subject, violation.unit) == ("goal", "drawer.slide", "m")
+    assert violation.amount == pytest.approx(0.2)
+    assert violation.waypoint == drawer.segments
+    first, second = impossible(problem(door_scene(), vkc.Actuate("door", {"hinge": -2.0}), vkc.GoTo(0.0, 3.0)))
+    assert (first.subject, first.unit, second.subject, second.unit) == ("door.hinge", "rad", "base_y", "m")
+    assert (first.amount, second.amount) == (pytest.approx(0.43), pytest.approx(0.9))
+    assert first.waypoint < second.waypoint
+
+
+def test_a_goal_at_the_limit_is_fine() -> None:
+    scene = door_scene()
+    assert impossible(problem(scene, vkc.Actuate("door", {"hinge": 1.57}))) == []
+    assert impossible(problem(scene, vkc.GoTo(scene.arena[1], scene.arena[3]))) == []
+
+
+def test_a_start_that_touches() -> None:
+    scene = hall(obstacles=[{**CRATE, "position": [0.7, 0.0, 0.2]}])
+    (violation, *_) = impossible(problem(scene, vkc.GoTo(-1.0, 0.0)))
+    assert (violation.constraint, violation.subject, violation.waypoint) == ("start", "base_link – crate", 0)
+    assert violation.amount == pytest.approx(0.495 + 0.3 - 0.7, abs=1e-6)
+
+
+def test_how_far_a_target_stays_out_of_reach() -> None:
+    (line,) = explain(problem(hall(), vkc.Reach((1.0, 0.0, 4.0, 0.0, 0.0, 0.0))), 0)
+    assert line.startswith("reach with tool: out of reach")
+    short = float(line.split("the nearest stays ")[1].split()[0])
+    assert 1.5 < short < 3.0
+
+
+def test_what_blocks_every_goal_configuration() -> None:
+    (line,) = explain(problem(hall(obstacles=[CRATE]), vkc.GoTo(1.5, 0.0, 0.0)), 0)
+    assert line.endswith("base_link – crate overlap by 270.0 mm")
+
+
+def test_a_goal_that_leaves_the_base_free_is_not_judged() -> None:
+    grasp = problem(door_scene(), vkc.Grasp("door"))
+    assert explain(grasp, 0) == explain(grasp, 1) == []
+
+
+def test_the_same_seed_says_the_same() -> None:
+    blocked = problem(hall(obstacles=[CRATE]), vkc.Reach((1.5, 0.0, 0.2, 0.0, np.pi, 0.0)))
+    assert explain(blocked, 3) == explain(blocked, 3)
+    assert explain(blocked, 3)

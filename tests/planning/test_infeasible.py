@@ -1,0 +1,138 @@
+"""What cannot be done is explained: which constraint, which links or coordinate, where and by how much."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.drives import hall
+
+import vkc_pin as vkc
+
+QUICK = vkc.Options(reach_waypoints=15, turn_waypoints=4, move_waypoints=12, max_restarts=1, max_outer=8)
+
+
+def box(name: str, size: Sequence[float], position: Sequence[float]) -> dict[str, Any]:
+    return {"name": name, "type": "box", "size": list(size), "position": list(position)}
+
+
+def door_with(*obstacles: dict[str, Any]) -> vkc.Scene:
+    scene = vkc.load_scene("door")
+    document = {**scene.document, "obstacles": [*scene.document["obstacles"], *obstacles]}
+    return vkc.Scene.from_document(document, scene.folder)
+
+
+def explained(plan: vkc.Plan, *texts: str) -> str:
+    """The plan failed, says so in words that contain `texts`, and every violation has its place and amount."""
+    assert not plan.success
+    assert plan.status in ("infeasible", "not converged", "rejected")
+    assert plan.validation.violations
+    for violation in plan.validation.violations:
+        assert violation.subject
+        assert violation.amount > 0.0
+        assert 0 <= violation.waypoint < len(plan.trajectory.times)
+        assert f"waypoint {violation.waypoint}" in str(violation)
+    report = plan.report()
+    assert report.splitlines()[0].startswith(f"{plan.scene.name}: FAILED, {plan.status} — ")
+    for text in texts:
+        assert text in report, report
+    assert not vkc.validate(plan.scene, plan.steps, plan.trajectory, plan.options).ok
+    return report
+
+
+def the(plan: vkc.Plan, constraint: str, subject: str) -> vkc.Violation:
+    """Return the violation of a constraint whose subject contains `subject`."""
+    found = [v for v in plan.validation.violations if v.constraint == constraint and subject in v.subject]
+    assert found, plan.report()
+    return found[0]
+
+
+def test_a_door_behind_a_wall() -> None:
+    scene = door_with(box("barrier", (0.1, 1.07, 2.0), (2.3, 0.0, 1.0)))
+    plan = vkc.plan(scene, [vkc.Actuate("door", {"hinge": 1.2})], options=QUICK)
+    assert plan.status == "infeasible"
+    explained(plan, "because reach door.handle", "are blocked", "– barrier", "mm")
+    assert the(plan, "penetration", "– barrier").unit == "m"
+
+
+@pytest.mark.parametrize(("joints", "name", "beyond"), [({"hinge": 2.0}, "door.hinge", 0.43), ({"knob": -0.5}, "door.knob", 0.5)])
+def test_a_goal_beyond_a_joint_limit(joints: dict[str, float], name: str, beyond: float) -> None:
+    plan = vkc.plan(vkc.load_scene("door"), [vkc.Actuate("door", joints)], options=QUICK)
+    assert plan.status == "infeasible"
+    explained(plan, f"goal {name}: {next(iter(joints.values())):g} is beyond the limits")
+    first = plan.validation.violations[0]
+    assert (first.constraint, first.subject, first.unit) == ("goal", name, "rad")
+    assert first.amount == pytest.approx(beyond)
+    assert plan.metrics["rounds"] == 0  # nothing was tried
+
+
+def test_a_goal_off_the_arena() -> None:
+    plan = vkc.plan(hall(), [vkc.GoTo(9.0, -6.5)], options=QUICK)
+    assert plan.status == "infeasible"
+    explained(plan, "goal base_x: 9 is beyond the limits -6 to 6 by 3", "goal base_y: -6.5 is beyond the limits -6 to 6 by 0.5")
+    assert the(plan, "goal", "base_x").waypoint == QUICK.reach_waypoints
+
+
+def test_a_target_out_of_reach() -> None:
+    plan = vkc.plan(hall(), [vkc.Reach((1.5, 0.0, 3.0, 0.0, 0.0, 0.0))], options=QUICK)
+    assert plan.status == "infeasible"
+    explained(plan, "because reach with tool: out of reach", "m or rad short", "goal tool")
+    goal = the(plan, "goal", "tool")
+    assert 1.0 < goal.amount < 2.0
+    assert goal.waypoint == len(plan.trajectory.times) - 1
+
+
+def test_a_start_in_collision() -> None:
+    plan = vkc.plan(hall(obstacles=[box("crate", (0.4, 0.4, 0.4), (0.5, 0.0, 0.2))]), [vkc.GoTo(-1.0, 0.0)], options=QUICK)
+    assert plan.status == "infeasible"
+    explained(plan, "start base_link – crate: overlap by 195.0 mm at the start (waypoint 0, 0.00 s)")
+    first = plan.validation.violations[0]
+    assert (first.constraint, first.subject, first.waypoint) == ("start", "base_link – crate", 0)
+    assert first.amount == pytest.approx(0.195, abs=1e-3)
+
+
+def test_a_start_that_collides_with_itself() -> None:
+    scene = hall()
+    folded = scene.start[3:].copy()
+    folded[2] = scene.robot.lower[5]
+    plan = vkc.plan(scene.with_start(arm=folded), [vkc.GoTo(-1.0, 0.0)], options=QUICK)
+    assert plan.status == "infeasible"
+    explained(plan, "start shoulder_link – forearm_link: overlap by")
+
+
+WALLS = [box("fence", (0.1, 12.0, 2.4), (1.2, 0.0, 1.2))]
+
+
+@pytest.mark.parametrize("step", [vkc.GoTo(3.0, 0.0), vkc.Reach((3.0, 0.0, 1.0, 0.0, np.pi / 2, 0.0))], ids=["base", "reach"])
+def test_a_closed_gap(step: Any) -> None:
+    plan = vkc.plan(hall(obstacles=WALLS), [step], options=QUICK)
+    explained(plan, "penetration", "– fence: overlap by")
+    assert any(violation.subject.endswith("– fence") for violation in plan.validation.violations)
+
+
+def test_a_base_goal_inside_furniture() -> None:
+    crate = box("crate", (0.6, 0.6, 0.4), (1.5, 0.0, 0.2))
+    plan = vkc.plan(hall(obstacles=[crate]), [vkc.GoTo(1.5, 0.0, 0.0)], options=QUICK)
+    assert plan.status == "infeasible"
+    explained(plan, "because go to: all", "are blocked", "base_link – crate overlap by", "penetration base_link – crate")
+
+
+def test_all_reasons_are_given_at_once() -> None:
+    scene = hall(obstacles=[box("crate", (0.4, 0.4, 0.4), (0.5, 0.0, 0.2))])
+    plan = vkc.plan(scene, [vkc.GoTo(9.0, 0.0)], options=QUICK)
+    explained(plan, "start base_link – crate", "goal base_x")
+
+
+def test_what_failed_is_saved_with_its_reasons(tmp_path: Any) -> None:
+    plan = vkc.plan(hall(), [vkc.Reach((1.5, 0.0, 3.0, 0.0, 0.0, 0.0))], options=QUICK)
+    loaded = vkc.Plan.load(plan.save(tmp_path / "failed.npz"))
+    assert not loaded.success
+    assert loaded.report() == plan.report()
+
+
+def test_the_stationary_seed_is_explained_too() -> None:
+    crate = box("crate", (0.6, 0.6, 0.4), (1.5, 0.0, 0.2))
+    plan = vkc.plan(hall(obstacles=[crate]), [vkc.GoTo(1.5, 0.0, 0.0)], initialization="stationary", options=QUICK)
+    explained(plan, "base_link – crate")

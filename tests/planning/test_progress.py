@@ -1,0 +1,161 @@
+from __future__ import annotations
+
+import io
+import os
+import pty
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from helpers.drives import hall
+
+import vkc_pin as vkc
+from vkc_pin.planning import one_problem
+from vkc_pin.planning import progress as module
+from vkc_pin.planning.progress import Progress, shown
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+class Terminal(io.StringIO):
+    """A terminal that remembers what was written to it."""
+
+    def isatty(self) -> bool:
+        return True
+
+    def lines(self) -> list[str]:
+        """Return what can be read in the end: a carriage return writes over what is there."""
+        seen = []
+        for line in self.getvalue().split("\n"):
+            text = ""
+            for part in line.split("\r"):
+                text = part + text[len(part) :]
+            seen.append(text.rstrip())
+        return seen
+
+
+@pytest.fixture
+def terminal(monkeypatch: pytest.MonkeyPatch) -> Terminal:
+    stream = Terminal()
+    monkeypatch.setattr(module, "sys", SimpleNamespace(stderr=stream))
+    monkeypatch.setattr(module.shutil, "get_terminal_size", lambda: os.terminal_size((70, 24)))
+    return stream
+
+
+def row(**changes: Any) -> Any:
+    return SimpleNamespace(**{"round": 3, "shortfall": 0.0123, "objective": 4.5678, **changes})
+
+
+def test_it_says_what_is_done() -> None:
+    seen: list[tuple[str, bool]] = []
+    line = Progress(lambda text, last: seen.append((text, last)))
+    line.part(3, 2, 18)
+    line.begin(["reach cup.side", "place cup"])
+    line.doing("looking for a seed")
+    line._changed = 0.0
+    line(row())
+    assert seen[-2][0] == "0 s · steps 3 to 4 of 18 · looking for a seed · reach cup.side, place cup"
+    assert seen[-1][0] == "0 s · steps 3 to 4 of 18 · round 3, 12.3 mm missing, objective 4.57 · reach cup.side, place cup"
+    line.part(7, 1, 18)
+    line._changed = 0.0
+    line(row(shortfall=0.0))
+    assert "step 7 of 18 · round 3, clear, " in seen[-1][0]
+    line.stop()
+    line.stop()
+    line.doing("nothing any more")
+    assert [last for _, last in seen] == [False] * (len(seen) - 1) + [True]
+    assert re.fullmatch(r"stopped after [\d.]+ s", seen[-1][0])
+
+
+def test_rounds_do_not_flood_it() -> None:
+    seen: list[str] = []
+    line = Progress(lambda text, last: seen.append(text))
+    for _ in range(1000):
+        line(row())
+    assert 1 <= len(seen) < 20
+
+
+def test_a_terminal_has_one_line(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_PAUSE", 0.0)  # however quick this is
+    plan = vkc.plan(hall(), [vkc.GoTo(-1.0, 0.5)], progress=True)
+    assert plan.success
+    first, rest = terminal.lines()
+    assert rest == ""
+    assert re.match(r".*: success — base \d\.\d\d m, arm .* rad, planned in [\d.]+ s$|.*: success — ", first)
+    assert all(len(part.rstrip()) < 70 for part in re.split(r"[\r\n]", terminal.getvalue()))
+    assert "looking for a seed" in terminal.getvalue()
+    assert "round 1" in terminal.getvalue()
+
+
+def test_an_error_leaves_a_line_as_well(terminal: Terminal) -> None:
+    def fails(line: vkc.Iteration) -> None:
+        raise ValueError("mine")
+
+    with pytest.raises(ValueError, match="mine"):
+        vkc.plan(hall(), [vkc.GoTo(-1.0, 0.5)], progress=True, callback=fails)
+    assert re.fullmatch(r"stopped after [\d.]+ s", terminal.lines()[0])
+
+
+def test_ctrl_c_leaves_a_line_as_well(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stop(*_: Any, **__: Any) -> Iterator[Any]:
+        signal.raise_signal(signal.SIGINT)
+        return iter(())
+
+    monkeypatch.setattr(one_problem, "initialize", stop)
+    plan = vkc.plan(hall(), [vkc.GoTo(-1.0, 0.5)], progress=True)
+    assert plan.status == "interrupted"
+    assert "FAILED, interrupted" in terminal.lines()[0]
+    assert terminal.lines()[1:] == [""]
+
+
+def test_a_pipe_gets_nothing(capfd: pytest.CaptureFixture[str]) -> None:
+    with shown(True) as line:
+        line.doing("something")
+        assert line.write is None
+    assert capfd.readouterr() == ("", "")
+
+
+def test_it_is_off_unless_asked_for(terminal: Terminal) -> None:
+    with shown(False) as line:
+        line.doing("something")
+    assert terminal.getvalue() == ""
+
+
+@pytest.mark.parametrize("value", [None, 1, "yes"])
+def test_true_or_false(value: Any) -> None:
+    with pytest.raises(vkc.InputError, match="progress: wrong kind of argument"):
+        vkc.plan(hall(), [vkc.GoTo(-1.0, 0.5)], progress=value)
+
+
+def test_a_chore_says_which_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[str] = []
+    monkeypatch.setattr(module, "_screen", lambda: lambda text, last: seen.append(text))
+    plan = vkc.plan_chore(hall(), [vkc.GoTo(-1.0, 0.5), vkc.GoTo(-0.5, 0.3)], progress=True)
+    assert plan.success
+    parts = [match[0] for text in seen if (match := re.search(r"steps? \d[\w ]* of 2", text))]
+    assert list(dict.fromkeys(parts)) == ["step 1 of 2", "step 2 of 2", "steps 1 to 2 of 2"]
+    assert "success" in seen[-1]
+
+
+def test_a_real_terminal(tmp_path: Path) -> None:
+    code = """
+import sys; sys.path.insert(0, "tests")
+from helpers.drives import hall
+import vkc_pin as vkc
+vkc.plan(hall(), [vkc.GoTo(-1.0, 0.5)], progress=True)
+"""
+    ours, theirs = pty.openpty()
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, stderr=theirs, timeout=120, check=True)
+    os.close(theirs)
+    text = os.read(ours, 100_000).decode()
+    os.close(ours)
+    assert done.stdout == b""
+    assert text.count("\n") == 1
+    assert text.count("\r") > 3
+    assert "success" in text

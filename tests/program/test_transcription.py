@@ -1,0 +1,445 @@
+"""The nonlinear program, row by row against its definitions, and its derivatives against finite differences."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from dataclasses import dataclass
+from functools import cache
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.carrying import room, stand, table
+from helpers.small_problems import door_scene, full_scene, random_configurations
+
+from vkc_pin.models.robot_file import load_robot
+from vkc_pin.options import Options
+from vkc_pin.program import transcription as module
+from vkc_pin.program import waypoint as kinds
+from vkc_pin.program.problem import TrajectoryProblem, build
+from vkc_pin.program.waypoint import Structure, waypoint_functions
+from vkc_pin.scene.scene import Scene
+from vkc_pin.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
+
+OPTIONS = Options(reach_waypoints=3, turn_waypoints=2, move_waypoints=3, contact_slots=2)
+QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes"}
+PENALTY = 7.0
+
+
+@cache
+def differential_scene() -> Scene:
+    return dataclasses.replace(door_scene(), robot=load_robot("husky_ur5e", base="differential"))
+
+
+@cache
+def problem(name: str) -> TrajectoryProblem:
+    pose = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array([0.4, 0.2, 0.9]))
+    if name == "reach":
+        return build(door_scene(), [Reach(pose)], options=OPTIONS)
+    if name == "door":
+        return build(door_scene(), [Actuate("door", {"hinge": 1.2})], options=OPTIONS)
+    if name == "differential":
+        return build(differential_scene(), [Reach(pose), GoTo(0.0, 0.0, 1.0)], options=OPTIONS)
+    if name == "stick":  # chosen where to grasp, clamped from then on; a point, and an upright place
+        return build(room(table()), [Touch("stick.tip", (0.8, 0.9, 0.7)), Place("stick", (0.8, 0.5, 0.56))], options=OPTIONS)
+    if name == "fetch":  # a ball with the stick that is held at the start, then the stick itself is put away
+        scene = room(stand(), objects=("stick", "ball")).with_held({"stick": "grip"}, at={"stick": (0.02, -0.1)})
+        steps = [Grasp("ball", "pull", "stick.tip"), Place("ball", pose), Release("stick"), GoTo(0.0, 0.0)]
+        return build(scene, steps, options=OPTIONS)
+    assert name == "two grasps"  # the second ends nothing: there is a pose to reach after it
+    steps = [Grasp("cabinet", "ball"), Actuate("drawer", {"slide": 0.2}, attachment="handle_free"), Reach(pose)]
+    return build(full_scene(), steps, options=OPTIONS)
+
+
+NAMES = ["reach", "door", "differential", "two grasps", "stick", "fetch"]
+
+
+@dataclass
+class Point:
+    """Where the program is evaluated: everything random but the targets."""
+
+    problem: TrajectoryProblem
+    z: np.ndarray  # (N, n)
+    slack: np.ndarray  # (N,)
+    planes: np.ndarray  # (N, K, 12·joints)
+    offsets: np.ndarray  # (N, K)
+
+    @property
+    def x(self) -> np.ndarray:
+        return np.column_stack([self.z, self.slack]).ravel()
+
+    @property
+    def parameters(self) -> np.ndarray:
+        p = self.problem
+        return p.transcription.parameter_vector(p.start, self.planes, self.offsets, p.target_matrix(), PENALTY)
+
+
+def random_point(p: TrajectoryProblem, seed: int = 0) -> Point:
+    rng, t = np.random.default_rng(seed), p.transcription
+    z = random_configurations(p.chain.lower, p.chain.upper, t.segments, rng)
+    planes = rng.normal(size=(t.segments, t.slots, 12 * (p.chain.model.njoints - 1)))
+    return Point(p, z, rng.uniform(0.0, 1.0, t.segments), planes, rng.normal(size=(t.segments, t.slots)))
+
+
+def functions(p: TrajectoryProblem, *, rates: bool) -> tuple[ca.Function, ca.Function, ca.Function]:
+    """Return what Ipopt is given: (x, p) → f, ∇f; (x, p) → g, ∂g; (x, p, σ, λ) → the upper half of ∇²L."""
+    solver = p.transcription.solver(rates=rates, options=QUIET)
+    return tuple(solver.get_function(name) for name in ("nlp_grad_f", "nlp_jac_g", "nlp_hess_l"))
+
+
+def rows(point: Point, *, rates: bool = False) -> np.ndarray:
+    value, _ = functions(point.problem, rates=rates)[1](point.x, point.parameters)
+    return np.asarray(value).ravel()
+
+
+def differences(function, x: np.ndarray, step: float = 1e-5) -> np.ndarray:  # type: ignore[no-untyped-def]
+    """Return the central differences of a vector function, shape (rows, len(x))."""
+    columns = [(function(x + step * e) - function(x - step * e)) / (2 * step) for e in np.eye(len(x))]
+    return np.array(columns).T
+
+
+def clamped(p: TrajectoryProblem) -> list[tuple[int, int, int]]:
+    """Return column, first and last waypoint of what a hand keeps as it chose it; by the definition of a firm grasp."""
+    found = []
+    for hold, names in p.chain.virtual.items():
+        firm = p.scene.objects[hold.object].object.attachments[hold.attachment].firm
+        grasps = [k for k, phase in enumerate(p.task.phases) if hold in phase.grasps]
+        for k in grasps if firm else ():
+            held = itertools.takewhile(lambda j, hold=hold: hold in p.task.phases[j].held, range(k + 1, len(p.task.phases)))
+            last = max([k, *held])
+            before = max(1, int(p.ends[k]) - OPTIONS.approach_waypoints)
+            found += [(p.chain.index(name), before, int(p.ends[last])) for name in names]
+    return found
+
+
+def clamp_rows(p: TrajectoryProblem) -> np.ndarray:
+    """Return the last rows: one for every coordinate that is clamped and every step of time."""
+    count = sum(last - first for _, first, last in clamped(p))
+    return p.transcription.rows - count + np.arange(count)
+
+
+def stretches(p: TrajectoryProblem) -> list[np.ndarray]:
+    """Return the waypoints of each stretch between two rests: the start, every grasp and release, the end."""
+    neighbours = zip(p.ends[:-1], p.task.phases[:-1], p.task.phases[1:], strict=True)
+    hands = [int(end) for end, a, b in neighbours if a.grasps or set(a.held) - set(b.held)]
+    stops = [0, *hands, p.segments]
+    return [np.arange(a, b + 1) for a, b in itertools.pairwise(stops)]
+
+
+# --- definitions ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_objective_is_equation_1(name: str) -> None:
+    p, o = problem(name), OPTIONS
+    point = random_point(p)
+    weight = np.array(
+        [
+            o.velocity_weight_base
+            if k < 2
+            else o.velocity_weight_heading
+            if k == 2
+            else o.velocity_weight_arm
+            if k < p.chain.robot.coordinates.size
+            else o.velocity_weight_object
+            for k in range(p.chain.size)
+        ]
+    )
+    weight[[column for column, _, _ in clamped(p)]] = 1e-3  # chosen once, and not moved
+    path = np.vstack([p.start, point.z])
+    expected = PENALTY * point.slack.sum()
+    for stretch in stretches(p):
+        step = np.diff(path[stretch], axis=0)
+        bend = np.diff(np.vstack([np.zeros(p.chain.size), step, np.zeros(p.chain.size)]), axis=0) / o.dt
+        holding = np.array([p.closed(p.task.phases[p.contacts.phase_of(int(t))]) for t in stretch[1:]])
+        heavier = np.where(holding[:, None] & (np.arange(p.chain.size) < 2), o.velocity_weight_holding, 1.0)
+        expected += np.sum(heavier * weight * step**2) + o.acceleration_weight * np.sum(weight * bend**2)
+    value, _ = functions(p, rates=False)[0](point.x, point.parameters)
+    assert float(value) == pytest.approx(expected, rel=1e-10)
+    assert p.objective(point.z, p.timing_for(point.z).dt) == pytest.approx(expected - PENALTY * point.slack.sum(), rel=1e-10)
+
+
+def test_there_are_rests_where_a_hand_closes_or_opens() -> None:
+    assert [len(stretches(problem(name))) for name in NAMES] == [1, 2, 1, 4, 2, 3]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_witness_rows_are_planes_over_the_placements_plus_slack(name: str) -> None:
+    p = problem(name)
+    point, model = random_point(p), p.chain.model
+    g, data = rows(point), model.createData()
+    assert p.transcription.slot_rows.shape == (p.segments, OPTIONS.contact_slots)
+    for t, q in enumerate(p.chain.coordinates.q(point.z)):
+        pin.forwardKinematics(model, data, q)
+        stacked = np.concatenate(
+            [np.r_[data.oMi[j].rotation.T.ravel(), data.oMi[j].translation] for j in range(1, model.njoints)]
+        )
+        expected = point.planes[t] @ stacked - point.offsets[t] + point.slack[t]
+        np.testing.assert_allclose(g[p.transcription.slot_rows[t]], expected, rtol=0.0, atol=1e-10)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_pose_rows_are_what_is_missing_to_the_pose(name: str) -> None:
+    p = problem(name)
+    point, model = random_point(p), p.chain.model
+    g, data, t = rows(point), model.createData(), p.transcription
+    assert len(t.pose_rows) == len(t.structure.poses) == len(p.targets) == len(p.pose_goals)
+    for pose, at, target in zip(t.structure.poses, t.pose_rows, p.targets, strict=True):
+        assert tuple(sorted(at)) == pose.waypoints
+        for waypoint, which in at.items():
+            pin.forwardKinematics(model, data, p.chain.coordinates.q(point.z[waypoint - 1]))
+            placement = data.oMi[pose.joint] * pose.local
+            shift = np.zeros(3) if pose.shift is None else data.oMi[pose.shift[0]].rotation @ np.array(pose.shift[1])
+            expected = [placement.translation + shift - target.translation]
+            if pose.kind == "pose":
+                error = target.rotation.T @ placement.rotation
+                turn = pin.log3(error)
+                angle = np.linalg.norm(turn)
+                expected += [np.sin(angle) * turn / angle, [np.trace(error)]]
+            elif pose.kind == "upright":
+                expected.append(target.rotation @ placement.rotation.T @ np.array([0.0, 0.0, 1.0]))
+            np.testing.assert_allclose(g[which], np.concatenate(expected), rtol=0.0, atol=1e-8)
+
+
+def test_there_are_goals_of_all_kinds() -> None:
+    kinds = {name: [pose.kind for pose in problem(name).transcription.structure.poses] for name in NAMES}
+    assert set(kinds["stick"]) == {"pose", "point", "upright"}
+    assert {kind for name in NAMES if name != "stick" for kind in kinds[name]} == {"pose"}
+    assert any(pose.shift for pose in problem("fetch").transcription.structure.poses)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_clamped_coordinates_keep_their_values(name: str) -> None:
+    """A row for every step of time from the way in to the end of the hold: the change of the coordinate in it."""
+    p = problem(name)
+    point = random_point(p)
+    path = p.waypoints(point.z)
+    expected = [path[t, column] - path[t - 1, column] for column, first, last in clamped(p) for t in range(first + 1, last + 1)]
+    np.testing.assert_allclose(rows(point)[clamp_rows(p)], expected, rtol=0.0, atol=1e-12)
+    assert p.transcription.structure.clamped == tuple(clamped(p))
+    assert len(expected) == {"stick": 2 * 8, "fetch": 3 * 5}.get(name, 0)
+
+
+def test_slip_rows_are_the_sideways_motion_at_the_middle_heading() -> None:
+    p = problem("differential")
+    point = random_point(p)
+    path = p.waypoints(point.z)
+    step, heading = np.diff(path[:, :2], axis=0), (path[1:, 2] + path[:-1, 2]) / 2
+    expected = np.cos(heading) * step[:, 1] - np.sin(heading) * step[:, 0]
+    np.testing.assert_allclose(rows(point)[p.transcription.base_rows], expected, rtol=0.0, atol=1e-12)
+    for name in set(NAMES) - {"differential"}:
+        assert problem(name).transcription.base_rows.size == 0
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_rate_rows_are_steps_and_their_changes(name: str) -> None:
+    p = problem(name)
+    point, t = random_point(p), p.transcription
+    g = rows(point, rates=True)
+    np.testing.assert_array_equal(g[: t.rows], rows(point))
+    path = p.waypoints(point.z)
+    steps = np.diff(path, axis=0)
+    changes = [
+        np.diff(np.vstack([np.zeros(t.n), np.diff(path[stretch], axis=0), np.zeros(t.n)]), axis=0) for stretch in stretches(p)
+    ]
+    expected = np.concatenate([steps.ravel(), *(change.ravel() for change in changes)])
+    np.testing.assert_allclose(g[t.rows :], expected, rtol=0.0, atol=1e-12)
+    assert len(expected) == p.chain.size * (p.segments + p.segments + len(changes))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_row_has_one_meaning(name: str) -> None:
+    t = problem(name).transcription
+    parts = [t.slot_rows.ravel(), t.base_rows, *(which for at in t.pose_rows for which in at.values())]
+    parts.append(clamp_rows(problem(name)))
+    np.testing.assert_array_equal(np.sort(np.concatenate(parts)), np.arange(t.rows))
+    assert t.size == t.segments * (t.n + 1)
+
+
+# --- derivatives ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_gradient_and_jacobian_are_those_of_finite_differences(name: str) -> None:
+    """A true nonzero that the sparsity pattern lacks would show up as a difference, too."""
+    p = problem(name)
+    point = random_point(p, seed=1)
+    objective, constraints, _ = functions(p, rates=True)
+    _, gradient = objective(point.x, point.parameters)
+    expected = differences(lambda x: np.asarray(objective(x, point.parameters)[0]).ravel(), point.x)
+    np.testing.assert_allclose(np.asarray(gradient).ravel(), expected[0], rtol=1e-6, atol=1e-5)
+    _, jacobian = constraints(point.x, point.parameters)
+    expected = differences(lambda x: np.asarray(constraints(x, point.parameters)[0]).ravel(), point.x)
+    np.testing.assert_allclose(np.asarray(jacobian.full()), expected, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("rates", [False, True])
+@pytest.mark.parametrize("name", NAMES)
+def test_hessian_of_the_lagrangian_is_that_of_finite_differences(name: str, rates: bool) -> None:
+    p = problem(name)
+    point = random_point(p, seed=2)
+    objective, constraints, lagrangian = functions(p, rates=rates)
+    multipliers, weight = np.random.default_rng(3).normal(size=len(rows(point, rates=rates))), 0.7
+
+    def slope(x: np.ndarray) -> np.ndarray:
+        gradient, jacobian = objective(x, point.parameters)[1], constraints(x, point.parameters)[1]
+        return weight * np.asarray(gradient).ravel() + np.asarray(jacobian.full()).T @ multipliers
+
+    half = np.asarray(lagrangian(point.x, point.parameters, weight, multipliers).full())
+    assert not np.tril(half, -1).any()
+    expected = differences(slope, point.x)
+    np.testing.assert_allclose(half + np.triu(half, 1).T, expected, rtol=1e-5, atol=2e-5)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_patterns_hold_everywhere(name: str) -> None:
+    """Patterns are found at one point; derivatives at others must fit in them."""
+    p = problem(name)
+    _, constraints, lagrangian = functions(p, rates=False)
+    sizes = set()
+    for seed in range(4, 7):
+        point = random_point(p, seed=seed)
+        jacobian = constraints(point.x, point.parameters)[1]
+        hessian = lagrangian(point.x, point.parameters, 1.0, np.ones(p.transcription.rows))
+        sizes.add((jacobian.nnz(), hessian.nnz()))
+        probe = np.random.default_rng(seed).normal(size=p.transcription.size)
+        ahead, behind = (np.asarray(constraints(point.x + s * 1e-6 * probe, point.parameters)[0]).ravel() for s in (1.0, -1.0))
+        np.testing.assert_allclose(np.asarray(jacobian @ probe).ravel(), (ahead - behind) / 2e-6, rtol=1e-5, atol=1e-5)
+    assert len(sizes) == 1
+    # Waypoints hang together by rates, and what is clamped, alone: all other rows of one touch no other's variables.
+    if p.transcription.base_rows.size == 0:
+        row, column = (np.array(part) for part in jacobian.sparsity().get_triplet())
+        alone = ~np.isin(row, clamp_rows(p))
+        row, column = row[alone], column[alone]
+        owner = np.empty(p.transcription.rows, int)
+        owner[p.transcription.slot_rows] = np.arange(p.segments)[:, None]
+        for at in p.transcription.pose_rows:
+            for waypoint, which in at.items():
+                owner[which] = waypoint - 1
+        np.testing.assert_array_equal(owner[row], column // (p.chain.size + 1))
+
+
+# --- reuse ----------------------------------------------------------------------------------------------------------
+
+
+def moved_door(scene: Scene) -> Scene:
+    placed = scene.objects["door"]
+    shifted = dataclasses.replace(
+        placed, placement=pin.SE3(pin.utils.rotate("z", 0.4), np.array([0.3, -0.2, 0.0])) * placed.placement
+    )
+    return dataclasses.replace(scene, objects={**scene.objects, "door": shifted})
+
+
+def test_one_program_serves_all_problems_of_a_structure() -> None:
+    steps, scene = [Actuate("door", {"hinge": 1.2})], door_scene()
+    first = build(scene, steps, options=OPTIONS)
+    first.transcription.take_build_time()
+    fewer = dataclasses.replace(scene, obstacles=pin.GeometryModel(), obstacle_labels=())
+    others = [
+        build(scene.with_start(base=[-1.0, 0.2, 0.5]), steps, options=OPTIONS),
+        build(scene.sample_start(np.random.default_rng(0)), steps, options=OPTIONS),
+        build(moved_door(scene), steps, options=OPTIONS),
+        build(fewer, steps, options=OPTIONS),
+        build(scene, [Actuate("door", {"hinge": 0.4})], options=OPTIONS),
+        build(scene.with_state("door", {"knob": 0.1}), steps, options=OPTIONS),
+        build(scene, steps, options=dataclasses.replace(OPTIONS, dist_safe=0.05, penalty=3.0)),
+    ]
+    for other in others:
+        assert other.transcription is first.transcription
+        assert other.transcription.take_build_time() == 0.0
+    again = [build(scene, [Reach(pin.SE3.Random())], options=OPTIONS).transcription for _ in range(2)]
+    assert again[0] is again[1]
+    assert again[0] is not first.transcription
+
+
+@pytest.mark.parametrize(
+    ("steps", "options"),
+    [
+        ([Actuate("door", {"hinge": 1.2})], dataclasses.replace(OPTIONS, move_waypoints=4)),
+        ([Actuate("door", {"hinge": 1.2})], dataclasses.replace(OPTIONS, contact_slots=3)),
+        ([Actuate("door", {"hinge": 1.2})], dataclasses.replace(OPTIONS, velocity_weight_base=3.0)),
+        ([Actuate("door", {"hinge": 1.2})], dataclasses.replace(OPTIONS, acceleration_weight=2.0)),
+        ([Actuate("door", {"hinge": 1.2})], dataclasses.replace(OPTIONS, dt=0.1)),
+        ([Actuate("door", {"hinge": 1.2}, attachment="handle_free")], OPTIONS),
+        ([Actuate("door", {"knob": 0.6})], OPTIONS),
+        ([Grasp("door")], OPTIONS),
+        ([Actuate("door", {"hinge": 1.2}), GoTo(0.0, 0.0)], OPTIONS),
+    ],
+)
+def test_another_structure_gets_another_program(steps: list[Step], options: Options) -> None:
+    structure = build(door_scene(), [Actuate("door", {"hinge": 1.2})], options=OPTIONS).transcription.structure
+    other = build(door_scene(), steps, options=options).transcription.structure
+    assert other.key != structure.key
+
+
+def test_a_base_that_cannot_slip_has_another_structure() -> None:
+    keys = [
+        build(scene, [GoTo(0.0, 0.0)], options=OPTIONS).transcription.structure.key
+        for scene in (door_scene(), differential_scene())
+    ]
+    assert keys[0] != keys[1]
+
+
+def test_only_the_programs_used_last_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    structure = problem("reach").transcription.structure
+    built: list[Structure] = []
+    times: list[float] = []
+
+    class Built:
+        def __init__(self, structure: Structure) -> None:
+            built.append(structure)
+
+        def take_build_time(self) -> float:
+            times.append(1.0)
+            return 1.0
+
+    monkeypatch.setattr(module, "Transcription", Built)
+    monkeypatch.setattr(module, "_transcriptions", type(module._transcriptions)())
+    limit = module._KEPT
+    structures = [dataclasses.replace(structure, slots=10 + k) for k in range(limit + 1)]
+    kept = [module.transcribe(s) for s in structures[:limit]]
+    assert times == []  # who has a program built is to count the time
+    assert module.transcribe(structures[0]) is kept[0]  # used again: the second is now the oldest
+    assert times == [1.0]  # whoever uses it again is not
+    module.transcribe(structures[limit])
+    assert len(module._transcriptions) == limit
+    assert module.transcribe(structures[0]) is kept[0]
+    assert len(built) == limit + 1
+    module.transcribe(structures[1])
+    assert len(built) == limit + 2
+
+
+def test_functions_of_waypoints_are_shared_by_structures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many waypoints there are, and wherever they must satisfy poses."""
+    monkeypatch.setattr(kinds, "_functions", type(kinds._functions)())
+    structure = problem("reach").transcription.structure
+    pose = structure.poses[0]
+    first = waypoint_functions(structure.model, 3, (pose,))
+    assert waypoint_functions(structure.model, 3, (dataclasses.replace(pose, waypoints=(1, 2)),)) is first
+    others = [
+        waypoint_functions(structure.model, 4, (pose,)),
+        waypoint_functions(structure.model, 3, ()),
+        waypoint_functions(structure.model, 3, (pose, pose)),
+        waypoint_functions(structure.model, 3, (dataclasses.replace(pose, kind="point"),)),
+        waypoint_functions(structure.model, 3, (dataclasses.replace(pose, local=pin.SE3.Random()),)),
+    ]
+    assert len({id(one) for one in [first, *others]}) == 6
+    monkeypatch.setattr(kinds, "_KEPT", 6)
+    assert waypoint_functions(structure.model, 3, (pose,)) is first  # used again: the others are older
+    waypoint_functions(structure.model, 5, (pose,))
+    assert len(kinds._functions) == 6
+    assert waypoint_functions(structure.model, 3, (pose,)) is first
+    assert waypoint_functions(structure.model, 4, (pose,)) is not others[0]
+
+
+def test_the_same_solver_is_not_made_twice() -> None:
+    t = problem("reach").transcription
+    first = t.solver(rates=False, options=QUIET)
+    t.take_build_time()
+    assert t.solver(rates=False, options=dict(reversed(QUIET.items()))) is first
+    assert t.take_build_time() == 0.0
+    assert t.solver(rates=False, options={**QUIET, "ipopt.tol": 1e-3}) is not first
+    assert t.take_build_time() > 0.0
+    assert t.take_build_time() == 0.0

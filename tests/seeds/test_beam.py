@@ -1,0 +1,214 @@
+"""From knot to knot, forwards and backwards: knots in order of time, on the closure, at the price that is said."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+
+import numpy as np
+import pytest
+from helpers.gates import walled
+from helpers.small_problems import door_scene, hand_off_the_handle, with_attachment, with_objects
+
+import vkc_pin as vkc
+from vkc_pin.seeds import beam as module
+from vkc_pin.seeds.beam import Beam, Found
+from vkc_pin.seeds.knots import Knots
+from vkc_pin.seeds.routes import Routes
+
+FEW = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20)
+OPEN = vkc.Actuate("door", {"hinge": 1.2})
+DIRECTIONS = pytest.mark.parametrize("backwards", [False, True], ids=["forwards", "backwards"])
+
+
+@cache
+def problem(*, around: bool = False) -> vkc.TrajectoryProblem:
+    """Return the problem of opening the door; around: and of driving somewhere before and after."""
+    steps = [vkc.GoTo(-1.0, 0.0), OPEN, vkc.GoTo(-1.0, 0.5)] if around else [OPEN]
+    return vkc.build(door_scene(), steps, options=FEW)
+
+
+def beam(seed: int = 0, *, around: bool = False, routes: bool = False) -> Beam:
+    p = problem(around=around)
+    return Beam(Knots(p, np.random.default_rng(seed)), Routes(p) if routes else None)
+
+
+@DIRECTIONS
+@pytest.mark.parametrize("thorough", [False, True], ids=["quick", "thorough"])
+@pytest.mark.parametrize("around", [False, True], ids=["alone", "driving before and after"])
+def test_knots_are_in_order_of_time_and_hold_the_closure(thorough: bool, backwards: bool, around: bool) -> None:
+    p, search = problem(around=around), beam(around=around)
+    found = search.search(thorough=thorough, backwards=backwards)
+    assert found.at[0] == 0
+    assert np.all(np.diff(found.at) > 0)
+    assert set(p.ends.tolist()) <= set(found.at), "a knot at the end of every phase"
+    assert found.at == beam(around=around).search(thorough=thorough).at
+    assert found.paths.shape == (len(found.cost), len(found.at), p.chain.size)
+    assert found.cost.shape == found.trouble.shape
+    np.testing.assert_array_equal(found.paths[:, 0], np.tile(p.start, (len(found.cost), 1)))
+    rows = np.array(found.at[1:]) - 1
+    assert np.all(found.paths[:, 1:] >= p.lower[rows] - 1e-9)
+    assert np.all(found.paths[:, 1:] <= p.upper[rows] + 1e-9)
+    hinge, knob = (p.chain.index(f"door.{name}") for name in ("hinge", "knob"))
+    np.testing.assert_allclose(
+        found.paths[:, 1:, [hinge, knob]], np.tile(search.knots.objects[rows][:, [hinge, knob]], (len(found.cost), 1, 1))
+    )
+    reach, _, move = (int(end) for end in p.ends[1 if around else 0 :][:3])
+    held = [k for k, waypoint in enumerate(found.at) if reach <= waypoint <= move]
+    assert len(held) >= 6
+    good = np.argsort(found.cost)[:3]
+    for path in found.paths[good]:
+        for row in path[held]:
+            assert hand_off_the_handle(door_scene(), row, row[hinge], row[knob]) < 1e-3
+
+
+@DIRECTIONS
+@pytest.mark.parametrize("around", [False, True], ids=["alone", "driving before and after"])
+def test_a_path_costs_its_way_and_its_trouble(backwards: bool, around: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whichever way it was looked for: the ways are those from start to end."""
+    monkeypatch.setattr(Beam, "_approach", lambda _, first, *__: np.zeros(len(first)))
+    search = beam(1, around=around)
+    found = search.search(thorough=True, backwards=backwards)
+    weights = search.knots.weights * np.where(np.arange(problem(around=around).chain.size) < 2, module._DRIVING, 1.0)
+    way = (np.abs(np.diff(found.paths, axis=1)) * weights).sum(axis=(1, 2))
+    np.testing.assert_allclose(found.cost, way + found.trouble, rtol=1e-9)
+    trouble = np.zeros(len(found.cost))
+    for k, waypoint in enumerate(found.at[1:], start=1):
+        at = np.full(len(trouble), waypoint)
+        short = problem(around=around).contacts.evaluate(found.paths[:, k], at, reach=0.1).shortfall(len(trouble))
+        trouble += np.where(short > 0.0, 10.0 + 300.0 * short, 0.0)
+    reached = found.trouble < 1e3
+    assert reached.any()
+    np.testing.assert_allclose(found.trouble[reached], trouble[reached], rtol=0.0, atol=1e-6)
+
+
+@DIRECTIONS
+def test_the_same_random_numbers_find_the_same(backwards: bool) -> None:
+    one, same = (beam(2).search(thorough=True, backwards=backwards) for _ in range(2))
+    np.testing.assert_array_equal(one.paths, same.paths)
+    np.testing.assert_array_equal(one.cost, same.cost)
+
+
+def test_without_a_grasp_backwards_is_forwards() -> None:
+    gone = walled(1.6)
+    one, other = (Beam(Knots(gone, np.random.default_rng(0))).search(thorough=True, backwards=back) for back in (False, True))
+    np.testing.assert_array_equal(one.paths, other.paths)
+    assert one.at == other.at == [0, gone.segments]
+
+
+def test_backwards_a_firm_hand_keeps_what_it_has_chosen() -> None:
+    clamped(backwards=True)
+
+
+def test_forwards_a_firm_hand_keeps_what_it_has_chosen() -> None:
+    clamped(backwards=False)
+
+
+def gripping(*, firm: bool) -> vkc.TrajectoryProblem:
+    """Return the problem of opening the door with a hand that may tilt, or that only chooses how far it does."""
+    scene = door_scene()
+    tilting = dataclasses.replace(scene.objects["door"].object.attachment("handle_free"), name="tilted", firm=firm)
+    scene = with_objects(scene, {"door": with_attachment(scene.objects["door"], tilting)})
+    return vkc.build(scene, [dataclasses.replace(OPEN, attachment="tilted")], options=FEW)
+
+
+@pytest.mark.parametrize("firm", [False, True])
+def test_a_hand_that_chooses_and_does_not_give_way_does_so_before_it_moves_anything(firm: bool) -> None:
+    """For it backwards is forwards; for one that gives way it is not."""
+    p = gripping(firm=firm)
+    assert bool(p.choices) == firm
+    one, other = (Beam(Knots(p, np.random.default_rng(0))).search(thorough=True, backwards=back) for back in (False, True))
+    assert np.array_equal(one.paths, other.paths) == firm
+
+
+def clamped(*, backwards: bool) -> None:
+    p = gripping(firm=True)
+    ((column, grasp, last),) = p.choices
+    found = Beam(Knots(p, np.random.default_rng(0))).search(thorough=True, backwards=backwards)
+    held = [k for k, waypoint in enumerate(found.at) if grasp <= waypoint <= last]
+    chosen = found.paths[:, held, column]
+    assert np.ptp(chosen, axis=1).max() < 1e-6, "the freedom changes while the hand clamps"
+    assert np.ptp(chosen) > 0.01, "it is the same in all paths"
+
+
+# --- what is tolerable ---------------------------------------------------------------------------------------------------
+
+
+def going(jump: float, when: int, *, trouble: float = 0.0) -> Found:
+    """Return two paths, of which the cheapest is where it was but for one jump of the base [m] before a knot."""
+    p, at = problem(), beam().search(thorough=False).at
+    paths = np.tile(p.start, (2, len(at), 1))
+    paths[1, at.index(when) :, 1] += jump
+    paths[0, :, :2] += np.linspace(0.0, 50.0, len(at))[:, None]
+    return Found(paths, np.array([2.0, 1.0]), np.array([1e3, trouble]), at)
+
+
+@pytest.mark.parametrize("routes", [False, True])
+def test_grazes_are_tolerable_and_collisions_are_not(routes: bool) -> None:
+    search, end = beam(routes=routes), int(problem().ends[0])
+    assert search.tolerable(going(0.0, end))
+    assert search.tolerable(going(0.0, end, trouble=59.0))
+    assert not search.tolerable(going(0.0, end, trouble=61.0))
+
+
+def test_the_base_does_not_jump_while_something_is_held() -> None:
+    reach, turn, move = problem().ends.tolist()
+    for when in (turn, move):
+        assert beam(routes=True).tolerable(going(0.4, when))
+        assert not beam(routes=True).tolerable(going(0.6, when))
+        assert not beam(routes=True).tolerable(going(-0.6, when))
+        assert beam().tolerable(going(0.6, when)), "without ways of the base nobody asks"
+    assert beam(routes=True).tolerable(going(3.0, reach)), "on the way to the handle it may be anywhere"
+
+
+# --- careful -------------------------------------------------------------------------------------------------------------
+
+
+def test_a_grasp_is_nearest_to_its_straight_way_so_many_waypoints_before() -> None:
+    """Where the row of the straight way in stands, at the latest after the first waypoint of its phase."""
+    grasp, options = int(problem().ends[0]), problem().options
+    assert beam().approaches == {grasp: grasp - options.approach_waypoints}
+    assert beam().knots.pose_at(grasp - options.approach_waypoints) is not None
+    _, grasp, *_ = problem(around=True).ends.tolist()
+    assert beam(around=True).approaches == {grasp: grasp - options.approach_waypoints}
+    brief = vkc.build(door_scene(), [OPEN], options=dataclasses.replace(FEW, reach_waypoints=3))
+    assert Beam(Knots(brief, np.random.default_rng(0))).approaches == {3: 1}
+
+
+@pytest.mark.parametrize("careful", [False, True])
+def test_a_careful_search_counts_what_is_hit_before_a_grasp(careful: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of four grasps one is blocked, one has a blocked way, one has none; and at other waypoints nothing changes."""
+    search, grasp = Beam(Knots(problem(), np.random.default_rng(0)), careful=careful), int(problem().ends[0])
+    before = search.approaches[grasp]
+    depths = {grasp: np.array([0.01, 0.0, 0.0, 0.0]), before: np.array([0.02, 0.0, 0.0])}
+    z, found = np.tile(problem().start, (4, 1)), np.ones(4, bool)
+    z[:, 4] += np.arange(4)
+
+    def knot(near: np.ndarray, waypoint: int, how: str) -> tuple[np.ndarray, np.ndarray]:
+        assert (waypoint, how) == (before, "track")
+        np.testing.assert_array_equal(near, z[1:])  # those that are free where they grasp
+        return near, np.array([True, False, True])
+
+    monkeypatch.setattr(search.knots, "depth", lambda _, waypoint: depths[waypoint])
+    monkeypatch.setattr(search.knots, "knot", knot)
+    bad = search._bad(z, found, grasp)
+    collision = [module._COLLISION + module._DEPTH * depth for depth in (0.01, 0.02)]
+    np.testing.assert_allclose(bad, [collision[0], collision[1], module._NOT_FOUND, 0.0] if careful else [collision[0], 0, 0, 0])
+    depths[int(problem().ends[1])] = np.zeros(4)
+    np.testing.assert_array_equal(search._bad(z, found, int(problem().ends[1])), np.zeros(4))
+
+
+def test_before_a_careful_grasp_nothing_is_hit() -> None:
+    """At the narrow door, open into the bedroom: a hand that has room at the lever may have none on the way to it."""
+    scene = vkc.load_scene("household").with_state("door", {"hinge": 1.52}).with_start(base=(1.5, -0.5, 1.57))
+    p = vkc.build(scene, [vkc.Grasp("door", "handle_free"), vkc.Actuate("door", {"hinge": 0.0})])
+    grasp, routes, shares = int(p.ends[0]), Routes(p), []
+    for careful in (False, True):
+        search = Beam(Knots(p, np.random.default_rng(0)), routes, careful=careful)
+        found = search.search(thorough=True, backwards=True)
+        before, held = search.approaches[grasp], found.paths[found.trouble == 0.0, found.at.index(grasp)]
+        assert len(held), "every path is blocked"
+        near, reached = search.knots.knot(held, before, "track")
+        hit = p.contacts.evaluate(near, np.full(len(near), before), reach=0.1).shortfall(len(near))
+        shares.append(float(np.mean((hit <= 1e-9) & reached)))
+    assert shares[0] < shares[1] == 1.0

@@ -1,0 +1,447 @@
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.drives import hall
+from helpers.gates import GOAL, NARROW, TIGHT, gated
+from helpers.small_problems import SHORT, door_scene, hand_off_the_handle
+from hypothesis import given
+from hypothesis import strategies as st
+
+import vkc_pin as vkc
+from vkc_pin.seeds import initialization, joining
+from vkc_pin.seeds.beam import Beam, Found
+from vkc_pin.seeds.initialization import _COLLIDING, _POOR, INITIALIZATIONS, _in_turn, initialize
+from vkc_pin.seeds.knots import scatter
+from vkc_pin.seeds.seed import Seed
+
+OPENED = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20)
+
+
+@cache
+def problem() -> vkc.TrajectoryProblem:
+    return vkc.build(door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=OPENED)
+
+
+def seeds(method: str = "interpolated", *, seed: int = 0, count: int = 1) -> list[np.ndarray]:
+    return [found.z for found in initialize(problem(), method, seed, count=count)]
+
+
+@pytest.mark.parametrize("method", INITIALIZATIONS)
+def test_seeds_are_within_bounds(method: str) -> None:
+    for z in seeds(method, count=3):
+        assert z.shape == (problem().segments, problem().chain.size)
+        assert np.all(z >= problem().lower)
+        assert np.all(z <= problem().upper)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_interpolated_seeds_hold_the_handle(seed: int) -> None:
+    chain, scene = problem().chain, door_scene()
+    hinge, knob = chain.index("door.hinge"), chain.index("door.knob")
+    for z in seeds(seed=seed, count=3):
+        held = z[problem().ends[0] - 1 :]  # the grasp and all that follows
+        for row in held:
+            assert hand_off_the_handle(scene, row, row[hinge], row[knob]) < 1e-3
+        assert problem().pose_error(z) < 1e-3
+
+
+def test_a_seed_opens_the_door() -> None:
+    (z,) = seeds()
+    hinge, knob = (z[:, problem().chain.index(name)] for name in ("door.hinge", "door.knob"))
+    reach, turn, _ = problem().ends
+    assert np.all(hinge[:turn] == 0.0)
+    assert np.all(knob[:reach] == 0.0)
+    assert hinge[-1] == pytest.approx(1.2)
+    assert np.all(np.diff(hinge) >= 0.0)
+    assert np.all(knob[turn - 1 :] >= 0.5)
+
+
+def test_seeds_go_from_the_start_without_a_jump() -> None:
+    for z in seeds(count=2):
+        path = problem().waypoints(z)
+        reach = int(problem().ends[0])
+        np.testing.assert_array_equal(path[0], problem().start)
+        # A straight way to where the hand is before the handle: every waypoint lies between its ends; and straight on.
+        before = reach - OPENED.approach_waypoints
+        low, high = np.minimum(path[0], path[before]), np.maximum(path[0], path[before])
+        assert np.all((path[: before + 1] >= low - 1e-9) & (path[: before + 1] <= high + 1e-9))
+        first, last = (dataclasses.replace(door_scene(), start=path[k, :9]).tool_placement() for k in (before, reach))
+        way = first.inverse() * last
+        np.testing.assert_allclose(way.translation, [0.0, 0.0, OPENED.approach], rtol=0.0, atol=1e-3)
+        np.testing.assert_allclose(way.rotation, np.eye(3), rtol=0.0, atol=1e-3)
+        assert np.abs(np.diff(path, axis=0)).max() < 0.8
+
+
+def test_the_same_seed_gives_the_same_seeds() -> None:
+    first, second = seeds(seed=4, count=4), seeds(seed=4, count=4)
+    assert len(first) == len(second)
+    for one, other in zip(first, second, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert not np.array_equal(seeds(seed=5)[0], first[0])
+
+
+def test_several_seeds_are_different() -> None:
+    found = seeds(count=3)
+    assert 1 <= len(found) <= 3
+    for k, z in enumerate(found):
+        for other in found[:k]:
+            assert np.abs(z - other)[:, :3].max() > 0.05
+    assert len(seeds(count=1)) == 1
+
+
+def test_the_stationary_seed_leaves_the_robot_where_it_is() -> None:
+    for seed in (0, 1):
+        (z,) = seeds("stationary", seed=seed, count=4)  # there is only one
+        robot = problem().chain.robot.coordinates.size
+        np.testing.assert_array_equal(z[:, :robot], np.tile(problem().start[:robot], (len(z), 1)))
+        hinge = z[:, problem().chain.index("door.hinge")]
+        assert hinge[-1] == pytest.approx(1.2)
+        assert hinge[problem().ends[1] - 1] == 0.0
+
+
+def test_a_seed_for_the_base_takes_the_shorter_way_round() -> None:
+    scene = hall().with_start(base=[0.0, 0.0, 3.0])
+    turn = vkc.build(scene, [vkc.GoTo(1.0, 0.5, -3.0)], options=SHORT)
+    (z,) = (found.z for found in initialize(turn, "interpolated", 0))
+    np.testing.assert_allclose(z[-1, :3], [1.0, 0.5, 2 * np.pi - 3.0])
+    np.testing.assert_allclose(z[:, 3:], np.tile(scene.start[3:], (len(z), 1)))
+
+
+def test_a_seed_for_a_target_out_of_reach_is_still_a_seed() -> None:
+    lost = vkc.build(hall(), [vkc.Reach((1.0, 0.0, 4.0, 0.0, 0.0, 0.0))], options=SHORT)
+    for z in (found.z for found in initialize(lost, "interpolated", 0, count=2)):
+        assert np.isfinite(z).all()
+        assert np.all((z >= lost.lower) & (z <= lost.upper))
+
+
+def test_a_fixed_base_stays_in_every_seed() -> None:
+    fixed = vkc.build(hall(base="fixed"), [vkc.Reach((0.5, 0.4, 1.0, 0.0, np.pi / 2, 0.0))], options=SHORT)
+    for z in (found.z for found in initialize(fixed, "interpolated", 0, count=3)):
+        assert np.ptp(fixed.waypoints(z)[:, :3], axis=0).max() == 0.0
+
+
+def test_scattered_configurations_are_where_they_say() -> None:
+    target = pin.SE3(pin.rpy.rpyToMatrix(0.0, np.pi / 2, 0.0), np.array([1.5, 0.5, 0.9]))
+    reach = vkc.build(hall(), [vkc.Reach(target)], options=SHORT)
+    found = scatter(reach, reach.segments, np.random.default_rng(0))
+    assert found is not None
+    z, residual = found
+    assert np.count_nonzero(residual < 1e-4) > len(z) / 2
+    assert np.all((z >= reach.lower[-1]) & (z <= reach.upper[-1]))
+    for row, error in list(zip(z, residual, strict=True))[:20]:
+        tool = dataclasses.replace(reach.scene, start=row).tool_placement()
+        off = np.concatenate([tool.translation - target.translation, pin.log3(tool.rotation.T @ target.rotation)])
+        assert np.abs(off).max() == pytest.approx(error, abs=5e-2, rel=0.5) if error > 1e-3 else np.abs(off).max() < 2e-3
+
+
+def test_nothing_to_scatter() -> None:
+    free = vkc.build(door_scene(), [vkc.Actuate("door", {"hinge": 1.2}), vkc.GoTo(0.0, 0.0)], options=SHORT)
+    last = scatter(free, free.segments, np.random.default_rng(0))
+    assert last is not None
+    z, residual = last
+    np.testing.assert_allclose(z[:, :2], 0.0)
+    assert np.all(residual == 0.0)
+    middle = int(free.ends[-1]) - 1  # on the way, nothing is asked for
+    assert scatter(free, middle, np.random.default_rng(0)) is None
+
+
+class Looked:
+    """Stands for three searches; says what is looked for (s0), and what came to be taken (S0)."""
+
+    def __init__(self, straight: list[float], around: list[float], trees: list[float]) -> None:
+        self.said: list[str] = []
+        self.races: dict[str, bool] = {}  # as they are yielded
+        kinds = {"s": straight, "a": around, "t": trees}
+        for seed in _in_turn(*(self._seeds(kind, shortfalls) for kind, shortfalls in kinds.items())):
+            self.said.append(seed.name.upper())
+            self.races[seed.name] = seed.races
+
+    def _seeds(self, kind: str, shortfalls: list[float]) -> Iterator[Seed]:
+        for number, shortfall in enumerate(shortfalls):
+            self.said.append(f"{kind}{number}")
+            yield Seed(f"{kind}{number}", np.zeros((1, 1)), shortfall)
+
+
+FINE, POOR, LOST = 0.9 * _POOR, 1.1 * _POOR, 1.1 * _COLLIDING
+
+
+@pytest.mark.parametrize(
+    ("straight", "around", "trees", "expected"),
+    [
+        # What goes straight is good: the others are looked for (s) when what was before them has been taken (S).
+        ([0.0, 0.0], [0.0, 0.0], [], "s0 S0 a0 A0 s1 S1 a1 A1"),
+        ([np.nan], [0.0], [], "s0 S0 a0 A0"),  # nobody looked
+        ([0.0, 0.0, 0.0], [0.0], [], "s0 S0 a0 A0 s1 S1 s2 S2"),
+        ([0.0], [0.0, 0.0, 0.0], [], "s0 S0 a0 A0 a1 A1 a2 A2"),
+        ([], [0.0, 0.0], [], "a0 A0 a1 A1"),
+        ([], [], [], ""),
+        ([FINE], [LOST], [0.0], "s0 S0 a0 A0 t0 T0"),  # trees last
+        ([], [0.0, 0.0], [0.0, 0.0], "a0 A0 a1 A1 t0 T0 t1 T1"),
+        ([], [], [0.0, 0.0], "t0 T0 t1 T1"),
+        # What goes straight hits things, what goes around does not: second, if it is hopeless.
+        ([LOST, 0.0], [0.0, 0.0], [], "s0 a0 A0 S0 s1 S1 a1 A1"),
+        ([LOST, 0.0], [0.0, 0.0], [0.0], "s0 a0 A0 S0 s1 S1 a1 A1 t0 T0"),
+        ([POOR, 0.0], [0.0, 0.0], [0.0], "s0 a0 S0 A0 s1 S1 a1 A1 t0 T0"),
+        ([LOST], [np.nan], [0.0], "s0 a0 A0 S0 t0 T0"),
+        # Both do, or there is no way around: first all that trees find, then the better of the two.
+        ([POOR], [LOST], [0.0, 0.0, 0.0], "s0 a0 t0 T0 t1 T1 t2 T2 S0 A0"),
+        ([LOST], [POOR], [0.0, 0.0, 0.0], "s0 a0 t0 T0 t1 T1 t2 T2 A0 S0"),
+        ([LOST], [], [0.0, 0.0], "s0 t0 T0 t1 T1 S0"),
+        ([POOR], [POOR], [LOST], "s0 a0 t0 T0 S0 A0"),  # whatever it is worth
+        ([LOST, LOST], [LOST, POOR], [0.0], "s0 a0 t0 T0 S0 A0 s1 a1 A1 S1"),  # of equals, what goes straight
+        ([LOST, LOST], [LOST, LOST], [], "s0 a0 S0 A0 s1 a1 S1 A1"),
+        # Once: where the next two are poor as well, or good, there is nothing left of them.
+        ([LOST, LOST], [POOR, 0.0], [0.0, 0.0], "s0 a0 t0 T0 t1 T1 A0 S0 s1 a1 A1 S1"),
+        ([LOST, LOST], [POOR], [0.0, 0.0], "s0 a0 t0 T0 t1 T1 A0 S0 s1 S1"),
+        ([0.0, LOST], [0.0, LOST], [0.0, 0.0], "s0 S0 a0 A0 s1 a1 t0 T0 t1 T1 S1 A1"),
+        ([POOR, POOR, POOR], [], [], "s0 S0 s1 S1 s2 S2"),
+    ],
+)
+def test_straight_around_and_trees_take_turns(
+    straight: list[float], around: list[float], trees: list[float], expected: str
+) -> None:
+    assert Looked(straight, around, trees).said == expected.split()
+
+
+@pytest.mark.parametrize(
+    ("straight", "around", "trees", "aside"),
+    [
+        ([POOR], [POOR], [0.0], "s0 a0"),
+        ([POOR], [POOR], [LOST], "s0 a0"),  # t0 is as it was
+        ([POOR], [], [0.0, 0.0], "s0"),
+        ([POOR, POOR], [POOR, 0.0], [0.0], "s0 a0"),  # the next have others beside them
+        ([POOR], [POOR], [], ""),  # trees found nothing: these are all there is
+        ([POOR], [0.0], [0.0], ""),
+        ([FINE], [POOR], [0.0], ""),
+    ],
+)
+def test_beside_what_trees_find_what_hits_things_does_not_race(
+    straight: list[float], around: list[float], trees: list[float], aside: str
+) -> None:
+    """So that the solver does not begin with it."""
+    given = [f"{kind}{k}" for kind, all_ in zip("sat", (straight, around, trees), strict=True) for k in range(len(all_))]
+    assert Looked(straight, around, trees).races == {name: name not in aside.split() for name in given}
+
+
+@pytest.mark.parametrize("collides", [False, True])
+def test_a_seed_that_collides_nearly_everywhere_does_not_race(collides: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(initialization, "_COLLIDING", -1.0 if collides else np.inf)
+    assert [found.races for found in initialize(problem(), "interpolated", 0)] == [not collides]
+
+
+@given(*(st.lists(st.sampled_from([0.0, FINE, POOR, LOST, np.nan]), max_size=5) for _ in range(3)))
+def test_every_seed_is_yielded_once_and_none_before_it_is_looked_for(
+    straight: list[float], around: list[float], trees: list[float]
+) -> None:
+    said = Looked(straight, around, trees).said
+    seeds = [f"{kind}{k}" for kind, found in (("s", straight), ("a", around), ("t", trees)) for k in range(len(found))]
+    assert sorted(said) == sorted([*seeds, *map(str.upper, seeds)])
+    assert all(said.index(name) < said.index(name.upper()) for name in seeds)
+    for kind in "SAT":
+        own = [name for name in said if name[0] == kind]
+        assert own == sorted(own), "each search's best comes first"
+
+
+def test_the_base_turns_on_the_way_and_not_in_the_last_step() -> None:
+    scene, rng = vkc.load_scene("aisle_drawer"), np.random.default_rng(7)
+    for _ in range(16):  # on some of these ways headings wind by a whole turn
+        problem = vkc.build(scene.sample_start(rng), [vkc.GoTo(2.9, 2.0, float(rng.uniform(-3.0, 3.0)))])
+        (seed,) = initialize(problem, "astar", 0)
+        turns = np.diff(problem.waypoints(seed.z)[:, 2])
+        assert abs(turns[-1]) < 0.2
+        assert np.abs(turns).max() < 1.0
+        assert abs(seed.z[-1, 2] - problem.start[2]) <= np.pi + 1e-9
+
+
+def test_what_costs_nothing_has_a_seed() -> None:
+    scene = vkc.load_scene("drawer")
+    problem = vkc.build(scene, [vkc.GoTo(*scene.start[:3].tolist())])
+    with np.errstate(all="raise"):
+        (seed,) = initialize(problem, "interpolated", 0)
+    assert np.abs(seed.z - problem.start).max() < 1e-9
+
+
+# --- through narrow places -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("width", [NARROW, TIGHT])
+def test_trees_make_a_seed_through_a_narrow_gate(width: float) -> None:
+    """Where the base alone finds no way with its arm at home; what is left is a graze."""
+    gate = gated(width)
+    assert list(initialize(gate, "astar", 0)) == []
+    notes: list[str] = []
+    (seed,) = initialize(gate, "rrt", 0, notes=notes)
+    assert notes == []
+    assert seed.name == "rrt"
+    short = gate.evaluate_contacts(seed.z, reach=0.1).shortfall(gate.segments)
+    assert seed.shortfall == pytest.approx(short.sum(), abs=1e-9)
+    assert seed.shortfall < _POOR
+    assert short.max() < gate.options.dist_safe + 0.01
+    np.testing.assert_allclose(seed.z[-1, :3], GOAL, atol=1e-9)
+    if width == TIGHT:  # in the other gate the arm at home just fits, if it may graze
+        assert np.ptp(seed.z[:, 3:9], axis=0).max() > 0.5, "the arm moves on the way"
+    (same,) = initialize(gate, "rrt", 0)
+    np.testing.assert_array_equal(seed.z, same.z)
+
+
+def test_in_turn_trees_come_first_where_the_others_hit_things() -> None:
+    found = list(initialize(gated(NARROW), "auto", 0, count=2))
+    assert [seed.name for seed in found] == ["rrt", "interpolated"]
+    assert found[0].shortfall < _POOR < found[1].shortfall
+
+
+def test_no_trees_are_grown_where_the_way_is_wide(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They take their time; they are asked last."""
+    grown: list[int] = []
+    connect = joining.connect
+
+    def watch(*given: Any, **named: Any) -> np.ndarray | None:
+        grown.append(1)
+        return connect(*given, **named)
+
+    monkeypatch.setattr(joining, "connect", watch)
+    found = initialize(gated(3.0), "auto", 0)
+    assert [next(found).name, next(found).name, len(grown)] == ["interpolated", "astar", 0]
+    assert next(found).name == "rrt"
+    assert grown
+
+
+def test_where_there_is_no_way_trees_make_no_seed() -> None:
+    notes: list[str] = []
+    assert list(initialize(gated(0.0), "rrt", 0, count=2, notes=notes)) == []
+    assert len(notes) == 1
+    plan = vkc.plan(gated(0.0).scene, [vkc.GoTo(*GOAL)], initialization="rrt")
+    assert plan.status == "infeasible"
+    assert "found no way" in plan.report()
+
+
+def test_a_motion_through_the_narrow_gate() -> None:
+    plan = vkc.plan(gated(NARROW).scene, [vkc.GoTo(*GOAL)])
+    assert plan.success, plan.report()
+    assert plan.initialization == "rrt"
+
+
+@pytest.mark.parametrize(("method", "stands"), [("astar", False), ("rrt", True)])
+def test_for_trees_the_base_stands_while_the_hand_goes_straight_in(method: str, stands: bool) -> None:
+    (z,) = seeds(method)
+    reach = int(problem().ends[0])
+    last = z[reach - OPENED.approach_waypoints - 1 : reach, :3]
+    assert (np.ptp(last, axis=0).max() < 1e-6) == stands
+
+
+@pytest.mark.parametrize("method", ["interpolated", "astar", "rrt"])
+def test_searches_are_quick_first_and_for_trees_careful_and_backwards_in_turn(
+    method: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing that is found is tolerable: only for trees that is a reason not to use what a thorough search finds."""
+    asked: list[tuple[bool, bool, bool]] = []
+    search = Beam.search
+
+    def watch(beam: Beam, *, thorough: bool, backwards: bool = False) -> Found:
+        asked.append((thorough, backwards, beam.careful))
+        return search(beam, thorough=thorough, backwards=backwards)
+
+    monkeypatch.setattr(Beam, "search", watch)
+    monkeypatch.setattr(Beam, "tolerable", lambda *_: False)
+    found = seeds(method, count=2)
+    if method == "rrt":
+        assert asked == [(False, False, True), (True, True, True), (True, False, True)]
+        assert found == []
+    else:
+        assert asked[:2] == [(False, False, False), (True, False, False)]
+        assert found
+
+
+class Watched:
+    """Notes what beams find: for ways of the base alone, and, with care, for trees."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.found: list[tuple[str, Found]] = []
+        search = Beam.search
+
+        def watch(beam: Beam, *, thorough: bool, backwards: bool = False) -> Found:
+            found = search(beam, thorough=thorough, backwards=backwards)
+            kind = "rrt" if beam.careful else "interpolated" if beam.routes is None else "astar"
+            self.found.append((kind, found))
+            return found
+
+        monkeypatch.setattr(Beam, "search", watch)
+
+    @property
+    def kinds(self) -> list[str]:
+        return [kind for kind, _ in self.found]
+
+
+def grasps(found: Found) -> np.ndarray:
+    """Return where the robot may stand and have its arm when it grasps, shape (B, 9)."""
+    return found.paths[:, found.at.index(int(problem().ends[0])), :9]
+
+
+def test_in_turn_trees_first_lead_to_what_was_found_for_the_base_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One search less, where what it found is any good."""
+    watched = Watched(monkeypatch)
+    found = initialize(problem(), "auto", 0)
+    assert [next(found).name, next(found).name] == ["interpolated", "astar"]
+    assert "astar" in watched.kinds
+    before = len(watched.found)
+    first = next(found)
+    assert first.name == "rrt"
+    assert len(watched.found) == before
+    taken = grasps(next(each for kind, each in watched.found[::-1] if kind == "astar"))
+    assert np.abs(taken - first.z[int(problem().ends[0]) - 1, :9]).max(axis=1).min() < 1e-3
+    names = [seed.name for seed in found]
+    assert names in ([], ["rrt 2"]), "trees may have a second seed, the others have one"
+
+
+def test_alone_or_beside_nothing_good_trees_search_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
+    watched = Watched(monkeypatch)
+    assert [seed.name for seed in initialize(problem(), "rrt", 0)] == ["rrt"]
+    assert watched.kinds == ["rrt"]
+    watched.found.clear()
+    tolerable = Beam.tolerable
+    monkeypatch.setattr(Beam, "tolerable", lambda beam, found: beam.careful and tolerable(beam, found))
+    first = next(seed for seed in initialize(problem(), "auto", 0) if seed.name == "rrt")
+    assert "astar" in watched.kinds
+    assert watched.kinds[-1] == "rrt"
+    assert np.abs(grasps(watched.found[-1][1]) - first.z[int(problem().ends[0]) - 1, :9]).max(axis=1).min() < 1e-3
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_in_turn_trees_make_two_seeds_at_least(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: dict[str, int] = {}
+
+    def seeds(one: Any, most: int) -> Iterator[Seed]:
+        asked[one.method] = most
+        return iter([])
+
+    monkeypatch.setattr(initialization._SeedSearch, "seeds", seeds)
+    assert list(initialize(problem(), "auto", 0, count=count)) == []
+    assert asked == {"interpolated": count, "astar": count, "rrt": max(count, 2)}
+    assert list(initialize(problem(), "rrt", 0, count=count)) == []
+    assert asked["rrt"] == count
+
+
+def test_trees_hold_the_handle_too() -> None:
+    chain = problem().chain
+    hinge, knob = chain.index("door.hinge"), chain.index("door.knob")
+    found = seeds("rrt", count=2)
+    assert found
+    for z in found:
+        for row in z[problem().ends[0] - 1 :]:
+            assert hand_off_the_handle(door_scene(), row, row[hinge], row[knob]) < 1e-3
+
+
+def test_the_narrow_door_is_shut_from_outside() -> None:
+    """It stands open into the bedroom: a hand at its lever is in the doorway, where the arm at home has no room."""
+    scene = vkc.load_scene("household").with_state("door", {"hinge": 1.52}).with_start(base=(1.5, -0.5, 1.57))
+    plan = vkc.plan(scene, [vkc.Grasp("door", "handle_free"), vkc.Actuate("door", {"hinge": 0.0})], seed=0)
+    assert plan.success, plan.report()
+    assert plan.trajectory.column("door.hinge")[-1] == pytest.approx(0.0, abs=1e-3)
+    assert plan.trajectory.positions[-1, 1] < 1.0  # the wall is at 1.25: it has come out

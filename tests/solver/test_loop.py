@@ -1,0 +1,445 @@
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import time
+from functools import cache
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from helpers.drives import hall, moved, through
+from helpers.small_problems import door_scene
+
+import vkc_pin as vkc
+from vkc_pin.program.timing import Timing
+from vkc_pin.seeds.initialization import initialize
+from vkc_pin.solver import loop as solver
+from vkc_pin.solver import trust_region
+from vkc_pin.solver.loop import Solution, solve
+
+FEW = vkc.Options(reach_waypoints=20, max_outer=12)
+PILLAR = {"name": "pillar", "type": "cylinder", "radius": 0.15, "length": 1.6, "position": [1.6, 0.05, 0.8]}
+
+
+@cache
+def round_a_pillar() -> vkc.TrajectoryProblem:
+    return vkc.build(hall(obstacles=[PILLAR]), [vkc.GoTo(3.2, 0.0, 0.0)], options=FEW)
+
+
+def straight(problem: vkc.TrajectoryProblem, x: float, y: float = 0.0) -> np.ndarray:
+    scene = problem.scene
+    return through(scene, scene.start, moved(scene.start, x=x, y=y), steps=problem.segments).positions[1:]
+
+
+@cache
+def solved() -> Solution:
+    return solve(round_a_pillar(), straight(round_a_pillar(), 3.2))
+
+
+@cache
+def hard() -> Solution:
+    """The whole task from a stationary seed, not given up: steps are rejected."""
+    options = vkc.Options(reach_waypoints=15, turn_waypoints=4, move_waypoints=12, max_outer=10)
+    problem = vkc.build(door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=options)
+    (seed,) = initialize(problem, "stationary", 0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(solver, "GIVE_UP_SHORTFALL", np.inf)
+        return solve(problem, seed.z)
+
+
+def feasible(problem: vkc.TrajectoryProblem, solution: Solution) -> None:
+    """Everything holds at the waypoints, and nothing collides between them."""
+    z = solution.z
+    assert np.all((z >= problem.lower - 1e-6) & (z <= problem.upper + 1e-6))
+    assert problem.evaluate_contacts(z, reach=0.1).violation() < 1e-3
+    assert problem.pose_error(z) < 1e-3
+    first, second = problem.rates(z)
+    still = problem.timing_for(problem.still)
+    assert dataclasses.replace(still, dt=solution.dt).violation(first, second) < 1e-3
+    assert problem.drift(z) < 1.0
+    path = problem.waypoints(z)
+    states = np.concatenate([(1 - s) * path[:-1] + s * path[1:] for s in np.linspace(0.0, 1.0, 12)[1:-1]])
+    between = problem.contacts.evaluate(states, np.tile(np.arange(1, len(path)), 10), reach=0.0)
+    assert len(between.waypoint) == 0, between.distance.min()
+
+
+def test_it_goes_round_what_stands_in_the_way() -> None:
+    problem = round_a_pillar()
+    assert problem.evaluate_contacts(straight(problem, 3.2), reach=0.0).clearance() < -0.1
+    assert solved().converged
+    assert solved().status == "converged"
+    feasible(problem, solved())
+
+
+def test_counts_and_times() -> None:
+    for solution in (solved(), hard()):
+        assert solution.rounds == len(solution.history)
+        assert solution.iterations == solution.history[-1].iterations
+        assert set(solution.timings) == {"coal", "casadi", "ipopt"}
+        assert all(value > 0.0 for value in solution.timings.values())
+
+
+@pytest.mark.parametrize("solution", [solved, hard], ids=["pillar", "door"])
+def test_columns_that_only_grow(solution) -> None:  # type: ignore[no-untyped-def]
+    history = solution().history
+    assert [row.round for row in history] == list(range(1, len(history) + 1))
+    for name in ("iterations", "time", "penalty"):
+        assert np.all(np.diff([getattr(row, name) for row in history]) >= 0), name
+    for row in history:
+        assert row.step <= row.radius * (1 + 1e-6)  # the trust region holds
+        assert row.shortfall >= 0.0
+        assert row.objective >= 0.0
+
+
+def test_the_trust_region_shrinks_when_a_step_is_rejected() -> None:
+    """Few enough waypoints to share one radius, and a straight way through two walls."""
+    walls = [
+        {"name": f"wall_{k}", "type": "box", "size": [0.1, 3.0, 1.0], "position": [1.5 + 1.2 * k, (-1.0) ** k, 0.5]}
+        for k in range(2)
+    ]
+    problem = vkc.build(hall(obstacles=walls), [vkc.GoTo(4.2, 0.0, 0.0)], options=vkc.Options(reach_waypoints=14))
+    history = solve(problem, straight(problem, 4.2)).history
+    rejected = [(row, after) for row, after in itertools.pairwise(history) if not row.accepted]
+    assert rejected, "nothing was rejected: choose a harder problem"
+    for row, after in rejected:
+        assert after.radius < row.radius or after.penalty > row.penalty
+
+
+def test_trouble_in_one_place_does_not_narrow_the_trust_region_in_others() -> None:
+    """Forty waypoints in four blocks: in one nothing came of what was promised."""
+    region, before = trust_region.TrustRegion(40), np.full(40, 0.1)
+    slack, shortfall = np.zeros(40), np.zeros(40)
+    shortfall[10:20] = 0.1
+    trial = dataclasses.replace(blank_trial(40), slack=slack, shortfall=shortfall)
+    first = region.radius.copy()
+    region.adapt(before, trial, True, 0.9)
+    assert len(np.unique(region.block)) == 4
+    trouble = region.block == region.block[15]
+    assert np.array_equal(np.flatnonzero(trouble), np.arange(10, 20))
+    assert (region.radius[trouble] < first[trouble]).all()
+    assert (region.radius[~trouble] > first[~trouble]).all()
+    region.adapt(before, dataclasses.replace(trial, shortfall=before), False, -1.0)
+    assert (region.radius < first).all()
+    region.restart()
+    assert (region.radius == trust_region.RESTART_RADIUS).all()
+
+
+def test_a_trust_region_goes_on_with_what_it_is_given() -> None:
+    given = np.linspace(0.01, 0.3, 40)
+    region = trust_region.TrustRegion(40, given)
+    np.testing.assert_array_equal(region.radius, given)
+    region.settle()
+    np.testing.assert_array_equal(region.radius, np.minimum(given, trust_region.SETTLE_RADIUS))
+    region.restart()
+    np.testing.assert_array_equal(given, np.linspace(0.01, 0.3, 40))  # it is another's
+
+
+def blank_trial(segments: int) -> trust_region.Trial:
+    """Return a trial in which every coordinate went 0.3 and nothing else is said."""
+    fields = dict.fromkeys(field.name for field in dataclasses.fields(trust_region.Trial))
+    return trust_region.Trial(**{**fields, "step": np.full(segments, 0.3)})  # type: ignore[arg-type]
+
+
+def test_a_solution_goes_on_with_the_radius_that_another_ended_with() -> None:
+    problem, seed = round_a_pillar(), straight(round_a_pillar(), 3.2)
+    first = solve(problem, seed, rounds=1)
+    assert first.history[0].radius == trust_region.FIRST_RADIUS
+    assert first.radius is not None
+    assert first.radius.shape == (problem.segments,)
+    assert len(np.unique(first.radius)) > 1, "one radius for all: choose a harder problem"
+    assert Solution(seed, problem.timing_for(seed).dt).radius is None
+    for radius in (first.radius, np.linspace(0.02, 0.1, problem.segments)):
+        kept = radius.copy()
+        second = solve(problem, first.z, rounds=1, radius=radius)
+        assert second.history[0].radius == radius.max()
+        assert np.all(np.abs(second.z - first.z).max(axis=1) <= radius * (1 + 1e-6))
+        np.testing.assert_array_equal(radius, kept)
+
+
+class Scripted:
+    """Stands for the loop's state: every round leads where it is said, and is accepted if that is said."""
+
+    def __init__(
+        self, *rounds: tuple[float, float, bool], drift: float = 0.0, done: bool = False, step: float | None = None
+    ) -> None:
+        self.step = step
+        self.problem, self.z, self.is_done = SimpleNamespace(drift=lambda _: drift), np.zeros((40, 1)), done
+        self.deadline, self.penalty, self.solution = np.inf, 200.0, Solution(np.zeros((40, 1)), np.full(40, 0.25))
+        self.far = False
+        self.objective, self.shortfall, self.rounds, self.radii = 10.0, np.full(40, 0.5), iter(rounds), list[np.ndarray]()
+
+    def try_step(self, radius: np.ndarray) -> trust_region.Trial:
+        self.radii.append(radius.copy())
+        objective, shortfall, self.taken = next(self.rounds)
+        short = np.full(40, shortfall)  # just what was promised: nobody narrows the trust region
+        contacts = SimpleNamespace(clearance=lambda: -shortfall, violation=lambda: shortfall)
+        return dataclasses.replace(
+            blank_trial(40),
+            z=np.zeros((40, 1)),
+            objective=objective,
+            shortfall=short,
+            slack=short,
+            pose_error=0.0,
+            step=blank_trial(40).step if self.step is None else self.step * radius,
+            contacts=contacts,  # type: ignore[arg-type]
+        )
+
+    def judge(self, _: trust_region.Trial) -> tuple[bool, float]:
+        return self.taken, 1.0
+
+    def accept(self, trial: trust_region.Trial) -> None:
+        self.objective, self.shortfall = trial.objective, trial.shortfall
+
+    def done(self, _: trust_region.Trial) -> bool:
+        return self.is_done
+
+    def astray(self) -> bool:
+        return self.far
+
+    def raise_penalty(self) -> None:
+        self.penalty *= 2
+
+
+def scripted(
+    *rounds: tuple[float, float, bool],
+    patient: bool = True,
+    thorough: bool = True,
+    drift: float = 0.0,
+    done: bool = False,
+    step: float | None = None,
+    far: bool = False,
+) -> Scripted:
+    loop = Scripted(*rounds, drift=drift, done=done, step=step)
+    loop.far = far
+    region, interrupt = trust_region.TrustRegion(40), SimpleNamespace(pressed=False)
+    solver._iterate(loop, region, None, interrupt, len(rounds), patient, thorough)  # type: ignore[arg-type]
+    loop.radii.append(region.radius)
+    return loop
+
+
+@pytest.mark.parametrize(
+    ("objective", "shortfall", "accepted", "small"),
+    [
+        (8.1, 0.009, True, True),
+        (7.9, 0.009, True, False),  # it gets better fast
+        (8.1, 0.011, True, False),  # it is far from free
+        (10.0, 0.0, True, True),
+        (14.0, 0.009, True, True),
+        (8.1, 0.009, False, False),
+    ],
+)
+def test_what_is_nearly_free_and_hardly_gets_better_is_first_made_free(
+    objective: float, shortfall: float, accepted: bool, small: bool
+) -> None:
+    """With small steps, on which planes are as good as distances."""
+    _, after = scripted((objective, shortfall, accepted)).radii
+    assert bool((after <= trust_region.SETTLE_RADIUS).all()) == small
+    assert small or (after > trust_region.SETTLE_RADIUS).all()
+    _, after = scripted((objective, shortfall, accepted), far=True).radii  # first to where own constraints hold
+    assert (after > trust_region.SETTLE_RADIUS).all()
+
+
+def test_a_grasp_between_obstacles_is_made_free_with_small_steps() -> None:
+    scene = vkc.load_scene("init_2").sample_start(np.random.default_rng(5))
+    problem = vkc.build(scene, [vkc.Grasp("stick")])
+    seed = next(initialize(problem, "astar", 0)).z
+    solution, objective, small = solve(problem, seed), problem.objective(seed, problem.timing_for(seed).dt), 0
+    for row, after in itertools.pairwise(solution.history):
+        nearly = trust_region.CLOSE_ENOUGH <= row.shortfall < solver.NEARLY_FREE  # and not yet free
+        if row.accepted and nearly and objective - row.objective < solver.SETTLING * objective:
+            assert after.radius <= trust_region.SETTLE_RADIUS
+            assert after.step <= trust_region.SETTLE_RADIUS * (1 + 1e-6)
+            small += 1
+        objective = row.objective if row.accepted else objective
+    assert small, "it never gets there: choose another problem"
+    assert solution.converged
+    feasible(problem, solution)
+
+
+LATE = [(10.0, 0.05, True)] * 20
+
+
+@pytest.mark.parametrize(
+    ("rounds", "expected"),
+    [
+        ([(10.0, 0.11, True)] * 20, 6),
+        ([(10.0, 0.0, False)] * 20, 6),  # what counts is where it is, not where it might have gone
+        ([(10.0, 0.11, True)] * 5 + LATE, 25),
+        (LATE[:8] + [(10.0, 0.11, True)] * 5, 9),
+        (LATE, 20),
+    ],
+)
+def test_after_a_few_rounds_what_is_far_from_free_is_given_up(rounds: list[tuple[float, float, bool]], expected: int) -> None:
+    loop = scripted(*rounds)
+    assert loop.solution.rounds == expected
+    assert loop.solution.status == "not converged"
+
+
+@pytest.mark.parametrize(("drift", "expected"), [(0.0, 20), (2.0, 20), (2.1, 6)])
+def test_what_drifts_far_is_given_up_after_a_few_rounds(drift: float, expected: int) -> None:
+    assert scripted(*LATE, drift=drift).solution.rounds == expected
+
+
+@pytest.mark.parametrize(("drift", "converged"), [(0.8, True), (0.95, False)])
+def test_what_only_drifts_ends_as_if_it_were_good(drift: float, converged: bool) -> None:
+    """No round can help that; it is not said to have converged."""
+    solution = scripted((8.0, 0.0, True), (1.0, 0.0, True), drift=drift, done=True).solution
+    assert (solution.rounds, solution.converged) == (1, converged)  # nothing holds the step back any more
+    assert solution.status == ("converged" if converged else "not converged")
+
+
+@pytest.mark.parametrize(
+    ("objectives", "step", "thorough", "expected"),
+    [
+        ([8.0, 7.0, 6.8, 5.0], 1.0, True, 3),  # the third is hardly better
+        ([8.0, 7.0, 6.0, 5.0], 1.0, True, 4),
+        ([8.0, 9.0, 6.0], 1.0, True, 2),
+        ([8.0, 7.0, 6.0, 5.0], 0.98, True, 4),  # Ipopt ends a little inside its bounds
+        ([8.0, 7.0, 6.0], 0.85, True, 1),  # nothing held it back
+        ([8.0, 7.0, 6.0], 1.0, False, 1),
+    ],
+)
+def test_what_is_good_is_improved_as_long_as_that_is_worth_while(
+    objectives: list[float], step: float, thorough: bool, expected: int
+) -> None:
+    rounds = [(objective, 0.0, True) for objective in objectives]
+    solution = scripted(*rounds, done=True, step=step, thorough=thorough).solution
+    assert (solution.rounds, solution.converged) == (expected, True)
+
+
+@pytest.mark.parametrize(("done", "small"), [(True, False), (False, True)])
+def test_only_what_is_not_yet_free_needs_small_steps(done: bool, small: bool) -> None:
+    _, after, *_ = scripted((8.1, 0.0, True), (8.1, 0.0, True), done=done, step=1.0).radii
+    assert bool((after <= trust_region.SETTLE_RADIUS).all()) == small
+
+
+@pytest.mark.parametrize("patient", [True, False])
+def test_without_patience_what_is_stuck_is_left_to_later(patient: bool) -> None:
+    """Stuck: something is in the way, and nothing moves."""
+    loop = scripted(*[(10.0, 0.05, False)] * 20, patient=patient)
+    first = next(k for k, radius in enumerate(loop.radii) if k and (radius == trust_region.RESTART_RADIUS).all())
+    assert (loop.solution.rounds == first) != patient
+    assert loop.penalty > 200.0
+    resume = loop.solution.resume
+    assert patient == (resume is None)
+    assert patient or resume.penalty == loop.penalty
+
+
+def test_motions_far_from_free_are_given_up_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A wall from side to side: whatever is done, something is in it."""
+    wall = {"name": "wall", "type": "box", "size": [1.0, 12.0, 2.0], "position": [2.0, 0.0, 1.0]}
+    problem = vkc.build(hall(obstacles=[wall]), [vkc.GoTo(4.0, 0.0, 0.0)], options=FEW)
+    seed = straight(problem, 4.0)
+    solution = solve(problem, seed)
+    assert (solution.status, solution.converged) == ("not converged", False)
+    assert solution.rounds == solver.GIVE_UP_ROUNDS < FEW.max_outer
+    assert problem.evaluate_contacts(solution.z, reach=0.1).violation() > solver.GIVE_UP_SHORTFALL
+    assert solve(problem, seed, rounds=2).rounds == 2
+    monkeypatch.setattr(solver, "GIVE_UP_SHORTFALL", np.inf)
+    assert solve(problem, seed).rounds > solver.GIVE_UP_ROUNDS
+
+
+def test_standing_still_where_one_is_already() -> None:
+    """The objective vanishes there; what is left is Ipopt's tolerance."""
+    problem = vkc.build(hall(), [vkc.GoTo(0.0, 0.0, 0.0)], options=FEW)
+    still = np.tile(problem.start, (problem.segments, 1))
+    solution = solve(problem, still)
+    assert solution.converged
+    np.testing.assert_allclose(solution.z, still, atol=0.05)
+    assert problem.objective(solution.z, solution.dt) <= 1e-3
+
+
+def test_the_merit_falls_from_one_accepted_step_to_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With one penalty and a seed on the manifold, objective + penalty · Σ shortfall of what is accepted only falls."""
+    problem = round_a_pillar()
+    merits: list[tuple[float, float, bool]] = []
+    judge = solver._Loop.judge
+
+    def watch(loop, trial):  # type: ignore[no-untyped-def]
+        before = loop.objective + loop.penalty * float(loop.shortfall.sum())
+        after = trial.objective + loop.penalty * float(trial.shortfall.sum())
+        accepted, ratio = judge(loop, trial)
+        merits.append((before, after, accepted))
+        return accepted, ratio
+
+    monkeypatch.setattr(solver._Loop, "judge", watch)
+    solve(problem, straight(problem, 3.2))
+    assert any(accepted for _, _, accepted in merits)
+    for before, after, accepted in merits:
+        if accepted:
+            assert after <= before + 1e-4 * max(1.0, abs(before))
+
+
+def test_the_motion_that_was_feasible_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rounds go on for a shorter motion; if they fail, the feasible one is returned."""
+    problem, seed = round_a_pillar(), straight(round_a_pillar(), 3.2)
+    done = solver._Loop.done
+    kept: list[np.ndarray] = []
+
+    def first_only(loop, trial):  # type: ignore[no-untyped-def]
+        if kept or not done(loop, trial):
+            return False
+        kept.append(trial.z.copy())
+        return True
+
+    monkeypatch.setattr(solver, "WORTHWHILE", -np.inf)  # never content with the first
+    monkeypatch.setattr(solver._Loop, "done", first_only)
+    solution = solve(problem, seed)
+    assert solution.converged
+    np.testing.assert_array_equal(solution.z, kept[0])
+    feasible(problem, solution)
+
+
+def test_no_time_at_all() -> None:
+    problem, seed = round_a_pillar(), straight(round_a_pillar(), 3.2)
+    solution = solve(problem, seed, deadline=time.perf_counter() - 1.0)
+    assert (solution.status, solution.converged, solution.rounds) == ("time limit", False, 0)
+    np.testing.assert_array_equal(solution.z, problem.clip(seed))
+
+
+def test_time_that_runs_out_in_the_middle() -> None:
+    problem, seed = round_a_pillar(), straight(round_a_pillar(), 3.2)
+    solution = solve(problem, seed, deadline=time.perf_counter() + 1e-3)
+    assert solution.status == "time limit"
+    assert solution.rounds <= 1
+    assert np.isfinite(solution.z).all()
+
+
+def test_seeds_outside_their_bounds_are_moved_inside() -> None:
+    problem = round_a_pillar()
+    wild = straight(problem, 3.2) + 20.0
+    solution = solve(problem, wild, deadline=time.perf_counter() - 1.0)
+    assert np.all((solution.z >= problem.lower) & (solution.z <= problem.upper))
+
+
+def test_velocity_bounds_bind_when_time_is_short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """When it may not take more."""
+    options = vkc.Options(reach_waypoints=12, dt=0.25)  # 2.4 m in 3 s at no more than 1 m/s
+    problem = vkc.build(hall(), [vkc.GoTo(2.4, 0.0, 0.0)], options=options)
+    least = problem.timing_for(problem.still)
+    monkeypatch.setattr(vkc.TrajectoryProblem, "timing_for", lambda self, z: least)
+    monkeypatch.setattr(Timing, "stretched", lambda self, first, second: self)
+    seed = straight(problem, 2.4)
+    assert least.violation(*problem.rates(seed)) > 0.05
+    solution = solve(problem, seed)
+    assert solution.converged
+    first, _ = problem.rates(solution.z)
+    assert np.abs(first[:, 0]).max() <= least.velocity[0, 0] * 1.001
+    assert np.abs(first[:, 0]).max() > 0.95 * least.velocity[0, 0]
+    feasible(problem, solution)
+
+
+def test_a_way_that_is_too_long_takes_longer() -> None:
+    options = vkc.Options(reach_waypoints=12, dt=0.25)
+    problem = vkc.build(hall(), [vkc.GoTo(2.4, 0.0, 0.0)], options=options)
+    solution = solve(problem, straight(problem, 2.4))
+    assert solution.converged
+    assert 3.0 < solution.dt.sum() < 6.0
+    feasible(problem, solution)
+
+
+def test_the_same_seed_gives_the_same_motion() -> None:
+    again = solve(round_a_pillar(), straight(round_a_pillar(), 3.2))
+    np.testing.assert_array_equal(again.z, solved().z)
+    assert [row.objective for row in again.history] == [row.objective for row in solved().history]

@@ -13,7 +13,7 @@ from helpers.drawers import drawer_scene, handle, holding, off, open_scene
 from helpers.drives import hall
 
 import vkc_pin as vkc
-from vkc_pin.baselines import BASELINES, attempt, base_poses, plan_separately
+from vkc_pin.baselines import BASELINES, attempt, plan_separately, poses
 from vkc_pin.baselines.attempt import Attempt
 from vkc_pin.baselines.failure import FailedError
 from vkc_pin.baselines.postures import postures
@@ -129,7 +129,7 @@ def test_what_is_held_at_the_start_is_carried_on() -> None:
 
 
 def test_no_room_to_put_it_down(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(base_poses, "TRIES", 1000)
+    monkeypatch.setattr(poses, "TRIES", 1000)
     found = plan(room(box("crate", [0.3, 0.3, 0.3], [THERE[0], THERE[1], 0.85])), CARRY)
     assert (found.success, found.status) == (False, "no base pose")
     assert names(found) == CARRIED[:2]

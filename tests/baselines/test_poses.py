@@ -10,7 +10,7 @@ import pytest
 from helpers.drawers import SHORT, changed, drawer_scene, handle, holding, off, spare, with_boxes
 
 import vkc_pin as vkc
-from vkc_pin.baselines import base_poses as module
+from vkc_pin.baselines import poses as module
 from vkc_pin.baselines.poses import base_poses
 from vkc_pin.seeds.knots import SCATTER, Knots
 

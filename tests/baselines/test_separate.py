@@ -52,7 +52,7 @@ def rows(plan: vkc.Plan, phase: int) -> np.ndarray:
 
 def limited(monkeypatch: pytest.MonkeyPatch, *, tries: int = 1000, stands: int = 1) -> None:
     """Look less far than usual for what is not there."""
-    monkeypatch.setattr(base_poses, "TRIES", tries)
+    monkeypatch.setattr(poses, "TRIES", tries)
     monkeypatch.setattr(attempt, "_STANDS", stands)
 
 

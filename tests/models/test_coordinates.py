@@ -38,6 +38,7 @@ def test_names_joints_and_limits() -> None:
     coordinates = Coordinates(mixed())
     assert coordinates.names == ("base_x", "base_y", "base_yaw", "wheel", *FREE, "lid", "lift")
     assert coordinates.joints == (1, 1, 1, 2, *[3] * 7, 4, 5)
+    assert coordinates.units == ("m", "m", "rad", "rad", *"mmm1111", "rad", "m")
     assert coordinates.size == 13
     assert coordinates.nq == 4 + 2 + 7 + 1 + 1
     assert (coordinates.lower[2:11] == -np.inf).all()

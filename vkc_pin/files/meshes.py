@@ -22,7 +22,7 @@ from vkc_pin.files.hulls import outer_hull
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["MeshPart", "convex_hull", "load_convex", "load_mesh", "load_parts", "to_bvh"]
+__all__ = ["MeshPart", "coarser", "convex_hull", "load_convex", "load_mesh", "load_parts", "to_bvh"]
 
 _NEIGHBOURS = 255  # coal's corners have no more
 _TOLERANCE = 1e-6  # how far, relatively, coal's volume and area may be from trimesh's
@@ -142,7 +142,7 @@ def load_parts(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0), *, detail: 
     file = Path(path)
     if file.suffix.lower() != ".obj" or not file.is_file():
         whole = load_mesh(file, scale)
-        return [_coarser(MeshPart(np.asarray(whole.vertices), np.asarray(whole.faces)), detail)]
+        return [coarser(MeshPart(np.asarray(whole.vertices), np.asarray(whole.faces)), detail)]
     factors = _factors(file, scale)
     try:
         scene = trimesh.load_scene(file, process=False, group_material=True, split_object=False)
@@ -155,7 +155,29 @@ def load_parts(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0), *, detail: 
     ]
     if not parts:
         raise InputError("the mesh is empty", file=file, expected="at least one triangle")
-    return [_coarser(part, detail) for part in parts]
+    return [coarser(part, detail) for part in parts]
+
+
+def coarser(part: MeshPart, detail: float) -> MeshPart:
+    """Return a lighter copy: the vertices in each cell of a grid become their mean, triangles without area go.
+
+    Args:
+        part: The triangles.
+        detail: Width of the cells [m]; 0 keeps all as it is.
+    """
+    if detail <= 0.0:
+        return part
+    cells = np.round(part.vertices / detail).astype(np.int64)
+    _, group, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    group = group.reshape(-1)
+    means = np.zeros((len(count), 3))
+    np.add.at(means, group, part.vertices)
+    faces = group[part.faces]
+    faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
+    if len(faces) == 0:
+        return part
+    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    return MeshPart(means / count[:, None], faces[np.sort(first)], part.colour)
 
 
 def to_bvh(part: MeshPart) -> coal.BVHModelOBBRSS:
@@ -213,20 +235,3 @@ def _colour(mesh: trimesh.Trimesh) -> tuple[float, float, float, float] | None:
         return (*(rgb / 255.0).tolist(), 1.0)
     rgba = np.asarray(material.main_color, float) / 255.0
     return (float(rgba[0]), float(rgba[1]), float(rgba[2]), float(rgba[3]))
-
-
-def _coarser(part: MeshPart, detail: float) -> MeshPart:
-    """Merge the vertices of each cell of a grid of width `detail` into their mean; drop triangles without area."""
-    if detail <= 0.0:
-        return part
-    cells = np.round(part.vertices / detail).astype(np.int64)
-    _, group, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    group = group.reshape(-1)
-    means = np.zeros((len(count), 3))
-    np.add.at(means, group, part.vertices)
-    faces = group[part.faces]
-    faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
-    if len(faces) == 0:
-        return part
-    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
-    return MeshPart(means / count[:, None], faces[np.sort(first)], part.colour)

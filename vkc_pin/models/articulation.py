@@ -41,6 +41,11 @@ class Freedom:
     lower: float
     upper: float
 
+    @property
+    def unit(self) -> str:
+        """Its unit, "m" or "rad"."""
+        return "m" if self.kind == "prismatic" else "rad"
+
     def motion(self, value: float) -> pin.SE3:
         """Return the motion at `value`, [rad] or [m]."""
         if self.kind == "revolute":

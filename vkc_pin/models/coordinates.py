@@ -16,6 +16,7 @@ from vkc_pin.errors import InputError, UnknownNameError
 
 __all__ = ["Coordinates", "wrapped"]
 
+_SLIDING = ("JointModelPX", "JointModelPY", "JointModelPZ", "JointModelPrismaticUnaligned")
 _UNBOUNDED = ("JointModelRUBX", "JointModelRUBY", "JointModelRUBZ", "JointModelRevoluteUnboundedUnaligned")
 
 
@@ -26,6 +27,7 @@ class Coordinates:
         names: One name per coordinate: the joint's, and for a planar joint `<joint>_x`, `<joint>_y`, `<joint>_yaw`; a free
             joint has seven, `<joint>_x`, `_y`, `_z` [m] and a quaternion `_qx`, `_qy`, `_qz`, `_qw` of any length but zero,
             so that it interpolates anywhere.
+        units: For each coordinate "m" or "rad", and "1" for the parts of a quaternion.
         joints: For each coordinate, the index of the joint it belongs to.
         size: Their number n (equal to `model.nv`, without free joints).
         lower, upper: Position limits, shape (n,), [m] or [rad]; infinite for continuous joints and the planar yaw.
@@ -37,6 +39,7 @@ class Coordinates:
 
     def __init__(self, model: pin.Model) -> None:
         names: list[str] = []
+        units: list[str] = []
         joints: list[int] = []
         plain: list[tuple[int, int]] = []  # q[i] = z[j]
         angles: list[tuple[int, int]] = []  # q[i] = cos z[j], q[i + 1] = sin z[j]
@@ -49,22 +52,26 @@ class Coordinates:
                 plain += [(i, len(names)), (i + 1, len(names) + 1)]
                 angles.append((i + 2, len(names) + 2))
                 names += [f"{name}_x", f"{name}_y", f"{name}_yaw"]
+                units += ["m", "m", "rad"]
                 lower += [*model.lowerPositionLimit[i : i + 2], -np.inf]
                 upper += [*model.upperPositionLimit[i : i + 2], np.inf]
             elif kind == "JointModelFreeFlyer":
                 plain += [(i + k, len(names) + k) for k in range(3)]
                 quaternions.append((i + 3, len(names) + 3))
                 names += [f"{name}_{part}" for part in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+                units += ["m"] * 3 + ["1"] * 4
                 lower += [-np.inf] * 7
                 upper += [np.inf] * 7
             elif kind in _UNBOUNDED:
                 angles.append((i, len(names)))
                 names.append(name)
+                units.append("rad")
                 lower.append(-np.inf)
                 upper.append(np.inf)
             elif joint.nq == 1 and joint.nv == 1:
                 plain.append((i, len(names)))
                 names.append(name)
+                units.append("m" if kind in _SLIDING else "rad")
                 lower.append(model.lowerPositionLimit[i])
                 upper.append(model.upperPositionLimit[i])
             else:
@@ -76,6 +83,7 @@ class Coordinates:
                 )
             joints += [index] * (len(names) - len(joints))
         self.names: tuple[str, ...] = tuple(names)
+        self.units: tuple[str, ...] = tuple(units)
         self.joints: tuple[int, ...] = tuple(joints)
         self.size = len(names)
         self.lower: NDArray[np.float64] = np.array(lower, float)

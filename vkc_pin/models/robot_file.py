@@ -123,9 +123,7 @@ def load_robot(
     semantics = read_srdf(beside, links=urdf.links) if beside is not None and pairs == "srdf" else None
 
     full = full_model(urdf)
-    tool = tool_frame if tool_frame is not None else settings.tool_frame or default_tool_frame(full, urdf)
-    if tool not in (frames := dict.fromkeys(frame.name for frame in full.frames)):
-        raise UnknownNameError("frame", tool, frames, file=urdf.path, field="tool_frame")
+    tool = _tool_frame(full, files, tool_frame)
     locked = {**settings.locked_joints, **(locked_joints or {})}
     given = {**settings.home, **(home or {}), **locked}
     rest = rest_positions(full, urdf, given)
@@ -152,12 +150,7 @@ def load_robot(
         touch_links=settings.touch_links,
         file=urdf,
     )
-    stated = () if pairs == "all" else None if semantics is None else semantics.allowed
-    robot = with_collision_pairs(robot, sample_allowed_pairs(robot, samples=_SAMPLES) if stated is None else stated)
-    if len(robot.collision.collisionPairs) == 0 and stated is not None:
-        expected = "<collision> elements, and an SRDF that fits"
-        raise InputError("no pair of links is left that could collide", file=robot.urdf, expected=expected)
-    return robot
+    return _with_pairs(robot, () if pairs == "all" else None if semantics is None else semantics.allowed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,6 +201,29 @@ def _read(name: str | Path, packages: Mapping[str, str | Path]) -> _Files:
     folders = {key: Path(folder) for key, folder in packages.items()}
     folders = {**python_packages(tuple(p for p in settings.packages if p not in folders), document), **folders}
     return _Files(source, settings, document, read_urdf(source.parent / settings.urdf, folders))
+
+
+def _tool_frame(full: pin.Model, files: _Files, stated: str | None) -> str:
+    """Return the frame that grasps: the stated one, that of robot.yaml, or the end of the arm."""
+    tool = stated if stated is not None else files.settings.tool_frame or default_tool_frame(full, files.urdf)
+    if tool not in (frames := dict.fromkeys(frame.name for frame in full.frames)):
+        raise UnknownNameError("frame", tool, frames, file=files.urdf.path, field="tool_frame")
+    return tool
+
+
+def _with_pairs(robot: Robot, allowed: Collection[tuple[str, str]] | None) -> Robot:
+    """Return `robot` with collision pairs; pairs of links that may touch are `allowed`, or found by sampling if that is None.
+
+    Raises:
+        InputError: No pair is left by an `allowed` that was given.
+    """
+    if allowed is None:
+        return with_collision_pairs(robot, sample_allowed_pairs(robot, samples=_SAMPLES))
+    robot = with_collision_pairs(robot, allowed)
+    if len(robot.collision.collisionPairs) == 0:
+        expected = "<collision> elements, and an SRDF that fits"
+        raise InputError("no pair of links is left that could collide", file=robot.urdf, expected=expected)
+    return robot
 
 
 def _state(model: pin.Model, semantics: Srdf | None, given: Collection[str]) -> dict[str, float]:

@@ -239,15 +239,12 @@ def scene_after(scene: Scene, trajectory: Trajectory, holds: Sequence[Hold]) -> 
 def units_of(scene: Scene) -> dict[str, str]:
     """Return coordinate → "m" or "rad" of everything that can move in a scene: robot, objects, and the freedoms of grasps."""
     units: dict[str, str] = {}
-    things = [("", scene.robot.model, scene.robot.coordinates)]
-    things += [(f"{name}.", placed.object.model, placed.object.coordinates) for name, placed in scene.objects.items()]
-    for prefix, model, coordinates in things:
-        for name, joint in zip(coordinates.names, coordinates.joints, strict=True):
-            kind = str(model.joints[joint].shortname()).removeprefix("JointModel")
-            metres = kind in ("PX", "PY", "PZ", "PrismaticUnaligned") or (kind == "Planar" and not name.endswith("_yaw"))
-            units[prefix + name] = "m" if metres else "rad"
+    things = [("", scene.robot.coordinates)]
+    things += [(f"{name}.", placed.object.coordinates) for name, placed in scene.objects.items()]
+    for prefix, coordinates in things:
+        units |= {prefix + name: unit for name, unit in zip(coordinates.names, coordinates.units, strict=True)}
     for owner, placed in scene.objects.items():
         for attachment in placed.object.attachments.values():
             for name, freedom in zip(attachment.coordinates, attachment.freedoms, strict=True):
-                units[f"{owner}.{name}"] = "m" if freedom.kind == "prismatic" else "rad"
+                units[f"{owner}.{name}"] = freedom.unit
     return units

@@ -185,9 +185,7 @@ class TrajectoryProblem:
 
     def unit(self, name: str) -> str:
         """Return "m" or "rad", the unit of a coordinate."""
-        kind = str(self.chain.model.joints[self.chain.coordinates.joints[self.chain.index(name)]].shortname())
-        planar = kind == "JointModelPlanar" and not name.endswith("_yaw")
-        return "m" if planar or "Prismatic" in kind or kind in ("JointModelPX", "JointModelPY", "JointModelPZ") else "rad"
+        return self.chain.coordinates.units[self.chain.index(name)]
 
     def waypoints(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return `z`, shape (N, n), with the start before it, shape (N + 1, n)."""

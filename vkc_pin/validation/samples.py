@@ -87,7 +87,7 @@ class Samples:
     def _sample(self) -> tuple[NDArray[np.float64], NDArray[np.int_]]:
         """Return the times to look at, and where among them the waypoints are."""
         steps = np.abs(np.diff(self.trajectory.positions, axis=0))
-        units = np.array([LENGTH_STEP if self.is_length(name) else ANGLE_STEP for name in self.trajectory.names])
+        units = np.array([LENGTH_STEP if self.unit(name) == "m" else ANGLE_STEP for name in self.trajectory.names])
         planar = np.linalg.norm(steps[:, :2], axis=1) / LENGTH_STEP
         counts = np.maximum(1, np.ceil(np.maximum(planar, (steps / units).max(axis=1)) - 1e-9)).astype(int)
         edges = itertools.pairwise(self.trajectory.times)
@@ -95,17 +95,11 @@ class Samples:
         rows = np.concatenate([[0], np.cumsum(counts)])
         return np.concatenate([*times, self.trajectory.times[-1:]]), rows
 
-    def is_length(self, name: str) -> bool:
-        """Return whether a coordinate is a length, [m], and not an angle, [rad]."""
-        if name in self.virtual:
-            return self.virtual[name].kind == "prismatic"
-        index = self.world.coordinates.index(name)
-        kind = str(self.world.model.joints[self.world.coordinates.joints[index]].shortname())
-        return index < 2 or (kind.startswith("JointModelP") and kind != "JointModelPlanar")
-
     def unit(self, name: str) -> str:
         """Return a coordinate's unit, "m" or "rad"."""
-        return "m" if self.is_length(name) else "rad"
+        if name in self.virtual:
+            return self.virtual[name].unit
+        return self.world.coordinates.units[self.world.coordinates.index(name)]
 
     def bounds(self, name: str) -> tuple[float, float, float, float]:
         """Return lower, upper, velocity and acceleration limit of a coordinate of the trajectory."""

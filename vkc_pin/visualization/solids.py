@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from vkc_pin.files.meshes import MeshPart, coarser
 from vkc_pin.models.shapes import triangles
 
 __all__ = ["Solid", "box_solid", "coarse", "merge_solids", "shade", "to_solid", "tube"]
@@ -55,14 +56,9 @@ def shade(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Solid:
 
 
 def coarse(solid: Solid, width: float) -> Solid:
-    """Return a lighter copy: vertices that fall together on a grid of `width` [m] become one."""
-    import trimesh
-
-    mesh = trimesh.Trimesh(solid.vertices / width, solid.faces, process=False)
-    mesh.merge_vertices(digits_vertex=0, merge_norm=True, merge_tex=True)
-    mesh.update_faces(mesh.nondegenerate_faces(height=1e-9) & mesh.unique_faces())
-    mesh.remove_unreferenced_vertices()
-    return shade(np.asarray(mesh.vertices) * width, np.asarray(mesh.faces))
+    """Return a lighter copy: vertices in one cell of a grid of `width` [m] become one."""
+    part = coarser(MeshPart(solid.vertices.astype(float), solid.faces.astype(np.int64)), width)
+    return shade(part.vertices, part.faces)
 
 
 def merge_solids(solids: list[Solid]) -> Solid:

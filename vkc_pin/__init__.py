@@ -13,7 +13,7 @@ from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.options import Options
 from vkc_pin.planning.chore import plan_chore
 from vkc_pin.planning.plan import Plan
-from vkc_pin.planning.planner import plan
+from vkc_pin.planning.planner import Planner, plan
 from vkc_pin.plotting import cards as _cards  # noqa: F401 - registers what notebooks show of a scene
 from vkc_pin.program.problem import TrajectoryProblem, build
 from vkc_pin.scene.placed import PlacedObject
@@ -48,6 +48,7 @@ __all__ = [
     "Place",
     "PlacedObject",
     "Plan",
+    "Planner",
     "Reach",
     "Release",
     "Report",

@@ -15,6 +15,7 @@ from vkc_pin.baselines.following import follow
 from vkc_pin.baselines.poses import base_poses
 from vkc_pin.baselines.postures import at_home, postures, through
 from vkc_pin.baselines.ways import BaseWays, headings
+from vkc_pin.cache import Cache
 from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.motion.trajectory import Trajectory, join
 from vkc_pin.motion.world import scene_after
@@ -48,7 +49,6 @@ class Attempt:
 
     Attributes:
         times: What it spent on the parts of `outcome.TIMES` [s].
-        build_time: On symbolic programs that were built for the first time [s].
     """
 
     def __init__(
@@ -60,6 +60,7 @@ class Attempt:
         seed: Sequence[int],
         deadline: float = np.inf,
         interrupt: Interrupt = NEVER,
+        cache: Cache | None = None,
     ) -> None:
         """Prepare a try.
 
@@ -70,12 +71,13 @@ class Attempt:
             seed: Of the random numbers.
             deadline: Value of `time.perf_counter()` after which no stage is begun.
             interrupt: Ends it with what there is.
+            cache: Keeps what is built; None: one of its own.
         """
         self.scene, self.options, self.refine, self.deadline, self.interrupt = scene, options, refine, deadline, interrupt
         self.rng = np.random.default_rng(seed)
         self.parts: list[Trajectory] = []
         self.times = dict.fromkeys([*TIMES, "following"], 0.0)
-        self.build_time, self.iterations = 0.0, 0
+        self.iterations, self.cache = 0, cache or Cache()
 
     def run(self, steps: Sequence[Doable]) -> tuple[Trajectory, float, str]:
         """Return the motion, how many stages it came through (infinite: all), and why no further."""
@@ -274,9 +276,7 @@ class Attempt:
     def _problem(self, steps: Sequence[Step], options: Options | None = None, scene: Scene | None = None) -> TrajectoryProblem:
         """Return the problem of steps from where the motion has come to, or from another scene."""
         options, scene = options or self.options, scene or self.scene
-        problem = TrajectoryProblem(scene, compile_task(scene, steps, options), options)
-        self.build_time += problem.transcription.take_build_time()
-        return problem
+        return TrajectoryProblem(scene, compile_task(scene, steps, options), options, cache=self.cache)
 
     def _solve(
         self, problem: TrajectoryProblem, seeds: Iterator[Seed], cause: str
@@ -286,7 +286,6 @@ class Attempt:
         for seed in seeds:
             self._in_time(failure)
             solution = solve(problem, seed.z, rounds=_ROUNDS, deadline=self.deadline, interrupt=self.interrupt)
-            self.build_time += problem.transcription.take_build_time()
             self.iterations += solution.iterations
             for key, value in solution.timings.items():
                 self.times[key] += value

@@ -28,6 +28,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -38,6 +39,7 @@ from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.options import Options
 from vkc_pin.planning.outcome import outcome, spent
 from vkc_pin.planning.plan import Plan
+from vkc_pin.planning.planner import Planner, borrowed
 from vkc_pin.planning.settings import check_arguments
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.compiler import compile_task
@@ -61,6 +63,7 @@ def plan_separately(
     seed: int = 0,
     time_limit: float | None = None,
     retries: int = RETRIES,
+    planner: Planner | None = None,
 ) -> Plan:
     """Plan as the baselines do.
 
@@ -72,6 +75,7 @@ def plan_separately(
         seed: Of the random numbers.
         time_limit: Seconds of planning after which nothing more is begun.
         retries: How often all is tried, with other random numbers, until validation accepts a motion.
+        planner: As for `planner.plan`.
 
     Returns:
         The plan of the first try that validation accepts, else the one that came furthest. Its status is then the cause:
@@ -95,24 +99,26 @@ def plan_separately(
             expected = "Actuate, Place or GoTo"
             raise InputError("the baselines know no such step", field=f"steps[{number}]", expected=expected, got=repr(step))
         actions.append(step)
-    with interruptible() as interrupt:
-        began, times, iterations, built = time.perf_counter(), Counter[str](), 0, 0.0
+    with borrowed(planner) as cache, interruptible() as interrupt:
+        began, times, iterations, before = time.perf_counter(), Counter[str](), 0, cache.building
         best: tuple[float, str, int, Trajectory, Report] | None = None
         for number in range(retries):
-            deadline = np.inf if time_limit is None else began + built + time_limit
+            deadline = np.inf if time_limit is None else began + cache.building - before + time_limit
             random = [int(seed), number]
-            attempt = Attempt(scene, options, refine=method == "B2", seed=random, deadline=deadline, interrupt=interrupt)
+            given: dict[str, Any] = {"deadline": deadline, "interrupt": interrupt, "cache": cache}
+            attempt = Attempt(scene, options, refine=method == "B2", seed=random, **given)
             trajectory, came, cause = attempt.run(actions)
             checked = time.perf_counter()
             report = validate(scene, task.steps, trajectory, options)
             attempt.times["validation"] += time.perf_counter() - checked
             status = "success" if report.ok else cause or "rejected"
-            built, iterations = built + attempt.build_time, iterations + attempt.iterations
+            iterations += attempt.iterations
             times.update(attempt.times)
             if best is None or status in ("success", "interrupted") or came > best[0]:
                 best = came, status, number, trajectory, report
             if status in ("success", "interrupted") or time.perf_counter() > deadline:
                 break
+        built = cache.building - before
     assert best is not None
     _, status, tried, trajectory, report = best
     took = spent(time.perf_counter() - began - built, built, iterations=iterations, rounds=number + 1, times=times)

@@ -45,10 +45,11 @@ class BaseWays:
         moving, standing = grid_shapes(problem, len(problem.task.phases) - 1, z)
         base = [shape for joint, shape in moving if whole or joint == 1]
         arena, margin = problem.scene.arena, problem.options.dist_safe
-        self.grid = BaseGrid(base, [], standing, arena, margin)
+        self.grid = BaseGrid(base, [], standing, arena, margin, cache=problem.cache)
         # Without margins where an optimisation follows: it restores them.
         cells = fine_cells(arena, margin)
-        self._finer = functools.partial(BaseGrid, base, [], standing, arena, 0.0 if whole else margin, cells=cells)
+        slack = 0.0 if whole else margin
+        self._finer = functools.partial(BaseGrid, base, [], standing, arena, slack, cells=cells, cache=problem.cache)
 
     @functools.cached_property
     def finer(self) -> BaseGrid:

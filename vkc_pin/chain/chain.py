@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from dataclasses import dataclass, field
+from functools import cached_property
 
-import casadi
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from vkc_pin import cpin
+from vkc_pin.cache import Cache
 from vkc_pin.chain.inversion import invert
-from vkc_pin.cpin.batch import BatchFunction
+from vkc_pin.chain.kinematics import Kinematics, kinematics_of
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.models.articulation import Attachment
 from vkc_pin.models.coordinates import Coordinates
@@ -61,6 +60,7 @@ class VirtualKinematicChain:
         virtual: Hold → names of the coordinates of its attachment's virtual joint.
         added: Hold → names of all coordinates that come with it: these, and the joints of the object that it moves.
         prefixes: Hold → what the object's frames and joints begin with in `model`.
+        cache: What was built for it, and can serve others.
     """
 
     robot: Robot
@@ -77,6 +77,7 @@ class VirtualKinematicChain:
     virtual: Mapping[Hold, tuple[str, ...]]
     added: Mapping[Hold, tuple[str, ...]]
     prefixes: Mapping[Hold, str]
+    cache: Cache = field(repr=False)
 
     @property
     def size(self) -> int:
@@ -90,7 +91,7 @@ class VirtualKinematicChain:
             z: Configurations, shape (W, n). Joint 0, the world, is among the J.
         """
         batch, joints = len(z), self.model.njoints
-        (columns,) = self._kinematics(z)
+        (columns,) = self._kinematics.batch(z)
         columns = columns.reshape(batch, joints - 1, 12)
         rotations, translations = np.zeros((batch, joints, 3, 3)), np.zeros((batch, joints, 3))
         rotations[:, 0] = np.eye(3)
@@ -99,8 +100,8 @@ class VirtualKinematicChain:
         return rotations, translations
 
     @cached_property
-    def _kinematics(self) -> BatchFunction:
-        return _placements(self.model.saveToString())
+    def _kinematics(self) -> Kinematics:
+        return kinematics_of(self.model, self.cache)
 
     @cached_property
     def carries(self) -> NDArray[np.bool_]:
@@ -173,13 +174,14 @@ def _virtual_joints(attachment: Attachment, owner: str) -> list[tuple[str, pin.J
     return joints[::-1]
 
 
-def consolidate(scene: Scene, holds: Iterable[Hold] | Mapping[str, str]) -> VirtualKinematicChain:
+def consolidate(scene: Scene, holds: Iterable[Hold] | Mapping[str, str], *, cache: Cache | None = None) -> VirtualKinematicChain:
     """Merge the scene's robot with the objects it holds into one model (section III of the paper).
 
     Args:
         scene: Robot, objects and where they stand.
         holds: What is held at any time, each after the hold it depends on; or object → attachment, all by the tool.
             Several become branches of one tree; only what is held at a waypoint, and stands fixed, is closed there.
+        cache: Where the chain's kinematics are kept; None: in one of its own.
 
     Returns:
         The chain. Branches of an object beside the path from grasp to base are fixed at their present state.
@@ -253,20 +255,10 @@ def consolidate(scene: Scene, holds: Iterable[Hold] | Mapping[str, str]) -> Virt
         virtual=virtual,
         added=with_hold,
         prefixes=prefixes,
+        cache=cache or Cache(),
     )
 
 
 def _base_target(placed: PlacedObject) -> pin.SE3:
     base = placed.object.model.frames[placed.object.model.getFrameId(placed.object.base_link, pin.FrameType.BODY)]
     return placed.placement * base.placement
-
-
-@lru_cache(maxsize=16)
-def _placements(model_text: str) -> BatchFunction:
-    """Return z → (12·(J − 1),): by columns R and t of every joint's placement in the world, built once per model."""
-    model = pin.Model()
-    model.loadFromString(model_text)
-    coordinates = Coordinates(model)
-    z = casadi.SX.sym("z", coordinates.size)
-    placements = cpin.joint_placements(model)(coordinates.q_symbolic(z))
-    return BatchFunction(casadi.Function("placements", [z], [casadi.densify(placements)], {"cse": True}))

@@ -7,10 +7,10 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from vkc_pin import cpin
+from vkc_pin.cache import Cache
+from vkc_pin.chain.kinematics import kinematics_of
 from vkc_pin.chain.pose import PoseRow, pose_residual, target_vector
 from vkc_pin.cpin.batch import BatchFunction
-from vkc_pin.models.coordinates import Coordinates
 
 __all__ = ["PoseSolver"]
 
@@ -23,15 +23,19 @@ class PoseSolver:
         rows: Number of residuals m: 6 of a pose, 5 of an upright place, 3 of a point; see `pose`.
     """
 
-    def __init__(self, model: pin.Model, pose: PoseRow) -> None:
-        coordinates = Coordinates(model)
-        self.size = coordinates.size
+    def __init__(self, model: pin.Model, pose: PoseRow, cache: Cache | None = None) -> None:
+        self.size = model.nv
         z, target = ca.SX.sym("z", self.size), ca.SX.sym("W", 12)
-        placements = cpin.joint_placements(model)(coordinates.q_symbolic(z))
+        placements = kinematics_of(model, cache or Cache()).symbolic(z)
         residual = pose_residual(pose.kind, *pose.placement(placements), target)
         self.rows = int(residual.numel())
         jacobian = ca.densify(ca.jacobian(residual, z))
         self._function = BatchFunction(ca.Function("pose", [z, target], [ca.densify(residual), jacobian], {"cse": True}))
+
+    @property
+    def nbytes(self) -> int:
+        """Its size in memory, estimated [bytes]."""
+        return self._function.nbytes
 
     def evaluate(self, z: NDArray[np.float64], target: pin.SE3) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return residuals, shape (B, m) ([m], [rad]), and their Jacobians, shape (B, m, n), at `z`, shape (B, n)."""

@@ -9,10 +9,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BatchFunction"]
+__all__ = ["BatchFunction", "size_of"]
 
 _KEPT = 16  # batch sizes whose buffers are kept
 _ROUND = 16  # they are multiples of this
+_INSTRUCTION = 70  # [bytes] that each instruction of a function takes, measured on those of waypoints
 
 
 class BatchFunction:
@@ -55,3 +56,14 @@ class BatchFunction:
         self._buffers[batch] = (buffer, trigger, arguments, results)
         while len(self._buffers) > _KEPT:
             self._buffers.popitem(last=False)
+
+    @property
+    def nbytes(self) -> int:
+        """Its size in memory, estimated [bytes]."""
+        buffers = (array.nbytes for *_, inputs, outputs in self._buffers.values() for array in (*inputs, *outputs))
+        return size_of(self.function) + sum(buffers)
+
+
+def size_of(*functions: ca.Function) -> int:
+    """Return the size of functions in memory, estimated [bytes]."""
+    return _INSTRUCTION * sum(function.n_instructions() for function in functions)

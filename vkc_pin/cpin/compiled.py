@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache, lru_cache
+from functools import cache
 from importlib import import_module
 from typing import Any
 
@@ -20,7 +20,7 @@ _REBUILD = "build vkc-pin again: pip install --force-reinstall --no-deps --no-ca
 
 def joint_placements(model: pin.Model) -> casadi.Function:
     """Return q → M; see `vkc_pin.cpin.joint_placements`."""
-    return _joint_placements(_extension(), _pack(model))
+    return _unpack(_extension().joint_placements(_pack(model)))
 
 
 def frame_placements(model: pin.Model, frames: list[int]) -> casadi.Function:
@@ -67,11 +67,6 @@ def _release(version: str) -> tuple[int, int]:
         return int(parts[0]), int(parts[1])
     except (IndexError, ValueError):
         raise BuildError(f"cannot read the version '{version}' of a library that vkc_pin.cpin needs; {_REBUILD}") from None
-
-
-@lru_cache(maxsize=8)  # several parts of a planning ask for the same
-def _joint_placements(extension: Any, model: str) -> casadi.Function:
-    return _unpack(extension.joint_placements(model))
 
 
 @cache

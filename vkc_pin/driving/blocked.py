@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from vkc_pin.driving.body import FAN, Shape, hull_points
 
-__all__ = ["Lattice", "stuck"]
+__all__ = ["Lattice", "PlanViews", "stuck"]
 
 _FLAT = 1e-6  # [m]: shapes, and what two have in common in height, that are no higher are left out
 _ROUNDING = 1e-5  # [m] of numbers of single precision
@@ -53,7 +53,12 @@ _Reach = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 def stuck(
-    base: Sequence[Shape], carried: Sequence[Shape], standing: Sequence[Shape], lattice: Lattice, margin: float
+    base: Sequence[Shape],
+    carried: Sequence[Shape],
+    standing: Sequence[Shape],
+    lattice: Lattice,
+    margin: float,
+    views: PlanViews | None = None,
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return where the base, and where what is carried, surely comes closer than `margin` [m] to an obstacle.
 
@@ -63,6 +68,7 @@ def stuck(
         standing: Obstacles in the world.
         lattice: Cells and headings.
         margin: [m].
+        views: Remembers what shapes look like from above.
 
     Returns:
         For base and carried, shape (cells, cells, H). What rides within the outline of the base is looked at only for obstacles
@@ -75,7 +81,9 @@ def stuck(
     )
     inside = [np.all((solid.points >= low) & (solid.points <= high), axis=0)[:2].all() for solid in above]
     hidden = np.array(inside, bool)[over[:, 0]] & np.isin(over[:, 1], pairs[:, 1])
-    return _fill(below, obstacles, pairs, lattice, margin), _fill(above, obstacles, over[~hidden], lattice, margin)
+    views = PlanViews() if views is None else views
+    carrying = _fill(above, obstacles, over[~hidden], lattice, margin, views)
+    return _fill(below, obstacles, pairs, lattice, margin, views), carrying
 
 
 def _solids(shapes: Sequence[Shape]) -> list[_Solid]:
@@ -113,11 +121,16 @@ def _touched(points: NDArray[np.float64]) -> NDArray[np.float64]:
     return points[np.flatnonzero(np.bincount((FAN @ points.T).argmax(axis=1)))]
 
 
-class _Supports:
+class PlanViews:
     """Support functions of slices, remembered: rooms and robots stay what they are from phase to phase and task to task."""
 
     def __init__(self) -> None:
         self._known: OrderedDict[tuple[bytes, float, float, bytes], _Reach] = OrderedDict()
+
+    @property
+    def nbytes(self) -> int:
+        """Its size in memory [bytes]."""
+        return sum(support.nbytes + spare.nbytes for support, spare in self._known.values())
 
     def of(self, parts: Sequence[_Part], directions: NDArray[np.float64]) -> _Reach:
         """Return support functions of the plan views of parts of solids, and how far beyond their hulls these let polygons reach.
@@ -144,15 +157,13 @@ class _Supports:
         return support, spare
 
 
-_supports = _Supports()
-
-
 def _support_of(
     outlines: list[NDArray[np.float64]], directions: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     size = max(len(points) for points in outlines)
     padded = np.array([np.concatenate([points, np.repeat(points[:1], size - len(points), axis=0)]) for points in outlines])
-    along = (directions.reshape(-1, 2) @ padded.swapaxes(1, 2)).swapaxes(1, 2).reshape(len(padded), size, *directions.shape[:2])
+    # No matrix product: its last digits hang on what else is in the batch, and so on what was remembered.
+    along = directions[..., 0] * padded[:, :, 0, None, None] + directions[..., 1] * padded[:, :, 1, None, None]
     support, which = along[:, 0].copy(), np.zeros((len(padded), *directions.shape[:2]), int)
     for point in range(1, size):  # faster than argmax, since there are many more directions than points
         further = along[:, point] > support
@@ -175,7 +186,12 @@ def _support_of(
 
 
 def _fill(
-    first: Sequence[_Solid], second: Sequence[_Solid], pairs: NDArray[np.int_], lattice: Lattice, margin: float
+    first: Sequence[_Solid],
+    second: Sequence[_Solid],
+    pairs: NDArray[np.int_],
+    lattice: Lattice,
+    margin: float,
+    views: PlanViews,
 ) -> NDArray[np.bool_]:
     """Return where any of pairs of solids, shape (P, 2), surely come too close, shape (cells, cells, H)."""
     count, cells = len(lattice.yaws), lattice.cells
@@ -194,8 +210,8 @@ def _fill(
     moving, standing = np.array(indices)
     cosine, sine = np.cos(lattice.yaws)[:, None], np.sin(lattice.yaws)[:, None]
     turned = -np.stack([cosine * FAN[:, 0] + sine * FAN[:, 1], cosine * FAN[:, 1] - sine * FAN[:, 0]], axis=-1)
-    support, spare = _supports.of([part for _, part in parts[0].values()], turned)
-    other_support, other_spare = _supports.of([part for _, part in parts[1].values()], FAN[None])
+    support, spare = views.of([part for _, part in parts[0].values()], turned)
+    other_support, other_spare = views.of([part for _, part in parts[1].values()], FAN[None])
     allowed = _SLANT * margin - spare[moving] - other_spare[standing] - _ROUNDING  # (pairs, H)
     reach = (support[moving] + other_support[standing] + allowed[..., None]).reshape(-1, len(FAN)).astype(np.float32)
     return _rows(reach, np.tile(np.arange(count), len(moving)), lattice)

@@ -8,7 +8,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vkc_pin.driving.blocked import Lattice, stuck
+from vkc_pin.cache import Cache
+from vkc_pin.driving.blocked import Lattice, PlanViews, stuck
 from vkc_pin.driving.body import FAN, Body, Shape, Standing
 from vkc_pin.errors import InputError
 
@@ -55,6 +56,7 @@ class BaseGrid:
         *,
         cells: int = _CELLS,
         near: float = 1.0,
+        cache: Cache | None = None,
     ) -> None:
         """Look at every cell once, without asking coal.
 
@@ -66,6 +68,7 @@ class BaseGrid:
             margin: Clearance to keep [m].
             cells: Number of cells along each side.
             near: Radius around the start and goals of a search in which only `base` counts: there the arm reaches in and out [m].
+            cache: Where what shapes look like from above is remembered; None: nowhere.
 
         Raises:
             InputError: The arena is empty, or a number is out of range.
@@ -84,8 +87,9 @@ class BaseGrid:
         self.lengths = np.hypot(*(_MOVES * self.step).T)
         world = Standing(standing)
         self.base, self.carried = Body(base, world, margin), Body(carried, world, margin)
+        views = (cache or Cache()).get("plan views", PlanViews)
         lattice = Lattice(self.origin, self.step, self.cells, self.yaws)
-        self.stuck, self.stuck_carrying = stuck(base, carried, standing, lattice, margin)
+        self.stuck, self.stuck_carrying = stuck(base, carried, standing, lattice, margin, views)
         self._edges: dict[tuple[int, int, int, bool, bool], bool] = {}
 
     # -- places ---------------------------------------------------------------------------------------------------------

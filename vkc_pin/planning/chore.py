@@ -14,7 +14,7 @@ from vkc_pin.options import Options
 from vkc_pin.planning.one_problem import OneProblem
 from vkc_pin.planning.outcome import joined
 from vkc_pin.planning.plan import Plan
-from vkc_pin.planning.planner import guarded
+from vkc_pin.planning.planner import Planner, guarded
 from vkc_pin.planning.settings import Settings, settings_for
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.scene.scene import Scene
@@ -50,6 +50,7 @@ def plan_chore(
     seed: int = 0,
     progress: bool = False,
     terms: Sequence[Term] = (),
+    planner: Planner | None = None,
 ) -> Plan:
     """Plan many steps over several objects, each with the next ones in mind.
 
@@ -69,6 +70,7 @@ def plan_chore(
         seed: Of the random numbers.
         progress: As for `planner.plan`.
         terms: Own constraints and costs, as for `planner.plan`.
+        planner: As for `planner.plan`.
 
     Returns:
         One plan of all steps, checked as a whole. If a step fails: of those before it, with the best motion there is of
@@ -89,12 +91,12 @@ def plan_chore(
     if not isinstance(window, int) or isinstance(window, bool) or window < 1:
         raise InputError("out of range", field="window", expected="a whole number of at least 1", got=repr(window))
 
-    def planner(settings: Settings) -> Plan:
+    def run(settings: Settings) -> Plan:
         tasks = foresee(scene, steps, settings.options)
         check_active(settings.terms, [stretch for task in tasks for stretch in stretches(task)])
         return _Chore(scene, tuple(steps), window, settings).run()
 
-    return guarded(planner, settings, progress)
+    return guarded(run, settings, progress, planner)
 
 
 @dataclass(frozen=True, eq=False)

@@ -87,20 +87,21 @@ class OneProblem:
                 None: those of the settings' initialization.
         """
         began = time.perf_counter()
-        limit = self.settings.time_limit
+        limit, cache = self.settings.time_limit, self.settings.cache
+        built = cache.building
         self.settings.progress.begin([phase.name for phase in self.task.phases])
-        problem = self.problem = TrajectoryProblem(self.scene, self.task, self.settings.options, self.settings.terms)
-        build_time = problem.transcription.take_build_time()
+        problem = TrajectoryProblem(self.scene, self.task, self.settings.options, self.settings.terms, cache=cache)
+        self.problem = problem
         reasons = impossible(problem)
         if reasons:
             best, status = self._stationary(problem), "infeasible"
             best = dataclasses.replace(best, report=best.report.with_reasons(reasons))
         else:
-            deadline = np.inf if limit is None else began + build_time + limit
+            deadline = np.inf if limit is None else began + cache.building - built + limit
             seeds = self._raced(problem, deadline) if seed is None else iter([seed(problem)])
             best, status = self._try_seeds(problem, seeds, deadline, searched=seed is None)
         self.z, self.initialization = best.z, best.name
-        build_time += problem.transcription.take_build_time()
+        build_time = cache.building - built
         return self._plan(best, status, time.perf_counter() - began - build_time, build_time)
 
     def piece(self) -> PhaseWaypoints:

@@ -1,10 +1,14 @@
-"""plan(): from steps to a checked motion."""
+"""plan(): from steps to a checked motion; and a `Planner`, which keeps what can be used again."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
 
+from vkc_pin.cache import Cache, CacheInfo
+from vkc_pin.errors import InputError
 from vkc_pin.interrupt import interruptible
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
@@ -18,7 +22,73 @@ from vkc_pin.task.phases import stretches
 from vkc_pin.task.steps import Step
 from vkc_pin.task.terms import Term, check_active
 
-__all__ = ["guarded", "plan"]
+__all__ = ["Planner", "borrowed", "guarded", "plan"]
+
+
+class Planner:
+    """Keeps what planning builds and can use again: symbolic programs with their solvers, kinematics, tables of shapes.
+
+    Pass one as `planner=` to keep apart what different parts of a program build, or to bound it; without one, all calls share
+    the process's own. It makes no difference to a motion what a planner has kept. Threads may plan with one planner at once: each
+    plan borrows a cache of its own, and at the end leaves it to the next.
+
+    Args:
+        entries: How many objects are kept at most.
+        megabytes: How much memory they take at most, as estimated [MB]. While plans run they may take more.
+    """
+
+    def __init__(self, *, entries: int = 512, megabytes: float = 1024.0) -> None:
+        if isinstance(entries, bool) or not isinstance(entries, int) or entries < 1:
+            raise InputError("out of range", field="entries", expected="a whole number of at least 1", got=repr(entries))
+        if isinstance(megabytes, bool) or not isinstance(megabytes, int | float) or not megabytes > 0.0:
+            raise InputError("out of range", field="megabytes", expected="more than 0", got=repr(megabytes))
+        self.entries, self.megabytes = entries, float(megabytes)
+        self._idle: list[Cache] = []
+        self._lock = threading.Lock()
+
+    def __repr__(self) -> str:
+        info = self.info()
+        return f"<Planner: {info.entries} of {self.entries} entries, {info.nbytes / 1e6:.1f} of {self.megabytes:g} MB>"
+
+    def info(self) -> CacheInfo:
+        """Return how much is kept, and how often something was there when it was asked for; not of plans that are running."""
+        with self._lock:
+            every = [dataclasses.astuple(cache.info()) for cache in self._idle]
+        return CacheInfo(*(sum(column) for column in zip(*every, strict=True)))
+
+    def clear(self) -> None:
+        """Forget all that is kept; plans that are running go on with what they have."""
+        with self._lock:
+            self._idle.clear()
+
+    @contextlib.contextmanager
+    def lent(self) -> Iterator[Cache]:
+        """Lend a cache that nobody else has, the one that was used last if it is free; at the end make room."""
+        with self._lock:
+            cache = self._idle.pop() if self._idle else Cache(entries=self.entries, nbytes=1e6 * self.megabytes)
+        try:
+            yield cache
+        finally:
+            cache.trim()
+            with self._lock:
+                self._idle.append(cache)
+                self._make_room()
+
+    def _make_room(self) -> None:
+        """Let go of caches, those first that were used longest ago, until all of them together are within the bounds."""
+        sizes = [cache.info() for cache in self._idle]
+        while len(sizes) > 1 and (
+            sum(info.entries for info in sizes) > self.entries or sum(info.nbytes for info in sizes) > 1e6 * self.megabytes
+        ):
+            del sizes[0], self._idle[0]
+
+
+_shared = Planner()
+
+
+def borrowed(planner: Planner | None) -> contextlib.AbstractContextManager[Cache]:
+    """Return what lends a cache of a planner, or of the process's own if there is none; see `Planner.lent`."""
+    return (_shared if planner is None else planner).lent()
 
 
 def plan(
@@ -34,6 +104,7 @@ def plan(
     perturbation: float = 0.0,
     progress: bool = False,
     terms: Sequence[Term] = (),
+    planner: Planner | None = None,
 ) -> Plan:
     """Plan one coordinated motion of base, arm and objects that brings about `steps`.
 
@@ -44,12 +115,13 @@ def plan(
         options: How to plan; `Options()` if left out.
         callback: Called after every round of the solver with an `Iteration`, whose fields are named columns.
         time_limit: Seconds of planning after which the best iterate is returned, with status "time limit".
-        seed: Of the random numbers. The same calls in a new process give the same trajectory on the same machine; what was
-            planned before in a process can change the last digits.
+        seed: Of the random numbers. The same call gives the same trajectory on the same machine, bit for bit, whatever was
+            planned before; only a time limit can make a difference.
         joint: Plan all steps as one problem; otherwise each from where the one before it ends, for comparison.
         perturbation: Standard deviation of smooth noise on the seeds, [m] and [rad], to see how much hangs on them.
         progress: Show one line that changes in its place: in a notebook or a terminal; elsewhere nothing is shown.
         terms: Own constraints and costs, beside those of every motion; see `Constraint` and `Cost`.
+        planner: Keeps what can be used again; None: the process's own.
 
     Returns:
         A plan, in every case: `plan.success` is true only if the independent `validation` found nothing wrong, and
@@ -70,17 +142,17 @@ def plan(
         terms=terms,
     )
 
-    def planner(settings: Settings) -> Plan:
+    def run(settings: Settings) -> Plan:
         task = compile_task(scene, steps, settings.options)
         check_active(settings.terms, stretches(task))
         return all_at_once(scene, task, settings) if joint else step_by_step(scene, task, settings)
 
-    return guarded(planner, settings, progress)
+    return guarded(run, settings, progress, planner)
 
 
-def guarded(planner: Callable[[Settings], Plan], settings: Settings, progress: bool) -> Plan:
-    """Return what a planner returns that is told of Ctrl-C by its settings; show its progress."""
-    with shown(progress) as line, interruptible(settings.interrupt):
-        found = planner(dataclasses.replace(settings, progress=line))
+def guarded(run: Callable[[Settings], Plan], settings: Settings, progress: bool, planner: Planner | None = None) -> Plan:
+    """Return what `run` returns, which is told of Ctrl-C by its settings and lent a cache; show its progress."""
+    with borrowed(planner) as cache, shown(progress) as line, interruptible(settings.interrupt):
+        found = run(dataclasses.replace(settings, progress=line, cache=cache))
         line.end(found)
     return found

@@ -8,6 +8,7 @@ from typing import TypeGuard
 
 import numpy as np
 
+from vkc_pin.cache import Cache
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.interrupt import Interrupt
 from vkc_pin.options import Options
@@ -29,6 +30,7 @@ class Settings:
             Then seeds do not race, and the first good motion will do.
         progress: Is told what is being done.
         interrupt: Whether Ctrl-C was pressed; then nothing new is begun. Copies for parts of a task share it.
+        cache: What was built before; they share that, too.
     """
 
     initialization: str
@@ -41,6 +43,7 @@ class Settings:
     rough: bool = False
     progress: Progress = field(default_factory=Progress)
     interrupt: Interrupt = field(default_factory=Interrupt)
+    cache: Cache = field(default_factory=Cache)
 
 
 def settings_for(

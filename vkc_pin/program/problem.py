@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from vkc_pin.cache import Cache
 from vkc_pin.chain.chain import VirtualKinematicChain, consolidate
 from vkc_pin.chain.contacts import ContactModel, Contacts
 from vkc_pin.chain.pose import ROW_BOUNDS, target_vector
@@ -45,17 +46,20 @@ class TrajectoryProblem:
         targets: Their placements.
         terms: The user's own constraints and costs that count here, one per `transcription.structure.terms`.
         term_numbers: Their values along a motion.
+        cache: Where the symbolic program came from, and searches keep what they build.
     """
 
-    def __init__(self, scene: Scene, task: Task, options: Options, terms: Sequence[Term] = ()) -> None:
-        self.scene, self.task, self.options = scene, task, options
-        self.chain: VirtualKinematicChain = consolidate(scene, task.holds)
+    def __init__(
+        self, scene: Scene, task: Task, options: Options, terms: Sequence[Term] = (), *, cache: Cache | None = None
+    ) -> None:
+        self.scene, self.task, self.options, self.cache = scene, task, options, cache or Cache()
+        self.chain: VirtualKinematicChain = consolidate(scene, task.holds, cache=self.cache)
         self.contacts = ContactModel(scene, self.chain, task, options)
         self.ends = np.cumsum([phase.segments for phase in task.phases])
         self.pose_goals = pose_goals(scene, self.chain, task, options)
         self.targets = tuple(goal.target for goal in self.pose_goals)
         rows, self.terms = term_goals(scene, self.chain, task, terms)
-        self.transcription = transcribe(self._structure(rows))
+        self.transcription = transcribe(self._structure(rows), self.cache)
         self.start = self._start()
         self.lower, self.upper = self._bounds()
         _freeze(self.start, self.lower, self.upper)

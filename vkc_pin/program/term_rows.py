@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
+import functools
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,15 +11,14 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from vkc_pin import cpin
+from vkc_pin.cache import Cache
+from vkc_pin.chain.kinematics import kinematics_of
+from vkc_pin.cpin.batch import size_of
 from vkc_pin.models.coordinates import Coordinates
 from vkc_pin.program.sparse import assemble
 from vkc_pin.task.formula import Formula
 
 __all__ = ["FrameAt", "TermAt", "TermProgram", "TermRow", "Tree", "Value"]
-
-_KEPT = 96  # kinds of rows kept for reuse
-_functions: OrderedDict[tuple[Any, ...], TermFunctions] = OrderedDict()
 
 
 @dataclass(frozen=True)
@@ -115,7 +114,7 @@ class TermFunctions:
         jacobian_pattern, hessian_pattern: Rows and columns of these.
     """
 
-    def __init__(self, model: pin.Model, row: TermRow, at: TermAt, before: int, waypoints: int) -> None:
+    def __init__(self, model: pin.Model, row: TermRow, at: TermAt, before: int, waypoints: int, cache: Cache) -> None:
         coordinates, formula = Coordinates(model), row.formula
         z, dt, multipliers = ca.SX.sym("z", coordinates.size * waypoints), ca.SX.sym("dt"), ca.SX.sym("lam", formula.rows)
         points = ca.vertsplit(z, coordinates.size) if waypoints else []
@@ -124,11 +123,11 @@ class TermFunctions:
         def column(place: FrameAt) -> Any:
             local = _matrix(ca.DM(place.local))
             if place.tree is not None:
-                return _column(_in_tree(place, points) @ local)
+                return _column(_in_tree(place, points, cache) @ local)
             if place.joint == 0:
                 return ca.DM(place.local)
             if place.waypoint not in chain:
-                chain[place.waypoint] = cpin.joint_placements(model)(coordinates.q_symbolic(points[place.waypoint]))
+                chain[place.waypoint] = kinematics_of(model, cache).symbolic(points[place.waypoint])
             return _column(_matrix(chain[place.waypoint][:, place.joint - 1]) @ local)
 
         inputs = []
@@ -143,9 +142,10 @@ class TermFunctions:
         self.hessian = ca.Function("term_hessian", [z, dt, multipliers], [ca.vertcat(*hessian.nonzeros())], options)
         self.jacobian_pattern = [np.array(part, int) for part in jacobian.sparsity().get_triplet()]
         self.hessian_pattern = [np.array(part, int) for part in hessian.sparsity().get_triplet()]
+        self.nbytes = size_of(self.value, self.jacobian, self.hessian)
 
 
-def _in_tree(place: FrameAt, points: list[Any]) -> Any:
+def _in_tree(place: FrameAt, points: list[Any], cache: Cache) -> Any:
     """Return where the joint of a place in an object's tree is in the world, shape (4, 4)."""
     tree = place.tree
     assert tree is not None
@@ -155,7 +155,7 @@ def _in_tree(place: FrameAt, points: list[Any]) -> Any:
     model = pin.Model()
     model.loadFromString(tree.model)
     values = [points[place.waypoint][v.column] if v.column is not None else ca.SX(v.number) for v in tree.values]
-    placements = cpin.joint_placements(model)(Coordinates(model).q_symbolic(ca.vertcat(*values)))
+    placements = kinematics_of(model, cache).symbolic(ca.vertcat(*values))
     return base @ _matrix(placements[:, place.joint - 1])
 
 
@@ -179,7 +179,7 @@ class TermProgram:
         cost, gradient, cost_hessian: Of the weighted sum of all costs.
     """
 
-    def __init__(self, model: pin.Model, terms: tuple[TermRow, ...], z: Any, dt: Any) -> None:
+    def __init__(self, model: pin.Model, terms: tuple[TermRow, ...], z: Any, dt: Any, cache: Cache) -> None:
         """Put the terms together.
 
         Args:
@@ -187,6 +187,7 @@ class TermProgram:
             terms: What to put together.
             z: z_0..z_N as columns, shape (n, N + 1).
             dt: Time of every step, shape (N, 1).
+            cache: Where the functions are kept.
         """
         self._n = z.shape[0]
         self._size = (z.shape[1] - 1) * (self._n + 1)
@@ -202,7 +203,9 @@ class TermProgram:
                 waypoints, kind = term.kind(at)
                 kinds.setdefault(kind, []).append((at.waypoint, waypoints))
             for (at, before), found in kinds.items():
-                functions = _term_functions(text, model, term, at, before, len(found[0][1]))
+                how = (term, at, before, len(found[0][1]))
+                key = ("term", text, term.formula, term.values, *how[1:])
+                functions = cache.get(key, functools.partial(TermFunctions, model, *how, cache))
                 involved = np.array([waypoints for _, waypoints in found])
                 steps = [waypoint - 1 for waypoint, _ in found]
                 inputs = [ca.vertcat(*(z[:, columns.tolist()] for columns in involved.T)), dt[steps].T]
@@ -260,14 +263,3 @@ class TermProgram:
         """Return which variables entries of a kind's z are, for all its waypoints one after the other; -1 for the start's."""
         waypoint, coordinate = involved[:, index // self._n], index % self._n
         return np.where(waypoint > 0, (waypoint - 1) * (self._n + 1) + coordinate, -1).ravel()
-
-
-def _term_functions(text: str, model: pin.Model, row: TermRow, at: TermAt, before: int, waypoints: int) -> TermFunctions:
-    """Return the functions of one kind of row, built if they are not there already."""
-    key = (text, row.formula, row.values, at, before, waypoints)
-    if key not in _functions:
-        _functions[key] = TermFunctions(model, row, at, before, waypoints)
-        while len(_functions) > _KEPT:
-            _functions.popitem(last=False)
-    _functions.move_to_end(key)
-    return _functions[key]

@@ -9,14 +9,13 @@ waypoints; its exact Hessian is that of λᵀ·C·vec(M(z)) plus the pose rows, 
 from __future__ import annotations
 
 import itertools
-import time
-from collections import OrderedDict
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from vkc_pin.cache import Cache
 from vkc_pin.chain.inverse_kinematics import PoseSolver
 from vkc_pin.models.coordinates import Coordinates
 from vkc_pin.program.deadline import Monitor
@@ -26,8 +25,15 @@ from vkc_pin.program.waypoint import Structure, waypoint_functions
 
 __all__ = ["Transcription", "transcribe"]
 
-_KEPT = 8  # programs kept for reuse; each holds some tens of MB
-_transcriptions: OrderedDict[tuple[Any, ...], Transcription] = OrderedDict()
+_ENTRY = 600  # [bytes] that an entry of Jacobian or Hessian takes, in a program and in a solver, measured at the door
+
+
+class _Ipopt(NamedTuple):
+    """A solver, and what stops it."""
+
+    solver: ca.Function
+    monitor: Monitor | None
+    nbytes: int
 
 
 class Transcription:
@@ -45,12 +51,10 @@ class Transcription:
         term_values: x, z_0 and times of all steps → values of these rows, their Jacobian, and the sum and slope of the costs.
         pose_solvers: Inverse kinematics of each pose.
         rate_matrix, rate_start: Velocities and accelerations per step are rate_matrix·x + rate_start·z_0.
-        build_time: Seconds spent on building that nobody has asked for yet; see `take_build_time`.
     """
 
-    def __init__(self, structure: Structure) -> None:
-        started = time.perf_counter()
-        self.structure = structure
+    def __init__(self, structure: Structure, cache: Cache) -> None:
+        self.structure, self.cache = structure, cache
         self.coordinates = Coordinates(structure.model)
         self.n, self.segments, self.slots = self.coordinates.size, structure.segments, structure.slots
         self.size = self.segments * (self.n + 1)
@@ -58,14 +62,12 @@ class Transcription:
         self._objective()
         self._constraints()
         self._rates()
-        self.pose_solvers = [PoseSolver(structure.model, pose) for pose in structure.poses]
-        self._solvers: dict[tuple[Any, ...], tuple[ca.Function, Monitor | None]] = {}
-        self.build_time = time.perf_counter() - started
+        self.pose_solvers = [PoseSolver(structure.model, pose, cache) for pose in structure.poses]
 
-    def take_build_time(self) -> float:
-        """Return the seconds spent on building since this was last asked."""
-        spent, self.build_time = self.build_time, 0.0
-        return spent
+    @property
+    def nbytes(self) -> int:
+        """Its size in memory, estimated [bytes]."""
+        return _ENTRY * (self.jacobian.nnz() + self.hessian.nnz()) + sum(solver.nbytes for solver in self.pose_solvers)
 
     def _symbols(self) -> None:
         n, N, K, joints = self.n, self.segments, self.slots, self.structure.model.njoints - 1
@@ -158,7 +160,7 @@ class Transcription:
         self.multipliers = ca.MX.sym("lam_g", self.rows)
         for poses in kinds:
             at = [t for t in range(N) if poses_at[t] == poses]
-            kind = waypoint_functions(self.structure.model, K, tuple(self.structure.poses[k] for k in poses))
+            kind = waypoint_functions(self.structure.model, K, tuple(self.structure.poses[k] for k in poses), self.cache)
             targets = ca.repmat(ca.vec(self.targets[:, list(poses)] if poses else self.targets[:, 0]), 1, len(at))
             inputs = [self.z[:, at], self.s[:, at], self.planes[:, at], self.offsets[:, at], targets]
             rows = first_row[at][:, None] + np.arange(kind.rows)
@@ -224,7 +226,7 @@ class Transcription:
     def _terms(self) -> None:
         """Append the user's own constraints, and add their costs to the objective."""
         dt = self.dt if self.structure.timed else ca.MX.zeros(self.segments)
-        part = TermProgram(self.structure.model, self.structure.terms, ca.horzcat(self.start, self.z), dt)
+        part = TermProgram(self.structure.model, self.structure.terms, ca.horzcat(self.start, self.z), dt, self.cache)
         self.term_rows = [{waypoint: self.rows + rows for waypoint, rows in at.items()} for at in part.at]
         outputs = [part.values, part.jacobian, part.cost, part.gradient]
         self.term_values = ca.Function("terms", [self.x, self.start, self.dt], outputs)
@@ -252,17 +254,13 @@ class Transcription:
             deadline: Value of `time.perf_counter()` at which it stops; applies to the solver's next call.
         """
         timed = bool(np.isfinite(deadline))
-        key = (rates, timed, tuple(sorted(options.items())))
-        if key not in self._solvers:
-            started = time.perf_counter()
-            self._solvers[key] = self._make_solver(rates, timed, options)
-            self.build_time += time.perf_counter() - started
-        solver, monitor = self._solvers[key]
-        if monitor is not None:
-            monitor.deadline = deadline
-        return solver
+        key = ("ipopt", self.structure.key, rates, timed, tuple(sorted(options.items())))
+        found = self.cache.get(key, lambda: self._make_solver(rates, timed, options))
+        if found.monitor is not None:
+            found.monitor.deadline = deadline
+        return found.solver
 
-    def _make_solver(self, rates: bool, timed: bool, options: dict[str, Any]) -> tuple[ca.Function, Monitor | None]:
+    def _make_solver(self, rates: bool, timed: bool, options: dict[str, Any]) -> _Ipopt:
         g, jacobian, multipliers = self.g, self.jacobian, self.multipliers
         if rates:
             g = ca.vertcat(g, self.rate_matrix @ self.x + self.rate_start @ self.start)
@@ -284,17 +282,10 @@ class Transcription:
         program = {"x": self.x, "p": self.parameters, "f": self.f, "g": g}
         monitor = Monitor(self.size, g.numel(), self.parameters.numel()) if timed else None
         callback = {"iteration_callback": monitor} if timed else {}
-        return ca.nlpsol("trajectory", "ipopt", program, {**quiet, **functions, **callback, **options}), monitor
+        solver = ca.nlpsol("trajectory", "ipopt", program, {**quiet, **functions, **callback, **options})
+        return _Ipopt(solver, monitor, _ENTRY * (jacobian.nnz() + hessian.nnz()))
 
 
-def transcribe(structure: Structure) -> Transcription:
-    """Return the program of `structure`, built if it is not there already."""
-    key = structure.key
-    if key in _transcriptions:
-        _transcriptions.move_to_end(key)
-        _transcriptions[key].take_build_time()  # that was somebody else's
-    else:
-        _transcriptions[key] = Transcription(structure)
-        while len(_transcriptions) > _KEPT:
-            _transcriptions.popitem(last=False)
-    return _transcriptions[key]
+def transcribe(structure: Structure, cache: Cache) -> Transcription:
+    """Return the program of `structure`, built if it is not in the cache."""
+    return cache.get(("program", structure.key), lambda: Transcription(structure, cache))

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -11,15 +11,14 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from vkc_pin import cpin
+from vkc_pin.cache import Cache
+from vkc_pin.chain.kinematics import kinematics_of
 from vkc_pin.chain.pose import PoseRow, pose_rows
+from vkc_pin.cpin.batch import size_of
 from vkc_pin.models.coordinates import Coordinates
 from vkc_pin.program.term_rows import TermRow
 
 __all__ = ["Structure", "WaypointFunctions", "waypoint_functions"]
-
-_KEPT = 48  # kinds of waypoints kept for reuse
-_functions: OrderedDict[tuple[Any, ...], WaypointFunctions] = OrderedDict()
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +55,7 @@ class Structure:
         """Whether the time of a step counts."""
         return any(term.formula.timed for term in self.terms)
 
-    @property
+    @cached_property
     def key(self) -> tuple[Any, ...]:
         """Equal for structures that share one program."""
         poses = tuple((*_key(pose), pose.waypoints) for pose in self.poses)
@@ -67,30 +66,25 @@ class Structure:
 
 def _key(pose: PoseRow) -> tuple[Any, ...]:
     """Equal for poses that are asked for with the same rows."""
-    return pose.joint, pose.local.homogeneous.round(12).tobytes(), pose.kind, pose.shift
+    return pose.joint, (pose.local.homogeneous + 0.0).tobytes(), pose.kind, pose.shift
 
 
-def waypoint_functions(model: pin.Model, slots: int, poses: tuple[PoseRow, ...]) -> WaypointFunctions:
-    """Return the functions of one kind of waypoint, built if they are not there already."""
-    key = (model.saveToString(), slots, *(_key(pose) for pose in poses))
-    if key not in _functions:
-        _functions[key] = WaypointFunctions(model, slots, poses)
-        while len(_functions) > _KEPT:
-            _functions.popitem(last=False)
-    _functions.move_to_end(key)
-    return _functions[key]
+def waypoint_functions(model: pin.Model, slots: int, poses: tuple[PoseRow, ...], cache: Cache) -> WaypointFunctions:
+    """Return the functions of one kind of waypoint, built if they are not in the cache."""
+    key = ("waypoint", model.saveToString(), slots, *(_key(pose) for pose in poses))
+    return cache.get(key, lambda: WaypointFunctions(model, slots, poses, cache))
 
 
 class WaypointFunctions:
     """The SX functions of one kind of waypoint: a model, so many witness planes, and which poses it must satisfy."""
 
-    def __init__(self, model: pin.Model, slots: int, poses: tuple[PoseRow, ...]) -> None:
+    def __init__(self, model: pin.Model, slots: int, poses: tuple[PoseRow, ...], cache: Cache) -> None:
         coordinates = Coordinates(model)
         n, joints = coordinates.size, model.njoints - 1
         z, s = ca.SX.sym("z", n), ca.SX.sym("s")
         planes, offsets = ca.SX.sym("C", slots, 12 * joints), ca.SX.sym("R", slots)
         targets = ca.SX.sym("W", 12, max(len(poses), 1))
-        placements = cpin.joint_placements(model)(coordinates.q_symbolic(z))
+        placements = kinematics_of(model, cache).symbolic(z)
         stacked = ca.vec(placements)
         # Every row is linear in the placements: rows = L·vec(M) + const, so one sweep of the kinematics serves them all.
         parts = []
@@ -117,6 +111,7 @@ class WaypointFunctions:
         self.jacobian_pattern = jacobian.sparsity().get_triplet()
         self.hessian = ca.Function("lagrangian_hessian", [*inputs, multipliers], [ca.vertcat(*hessian.nonzeros())], options)
         self.hessian_pattern = hessian.sparsity().get_triplet()
+        self.nbytes = size_of(self.value, self.jacobian, self.hessian)
 
 
 def _slopes(model: pin.Model, coordinates: Coordinates, z: Any, placements: Any, planes: Any) -> Any:

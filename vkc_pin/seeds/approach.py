@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 
 import numpy as np
 import pinocchio as pin
@@ -37,7 +36,9 @@ class Approach:
         self.knots, self.problem, self.chain, self.stands = knots, knots.problem, knots.chain, stands
         joint, local = self.chain.frame(self.chain.robot.tool_frame)
         self.joint, self.local = joint, local
-        self.solver = _tool_solver(self.chain.model.saveToString(), joint, local.homogeneous.tobytes())
+        model, cache = self.chain.model, self.problem.cache
+        key = ("tool", model.saveToString(), joint, local.homogeneous.tobytes())
+        self.solver = cache.get(key, lambda: PoseSolver(model, PoseRow(joint, local, ()), cache))
 
     def before(self, z: NDArray[np.float64], phase: Phase) -> NDArray[np.float64]:
         """Return configurations on the way to `z`, shape (n,), the end of a phase: shape (K, n), the last is the nearest."""
@@ -104,11 +105,3 @@ class Approach:
                 break
             found.append(near[0])
         return np.array(found).reshape(len(found), len(z))
-
-
-@lru_cache(maxsize=16)
-def _tool_solver(model_text: str, joint: int, local: bytes) -> PoseSolver:
-    """Return the inverse kinematics of the tool, built once per model."""
-    model = pin.Model()
-    model.loadFromString(model_text)
-    return PoseSolver(model, PoseRow(joint, pin.SE3(np.frombuffer(local).reshape(4, 4)), ()))

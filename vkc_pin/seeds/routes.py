@@ -49,6 +49,7 @@ class Routes:
         key = (phase, folded)
         if key not in self._grids:
             z, arena, margin = self._resting(), self.problem.scene.arena, self.problem.options.dist_safe
+            cache = self.problem.cache
             if folded:
                 z[self.arm] = self.folded_arm(phase)
             moving, standing = grid_shapes(self.problem, phase, z)
@@ -56,9 +57,9 @@ class Routes:
             base = [shape for joint, shape in moving if joint <= _FOOT]
             carried = [shape for joint, shape in moving if joint > _FOOT]
             self._grids[key] = (
-                BaseGrid(base, carried, standing, arena, 0.0, near=_NEAR, cells=fine_cells(arena, margin))
+                BaseGrid(base, carried, standing, arena, 0.0, near=_NEAR, cells=fine_cells(arena, margin), cache=cache)
                 if folded
-                else BaseGrid(base, carried, standing, arena, margin, near=_NEAR)
+                else BaseGrid(base, carried, standing, arena, margin, near=_NEAR, cache=cache)
             )
         return self._grids[key]
 

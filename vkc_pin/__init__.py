@@ -15,7 +15,8 @@ from vkc_pin.planning.chore import plan_chore
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import Planner, plan
 from vkc_pin.plotting import cards as _cards  # noqa: F401 - registers what notebooks show of a scene
-from vkc_pin.program.problem import TrajectoryProblem, build
+from vkc_pin.program.inspection import build
+from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.scene.placed import PlacedObject
 from vkc_pin.scene.scene import Scene, load_scene
 from vkc_pin.solver.solution import Iteration

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 from helpers.drawers import SHORT, drawer_scene, handle, holding, off, open_scene
-from helpers.small_problems import door_scene
+from helpers.small_problems import door_scene, program_of
 
 import vkc_pin as vkc
 from vkc_pin.baselines.arm_kinematics import ArmKinematics
@@ -20,7 +20,7 @@ STILL = 0.0
 
 
 def built(attachment: str = "handle") -> tuple[vkc.TrajectoryProblem, ArmKinematics]:
-    problem = vkc.build(holding(attachment=attachment), [vkc.Actuate("drawer", SLIDE)], options=SHORT)
+    problem = program_of(holding(attachment=attachment), [vkc.Actuate("drawer", SLIDE)], options=SHORT)
     return problem, ArmKinematics(problem, Knots(problem, np.random.default_rng(0)))
 
 
@@ -76,10 +76,10 @@ def test_the_columns_of_a_robot_with_a_door() -> None:
     """Hinge and knob are the object's, not the arm's."""
     scene = door_scene()
     rows = base_poses(
-        reach := vkc.build(scene, [vkc.Grasp("door")], options=SHORT), reach.segments, reach.start, np.random.default_rng(0)
+        reach := program_of(scene, [vkc.Grasp("door")], options=SHORT), reach.segments, reach.start, np.random.default_rng(0)
     )
     held = scene.with_start(base=rows[0, :3], arm=rows[0, 3:9]).with_held({"door": "handle"})
-    problem = vkc.build(held, [vkc.Actuate("door", {"hinge": 0.3})], options=SHORT)
+    problem = program_of(held, [vkc.Actuate("door", {"hinge": 0.3})], options=SHORT)
     arm = ArmKinematics(problem, Knots(problem, np.random.default_rng(0)))
     assert arm.columns.tolist() == [3, 4, 5, 6, 7, 8]
     knob, hinge = problem.chain.index("door.knob"), problem.chain.index("door.hinge")
@@ -94,7 +94,7 @@ def test_the_columns_of_a_robot_with_a_door() -> None:
 
 def test_where_nothing_is_held_there_is_nothing_to_solve() -> None:
     """Only from where the hand comes straight to the handle does it have to be somewhere."""
-    problem = vkc.build(drawer_scene(), [vkc.Grasp("drawer")])
+    problem = program_of(drawer_scene(), [vkc.Grasp("drawer")])
     arm = ArmKinematics(problem, Knots(problem, np.random.default_rng(0)))
     z, closed = arm.solve(problem.start, 1)
     assert closed
@@ -133,7 +133,7 @@ def test_a_start_outside_its_limits_by_rounding() -> None:
 
 def test_out_of_reach() -> None:
     scene = open_scene()
-    problem = vkc.build(holding(scene), [vkc.Actuate("drawer", SLIDE)], options=SHORT)
+    problem = program_of(holding(scene), [vkc.Actuate("drawer", SLIDE)], options=SHORT)
     arm = ArmKinematics(problem, Knots(problem, np.random.default_rng(0)))
     away = problem.start.copy()
     away[0] -= 1.5
@@ -145,7 +145,7 @@ def test_out_of_reach() -> None:
 
 @pytest.mark.parametrize("waypoint", [1, 4, 8])
 def test_nothing_but_the_arm_moves(waypoint: int) -> None:
-    problem = vkc.build(holding(), [vkc.Actuate("drawer", {"slide": 0.3})], options=SHORT)
+    problem = program_of(holding(), [vkc.Actuate("drawer", {"slide": 0.3})], options=SHORT)
     arm = ArmKinematics(problem, Knots(problem, np.random.default_rng(0)))
     for seed in range(5):
         rng = np.random.default_rng(seed)

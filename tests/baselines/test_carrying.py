@@ -11,6 +11,7 @@ import pytest
 from helpers.carrying import box
 from helpers.drawers import drawer_scene, handle, holding, off, open_scene
 from helpers.drives import hall
+from helpers.small_problems import program_of
 
 import vkc_pin as vkc
 from vkc_pin.baselines import BASELINES, attempt, plan_separately, poses
@@ -195,7 +196,7 @@ def test_no_way_there() -> None:
 
 
 def stay(scene: vkc.Scene) -> vkc.TrajectoryProblem:
-    return vkc.build(scene, [vkc.GoTo(*scene.start[:3].tolist())], options=OPTIONS)
+    return program_of(scene, [vkc.GoTo(*scene.start[:3].tolist())], options=OPTIONS)
 
 
 def folded(scene: vkc.Scene) -> np.ndarray:

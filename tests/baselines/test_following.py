@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 from helpers.drawers import SHORT, handle, holding, off, spare, with_boxes
+from helpers.small_problems import program_of
 
 import vkc_pin as vkc
 from vkc_pin.baselines import following as module
@@ -23,7 +24,7 @@ def pulling(lamp: float | None = None, attachment: str = "handle") -> vkc.Trajec
     scene = holding(attachment=attachment)
     if lamp is not None:
         scene = with_boxes(scene, lamp=([0.3, 0.3, 0.1], [1.44, 0.0, lamp + 0.05]))
-    return vkc.build(scene, [vkc.Actuate("drawer", {"slide": GOAL})], options=SHORT)
+    return program_of(scene, [vkc.Actuate("drawer", {"slide": GOAL})], options=SHORT)
 
 
 def base(problem: vkc.TrajectoryProblem, *change: float) -> np.ndarray:
@@ -200,7 +201,7 @@ def test_random_arms_are_within_limits_and_nothing_else_changes() -> None:
 
 def test_what_falls_short_by_rounding_is_no_collision(monkeypatch: pytest.MonkeyPatch) -> None:
     """Refinement ends on the margin, a hair to one side of it or the other."""
-    problem = vkc.build(holding(), [vkc.Actuate("drawer", {"slide": 0.3})], options=SHORT)
+    problem = program_of(holding(), [vkc.Actuate("drawer", {"slide": 0.3})], options=SHORT)
     arm = module._Arm(problem, Knots(problem, np.random.default_rng(0)), refine=True)
     monkeypatch.setattr(arm.knots, "depth", lambda z, waypoint: np.full(len(z), 1e-7))
     assert arm._candidate(problem.start, 1)[1] == ""

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.drawers import SHORT, changed, drawer_scene, handle, holding, off, spare, with_boxes
+from helpers.small_problems import program_of
 
 import vkc_pin as vkc
 from vkc_pin.baselines import poses as module
@@ -16,12 +17,12 @@ from vkc_pin.seeds.knots import SCATTER, Knots
 
 
 def reaching(scene: vkc.Scene, attachment: str = "handle") -> vkc.TrajectoryProblem:
-    return vkc.build(scene, [vkc.Grasp("drawer", attachment)], options=SHORT)
+    return program_of(scene, [vkc.Grasp("drawer", attachment)], options=SHORT)
 
 
 @cache
 def pulling() -> vkc.TrajectoryProblem:
-    return vkc.build(holding(), [vkc.Actuate("drawer", {"slide": 0.3})], options=SHORT)
+    return program_of(holding(), [vkc.Actuate("drawer", {"slide": 0.3})], options=SHORT)
 
 
 def found(problem: vkc.TrajectoryProblem, waypoint: int | None = None, *, seed: int = 0, near: Any = None) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.drawers import SHORT, drawer_scene, handle, holding, off, spare, with_boxes
-from helpers.small_problems import all_pairs
+from helpers.small_problems import all_pairs, program_of
 
 import vkc_pin as vkc
 from vkc_pin.baselines import refining as module
@@ -28,7 +28,7 @@ class Pulling:
     def __init__(self, bottom: float, *, waypoint: int = HALF) -> None:
         scene = holding(attachment="handle_free")
         self.scene = with_boxes(scene, lamp=([0.3, 0.3, 0.1], [1.44, 0.0, bottom + 0.05]))
-        self.problem = vkc.build(self.scene, [vkc.Actuate("drawer", {"slide": 0.3})], options=SHORT)
+        self.problem = program_of(self.scene, [vkc.Actuate("drawer", {"slide": 0.3})], options=SHORT)
         self.knots = Knots(self.problem, np.random.default_rng(0))
         arm = ArmKinematics(self.problem, self.knots)
         self.columns, self.waypoint = arm.columns, waypoint
@@ -134,7 +134,7 @@ def test_out_of_reach() -> None:
 
 
 def test_where_nothing_must_hold() -> None:
-    problem = vkc.build(drawer_scene(), [vkc.Grasp("drawer")])
+    problem = program_of(drawer_scene(), [vkc.Grasp("drawer")])
     knots = Knots(problem, np.random.default_rng(0))
     z, closed = refined(problem, knots, problem.start, problem.start, 1, np.arange(3, 9))
     assert closed
@@ -150,7 +150,7 @@ def test_gradients_are_those_of_coals_distances(held: bool) -> None:
         problem, waypoint = pulling.problem, HALF
         z = np.tile(pulling.z, (6, 1))
     else:
-        problem = vkc.build(drawer_scene(), [vkc.Grasp("drawer")], options=SHORT)
+        problem = program_of(drawer_scene(), [vkc.Grasp("drawer")], options=SHORT)
         waypoint = problem.segments
         z = base_poses(problem, waypoint, problem.start, rng)[:6]
     z[:, :9] += rng.normal(0.0, 0.05, (len(z), 9))

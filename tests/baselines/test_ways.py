@@ -12,7 +12,7 @@ from helpers.base_scenes import BLINK, MARGIN, between, distance
 from helpers.carrying import box, room
 from helpers.drawers import SHORT, changed, drawer_scene, open_scene
 from helpers.drives import hall
-from helpers.small_problems import door_scene
+from helpers.small_problems import door_scene, program_of
 
 import vkc_pin as vkc
 from vkc_pin.baselines.ways import BaseWays, headings
@@ -27,7 +27,7 @@ POST: dict[str, Any] = {"name": "post", "type": "box", "size": [0.2, 0.2, 1.0], 
 
 
 def ways(scene: vkc.Scene, name: str = "drawer", **joints: float) -> BaseWays:
-    return BaseWays(vkc.build(scene, [vkc.Actuate(name, joints or {"slide": 0.3})], options=SHORT))
+    return BaseWays(program_of(scene, [vkc.Actuate(name, joints or {"slide": 0.3})], options=SHORT))
 
 
 def room_of(scene: vkc.Scene, poses: np.ndarray, *, without: Sequence[str] = ("drawer",)) -> float:
@@ -141,7 +141,7 @@ ASIDE = np.array([-1.5, -1.57, 0.0, 0.0, 0.0, 0.0])  # the arm stretched out upw
 
 
 def to(scene: vkc.Scene, x: float, y: float, yaw: float | None = None) -> vkc.TrajectoryProblem:
-    return vkc.build(scene.with_start(base=START), [vkc.GoTo(x, y, yaw)], options=SHORT)
+    return program_of(scene.with_start(base=START), [vkc.GoTo(x, y, yaw)], options=SHORT)
 
 
 def test_the_arm_counts_if_it_is_to() -> None:

@@ -14,6 +14,7 @@ import pinocchio as pin
 import pytest
 from helpers.fake_plan import fake_plan
 from helpers.markdown import cells
+from helpers.small_problems import program_of
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks import comparison, household
@@ -89,7 +90,7 @@ def test_the_tasks_are_the_papers() -> None:
     assert {task.scene for task in TASKS.values()} == {"household"}
     scene = vkc.load_scene("household")
     for task in TASKS.values():  # everything that they name is there
-        assert vkc.build(scene, task.steps).segments > 0
+        assert program_of(scene, task.steps).segments > 0
 
 
 def test_every_method_is_asked_for_the_same(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,13 +10,13 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.small_problems import SHORT, all_pairs, cabinet, door_scene, full_scene, random_configurations
+from helpers.small_problems import SHORT, all_pairs, cabinet, door_scene, full_scene, program_of, random_configurations
 
 from vkc_pin.chain.contacts import Contacts
 from vkc_pin.errors import InputError
 from vkc_pin.models.shapes import link_name
 from vkc_pin.options import Options
-from vkc_pin.program.problem import TrajectoryProblem, build
+from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.scene import Scene
@@ -30,7 +30,7 @@ MARGIN, CLOSE = SHORT.dist_safe, SHORT.grasp_clearance
 @cache
 def door_problem() -> TrajectoryProblem:
     """Return the problem of opening the door and driving away: reach, turn, move, go to."""
-    return build(door_scene(), [Actuate("door", {"hinge": 1.2}), GoTo(0.0, 0.0)], options=SHORT)
+    return program_of(door_scene(), [Actuate("door", {"hinge": 1.2}), GoTo(0.0, 0.0)], options=SHORT)
 
 
 def waypoint_in(problem: TrajectoryProblem, phase: str) -> int:
@@ -173,7 +173,7 @@ def test_objects_stand_where_the_phases_before_left_them() -> None:
 
 def test_a_held_object_can_hit_other_objects_and_its_own_other_branches_stand() -> None:
     scene = full_scene()
-    problem = build(scene, [Actuate("cabinet", {"swing": 0.5})], options=SHORT)
+    problem = program_of(scene, [Actuate("cabinet", {"swing": 0.5})], options=SHORT)
     n, found = Counted.of(scene), pairs(problem, 1)
     assert problem.task.phases[1].held == (Hold("cabinet", "grip"),)
     held = {"cabinet.arm": 1, "cabinet.tray": 2, "cabinet.flap": 1}
@@ -197,7 +197,7 @@ def test_a_held_object_can_hit_other_objects_and_its_own_other_branches_stand() 
 
 
 def test_two_objects_one_after_the_other() -> None:
-    problem = build(full_scene(), [Grasp("door"), Actuate("drawer", {"slide": 0.2})], options=SHORT)
+    problem = program_of(full_scene(), [Grasp("door"), Actuate("drawer", {"slide": 0.2})], options=SHORT)
     phases = problem.task.phases
     assert [phase.held for phase in phases] == [(), (), (Hold("drawer", "handle"),)]
     for number, standing in enumerate([{"door", "drawer", "cabinet"}, {"door", "drawer", "cabinet"}, {"door", "cabinet"}]):
@@ -218,7 +218,7 @@ def test_a_scene_in_which_nothing_can_collide_is_refused() -> None:
     robot = dataclasses.replace(scene.robot, collision=pin.GeometryModel())
     empty = dataclasses.replace(scene, robot=robot, objects={}, obstacles=pin.GeometryModel(), obstacle_labels=())
     with pytest.raises(InputError, match="no pair"):
-        build(empty, [GoTo(0.0, 0.0)], options=SHORT)
+        program_of(empty, [GoTo(0.0, 0.0)], options=SHORT)
 
 
 # --- distances ------------------------------------------------------------------------------------------------------
@@ -464,6 +464,6 @@ def test_more_contacts_than_slots_keep_the_worst() -> None:
     "steps", [[Reach(pin.SE3.Identity())], [GoTo(0.0, 0.0)], [Grasp("door", "handle_free")]], ids=["reach", "go", "grasp"]
 )
 def test_margins_follow_the_options(steps: list[Step]) -> None:
-    problem = build(door_scene(), steps, options=Options(dist_safe=0.05, grasp_clearance=0.01, reach_waypoints=2))
+    problem = program_of(door_scene(), steps, options=Options(dist_safe=0.05, grasp_clearance=0.01, reach_waypoints=2))
     margins = set(problem.contacts.phases[0].margins.tolist())
     assert margins == ({0.05, 0.01} if isinstance(steps[0], Grasp) else {0.05})

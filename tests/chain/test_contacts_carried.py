@@ -9,9 +9,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.carrying import BALL, STICK, lifted, room, stand, table
-from helpers.small_problems import SHORT, random_configurations
+from helpers.small_problems import SHORT, program_of, random_configurations
 
-from vkc_pin.program.problem import TrajectoryProblem, build
+from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.placed import standing_geometry
 from vkc_pin.scene.scene import Scene
@@ -31,14 +31,14 @@ def scene() -> Scene:
 @cache
 def placing() -> TrajectoryProblem:
     """Return the problem of taking the stick, putting it elsewhere, and driving away."""
-    return build(scene(), [Place("stick", ASIDE), GoTo(0.0, 0.0)], options=SHORT)
+    return program_of(scene(), [Place("stick", ASIDE), GoTo(0.0, 0.0)], options=SHORT)
 
 
 @cache
 def fetching() -> TrajectoryProblem:
     """Return the problem of taking the ball with the stick, and letting go of it where the motion wants, then of the stick."""
     steps = [Grasp("stick"), Grasp("ball", "pull", "stick.tip"), Reach(POSE), Release("ball"), GoTo(0.0, 0.0)]
-    return build(scene(), [*steps, Place("stick", (0.8, 0.0, 0.6)), GoTo(1.0, 0.0)], options=SHORT)
+    return program_of(scene(), [*steps, Place("stick", (0.8, 0.0, 0.6)), GoTo(1.0, 0.0)], options=SHORT)
 
 
 def margins(problem: TrajectoryProblem, phase: int) -> dict[tuple[str, str], set[float]]:
@@ -167,7 +167,7 @@ def test_distances_to_what_was_left_are_those_of_a_scene_in_which_it_stands_ther
     stands = scene()
     for name, end in (("ball", problem.ends[2]), ("stick", problem.ends[4])):
         stands = stands.with_placement(name, expected_placement(problem, name, z[end - 1]))
-    alone = build(stands, [GoTo(1.0, 0.0)], options=SHORT)
+    alone = program_of(stands, [GoTo(1.0, 0.0)], options=SHORT)
     rows = np.arange(problem.ends[4], problem.ends[5])
     seen = alone.contacts.evaluate(z[rows][:, : alone.chain.size], np.ones(len(rows), int), reach=0.3)
     labels, own = problem.contacts.phases[5].labels, alone.contacts.phases[0].labels

@@ -9,10 +9,10 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.carrying import STICK, TOP, above, box, lifted, moved_base, reaching, room, table, tool_at
-from helpers.small_problems import SHORT
+from helpers.small_problems import SHORT, program_of
 
 from vkc_pin.chain.margins import NEAR, SHARE
-from vkc_pin.program.problem import TrajectoryProblem, build
+from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.steps import GoTo, Grasp, Place, Reach, Step, Touch
@@ -24,7 +24,7 @@ ASIDE = lifted(STICK, [0.0, 0.5, 0.0])
 
 
 def problem(scene: Scene, *steps: Step) -> TrajectoryProblem:
-    return build(scene, steps, options=LONG)
+    return program_of(scene, steps, options=LONG)
 
 
 def margins(p: TrajectoryProblem, phase: int) -> dict[tuple[str, str], np.ndarray]:
@@ -108,7 +108,7 @@ def test_taken_again_it_is_eased_where_it_was_put() -> None:
 def test_in_a_short_phase_both_ends_must_be_possible() -> None:
     """It is lifted and lowered within a few waypoints, and lies on the table in the end, though above it at first."""
     options = dataclasses.replace(SHORT, reach_waypoints=NEAR)
-    p = build(room(table(gap=GAP)), [Place("stick", lifted(STICK, [0.0, 0.5, -GAP]))], options=options)
+    p = program_of(room(table(gap=GAP)), [Place("stick", lifted(STICK, [0.0, 0.5, -GAP]))], options=options)
     np.testing.assert_allclose(margins(p, 1)["stick.stick", "table"], np.zeros(NEAR + 1), atol=1e-6)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 import vkc_pin as vkc
 from helpers.drives import hall
+from helpers.small_problems import program_of
 
 NARROW = 0.73  # [m] the base is 0.67 wide and the arm at home 0.72; both want 0.02 on either side
 TIGHT = 0.70  # [m] here the arm at home does not fit, not even if it may graze
@@ -18,7 +19,7 @@ GOAL = (4.0, 0.5, 0.0)
 def _across(obstacles: Sequence[dict[str, Any]], goal: Sequence[float]) -> vkc.TrajectoryProblem:
     scene = hall(obstacles=obstacles)
     document = {**scene.document, "arena": {"x": [-3.0, 6.0], "y": [-3.0, 3.0]}}
-    return vkc.build(vkc.Scene.from_document(document, scene.folder), [vkc.GoTo(*goal)])
+    return program_of(vkc.Scene.from_document(document, scene.folder), [vkc.GoTo(*goal)])
 
 
 def walled(gap: float) -> vkc.TrajectoryProblem:

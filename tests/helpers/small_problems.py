@@ -4,20 +4,26 @@ from __future__ import annotations
 
 import dataclasses
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 
+from vkc_pin.cache import Cache
 from vkc_pin.chain.broadphase import PhaseGeometry
 from vkc_pin.models.articulation import ArticulatedObject, Attachment, Freedom
 from vkc_pin.models.object_file import load_object
 from vkc_pin.options import Options
+from vkc_pin.program.inspection import build
+from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.scene.placed import PlacedObject
 from vkc_pin.scene.scene import Scene, load_scene
+from vkc_pin.task.steps import Step
+from vkc_pin.task.terms import Term
 
+CACHE = Cache()
 SHORT = Options(reach_waypoints=5, turn_waypoints=3, move_waypoints=4)
 
 # A cabinet with a swinging arm on a slanted axis, on it a tray that slides, and beside the way two flaps.
@@ -123,3 +129,10 @@ def hand_off_the_handle(scene: Scene, row: np.ndarray, hinge: float, knob: float
     tool = dataclasses.replace(scene, start=row[:9]).tool_placement()
     error = tool.inverse() * placed.link_placement(attachment.link) * attachment.placement
     return float(np.abs(pin.log6(error).vector).max())
+
+
+def program_of(
+    scene: Scene, steps: Sequence[Step], *, options: Options | None = None, terms: Sequence[Term] = ()
+) -> TrajectoryProblem:
+    """Return the program of `steps`; tests of one process share the symbolic ones."""
+    return build(scene, steps, options=options, terms=terms, cache=CACHE)

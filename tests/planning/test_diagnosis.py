@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.drives import hall
-from helpers.small_problems import SHORT, door_scene
+from helpers.small_problems import SHORT, door_scene, program_of
 
 import vkc_pin as vkc
 from vkc_pin.planning.diagnosis import explain, impossible
@@ -12,7 +12,7 @@ CRATE = {"name": "crate", "type": "box", "size": [0.6, 0.6, 0.4], "position": [1
 
 
 def problem(scene: vkc.Scene, *steps: vkc.steps.Step) -> vkc.TrajectoryProblem:
-    return vkc.build(scene, list(steps), options=SHORT)
+    return program_of(scene, list(steps), options=SHORT)
 
 
 def test_nothing_is_wrong_with_the_demo() -> None:

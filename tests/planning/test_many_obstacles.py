@@ -14,7 +14,7 @@ import pytest
 from helpers.carrying import STICK, box, lifted, room, table
 from helpers.clutter import cluttered, cluttered_room
 from helpers.motions import brute_force, pair_names, wander, whirl
-from helpers.small_problems import SHORT, all_pairs, random_configurations
+from helpers.small_problems import SHORT, all_pairs, program_of, random_configurations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -29,7 +29,7 @@ from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.motion.world import World
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
-from vkc_pin.program.problem import TrajectoryProblem, build
+from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.placed import standing_geometry
 from vkc_pin.scene.scene import Scene
@@ -95,7 +95,7 @@ def test_distances_asked_for_hardly_depend_on_the_number_of_obstacles(plans: dic
     assert many.metrics["rounds"] <= 2 * few.metrics["rounds"]
     assert asked_few > 1000
     assert asked_many <= 2 * asked_few
-    pairs = sum(len(part.pairs) for part in build(many.scene, many.steps).contacts.phases)
+    pairs = sum(len(part.pairs) for part in program_of(many.scene, many.steps).contacts.phases)
     assert asked_many < pairs  # at hundreds of configurations
 
 
@@ -172,7 +172,7 @@ REACHES, NUMBERS = st.sampled_from([0.0, 0.02, 0.25, 1.0]), st.sampled_from([Non
 @settings(max_examples=25, deadline=None)
 @given(SEEDS, st.sampled_from([0, 3, 40, 150]), REACHES, NUMBERS)
 def test_contacts_are_those_among_all_pairs(seed: int, count: int, reach: float, nearest: int | None) -> None:
-    problem = build(cluttered(seed, count), [Actuate("door", {"hinge": 1.2})], options=SHORT)
+    problem = program_of(cluttered(seed, count), [Actuate("door", {"hinge": 1.2})], options=SHORT)
     rng = np.random.default_rng(seed)
     for phase in (0, 2):
         check_contacts(problem, problem.contacts, phase, rng, reach=reach, nearest=nearest)
@@ -183,7 +183,7 @@ def test_contacts_are_those_among_all_pairs(seed: int, count: int, reach: float,
 def test_contacts_of_what_is_carried_are_those_among_all_pairs(seed: int, count: int, reach: float, nearest: int | None) -> None:
     """Of a stick in the hand, of a ball on its tip, and of what the motion leaves somewhere."""
     steps = [Grasp("stick"), Grasp("ball", "pull", "stick.tip"), Reach(POSE), Release("ball"), GoTo(0.0, 0.0)]
-    problem = build(cluttered_room(seed, count), steps, options=SHORT)
+    problem = program_of(cluttered_room(seed, count), steps, options=SHORT)
     rng = np.random.default_rng(seed)
     z = random_configurations(problem.chain.lower, problem.chain.upper, problem.segments, rng)
     model = problem.contacts.settled(z)
@@ -195,7 +195,7 @@ def test_contacts_of_what_is_carried_are_those_among_all_pairs(seed: int, count:
 @settings(max_examples=15, deadline=None)
 @given(SEEDS, st.sampled_from([3, 60]))
 def test_no_distance_depends_on_what_was_asked_before(seed: int, count: int) -> None:
-    problem = build(cluttered(seed, count), [Actuate("door", {"hinge": 1.2})], options=SHORT)
+    problem = program_of(cluttered(seed, count), [Actuate("door", {"hinge": 1.2})], options=SHORT)
     z = random_configurations(problem.chain.lower, problem.chain.upper, 6, np.random.default_rng(seed))
     waypoints = np.full(len(z), problem.ends[2])
     few = problem.contacts.evaluate(z, waypoints, reach=0.3, nearest=3)

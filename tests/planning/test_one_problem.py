@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from helpers.drawers import SHORT, drawer_scene, holding
 from helpers.drives import hall
-from helpers.small_problems import door_scene
+from helpers.small_problems import door_scene, program_of
 
 import vkc_pin as vkc
 from vkc_pin.interrupt import Interrupt
@@ -135,7 +135,7 @@ class Race:
 @cache
 def flat() -> float:
     """Return the objective of standing still."""
-    problem = vkc.build(drawer_scene(), PULL, options=SHORT)
+    problem = program_of(drawer_scene(), PULL, options=SHORT)
     return problem.objective(problem.still, problem.timing_for(problem.still).dt)
 
 
@@ -346,7 +346,7 @@ def test_ctrl_c_anywhere(when: str, name: str, monkeypatch: pytest.MonkeyPatch) 
 )
 def test_a_weight_weighs_what_it_says(field: str, columns: list[int]) -> None:
     options = [vkc.Options(**{**dataclasses.asdict(SHORT), field: value}) for value in (getattr(SHORT, field), 7.0)]
-    usual, other = (vkc.build(drawer_scene(), PULL, options=each).transcription.structure for each in options)
+    usual, other = (program_of(drawer_scene(), PULL, options=each).transcription.structure for each in options)
     for name in ("weights_velocity", "weights_acceleration"):
         weights, changed = getattr(usual, name), getattr(other, name)
         factors = np.ones(weights.shape[-1])
@@ -358,7 +358,7 @@ def test_a_weight_weighs_what_it_says(field: str, columns: list[int]) -> None:
 def test_turning_costs_what_the_heading_weighs() -> None:
     """Σ w δ² + w_acc δδ²/dt² over a turn on the spot, by hand."""
     options = dataclasses.replace(SHORT, velocity_weight_heading=0.7, dt=0.5)
-    problem = vkc.build(hall(), [vkc.GoTo(0.0, 0.0, 1.0)], options=options)
+    problem = program_of(hall(), [vkc.GoTo(0.0, 0.0, 1.0)], options=options)
     z = np.tile(problem.start, (problem.segments, 1))
     z[:, 2] = np.linspace(0.0, 1.0, problem.segments + 1)[1:] ** 2
     first = np.diff(np.concatenate([[0.0], z[:, 2]]))
@@ -385,6 +385,6 @@ def test_the_leader_keeps_its_own_time(monkeypatch: pytest.MonkeyPatch) -> None:
     race = Race(monkeypatch, [2.0, 40.0, 40.0], after={"a": (2.0, "not converged"), "b": (40.0, "interrupted")})
     plan = race.run()
     assert plan.initialization == "a"
-    alone = vkc.build(drawer_scene(), PULL, options=SHORT)
+    alone = program_of(drawer_scene(), PULL, options=SHORT)
     dt = alone.timing_for(race.z(alone, "a", 2.0)).dt
     assert plan.metrics["duration"] == pytest.approx(float(dt.sum()) + SHORT.grasp_time, rel=1e-6)

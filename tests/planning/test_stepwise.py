@@ -11,7 +11,7 @@ import pinocchio as pin
 import pytest
 from helpers.carrying import STICK, Script, above, carried_over, lifted, moved_base, room, table, tool_at
 from helpers.drives import hall
-from helpers.small_problems import full_scene
+from helpers.small_problems import full_scene, program_of
 
 import vkc_pin as vkc
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
@@ -231,7 +231,7 @@ def test_building_before_planning_costs_no_negative_time() -> None:
     scene = vkc.load_scene("drawer")
     steps = [vkc.Actuate("drawer", {"slide": 0.2})]
     options = vkc.Options(reach_waypoints=23, move_waypoints=11)  # a structure of its own
-    vkc.build(scene, steps, options=options)
+    program_of(scene, steps, options=options)
     metrics = vkc.plan(scene, steps, options=options).metrics
     parts = sum(value for key, value in metrics.items() if key.startswith("time_"))
     assert metrics["planning_time"] >= parts > 0.0

@@ -7,6 +7,7 @@ from functools import cache, partial
 import numpy as np
 import pinocchio as pin
 import pytest
+from helpers.small_problems import program_of
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks.initialization import TARGET
@@ -135,7 +136,7 @@ def test_a_perturbation_that_is_none(bad: object) -> None:
 def test_a_perturbed_seed_is_another_one_and_the_same_again() -> None:
     from vkc_pin.seeds.initialization import initialize
 
-    problem = vkc.build(start(), [vkc.GoTo(1.0, -4.0, 0.0)])
+    problem = program_of(start(), [vkc.GoTo(1.0, -4.0, 0.0)])
     plain, one, same, other = (
         next(initialize(problem, "interpolated", seed, perturbation=deviation)).z
         for seed, deviation in ((0, 0.0), (0, 0.05), (0, 0.05), (1, 0.05))

@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from helpers.carrying import room, stand
-from helpers.small_problems import SHORT
+from helpers.small_problems import SHORT, program_of
 
 import vkc_pin as vkc
 from vkc_pin.program.inspection import patterns, planes, sizes
@@ -13,7 +13,7 @@ from vkc_pin.program.problem import TrajectoryProblem
 
 @pytest.fixture(scope="module")
 def problem() -> TrajectoryProblem:
-    return vkc.build(vkc.load_scene("door"), [vkc.Actuate("door", {"hinge": 1.2})])
+    return program_of(vkc.load_scene("door"), [vkc.Actuate("door", {"hinge": 1.2})])
 
 
 @pytest.fixture(scope="module")
@@ -37,9 +37,9 @@ def test_sizes_add_up(problem: TrajectoryProblem) -> None:
 def test_rows_of_own_constraints_are_told_from_clamped_freedoms() -> None:
     """And rows of goals of one name are added up."""
     low = vkc.Constraint("low", lambda s: s.coordinate("base_x"), upper=5.0, during=["go to"])
-    pose = vkc.build(room(stand()), [vkc.Grasp("stick")], options=SHORT).targets[0]
+    pose = program_of(room(stand()), [vkc.Grasp("stick")], options=SHORT).targets[0]
     steps = [vkc.Grasp("stick"), vkc.GoTo(0.0, 0.0), vkc.Reach(pose), vkc.Reach(pose)]
-    problem = vkc.build(room(stand()), steps, options=SHORT, terms=[low])
+    problem = program_of(room(stand()), steps, options=SHORT, terms=[low])
     found, t = sizes(problem), problem.transcription
     assert found["rows: own constraints"] == SHORT.reach_waypoints
     (goal,) = (name for name in found if name.startswith("rows: goal"))
@@ -53,7 +53,7 @@ def test_planes_of_a_program_with_a_speed_are_those_without(z: np.ndarray) -> No
     """The time of the steps is one of its parameters."""
     steps = [vkc.Actuate("door", {"hinge": 1.2})]
     slow = vkc.Constraint("slow", lambda s: ca.norm_2(s.velocity("tool")) ** 2, upper=4.0)
-    plain, timed = (vkc.build(vkc.load_scene("door"), steps, terms=terms) for terms in ([], [slow]))
+    plain, timed = (program_of(vkc.load_scene("door"), steps, terms=terms) for terms in ([], [slow]))
     for one, other in zip(planes(plain, z, 60), planes(timed, z, 60), strict=True):
         assert one.names == other.names
         np.testing.assert_allclose(one.gradient, other.gradient, atol=1e-9)

@@ -9,12 +9,12 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.carrying import STICK, lifted, room, stand, table
-from helpers.small_problems import SHORT, door_scene, full_scene, random_configurations
+from helpers.small_problems import SHORT, door_scene, full_scene, program_of, random_configurations
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.models.robot_file import load_robot
 from vkc_pin.options import Options
-from vkc_pin.program.problem import TrajectoryProblem, build
+from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.scene import load_scene
 from vkc_pin.solver.to_trajectory import as_trajectory
@@ -28,13 +28,13 @@ REACH, TURN, MOVE = SHORT.reach_waypoints, SHORT.turn_waypoints, SHORT.move_wayp
 
 @pytest.fixture(scope="module")
 def opened() -> TrajectoryProblem:
-    return build(door_scene(), [Actuate("door", {"hinge": 1.2}), GoTo(-0.5, 0.1, -2.2)], options=SHORT)
+    return program_of(door_scene(), [Actuate("door", {"hinge": 1.2}), GoTo(-0.5, 0.1, -2.2)], options=SHORT)
 
 
 @pytest.fixture(scope="module")
 def two_grasps() -> TrajectoryProblem:
     steps: list[Step] = [Grasp("cabinet", "ball"), Actuate("drawer", {"slide": 0.2}, attachment="handle_free"), Reach(POSE)]
-    return build(full_scene(), steps, options=SHORT)
+    return program_of(full_scene(), steps, options=SHORT)
 
 
 def column(problem: TrajectoryProblem, name: str) -> np.ndarray:
@@ -79,7 +79,7 @@ def test_objects_joints_stand_still_until_they_are_moved(opened: TrajectoryProbl
 
 
 def test_a_goal_beyond_a_limit_is_approached_as_far_as_it_goes() -> None:
-    problem = build(door_scene(), [Actuate("door", {"hinge": 2.0}), GoTo(0.0, 0.0)], options=SHORT)
+    problem = program_of(door_scene(), [Actuate("door", {"hinge": 2.0}), GoTo(0.0, 0.0)], options=SHORT)
     hinge = column(problem, "door.hinge")
     assert np.all(hinge[problem.ends[2] - 1 :] == 1.57)
     panel = next(i for i, label in enumerate(problem.contacts.phases[3].labels) if label == "door.panel" and i > 20)
@@ -100,7 +100,7 @@ def test_the_robot_keeps_its_limits_and_stays_in_the_arena(opened: TrajectoryPro
     np.testing.assert_array_equal(opened.lower[:, arm], np.tile(robot.lower[arm], (opened.segments, 1)))
     np.testing.assert_array_equal(opened.upper[:, arm], np.tile(robot.upper[arm], (opened.segments, 1)))
     narrow = dataclasses.replace(scene, arena=(-50.0, 1.0, -1.0, 60.0))
-    problem = build(narrow, [Reach(POSE)], options=SHORT)
+    problem = program_of(narrow, [Reach(POSE)], options=SHORT)
     np.testing.assert_array_equal(problem.lower[0, :2], [robot.lower[0], -1.0])
     np.testing.assert_array_equal(problem.upper[0, :2], [1.0, robot.upper[1]])
     assert problem.limits("base_x") == (robot.lower[0], 1.0)
@@ -109,7 +109,7 @@ def test_the_robot_keeps_its_limits_and_stays_in_the_arena(opened: TrajectoryPro
 @pytest.mark.parametrize("start", [2.2, -2.2 - 2 * np.pi, 15.0])
 def test_the_base_goes_to_its_goal_by_the_nearest_heading(start: float) -> None:
     scene = door_scene().with_start(base=[-0.7, 0.3, start])
-    problem = build(scene, [GoTo(-0.5, 0.1, -2.2)], options=SHORT)
+    problem = program_of(scene, [GoTo(-0.5, 0.1, -2.2)], options=SHORT)
     np.testing.assert_array_equal(problem.lower[-1, :3], problem.upper[-1, :3])
     np.testing.assert_array_equal(problem.lower[-1, :2], [-0.5, 0.1])
     heading = problem.lower[-1, 2]
@@ -118,14 +118,14 @@ def test_the_base_goes_to_its_goal_by_the_nearest_heading(start: float) -> None:
 
 
 def test_a_goal_without_heading_leaves_it_open() -> None:
-    problem = build(door_scene(), [GoTo(-0.5, 0.1)], options=SHORT)
+    problem = program_of(door_scene(), [GoTo(-0.5, 0.1)], options=SHORT)
     np.testing.assert_array_equal(problem.lower[-1, :2], problem.upper[-1, :2])
     assert (problem.lower[-1, 2], problem.upper[-1, 2]) == (-np.inf, np.inf)
 
 
 def test_a_fixed_base_stays_where_it_stands() -> None:
     scene = dataclasses.replace(door_scene(), robot=load_robot("husky_ur5e", base="fixed"))
-    problem = build(scene, [Reach(POSE)], options=SHORT)
+    problem = program_of(scene, [Reach(POSE)], options=SHORT)
     for bound in (problem.lower, problem.upper):
         np.testing.assert_array_equal(bound[:, :3], np.tile(scene.start[:3], (problem.segments, 1)))
     for k, name in enumerate(("base_x", "base_y", "base_yaw")):
@@ -150,7 +150,7 @@ def test_what_is_grasped_only_does_not_move(two_grasps: TrajectoryProblem) -> No
 
 def test_the_start_is_the_scenes() -> None:
     scene = door_scene().with_state("door", {"hinge": 0.3, "knob": 0.2}).with_start(base=[0.1, 0.2, 0.3])
-    problem = build(scene, [Actuate("door", {"hinge": 1.2})], options=SHORT)
+    problem = program_of(scene, [Actuate("door", {"hinge": 1.2})], options=SHORT)
     np.testing.assert_array_equal(problem.start[: len(scene.start)], scene.start)
     assert problem.start[problem.chain.index("door.hinge")] == 0.3
     assert problem.start[problem.chain.index("door.knob")] == 0.2
@@ -204,14 +204,14 @@ def test_every_object_is_closed_while_it_is_held_and_goals_are_met_at_the_end(tw
 
 def test_what_is_held_at_the_start_is_closed_from_the_first_waypoint() -> None:
     scene = dataclasses.replace(door_scene(), held={"door": "handle"})
-    problem = build(scene, [Actuate("door", {"knob": 0.3})], options=SHORT)
+    problem = program_of(scene, [Actuate("door", {"knob": 0.3})], options=SHORT)
     assert [phase.held for phase in problem.task.phases] == [(HANDLE,)]
     assert problem.transcription.structure.poses[0].waypoints == tuple(range(1, MOVE + 1))
     assert problem.transcription.structure.rests == ()
 
 
 def test_a_frame_of_the_robot_can_reach_too() -> None:
-    problem = build(door_scene(), [Reach(POSE, frame="forearm_link")], options=SHORT)
+    problem = program_of(door_scene(), [Reach(POSE, frame="forearm_link")], options=SHORT)
     frame = problem.chain.model.frames[problem.chain.model.getFrameId("forearm_link")]
     (pose,) = problem.transcription.structure.poses
     assert (names_of(problem), pose.joint, pose.waypoints) == (["goal forearm_link"], frame.parentJoint, (REACH,))
@@ -243,7 +243,7 @@ def test_pose_error_and_drift(opened: TrajectoryProblem) -> None:
     drifts = [np.linalg.norm(r[:3]) / SHORT.closure_position for r in between]
     drifts += [np.linalg.norm(r[3:]) / SHORT.closure_angle for r in between]
     assert opened.drift(z) == pytest.approx(max(drifts), rel=1e-6)
-    alone = build(door_scene(), [GoTo(0.0, 0.0)], options=SHORT)
+    alone = program_of(door_scene(), [GoTo(0.0, 0.0)], options=SHORT)
     assert alone.pose_error(random_path(alone)) == alone.drift(random_path(alone)) == 0.0
 
 
@@ -266,7 +266,7 @@ def tool(problem: TrajectoryProblem, row: np.ndarray) -> pin.SE3:
 )
 def test_a_hand_comes_straight_to_what_it_grasps(step: Step, scene) -> None:  # type: ignore[no-untyped-def]
     """Some waypoints before, the pose holds exactly where the tool is `approach` behind the grasp, wherever in it that is."""
-    problem = build(scene(), [step], options=SHORT)
+    problem = program_of(scene(), [step], options=SHORT)
     number = next(k for k, name in enumerate(names_of(problem)) if name.startswith("approach "))
     pose, solver, target = (
         part[number] for part in (problem.transcription.structure.poses, problem.transcription.pose_solvers, problem.targets)
@@ -297,13 +297,13 @@ FETCH: list[Step] = [Grasp("ball", "pull", "stick.tip"), Place("ball", (0.8, 0.6
 @pytest.fixture(scope="module")
 def fetching() -> TrajectoryProblem:
     scene = room(stand(), objects=("stick", "ball")).with_held({"stick": "grip"}, at={"stick": (0.02, -0.1)})
-    return build(scene, FETCH, options=SHORT)
+    return program_of(scene, FETCH, options=SHORT)
 
 
 def test_free_objects_are_grasped_where_they_stand_and_closed_nowhere_else() -> None:
     aside = lifted(STICK, [0.0, 0.5, 0.0])
     steps = [Touch("stick.tip", (0.8, 0.9, 0.7)), Place("stick", aside), GoTo(0.0, 0.0), Grasp("stick")]
-    problem = build(room(table()), steps, options=SHORT)
+    problem = program_of(room(table()), steps, options=SHORT)
     ends = problem.ends.tolist()
     at = list(zip(names_of(problem), problem.targets, problem.transcription.structure.poses, strict=True))
     found = [(name, target, pose.waypoints, pose.kind) for name, target, pose in at]
@@ -337,7 +337,7 @@ def test_what_is_held_at_the_start_stays_where_the_hand_has_it(fetching: Traject
 
 
 def test_a_loose_grasp_is_not_clamped() -> None:
-    problem = build(full_scene(), [Actuate("cabinet", {"swing": 0.5}, "sleeve")], options=SHORT)
+    problem = program_of(full_scene(), [Actuate("cabinet", {"swing": 0.5}, "sleeve")], options=SHORT)
     assert problem.choices == ()
     assert problem.transcription.structure.clamped == ()
 
@@ -415,7 +415,7 @@ def runs(problem: TrajectoryProblem) -> list[slice]:
 
 def test_a_way_that_is_too_long_gets_more_time() -> None:
     """Only where it is too long, and so much that the profile 3s² − 2s³ is within all rates; then less again."""
-    problem = build(full_scene(), [Actuate("door", {"hinge": 1.2}), GoTo(-0.5, 0.1)], options=SHORT)
+    problem = program_of(full_scene(), [Actuate("door", {"hinge": 1.2}), GoTo(-0.5, 0.1)], options=SHORT)
     first, *others = runs(problem)
     z = np.tile(problem.start, (problem.segments, 1))
     share = np.arange(1, first.stop + 1) / first.stop
@@ -442,7 +442,7 @@ def test_a_way_that_is_too_long_gets_more_time() -> None:
 
 
 def test_a_step_that_is_too_fast_gets_more_time_within_reason() -> None:
-    problem = build(full_scene(), [Actuate("door", {"hinge": 1.2}), GoTo(-0.5, 0.1)], options=SHORT)
+    problem = program_of(full_scene(), [Actuate("door", {"hinge": 1.2}), GoTo(-0.5, 0.1)], options=SHORT)
     first, second, *_ = runs(problem)
     for jump, enough in ((0.15, True), (30.0, False)):
         z = problem.still
@@ -508,7 +508,7 @@ def test_it_says_what_it_is(opened: TrajectoryProblem) -> None:
 
 
 def test_units(two_grasps: TrajectoryProblem) -> None:
-    rail = build(full_scene(), [Grasp("cabinet", "rail")], options=SHORT)
+    rail = program_of(full_scene(), [Grasp("cabinet", "rail")], options=SHORT)
     lengths = {"base_x", "base_y", "drawer.slide", "cabinet.slide"}
     assert {name for name in two_grasps.chain.names if two_grasps.unit(name) == "m"} == lengths
     assert rail.unit("cabinet.rail") == "m"
@@ -516,13 +516,13 @@ def test_units(two_grasps: TrajectoryProblem) -> None:
 
 
 def test_options_have_defaults() -> None:
-    assert build(door_scene(), [Reach(POSE)]).options == Options()
+    assert program_of(door_scene(), [Reach(POSE)]).options == Options()
 
 
 def test_scene_steps_and_options_are_left_as_they_were() -> None:
     scene, steps = door_scene(), [Actuate("door", {"hinge": 1.2})]
     start, state, pairs = scene.start.copy(), scene.objects["door"].state.copy(), len(scene.robot.collision.collisionPairs)
-    build(scene, steps, options=SHORT)
+    program_of(scene, steps, options=SHORT)
     np.testing.assert_array_equal(scene.start, start)
     np.testing.assert_array_equal(scene.objects["door"].state, state)
     assert len(scene.robot.collision.collisionPairs) == pairs
@@ -543,7 +543,7 @@ def test_scene_steps_and_options_are_left_as_they_were() -> None:
 )
 def test_steps_that_cannot_be_are_refused(steps: list[Step], error: type[Exception], match: str) -> None:
     with pytest.raises(error, match=match):
-        build(door_scene(), steps, options=SHORT)
+        program_of(door_scene(), steps, options=SHORT)
 
 
 @pytest.mark.parametrize("waypoints", [1, 3, 10])
@@ -551,7 +551,7 @@ def test_a_grasp_is_chosen_within_its_own_phase(waypoints: int) -> None:
     """What an earlier grasp chose does not bind a later one, however short the phases are."""
     scene, few = load_scene("init_1"), Options(reach_waypoints=waypoints)
     aside = Place("stick", pin.SE3(np.eye(3), np.array([2.5, 0.5, 0.771])))
-    problem = build(scene, [aside, Grasp("stick")], options=few)
+    problem = program_of(scene, [aside, Grasp("stick")], options=few)
     clamped = problem.transcription.structure.clamped
     spans = sorted({(first, last) for _, first, last in clamped})
     assert len(spans) == 2

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.carrying import room, stand, table
-from helpers.small_problems import full_scene, random_configurations
+from helpers.small_problems import full_scene, program_of, random_configurations
 
 import vkc_pin as vkc
 from vkc_pin.program.term_rows import TermProgram
@@ -63,7 +63,7 @@ def problem(name: str) -> vkc.TrajectoryProblem:
     else:
         scene = full_scene()
         steps = [vkc.Actuate("cabinet", {"swing": 0.5}), vkc.Actuate("door", {"hinge": 1.2}), vkc.GoTo(0.0, 0.0)]
-    return vkc.build(scene, steps, options=OPTIONS, terms=terms_of(name))
+    return program_of(scene, steps, options=OPTIONS, terms=terms_of(name))
 
 
 NAMES = ["stick", "ball", "furniture"]
@@ -234,7 +234,7 @@ def test_a_hand_left_where_it_was_counts_after_it_was_let_go_of() -> None:
 def test_programs_with_different_terms_are_told_apart() -> None:
     def made(limit: float, upper: float, *, terms: bool = True) -> vkc.TrajectoryProblem:
         near = vkc.Constraint("near", lambda s: s.position("tool")[2] - limit, upper=upper)
-        return vkc.build(room(table()), [vkc.GoTo(0.5, 0.5)], options=OPTIONS, terms=[near] if terms else [])
+        return program_of(room(table()), [vkc.GoTo(0.5, 0.5)], options=OPTIONS, terms=[near] if terms else [])
 
     first = made(0.5, 1.0)
     assert made(0.5, 1.0).transcription is first.transcription
@@ -248,13 +248,13 @@ def test_programs_with_different_terms_are_told_apart() -> None:
     parameters = [p.transcription.parameters.numel() for p in (first, without)]
     assert parameters[0] == parameters[1]  # no term needs the time of a step
     fast = vkc.Cost("fast", lambda s: ca.sumsqr(s.velocity("tool")))
-    timed = vkc.build(room(table()), [vkc.GoTo(0.5, 0.5)], options=OPTIONS, terms=[fast])
+    timed = program_of(room(table()), [vkc.GoTo(0.5, 0.5)], options=OPTIONS, terms=[fast])
     assert timed.transcription.parameters.numel() == parameters[0] + OPTIONS.reach_waypoints
 
 
 def test_errors_count_in_tolerances() -> None:
     low = vkc.Constraint("low", lambda s: s.coordinate("base_x"), upper=0.5, tolerance=0.02)
-    p = vkc.build(room(table()), [vkc.GoTo(1.0, 0.0)], options=OPTIONS, terms=[low])
+    p = program_of(room(table()), [vkc.GoTo(1.0, 0.0)], options=OPTIONS, terms=[low])
     z = p.still
     dt = p.timing_for(z).dt
     assert p.term_numbers.error(z, dt) == p.row_error(z, dt) - p.pose_error(z) == 0.0
@@ -269,7 +269,7 @@ def test_errors_count_in_tolerances() -> None:
 def test_steps_take_longer_where_a_speed_asks_for_it() -> None:
     def at(limit: float, start: float = 0.0) -> vkc.TrajectoryProblem:
         slow = vkc.Constraint("slow", lambda s: ca.norm_2(s.velocity("tool")), lower=start, upper=limit, tolerance=1e-3)
-        return vkc.build(room(), [vkc.GoTo(2.0, 0.0)], options=vkc.Options(reach_waypoints=20), terms=[slow])
+        return program_of(room(), [vkc.GoTo(2.0, 0.0)], options=vkc.Options(reach_waypoints=20), terms=[slow])
 
     share = np.linspace(0.0, 1.0, 21)[1:, None]
     usual = at(9.0)
@@ -289,18 +289,18 @@ def test_terms_without_a_slope_are_refused() -> None:
     for expression in (lambda s: ca.acos(s.rotation("stick.stick")[2, 2]), lambda s: 1 / ca.sumsqr(s.velocity("tool"))):
         for term in (vkc.Constraint("mine", expression, upper=0.2), vkc.Cost("mine", expression)):
             with pytest.raises(vkc.InputError, match=r"terms\['mine'\]\.expression: it has no value or no slope at the start"):
-                vkc.build(room(table()).with_held({"stick": "grip"}), [vkc.GoTo(0.5, 0.5)], options=OPTIONS, terms=[term])
+                program_of(room(table()).with_held({"stick": "grip"}), [vkc.GoTo(0.5, 0.5)], options=OPTIONS, terms=[term])
 
 
 def test_what_nothing_can_change_is_no_row() -> None:
     here = vkc.Constraint("here", lambda s: s.position("stick.tip"), upper=-9.0, during="go to")
-    p = vkc.build(room(table()), [vkc.GoTo(1.0, 0.0)], options=OPTIONS, terms=[here])
+    p = program_of(room(table()), [vkc.GoTo(1.0, 0.0)], options=OPTIONS, terms=[here])
     assert p.terms == ()
     assert p.transcription.structure.terms == ()
 
 
 def test_an_empty_program() -> None:
     p = problem("furniture")
-    part = TermProgram(p.chain.model, (), ca.MX.sym("z", p.chain.size, 4), ca.MX.sym("dt", 3))
+    part = TermProgram(p.chain.model, (), ca.MX.sym("z", p.chain.size, 4), ca.MX.sym("dt", 3), p.cache)
     assert part.rows == 0
     assert part.jacobian.shape == (0, 3 * (p.chain.size + 1))

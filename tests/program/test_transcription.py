@@ -12,14 +12,14 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.carrying import room, stand, table
-from helpers.small_problems import door_scene, full_scene, random_configurations
+from helpers.small_problems import CACHE, door_scene, full_scene, program_of, random_configurations
 
+from vkc_pin.cache import Cache
 from vkc_pin.models.robot_file import load_robot
 from vkc_pin.options import Options
-from vkc_pin.program import transcription as module
-from vkc_pin.program import waypoint as kinds
-from vkc_pin.program.problem import TrajectoryProblem, build
-from vkc_pin.program.waypoint import Structure, waypoint_functions
+from vkc_pin.program.problem import TrajectoryProblem
+from vkc_pin.program.transcription import transcribe
+from vkc_pin.program.waypoint import waypoint_functions
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
 
@@ -37,20 +37,20 @@ def differential_scene() -> Scene:
 def problem(name: str) -> TrajectoryProblem:
     pose = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array([0.4, 0.2, 0.9]))
     if name == "reach":
-        return build(door_scene(), [Reach(pose)], options=OPTIONS)
+        return program_of(door_scene(), [Reach(pose)], options=OPTIONS)
     if name == "door":
-        return build(door_scene(), [Actuate("door", {"hinge": 1.2})], options=OPTIONS)
+        return program_of(door_scene(), [Actuate("door", {"hinge": 1.2})], options=OPTIONS)
     if name == "differential":
-        return build(differential_scene(), [Reach(pose), GoTo(0.0, 0.0, 1.0)], options=OPTIONS)
+        return program_of(differential_scene(), [Reach(pose), GoTo(0.0, 0.0, 1.0)], options=OPTIONS)
     if name == "stick":  # chosen where to grasp, clamped from then on; a point, and an upright place
-        return build(room(table()), [Touch("stick.tip", (0.8, 0.9, 0.7)), Place("stick", (0.8, 0.5, 0.56))], options=OPTIONS)
+        return program_of(room(table()), [Touch("stick.tip", (0.8, 0.9, 0.7)), Place("stick", (0.8, 0.5, 0.56))], options=OPTIONS)
     if name == "fetch":  # a ball with the stick that is held at the start, then the stick itself is put away
         scene = room(stand(), objects=("stick", "ball")).with_held({"stick": "grip"}, at={"stick": (0.02, -0.1)})
         steps = [Grasp("ball", "pull", "stick.tip"), Place("ball", pose), Release("stick"), GoTo(0.0, 0.0)]
-        return build(scene, steps, options=OPTIONS)
+        return program_of(scene, steps, options=OPTIONS)
     assert name == "two grasps"  # the second ends nothing: there is a pose to reach after it
     steps = [Grasp("cabinet", "ball"), Actuate("drawer", {"slide": 0.2}, attachment="handle_free"), Reach(pose)]
-    return build(full_scene(), steps, options=OPTIONS)
+    return program_of(full_scene(), steps, options=OPTIONS)
 
 
 NAMES = ["reach", "door", "differential", "two grasps", "stick", "fetch"]
@@ -334,22 +334,22 @@ def moved_door(scene: Scene) -> Scene:
 
 def test_one_program_serves_all_problems_of_a_structure() -> None:
     steps, scene = [Actuate("door", {"hinge": 1.2})], door_scene()
-    first = build(scene, steps, options=OPTIONS)
-    first.transcription.take_build_time()
+    first = program_of(scene, steps, options=OPTIONS)
+    spent = CACHE.building
     fewer = dataclasses.replace(scene, obstacles=pin.GeometryModel(), obstacle_labels=())
     others = [
-        build(scene.with_start(base=[-1.0, 0.2, 0.5]), steps, options=OPTIONS),
-        build(scene.sample_start(np.random.default_rng(0)), steps, options=OPTIONS),
-        build(moved_door(scene), steps, options=OPTIONS),
-        build(fewer, steps, options=OPTIONS),
-        build(scene, [Actuate("door", {"hinge": 0.4})], options=OPTIONS),
-        build(scene.with_state("door", {"knob": 0.1}), steps, options=OPTIONS),
-        build(scene, steps, options=dataclasses.replace(OPTIONS, dist_safe=0.05, penalty=3.0)),
+        program_of(scene.with_start(base=[-1.0, 0.2, 0.5]), steps, options=OPTIONS),
+        program_of(scene.sample_start(np.random.default_rng(0)), steps, options=OPTIONS),
+        program_of(moved_door(scene), steps, options=OPTIONS),
+        program_of(fewer, steps, options=OPTIONS),
+        program_of(scene, [Actuate("door", {"hinge": 0.4})], options=OPTIONS),
+        program_of(scene.with_state("door", {"knob": 0.1}), steps, options=OPTIONS),
+        program_of(scene, steps, options=dataclasses.replace(OPTIONS, dist_safe=0.05, penalty=3.0)),
     ]
     for other in others:
         assert other.transcription is first.transcription
-        assert other.transcription.take_build_time() == 0.0
-    again = [build(scene, [Reach(pin.SE3.Random())], options=OPTIONS).transcription for _ in range(2)]
+    assert CACHE.building == spent
+    again = [program_of(scene, [Reach(pin.SE3.Random())], options=OPTIONS).transcription for _ in range(2)]
     assert again[0] is again[1]
     assert again[0] is not first.transcription
 
@@ -369,77 +369,43 @@ def test_one_program_serves_all_problems_of_a_structure() -> None:
     ],
 )
 def test_another_structure_gets_another_program(steps: list[Step], options: Options) -> None:
-    structure = build(door_scene(), [Actuate("door", {"hinge": 1.2})], options=OPTIONS).transcription.structure
-    other = build(door_scene(), steps, options=options).transcription.structure
+    structure = program_of(door_scene(), [Actuate("door", {"hinge": 1.2})], options=OPTIONS).transcription.structure
+    other = program_of(door_scene(), steps, options=options).transcription.structure
     assert other.key != structure.key
 
 
 def test_a_base_that_cannot_slip_has_another_structure() -> None:
     keys = [
-        build(scene, [GoTo(0.0, 0.0)], options=OPTIONS).transcription.structure.key
+        program_of(scene, [GoTo(0.0, 0.0)], options=OPTIONS).transcription.structure.key
         for scene in (door_scene(), differential_scene())
     ]
     assert keys[0] != keys[1]
 
 
-def test_only_the_programs_used_last_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    structure = problem("reach").transcription.structure
-    built: list[Structure] = []
-    times: list[float] = []
-
-    class Built:
-        def __init__(self, structure: Structure) -> None:
-            built.append(structure)
-
-        def take_build_time(self) -> float:
-            times.append(1.0)
-            return 1.0
-
-    monkeypatch.setattr(module, "Transcription", Built)
-    monkeypatch.setattr(module, "_transcriptions", type(module._transcriptions)())
-    limit = module._KEPT
-    structures = [dataclasses.replace(structure, slots=10 + k) for k in range(limit + 1)]
-    kept = [module.transcribe(s) for s in structures[:limit]]
-    assert times == []  # who has a program built is to count the time
-    assert module.transcribe(structures[0]) is kept[0]  # used again: the second is now the oldest
-    assert times == [1.0]  # whoever uses it again is not
-    module.transcribe(structures[limit])
-    assert len(module._transcriptions) == limit
-    assert module.transcribe(structures[0]) is kept[0]
-    assert len(built) == limit + 1
-    module.transcribe(structures[1])
-    assert len(built) == limit + 2
-
-
-def test_functions_of_waypoints_are_shared_by_structures(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_functions_of_waypoints_are_shared_by_structures() -> None:
     """However many waypoints there are, and wherever they must satisfy poses."""
-    monkeypatch.setattr(kinds, "_functions", type(kinds._functions)())
-    structure = problem("reach").transcription.structure
+    structure, cache = problem("reach").transcription.structure, Cache()
     pose = structure.poses[0]
-    first = waypoint_functions(structure.model, 3, (pose,))
-    assert waypoint_functions(structure.model, 3, (dataclasses.replace(pose, waypoints=(1, 2)),)) is first
+    first = waypoint_functions(structure.model, 3, (pose,), cache)
+    assert waypoint_functions(structure.model, 3, (dataclasses.replace(pose, waypoints=(1, 2)),), cache) is first
+    almost = pin.SE3(pose.local.rotation, pose.local.translation + 1e-14)  # other last digits
     others = [
-        waypoint_functions(structure.model, 4, (pose,)),
-        waypoint_functions(structure.model, 3, ()),
-        waypoint_functions(structure.model, 3, (pose, pose)),
-        waypoint_functions(structure.model, 3, (dataclasses.replace(pose, kind="point"),)),
-        waypoint_functions(structure.model, 3, (dataclasses.replace(pose, local=pin.SE3.Random()),)),
+        waypoint_functions(structure.model, 4, (pose,), cache),
+        waypoint_functions(structure.model, 3, (), cache),
+        waypoint_functions(structure.model, 3, (pose, pose), cache),
+        waypoint_functions(structure.model, 3, (dataclasses.replace(pose, kind="point"),), cache),
+        waypoint_functions(structure.model, 3, (dataclasses.replace(pose, local=pin.SE3.Random()),), cache),
+        waypoint_functions(structure.model, 3, (dataclasses.replace(pose, local=almost),), cache),
     ]
-    assert len({id(one) for one in [first, *others]}) == 6
-    monkeypatch.setattr(kinds, "_KEPT", 6)
-    assert waypoint_functions(structure.model, 3, (pose,)) is first  # used again: the others are older
-    waypoint_functions(structure.model, 5, (pose,))
-    assert len(kinds._functions) == 6
-    assert waypoint_functions(structure.model, 3, (pose,)) is first
-    assert waypoint_functions(structure.model, 4, (pose,)) is not others[0]
+    assert len({id(one) for one in [first, *others]}) == 7
 
 
 def test_the_same_solver_is_not_made_twice() -> None:
-    t = problem("reach").transcription
-    first = t.solver(rates=False, options=QUIET)
-    t.take_build_time()
+    structure, cache = problem("reach").transcription.structure, Cache()
+    t = transcribe(structure, cache)
+    assert transcribe(structure, cache) is t
+    first, spent = t.solver(rates=False, options=QUIET), cache.building
     assert t.solver(rates=False, options=dict(reversed(QUIET.items()))) is first
-    assert t.take_build_time() == 0.0
+    assert cache.building == spent
     assert t.solver(rates=False, options={**QUIET, "ipopt.tol": 1e-3}) is not first
-    assert t.take_build_time() > 0.0
-    assert t.take_build_time() == 0.0
+    assert cache.building > spent

@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from helpers.small_problems import door_scene
+from helpers.small_problems import door_scene, program_of
 
 import vkc_pin as vkc
 from vkc_pin.seeds.approach import Approach
@@ -20,7 +20,7 @@ FEW = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20)
 @cache
 def grasp() -> tuple[vkc.TrajectoryProblem, np.ndarray]:
     """Return the problem of opening the door and a configuration that holds its handle."""
-    problem = vkc.build(door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=FEW)
+    problem = program_of(door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=FEW)
     found = Beam(Knots(problem, np.random.default_rng(0))).search(thorough=True)
     return problem, found.paths[int(np.argmin(found.cost)), 1]
 

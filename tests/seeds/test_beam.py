@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 from helpers.gates import walled
-from helpers.small_problems import door_scene, hand_off_the_handle, with_attachment, with_objects
+from helpers.small_problems import door_scene, hand_off_the_handle, program_of, with_attachment, with_objects
 
 import vkc_pin as vkc
 from vkc_pin.seeds import beam as module
@@ -25,7 +25,7 @@ DIRECTIONS = pytest.mark.parametrize("backwards", [False, True], ids=["forwards"
 def problem(*, around: bool = False) -> vkc.TrajectoryProblem:
     """Return the problem of opening the door; around: and of driving somewhere before and after."""
     steps = [vkc.GoTo(-1.0, 0.0), OPEN, vkc.GoTo(-1.0, 0.5)] if around else [OPEN]
-    return vkc.build(door_scene(), steps, options=FEW)
+    return program_of(door_scene(), steps, options=FEW)
 
 
 def beam(seed: int = 0, *, around: bool = False, routes: bool = False) -> Beam:
@@ -109,7 +109,7 @@ def gripping(*, firm: bool) -> vkc.TrajectoryProblem:
     scene = door_scene()
     tilting = dataclasses.replace(scene.objects["door"].object.attachment("handle_free"), name="tilted", firm=firm)
     scene = with_objects(scene, {"door": with_attachment(scene.objects["door"], tilting)})
-    return vkc.build(scene, [dataclasses.replace(OPEN, attachment="tilted")], options=FEW)
+    return program_of(scene, [dataclasses.replace(OPEN, attachment="tilted")], options=FEW)
 
 
 @pytest.mark.parametrize("firm", [False, True])
@@ -171,7 +171,7 @@ def test_a_grasp_is_nearest_to_its_straight_way_so_many_waypoints_before() -> No
     assert beam().knots.pose_at(grasp - options.approach_waypoints) is not None
     _, grasp, *_ = problem(around=True).ends.tolist()
     assert beam(around=True).approaches == {grasp: grasp - options.approach_waypoints}
-    brief = vkc.build(door_scene(), [OPEN], options=dataclasses.replace(FEW, reach_waypoints=3))
+    brief = program_of(door_scene(), [OPEN], options=dataclasses.replace(FEW, reach_waypoints=3))
     assert Beam(Knots(brief, np.random.default_rng(0))).approaches == {3: 1}
 
 
@@ -201,7 +201,7 @@ def test_a_careful_search_counts_what_is_hit_before_a_grasp(careful: bool, monke
 def test_before_a_careful_grasp_nothing_is_hit() -> None:
     """At the narrow door, open into the bedroom: a hand that has room at the lever may have none on the way to it."""
     scene = vkc.load_scene("household").with_state("door", {"hinge": 1.52}).with_start(base=(1.5, -0.5, 1.57))
-    p = vkc.build(scene, [vkc.Grasp("door", "handle_free"), vkc.Actuate("door", {"hinge": 0.0})])
+    p = program_of(scene, [vkc.Grasp("door", "handle_free"), vkc.Actuate("door", {"hinge": 0.0})])
     grasp, routes, shares = int(p.ends[0]), Routes(p), []
     for careful in (False, True):
         search = Beam(Knots(p, np.random.default_rng(0)), routes, careful=careful)

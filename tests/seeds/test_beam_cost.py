@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.small_problems import SHORT, door_scene
+from helpers.small_problems import SHORT, door_scene, program_of
 from numpy.typing import NDArray
 
 import vkc_pin as vkc
@@ -11,7 +11,7 @@ from vkc_pin.seeds.knots import Knots
 
 
 def beam(seed: int = 0) -> Beam:
-    problem = vkc.build(door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=SHORT)
+    problem = program_of(door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=SHORT)
     return Beam(Knots(problem, np.random.default_rng(seed)))
 
 

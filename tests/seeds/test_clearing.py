@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.small_problems import door_scene
+from helpers.small_problems import door_scene, program_of
 
 import vkc_pin as vkc
 from vkc_pin.seeds import clearing
@@ -16,7 +16,7 @@ from vkc_pin.seeds.knots import Knots, Known
 
 
 def drawn(steps: list[vkc.Grasp | vkc.Actuate | vkc.Touch], scene: vkc.Scene) -> tuple[vkc.TrajectoryProblem, Knots]:
-    problem = vkc.build(scene, steps)
+    problem = program_of(scene, steps)
     return problem, Knots(problem, np.random.default_rng(0))
 
 
@@ -155,7 +155,7 @@ def test_what_weighs_more_moves_less(scattered: Scattered, monkeypatch: pytest.M
 
 
 def test_searches_that_share_what_they_know_find_what_they_would_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    problem = vkc.build(door_scene(), [vkc.Grasp("door", "handle_free")])
+    problem = program_of(door_scene(), [vkc.Grasp("door", "handle_free")])
     known, waypoint = Known(), int(problem.ends[0])
     before = np.tile(problem.start, (8, 1))
 

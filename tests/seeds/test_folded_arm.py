@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 import pinocchio as pin
 import pytest
+from helpers.small_problems import program_of
 
 import vkc_pin as vkc
 from vkc_pin.seeds import folded_arm as compact
@@ -23,7 +24,7 @@ TASKS = {  # scene and steps, in the last phase of which something is carried
 @cache
 def problem(load: str) -> vkc.TrajectoryProblem:
     name, steps = TASKS[load]
-    return vkc.build(vkc.load_scene(name), steps)
+    return program_of(vkc.load_scene(name), steps)
 
 
 def resting(load: str) -> np.ndarray:

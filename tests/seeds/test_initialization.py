@@ -10,7 +10,7 @@ import pinocchio as pin
 import pytest
 from helpers.drives import hall
 from helpers.gates import GOAL, NARROW, TIGHT, gated
-from helpers.small_problems import SHORT, door_scene, hand_off_the_handle
+from helpers.small_problems import SHORT, door_scene, hand_off_the_handle, program_of
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -26,7 +26,7 @@ OPENED = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20)
 
 @cache
 def problem() -> vkc.TrajectoryProblem:
-    return vkc.build(door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=OPENED)
+    return program_of(door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=OPENED)
 
 
 def seeds(method: str = "interpolated", *, seed: int = 0, count: int = 1) -> list[np.ndarray]:
@@ -108,28 +108,28 @@ def test_the_stationary_seed_leaves_the_robot_where_it_is() -> None:
 
 def test_a_seed_for_the_base_takes_the_shorter_way_round() -> None:
     scene = hall().with_start(base=[0.0, 0.0, 3.0])
-    turn = vkc.build(scene, [vkc.GoTo(1.0, 0.5, -3.0)], options=SHORT)
+    turn = program_of(scene, [vkc.GoTo(1.0, 0.5, -3.0)], options=SHORT)
     (z,) = (found.z for found in initialize(turn, "interpolated", 0))
     np.testing.assert_allclose(z[-1, :3], [1.0, 0.5, 2 * np.pi - 3.0])
     np.testing.assert_allclose(z[:, 3:], np.tile(scene.start[3:], (len(z), 1)))
 
 
 def test_a_seed_for_a_target_out_of_reach_is_still_a_seed() -> None:
-    lost = vkc.build(hall(), [vkc.Reach((1.0, 0.0, 4.0, 0.0, 0.0, 0.0))], options=SHORT)
+    lost = program_of(hall(), [vkc.Reach((1.0, 0.0, 4.0, 0.0, 0.0, 0.0))], options=SHORT)
     for z in (found.z for found in initialize(lost, "interpolated", 0, count=2)):
         assert np.isfinite(z).all()
         assert np.all((z >= lost.lower) & (z <= lost.upper))
 
 
 def test_a_fixed_base_stays_in_every_seed() -> None:
-    fixed = vkc.build(hall(base="fixed"), [vkc.Reach((0.5, 0.4, 1.0, 0.0, np.pi / 2, 0.0))], options=SHORT)
+    fixed = program_of(hall(base="fixed"), [vkc.Reach((0.5, 0.4, 1.0, 0.0, np.pi / 2, 0.0))], options=SHORT)
     for z in (found.z for found in initialize(fixed, "interpolated", 0, count=3)):
         assert np.ptp(fixed.waypoints(z)[:, :3], axis=0).max() == 0.0
 
 
 def test_scattered_configurations_are_where_they_say() -> None:
     target = pin.SE3(pin.rpy.rpyToMatrix(0.0, np.pi / 2, 0.0), np.array([1.5, 0.5, 0.9]))
-    reach = vkc.build(hall(), [vkc.Reach(target)], options=SHORT)
+    reach = program_of(hall(), [vkc.Reach(target)], options=SHORT)
     found = scatter(reach, reach.segments, np.random.default_rng(0))
     assert found is not None
     z, residual = found
@@ -142,7 +142,7 @@ def test_scattered_configurations_are_where_they_say() -> None:
 
 
 def test_nothing_to_scatter() -> None:
-    free = vkc.build(door_scene(), [vkc.Actuate("door", {"hinge": 1.2}), vkc.GoTo(0.0, 0.0)], options=SHORT)
+    free = program_of(door_scene(), [vkc.Actuate("door", {"hinge": 1.2}), vkc.GoTo(0.0, 0.0)], options=SHORT)
     last = scatter(free, free.segments, np.random.default_rng(0))
     assert last is not None
     z, residual = last
@@ -252,7 +252,7 @@ def test_every_seed_is_yielded_once_and_none_before_it_is_looked_for(
 def test_the_base_turns_on_the_way_and_not_in_the_last_step() -> None:
     scene, rng = vkc.load_scene("aisle_drawer"), np.random.default_rng(7)
     for _ in range(16):  # on some of these ways headings wind by a whole turn
-        problem = vkc.build(scene.sample_start(rng), [vkc.GoTo(2.9, 2.0, float(rng.uniform(-3.0, 3.0)))])
+        problem = program_of(scene.sample_start(rng), [vkc.GoTo(2.9, 2.0, float(rng.uniform(-3.0, 3.0)))])
         (seed,) = initialize(problem, "astar", 0)
         turns = np.diff(problem.waypoints(seed.z)[:, 2])
         assert abs(turns[-1]) < 0.2
@@ -262,7 +262,7 @@ def test_the_base_turns_on_the_way_and_not_in_the_last_step() -> None:
 
 def test_what_costs_nothing_has_a_seed() -> None:
     scene = vkc.load_scene("drawer")
-    problem = vkc.build(scene, [vkc.GoTo(*scene.start[:3].tolist())])
+    problem = program_of(scene, [vkc.GoTo(*scene.start[:3].tolist())])
     with np.errstate(all="raise"):
         (seed,) = initialize(problem, "interpolated", 0)
     assert np.abs(seed.z - problem.start).max() < 1e-9

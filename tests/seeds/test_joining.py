@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from helpers.drives import hall
 from helpers.gates import GOAL, NARROW, at, gated, walled
-from helpers.small_problems import door_scene, hand_off_the_handle
+from helpers.small_problems import door_scene, hand_off_the_handle, program_of
 
 import vkc_pin as vkc
 from vkc_pin.seeds import joining
@@ -30,7 +30,7 @@ ROBOT = 9  # x, y and yaw of the base, six joints of the arm
 @cache
 def door() -> tuple[vkc.TrajectoryProblem, np.ndarray, tuple[int, ...]]:
     """Return the problem of opening the door, and knots of it and when they are."""
-    p = vkc.build(door_scene(), [OPEN], options=FEW)
+    p = program_of(door_scene(), [OPEN], options=FEW)
     found = Beam(Knots(p, np.random.default_rng(0))).search(thorough=True)
     best = int(np.argmin(found.cost))
     assert found.trouble[best] == 0.0
@@ -103,7 +103,7 @@ def test_straight_through_the_knots_and_closed_where_it_is_held() -> None:
 
 
 def test_where_nothing_is_on_the_way_the_profile_is_smooth() -> None:
-    p = vkc.build(hall(), [vkc.GoTo(2.0, 1.0, 0.5)])
+    p = program_of(hall(), [vkc.GoTo(2.0, 1.0, 0.5)])
     z = joiner(p).join(np.array([p.start, at(p, (2.0, 1.0, 0.5))]), [0, p.segments])
     assert z is not None
     np.testing.assert_allclose(z[:, :3], np.outer(smooth(p.segments), [2.0, 1.0, 0.5]), atol=1e-12)
@@ -147,7 +147,7 @@ def test_what_follows_goes_on_from_a_way_that_ends_with_whole_turns(turns: int) 
 @pytest.mark.parametrize(("yaw", "turns"), [(0.5, False), (None, True)])
 def test_a_way_may_end_whole_turns_further_unless_the_goal_says_how_far_to_turn(yaw: float | None, turns: bool) -> None:
     """What the way says is taken as it is: whoever finds it knows where there is room to turn."""
-    p = vkc.build(hall(), [vkc.GoTo(2.0, 1.0, yaw)])
+    p = program_of(hall(), [vkc.GoTo(2.0, 1.0, yaw)])
     ways = Say(turning(0.0))
     z = joiner(p, ways).join(np.array([p.start, at(p, (2.0, 1.0, 0.5))]), [0, p.segments])
     assert ways.turns == [turns]
@@ -157,7 +157,7 @@ def test_a_way_may_end_whole_turns_further_unless_the_goal_says_how_far_to_turn(
 
 def test_after_a_phase_whose_arm_ends_elsewhere_the_next_begins_there() -> None:
     """Where nothing is to be reached the arm may stay folded."""
-    p = vkc.build(hall(), [vkc.GoTo(2.0, 1.0, 0.5), vkc.GoTo(0.0, 1.0, 0.5)])
+    p = program_of(hall(), [vkc.GoTo(2.0, 1.0, 0.5), vkc.GoTo(0.0, 1.0, 0.5)])
 
     def lifting(first: np.ndarray, last: np.ndarray, steps: int) -> np.ndarray:
         way = turning(0.0, ROBOT)(first, last, steps)
@@ -176,7 +176,7 @@ def test_after_a_phase_whose_arm_ends_elsewhere_the_next_begins_there() -> None:
 
 
 def test_where_there_is_no_way_it_is_said_once_for_each_phase() -> None:
-    p = vkc.build(hall(), [vkc.GoTo(2.0, 1.0, 0.5), vkc.GoTo(0.0, 1.0, 0.5)])
+    p = program_of(hall(), [vkc.GoTo(2.0, 1.0, 0.5), vkc.GoTo(0.0, 1.0, 0.5)])
     allowed: list[Any] = [None]
     ways = Say(lambda first, last, steps: turning(0.0)(first, last, steps) if allowed.pop(0) else None)
     join = joiner(p, ways)
@@ -195,7 +195,7 @@ def test_where_there_is_no_way_it_is_said_once_for_each_phase() -> None:
 
 
 def test_phases_that_are_called_differently_have_a_line_each() -> None:
-    both = vkc.build(door_scene(), [vkc.GoTo(0.0, 0.0), OPEN], options=FEW)
+    both = program_of(door_scene(), [vkc.GoTo(0.0, 0.0), OPEN], options=FEW)
     found = Beam(Knots(both, np.random.default_rng(0))).search(thorough=False)
     allowed: list[Any] = [None, True, None]
     join = joiner(both, Say(lambda first, last, steps: turning(0.0)(first, last, steps) if allowed.pop(0) else None))
@@ -355,7 +355,7 @@ def test_trees_of_a_fixed_base_move_the_arm_alone(monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(Routes, "guide", never)
     beam = {"name": "beam", "type": "cylinder", "radius": 0.05, "length": 1.2, "position": [0.37, 0.25, 1.7]}
-    p = vkc.build(hall(base="fixed", obstacles=[beam]), [vkc.Reach((0.6, 0.35, 0.9, 0.0, np.pi / 2, 0.0))])
+    p = program_of(hall(base="fixed", obstacles=[beam]), [vkc.Reach((0.6, 0.35, 0.9, 0.0, np.pi / 2, 0.0))])
     first, last = p.start.copy(), p.start.copy()
     first[3:6], last[3:6] = (0.57, -1.2, -1.2), (2.57, -1.2, -1.2)
     way = trees(p).path(0, first, last, 60, turns=False, reaches=True)
@@ -370,7 +370,7 @@ def test_trees_of_a_fixed_base_move_the_arm_alone(monkeypatch: pytest.MonkeyPatc
 
 def test_a_way_of_trees_stays_free_where_the_goal_says_how_far_to_turn() -> None:
     """The guide drives backwards through the gate, which would end a whole turn further."""
-    p = vkc.build(gated(NARROW).scene, [vkc.GoTo(*GOAL[:2], -3.1)])
+    p = program_of(gated(NARROW).scene, [vkc.GoTo(*GOAL[:2], -3.1)])
     z = joiner(p, trees(p)).join(np.array([p.start, at(p, (*GOAL[:2], -3.1))]), [0, p.segments])
     assert z is not None
     np.testing.assert_allclose(z[-1, 2], -3.1, atol=1e-9)

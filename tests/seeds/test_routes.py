@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.gates import GOAL, NARROW, TIGHT, gated, walled
+from helpers.small_problems import program_of
 
 import vkc_pin as vkc
 from vkc_pin.seeds.initialization import initialize
@@ -122,7 +123,7 @@ def test_a_guide_to_what_is_far_inside_something_does_not_exist() -> None:
 
 def test_the_arm_is_folded_once_for_what_is_held() -> None:
     """With nothing in the hand in the first phase, and the cup in the second, of another width."""
-    problem = vkc.build(vkc.load_scene("household"), [vkc.Grasp("cup"), vkc.GoTo(1.0, 0.5)])
+    problem = program_of(vkc.load_scene("household"), [vkc.Grasp("cup"), vkc.GoTo(1.0, 0.5)])
     routes = Routes(problem)
     empty, cup = routes.folded_arm(0), routes.folded_arm(1)
     assert empty is routes.folded_arm(0)

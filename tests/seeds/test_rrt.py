@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from helpers.drives import hall
 from helpers.gates import GOAL, TIGHT, at, gated
+from helpers.small_problems import program_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as some
@@ -135,7 +136,7 @@ def test_who_is_there_already_stays() -> None:
 
 def test_nothing_in_the_way_nothing_beside_it() -> None:
     """The straight way is tried before anything is drawn."""
-    problem = vkc.build(hall(), [vkc.GoTo(2.0, 1.0, 0.5)])
+    problem = program_of(hall(), [vkc.GoTo(2.0, 1.0, 0.5)])
     end = at(problem, (2.0, 1.0, 0.5))
     end[3:] += 0.3
     path = connect(problem, 0, problem.start, end[None], poses=end[None, :3], arms=end[None, 3:], rng=np.random.default_rng(0))
@@ -146,7 +147,7 @@ def test_nothing_in_the_way_nothing_beside_it() -> None:
 
 def test_the_arm_of_a_fixed_base_goes_around_a_pole() -> None:
     pole = {"name": "pole", "type": "cylinder", "radius": 0.05, "length": 1.2, "position": [0.37, 0.25, 1.7]}  # from the ceiling
-    problem = vkc.build(hall(base="fixed", obstacles=[pole]), [vkc.Reach((0.6, 0.35, 0.9, 0.0, np.pi / 2, 0.0))])
+    problem = program_of(hall(base="fixed", obstacles=[pole]), [vkc.Reach((0.6, 0.35, 0.9, 0.0, np.pi / 2, 0.0))])
     first, last = problem.start.copy(), problem.start.copy()
     first[3:6], last[3:6] = (0.57, -1.2, -1.2), (2.57, -1.2, -1.2)
     assert missing(problem, np.array([first, last])).max() == 0.0

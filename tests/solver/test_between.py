@@ -5,9 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 from helpers.drives import hall, moved, through
+from helpers.small_problems import program_of
 
 import vkc_pin as vkc
-from vkc_pin.program.problem import TrajectoryProblem, build
+from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.solver.between import CLOSE, KEEP, collisions_between, merge
 
 ARM = [np.pi, -1.2, 1.9, -0.7, np.pi / 2, 0.0]  # stretched out ahead of the base
@@ -25,7 +26,7 @@ def past_a_post(reach: float = 0.02) -> vkc.Scene:
 
 def straight(scene: vkc.Scene) -> tuple[TrajectoryProblem, np.ndarray]:
     """Return a problem of few waypoints, and the straight way sideways without the start, shape (N, n)."""
-    problem = build(scene, [vkc.GoTo(0.0, WIDTH, 0.0)], options=FEW)
+    problem = program_of(scene, [vkc.GoTo(0.0, WIDTH, 0.0)], options=FEW)
     return problem, through(scene, scene.start, moved(scene.start, y=WIDTH), steps=FEW.reach_waypoints).positions[1:]
 
 
@@ -107,7 +108,7 @@ def test_a_start_that_is_close_to_something_may_leave_it() -> None:
     wall = {"name": "wall", "type": "box", "size": [0.1, 2.0, 0.5], "position": [0.546, 0.0, 0.25]}
     scene = hall(obstacles=[wall])
     assert 0.0 < scene.start_clearance() < KEEP
-    problem = build(scene, [vkc.GoTo(-1.0, 0.0, 0.0)], options=FEW)
+    problem = program_of(scene, [vkc.GoTo(-1.0, 0.0, 0.0)], options=FEW)
     away = through(scene, scene.start, moved(scene.start, x=-1.0), steps=FEW.reach_waypoints).positions[1:]
     assert len(collisions_between(problem, away)[0].waypoint) == 0
     into = through(scene, scene.start, moved(scene.start, x=1.0), steps=FEW.reach_waypoints).positions[1:]

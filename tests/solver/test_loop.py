@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers.drives import hall, moved, through
-from helpers.small_problems import door_scene
+from helpers.small_problems import door_scene, program_of
 
 import vkc_pin as vkc
 from vkc_pin.program.timing import Timing
@@ -24,7 +24,7 @@ PILLAR = {"name": "pillar", "type": "cylinder", "radius": 0.15, "length": 1.6, "
 
 @cache
 def round_a_pillar() -> vkc.TrajectoryProblem:
-    return vkc.build(hall(obstacles=[PILLAR]), [vkc.GoTo(3.2, 0.0, 0.0)], options=FEW)
+    return program_of(hall(obstacles=[PILLAR]), [vkc.GoTo(3.2, 0.0, 0.0)], options=FEW)
 
 
 def straight(problem: vkc.TrajectoryProblem, x: float, y: float = 0.0) -> np.ndarray:
@@ -41,7 +41,7 @@ def solved() -> Solution:
 def hard() -> Solution:
     """The whole task from a stationary seed, not given up: steps are rejected."""
     options = vkc.Options(reach_waypoints=15, turn_waypoints=4, move_waypoints=12, max_outer=10)
-    problem = vkc.build(door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=options)
+    problem = program_of(door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=options)
     (seed,) = initialize(problem, "stationary", 0)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(solver, "GIVE_UP_SHORTFALL", np.inf)
@@ -98,7 +98,7 @@ def test_the_trust_region_shrinks_when_a_step_is_rejected() -> None:
         {"name": f"wall_{k}", "type": "box", "size": [0.1, 3.0, 1.0], "position": [1.5 + 1.2 * k, (-1.0) ** k, 0.5]}
         for k in range(2)
     ]
-    problem = vkc.build(hall(obstacles=walls), [vkc.GoTo(4.2, 0.0, 0.0)], options=vkc.Options(reach_waypoints=14))
+    problem = program_of(hall(obstacles=walls), [vkc.GoTo(4.2, 0.0, 0.0)], options=vkc.Options(reach_waypoints=14))
     history = solve(problem, straight(problem, 4.2)).history
     rejected = [(row, after) for row, after in itertools.pairwise(history) if not row.accepted]
     assert rejected, "nothing was rejected: choose a harder problem"
@@ -242,7 +242,7 @@ def test_what_is_nearly_free_and_hardly_gets_better_is_first_made_free(
 
 def test_a_grasp_between_obstacles_is_made_free_with_small_steps() -> None:
     scene = vkc.load_scene("init_2").sample_start(np.random.default_rng(5))
-    problem = vkc.build(scene, [vkc.Grasp("stick")])
+    problem = program_of(scene, [vkc.Grasp("stick")])
     seed = next(initialize(problem, "astar", 0)).z
     solution, objective, small = solve(problem, seed), problem.objective(seed, problem.timing_for(seed).dt), 0
     for row, after in itertools.pairwise(solution.history):
@@ -329,7 +329,7 @@ def test_without_patience_what_is_stuck_is_left_to_later(patient: bool) -> None:
 def test_motions_far_from_free_are_given_up_soon(monkeypatch: pytest.MonkeyPatch) -> None:
     """A wall from side to side: whatever is done, something is in it."""
     wall = {"name": "wall", "type": "box", "size": [1.0, 12.0, 2.0], "position": [2.0, 0.0, 1.0]}
-    problem = vkc.build(hall(obstacles=[wall]), [vkc.GoTo(4.0, 0.0, 0.0)], options=FEW)
+    problem = program_of(hall(obstacles=[wall]), [vkc.GoTo(4.0, 0.0, 0.0)], options=FEW)
     seed = straight(problem, 4.0)
     solution = solve(problem, seed)
     assert (solution.status, solution.converged) == ("not converged", False)
@@ -342,7 +342,7 @@ def test_motions_far_from_free_are_given_up_soon(monkeypatch: pytest.MonkeyPatch
 
 def test_standing_still_where_one_is_already() -> None:
     """The objective vanishes there; what is left is Ipopt's tolerance."""
-    problem = vkc.build(hall(), [vkc.GoTo(0.0, 0.0, 0.0)], options=FEW)
+    problem = program_of(hall(), [vkc.GoTo(0.0, 0.0, 0.0)], options=FEW)
     still = np.tile(problem.start, (problem.segments, 1))
     solution = solve(problem, still)
     assert solution.converged
@@ -416,7 +416,7 @@ def test_seeds_outside_their_bounds_are_moved_inside() -> None:
 def test_velocity_bounds_bind_when_time_is_short(monkeypatch: pytest.MonkeyPatch) -> None:
     """When it may not take more."""
     options = vkc.Options(reach_waypoints=12, dt=0.25)  # 2.4 m in 3 s at no more than 1 m/s
-    problem = vkc.build(hall(), [vkc.GoTo(2.4, 0.0, 0.0)], options=options)
+    problem = program_of(hall(), [vkc.GoTo(2.4, 0.0, 0.0)], options=options)
     least = problem.timing_for(problem.still)
     monkeypatch.setattr(vkc.TrajectoryProblem, "timing_for", lambda self, z: least)
     monkeypatch.setattr(Timing, "stretched", lambda self, first, second: self)
@@ -432,7 +432,7 @@ def test_velocity_bounds_bind_when_time_is_short(monkeypatch: pytest.MonkeyPatch
 
 def test_a_way_that_is_too_long_takes_longer() -> None:
     options = vkc.Options(reach_waypoints=12, dt=0.25)
-    problem = vkc.build(hall(), [vkc.GoTo(2.4, 0.0, 0.0)], options=options)
+    problem = program_of(hall(), [vkc.GoTo(2.4, 0.0, 0.0)], options=options)
     solution = solve(problem, straight(problem, 2.4))
     assert solution.converged
     assert 3.0 < solution.dt.sum() < 6.0

@@ -7,10 +7,10 @@ from functools import cache
 import numpy as np
 import pytest
 from helpers.carrying import STICK, lifted, room, stand, table
-from helpers.small_problems import SHORT, door_scene, random_configurations
+from helpers.small_problems import SHORT, door_scene, program_of, random_configurations
 
 from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.program.problem import TrajectoryProblem, build
+from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.solver.to_trajectory import as_trajectory
 from vkc_pin.task.steps import Actuate, GoTo, Grasp, Place, Release, Step
 
@@ -20,12 +20,12 @@ ASIDE = lifted(STICK, [0.0, 0.5, 0.0])
 @cache
 def fetching() -> TrajectoryProblem:
     scene = room(stand(), objects=("stick", "ball")).with_held({"stick": "grip"}, at={"stick": (0.02, -0.1)})
-    return build(scene, [Grasp("ball", "pull", "stick.tip"), Place("ball", (0.8, 0.6, 0.7)), GoTo(0.0, 0.0)], options=SHORT)
+    return program_of(scene, [Grasp("ball", "pull", "stick.tip"), Place("ball", (0.8, 0.6, 0.7)), GoTo(0.0, 0.0)], options=SHORT)
 
 
 @cache
 def placing() -> TrajectoryProblem:
-    return build(room(table()), [Place("stick", ASIDE)], options=SHORT)
+    return program_of(room(table()), [Place("stick", ASIDE)], options=SHORT)
 
 
 def unfolded(problem: TrajectoryProblem, seed: int = 0) -> tuple[np.ndarray, Trajectory]:
@@ -76,7 +76,7 @@ def test_what_is_put_down_last_is_let_go_of_at_the_end() -> None:
 )
 def test_a_hand_opens_at_the_end_only_if_it_is_told_to(steps: list[Step], held: dict[str, str], last: str) -> None:
     scene = door_scene().with_held(held) if steps[0] == Release() else door_scene()
-    motion = unfolded(build(scene, steps, options=SHORT))[1]
+    motion = unfolded(program_of(scene, steps, options=SHORT))[1]
     assert motion.phases[-1].name == last
     if last == "let go":
         assert dict(motion.phases[-1].held) == {}
@@ -86,7 +86,7 @@ def test_a_hand_opens_at_the_end_only_if_it_is_told_to(steps: list[Step], held: 
 def test_what_is_let_go_of_before_anything_happens() -> None:
     """A door in the hand at the start is held in no phase. What the hand chose means nothing any more; it keeps its value."""
     for attachment in ("handle", "handle_free"):
-        problem = build(door_scene().with_held({"door": attachment}), [GoTo(0.0, 0.0)], options=SHORT)
+        problem = program_of(door_scene().with_held({"door": attachment}), [GoTo(0.0, 0.0)], options=SHORT)
         motion = unfolded(problem)[1]
         assert [dict(phase.held) for phase in motion.phases] == [{}]
     assert np.all(motion.column("door.handle_free") == 0.0)

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vkc_pin.cache import Cache
 from vkc_pin.chain.contacts import ContactModel
+from vkc_pin.options import Options
 from vkc_pin.program.problem import TrajectoryProblem
+from vkc_pin.scene.scene import Scene
+from vkc_pin.task.compiler import compile_task
+from vkc_pin.task.phases import stretches
+from vkc_pin.task.steps import Step
+from vkc_pin.task.terms import Term, check_active, traced
 
-__all__ = ["Plane", "patterns", "planes", "sizes"]
+__all__ = ["Plane", "build", "patterns", "planes", "sizes"]
 
 _FURTHER = 0.3  # [m]: pairs that much further apart than a plane's are not asked for
 
@@ -120,3 +128,29 @@ def sizes(problem: TrajectoryProblem) -> dict[str, int]:
 def patterns(problem: TrajectoryProblem) -> tuple[Any, Any]:
     """Return where the rows' Jacobian and the Lagrangian's Hessian can differ from zero, as sparse matrices (SciPy)."""
     return problem.transcription.patterns()
+
+
+def build(
+    scene: Scene,
+    steps: Sequence[Step],
+    *,
+    options: Options | None = None,
+    terms: Sequence[Term] = (),
+    cache: Cache | None = None,
+) -> TrajectoryProblem:
+    """Return the nonlinear program of `steps` in `scene`, to look at before solving.
+
+    Args:
+        scene: Robot, objects and obstacles.
+        steps: What should change in the world.
+        options: How to plan.
+        terms: Own constraints and costs.
+        cache: Where the symbolic program is kept, for problems of the same structure in the same thread; None: one of its own.
+
+    Raises:
+        InputError: The steps or terms name something that is not there, or ask for what cannot be done.
+    """
+    options = options or Options()
+    task, terms = compile_task(scene, steps, options), traced(scene, terms)
+    check_active(terms, stretches(task))
+    return TrajectoryProblem(scene, task, options, terms, cache=cache)

@@ -22,12 +22,10 @@ from vkc_pin.program.timing import Timing, runs_between, time_for
 from vkc_pin.program.transcription import transcribe
 from vkc_pin.program.waypoint import Structure
 from vkc_pin.scene.scene import Scene
-from vkc_pin.task.compiler import compile_task
-from vkc_pin.task.phases import Phase, Task, stretches
-from vkc_pin.task.steps import Step
-from vkc_pin.task.terms import Term, check_active, traced
+from vkc_pin.task.phases import Phase, Task
+from vkc_pin.task.terms import Term
 
-__all__ = ["TrajectoryProblem", "build"]
+__all__ = ["TrajectoryProblem"]
 
 _CHOICE_WEIGHT = 1e-3  # of coordinates that are chosen when grasping and do not move: only keeps the problem regular
 
@@ -280,23 +278,3 @@ class TrajectoryProblem:
 def _freeze(*arrays: NDArray[np.float64]) -> None:
     for array in arrays:
         array.flags.writeable = False
-
-
-def build(
-    scene: Scene, steps: Sequence[Step], *, options: Options | None = None, terms: Sequence[Term] = ()
-) -> TrajectoryProblem:
-    """Return the nonlinear program of `steps` in `scene`, to look at before solving.
-
-    Args:
-        scene: Robot, objects and obstacles.
-        steps: What should change in the world.
-        options: How to plan.
-        terms: Own constraints and costs.
-
-    Raises:
-        InputError: The steps or terms name something that is not there, or ask for what cannot be done.
-    """
-    options = options or Options()
-    task, terms = compile_task(scene, steps, options), traced(scene, terms)
-    check_active(terms, stretches(task))
-    return TrajectoryProblem(scene, task, options, terms)

@@ -7,7 +7,6 @@ import base64
 import html
 import itertools
 import re
-import time
 from pathlib import Path
 
 import nbformat
@@ -90,9 +89,7 @@ def test_notebooks_are_kept_without_outputs(path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_first_plan(tmp_path: Path) -> None:
-    began = time.perf_counter()
     cells = executed("01_first_plan", tmp_path)
-    assert time.perf_counter() - began < 150.0  # about ten seconds on a machine that does nothing else
 
     code = [cell for cell in cells.values() if cell.cell_type == "code"]
     until = [cell.id for cell in code].index("show") + 1
@@ -134,9 +131,7 @@ def test_first_plan(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_virtual_kinematic_chain(tmp_path: Path) -> None:
-    began = time.perf_counter()
     cells = executed("02_virtual_kinematic_chain", tmp_path)
-    assert time.perf_counter() - began < 150.0  # about ten seconds on a machine that does nothing else
 
     # A joint a line: name, what it is below, kind, limits.
     tables = {name: [line.split() for line in text(cells[name]).splitlines()[1:]] for name in ("urdf", "inverted", "chain")}
@@ -170,9 +165,7 @@ def test_virtual_kinematic_chain(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_optimisation_problem(tmp_path: Path) -> None:
-    began = time.perf_counter()
     cells = executed("03_optimisation_problem", tmp_path)
-    assert time.perf_counter() - began < 150.0  # about ten seconds on a machine that does nothing else
 
     # The equations are those of the page on the mathematics.
     page = (ROOT / "docs" / "formulation.md").read_text(encoding="utf-8")
@@ -213,9 +206,7 @@ def test_optimisation_problem(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_tools_and_grasps(tmp_path: Path) -> None:
-    began = time.perf_counter()
     cells = executed("04_tools_and_grasps", tmp_path)
-    assert time.perf_counter() - began < 120.0  # less than half a minute on a machine that does nothing else
 
     assert text(cells["attachments"]).startswith("grip: cylindrical, firm True\n  grip_slide: prismatic -0.095 to 0.095\n")
     assert "end: fixed, firm True" in text(cells["attachments"])
@@ -241,9 +232,7 @@ def test_tools_and_grasps(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_initialization(tmp_path: Path) -> None:
-    began = time.perf_counter()
     cells = executed("05_initialization", tmp_path)
-    assert time.perf_counter() - began < 150.0  # less than a minute on a machine that does nothing else
 
     report = text(cells["plan"])
     assert report.startswith("init_3: success — reach stick.grip, touch with stick.tip")
@@ -277,9 +266,7 @@ def test_initialization(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_baselines(tmp_path: Path) -> None:
-    began = time.perf_counter()
     cells = executed("06_baselines", tmp_path)
-    assert time.perf_counter() - began < 240.0  # about a minute on a machine that does nothing else
 
     assert text(cells["vkc"]).startswith("aisle_drawer: success — reach drawer.handle, move drawer.slide")
     assert "every constraint holds" in text(cells["vkc"])
@@ -300,9 +287,7 @@ def test_baselines(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_chores(tmp_path: Path) -> None:
-    began = time.perf_counter()
     cells = executed("07_chores", tmp_path)
-    assert time.perf_counter() - began < 240.0  # about a minute on a machine that does nothing else
 
     report = text(cells["plan"])
     assert report.startswith("household: success — reach refrigerator.handle, move refrigerator.hinge, reach cold_cup.")
@@ -323,9 +308,7 @@ def test_chores(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_own_robot_and_object(tmp_path: Path) -> None:
-    began = time.perf_counter()
     cells = executed("08_own_robot_and_object", tmp_path)
-    assert time.perf_counter() - began < 120.0  # less than half a minute on a machine that does nothing else
 
     assert "('base_x', 'base_y', 'base_yaw', 'panda_joint1'" in text(cells["panda"])
     assert "<Robot panda_cart: 7 joints on a base that is omni, tool frame tool>" in text(cells["robot"])
@@ -347,9 +330,7 @@ def test_own_robot_and_object(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_when_planning_fails(tmp_path: Path) -> None:
-    began = time.perf_counter()
     cells = executed("09_when_planning_fails", tmp_path)
-    assert time.perf_counter() - began < 120.0  # less than half a minute on a machine that does nothing else
 
     assert text(cells["typo-error"]).startswith("steps[0].object: there is no object 'drawr'; did you mean 'drawer'?")
     assert text(cells["limit-report"]).startswith("drawer: FAILED, infeasible")

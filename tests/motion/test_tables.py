@@ -9,50 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.fake_plan import fake_plan
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from helpers.written import FILES, ROBOT, broken, same, trajectories
+from hypothesis import given
 
 import vkc_pin as vkc
 from vkc_pin import cli
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
-from vkc_pin.motion.world import units_of
 from vkc_pin.planning.plan import Plan
-
-FILES = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60, deadline=None)
-ROBOT = ("base_x", "base_y", "base_yaw", "lift", "elbow")
-
-
-@st.composite
-def trajectories(draw: st.DrawFn, largest: float | None = None) -> Trajectory:
-    """Return trajectories whose robot has up to five coordinates, with things held and carried through others."""
-    robot, things = draw(st.integers(3, 5)), draw(st.lists(st.sampled_from("abcde"), max_size=4, unique=True))
-    names = (*ROBOT[:robot], *(f"{name}.joint" for name in things))
-    steps = draw(st.lists(st.floats(1e-3, 1e3), min_size=1, max_size=8))
-    times = draw(st.floats(-1e3, 1e3)) + np.cumsum([0.0, *steps])
-    numbers = st.floats(allow_nan=False, allow_infinity=False) if largest is None else st.floats(-largest, largest)
-    rows = draw(st.lists(st.lists(numbers, min_size=len(names), max_size=len(names)), min_size=len(times), max_size=len(times)))
-    cuts = sorted(draw(st.sets(st.integers(1, len(steps)))) | {len(steps)})
-    label, phases, first = st.text(st.characters(exclude_categories=["Cs"]), max_size=6), [], 0
-    for last in cuts:
-        held = draw(st.dictionaries(label, label, max_size=2))
-        by = {name: draw(label) for name in held if draw(st.booleans())}
-        phases.append(PhaseSpan(draw(label), first, last, held, by))
-        first = last
-    return Trajectory(names, times, rows, tuple(phases), robot)
-
-
-def same(one: Trajectory, other: Trajectory) -> bool:
-    return one.to_dict() == other.to_dict()
 
 
 @pytest.fixture(scope="module")
 def plan() -> Plan:
     return fake_plan()
-
-
-def broken(path: Path, text: str) -> Path:
-    path.write_text(text, encoding="utf-8")
-    return path
 
 
 # There and back
@@ -68,14 +36,6 @@ def test_tables_are_exact(trajectory: Trajectory, tmp_path: Path) -> None:
 @given(trajectory=trajectories())
 def test_json_is_exact(trajectory: Trajectory, tmp_path: Path) -> None:
     assert same(Trajectory.from_json(trajectory.to_json(tmp_path / "motion.json")), trajectory)
-
-
-@FILES
-@given(trajectory=trajectories(largest=1e6))
-def test_ros_is_exact_to_a_nanosecond(trajectory: Trajectory) -> None:
-    back = Trajectory.from_ros(json.loads(json.dumps(trajectory.to_ros(joints="all"))), like=trajectory)
-    np.testing.assert_allclose(back.times, trajectory.times - trajectory.times[0], rtol=0.0, atol=1e-9)
-    assert {**back.to_dict(), "times": 0} == {**trajectory.to_dict(), "times": 0}
 
 
 @pytest.mark.parametrize("name", ["a\rb", "\n", "\r\n", 'a "quoted", name'])
@@ -105,18 +65,6 @@ def test_columns_have_names_and_units(plan: Plan, tmp_path: Path) -> None:
     assert lines[1][-3:] == ["1", "reach door.handle", "{}"]
     assert lines[8][-3:] == ["2", "move door.hinge", '{"door": "handle"}']
     assert [float(cell) for cell in lines[5][1:4]] == plan.trajectory.positions[4, :3].tolist()
-
-
-def test_units_of_joints_that_slide_and_of_grasps() -> None:
-    units = units_of(vkc.load_scene("drawer"))
-    assert (units["drawer.slide"], units["base_x"], units["base_yaw"]) == ("m", "m", "rad")
-    stick = units_of(vkc.load_scene("init_3"))
-    assert {stick[name] for name in stick if name.endswith("_slide")} == {"m"}
-    assert {stick[name] for name in stick if name.endswith("_turn")} == {"rad"}
-
-
-def test_every_coordinate_of_a_plan_has_a_unit(door_plan: Plan) -> None:
-    assert set(door_plan.trajectory.names) <= set(units_of(door_plan.scene))
 
 
 @pytest.mark.parametrize(
@@ -210,117 +158,6 @@ def test_bad_json(tmp_path: Path, text: str, message: str) -> None:
 
 
 # ROS
-
-
-def test_a_message_has_the_fields_of_a_joint_trajectory(plan: Plan) -> None:
-    message = plan.to_ros(frame="map", stamp=1.5)
-    assert json.loads(json.dumps(message)) == message, "plain data"
-    assert set(message) == {"header", "joint_names", "points"}
-    assert message["header"] == {"stamp": {"sec": 1, "nanosec": 500_000_000}, "frame_id": "map"}
-    assert message["joint_names"] == list(plan.trajectory.names[:9]), "what has a motor"
-    for point, moment in zip(message["points"], plan.trajectory.times, strict=True):
-        assert set(point) == {"positions", "velocities", "accelerations", "effort", "time_from_start"}
-        assert {len(point[key]) for key in ("positions", "velocities", "accelerations")} == {9}
-        assert point["effort"] == []
-        since = point["time_from_start"]
-        assert type(since["sec"]) is type(since["nanosec"]) is int
-        assert 0 <= since["nanosec"] < 1_000_000_000
-        assert since["sec"] + 1e-9 * since["nanosec"] == pytest.approx(moment, abs=1e-9)
-    for end in (message["points"][0], message["points"][-1]):
-        assert set(end["velocities"]) == {0.0}
-
-
-def test_fewer_derivatives(plan: Plan) -> None:
-    for count in (0, 1, 2):
-        point = plan.to_ros(derivatives=count)["points"][1]
-        assert [len(point["velocities"]) > 0, len(point["accelerations"]) > 0] == [count > 0, count > 1]
-
-
-@pytest.mark.parametrize("rate", [1.0, 7.0, 50])
-def test_points_at_a_rate(plan: Plan, rate: float) -> None:
-    message = plan.to_ros(rate=rate, joints="all")
-    times = np.array([p["time_from_start"]["sec"] + 1e-9 * p["time_from_start"]["nanosec"] for p in message["points"]])
-    assert len(times) == np.ceil(6.0 * rate) + 1
-    np.testing.assert_allclose(times[:-1], np.arange(len(times) - 1) / rate, atol=1e-9)
-    assert times[-1] == pytest.approx(6.0)
-    assert message["points"][0]["positions"] == plan.trajectory.positions[0].tolist()
-    assert message["points"][-1]["positions"] == plan.trajectory.positions[-1].tolist()
-    assert np.ptp([point["positions"] for point in message["points"]], axis=0) == pytest.approx(
-        np.ptp(plan.trajectory.positions, axis=0)
-    )
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"rate": 0.0}, "rate: out of range"),
-        ({"rate": "10"}, "rate: out of range"),
-        ({"derivatives": 3}, "derivatives: out of range"),
-        ({"stamp": -1.0}, "stamp: out of range"),
-    ],
-)
-def test_bad_options(plan: Plan, options: dict[str, Any], message: str) -> None:
-    with pytest.raises(vkc.InputError, match=message):
-        plan.to_ros(**options)
-
-
-def changed(message: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
-    """Return a copy with another value at a path such as "points/0/positions"; None removes it."""
-    copy = json.loads(json.dumps(message))
-    *way, last = [int(part) if part.isdigit() else part for part in path.split("/")]
-    inner = copy
-    for part in way:
-        inner = inner[part]
-    if value is None:
-        del inner[last]
-    else:
-        inner[last] = value
-    return copy
-
-
-@pytest.mark.parametrize(
-    ("path", "value", "expected"),
-    [
-        ("joint_names", None, "joint_names: this is missing"),
-        ("joint_names", "x", "joint_names: wrong kind of value .expected a list, got 'x'"),
-        ("joint_names/1", "base_x", "Trajectory.names: a name occurs twice"),
-        ("points", {}, "points: wrong kind of value"),
-        ("points", [], "Trajectory.times: times do not increase"),
-        ("points/2", 3, r"points\[2\].positions: this is missing"),
-        ("points/2/positions", [1.0], r"points\[2\].positions: wrong number of values .expected 9, got 1"),
-        ("points/2/positions/4", "far", r"points\[2\].positions\[4\]: not a number .expected a number, got 'far'"),
-        ("points/2/positions/4", True, r"points\[2\].positions\[4\]: not a number"),
-        ("points/2/positions/4", float("nan"), r"Trajectory.positions\[2, 4\]: not finite"),
-        ("points/1/time_from_start/sec", 0.5, r"points\[1\].time_from_start.sec: wrong kind of value .expected a whole number"),
-        ("points/1/time_from_start", None, r"points\[1\].time_from_start: this is missing"),
-        ("points/1/time_from_start/nanosec", None, r"points\[1\].time_from_start.nanosec: this is missing"),
-        ("points/1/time_from_start/sec", 5, "Trajectory.times: times do not increase"),
-    ],
-)
-def test_bad_messages(plan: Plan, tmp_path: Path, path: str, value: Any, expected: str) -> None:
-    message = changed(plan.to_ros(), path, value)
-    with pytest.raises(vkc.InputError, match=f"^{expected}"):
-        Trajectory.from_ros(message)
-    with pytest.raises(vkc.InputError, match=f"bad.json: {expected}"):
-        Trajectory.from_ros(broken(tmp_path / "bad.json", json.dumps(message)))
-
-
-def test_the_arm_alone_is_no_trajectory(plan: Plan) -> None:
-    few = plan.to_ros(joints=list(plan.trajectory.names[3:5]))
-    with pytest.raises(vkc.InputError, match="robot_size: out of range"):
-        Trajectory.from_ros(few)
-
-
-@pytest.mark.parametrize("smooth", [True, False])
-def test_what_is_sent_can_be_validated(door_plan: Plan, smooth: bool) -> None:
-    """Between waypoints, on lines or cubics, the motion does what was asked for, and keeps its distances."""
-    sent = Trajectory.from_ros(door_plan.to_ros(joints="all", rate=50, smooth=smooth), like=door_plan.trajectory)
-    assert [phase.name for phase in sent.phases] == [phase.name for phase in door_plan.trajectory.phases]
-    report = vkc.validate(door_plan.scene, door_plan.steps, sent, door_plan.options)
-    wrong = {"acceleration", "closure"} if smooth else {"acceleration"}  # it jumps between linear pieces
-    assert {violation.constraint for violation in report.violations} <= wrong, report.lines()
-    assert report.closure_error < (2e-3 if smooth else 1e-3)
-    assert np.abs(sent.positions - door_plan.trajectory.at(sent.times)).max() < (0.02 if smooth else 1e-9)
 
 
 # The command line

@@ -9,8 +9,10 @@ from helpers.small_problems import full_scene, random_configurations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import vkc_pin as vkc
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
-from vkc_pin.motion.world import World
+from vkc_pin.motion.world import World, units_of
+from vkc_pin.planning.plan import Plan
 from vkc_pin.scene.placed import standing_geometry
 
 
@@ -139,3 +141,15 @@ def test_positions_along_a_motion(world: World) -> None:
 
 def test_the_robots_meshes_are_read_only_to_be_drawn() -> None:
     assert "visual" not in vars(World(full_scene()))
+
+
+def test_units_of_joints_that_slide_and_of_grasps() -> None:
+    units = units_of(vkc.load_scene("drawer"))
+    assert (units["drawer.slide"], units["base_x"], units["base_yaw"]) == ("m", "m", "rad")
+    stick = units_of(vkc.load_scene("init_3"))
+    assert {stick[name] for name in stick if name.endswith("_slide")} == {"m"}
+    assert {stick[name] for name in stick if name.endswith("_turn")} == {"rad"}
+
+
+def test_every_coordinate_of_a_plan_has_a_unit(door_plan: Plan) -> None:
+    assert set(door_plan.trajectory.names) <= set(units_of(door_plan.scene))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from typing import Any
@@ -287,10 +286,11 @@ def test_time_is_up_during_the_race(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_real_solver_stops_during_the_race() -> None:
-    before = time.perf_counter()
+    """No round is begun any more, and Ipopt stops at its first iteration."""
     plan = vkc.plan(door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], time_limit=0.01)
-    assert time.perf_counter() - before - plan.metrics["build_time"] < 5.0
     assert plan.status == "time limit"
+    assert plan.metrics["rounds"] <= 1
+    assert plan.metrics["iterations"] <= 1
     assert plan.validation.violations
     assert plan.initialization != "none"
     assert np.isfinite(plan.trajectory.positions).all()

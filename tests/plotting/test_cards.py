@@ -6,7 +6,6 @@ import io
 import re
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -66,11 +65,8 @@ def test_long_lists_are_cut(plan: Plan) -> None:
     assert "... and 4 more" in html
 
 
-def test_the_picture_is_small_quick_and_not_empty(door_plan: Plan) -> None:
-    door_plan._repr_html_()
-    began = time.process_time()
+def test_the_picture_is_small_and_not_empty(door_plan: Plan) -> None:
     html = door_plan._repr_html_()
-    assert time.process_time() - began < 1.0
     assert len(html) < 60_000
     pixels = picture(html)
     assert min(pixels.shape[:2]) > 120

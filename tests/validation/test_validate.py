@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 
 import coal
 import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.drives import DT, hall, moved, of_rows, through, with_positions
+from helpers.judging import check, names, only, until_the_grasp, with_attachments, with_object
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.models.articulation import Attachment
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.options import Options
 from vkc_pin.scene.placed import PlacedObject
 from vkc_pin.scene.scene import Scene
 from vkc_pin.validation.clearance import clearance_curves
-from vkc_pin.validation.report import Report, Violation
 from vkc_pin.validation.validate import validate
 
 WRIST = "wrist_3_joint"
@@ -37,34 +35,6 @@ def drive(empty: Scene) -> Trajectory:
 
 
 ARRIVED = vkc.GoTo(2.0, 0.0, np.pi / 2)
-
-
-def only(report: Report) -> Violation:
-    """Return the one violation there is."""
-    assert len(report.violations) == 1, "\n".join(report.lines())
-    return report.violations[0]
-
-
-def names(report: Report) -> set[tuple[str, str]]:
-    return {(violation.constraint, violation.subject) for violation in report.violations}
-
-
-def check(plan: vkc.Plan, *, scene: Scene | None = None, trajectory: Trajectory | None = None, **options: float) -> Report:
-    """Validate the planned motion with something about it changed."""
-    return validate(scene or plan.scene, plan.steps, trajectory or plan.trajectory, dataclasses.replace(plan.options, **options))
-
-
-def with_object(scene: Scene, name: str = "door", *, placement: pin.SE3 | None = None, **fields: object) -> Scene:
-    """Return `scene` with an object that stands elsewhere or has other fields."""
-    placed = scene.objects[name]
-    changed = dataclasses.replace(placed, object=dataclasses.replace(placed.object, **fields))
-    if placement is not None:
-        changed = dataclasses.replace(changed, placement=placement)
-    return dataclasses.replace(scene, objects={**scene.objects, name: changed})
-
-
-def with_attachments(scene: Scene, change: Mapping[str, Attachment]) -> Scene:
-    return with_object(scene, attachments={**scene.objects["door"].object.attachments, **change})
 
 
 # --- what is right ------------------------------------------------------------------------------------------------
@@ -367,125 +337,6 @@ def test_a_joint_that_the_grasp_cannot_drive_moves(door_plan: vkc.Plan) -> None:
 # --- goals and their order ----------------------------------------------------------------------------------------
 
 
-def test_not_far_enough_open(door_plan: vkc.Plan) -> None:
-    steps = [vkc.Actuate("door", {"hinge": 1.25})]
-    found = only(validate(door_plan.scene, steps, door_plan.trajectory, door_plan.options))
-    assert (found.constraint, found.subject, found.unit) == ("goal", "door.hinge", "rad")
-    assert found.waypoint == len(door_plan.trajectory.times) - 1
-    assert found.amount == pytest.approx(0.05 - door_plan.options.goal_angle, abs=1e-6)
-
-
-def until_the_grasp(plan: vkc.Plan) -> Trajectory:
-    """Return the first phase of the planned motion."""
-    first = plan.trajectory.phases[0]
-    times, positions = plan.trajectory.times[: first.last + 1], plan.trajectory.positions[: first.last + 1]
-    return dataclasses.replace(plan.trajectory, times=times, positions=positions, phases=(first,))
-
-
-def test_grasp(door_plan: vkc.Plan) -> None:
-    motion = until_the_grasp(door_plan)
-    loose = dataclasses.replace(door_plan.options)
-    for step in (vkc.Grasp("door"), vkc.Grasp("door", "handle"), vkc.Grasp("door", "handle_free")):
-        report = validate(door_plan.scene, [step], motion, loose)
-        assert {found.constraint for found in report.violations} <= {"acceleration"}, "\n".join(report.lines())
-    here = door_plan.scene.objects["door"].placement
-    away = with_object(door_plan.scene, placement=pin.SE3(here.rotation, here.translation + np.array([0.0, 0.0, 0.003])))
-    found = next(v for v in validate(away, [vkc.Grasp("door")], motion, loose).violations if v.constraint == "goal")
-    assert (found.subject, found.unit, found.waypoint) == ("door.handle", "m", len(motion.times) - 1)
-    assert found.amount == pytest.approx(0.003 - loose.goal_position, abs=5e-4)
-
-
-def test_the_grasp_that_is_used_is_the_one_that_is_meant(door_plan: vkc.Plan) -> None:
-    """Without a name, holding it anywhere will do."""
-    grasps = door_plan.scene.objects["door"].object.attachments
-    elsewhere = pin.SE3(grasps["handle"].placement.rotation, grasps["handle"].placement.translation + np.array([0.0, 0.05, 0.0]))
-    first = {"decoy": dataclasses.replace(grasps["handle"], name="decoy", placement=elsewhere), **grasps}
-    scene = with_object(door_plan.scene, attachments=first)
-    steps = [vkc.Grasp("door"), *door_plan.steps]
-    assert validate(scene, steps, door_plan.trajectory, door_plan.options).ok
-    steps = [vkc.Grasp("door", "decoy"), *door_plan.steps]
-    assert {v.constraint for v in validate(scene, steps, door_plan.trajectory, door_plan.options).violations} == {"goal"}
-
-
-def tool_at_the_end(scene: Scene, motion: Trajectory, frame: str) -> pin.SE3:
-    model = scene.robot.model
-    data = model.createData()
-    pin.framesForwardKinematics(model, data, scene.robot.coordinates.q(motion.positions[-1]))
-    return data.oMf[model.getFrameId(frame)].copy()
-
-
-@pytest.mark.parametrize("frame", [None, "forearm_link"])
-def test_reach(empty: Scene, drive: Trajectory, frame: str | None) -> None:
-    name = frame or empty.robot.tool_frame
-    pose = tool_at_the_end(empty, drive, name)
-    assert validate(empty, [vkc.Reach(pose, frame)], drive).ok
-    beside = pin.SE3(pose.rotation, pose.translation + np.array([0.0, 0.003, 0.004]))
-    found = only(validate(empty, [vkc.Reach(beside, frame)], drive))
-    assert (found.constraint, found.subject, found.waypoint, found.unit) == ("goal", name, 40, "m")
-    assert found.amount == pytest.approx(0.005 - 1e-3)
-    turned = pose * pin.SE3(pin.exp3(np.array([0.0, 0.01, 0.0])), np.zeros(3))
-    found = only(validate(empty, [vkc.Reach(turned, frame)], drive))
-    assert (found.constraint, found.subject, found.waypoint, found.unit) == ("goal", name, 40, "rad")
-    assert found.amount == pytest.approx(0.01 - 1e-3)
-    half_round = pose * pin.SE3(pin.exp3(np.array([np.pi, 0.0, 0.0])), np.zeros(3))
-    assert only(validate(empty, [vkc.Reach(half_round, frame)], drive)).amount == pytest.approx(np.pi - 1e-3, abs=1e-6)
-
-
-def test_go_to(empty: Scene, drive: Trajectory) -> None:
-    found = only(validate(empty, [vkc.GoTo(2.003, 0.004, np.pi / 2)], drive))
-    assert (found.constraint, found.subject, found.waypoint, found.unit) == ("goal", "base", 40, "m")
-    assert found.amount == pytest.approx(0.005 - 1e-3)
-    found = only(validate(empty, [vkc.GoTo(2.0, 0.0, np.pi / 2 + 2 * np.pi - 0.02)], drive))
-    assert (found.constraint, found.subject, found.waypoint, found.unit) == ("goal", "base heading", 40, "rad")
-    assert found.amount == pytest.approx(0.02 - 1e-3)
-
-
-def test_places_in_the_wrong_order(empty: Scene) -> None:
-    one, two = moved(empty.start, x=1.0), moved(empty.start, x=1.0, y=1.0)
-    motion = through(empty, empty.start, one, two)
-    first, second = vkc.GoTo(1.0, 0.0), vkc.GoTo(1.0, 1.0)
-    assert validate(empty, [first, second], motion).ok
-    found = only(validate(empty, [second, first], motion))
-    assert (found.constraint, found.subject) == ("goal", "base")
-    assert found.amount == pytest.approx(1.0 - 1e-3)
-    assert ("goal", "base") in names(validate(empty, [vkc.GoTo(0.5, 0.0), second], motion))  # passed, but not at an end
-    assert names(validate(empty, [first], motion)) == {("goal", "base")}  # it does not stay there
-    further = through(empty, empty.start, one, two, empty.start)
-    home = vkc.GoTo(0.0, 0.0)
-    assert validate(empty, [first, second, home], further).ok
-    assert names(validate(empty, [second, first, home], further)) == {("goal", "base")}
-
-
-def test_a_step_that_is_missing(empty: Scene, drive: Trajectory) -> None:
-    found = only(validate(empty, [vkc.GoTo(-1.0, 0.0), ARRIVED], drive))
-    assert (found.constraint, found.subject) == ("goal", "base")
-
-
-def test_the_door_is_opened_before_its_turn(door_plan: vkc.Plan) -> None:
-    """At the end both steps' goals hold; but the robot was to drive there first."""
-    x, y, yaw = door_plan.trajectory.positions[-1, :3]
-    there, open_it = vkc.GoTo(x, y, yaw), door_plan.steps[0]
-    assert validate(door_plan.scene, [open_it, there], door_plan.trajectory, door_plan.options).ok
-    found = only(validate(door_plan.scene, [there, open_it], door_plan.trajectory, door_plan.options))
-    assert (found.constraint, found.subject) == ("order", "door")
-    assert found.waypoint == door_plan.trajectory.phases[1].first
-
-
-def test_steps_that_are_done_already(door_plan: vkc.Plan) -> None:
-    """A step whose goal holds anyway takes no time, wherever it stands."""
-    scene, motion, options = door_plan.scene, door_plan.trajectory, door_plan.options
-    here = vkc.GoTo(*scene.start[:3].tolist())
-    for steps in (
-        [here, *door_plan.steps],
-        [vkc.Grasp("door"), *door_plan.steps],
-        [vkc.Actuate("door", {"hinge": 0.0}), *door_plan.steps],
-        [*door_plan.steps, *door_plan.steps],
-        [*door_plan.steps, vkc.Grasp("door")],
-    ):
-        report = validate(scene, steps, motion, options)
-        assert report.ok, "\n".join(report.lines())
-
-
 # --- clearance ----------------------------------------------------------------------------------------------------
 
 
@@ -603,25 +454,3 @@ def test_bad_trajectories(door_plan: vkc.Plan, empty: Scene) -> None:
     assert other.value.expected == "door.handle_free"
     with pytest.raises(UnknownNameError):
         validate(empty, steps, motion)
-
-
-@pytest.mark.parametrize(
-    ("step", "field", "nearest"),
-    [
-        (vkc.Actuate("dor", {"hinge": 1.0}), "steps[0].object", "door"),
-        (vkc.Actuate("door", {"hinges": 1.0}), "steps[0].joints", "hinge"),
-        (vkc.Actuate("door", {"hinge": 1.0}, "handel"), "steps[0].attachment", "handle"),
-        (vkc.Grasp("door", "handel"), "steps[0].attachment", "handle"),
-        (vkc.Reach([0.0] * 6, "tol"), "steps[0].frame", "tool"),
-    ],
-)
-def test_steps_that_name_what_is_not_there(door_plan: vkc.Plan, step: object, field: str, nearest: str) -> None:
-    with pytest.raises(UnknownNameError) as caught:
-        validate(door_plan.scene, [step], door_plan.trajectory, door_plan.options)
-    assert (caught.value.field, caught.value.nearest) == (field, nearest)
-
-
-def test_no_steps(door_plan: vkc.Plan) -> None:
-    for steps in ([], ["open the door"]):
-        with pytest.raises(InputError, match="steps"):
-            validate(door_plan.scene, steps, door_plan.trajectory, door_plan.options)

@@ -67,7 +67,7 @@ def test_results(tmp_path: Path) -> None:
     assert (meta["benchmark"], meta["seed"], meta["scenes"]) == ("squares", 3, ["a", "b"])
     (session,) = meta["sessions"]
     assert (session["jobs"], session["trials"]) == (1, 6)
-    assert 0.0 <= session["seconds"] < 60.0  # rounded
+    assert session["seconds"] >= 0.0  # rounded
     assert 20.0 < meta["peak_memory_mb"] < 10_000.0
 
 

@@ -1,0 +1,50 @@
+"""Reports on motions, and scenes and motions with something about them changed."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+import pinocchio as pin
+
+import vkc_pin as vkc
+from vkc_pin.models.articulation import Attachment
+from vkc_pin.motion.trajectory import Trajectory
+from vkc_pin.scene.scene import Scene
+from vkc_pin.validation.report import Report, Violation
+from vkc_pin.validation.validate import validate
+
+
+def only(report: Report) -> Violation:
+    """Return the one violation there is."""
+    assert len(report.violations) == 1, "\n".join(report.lines())
+    return report.violations[0]
+
+
+def names(report: Report) -> set[tuple[str, str]]:
+    return {(violation.constraint, violation.subject) for violation in report.violations}
+
+
+def check(plan: vkc.Plan, *, scene: Scene | None = None, trajectory: Trajectory | None = None, **options: float) -> Report:
+    """Validate the planned motion with something about it changed."""
+    return validate(scene or plan.scene, plan.steps, trajectory or plan.trajectory, dataclasses.replace(plan.options, **options))
+
+
+def with_object(scene: Scene, name: str = "door", *, placement: pin.SE3 | None = None, **fields: object) -> Scene:
+    """Return `scene` with an object that stands elsewhere or has other fields."""
+    placed = scene.objects[name]
+    changed = dataclasses.replace(placed, object=dataclasses.replace(placed.object, **fields))
+    if placement is not None:
+        changed = dataclasses.replace(changed, placement=placement)
+    return dataclasses.replace(scene, objects={**scene.objects, name: changed})
+
+
+def with_attachments(scene: Scene, change: Mapping[str, Attachment]) -> Scene:
+    return with_object(scene, attachments={**scene.objects["door"].object.attachments, **change})
+
+
+def until_the_grasp(plan: vkc.Plan) -> Trajectory:
+    """Return the first phase of the planned motion."""
+    first = plan.trajectory.phases[0]
+    times, positions = plan.trajectory.times[: first.last + 1], plan.trajectory.positions[: first.last + 1]
+    return dataclasses.replace(plan.trajectory, times=times, positions=positions, phases=(first,))

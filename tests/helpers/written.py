@@ -1,0 +1,42 @@
+"""Trajectories of all kinds, and files that hold them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+
+from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+
+FILES = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60, deadline=None)
+ROBOT = ("base_x", "base_y", "base_yaw", "lift", "elbow")
+
+
+@st.composite
+def trajectories(draw: st.DrawFn, largest: float | None = None) -> Trajectory:
+    """Return trajectories whose robot has up to five coordinates, with things held and carried through others."""
+    robot, things = draw(st.integers(3, 5)), draw(st.lists(st.sampled_from("abcde"), max_size=4, unique=True))
+    names = (*ROBOT[:robot], *(f"{name}.joint" for name in things))
+    steps = draw(st.lists(st.floats(1e-3, 1e3), min_size=1, max_size=8))
+    times = draw(st.floats(-1e3, 1e3)) + np.cumsum([0.0, *steps])
+    numbers = st.floats(allow_nan=False, allow_infinity=False) if largest is None else st.floats(-largest, largest)
+    rows = draw(st.lists(st.lists(numbers, min_size=len(names), max_size=len(names)), min_size=len(times), max_size=len(times)))
+    cuts = sorted(draw(st.sets(st.integers(1, len(steps)))) | {len(steps)})
+    label, phases, first = st.text(st.characters(exclude_categories=["Cs"]), max_size=6), [], 0
+    for last in cuts:
+        held = draw(st.dictionaries(label, label, max_size=2))
+        by = {name: draw(label) for name in held if draw(st.booleans())}
+        phases.append(PhaseSpan(draw(label), first, last, held, by))
+        first = last
+    return Trajectory(names, times, rows, tuple(phases), robot)
+
+
+def same(one: Trajectory, other: Trajectory) -> bool:
+    return one.to_dict() == other.to_dict()
+
+
+def broken(path: Path, text: str) -> Path:
+    path.write_text(text, encoding="utf-8")
+    return path

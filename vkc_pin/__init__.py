@@ -16,6 +16,7 @@ from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
 from vkc_pin.plotting import cards as _cards  # noqa: F401 - registers what notebooks show of a scene
 from vkc_pin.program.problem import TrajectoryProblem, build
+from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.placed import PlacedObject
 from vkc_pin.scene.scene import Scene, load_scene
 from vkc_pin.solver.solution import Iteration
@@ -40,6 +41,7 @@ __all__ = [
     "Freedom",
     "GoTo",
     "Grasp",
+    "Hold",
     "InputError",
     "Iteration",
     "Latch",

@@ -17,6 +17,7 @@ from vkc_pin import cli
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.motion.world import units_of
 from vkc_pin.planning.plan import Plan
+from vkc_pin.scene.hold import Hold
 
 FILES = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60, deadline=None)
 ROBOT = ("base_x", "base_y", "base_yaw", "lift", "elbow")
@@ -33,10 +34,14 @@ def trajectories(draw: st.DrawFn, largest: float | None = None) -> Trajectory:
     rows = draw(st.lists(st.lists(numbers, min_size=len(names), max_size=len(names)), min_size=len(times), max_size=len(times)))
     cuts = sorted(draw(st.sets(st.integers(1, len(steps)))) | {len(steps)})
     label, phases, first = st.text(st.characters(exclude_categories=["Cs"]), max_size=6), [], 0
+    name, link = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="."), max_size=6), label.filter(bool)
     for last in cuts:
-        held = draw(st.dictionaries(label, label, max_size=2))
-        by = {name: draw(label) for name in held if draw(st.booleans())}
-        phases.append(PhaseSpan(draw(label), first, last, held, by))
+        held = list(draw(st.dictionaries(name, label, max_size=3)).items())
+        holds: list[Hold] = []
+        for thing, attachment in held:
+            by = draw(st.sampled_from([None, *holds]))
+            holds.append(Hold(thing, attachment, by, draw(link) if by else None))
+        phases.append(PhaseSpan(draw(label), first, last, tuple(holds)))
         first = last
     return Trajectory(names, times, rows, tuple(phases), robot)
 
@@ -80,7 +85,7 @@ def test_ros_is_exact_to_a_nanosecond(trajectory: Trajectory) -> None:
 
 @pytest.mark.parametrize("name", ["a\rb", "\n", "\r\n", 'a "quoted", name'])
 def test_names_with_line_ends_come_back(name: str, tmp_path: Path) -> None:
-    phase = PhaseSpan(name, 0, 1, {name: name}, {name: name})
+    phase = PhaseSpan(name, 0, 1, (Hold(name, name), Hold("other", name, Hold(name, name), name)))
     trajectory = Trajectory(ROBOT[:3], np.arange(2.0), np.zeros((2, 3)), (phase,), 3)
     assert same(Trajectory.from_csv(trajectory.to_csv(tmp_path / "motion.csv")), trajectory)
 

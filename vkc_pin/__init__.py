@@ -17,6 +17,7 @@ from vkc_pin.planning.planner import Planner, plan
 from vkc_pin.plotting import cards as _cards  # noqa: F401 - registers what notebooks show of a scene
 from vkc_pin.program.inspection import build
 from vkc_pin.program.problem import TrajectoryProblem
+from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.placed import PlacedObject
 from vkc_pin.scene.scene import Scene, load_scene
 from vkc_pin.solver.solution import Iteration
@@ -41,6 +42,7 @@ __all__ = [
     "Freedom",
     "GoTo",
     "Grasp",
+    "Hold",
     "InputError",
     "Iteration",
     "Latch",

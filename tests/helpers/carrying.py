@@ -13,6 +13,7 @@ import pinocchio as pin
 from helpers.drives import DT, hall
 from vkc_pin.models.object_file import load_object
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.scene.hold import holds_of
 from vkc_pin.scene.placed import PlacedObject
 from vkc_pin.scene.scene import Scene
 
@@ -125,10 +126,10 @@ class Script:
     def __post_init__(self) -> None:
         self.rows = [np.array(self.scene.start)]
         self.phases: list[PhaseSpan] = []
-        self.held, self.by = dict(self.scene.held), dict(self.scene.held_by)
-        for name, attachment in self.held.items():
-            freedoms = self.scene.objects[name].object.attachment(attachment).freedoms
-            self._set(name, attachment, self.scene.held_at.get(name, (0.0,) * len(freedoms)))
+        self.held = self.scene.held
+        self.by = {hold.object: str(hold.frame) for hold in self.scene.holds if hold.by}
+        for hold in self.scene.holds:
+            self._set(hold.object, hold.attachment, hold.at)
 
     def _set(self, name: str, attachment: str, values: Sequence[float]) -> None:
         grasp = self.scene.objects[name].object.attachment(attachment)
@@ -140,7 +141,8 @@ class Script:
         smooth, before = share**2 * (3.0 - 2.0 * share), self.rows[-1]
         first = len(self.rows) - 1
         self.rows += list(before + smooth * (row - before))
-        self.phases.append(PhaseSpan(f"phase {len(self.phases)}", first, len(self.rows) - 1, dict(self.held), dict(self.by)))
+        holds = holds_of(self.held, self.by)
+        self.phases.append(PhaseSpan(f"phase {len(self.phases)}", first, len(self.rows) - 1, holds))
         return self
 
     def wait(self) -> Script:

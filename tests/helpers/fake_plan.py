@@ -7,6 +7,7 @@ import numpy as np
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
+from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.scene import Scene, load_scene
 from vkc_pin.task.steps import Actuate
 from vkc_pin.validation.report import Report, Violation
@@ -24,7 +25,7 @@ def fake_plan(scene: Scene | None = None) -> Plan:
     start = np.concatenate([scene.start, np.zeros(3)])
     end = start + np.concatenate([[2.3, -0.5, -3.9], 0.8 * np.ones(len(robot) - 3), [HINGE, 0.6, 0.3]])
     positions = start + np.outer(done**2, end - start)
-    phases = (PhaseSpan("reach door.handle", 0, 6), PhaseSpan("move door.hinge", 6, len(times) - 1, {"door": "handle"}))
+    phases = (PhaseSpan("reach door.handle", 0, 6), PhaseSpan("move door.hinge", 6, len(times) - 1, (Hold("door", "handle"),)))
     blame = Violation("penetration", "forearm_link – sofa", 9, 4.0, 0.03, "m", "overlap by 30 mm")
     return Plan(
         scene=scene,

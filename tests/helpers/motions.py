@@ -7,6 +7,7 @@ import pinocchio as pin
 
 from helpers.carrying import Script, room, table
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.scene import Scene
 from vkc_pin.validation.pairs import PairTable
 
@@ -24,7 +25,7 @@ def wander(scene: Scene, seed: int, *, size: float) -> Trajectory:
     positions = np.array(rows)
     positions[:, 9:] = np.clip(positions[:, 9:], door.lower, door.upper)
     names = (*scene.robot.coordinates.names, "door.hinge", "door.knob")
-    return Trajectory(names, np.arange(4.0), positions, (PhaseSpan("all", 0, 3, {"door": "handle"}),), 9)
+    return Trajectory(names, np.arange(4.0), positions, (PhaseSpan("all", 0, 3, (Hold("door", "handle"),)),), 9)
 
 
 def brute_force(table: PairTable, z: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.scene.hold import Hold
 
 FILES = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60, deadline=None)
 ROBOT = ("base_x", "base_y", "base_yaw", "lift", "elbow")
@@ -25,10 +26,14 @@ def trajectories(draw: st.DrawFn, largest: float | None = None) -> Trajectory:
     rows = draw(st.lists(st.lists(numbers, min_size=len(names), max_size=len(names)), min_size=len(times), max_size=len(times)))
     cuts = sorted(draw(st.sets(st.integers(1, len(steps)))) | {len(steps)})
     label, phases, first = st.text(st.characters(exclude_categories=["Cs"]), max_size=6), [], 0
+    name, link = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="."), max_size=6), label.filter(bool)
     for last in cuts:
-        held = draw(st.dictionaries(label, label, max_size=2))
-        by = {name: draw(label) for name in held if draw(st.booleans())}
-        phases.append(PhaseSpan(draw(label), first, last, held, by))
+        held = list(draw(st.dictionaries(name, label, max_size=3)).items())
+        holds: list[Hold] = []
+        for thing, attachment in held:
+            by = draw(st.sampled_from([None, *holds]))
+            holds.append(Hold(thing, attachment, by, draw(link) if by else None))
+        phases.append(PhaseSpan(draw(label), first, last, tuple(holds)))
         first = last
     return Trajectory(names, times, rows, tuple(phases), robot)
 

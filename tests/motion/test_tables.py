@@ -16,6 +16,7 @@ import vkc_pin as vkc
 from vkc_pin import cli
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.planning.plan import Plan
+from vkc_pin.scene.hold import Hold
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +41,7 @@ def test_json_is_exact(trajectory: Trajectory, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["a\rb", "\n", "\r\n", 'a "quoted", name'])
 def test_names_with_line_ends_come_back(name: str, tmp_path: Path) -> None:
-    phase = PhaseSpan(name, 0, 1, {name: name}, {name: name})
+    phase = PhaseSpan(name, 0, 1, (Hold(name, name), Hold("other", name, Hold(name, name), name)))
     trajectory = Trajectory(ROBOT[:3], np.arange(2.0), np.zeros((2, 3)), (phase,), 3)
     assert same(Trajectory.from_csv(trajectory.to_csv(tmp_path / "motion.csv")), trajectory)
 

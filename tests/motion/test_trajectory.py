@@ -10,6 +10,7 @@ import pytest
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory, filled, join
+from vkc_pin.scene.hold import Hold, holds_of
 
 NAMES = ("base_x", "base_y", "base_yaw", "shoulder", "elbow", "door.hinge")
 ROWS = np.array(
@@ -21,7 +22,7 @@ ROWS = np.array(
     ]
 )
 TIMES = np.array([0.0, 2.0, 2.5, 6.5])
-PHASES = (PhaseSpan("reach door.handle", 0, 2), PhaseSpan("move door.hinge", 2, 3, {"door": "handle"}))
+PHASES = (PhaseSpan("reach door.handle", 0, 2), PhaseSpan("move door.hinge", 2, 3, (Hold("door", "handle"),)))
 
 
 def example(**changes: Any) -> Trajectory:
@@ -87,13 +88,13 @@ def test_round_trip() -> None:
 
 def test_what_is_held_through_something_is_kept_too() -> None:
     held, by = {"stick": "grip", "ball": "pull"}, {"ball": "stick.tip"}
-    phases = (PhaseSpan("reach", 0, 2), PhaseSpan("carry", 2, 3, held, by))
+    phases = (PhaseSpan("reach", 0, 2), PhaseSpan("carry", 2, 3, holds_of(held, by)))
     data = json.loads(json.dumps(example(phases=phases).to_dict()))
     assert [phase["by"] for phase in data["phases"]] == [{}, by]
     assert Trajectory.from_dict(data).phases == phases
     for phase in data["phases"]:  # as motions were saved before there was such a thing
         del phase["by"]
-    assert [phase.by for phase in Trajectory.from_dict(data).phases] == [{}, {}]
+    assert [phase.holds for phase in Trajectory.from_dict(data).phases] == [(), holds_of(held)]
 
 
 @pytest.mark.parametrize("key", ["names", "times", "positions", "phases", "robot_size"])
@@ -145,7 +146,7 @@ def test_what_is_not_known_is_as_it_was_or_as_it_will_be() -> None:
 def parts() -> tuple[Trajectory, Trajectory, Trajectory]:
     """Reach for the door, open it, and go on, holding what was held; only the second knows the door's hinge."""
     robot = NAMES[:5]
-    held = {"door": "handle"}
+    held = (Hold("door", "handle"),)
     reach = Trajectory(robot, np.array([0.0, 1.0, 3.0]), ROWS[:3, :5], (PhaseSpan("a", 0, 1), PhaseSpan("b", 1, 2)), 5)
     opens = Trajectory(NAMES, np.array([7.0, 8.0]), ROWS[2:], (PhaseSpan("c", 0, 1, held),), 5)
     after = Trajectory(robot, np.array([0.0, 0.5]), ROWS[[3, 0], :5], (PhaseSpan("d", 0, 1, held),), 5)
@@ -166,8 +167,9 @@ def test_motions_are_joined() -> None:
 
 
 def test_what_is_held_through_another_thing_makes_a_pause_too() -> None:
-    stick, both = {"stick": "grip"}, {"stick": "grip", "ball": "pull"}
-    spans = [PhaseSpan("a", 0, 1, both, {"ball": "stick.tip"}), PhaseSpan("b", 0, 1, both), PhaseSpan("c", 0, 1, stick)]
+    both = {"stick": "grip", "ball": "pull"}
+    holds = [holds_of(both, {"ball": "stick.tip"}), holds_of(both), holds_of({"stick": "grip"})]
+    spans = [PhaseSpan(name, 0, 1, held) for name, held in zip("abc", holds, strict=True)]
     motions = [Trajectory(NAMES, np.array([0.0, 1.0]), ROWS[[1, 2]], (span,), 5) for span in spans]
     np.testing.assert_allclose(join(motions, pause=0.5).times, [0.0, 1.0, 1.5, 2.5, 3.0, 4.0])
 

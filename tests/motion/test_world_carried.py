@@ -136,7 +136,7 @@ def fetched() -> tuple[Scene, Script]:
 def test_what_is_held_through_a_stick_follows_its_tip() -> None:
     scene, script = fetched()
     motion = script.motion()
-    assert [dict(phase.by) for phase in motion.phases] == [{}, *[{"ball": "stick.tip"}] * 3, {}]
+    assert [phase["by"] for phase in motion.to_dict()["phases"]] == [{}, *[{"ball": "stick.tip"}] * 3, {}]
     on_tip = (freedom("pull", PULL) * pin.SE3(np.eye(3), np.array([0.0, 0.0, -0.035]))).inverse()
     flipped = pin.SE3(np.diag([1.0, -1.0, -1.0]), np.zeros(3))  # of the ball's attachment, which looks down
     for phase in (1, 2, 3):
@@ -274,7 +274,8 @@ def test_coordinates_frames_and_shapes_of_what_is_free() -> None:
 
 
 def test_objects_that_hold_each_other() -> None:
-    scene, script = fetched()
-    script.phases[2].by["stick"] = "ball.ball"  # type: ignore[index]
+    _, script = fetched()
+    data = script.motion().to_dict()
+    data["phases"][2]["by"]["stick"] = "ball.ball"
     with pytest.raises(InputError, match="circle"):
-        World(scene).positions(script.motion())
+        Trajectory.from_dict(data)

@@ -346,9 +346,11 @@ def test_the_clearance_at_the_start_is_that_of_all_pairs(seed: int, count: int, 
 def test_what_a_scene_does_not_change_it_shares() -> None:
     scene = crowded(100)
     moved = scene.with_start(base=[-0.5, 0.2, 0.0]).with_state("door", {"hinge": 0.5}).with_held({"door": "handle"})
-    assert moved.document["obstacles"] is scene.document["obstacles"]
+    assert moved.obstacles is scene.obstacles
+    assert moved.described is scene.described
+    assert moved.document["obstacles"] == scene.document["obstacles"]
     assert scene.document["start"]["base"] == scene.start[:3].tolist()
-    assert "held" not in scene.document["start"] or not scene.document["start"]["held"]
+    assert scene.document["start"]["held"] == {}
     assert scene.document["objects"][0]["state"]["hinge"] == 0.0
 
 

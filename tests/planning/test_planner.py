@@ -227,7 +227,7 @@ def test_a_ball_is_fetched_with_a_stick() -> None:
     plan = vkc.plan(scene.with_start(base=[-0.6, -0.3, 0.0]), steps, options=SEEN)
     confirm(plan)
     assert max(apart(left_at(plan, "ball"), aside)) <= 1e-3
-    assert {"ball": "stick.tip"} in [dict(phase.by) for phase in plan.trajectory.phases]
+    assert {"ball": "stick.tip"} in [phase["by"] for phase in plan.trajectory.to_dict()["phases"]]
     assert dict(plan.trajectory.phases[-1].held) == {"stick": "grip"}
 
 

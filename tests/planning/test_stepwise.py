@@ -43,7 +43,7 @@ def test_robot_and_joints_are_where_the_motion_ends() -> None:
     np.testing.assert_array_equal(after.objects["door"].state, [0.4, 0.2])
     for name in ("drawer", "cabinet"):
         np.testing.assert_array_equal(after.objects[name].state, scene.objects[name].state)
-    assert (dict(after.held), dict(after.held_at)) == ({}, {})
+    assert after.holds == ()
 
 
 def test_what_ends_a_little_outside_its_limits_is_at_them() -> None:
@@ -63,8 +63,8 @@ def test_what_ends_a_little_outside_its_limits_is_at_them() -> None:
     after = scene_after(scene, motion, [Hold("cabinet", "sleeve")])
     np.testing.assert_array_equal(after.start, [scene.arena[1], scene.arena[2], 0.0, *robot.upper[3:]])
     np.testing.assert_array_equal(after.objects["door"].state, [door.upper[0], door.lower[1]])
-    assert dict(after.held) == {"cabinet": "sleeve"}
-    assert dict(after.held_at) == {"cabinet": (sleeve.freedoms[0].lower, sleeve.freedoms[1].upper)}
+    (hold,) = after.holds
+    assert (hold, hold.at) == (Hold("cabinet", "sleeve"), (sleeve.freedoms[0].lower, sleeve.freedoms[1].upper))
 
 
 def test_what_is_carried_is_in_the_hand() -> None:
@@ -73,7 +73,7 @@ def test_what_is_carried_is_in_the_hand() -> None:
     down = above(STICK, values=values)
     script = Script(scene).go(down).take("stick", values=values).go(moved_base(down, x=-0.4, yaw=0.5))
     after = scene_after(scene, script.motion(), [Hold("stick", "grip")])
-    assert (dict(after.held), dict(after.held_at)) == ({"stick": "grip"}, {"stick": values})
+    assert [(hold, hold.at) for hold in after.holds] == [(Hold("stick", "grip"), values)]
     data = scene.robot.model.createData()
     pin.framesForwardKinematics(scene.robot.model, data, scene.robot.coordinates.q(script.rows[-1]))
     tool = data.oMf[scene.robot.model.getFrameId(scene.robot.tool_frame)]
@@ -98,7 +98,7 @@ def test_what_was_held_at_the_start_can_be_let_go_of() -> None:
     script = Script(scene).go(moved_base(scene.start, y=0.3))
     kept = scene_after(scene, script.motion(), [Hold("stick", "grip")])
     left = scene_after(scene, script.let_go().go(moved_base(scene.start, x=-0.5)).motion(), [])
-    assert (dict(kept.held), dict(kept.held_at)) == ({"stick": "grip"}, {"stick": (0.02, -0.1)})
+    assert [(hold, hold.at) for hold in kept.holds] == [(Hold("stick", "grip"), (0.02, -0.1))]
     assert dict(left.held) == {}
     there = lifted(scene.objects["stick"].placement, [0.0, 0.3, 0.0]).homogeneous
     for after in (kept, left):
@@ -113,9 +113,8 @@ def test_what_is_held_through_another_thing_stays_there() -> None:
     stick = Hold("stick", "grip")
     holds = (stick, Hold("ball", "pull", stick, "tip"))
     after = scene_after(scene, script.motion(), holds)
-    assert (dict(after.held), dict(after.held_by)) == ({"stick": "grip", "ball": "pull"}, {"ball": "stick.tip"})
-    assert after.held_at["ball"] == tuple(values)
     assert after.holds == holds
+    assert after.holds[1].at == tuple(values)
 
 
 @pytest.mark.parametrize("brief", [False, True])

@@ -7,7 +7,7 @@ import itertools
 import pytest
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.scene.hold import Hold, as_mappings, holds_of
+from vkc_pin.scene.hold import Hold, holds_of, in_order
 
 STICK = Hold("stick", "grip")
 BALL = Hold("ball", "pull", STICK, "tip")
@@ -49,8 +49,21 @@ def test_equal_holds_are_one_key() -> None:
     ],
 )
 def test_mappings_round_trip(held: dict[str, str], by: dict[str, str]) -> None:
-    assert as_mappings(holds_of(held, by)) == (held, by)
-    assert as_mappings(iter(holds_of(held, by))) == (held, by)
+    found = holds_of(held, by)
+    assert {hold.object: hold.attachment for hold in found} == held
+    assert {hold.object: hold.frame for hold in found if hold.by} == by
+    assert holds_of({hold.object: hold.attachment for hold in found}, by) == in_order(iter(found)) == found
+
+
+def test_values_do_not_make_another_hold() -> None:
+    (again,) = holds_of({"stick": "grip"}, at={"stick": [0.1, 2]})
+    assert (again, hash(again), again.at, STICK.at) == (STICK, hash(STICK), (0.1, 2.0), ())
+
+
+def test_a_hold_comes_after_the_one_it_depends_on() -> None:
+    for holds in ((BALL,), (BALL, STICK), (STICK, FLY), (Hold("stick", "end"), BALL)):
+        with pytest.raises(InputError, match="not held before"):
+            in_order(holds)
 
 
 @pytest.mark.parametrize(

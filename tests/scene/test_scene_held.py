@@ -13,6 +13,7 @@ import pytest
 from helpers.carrying import tool_at
 
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.scene import Scene, load_scene
 
 HALL = """\
@@ -46,10 +47,13 @@ def again(scene: Scene) -> Scene:
     return Scene.from_document(json.loads(json.dumps(scene.document)), scene.folder)
 
 
+def grips(scene: Scene) -> dict[Hold, tuple[float, ...]]:
+    return {hold: hold.at for hold in scene.holds}
+
+
 def same(first: Scene, second: Scene) -> None:
     """Assert that two scenes are equal in what is where and what is held how."""
-    for field in ("held", "held_by", "held_at"):
-        assert dict(getattr(first, field)) == dict(getattr(second, field)), field
+    assert grips(first) == grips(second)
     np.testing.assert_array_equal(first.start, second.start)
     for name, placed in first.objects.items():
         np.testing.assert_allclose(placed.placement.homogeneous, second.objects[name].placement.homogeneous, atol=1e-9)
@@ -112,15 +116,15 @@ def test_there_is_no_such_object(hall: Scene) -> None:
 @pytest.mark.parametrize("values", [(0.0, 0.0), (0.05, -0.4), (-0.095, 1.2)])
 def test_held_at_some_values_of_the_grasp(hall: Scene, values: tuple[float, float]) -> None:
     held = hall.with_held({"cane": "grip"}, at={"cane": values})
-    assert (dict(held.held), dict(held.held_by), dict(held.held_at)) == ({"cane": "grip"}, {}, {"cane": values})
+    assert grips(held) == {Hold("cane", "grip"): values}
     for scene in (held, again(held), held.with_start(base=[1.0, 2.0, -2.0]), held.with_state("front", {"hinge": 0.5})):
         expected = scene.tool_placement() * tool_at(pin.SE3.Identity(), values=values).inverse()
         assert_same(scene.objects["cane"].placement, expected)
-        assert dict(scene.held_at) == {"cane": values}
+        assert grips(scene) == {Hold("cane", "grip"): values}
     same(held, again(held))
     if values == (0.0, 0.0):
         assert_same(held.objects["cane"].placement, hall.with_held({"cane": "grip"}).objects["cane"].placement)
-    assert dict(hall.held) == {}
+    assert hall.holds == ()
 
 
 def test_held_through_something(hall: Scene) -> None:
@@ -135,13 +139,13 @@ def test_held_through_something(hall: Scene) -> None:
         touch = tip.translation - scene.objects["fruit"].placement.translation
         assert np.linalg.norm(touch) == pytest.approx(0.035)  # the ball's radius
     same(held, again(held))
-    assert dict(held.held_by) == {"fruit": "cane.tip"}
+    assert [str(hold) for hold in held.holds] == ["cane.grip", "fruit.pull by cane.tip"]
 
 
 def test_holding_anew_forgets_how_it_was_held(hall: Scene) -> None:
     held = hall.with_held({"cane": "grip", "fruit": "pull"}, by={"fruit": "cane.tip"}, at={"cane": (0.05, 0.1)})
     other = held.with_held({"cane": "end"})
-    assert (dict(other.held), dict(other.held_by), dict(other.held_at)) == ({"cane": "end"}, {}, {})
+    assert grips(other) == {Hold("cane", "end"): ()}
     assert other.document["start"]["held"] == {"cane": {"attachment": "end"}}
     same(other, again(other))
 

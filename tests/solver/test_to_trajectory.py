@@ -49,7 +49,7 @@ def test_what_is_held_when_and_through_what() -> None:
     assert [phase.name for phase in motion.phases] == names
     both = {"stick": "grip", "ball": "pull"}
     assert [dict(phase.held) for phase in motion.phases] == [{"stick": "grip"}, both, {"stick": "grip"}]
-    assert [dict(phase.by) for phase in motion.phases] == [{}, {"ball": "stick.tip"}, {}]
+    assert [phase["by"] for phase in motion.to_dict()["phases"]] == [{}, {"ball": "stick.tip"}, {}]
     n = SHORT.reach_waypoints
     assert [(phase.first, phase.last) for phase in motion.phases] == [(0, n), (n, 2 * n + 1), (2 * n + 1, 3 * n + 2)]
     assert pauses(fetching(), motion) == [n + 1, 2 * n + 2]

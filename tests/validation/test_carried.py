@@ -31,6 +31,7 @@ from helpers.carrying import (
 import vkc_pin as vkc
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.scene import Scene
 from vkc_pin.validation.report import Report, Violation
 from vkc_pin.validation.validate import validate
@@ -274,7 +275,7 @@ def test_let_go_of_too_early() -> None:
     half = (middle.first + middle.last) // 2
     phases = (
         *script.phases[:3],
-        PhaseSpan("carry", middle.first, half, middle.held),
+        PhaseSpan("carry", middle.first, half, middle.holds),
         PhaseSpan("drop", half, middle.last),
         *(PhaseSpan(phase.name, phase.first, phase.last) for phase in script.phases[4:]),
     )
@@ -289,7 +290,7 @@ def test_let_go_of_too_early() -> None:
 
 def test_never_let_go_of() -> None:
     script = carried_over(hall())
-    script.phases[5] = PhaseSpan("stay", script.phases[4].last, script.phases[4].last + 2, dict(script.phases[4].held))
+    script.phases[5] = PhaseSpan("stay", script.phases[4].last, script.phases[4].last + 2, script.phases[4].holds)
     del script.rows[script.phases[5].last + 1 :]
     script.rows[-2:] = [script.rows[-3]] * 2
     motion = script.motion()
@@ -599,13 +600,14 @@ def test_a_ball_that_rolls_on_the_tip() -> None:
 
 def test_a_ball_that_is_dropped_with_the_stick() -> None:
     """Nothing is held through what nobody holds."""
-    script = fetching()
-    phases = list(script.phases)
-    phases[2] = PhaseSpan("no stick", phases[2].first, phases[2].last, {"ball": "pull"}, {"ball": "stick.tip"})
-    full = script.motion()
-    motion = Trajectory(full.names, full.times, full.positions, tuple(phases), full.robot_size)
-    with pytest.raises(InputError):
-        validate(script.scene, [FETCHED], motion)
+    ball = Hold("ball", "pull", Hold("stick", "grip"), "tip")
+    with pytest.raises(InputError, match="held through what is not held"):
+        PhaseSpan("no stick", 0, 1, (ball,))
+    data = fetching().motion().to_dict()
+    data["phases"][2] |= {"held": {"ball": "pull"}, "by": {"ball": "stick.tip"}}
+    with pytest.raises(UnknownNameError) as caught:
+        Trajectory.from_dict(data)
+    assert caught.value.field == "by"
 
 
 # --- what is no motion of this scene ----------------------------------------------------------------------------------
@@ -638,11 +640,9 @@ def test_trajectories_that_do_not_fit() -> None:
         validate(hall(), [PLACED], lacking)
     assert caught.value.expected == "stick.grip_slide"
     script = fetching()
-    for by, nearest in (("stick.tap", "tip"), ("stik.tip", "stick")):
-        phases = [PhaseSpan(p.name, p.first, p.last, p.held, dict.fromkeys(p.by, by)) for p in script.phases]
-        whole = script.motion()
-        wrong = Trajectory(whole.names, whole.times, whole.positions, tuple(phases), whole.robot_size)
-        with pytest.raises(UnknownNameError) as unknown:
-            validate(script.scene, [FETCHED], wrong)
-        assert unknown.value.field == "trajectory.phases[1].by"
-        assert unknown.value.nearest == nearest
+    data = script.motion().to_dict()
+    for phase in data["phases"]:
+        phase["by"] = dict.fromkeys(phase["by"], "stick.tap")
+    with pytest.raises(UnknownNameError) as unknown:
+        validate(script.scene, [FETCHED], Trajectory.from_dict(data))
+    assert (unknown.value.field, unknown.value.nearest) == ("trajectory.phases[1].by", "tip")

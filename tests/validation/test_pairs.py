@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.motion.world import World
+from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.scene import Scene
 from vkc_pin.validation import pairs as validation_pairs
@@ -139,7 +140,7 @@ def test_a_side_branch_that_nothing_moves_hits_nothing_that_stands() -> None:
     scene = full_scene()
     names = (*scene.robot.coordinates.names, "cabinet.slide", "cabinet.swing")
     positions = np.tile(np.concatenate([scene.start, [0.1, 0.3]]), (2, 1))
-    motion = Trajectory(names, np.arange(2.0), positions, (PhaseSpan("all", 0, 1, {"cabinet": "grip"}),), 9)
+    motion = Trajectory(names, np.arange(2.0), positions, (PhaseSpan("all", 0, 1, (Hold("cabinet", "grip"),)),), 9)
     table = PairTable(scene, Samples(scene, motion).world, motion, 0.02)
     paired = {frozenset(table.world.collision_labels[k] for k in pair) for pair in table.pairs.tolist()}
     for still in ("cabinet.lid", "cabinet.case"):

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.scene import Scene
 from vkc_pin.validation.samples import ANGLE_STEP, LENGTH_STEP, Samples
 
@@ -31,7 +32,7 @@ def motion(scene: Scene, seed: int, *, grasp: str = "grip", number: int = 5) -> 
     objects = [f"{name}.{joint}" for name, placed in scene.objects.items() for joint in placed.object.coordinates.names]
     names = (*scene.robot.coordinates.names, *objects, *(f"cabinet.{name}" for name in VIRTUAL[grasp]))
     positions = rng.uniform(-1.0, 1.0, (number, len(names))) * rng.choice([0.0, 0.01, 1.0], len(names))
-    phases = (PhaseSpan("all", 0, number - 1, {"cabinet": grasp}),)
+    phases = (PhaseSpan("all", 0, number - 1, (Hold("cabinet", grasp),)),)
     return Trajectory(names, np.cumsum(rng.uniform(0.1, 2.0, number)), positions, phases, len(scene.start))
 
 

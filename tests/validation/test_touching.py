@@ -27,6 +27,7 @@ from helpers.small_problems import door_scene, full_scene
 
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.motion.world import World
+from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.steps import Actuate, Grasp, Place, Step, Touch
@@ -62,7 +63,7 @@ def test_a_hand_and_what_it_holds_held_or_is_asked_to_grasp() -> None:
     assert pairs(door, still(door), [Grasp("door", "handle_free")]) == hand_on("door.lever")
     assert pairs(door.with_held({"door": "handle"}), still(door)) == hand_on("door.lever")
     motion = still(door)
-    held = Trajectory(motion.names, motion.times, motion.positions, (PhaseSpan("hold", 0, 1, {"door": "handle"}),), 9)
+    held = Trajectory(motion.names, motion.times, motion.positions, (PhaseSpan("hold", 0, 1, (Hold("door", "handle"),)),), 9)
     assert pairs(door, held) == hand_on("door.lever")
     scene = full_scene()
     two = [Grasp("drawer"), Grasp("door")]

@@ -190,7 +190,7 @@ def consolidate(scene: Scene, holds: Iterable[Hold] | Mapping[str, str], *, cach
         UnknownNameError: The scene has no such object, or the object no such attachment.
         InputError: A grasp that leaves a freedom is called like a joint of its object.
     """
-    robot, holds = scene.robot, holds_of(holds, {}) if isinstance(holds, Mapping) else tuple(holds)
+    robot, holds = scene.robot, holds_of(holds) if isinstance(holds, Mapping) else tuple(holds)
     model, collision = pin.Model(robot.model), pin.GeometryModel()
     graft_geometry(collision, robot.collision.geometryObjects, joints=list(range(model.njoints)), placement=pin.SE3.Identity())
     names = list(robot.coordinates.names)

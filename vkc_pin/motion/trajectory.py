@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.scene.hold import Hold, holds_of, in_order
 
 __all__ = ["PhaseSpan", "Trajectory", "filled", "join"]
 
@@ -22,15 +23,29 @@ class PhaseSpan:
     Attributes:
         name: What happens in it, e.g. "reach door.handle".
         first, last: Its waypoints; `last` is the next phase's `first`.
-        held: Object → attachment, for all that is held in it.
-        by: Object → "<object>.<link>", for what is held through another object that is held.
+        holds: All that is held in it, each hold after the one it depends on.
+
+    Raises:
+        InputError: Something is held through what is not.
     """
 
     name: str
     first: int
     last: int
-    held: Mapping[str, str] = field(default_factory=dict)
-    by: Mapping[str, str] = field(default_factory=dict)
+    holds: tuple[Hold, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "holds", in_order(self.holds))
+
+    @property
+    def held(self) -> dict[str, str]:
+        """Object → attachment, for all that is held in it."""
+        return {hold.object: hold.attachment for hold in self.holds}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data of it; `by` names the link, "<object>.<link>", for what is held through another object."""
+        by = {hold.object: hold.frame for hold in self.holds if hold.by}
+        return {"name": self.name, "first": self.first, "last": self.last, "held": self.held, "by": by}
 
 
 @dataclass(frozen=True)
@@ -141,7 +156,7 @@ class Trajectory:
             "times": self.times.tolist(),
             "positions": self.positions.tolist(),
             "robot_size": self.robot_size,
-            "phases": [{**vars(p), "held": dict(p.held), "by": dict(p.by)} for p in self.phases],
+            "phases": [phase.to_dict() for phase in self.phases],
         }
 
     @classmethod
@@ -153,8 +168,7 @@ class Trajectory:
         """
         try:
             phases = tuple(
-                PhaseSpan(p["name"], int(p["first"]), int(p["last"]), dict(p["held"]), dict(p.get("by", {})))
-                for p in data["phases"]
+                PhaseSpan(p["name"], int(p["first"]), int(p["last"]), holds_of(p["held"], p.get("by"))) for p in data["phases"]
             )
             return cls(tuple(data["names"]), data["times"], data["positions"], phases, int(data["robot_size"]))
         except KeyError as error:
@@ -260,7 +274,7 @@ def join(parts: Sequence[Trajectory], *, pause: float) -> Trajectory:
                 raise InputError("a motion does not begin where the one before it ends", field=where, got=f"{apart:g} apart")
             before, after = phases[-1], part.phases[0]
             shift = len(rows) - 1
-            if (before.held, before.by) != (after.held, after.by):
+            if set(before.holds) != set(after.holds):
                 rows.append(values[0])
                 times.append(start + pause)
                 start, shift = start + pause, shift + 1

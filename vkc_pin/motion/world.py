@@ -6,6 +6,7 @@ a free joint: it stands where it was left, and moves rigidly with the hand from 
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 
@@ -17,7 +18,7 @@ from vkc_pin.models.coordinates import Coordinates
 from vkc_pin.models.grafting import graft, graft_geometry
 from vkc_pin.models.shapes import link_name
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
-from vkc_pin.scene.hold import Hold, as_mappings, holds_of
+from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.placed import PlacedObject
 from vkc_pin.scene.scene import Scene
 
@@ -153,7 +154,7 @@ class World:
         tool = robot.model.getFrameId(robot.tool_frame)
         tools: list[pin.SE3] = []
         found: dict[str, list[pin.SE3]] = {}
-        for hold in holds_of(phase.held, phase.by):
+        for hold in phase.holds:
             placed = self.scene.objects[hold.object]
             if not placed.object.free:
                 continue
@@ -226,14 +227,13 @@ def scene_after(scene: Scene, trajectory: Trajectory, holds: Sequence[Hold]) -> 
         state = {joint: end(f"{name}.{joint}", low, high) for joint, low, high in joints if f"{name}.{joint}" in last}
         if state:
             after = after.with_state(name, state)
-    at: dict[str, list[float]] = {}
+    held = []
     for hold in holds:
         attachment = scene.objects[hold.object].object.attachment(hold.attachment)
-        if attachment.freedoms:
-            freedoms = zip(attachment.coordinates, attachment.freedoms, strict=True)
-            at[hold.object] = [end(f"{hold.object}.{name}", freedom.lower, freedom.upper) for name, freedom in freedoms]
-    held, by = as_mappings(holds)
-    return after.with_held(held, by=by, at=at)
+        freedoms = zip(attachment.coordinates, attachment.freedoms, strict=True)
+        at = tuple(end(f"{hold.object}.{name}", freedom.lower, freedom.upper) for name, freedom in freedoms)
+        held.append(dataclasses.replace(hold, at=at))
+    return after.with_held(held)
 
 
 def units_of(scene: Scene) -> dict[str, str]:

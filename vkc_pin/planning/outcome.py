@@ -164,8 +164,7 @@ def _still(scene: Scene, options: Options) -> Trajectory:
         values |= {f"{name}.{joint}": value for joint, value in joints}
     for hold in scene.holds:
         names = scene.objects[hold.object].object.attachment(hold.attachment).coordinates
-        at = scene.held_at.get(hold.object, (0.0,) * len(names))
-        values |= {f"{hold.object}.{name}": value for name, value in zip(names, at, strict=True)}
+        values |= {f"{hold.object}.{name}": value for name, value in zip(names, hold.at, strict=True)}
     row = list(values.values())
-    phase = PhaseSpan("stand", 0, 1, dict(scene.held), dict(scene.held_by))
-    return Trajectory(tuple(values), np.array([0.0, options.dt]), np.array([row, row]), (phase,), len(scene.start))
+    phases = (PhaseSpan("stand", 0, 1, scene.holds),)
+    return Trajectory(tuple(values), np.array([0.0, options.dt]), np.array([row, row]), phases, len(scene.start))

@@ -129,7 +129,7 @@ class TrajectoryProblem:
             start[self.chain.index(name)] = value
         for hold in self.scene.holds:
             names = self.scene.objects[hold.object].object.attachment(hold.attachment).coordinates
-            for name, value in zip(names, self.scene.held_at.get(hold.object, ()), strict=False):
+            for name, value in zip(names, hold.at, strict=True):
                 start[self.chain.index(f"{hold.object}.{name}")] = value
         return start
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import itertools
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -19,13 +18,14 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.files.resources import find
 from vkc_pin.models.shapes import clearance, placed_shapes, within_limits
 from vkc_pin.notebook import card
-from vkc_pin.scene.hold import Hold, check_holds, holds_of, in_hand
+from vkc_pin.scene.hold import Hold, checked_holds, holds_of, in_hand
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.placed import PlacedObject, standing_geometry
 from vkc_pin.scene.start import START_CLEARANCE, StartRegion, start_limits
 
 if TYPE_CHECKING:
     from vkc_pin.models.robot import Robot
+    from vkc_pin.scene.scene_schema import SceneSchema
 
 __all__ = ["Scene", "load_scene"]
 
@@ -51,10 +51,8 @@ class Scene:
         floor: Whether there is a floor at z = 0.
         arena: The floor that belongs to the scene: (x_min, x_max, y_min, y_max) [m].
         start_region: Where `sample_start` draws from, if the scene says so.
-        held: Object → attachment of what the robot holds at the start.
-        held_by: Object → "<object>.<link>", for what it holds through another thing that it holds.
-        held_at: Object → values of its attachment's freedoms, [m] and [rad]; zero where nothing is said.
-        document: The scene as plain data, from which `from_document` builds it again; not to be changed, as scenes share parts.
+        holds: What the robot holds at the start, each hold after the one it depends on.
+        described: What it was made of; `document` takes from it what cannot be told from the rest: robot, obstacles, files.
     """
 
     name: str
@@ -70,10 +68,8 @@ class Scene:
     floor: bool
     arena: tuple[float, float, float, float]
     start_region: StartRegion | None
-    held: Mapping[str, str]
-    document: dict[str, Any]
-    held_by: Mapping[str, str] = field(default_factory=dict)
-    held_at: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    holds: tuple[Hold, ...]
+    described: SceneSchema
 
     def __repr__(self) -> str:
         return (
@@ -85,9 +81,16 @@ class Scene:
         return card(self)
 
     @property
-    def holds(self) -> tuple[Hold, ...]:
-        """What the robot holds at the start, each after the hold it depends on."""
-        return holds_of(self.held, self.held_by)
+    def held(self) -> dict[str, str]:
+        """Object → attachment of what the robot holds at the start."""
+        return {hold.object: hold.attachment for hold in self.holds}
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """The scene as plain data, from which `from_document` builds it again; made when asked for."""
+        from vkc_pin.scene.scene_file import document_of
+
+        return document_of(vars(self))
 
     @staticmethod
     def from_document(document: Mapping[str, Any], folder: str | Path = ".") -> Scene:
@@ -103,7 +106,7 @@ class Scene:
         from vkc_pin.files.documents import Document
         from vkc_pin.scene.scene_file import scene_fields
 
-        fields = scene_fields(Document(copy.deepcopy(dict(document))), Path(folder))
+        fields = scene_fields(Document(dict(document)), Path(folder))
         return Scene(**fields).with_held_objects_in_the_hand()
 
     def with_start(self, base: ArrayLike | None = None, arm: ArrayLike | None = None) -> Scene:
@@ -131,12 +134,7 @@ class Scene:
         for value, low, high, name in zip(start[:2], self.arena[::2], self.arena[1::2], names[:2], strict=True):
             if not low <= value <= high:
                 raise InputError("outside the arena", field=f"base.{name}", expected=f"{low:g} to {high:g}", got=f"{value:g}")
-        document = self._document_with_own("start")
-        document["start"]["base"] = start[:3].tolist()
-        if arm is not None:
-            document["start"]["arm"] = start[3:].tolist()
-        changed = dataclasses.replace(self, start=start, document=document)
-        return changed.with_held_objects_in_the_hand()
+        return self._with(start=start)
 
     def with_state(self, name: str, values: Mapping[str, float]) -> Scene:
         """Return the scene with joints of object `name` at `values`, by joint name, [rad] or [m].
@@ -145,15 +143,8 @@ class Scene:
             UnknownNameError: There is no such object, or it has no such joint.
             InputError: A value is not finite or outside the joint's limits.
         """
-        if name not in self.objects:
-            raise UnknownNameError("object", name, self.objects)
-        placed = self.objects[name].with_state(values)
-        document = self._document_with_own("objects")
-        (entry,) = (item for item in document["objects"] if item["name"] == name)
-        state = zip(placed.object.coordinates.names, placed.state.tolist(), strict=True)
-        entry["state"] = dict(state)
-        changed = dataclasses.replace(self, objects=MappingProxyType({**self.objects, name: placed}), document=document)
-        return changed.with_held_objects_in_the_hand()
+        placed = self._placed(name).with_state(values)
+        return self._with(objects=MappingProxyType({**self.objects, name: placed}))
 
     def with_placement(self, name: str, placement: pin.SE3) -> Scene:
         """Return the scene with object `name` at `placement` (of its base link, in the world frame).
@@ -161,17 +152,12 @@ class Scene:
         Raises:
             UnknownNameError: There is no such object.
         """
-        if name not in self.objects:
-            raise UnknownNameError("object", name, self.objects)
-        document = self._document_with_own("objects")
-        _write_placement(document, name, placement)
-        placed = dataclasses.replace(self.objects[name], placement=pin.SE3(placement))
-        changed = dataclasses.replace(self, objects=MappingProxyType({**self.objects, name: placed}), document=document)
-        return changed.with_held_objects_in_the_hand()
+        placed = dataclasses.replace(self._placed(name), placement=pin.SE3(placement))
+        return self._with(objects=MappingProxyType({**self.objects, name: placed}))
 
     def with_held(
         self,
-        held: Mapping[str, str],
+        held: Mapping[str, str] | Iterable[Hold],
         *,
         by: Mapping[str, str] | None = None,
         at: Mapping[str, Sequence[float]] | None = None,
@@ -179,7 +165,7 @@ class Scene:
         """Return the scene with the robot holding objects at the start.
 
         Args:
-            held: Object → attachment.
+            held: Object → attachment; or holds, each after the one it depends on, which say all of it.
             by: Object → "<object>.<link>", for what is held through another object of `held`.
             at: Object → values of its attachment's freedoms, [m] and [rad]; zero where nothing is said.
 
@@ -187,36 +173,20 @@ class Scene:
             UnknownNameError: There is no such object, attachment or link.
             InputError: Values that do not fit the attachment's freedoms, or objects that hold each other.
         """
-        by = {} if by is None else by
-        values = {name: tuple(float(value) for value in row) for name, row in ({} if at is None else at).items()}
-        check_holds(self.objects, held, by, values)
-        document = self._document_with_own("start", "objects")
-        document["start"]["held"] = {
-            name: {"attachment": attachment}
-            | ({"by": by[name]} if name in by else {})
-            | ({"at": list(values[name])} if name in values else {})
-            for name, attachment in held.items()
-        }
-        for name in self.held.keys() - held.keys():  # it stays where the hand had it
-            if self.objects[name].object.free:
-                _write_placement(document, name, self.objects[name].placement)
-        changed = dataclasses.replace(
-            self,
-            held=MappingProxyType(dict(held)),
-            held_by=MappingProxyType(dict(by)),
-            held_at=MappingProxyType(values),
-            document=document,
-        )
-        return changed.with_held_objects_in_the_hand()
+        holds = holds_of(held, by, at) if isinstance(held, Mapping) else held
+        return self._with(holds=checked_holds(self.objects, holds))
 
-    def _document_with_own(self, *parts: str) -> dict[str, Any]:
-        """Return the document with copies of some of its parts, which may be changed; the others it shares."""
-        return {**self.document, **{part: copy.deepcopy(self.document[part]) for part in parts if part in self.document}}
+    def _placed(self, name: str) -> PlacedObject:
+        if name not in self.objects:
+            raise UnknownNameError("object", name, self.objects)
+        return self.objects[name]
+
+    def _with(self, **fields: Any) -> Scene:
+        return dataclasses.replace(self, **fields).with_held_objects_in_the_hand()
 
     def with_held_objects_in_the_hand(self) -> Scene:
         """Return the scene with every free object that is held placed where the robot holds it at the start."""
-        objects = in_hand(self.objects, self.tool_placement, self.held, self.held_by, self.held_at)
-        return dataclasses.replace(self, objects=objects)
+        return dataclasses.replace(self, objects=in_hand(self.objects, self.tool_placement, self.holds))
 
     def tool_placement(self) -> pin.SE3:
         """Return the placement of the robot's tool frame in the world frame at the start."""
@@ -272,14 +242,6 @@ class Scene:
                 return there
         problem = f"no free place for the robot in {_TRIES} tries"
         raise InputError(problem, file=file, field="start_region", expected=f"a clearance of {START_CLEARANCE} m somewhere")
-
-
-def _write_placement(document: dict[str, Any], name: str, placement: pin.SE3) -> None:
-    """Let object `name` stand at `placement` in a scene's document."""
-    (entry,) = (item for item in document["objects"] if item["name"] == name)
-    entry.pop("yaw", None)
-    entry["position"] = np.asarray(placement.translation).tolist()
-    entry["rpy"] = np.asarray(pin.rpy.matrixToRpy(placement.rotation)).tolist()
 
 
 def load_scene(name_or_path: str | Path) -> Scene:

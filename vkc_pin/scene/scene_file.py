@@ -1,7 +1,8 @@
-"""Makes the parts of a scene of its description, and says where the description is wrong."""
+"""Makes the parts of a scene of its description, says where the description is wrong, and describes the parts again."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -16,7 +17,7 @@ from vkc_pin.models.grafting import clean
 from vkc_pin.models.object_file import load_object
 from vkc_pin.models.shapes import within_limits
 from vkc_pin.scene import scene_schema as schema
-from vkc_pin.scene.hold import check_holds, holds_of
+from vkc_pin.scene.hold import Hold, checked_holds, holds_of
 from vkc_pin.scene.obstacles import FLOOR, floor_shape, obstacle_shapes
 from vkc_pin.scene.placed import PlacedObject
 from vkc_pin.scene.start import StartRegion, start_limits
@@ -24,7 +25,7 @@ from vkc_pin.scene.start import StartRegion, start_limits
 if TYPE_CHECKING:
     from vkc_pin.models.robot import Robot
 
-__all__ = ["scene_fields"]
+__all__ = ["document_of", "scene_fields"]
 
 
 def scene_fields(document: Document, folder: Path) -> dict[str, Any]:
@@ -55,12 +56,8 @@ def scene_fields(document: Document, folder: Path) -> dict[str, Any]:
         labels.append(FLOOR)
     region = description.start_region
     _check_places(document, description, arena)
-    plain: dict[str, Any] = description.model_dump(mode="json", exclude_none=True)
-    held = description.start.held
-    _held(document, held, objects)
-    name = description.name or (document.file.stem if document.file else "scene")
     return {
-        "name": name,
+        "name": description.name or (document.file.stem if document.file else "scene"),
         "file": document.file,
         "folder": folder,
         "robot": robot,
@@ -73,10 +70,46 @@ def scene_fields(document: Document, folder: Path) -> dict[str, Any]:
         "floor": description.floor,
         "arena": arena,
         "start_region": StartRegion(region.x, region.y, region.yaw) if region else None,
-        "held": MappingProxyType({name: item.attachment for name, item in held.items()}),
-        "held_by": MappingProxyType({name: item.by for name, item in held.items() if item.by}),
-        "held_at": MappingProxyType({name: item.at for name, item in held.items() if item.at}),
-        "document": {**plain, "name": name},
+        "holds": _holds(document, description.start.held, objects),
+        "described": description,
+    }
+
+
+def document_of(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Return plain data from which `scene_fields` makes these parts of a scene again.
+
+    What stands where it was described keeps the words of the description; what does not is described by position and rpy.
+
+    Args:
+        fields: The attributes of a `Scene`, by name.
+    """
+    described, start, objects, region = (fields[key] for key in ("described", "start", "objects", "start_region"))
+    plain = described.model_dump(mode="json", include={"robot", "obstacles", "objects"}, exclude_none=True)
+    held: dict[str, dict[str, Any]] = {}
+    for hold in fields["holds"]:
+        held[hold.object] = {"attachment": hold.attachment}
+        held[hold.object] |= {"by": hold.frame} if hold.by else {}
+        held[hold.object] |= {"at": list(hold.at)} if any(hold.at) else {}
+    for item, entry in zip(described.objects, plain["objects"], strict=True):
+        placed = objects[item.name]
+        entry["state"] = dict(zip(placed.object.coordinates.names, placed.state.tolist(), strict=True))
+        in_hand = placed.object.free and item.name in held
+        if not in_hand and not np.array_equal(placed.placement.homogeneous, _pose(item).homogeneous):
+            entry.pop("yaw", None)
+            entry["position"] = placed.placement.translation.tolist()
+            entry["rpy"] = pin.rpy.matrixToRpy(placed.placement.rotation).tolist()
+    at_home = described.start.arm is None and np.array_equal(start[3:], fields["robot"].home)
+    x_min, x_max, y_min, y_max = fields["arena"]
+    intervals = {} if region is None else dataclasses.asdict(region)
+    return {
+        "name": fields["name"],
+        "robot": plain["robot"],
+        "start": {"base": start[:3].tolist(), **({} if at_home else {"arm": start[3:].tolist()}), "held": held},
+        "arena": {"x": [x_min, x_max], "y": [y_min, y_max]},
+        **({"start_region": {key: list(value) for key, value in intervals.items() if value}} if intervals else {}),
+        "floor": fields["floor"],
+        "obstacles": plain["obstacles"],
+        "objects": plain["objects"],
     }
 
 
@@ -126,20 +159,24 @@ def _start(document: Document, item: schema.StartSchema, robot: Robot) -> NDArra
     return start
 
 
-def _held(document: Document, held: Mapping[str, schema.HeldSchema], objects: Mapping[str, PlacedObject]) -> None:
-    """Check what the robot is said to hold."""
-    for name, item in held.items():
+def _holds(document: Document, held: Mapping[str, schema.HeldSchema], objects: Mapping[str, PlacedObject]) -> tuple[Hold, ...]:
+    """Return what the robot is said to hold."""
+    attachments = {name: item.attachment for name, item in held.items()}
+    by = {name: item.by for name, item in held.items() if item.by is not None}
+    at = {name: item.at for name, item in held.items() if item.at is not None}
+    for name in held:
         path = ("start", "held", name)
         if name not in objects:
             raise document.unknown(path, "object", name, objects)
         with document.at(path):
-            check_holds(objects, {name: item.attachment}, {}, {} if item.at is None else {name: item.at})
-            if item.by is not None:
-                owner = item.by.partition(".")[0]
-                both = {owner: held[owner].attachment} if owner in held else {}
-                check_holds(objects, {name: item.attachment, **both}, {name: item.by}, {})
+            alone = {name: attachments[name]}
+            checked_holds(objects, holds_of(alone, at={name: at[name]} if name in at else {}))
+            if name in by:
+                owner = by[name].partition(".")[0]
+                both = {owner: attachments[owner]} if owner in held else {}
+                checked_holds(objects, holds_of({**both, **alone}, {name: by[name]}))
     with document.at(("start", "held")):
-        holds_of({n: item.attachment for n, item in held.items()}, {n: item.by for n, item in held.items() if item.by})
+        return checked_holds(objects, holds_of(attachments, by, at))
 
 
 def _pose(item: schema.PoseSchema) -> pin.SE3:

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.program.problem import TrajectoryProblem
-from vkc_pin.scene.hold import as_mappings
 
 __all__ = ["as_trajectory"]
 
@@ -33,13 +32,13 @@ def as_trajectory(problem: TrajectoryProblem, z: NDArray[np.float64], dt: NDArra
         for row in range(begin + 1, int(end) + 1):
             rows.append(row)
             times.append(times[-1] + dt[row - 1])
-        phases.append(PhaseSpan(phase.name, first, len(rows) - 1, *as_mappings(phase.held)))
+        phases.append(PhaseSpan(phase.name, first, len(rows) - 1, phase.held))
         begin = int(end)
     last = problem.task.phases[-1]
     if set(problem.task.after) < {*last.held, *last.grasps}:
         rows.append(rows[-1])
         times.append(times[-1] + wait)
-        phases.append(PhaseSpan("let go", len(rows) - 2, len(rows) - 1, *as_mappings(problem.task.after)))
+        phases.append(PhaseSpan("let go", len(rows) - 2, len(rows) - 1, problem.task.after))
     robot = problem.chain.robot.coordinates.size
     return Trajectory(problem.chain.names, np.array(times), waypoints[rows], tuple(phases), robot)
 

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from vkc_pin.options import Options
-from vkc_pin.scene.hold import as_mappings
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.compiler import compile_task, nothing_to_do
 from vkc_pin.task.phases import Task
@@ -56,5 +55,4 @@ def _ideally_after(scene: Scene, task: Task) -> Scene:
             scene = scene.with_state(name, {joint: float(np.clip(value, thing.lower[index], thing.upper[index]))})
         for hold, placement in phase.lowered.items():
             scene = scene.with_placement(hold.object, placement)
-    held, by = as_mappings(task.after)
-    return scene.with_held(held, by=by)
+    return scene.with_held(task.after)

@@ -97,7 +97,7 @@ def check_goals(samples: Samples, steps: Sequence[Step], options: Options) -> li
 def _in_hand(samples: Samples, steps: Sequence[Step]) -> list[set[str]]:
     """Return which free objects the steps want in the hand before the first and after each of them."""
     objects = samples.scene.objects
-    held = {name: samples.scene.held_by.get(name, "") for name in samples.scene.held if objects[name].object.free}
+    held = {hold.object: hold.frame or "" for hold in samples.scene.holds if objects[hold.object].object.free}
     hands = [set(held)]
     for step in steps:
         owner = step.frame.partition(".")[0] if isinstance(step, Touch) else getattr(step, "object", None)
@@ -176,7 +176,7 @@ def _moved(samples: Samples, number: int) -> dict[str, tuple[float, str]]:
     """Return the objects that are moved by the hand in a phase, and how far; what moves by itself is "unheld"."""
     phase = samples.trajectory.phases[number]
     moved: dict[str, tuple[float, str]] = {}
-    driven = samples.moved_by(phase.held)
+    driven = samples.moved_by(phase.holds)
     for column, name in enumerate(samples.trajectory.names):
         if name not in driven:
             continue

@@ -98,7 +98,7 @@ class PairTable:
         for pair, overlap in touching.items():
             which = (self.pairs == pair).all(axis=1)
             self.margins[which], self.contact[which], self.together[which] = 0.0, overlap, overlap == 0.0
-        for owner, link in {item for phase in trajectory.phases for item in phase.by.items()}:
+        for owner, link in {(hold.object, hold.frame) for phase in trajectory.phases for hold in phase.holds if hold.by}:
             ones, others = np.array(self.group) == owner, np.array(labels) == link
             first, second = self.pairs.T
             self.together |= (ones[first] & others[second]) | (others[first] & ones[second])

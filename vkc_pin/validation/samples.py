@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 
 import numpy as np
 import pinocchio as pin
@@ -13,6 +13,7 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.models.articulation import Freedom
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.motion.world import World
+from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.scene import Scene
 
 __all__ = ["ANGLE_STEP", "LENGTH_STEP", "Samples"]
@@ -58,15 +59,15 @@ class Samples:
             if name not in known:
                 raise UnknownNameError("coordinate", name, known, field="trajectory.names")
         for number, phase in enumerate(self.trajectory.phases):
-            for owner, attachment in phase.held.items():
-                field = f"trajectory.phases[{number}].held"
+            for hold in phase.holds:
+                owner, attachment, field = hold.object, hold.attachment, f"trajectory.phases[{number}].held"
                 if owner not in self.scene.objects:
                     raise UnknownNameError("object", owner, self.scene.objects, field=field)
                 attachments = self.scene.objects[owner].object.attachments
                 if attachment not in attachments:
                     raise UnknownNameError(f"attachment of '{owner}'", attachment, attachments, field=field)
-                if owner in phase.by:
-                    self.check_frame(phase.by[owner], field.replace("held", "by"))
+                if hold.frame is not None:
+                    self.check_frame(hold.frame, field.replace("held", "by"))
                 for name in attachments[attachment].coordinates:
                     if f"{owner}.{name}" not in names:
                         raise InputError(
@@ -127,12 +128,12 @@ class Samples:
         """Return the samples of a phase, both ends among them."""
         return np.arange(self.waypoint_rows[phase.first], self.waypoint_rows[phase.last] + 1)
 
-    def moved_by(self, held: Mapping[str, str]) -> set[str]:
+    def moved_by(self, holds: Iterable[Hold]) -> set[str]:
         """Return the coordinates of objects that a hand that holds them can move: those between base and attachment."""
         model, names = self.world.model, set()
-        for owner, attachment in held.items():
-            link = self.scene.objects[owner].object.attachments[attachment].link
-            joint = model.frames[model.getFrameId(f"{owner}.{link}")].parentJoint
+        for hold in holds:
+            link = self.scene.objects[hold.object].object.attachments[hold.attachment].link
+            joint = model.frames[model.getFrameId(f"{hold.object}.{link}")].parentJoint
             while joint:
                 names.add(str(model.names[joint]))
                 joint = model.parents[joint]

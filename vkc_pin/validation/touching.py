@@ -46,8 +46,8 @@ def may_touch(
 
     hands = set(scene.robot.touch_links)
     grips = [(step.object, step.attachment, step.by) for step in steps if isinstance(step, Grasp)]
-    grips += [(owner, attachment, phase.by.get(owner)) for phase in trajectory.phases for owner, attachment in phase.held.items()]
-    grips += [(owner, attachment, scene.held_by.get(owner)) for owner, attachment in scene.held.items()]
+    holds = [*(hold for phase in trajectory.phases for hold in phase.holds), *scene.holds]
+    grips += [(hold.object, hold.attachment, hold.frame) for hold in holds]
     for owner, attachment, by in grips:
         grasped = f"{owner}.{scene.objects[owner].object.attachment(attachment).link}"
         allow({by} if by else hands, {grasped}, CONTACT if by else 0.0)

@@ -151,7 +151,7 @@ class _Check:
     def _unheld(self) -> None:
         """What no hand moves does not move."""
         for phase in self.trajectory.phases:
-            driven = self.samples.moved_by(phase.held)
+            driven = self.samples.moved_by(phase.holds)
             for i, name in enumerate(self.trajectory.names):
                 if i < self.trajectory.robot_size or name in driven or name in self.samples.virtual:
                     continue
@@ -198,17 +198,16 @@ class _Check:
         largest = np.zeros(2)
         for phase in self.trajectory.phases:
             rows = self.samples.rows(phase)
-            for owner, attachment in phase.held.items():
-                errors = self.samples.grasp_errors(owner, attachment, rows, phase.by.get(owner))
+            for hold in phase.holds:
+                errors = self.samples.grasp_errors(hold.object, hold.attachment, rows, hold.frame)
                 largest = np.maximum(largest, errors.max(axis=0))
                 limits = (self.options.closure_position, self.options.closure_angle)
                 for column, limit, unit in zip(errors.T, limits, ("m", "rad"), strict=True):
                     worst = int(np.argmax(column))
                     if not column[worst] <= limit:
                         detail = f"the grasp drifts by {1e3 * column[worst]:.3f} m{unit}, more than {1e3 * limit:g} m{unit}"
-                        self._add(
-                            "closure", f"{owner}.{attachment}", 0, column[worst] - limit, unit, detail, row=int(rows[worst])
-                        )
+                        subject = f"{hold.object}.{hold.attachment}"
+                        self._add("closure", subject, 0, column[worst] - limit, unit, detail, row=int(rows[worst]))
         return float(largest[0]), float(largest[1])
 
     def _slides(self) -> None:

@@ -22,7 +22,7 @@ import vkc_pin as vkc
 from vkc_pin.baselines import BASELINES, attempt, plan_separately, poses, separate
 from vkc_pin.baselines.attempt import FINER
 from vkc_pin.baselines.following import Followed, follow
-from vkc_pin.baselines.ways import BaseWays
+from vkc_pin.baselines.paths import BasePaths
 from vkc_pin.planning.outcome import TIMES
 from vkc_pin.solver.to_trajectory import as_trajectory
 
@@ -215,7 +215,7 @@ def test_the_arm_does_not_reach(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_no_way_for_the_base_while_the_drawer_moves(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(BaseWays, "way", lambda *_: None)
+    monkeypatch.setattr(BasePaths, "path", lambda *_: None)
     plan = failed(open_scene())
     assert plan.status == "no base path"
     assert [phase.name for phase in plan.trajectory.phases] == ["go to", "reach drawer.handle"]

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from vkc_pin.baselines.failure import FailedError
 from vkc_pin.baselines.following import follow
+from vkc_pin.baselines.paths import BasePaths, headings
 from vkc_pin.baselines.poses import base_poses
 from vkc_pin.baselines.postures import at_home, postures, through
-from vkc_pin.baselines.ways import BaseWays, headings
 from vkc_pin.cache import Cache
 from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.motion.trajectory import Trajectory, join
@@ -41,6 +41,7 @@ Doable = Actuate | Place | GoTo
 FINER = 2
 """How many times more waypoints than elsewhere objects are moved in: an arm that only follows needs smaller steps, and time."""
 _STANDS, _ENDS = 4, 10  # base poses that are tried in turn, the nearest first, at the handle and at the end
+_BASE = slice(3)  # its coordinates
 _ROUNDS = 8  # of the solver: what takes more is mostly in vain
 
 
@@ -138,8 +139,8 @@ class Attempt:
     def _withdrawn(self, stage: Callable[[], None], failure: FailedError) -> None:
         """Bring the arm to how it can be held while the base drives, with as little motion as will do, and go on with a stage."""
 
-        def held(way: NDArray[np.float64]) -> None:
-            self._withdraw(way)
+        def held(path: NDArray[np.float64]) -> None:
+            self._withdraw(path)
             stage()
 
         self._first(postures(self._problem([self._here()]), self.interrupt), held, failure)
@@ -180,35 +181,32 @@ class Attempt:
         depth = Knots(stay, self.rng).depth(ends, stay.segments)
         return np.asarray(poses[depth[:-1] <= min(depth[-1], CLOSE_ENOUGH)])  # the arm may be as close to the robot as it is
 
-    def _withdraw(self, way: NDArray[np.float64]) -> None:
+    def _withdraw(self, path: NDArray[np.float64]) -> None:
         """Move the arm along configurations, shape (K, n), to the last of them, the base stands; nothing to do if K = 0."""
-        if not len(way):
+        if not len(path):
             return
-        problem = self._problem([self._here()])
+        problem = _fixed(self._problem([self._here()]), _BASE)
         arm = slice(3, problem.chain.robot.coordinates.size)
-        problem = _standing(problem, arm, way[-1, arm])
-        seeds = [Seed("straight", through(problem, way[k:])) for k in (0, -1)[: len(way)]]  # by that way, and directly
+        problem = _fixed(problem, arm, path[-1, arm], rows=-1)
+        seeds = [Seed("straight", through(problem, path[k:])) for k in (0, -1)[: len(path)]]  # along it, and directly
         self._take(problem, *self._solve(problem, iter(seeds), "arm does not reach"))
 
     def _drive(self, goals: NDArray[np.float64]) -> None:
         """Drive to where the base has to stand, or to one of several headings there, shape (G, 3), the arm as it is."""
         x, y, yaw = goals[0].tolist()
         problem = self._problem([GoTo(x, y, yaw if len(goals) == 1 else None)])
-        arm = slice(3, problem.chain.robot.coordinates.size)
-        lower, upper = problem.lower.copy(), problem.upper.copy()
-        lower[:, arm] = upper[:, arm] = problem.start[arm]
-        problem = problem.with_bounds(lower, upper)
+        problem = _fixed(problem, slice(3, problem.chain.robot.coordinates.size))
         bare = at_home(problem) and not self.scene.held and len(goals) == 1
         seeds = (
             initialize(problem, "astar", self._seed(), interrupt=self.interrupt)
             if bare
-            else BaseWays(problem, whole=True, interrupt=self.interrupt).seeds(problem, goals)
+            else BasePaths(problem, whole=True, interrupt=self.interrupt).seeds(problem, goals)
         )
         self._take(problem, *self._solve(problem, seeds, "no base path"))
 
     def _reach(self, steps: Sequence[Step], pose: NDArray[np.float64]) -> None:
         """Take hold of the object, or put it down, the base stands."""
-        problem = _standing(self._problem(steps))
+        problem = _fixed(self._problem(steps), _BASE)
         last = np.append(problem.start[:3], pose[3:])
         seeds = [Seed("straight", problem.start + smooth(problem.segments)[:, None] * (last - problem.start))]
         phase = problem.task.phases[-1]
@@ -221,9 +219,9 @@ class Attempt:
     def _move(self, step: Actuate) -> None:
         """Move the object's joints: the base goes to the nearest pose to which the arm can follow."""
         problem = self._problem([step], replace(self.options, move_waypoints=FINER * self.options.move_waypoints))
-        ways, failure = BaseWays(problem, interrupt=self.interrupt), FailedError("no base path")
+        paths, failure = BasePaths(problem, interrupt=self.interrupt), FailedError("no base path")
         for pose in self._poses(problem)[:_ENDS]:
-            base = self._path(problem, ways, pose[:3])
+            base = paths.along(problem, pose[:3])
             if base is None:
                 continue
             self._in_time(failure)
@@ -253,21 +251,6 @@ class Attempt:
         if time.perf_counter() > self.deadline:
             failure.cause = failure.cause if failure.parts else "time limit"
             raise failure
-
-    def _path(self, problem: TrajectoryProblem, ways: BaseWays, goal: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Return the base at every waypoint, shape (N, 3): it stands while a latch is released; None: there is no way."""
-        base: list[NDArray[np.float64]] = []
-        now = problem.start[:3]
-        for phase in problem.task.phases:
-            if phase.kind == "move":
-                way = ways.way(now, goal, phase.segments)
-                if way is None:
-                    return None
-            else:
-                way = np.tile(now, (phase.segments, 1))
-            base.append(way)
-            now = way[-1]
-        return np.concatenate(base)
 
     def _here(self) -> GoTo:
         """Return the step of the base to where it is."""
@@ -306,10 +289,10 @@ class Attempt:
         return int(self.rng.integers(2**32))
 
 
-def _standing(problem: TrajectoryProblem, arm: slice | None = None, last: NDArray[np.float64] | None = None) -> TrajectoryProblem:
-    """Return a problem in which the base stands, and the arm ends at `last` if that is given."""
+def _fixed(
+    problem: TrajectoryProblem, columns: slice, values: NDArray[np.float64] | None = None, rows: slice | int = slice(None)
+) -> TrajectoryProblem:
+    """Return a problem in which coordinates are at `values`, or else where they start, at some waypoints, by default all."""
     lower, upper = problem.lower.copy(), problem.upper.copy()
-    lower[:, :3] = upper[:, :3] = problem.start[:3]
-    if arm is not None:
-        lower[-1, arm] = upper[-1, arm] = last
+    lower[rows, columns] = upper[rows, columns] = problem.start[columns] if values is None else values
     return problem.with_bounds(lower, upper)

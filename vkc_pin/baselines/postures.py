@@ -22,30 +22,30 @@ _SAME = 1e-6  # [rad]
 def postures(problem: TrajectoryProblem, interrupt: Interrupt = NEVER) -> Iterator[NDArray[np.float64]]:
     """Yield configurations, shape (n,), in which the base may drive away from where it is, and the ones that lead to them.
 
-    Each is a way for the arm while the base stands, shape (K, n), and ends in what the base then drives in: nothing to do (K =
+    Each is a path of the arm while the base stands, shape (K, n), and ends in what the base then drives in: nothing to do (K =
     0), back from what it lets go of, or up with what it carries, from there to home, and from there folded, for narrow
     passages. Those that are not free are left out.
 
     Args:
         problem: Lets go of what stands fixed in the world and carries the rest along.
-        interrupt: Ends the search for an arm drawn in.
+        interrupt: Ends the search for a folded arm.
     """
     knots, robot = Knots(problem, np.random.default_rng(0)), problem.chain.robot  # nothing is drawn
 
-    def is_free(way: NDArray[np.float64]) -> bool:
-        end = way[-1:] if len(way) else problem.start[None]
+    def is_free(path: NDArray[np.float64]) -> bool:
+        end = path[-1:] if len(path) else problem.start[None]
         return bool(knots.depth(end, problem.segments)[0] <= CLOSE_ENOUGH)
 
     away = Approach(knots).away(problem.start, problem.task.phases[0])
     home = (away[-1] if len(away) else problem.start).copy()
     home[3 : robot.coordinates.size] = robot.home
-    ways = [np.empty((0, problem.chain.size))]
-    ways += [away] if len(away) else []
-    ways += [] if at_home(problem) else [np.vstack([away, home])]
-    yield from filter(is_free, ways)
+    paths = [np.empty((0, problem.chain.size))]
+    paths += [away] if len(away) else []
+    paths += [] if at_home(problem) else [np.vstack([away, home])]
+    yield from filter(is_free, paths)
     folded = home.copy()
     folded[3 : robot.coordinates.size] = Routes(problem, interrupt).folded_arm(0)  # looked for only if nothing else will do
-    yield from filter(is_free, [np.vstack([ways[-1], folded])])
+    yield from filter(is_free, [np.vstack([paths[-1], folded])])
 
 
 def at_home(problem: TrajectoryProblem) -> bool:
@@ -54,9 +54,9 @@ def at_home(problem: TrajectoryProblem) -> bool:
     return bool(np.abs(problem.start[3 : robot.coordinates.size] - robot.home).max() < _SAME)
 
 
-def through(problem: TrajectoryProblem, way: NDArray[np.float64]) -> NDArray[np.float64]:
+def through(problem: TrajectoryProblem, path: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return waypoints from a problem's start through configurations, shape (K, n), to the last of them, shape (N, n)."""
-    knots = np.vstack([problem.start, way])
+    knots = np.vstack([problem.start, path])
     lengths = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(knots, axis=0)).max(axis=1))])
     at = lengths[-1] * smooth(problem.segments)
     return problem.clip(np.column_stack([np.interp(at, lengths, column) for column in knots.T]))

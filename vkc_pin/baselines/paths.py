@@ -1,4 +1,4 @@
-"""The base's ways: straight if that is free, else the shortest by A*; of the bare base, or with the arm as it is."""
+"""Paths of the base: straight if that is free, else the shortest by A*; of the bare base, or with the arm as it is."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from vkc_pin.seeds.routes import grid_shapes
 from vkc_pin.seeds.seed import Seed
 from vkc_pin.task.steps import GoTo
 
-__all__ = ["BaseWays", "headings"]
+__all__ = ["BasePaths", "headings"]
 
-_STEPS, _STEP = 25, 0.08  # places of a straight way that are looked at: at least so many, and at most so far apart [m]
+_STEPS, _STEP = 25, 0.08  # poses on a straight path that are looked at: at least so many, and at most so far apart [m]
 
 
-class BaseWays:
-    """Ways of the base between places, around all that stands in the last phase of a problem.
+class BasePaths:
+    """Paths of the base between places, around all that stands in the last phase of a problem.
 
     Attributes:
         grid: Where the base fits.
@@ -34,9 +34,9 @@ class BaseWays:
         """Look at the floor.
 
         Args:
-            problem: Whose ways they are.
+            problem: Whose base it is.
             whole: The arm counts as well, as it is at the start, with what it holds; otherwise the bare base alone.
-            interrupt: Ends a search, as if there were no way.
+            interrupt: Ends a search, as if there were no path.
         """
         self.interrupt = interrupt
         self.omni = problem.chain.robot.base == "omni"
@@ -56,13 +56,13 @@ class BaseWays:
         """A grid of smaller cells, for narrow passages."""
         return self._finer()
 
-    def way(self, start: NDArray[np.float64], goals: NDArray[np.float64], steps: int) -> NDArray[np.float64] | None:
-        """Return poses after the start, slow at both ends, the last at a goal, shape (steps, 3); None: there is no way.
+    def path(self, start: NDArray[np.float64], goals: NDArray[np.float64], steps: int) -> NDArray[np.float64] | None:
+        """Return poses after the start, slow at both ends, the last at a goal, shape (steps, 3); None: there is no path.
 
         Args:
             start: x, y, yaw [m, rad].
             goals: The same, shape (3,), or several of them, shape (G, 3): the first that can be reached straight, else the one
-                to which the way is the shortest.
+                to which the path is the shortest.
             steps: How many poses.
         """
         goals = np.atleast_2d(goals)
@@ -70,17 +70,27 @@ class BaseWays:
             places = max(_STEPS, int(np.ceil(np.hypot(*(goal - start)[:2]) / _STEP)))
             if all(self.grid.clear(*pose) for pose in np.linspace(start, goal, places)):
                 return np.asarray(start + smooth(steps)[:, None] * (goal - start))
-        path = shortest_path(self.grid, start.tolist(), goals, interrupt=self.interrupt)
-        if path is None:
-            path = shortest_path(self.finer, start.tolist(), goals, interrupt=self.interrupt)
-        return None if path is None else poses_along(path, steps)
+        find = functools.partial(shortest_path, start=start.tolist(), goals=goals, interrupt=self.interrupt)
+        found = find(self.grid) or find(self.finer)
+        return None if found is None else poses_along(found, steps)
+
+    def along(self, problem: TrajectoryProblem, goal: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Return the base at every waypoint, shape (N, 3): it stands while a latch is released; None: there is no path."""
+        base = [problem.start[None, :3]]
+        for phase in problem.task.phases:
+            moves = phase.kind == "move"
+            part = self.path(base[-1][-1], goal, phase.segments) if moves else np.tile(base[-1][-1], (phase.segments, 1))
+            if part is None:
+                return None
+            base.append(part)
+        return np.concatenate(base[1:])
 
     def seeds(self, problem: TrajectoryProblem, goals: NDArray[np.float64]) -> Iterator[Seed]:
-        """Yield the way from a problem's start to one of `goals`, shape (G, 3), the arm at rest, if there is one."""
-        way = self.way(problem.start[:3], goals, problem.segments)
-        if way is not None:
+        """Yield the path from a problem's start to one of `goals`, shape (G, 3), the arm at rest, if there is one."""
+        path = self.path(problem.start[:3], goals, problem.segments)
+        if path is not None:
             z = np.tile(problem.start, (problem.segments, 1))
-            z[:, :3] = way
+            z[:, :3] = path
             yield Seed("astar", problem.clip(z))
 
 

@@ -1,4 +1,4 @@
-"""Ways of the base, bare or with the arm as it is: straight, around what stands there, or none."""
+"""Paths of the base, bare or with the arm as it is: straight, around what stands there, or none."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from helpers.drives import hall
 from helpers.small_problems import door_scene, program_of
 
 import vkc_pin as vkc
-from vkc_pin.baselines.ways import BaseWays, headings
+from vkc_pin.baselines.paths import BasePaths, headings
 from vkc_pin.driving.path import shortest_path
 from vkc_pin.models.shapes import placed_shapes
 from vkc_pin.scene.obstacles import FLOOR
@@ -26,8 +26,8 @@ AISLE = np.array([1.0, -1.4, 0.0])  # behind the post
 POST: dict[str, Any] = {"name": "post", "type": "box", "size": [0.2, 0.2, 1.0], "position": [-0.3, -0.1, 0.5]}
 
 
-def ways(scene: vkc.Scene, name: str = "drawer", **joints: float) -> BaseWays:
-    return BaseWays(program_of(scene, [vkc.Actuate(name, joints or {"slide": 0.3})], options=SHORT))
+def base_paths(scene: vkc.Scene, name: str = "drawer", **joints: float) -> BasePaths:
+    return BasePaths(program_of(scene, [vkc.Actuate(name, joints or {"slide": 0.3})], options=SHORT))
 
 
 def room_of(scene: vkc.Scene, poses: np.ndarray, *, without: Sequence[str] = ("drawer",)) -> float:
@@ -42,25 +42,25 @@ def room_of(scene: vkc.Scene, poses: np.ndarray, *, without: Sequence[str] = ("d
 
 
 def test_straight_where_that_is_free() -> None:
-    way = ways(open_scene(POST)).way(START, BESIDE, 10)
-    assert way is not None
+    path = base_paths(open_scene(POST)).path(START, BESIDE, 10)
+    assert path is not None
     u = np.arange(1, 11) / 10
     for column in range(3):  # from rest to rest
         expected = START[column] + (3 * u**2 - 2 * u**3) * (BESIDE[column] - START[column])
-        np.testing.assert_allclose(way[:, column], expected, atol=1e-12)
+        np.testing.assert_allclose(path[:, column], expected, atol=1e-12)
 
 
 def test_around_what_stands_there() -> None:
     scene = open_scene(POST)
     assert room_of(scene, np.array([START, AISLE])) < 0.0
-    way = ways(scene).way(START, AISLE, 80)
-    assert way is not None
-    assert way.shape == (80, 3)
-    np.testing.assert_array_equal(way[-1, :2], AISLE[:2])
-    assert np.cos(way[-1, 2] - AISLE[2]) == pytest.approx(1.0)
+    path = base_paths(scene).path(START, AISLE, 80)
+    assert path is not None
+    assert path.shape == (80, 3)
+    np.testing.assert_array_equal(path[-1, :2], AISLE[:2])
+    assert np.cos(path[-1, 2] - AISLE[2]) == pytest.approx(1.0)
     # It keeps its margin, but for the corners that are cut between two waypoints.
-    assert room_of(scene, np.vstack([START, way])) >= MARGIN - BLINK - 0.01
-    steps = np.linalg.norm(np.diff(np.vstack([START, way])[:, :2], axis=0), axis=1)
+    assert room_of(scene, np.vstack([START, path])) >= MARGIN - BLINK - 0.01
+    steps = np.linalg.norm(np.diff(np.vstack([START, path])[:, :2], axis=0), axis=1)
     assert steps.sum() < 1.3 * np.hypot(*(AISLE - START)[:2])
     assert steps.max() < 0.15
     assert max(steps[0], steps[-1]) < 0.01, "slow at both ends"
@@ -74,24 +74,24 @@ def test_around_what_stands_there() -> None:
     ],
     ids=["a wall across", "walled in"],
 )
-def test_no_way(walls: list[tuple[list[float], list[float]]]) -> None:
+def test_no_path(walls: list[tuple[list[float], list[float]]]) -> None:
     boxes = [{"name": f"wall_{k}", "type": "box", "size": size, "position": at} for k, (size, at) in enumerate(walls)]
     scene = open_scene(*boxes)
     assert room_of(scene, np.array([START, START])) > MARGIN
     assert room_of(scene, np.array([AISLE, AISLE])) > MARGIN
-    assert ways(scene).way(START, AISLE, 10) is None
+    assert base_paths(scene).path(START, AISLE, 10) is None
 
 
 def test_a_blocked_end_is_not_reached() -> None:
     scene = open_scene(POST)
-    assert ways(scene).way(START, np.array([-0.3, -0.1, 0.0]), 10) is None
+    assert base_paths(scene).path(START, np.array([-0.3, -0.1, 0.0]), 10) is None
 
 
 def test_a_differential_base_does_not_go_sideways() -> None:
-    way = ways(open_scene(base="differential")).way(START, BESIDE, 400)
-    assert way is not None
-    steps = np.diff(np.vstack([START, way]), axis=0)
-    heading = np.vstack([START, way])[:-1, 2] + steps[:, 2] / 2
+    path = base_paths(open_scene(base="differential")).path(START, BESIDE, 400)
+    assert path is not None
+    steps = np.diff(np.vstack([START, path]), axis=0)
+    heading = np.vstack([START, path])[:-1, 2] + steps[:, 2] / 2
     sideways = np.abs(np.cos(heading) * steps[:, 1] - np.sin(heading) * steps[:, 0])
     assert sideways.max() < 5e-3, "it turns where it stands, but for the step in which it begins to"
     assert np.median(sideways) < 1e-9
@@ -106,10 +106,10 @@ def test_other_objects_are_in_the_way_as_they_stand() -> None:
     for hinge, straight in ((0.0, False), (1.5, True)):
         here = both.with_state("door", {"hinge": hinge})
         assert (room_of(here, np.array([before, after])) > MARGIN) == straight
-        way = ways(here).way(before, after, 80)
-        assert way is not None
-        assert (np.ptp(way[:, 1]) < 1e-9) == straight
-        assert room_of(here, np.vstack([before, way])) >= MARGIN - BLINK - 0.01
+        path = base_paths(here).path(before, after, 80)
+        assert path is not None
+        assert (np.ptp(path[:, 1]) < 1e-9) == straight
+        assert room_of(here, np.vstack([before, path])) >= MARGIN - BLINK - 0.01
 
 
 def test_the_door_that_it_opens_is_not_in_its_way() -> None:
@@ -117,20 +117,20 @@ def test_the_door_that_it_opens_is_not_in_its_way() -> None:
     scene = door_scene()
     before, after = np.array([1.8, -0.05, 0.0]), np.array([3.3, -0.05, 0.0])
     assert room_of(scene, np.array([before, after]), without=()) < 0.0
-    found = ways(scene, "door", hinge=1.2)
-    way = found.way(before, after, 10)
-    assert way is not None
-    np.testing.assert_allclose(way[:, 1:], np.tile(before[1:], (10, 1)), atol=1e-12)
+    found = base_paths(scene, "door", hinge=1.2)
+    path = found.path(before, after, 10)
+    assert path is not None
+    np.testing.assert_allclose(path[:, 1:], np.tile(before[1:], (10, 1)), atol=1e-12)
     assert not found.grid.clear(2.55, -0.5, 0.0)
 
 
-def test_what_stands_still_of_the_thing_it_holds_is_in_its_way() -> None:
+def test_what_stands_still_of_the_object_it_holds_is_in_its_way() -> None:
     """The drawer's case does not move with the drawer."""
     scene = changed(open_scene(), objects=[{**drawer_scene().document["objects"][0], "position": [-0.4, 0.0, 0.0]}])
     before, after = np.array([-0.1, -1.7, np.pi / 2]), np.array([-0.1, 1.7, np.pi / 2])
-    way = ways(scene).way(before, after, 80)
-    assert way is not None
-    assert room_of(scene, np.vstack([before, way]), without=()) >= MARGIN - 0.02
+    path = base_paths(scene).path(before, after, 80)
+    assert path is not None
+    assert room_of(scene, np.vstack([before, path]), without=()) >= MARGIN - 0.02
 
 
 # --- with the arm as it is ---------------------------------------------------------------------------------------------
@@ -147,16 +147,16 @@ def to(scene: vkc.Scene, x: float, y: float, yaw: float | None = None) -> vkc.Tr
 def test_the_arm_counts_if_it_is_to() -> None:
     problem = to(open_scene(SHELF).with_start(arm=ASIDE), 0.5, 0.6)
     goal = np.array([0.5, 0.6, 0.0])
-    bare = BaseWays(problem).way(START, goal, 80)
+    bare = BasePaths(problem).path(START, goal, 80)
     assert bare is not None
     np.testing.assert_allclose(np.diff(bare[:, 0]) * 0.9 / 2.0, -np.diff(bare[:, 1]), atol=1e-9)  # straight below the shelf
-    whole = BaseWays(problem, whole=True)
+    whole = BasePaths(problem, whole=True)
     assert not all(whole.grid.clear(*pose) for pose in bare)
-    way = whole.way(START, goal, 80)
-    assert way is not None
-    np.testing.assert_array_equal(way[-1, :2], goal[:2])
-    z = np.tile(problem.start, (len(way), 1))
-    z[:, :3] = way
+    path = whole.path(START, goal, 80)
+    assert path is not None
+    np.testing.assert_array_equal(path[-1, :2], goal[:2])
+    z = np.tile(problem.start, (len(path), 1))
+    z[:, :3] = path
     contacts = problem.contacts.evaluate(z, np.ones(len(z), int), reach=MARGIN)
     assert contacts.violation() < 0.01 + BLINK, "but for the corners that are cut between two waypoints"
 
@@ -164,46 +164,46 @@ def test_the_arm_counts_if_it_is_to() -> None:
 def test_what_is_held_counts_with_the_arm() -> None:
     scene = room(objects=["stick"])
     held = scene.with_held({"stick": "grip"})
-    shapes = [len(BaseWays(to(one, 1.0, 1.0), whole=True).grid.base.shapes) for one in (scene, held)]
+    shapes = [len(BasePaths(to(one, 1.0, 1.0), whole=True).grid.base.shapes) for one in (scene, held)]
     assert shapes[1] == shapes[0] + len(scene.objects["stick"].object.collision.geometryObjects)
 
 
 def test_of_several_goals_the_first_that_is_straight_ahead_or_else_the_nearest() -> None:
-    found = ways(open_scene(POST))
+    found = base_paths(open_scene(POST))
     blocked, free = AISLE, np.array([0.5, 1.0, 0.5])
-    way = found.way(START, np.array([blocked, free]), 10)
-    assert way is not None
-    np.testing.assert_array_equal(way[-1], free)
+    path = found.path(START, np.array([blocked, free]), 10)
+    assert path is not None
+    np.testing.assert_array_equal(path[-1], free)
     near, far = np.array([-0.3, -0.7, 0.0]), np.array([1.0, -1.4, 0.0])
     start = np.array([-0.3, 0.9, -np.pi / 2])
     for goals in ([far, near], [near, far]):
-        way = found.way(start, np.array(goals), 10)
-        assert way is not None
-        np.testing.assert_array_equal(way[-1, :2], near[:2])
+        path = found.path(start, np.array(goals), 10)
+        assert path is not None
+        np.testing.assert_array_equal(path[-1, :2], near[:2])
 
 
 def test_the_seed_has_the_arm_at_rest() -> None:
     problem = to(open_scene(POST), *AISLE[:2].tolist())
     goals = headings(vkc.GoTo(*AISLE[:2].tolist()), 0.0)
-    (seed,) = BaseWays(problem, whole=True).seeds(problem, goals)
+    (seed,) = BasePaths(problem, whole=True).seeds(problem, goals)
     assert seed.z.shape == (problem.segments, problem.chain.size)
     np.testing.assert_array_equal(seed.z[:, 3:], np.tile(problem.start[3:], (problem.segments, 1)))
     np.testing.assert_allclose(seed.z[-1, :2], AISLE[:2], atol=1e-12)
     wall: dict[str, Any] = {"name": "wall", "type": "box", "size": [0.1, 4.6, 1.0], "position": [0.0, 0.0, 0.5]}
     problem = to(open_scene(wall), *AISLE[:2].tolist())
-    assert list(BaseWays(problem, whole=True).seeds(problem, goals)) == []
+    assert list(BasePaths(problem, whole=True).seeds(problem, goals)) == []
 
 
 def test_through_a_gate_that_is_hardly_wider_than_the_base() -> None:
-    """0.73 m wide for 0.67 m: there is no way on a grid whose cells are larger than what is left."""
+    """0.73 m wide for 0.67 m: there is no path on a grid whose cells are larger than what is left."""
     walls = [box(str(side), [0.2, 6.0, 1.5], [0.0, 0.09 + 3.365 * side, 0.75]) for side in (1, -1)]
-    narrow = hall(obstacles=walls).with_start(arm=np.array([1.57, -2.2, 2.5, -1.9, -1.57, 0.0]))  # the arm drawn in
-    found, goal = BaseWays(to(narrow, 1.5, 0.5, 0.0), whole=True), np.array([1.5, 0.5, 0.0])
+    narrow = hall(obstacles=walls).with_start(arm=np.array([1.57, -2.2, 2.5, -1.9, -1.57, 0.0]))  # the arm folded
+    found, goal = BasePaths(to(narrow, 1.5, 0.5, 0.0), whole=True), np.array([1.5, 0.5, 0.0])
     assert shortest_path(found.grid, START.tolist(), goal[None]) is None
-    way = found.way(START, goal, 80)
-    assert way is not None
-    np.testing.assert_array_equal(way[-1, :2], goal[:2])
-    through = way[np.abs(way[:, 0]) < 0.3]
+    path = found.path(START, goal, 80)
+    assert path is not None
+    np.testing.assert_array_equal(path[-1, :2], goal[:2])
+    through = path[np.abs(path[:, 0]) < 0.3]
     assert len(through)
     assert np.abs(through[:, 1] - 0.09).max() < 0.04
 

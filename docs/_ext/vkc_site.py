@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import re
 import shutil
@@ -14,6 +15,7 @@ from sphinx.application import Sphinx
 from sphinx.environment import BuildEnvironment
 from sphinx.util.nodes import make_refnode
 
+import api_pages
 import vkc_pin as vkc
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -40,6 +42,11 @@ def read(app: Sphinx, name: str, source: list[str]) -> None:
     )
     source[0] = re.sub(r"\[(\w+)\.md\]\((\1\.md[^)]*)\)", r"[](\2)", source[0])  # the page's title instead of its file's name
     source[0] = re.sub(r"\[([^\]]*)\]\((animations/\w+\.html)\)", r'<a href="\2">\1</a>', source[0])
+
+
+def generate(app: Sphinx) -> None:
+    """Write the reference's pages on the wings, before it is looked which files there are."""
+    api_pages.write()
 
 
 def outdated(app: Sphinx, env: BuildEnvironment, added: set[str], changed: set[str], removed: set[str]) -> list[str]:
@@ -72,6 +79,12 @@ def plain(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: li
         lines[number] = "".join(parts)
 
 
+def whole(app: Sphinx, thing: Any, bound: bool) -> None:
+    """Undo what `autodoc_preserve_defaults` does to a bound method: it takes the first parameter of its function, every time."""
+    if inspect.ismethod(thing):
+        vars(thing.__func__).pop("__signature__", None)
+
+
 def skip(app: Sphinx, what: str, name: str, thing: Any, skipped: bool, options: Any) -> bool | None:
     """Leave out of a module's page what has its place among the names of `vkc_pin` itself."""
     public = what == "module" and name in vkc.__all__ and getattr(vkc, name) is thing
@@ -100,10 +113,12 @@ def resolve(app: Sphinx, env: BuildEnvironment, node: addnodes.pending_xref, con
 def setup(app: Sphinx) -> dict[str, Any]:
     """Connect all of it."""
     os.environ.setdefault("MPLBACKEND", "agg")
+    app.connect("builder-inited", generate)
     app.connect("source-read", read)
     app.connect("env-get-outdated", outdated)
     app.connect("build-finished", films)
     app.connect("autodoc-process-docstring", plain, priority=400)
+    app.connect("autodoc-before-process-signature", whole, priority=900)
     app.connect("autodoc-skip-member", skip)
     app.connect("missing-reference", resolve)
     return {"version": "1", "parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,0 +1,51 @@
+"""Writes the reference's pages on the package's wings, docs/api/wings/*.md, from the package itself when the site is built."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGE, FOLDER = ROOT / "vkc_pin", ROOT / "docs" / "api" / "wings"
+OPTIONAL = {"vkc_pin.cpin.upstream"}  # can be imported only where pinocchio.casadi can
+
+
+def wings() -> dict[str, dict[str, Path]]:
+    """Return wing → full name → file of its modules, itself first; "package" stands for the modules beside the wings."""
+    found: dict[str, dict[str, Path]] = {}
+    for file in sorted(PACKAGE.rglob("*.py"), key=lambda file: (file.parent, file.name != "__init__.py", file.name)):
+        parts = file.relative_to(ROOT).with_suffix("").parts
+        name = ".".join(part for part in parts if part != "__init__")
+        if name != "vkc_pin" and name not in OPTIONAL:
+            found.setdefault(parts[1] if len(parts) > 2 else "package", {})[name] = file
+    return found
+
+
+def taken(file: Path) -> dict[str, list[str]]:
+    """Return module → names that a wing's `__init__.py` takes from it: they are documented as the wing's own."""
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    return {node.module: [a.name for a in node.names] for node in tree.body if isinstance(node, ast.ImportFrom) and node.module}
+
+
+def page(wing: str, files: dict[str, Path]) -> str:
+    """Return a wing's page."""
+    own = f"vkc_pin.{wing}"
+    faces = taken(files[own]) if own in files else {}
+    title = "Beside the wings" if wing == "package" else f"`{wing}`"
+    blocks = [f"# {title}\n"]
+    for name in files:
+        left_out = f"   :exclude-members: {', '.join(faces[name])}\n" if name in faces else ""
+        heading = "" if name == own else f"## {name.removeprefix('vkc_pin.')}\n\n"
+        blocks.append(f"{heading}```{{eval-rst}}\n.. automodule:: {name}\n{left_out}```\n")
+    return "\n".join(blocks)
+
+
+def write() -> None:
+    """Write a page for every wing, if it is not as it should be, and delete those of wings that are no more."""
+    FOLDER.mkdir(exist_ok=True)
+    pages = {FOLDER / f"{wing}.md": page(wing, files) for wing, files in wings().items()}
+    for file in set(FOLDER.glob("*.md")) - set(pages):
+        file.unlink()
+    for file, text in pages.items():
+        if not file.is_file() or file.read_text(encoding="utf-8") != text:
+            file.write_text(text, encoding="utf-8")

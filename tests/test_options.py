@@ -52,6 +52,11 @@ def test_numbers_become_plain() -> None:
     assert Options(dt=1).dt == 1.0
 
 
+def test_how_many_steps_a_time_takes() -> None:
+    assert [Options().steps(seconds) for seconds in (0.01, 1.0, 2.5)] == [1, 4, 10]
+    assert Options(dt=0.1).steps(1.0) == 10
+
+
 def test_they_stay_as_they_are() -> None:
     with pytest.raises(FrozenInstanceError):
         Options().dt = 0.1  # type: ignore[misc]

@@ -31,7 +31,7 @@ class Options:
         velocity_weight_object: W_vel for the object's and the virtual joints.
         acceleration_weight: W_acc of eq. 1, as a multiple of W_vel [s²].
         approach: Length of the straight way on which a hand comes to what it grasps [m].
-        approach_waypoints: Segments it takes.
+        approach_time: How long it takes, at `dt` a waypoint [s].
         contact_slots: Witness planes a waypoint can hold.
         contact_reach: Pairs closer than this get a witness plane [m].
         closure_position: Largest drift of a held object's base that `validation` accepts [m].
@@ -58,7 +58,7 @@ class Options:
     velocity_weight_object: float = 0.1
     acceleration_weight: float = 0.3
     approach: float = 0.08
-    approach_waypoints: int = 4
+    approach_time: float = 1.0
     contact_slots: int = 4
     contact_reach: float = 0.25
     closure_position: float = 1e-3
@@ -83,3 +83,7 @@ class Options:
                 if not number or not 0 < value < np.inf:
                     raise InputError("out of range", field=field, expected="a positive finite number", got=repr(value))
                 object.__setattr__(self, item.name, float(value))
+
+    def steps(self, seconds: float) -> int:
+        """Return how many steps of `dt` a time [s] takes, at least 1."""
+        return max(1, round(seconds / self.dt))

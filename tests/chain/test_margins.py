@@ -11,13 +11,14 @@ import pytest
 from helpers.carrying import STICK, TOP, above, box, lifted, moved_base, reaching, room, table, tool_at
 from helpers.small_problems import SHORT, program_of
 
-from vkc_pin.chain.margins import NEAR, SHARE
+from vkc_pin.chain.margins import EASED_SHARE, EASED_TIME
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.steps import GoTo, Grasp, Place, Reach, Step, Touch
 
 GAP = 4e-3  # [m] of what the stick lies on
+NEAR = SHORT.steps(EASED_TIME)
 LONG = dataclasses.replace(SHORT, reach_waypoints=2 * NEAR + 3)
 N = LONG.reach_waypoints
 ASIDE = lifted(STICK, [0.0, 0.5, 0.0])
@@ -65,7 +66,7 @@ def test_what_is_lifted_may_be_close_to_what_it_lay_on_and_what_is_lowered_to_wh
     assert margins(p, 2) == {}
     found = margins(p, 1)
     assert set(found) == {("stick.stick", "table")}
-    only_near(found["stick.stick", "table"], SHARE * GAP, begin=True, end=True)
+    only_near(found["stick.stick", "table"], EASED_SHARE * GAP, begin=True, end=True)
 
 
 def test_the_margin_is_half_the_distance_of_that_shape() -> None:
@@ -80,7 +81,18 @@ def test_the_margin_is_half_the_distance_of_that_shape() -> None:
     assert not {name for name, label in eased if label == "table"} - {"stick.stick_1", "stick.stick_2"}
     ((begin, end, margin),) = eased["stick.tip_1", "wall"]  # at the other end the wall is far away
     assert (begin, end) == (first, first + NEAR)
-    assert margin == pytest.approx(SHARE * 0.01, abs=1e-6)
+    assert margin == pytest.approx(EASED_SHARE * 0.01, abs=1e-6)
+
+
+def test_how_long_it_may_be_close_does_not_hang_on_the_number_of_waypoints() -> None:
+    """Twice as many waypoints, half as far apart in time: the same seconds at either end."""
+    steps, spans = [Place("stick", ASIDE)], []
+    for options in (LONG, dataclasses.replace(LONG, dt=LONG.dt / 2, reach_waypoints=2 * LONG.reach_waypoints)):
+        p = build(room(table(gap=GAP)), steps, options=options)
+        first = int(p.contacts.first_waypoint[1])
+        moments = [moment for eased in p.contacts.phases[1].eased.values() for moment in eased]
+        spans.append({((begin - first) * options.dt, (end - first) * options.dt) for begin, end, _ in moments})
+    assert spans[0] == spans[1] == {(0.0, EASED_TIME), (N * LONG.dt - EASED_TIME, N * LONG.dt)}
 
 
 @pytest.mark.parametrize("gap", [0.0, -1e-3])
@@ -95,14 +107,14 @@ def test_what_is_put_down_elsewhere_is_eased_there_alone() -> None:
     p = problem(room(small, other), Place("stick", lifted(STICK, [0.0, 1.0, 0.0])))
     found = margins(p, 1)
     assert set(found) == {("stick.stick", "table"), ("stick.stick", "other")}
-    only_near(found["stick.stick", "table"], SHARE * GAP, begin=True)
-    only_near(found["stick.stick", "other"], SHARE * GAP, end=True)
+    only_near(found["stick.stick", "table"], EASED_SHARE * GAP, begin=True)
+    only_near(found["stick.stick", "other"], EASED_SHARE * GAP, end=True)
 
 
 def test_taken_again_it_is_eased_where_it_was_put() -> None:
     p = problem(room(table(gap=GAP)), Place("stick", ASIDE), Grasp("stick"), GoTo(0.0, 0.0))
     assert [phase.name for phase in p.task.phases] == ["reach stick.grip", "place stick", "reach stick.grip", "go to"]
-    only_near(margins(p, 3)["stick.stick", "table"], SHARE * GAP, begin=True)
+    only_near(margins(p, 3)["stick.stick", "table"], EASED_SHARE * GAP, begin=True)
 
 
 def test_in_a_short_phase_both_ends_must_be_possible() -> None:
@@ -117,7 +129,7 @@ def test_the_floor_too() -> None:
     p = problem(room(), Place("stick", low))
     found = margins(p, 1)
     assert set(found) == {("stick.stick", FLOOR)}
-    only_near(found["stick.stick", FLOOR], SHARE * 1e-3, end=True)
+    only_near(found["stick.stick", FLOOR], EASED_SHARE * 1e-3, end=True)
 
 
 def tip_at_a_wall(gap: float, *steps: Step) -> tuple[TrajectoryProblem, np.ndarray]:
@@ -177,5 +189,5 @@ def test_a_motion_that_lifts_and_lowers_keeps_its_margins() -> None:
     ):
         if waypoint >= N and {labels[pair[0]], labels[pair[1]]} == {"stick.stick", "table"}:
             lies[int(waypoint) + 1] = min(lies.get(int(waypoint) + 1, (np.inf, 0.0)), (float(distance), float(margin)))
-    assert lies[2 * N] == (pytest.approx(GAP, abs=1e-6), pytest.approx(SHARE * GAP, abs=1e-7))
+    assert lies[2 * N] == (pytest.approx(GAP, abs=1e-6), pytest.approx(EASED_SHARE * GAP, abs=1e-7))
     assert all(distance >= margin for distance, margin in lies.values())

@@ -186,7 +186,7 @@ def test_closure_holds_from_the_grasp_to_the_end_of_the_hold(opened: TrajectoryP
 def test_every_object_is_closed_while_it_is_held_and_goals_are_met_at_the_end(two_grasps: TrajectoryProblem) -> None:
     first, second, third, fourth = two_grasps.ends.tolist()
     at = dict(zip(names_of(two_grasps), (p.waypoints for p in two_grasps.transcription.structure.poses), strict=True))
-    way = SHORT.approach_waypoints
+    way = SHORT.steps(SHORT.approach_time)
     assert at == {
         "approach cabinet.ball": (first - way,),
         "approach drawer.handle_free": (second - way,),
@@ -271,7 +271,7 @@ def test_a_hand_comes_straight_to_what_it_grasps(step: Step, scene) -> None:  # 
     pose, solver, target = (
         part[number] for part in (problem.transcription.structure.poses, problem.transcription.pose_solvers, problem.targets)
     )
-    assert pose.waypoints == (REACH - SHORT.approach_waypoints,)
+    assert pose.waypoints == (REACH - SHORT.steps(SHORT.approach_time),)
     (hold,) = problem.task.holds
     placed = problem.scene.objects[hold.object]
     grasp = placed.object.attachments[hold.attachment]
@@ -307,7 +307,7 @@ def test_free_objects_are_grasped_where_they_stand_and_closed_nowhere_else() -> 
     ends = problem.ends.tolist()
     at = list(zip(names_of(problem), problem.targets, problem.transcription.structure.poses, strict=True))
     found = [(name, target, pose.waypoints, pose.kind) for name, target, pose in at]
-    way = SHORT.approach_waypoints
+    way = SHORT.steps(SHORT.approach_time)
     point = pin.SE3(np.eye(3), np.array([0.8, 0.9, 0.7]))
     assert found == [
         ("grasp stick.grip", STICK, (ends[0],), "pose"),

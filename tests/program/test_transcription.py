@@ -109,7 +109,7 @@ def clamped(p: TrajectoryProblem) -> list[tuple[int, int, int]]:
         for k in grasps if firm else ():
             held = itertools.takewhile(lambda j, hold=hold: hold in p.task.phases[j].held, range(k + 1, len(p.task.phases)))
             last = max([k, *held])
-            before = max(1, int(p.ends[k]) - OPTIONS.approach_waypoints)
+            before = max(1, int(p.ends[k]) - OPTIONS.steps(OPTIONS.approach_time))
             found += [(p.chain.index(name), before, int(p.ends[last])) for name in names]
     return found
 

@@ -167,10 +167,10 @@ def test_the_base_does_not_jump_while_something_is_held() -> None:
 def test_a_grasp_is_nearest_to_its_straight_way_so_many_waypoints_before() -> None:
     """Where the row of the straight way in stands, at the latest after the first waypoint of its phase."""
     grasp, options = int(problem().ends[0]), problem().options
-    assert beam().approaches == {grasp: grasp - options.approach_waypoints}
-    assert beam().knots.pose_at(grasp - options.approach_waypoints) is not None
+    assert beam().approaches == {grasp: grasp - options.steps(options.approach_time)}
+    assert beam().knots.pose_at(grasp - options.steps(options.approach_time)) is not None
     _, grasp, *_ = problem(around=True).ends.tolist()
-    assert beam(around=True).approaches == {grasp: grasp - options.approach_waypoints}
+    assert beam(around=True).approaches == {grasp: grasp - options.steps(options.approach_time)}
     brief = program_of(door_scene(), [OPEN], options=dataclasses.replace(FEW, reach_waypoints=3))
     assert Beam(Knots(brief, np.random.default_rng(0))).approaches == {3: 1}
 

@@ -69,7 +69,7 @@ def test_seeds_go_from_the_start_without_a_jump() -> None:
         reach = int(problem().ends[0])
         np.testing.assert_array_equal(path[0], problem().start)
         # A straight way to where the hand is before the handle: every waypoint lies between its ends; and straight on.
-        before = reach - OPENED.approach_waypoints
+        before = reach - OPENED.steps(OPENED.approach_time)
         low, high = np.minimum(path[0], path[before]), np.maximum(path[0], path[before])
         assert np.all((path[: before + 1] >= low - 1e-9) & (path[: before + 1] <= high + 1e-9))
         first, last = (dataclasses.replace(door_scene(), start=path[k, :9]).tool_placement() for k in (before, reach))
@@ -332,7 +332,7 @@ def test_a_motion_through_the_narrow_gate() -> None:
 def test_for_trees_the_base_stands_while_the_hand_goes_straight_in(method: str, stands: bool) -> None:
     (z,) = seeds(method)
     reach = int(problem().ends[0])
-    last = z[reach - OPENED.approach_waypoints - 1 : reach, :3]
+    last = z[reach - OPENED.steps(OPENED.approach_time) - 1 : reach, :3]
     assert (np.ptp(last, axis=0).max() < 1e-6) == stands
 
 

@@ -94,7 +94,7 @@ def test_straight_through_the_knots_and_closed_where_it_is_held() -> None:
     assert np.all((z >= p.lower) & (z <= p.upper))
     reach = int(p.ends[0])
     np.testing.assert_allclose(z[reach - 1], knots[at_.index(reach)], atol=1e-3)
-    before = reach - FEW.approach_waypoints
+    before = reach - FEW.steps(FEW.approach_time)
     first, last = p.start, z[before - 1]
     share = np.linalg.norm(z[:before] - first, axis=1) / np.linalg.norm(last - first)
     assert np.all(np.diff(share) > 0.0)
@@ -120,7 +120,7 @@ def test_a_way_is_asked_for_where_nothing_is_held_and_between_straight_ways() ->
     ((phase, first, last, steps, reaches),) = ways.asked
     assert (phase, reaches, ways.turns) == (0, True, [True])
     np.testing.assert_array_equal(first, p.start)
-    assert steps == int(p.ends[0]) - FEW.approach_waypoints
+    assert steps == int(p.ends[0]) - FEW.steps(FEW.approach_time)
     np.testing.assert_allclose(z[:steps, :3], turning(0.0)(first, last, steps), atol=1e-9)
     hand, ahead = (
         dataclasses.replace(door_scene(), start=row[:ROBOT]).tool_placement() for row in (last, knots[at_.index(int(p.ends[0]))])
@@ -222,7 +222,7 @@ def test_a_careful_way_leaves_out_what_hits_something(
     reach = int(p.ends[0])
     grasp = knots[at_.index(reach)]
     if kept:
-        assert steps == reach - FEW.approach_waypoints
+        assert steps == reach - FEW.steps(FEW.approach_time)
         assert np.abs(last - grasp)[:ROBOT].max() > 0.01
     else:
         assert steps == reach

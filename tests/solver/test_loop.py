@@ -108,7 +108,7 @@ def test_the_trust_region_shrinks_when_a_step_is_rejected() -> None:
 
 def test_trouble_in_one_place_does_not_narrow_the_trust_region_in_others() -> None:
     """Forty waypoints in four blocks: in one nothing came of what was promised."""
-    region, before = trust_region.TrustRegion(40), np.full(40, 0.1)
+    region, before = trust_region.TrustRegion(40, 10), np.full(40, 0.1)
     slack, shortfall = np.zeros(40), np.zeros(40)
     shortfall[10:20] = 0.1
     trial = dataclasses.replace(blank_trial(40), slack=slack, shortfall=shortfall)
@@ -127,7 +127,7 @@ def test_trouble_in_one_place_does_not_narrow_the_trust_region_in_others() -> No
 
 def test_a_trust_region_goes_on_with_what_it_is_given() -> None:
     given = np.linspace(0.01, 0.3, 40)
-    region = trust_region.TrustRegion(40, given)
+    region = trust_region.TrustRegion(40, 10, given)
     np.testing.assert_array_equal(region.radius, given)
     region.settle()
     np.testing.assert_array_equal(region.radius, np.minimum(given, trust_region.SETTLE_RADIUS))
@@ -212,7 +212,7 @@ def scripted(
 ) -> Scripted:
     loop = Scripted(*rounds, drift=drift, done=done, step=step)
     loop.far = far
-    region, interrupt = trust_region.TrustRegion(40), SimpleNamespace(pressed=False)
+    region, interrupt = trust_region.TrustRegion(40, 10), SimpleNamespace(pressed=False)
     solver._iterate(loop, region, None, interrupt, len(rounds), patient, thorough)  # type: ignore[arg-type]
     loop.radii.append(region.radius)
     return loop

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from vkc_pin.chain.broadphase import PhaseGeometry
 from vkc_pin.chain.chain import VirtualKinematicChain
-from vkc_pin.chain.margins import eased_pairs
+from vkc_pin.chain.margins import EASED_TIME, eased_pairs
 from vkc_pin.errors import InputError
 from vkc_pin.models.shapes import bounding_box, link_name, own_name
 from vkc_pin.options import Options
@@ -113,7 +113,8 @@ class _Pairing:
             translation=translation,
             left=left,
         )
-        return dataclasses.replace(part, eased=eased_pairs(scene, chain, phase, part, int(self.first_waypoint[number]), before))
+        first, steps = int(self.first_waypoint[number]), self.options.steps(EASED_TIME)
+        return dataclasses.replace(part, eased=eased_pairs(scene, chain, phase, part, first, before, steps))
 
     def _with_obstacles(self, first: int, moving: Sequence[int], above: Sequence[int]) -> NDArray[np.float64]:
         """Return the pairs of what moves with the obstacles, the first of which is geometry `first`, and their margins.

@@ -17,8 +17,8 @@ from vkc_pin.task.phases import Phase
 
 __all__ = ["eased_pairs"]
 
-NEAR = 4  # waypoints from a contact within which the shapes may still be close
-SHARE = 0.5  # of the distance there is at the contact itself
+EASED_TIME = 1.0  # [s] before and after a contact in which the shapes may be close, at `Options.dt` a waypoint
+EASED_SHARE = 0.5  # margin, as a share of the distance at the contact itself
 
 
 def eased_pairs(
@@ -28,6 +28,7 @@ def eased_pairs(
     part: PhaseGeometry,
     first: int,
     before: Phase | None,
+    steps: int,
 ) -> dict[int, list[tuple[int, int, float]]]:
     """Return pair → (first waypoint, last waypoint, margin [m]) for what may be close for a while.
 
@@ -41,6 +42,7 @@ def eased_pairs(
         part: Its geometry and pairs.
         first: The waypoint at which the phase begins.
         before: The phase before it.
+        steps: The waypoints of `EASED_TIME`.
     """
     shapes, last = part.shapes, first + phase.segments
     eased: dict[int, list[tuple[int, int, float]]] = {}
@@ -52,17 +54,17 @@ def eased_pairs(
             other = shapes[int(part.pairs[k, 1])]
             distance = shape_distance(shape, where, other.geometry, other.placement)
             if distance < part.margins[k]:
-                eased.setdefault(k, []).append((begin, end, SHARE * max(distance, 0.0)))
+                eased.setdefault(k, []).append((begin, end, EASED_SHARE * max(distance, 0.0)))
 
-    moments = [(h, p, first, first + NEAR) for h, p in phase.lifted.items()]
-    moments += [(h, p, last - NEAR, last) for h, p in phase.lowered.items()]
+    moments = [(h, p, first, first + steps) for h, p in phase.lifted.items()]
+    moments += [(h, p, last - steps, last) for h, p in phase.lowered.items()]
     for hold, placement, begin, end in moments:
         placed = dataclasses.replace(scene.objects[hold.object], placement=placement)
         rests = {shape.name: shape.placement for shape in standing_geometry(placed)}
         for i in chain.held_geometries[hold]:
             ease(i, shapes[i].geometry, rests[own_name(shapes[i].name)], begin, end)
-    touches = [(goal, last - NEAR, last) for goal in phase.frames]
-    touches += [(goal, first, first + NEAR) for goal in (before.frames if before else ())]
+    touches = [(goal, last - steps, last) for goal in phase.frames]
+    touches += [(goal, first, first + steps) for goal in (before.frames if before else ())]
     for goal, begin, end in touches:
         if not goal.touches:
             continue

@@ -85,4 +85,4 @@ def pose_goals(scene: Scene, chain: VirtualKinematicChain, task: Task, options: 
 
 def approach_at(first: int, last: int, options: Options) -> int:
     """Return the waypoint from which a hand goes straight to a grasp, in a phase from waypoint `first` to `last`."""
-    return max(first + 1, last - options.approach_waypoints)
+    return max(first + 1, last - options.steps(options.approach_time))

@@ -15,7 +15,7 @@ from vkc_pin.chain.contacts import ContactModel, Contacts
 from vkc_pin.chain.pose import ROW_BOUNDS, target_vector
 from vkc_pin.models.coordinates import wrapped
 from vkc_pin.options import Options
-from vkc_pin.program.pose_goals import pose_goals
+from vkc_pin.program.pose_goals import approach_at, pose_goals
 from vkc_pin.program.term_places import TermNumbers, term_goals
 from vkc_pin.program.term_rows import TermRow
 from vkc_pin.program.timing import Timing, runs_between, time_for
@@ -89,9 +89,7 @@ class TrajectoryProblem:
         # From the straight way to the grasp on: there the hand must already be where it will close.
         starts = np.concatenate([[0], self.ends[:-1]])
         begin = {int(end): int(start) for start, end in zip(starts, self.ends, strict=True)}
-        clamped = tuple(
-            (column, max(grasp - o.approach_waypoints, begin[grasp] + 1), last) for column, grasp, last in self.choices
-        )
+        clamped = tuple((column, approach_at(begin[grasp], grasp, o), last) for column, grasp, last in self.choices)
         weights[[column for column, _, _ in clamped]] = _CHOICE_WEIGHT
         acceleration = weights * o.acceleration_weight / o.dt**2
         velocity = np.tile(weights, (self.segments, 1))

@@ -18,7 +18,7 @@ _DRAWS, _ENOUGH = 6, 60  # how often random seeds are drawn until so many are fr
 _OTHERS = 3  # where a hand chooses how to grasp, so many times fewer of the others are kept than of the cheap ones
 _FEW = 12  # free configurations at a knot with which none are pushed out of collisions
 _BEAM, _QUICK_BEAM, _CHILDREN = 40, 24, 4  # configurations kept per knot, and tried from each for the next
-_SPACING = 4  # waypoints between knots along a phase in which something is held
+_KNOT_TIME = 1.0  # [s] from knot to knot along a phase in which something fixed is held, at `Options.dt` a waypoint
 _APPROACH = 6  # configurations looked at on the way to a grasp
 _EASY = 0.5  # share of the beam that must go on freely for a knot to be easy
 _COLLISION, _DEPTH = 10.0, 300.0  # what a collision costs, and a metre of its depth, beside radians of motion
@@ -128,7 +128,8 @@ class Beam:
         problem, knots = self.problem, list[int]()
         for number in range(first, last + 1):
             begin, end = int(problem.ends[number - 1]) if number else 0, int(problem.ends[number])
-            pieces = max(1, round((end - begin) / _SPACING)) if problem.closed(problem.task.phases[number]) else 1
+            closed, steps = problem.closed(problem.task.phases[number]), problem.options.steps(_KNOT_TIME)
+            pieces = max(1, round((end - begin) / steps)) if closed else 1
             knots += np.linspace(begin, end, pieces + 1).round().astype(int)[1:].tolist()
         return knots
 

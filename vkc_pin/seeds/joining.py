@@ -166,7 +166,7 @@ class Joiner:
         if self.paths is not None and self.paths.careful:
             waypoint = self.problem.contacts.inside(number)
             first, last = (part[: len(part) if self._free(part, waypoint) else 0] for part in (first, last))
-        steps = self.problem.options.approach_waypoints
+        steps = self.problem.options.steps(self.problem.options.approach_time)
         spacing = max(1, min(steps, segments // (2 * max(len(first) + len(last), 1))))
         when = [0, *(spacing * (1 + k) for k in range(len(first)))]
         when += [*(segments - spacing * (len(last) - k) for k in range(len(last))), segments]

@@ -15,7 +15,7 @@ from vkc_pin.interrupt import Interrupt, interruptible
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.solver.between import collisions_between, merge
 from vkc_pin.solver.solution import Iteration, Resume, Solution
-from vkc_pin.solver.trust_region import CLOSE_ENOUGH, FAR, Trial, TrustRegion, judge
+from vkc_pin.solver.trust_region import BLOCK_TIME, CLOSE_ENOUGH, FAR, Trial, TrustRegion, judge
 
 __all__ = ["solve"]
 
@@ -220,7 +220,7 @@ def solve(
     loop.penalty = loop.penalty if penalty is None else penalty
     solution = loop.solution
     with interruptible() if interrupt is None else contextlib.nullcontext(interrupt) as noted:
-        region = TrustRegion(problem.segments, radius)
+        region = TrustRegion(problem.segments, problem.options.steps(BLOCK_TIME), radius)
         _iterate(loop, region, callback, noted, loop.options.max_outer if rounds is None else rounds, patient, thorough)
     solution.radius = region.radius
     if noted.pressed:  # whichever way the loop ended, nothing else is to be tried

@@ -11,7 +11,7 @@ from vkc_pin.chain.contacts import Contacts
 
 __all__ = ["Trial", "TrustRegion", "judge"]
 
-BLOCK = 10  # waypoints that share a radius
+BLOCK_TIME = 2.5  # [s] of motion that share a radius, at `Options.dt` a waypoint
 FIRST_RADIUS, RESTART_RADIUS, SETTLE_RADIUS, MIN_RADIUS, SHRINK = 0.5, 0.2, 0.05, 5e-3, 0.4  # [m] and [rad]
 NO_MATTER = 2e-3  # [m] of shortfall, summed over a block, that does not matter
 CLOSE_ENOUGH = 5e-4  # [m] shortfall of clearance at a waypoint that is none
@@ -52,12 +52,18 @@ class Trial:
 class TrustRegion:
     """How far waypoints may move in a round: the same for all of a block, so that trouble in one place does not hold up others.
 
+    Args:
+        segments: N, the number of waypoints.
+        length: How many of them make a block, about.
+        radius: Of each waypoint at first, shape (N,) [m] and [rad]; None: `FIRST_RADIUS`.
+
     Attributes:
+        block: The block of each waypoint, shape (N,).
         radius: Of each waypoint, shape (N,) [m] and [rad].
     """
 
-    def __init__(self, segments: int, radius: NDArray[np.float64] | None = None) -> None:
-        self.block = np.arange(segments) * max(1, round(segments / BLOCK)) // segments
+    def __init__(self, segments: int, length: int, radius: NDArray[np.float64] | None = None) -> None:
+        self.block = np.arange(segments) * max(1, round(segments / length)) // segments
         self.radius = np.full(segments, FIRST_RADIUS) if radius is None else radius.copy()
 
     def adapt(self, before: NDArray[np.float64], trial: Trial, accepted: bool, ratio: float) -> None:

@@ -22,7 +22,7 @@ from vkc_pin.validation import pairs as validation_pairs
 from vkc_pin.validation.pairs import Hit, PairTable
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.touching import may_touch
-from vkc_pin.validation.travel import ways
+from vkc_pin.validation.travel import travelled
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +81,7 @@ def test_no_point_moves_further_than_the_bound(seed: int, size: float) -> None:
     z = world.positions(motion)
     z[:, 11:] += rng.uniform(0.0, 2.0, z.shape[1] - 11)
     z[1:, 11:] += size * rng.uniform(-1.0, 1.0, (len(z) - 1, z.shape[1] - 11))
-    bounds = np.diff(ways(table.solids, z), axis=0)
+    bounds = np.diff(travelled(table.solids, z), axis=0)
     data, shapes = world.model.createData(), pin.GeometryData(world.collision)
     corners = [np.array(box_corners(shape)) for shape in world.shapes]
     for t in range(len(z) - 1):
@@ -197,13 +197,13 @@ def test_no_point_of_what_is_carried_moves_further_than_the_bound(seed: int, siz
     scene, motion = whirl(seed, size=size)
     samples = Samples(scene, motion)
     table_of_pairs = PairTable(scene, samples.world, motion, 0.02)
-    bounds = np.diff(ways(table_of_pairs.solids, samples.z)[samples.waypoint_rows], axis=0)
+    bounds = np.diff(travelled(table_of_pairs.solids, samples.z)[samples.waypoint_rows], axis=0)
     world = samples.world
     data, shapes = world.model.createData(), pin.GeometryData(world.collision)
     corners = [np.array(box_corners(shape)) for shape in world.shapes]
     carried = [i for i, label in enumerate(world.collision_labels) if label.partition(".")[0] in ("stick", "ball")]
     assert len(carried) == 6
-    travelled = 0.0
+    total = 0.0
     for t, (first, last) in enumerate(itertools.pairwise(samples.waypoint_rows)):
         path = np.zeros(len(corners))
         before: list[np.ndarray] = []
@@ -217,10 +217,10 @@ def test_no_point_of_what_is_carried_moves_further_than_the_bound(seed: int, siz
             before = now
         assert (path <= bounds[t] + 1e-6).all()
         assert (bounds[t][path == 0] <= 1e-6).all()
-        travelled += path[carried].max()
+        total += path[carried].max()
         for i in carried:  # and it is no idle bound
             assert bounds[t][i] <= 100 * path[i] + 1e-6
-    assert travelled > 0.0 or np.ptp(motion.positions, axis=0).max() == 0.0
+    assert total > 0.0 or np.ptp(motion.positions, axis=0).max() == 0.0
 
 
 @settings(max_examples=12, deadline=None)

@@ -319,7 +319,9 @@ def test_ctrl_c_says_how_to_go_on(experiment: dict[str, Any], capsys: pytest.Cap
 
 
 def test_records_of_failures(door_plan: vkc.Plan) -> None:
-    blame = vkc.Violation("penetration", "forearm_link – sofa", 9, 4.0, 0.03, "m", "overlap by 30 mm")
+    blame = vkc.Violation(
+        "penetration", "forearm_link – sofa", waypoint=9, time=4.0, amount=0.03, unit="m", detail="overlap by 30 mm"
+    )
     worse = dataclasses.replace(
         door_plan, validation=vkc.Report((blame,)), status="rejected", metrics={**door_plan.metrics, "clearance": np.inf}
     )

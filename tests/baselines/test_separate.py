@@ -349,7 +349,7 @@ class Tries:
         return dataclasses.replace(self.trajectory, positions=positions), came, self.status
 
     def validate(self, *_: Any) -> vkc.Report:
-        wrong = vkc.Violation("goal", "drawer.slide", 0, 0.0, 1.0, "m", "")
+        wrong = vkc.Violation("goal", "drawer.slide", waypoint=0, time=0.0, amount=1.0, unit="m", detail="")
         return vkc.Report(() if self.status == "fine" else (wrong,))
 
 

@@ -26,9 +26,9 @@ from vkc_pin.validation.report import Report, Violation
 GOOD = {"B1": {2, 3}, "B2": {1, 2}, "VKC": {0, 1, 2}}
 """Method → the starts from which `solve` has it succeed."""
 BLAME = (
-    Violation("penetration", "forearm_link – door.panel", 9, 4.0, 0.03, "m", "overlap by 30 mm"),
-    Violation("clearance", "base_link – block_left", 3, 1.5, 0.01, "m", "10 mm too close"),
-    Violation("velocity", "elbow_joint", 11, 5.0, 0.1, "rad/s", "0.1 rad/s too fast"),
+    Violation("penetration", "forearm_link – door.panel", waypoint=9, time=4.0, amount=0.03, unit="m", detail="overlap by 30 mm"),
+    Violation("clearance", "base_link – block_left", waypoint=3, time=1.5, amount=0.01, unit="m", detail="10 mm too close"),
+    Violation("velocity", "elbow_joint", waypoint=11, time=5.0, amount=0.1, unit="rad/s", detail="0.1 rad/s too fast"),
 )
 
 

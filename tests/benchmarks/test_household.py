@@ -28,7 +28,7 @@ from vkc_pin.validation.report import Report, Violation
 
 GOOD = {("cup", "B1"): {0}, ("cup", "B2"): {0, 1}, ("door", "B2"): {1}}
 """(task, method) → the starts from which `solve` has it succeed; VKC always does."""
-BLAME = Violation("closure", "door.handle", 9, 4.0, 0.09, "m", "the grasp drifts by 90 mm")
+BLAME = Violation("closure", "door.handle", waypoint=9, time=4.0, amount=0.09, unit="m", detail="the grasp drifts by 90 mm")
 
 
 @pytest.fixture(autouse=True)

@@ -18,7 +18,7 @@ from vkc_pin.benchmarks.initialization import COMPARED_INITIALIZATIONS, STEPWISE
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.validation.report import Report, Violation
 
-BLAME = Violation("closure", "stick", 3, 1.0, 0.01, "m", "10 mm off")
+BLAME = Violation("closure", "stick", waypoint=3, time=1.0, amount=0.01, unit="m", detail="10 mm off")
 
 
 @pytest.fixture(autouse=True)

@@ -88,7 +88,7 @@ def test_how_long_it_may_be_close_does_not_hang_on_the_number_of_waypoints() -> 
     """Twice as many waypoints, half as far apart in time: the same seconds at either end."""
     steps, spans = [Place("stick", ASIDE)], []
     for options in (LONG, dataclasses.replace(LONG, dt=LONG.dt / 2, reach_waypoints=2 * LONG.reach_waypoints)):
-        p = build(room(table(gap=GAP)), steps, options=options)
+        p = program_of(room(table(gap=GAP)), steps, options=options)
         first = int(p.contacts.first_waypoint[1])
         moments = [moment for eased in p.contacts.phases[1].eased.values() for moment in eased]
         spans.append({((begin - first) * options.dt, (end - first) * options.dt) for begin, end, _ in moments})

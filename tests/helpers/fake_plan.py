@@ -26,7 +26,9 @@ def fake_plan(scene: Scene | None = None) -> Plan:
     end = start + np.concatenate([[2.3, -0.5, -3.9], 0.8 * np.ones(len(robot) - 3), [HINGE, 0.6, 0.3]])
     positions = start + np.outer(done**2, end - start)
     phases = (PhaseSpan("reach door.handle", 0, 6), PhaseSpan("move door.hinge", 6, len(times) - 1, (Hold("door", "handle"),)))
-    blame = Violation("penetration", "forearm_link – sofa", 9, 4.0, 0.03, "m", "overlap by 30 mm")
+    blame = Violation(
+        "penetration", "forearm_link â sofa", waypoint=9, time=4.0, amount=0.03, unit="m", detail="overlap by 30 mm"
+    )
     return Plan(
         scene=scene,
         steps=(Actuate("door", {"hinge": HINGE}),),

@@ -39,7 +39,7 @@ from vkc_pin.validation.distances import Placed
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.touching import may_touch
-from vkc_pin.validation.travel import ways
+from vkc_pin.validation.travel import travelled
 
 SEEDS = st.integers(0, 2**32 - 1)
 POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array([0.4, 0.2, 0.9]))
@@ -262,7 +262,7 @@ def test_bounds_are_bounds(seed: int, count: int, size: float) -> None:
         nearest, distance = here.nearest(table.pairs)
         assert distance == pytest.approx(expected.min(), abs=COAL)
         assert expected[nearest] == pytest.approx(expected.min(), abs=COAL)
-    bounds = np.diff(ways(table.solids, samples.z)[samples.waypoint_rows], axis=0)
+    bounds = np.diff(travelled(table.solids, samples.z)[samples.waypoint_rows], axis=0)
     for t, (here, there) in enumerate(itertools.pairwise(placed)):
         floor = (distances[t] + distances[t + 1] - bounds[t, table.pairs].sum(axis=1)) / 2
         for smallest in (1e-3, 0.1):

@@ -122,7 +122,7 @@ class Race:
 
     def validate(self, scene: vkc.Scene, steps: Any, trajectory: vkc.Trajectory, *options: Any) -> vkc.Report:
         amount = next(self.amounts)
-        wrong = vkc.Violation("goal", "drawer.slide", 0, 0.0, amount, "m", "")
+        wrong = vkc.Violation("goal", "drawer.slide", waypoint=0, time=0.0, amount=amount, unit="m", detail="")
         return vkc.Report((wrong,) if amount else ())
 
     def run(self, steps: Sequence[Any] = PULL, *, scene: vkc.Scene | None = None, **settings: Any) -> vkc.Plan:

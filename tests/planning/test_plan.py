@@ -99,8 +99,12 @@ def test_round_trip_of_every_step(door_plan: vkc.Plan, tmp_path: Path) -> None:
 
 
 def test_a_failed_plan_keeps_its_violations(door_plan: vkc.Plan, tmp_path: Path) -> None:
-    blame = Violation("penetration", "forearm_link – sofa", 9, 4.0, 0.03, "m", "overlap by 30 mm")
-    report = Report((blame,), float("inf"), 1e-4, 2e-4, 77, ("the sofa stands in the way",))
+    blame = Violation(
+        "penetration", "forearm_link – sofa", waypoint=9, time=4.0, amount=0.03, unit="m", detail="overlap by 30 mm"
+    )
+    report = Report(
+        (blame,), float("inf"), closure_error=1e-4, closure_angle=2e-4, states=77, notes=("the sofa stands in the way",)
+    )
     metrics = {**door_plan.metrics, "clearance": np.inf}
     failed = dataclasses.replace(door_plan, validation=report, status="infeasible", metrics=metrics)
     loaded = vkc.Plan.load(failed.save(tmp_path / "failed.npz"))
@@ -287,7 +291,9 @@ def test_the_report_of_a_success(door_plan: vkc.Plan) -> None:
 
 
 def test_the_report_of_a_failure(door_plan: vkc.Plan) -> None:
-    blame = Violation("penetration", "forearm_link – sofa", 9, 4.0, 0.03, "m", "overlap by 30 mm")
+    blame = Violation(
+        "penetration", "forearm_link – sofa", waypoint=9, time=4.0, amount=0.03, unit="m", detail="overlap by 30 mm"
+    )
     failed = dataclasses.replace(door_plan, status="rejected", validation=Report((blame,), -0.03, states=100))
     report = failed.report()
     assert report.startswith("door: FAILED, rejected — reach")
@@ -297,7 +303,7 @@ def test_the_report_of_a_failure(door_plan: vkc.Plan) -> None:
 def test_success_needs_both_words(door_plan: vkc.Plan) -> None:
     assert door_plan.success
     assert not dataclasses.replace(door_plan, status="not converged").success
-    blame = Violation("goal", "base", 9, 4.0, 0.03, "m", "elsewhere")
+    blame = Violation("goal", "base", waypoint=9, time=4.0, amount=0.03, unit="m", detail="elsewhere")
     assert not dataclasses.replace(door_plan, validation=Report((blame,))).success
 
 

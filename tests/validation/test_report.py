@@ -6,8 +6,8 @@ import json
 
 from vkc_pin.validation.report import Report, Violation
 
-ONE = Violation("limit", "elbow_joint", 4, 1.0, 0.05, "rad", "3.2 rad is outside")
-TWO = Violation("penetration", "forearm_link – sofa", 7, 1.9, 0.01, "m", "overlap by 10.0 mm")
+ONE = Violation("limit", "elbow_joint", waypoint=4, time=1.0, amount=0.05, unit="rad", detail="3.2 rad is outside")
+TWO = Violation("penetration", "forearm_link – sofa", waypoint=7, time=1.9, amount=0.01, unit="m", detail="overlap by 10.0 mm")
 
 
 def test_text() -> None:
@@ -20,6 +20,9 @@ def test_text() -> None:
 
 
 def test_round_trip() -> None:
-    for report in (Report((ONE, TWO), -0.01, 0.001, 0.002, 12, ("a wall is in the way",)), Report()):
+    for report in (
+        Report((ONE, TWO), -0.01, closure_error=0.001, closure_angle=0.002, states=12, notes=("a wall is in the way",)),
+        Report(),
+    ):
         assert Report.from_dict(json.loads(json.dumps(report.to_dict()))) == report
     assert not Report((ONE,)).ok

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from vkc_pin.motion.world import World
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.samples import Samples
-from vkc_pin.validation.travel import ways
+from vkc_pin.validation.travel import travelled
 
 
 @settings(max_examples=25, deadline=None)
@@ -28,7 +28,7 @@ def test_no_point_moves_further_than_the_bound(seed: int, size: float) -> None:
     z = world.positions(motion)
     z[:, 11:] += rng.uniform(0.0, 2.0, z.shape[1] - 11)
     z[1:, 11:] += size * rng.uniform(-1.0, 1.0, (len(z) - 1, z.shape[1] - 11))
-    bounds = np.diff(ways(table.solids, z), axis=0)
+    bounds = np.diff(travelled(table.solids, z), axis=0)
     data, shapes = world.model.createData(), pin.GeometryData(world.collision)
     corners = [np.array(box_corners(shape)) for shape in world.shapes]
     for t in range(len(z) - 1):
@@ -57,7 +57,7 @@ def test_no_point_of_what_is_carried_moves_further_than_the_bound(seed: int, siz
     scene, motion = whirl(seed, size=size)
     samples = Samples(scene, motion)
     table_of_pairs = PairTable(scene, samples.world, motion, 0.02)
-    bounds = np.diff(ways(table_of_pairs.solids, samples.z)[samples.waypoint_rows], axis=0)
+    bounds = np.diff(travelled(table_of_pairs.solids, samples.z)[samples.waypoint_rows], axis=0)
     world = samples.world
     data, shapes = world.model.createData(), pin.GeometryData(world.collision)
     corners = [np.array(box_corners(shape)) for shape in world.shapes]

@@ -187,9 +187,7 @@ def scale_chart(records: Sequence[Mapping[str, Any]], path: str | Path | None, *
         axes.set_ylabel("planning time, median and quartiles [s]")
         axes.set_title(title, fontsize=10)
         figure.legend(loc="outside right upper")
-        if path is not None:
-            save_figure(figure, Path(path))
-    return figure
+        return save_figure(figure, path)
 
 
 def _record(spec: dict[str, Any]) -> dict[str, Any]:

@@ -22,13 +22,14 @@ def impossible(problem: TrajectoryProblem) -> list[Violation]:
     for (first, second), distance in zip(contacts.pair, contacts.distance, strict=True):
         labels = problem.contacts.phases[0].labels
         subject = f"{labels[first]} – {labels[second]}"
-        found.append(Violation("start", subject, 0, 0.0, -distance, "m", f"overlap by {-1e3 * distance:.1f} mm at the start"))
+        detail = f"overlap by {-1e3 * distance:.1f} mm at the start"
+        found.append(Violation("start", subject, amount=-distance, unit="m", detail=detail))
     for goal, solver in zip(problem.pose_goals, problem.transcription.pose_solvers, strict=True):
         if goal.kind == "closure" and goal.object in problem.scene.held and 1 in goal.row.waypoints:
             error = float(np.abs(solver.evaluate(problem.start[None], goal.target)[0]).max())
             if error > problem.options.closure_position:
                 detail = f"it is held at the start, but the hand is {error:.4f} m or rad from its attachment"
-                found.append(Violation("closure", goal.about, 0, 0.0, error, "m", detail))
+                found.append(Violation("closure", goal.about, amount=error, unit="m", detail=detail))
     dt = problem.timing_for(problem.still).dt
     for phase, end in zip(problem.task.phases, problem.ends, strict=True):
         waypoint, time = int(end), float(dt[:end].sum())
@@ -40,7 +41,9 @@ def impossible(problem: TrajectoryProblem) -> list[Violation]:
             beyond = max(lower - value, value - upper)
             if beyond > 1e-9:
                 detail = f"{value:g} is beyond the limits {lower:g} to {upper:g} by {beyond:.4g}"
-                found.append(Violation("goal", name, waypoint, time, beyond, problem.unit(name), detail))
+                found.append(
+                    Violation("goal", name, waypoint=waypoint, time=time, amount=beyond, unit=problem.unit(name), detail=detail)
+                )
     return found
 
 

@@ -45,10 +45,7 @@ def plot(plan: Judged, path: str | Path | None = None) -> Figure | dict[str, Fig
         raise InputError("this cannot be plotted", field="plan", expected="a Plan", got=type(plan).__name__)
     target = None if path is None else Path(path)
     if target is None or target.suffix.lower() in _SUFFIXES:
-        figure = _combined(plan)
-        if target is not None:
-            save_figure(figure, target)
-        return figure
+        return save_figure(_combined(plan), target)
     if target.is_file():
         expected = f"a folder, or a name ending with {', '.join(_SUFFIXES)}"
         raise InputError("this is a file", field="path", file=target, expected=expected)

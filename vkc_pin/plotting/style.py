@@ -46,11 +46,13 @@ def new_figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure whole or not at all, in the format that the name's end says."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format=path.suffix.lower()[1:], dpi=130, facecolor="white")
-    write_atomically(path, buffer.getvalue())
+def save_figure(figure: Figure, path: str | Path | None) -> Figure:
+    """Write a figure whole or not at all, in the format that the name's end says; None: nowhere. Returns the figure."""
+    if path is not None:
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format=Path(path).suffix.lower()[1:], dpi=130, facecolor="white")
+        write_atomically(path, buffer.getvalue())
+    return figure
 
 
 def shade_phases(axes: Axes, trajectory: Trajectory) -> None:

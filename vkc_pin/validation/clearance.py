@@ -1,4 +1,4 @@
-"""How close things come over time, and which: for plots."""
+"""How close shapes come to each other over time, and which: for plots."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class ClearanceCurve:
 def clearance_curves(
     scene: Scene, trajectory: Trajectory, times: ArrayLike, *, dist_safe: float, world: World | None = None
 ) -> list[ClearanceCurve]:
-    """Return how close things come along a motion, for each kind of pair that there is.
+    """Return how close shapes come along a motion, for each kind of pair that there is.
 
     The kinds are the robot with itself, with articulated objects, with obstacles, objects with what stands around them,
     and the gripper with what it grasps, which may touch.

@@ -21,7 +21,7 @@ MOTION_TOLERANCE = 1e-5  # [m] or [rad]: less is no motion
 
 
 class Miss(NamedTuple):
-    """One thing of a step that is not as it was asked for."""
+    """What of a step is not as it was asked for."""
 
     subject: str
     amount: float
@@ -87,8 +87,7 @@ def check_goals(samples: Samples, steps: Sequence[Step], options: Options) -> li
         fit = next((k for k in candidates if not misses[number][k]), None)
         if fit is None:
             best = min((k for k in candidates if k), key=lambda k: max(m.amount for m in misses[number][k]))
-            time = float(samples.trajectory.times[ends[best]])
-            found += [Violation("goal", m.subject, ends[best], time, m.amount, m.unit, m.detail) for m in misses[number][best]]
+            found += [_violation(samples, "goal", ends[best], miss) for miss in misses[number][best]]
         else:
             reached = fit
     return found or _check_order(samples, steps, hands, [[not missing for missing in row] for row in misses])
@@ -147,13 +146,18 @@ def _check_order(samples: Samples, steps: Sequence[Step], hands: list[set[str]],
             detail = (
                 f"moves by {amount:.4f} {unit} in '{phase.name}', when it is the turn of step {last + 1}, {_kind(steps[last])}"
             )
-            return [Violation("order", name, phase.first, float(samples.trajectory.times[phase.first]), amount, unit, detail)]
+            return [_violation(samples, "order", phase.first, Miss(name, amount, unit, detail))]
         turns = left
     if len(steps) - 1 in turns:
         return []
     first = max(turns)
     detail = f"{_kind(steps[first])} is undone before the next step begins"
-    return [Violation("order", f"step {first + 1}", phases[-1].last, float(samples.times[-1]), 1.0, "steps", detail)]
+    return [_violation(samples, "order", phases[-1].last, Miss(f"step {first + 1}", 1.0, "steps", detail))]
+
+
+def _violation(samples: Samples, constraint: str, waypoint: int, miss: Miss) -> Violation:
+    """Return what is missed at a waypoint as a violation."""
+    return Violation(constraint, waypoint=waypoint, time=float(samples.trajectory.times[waypoint]), **miss._asdict())
 
 
 def _kind(step: Step) -> str:
@@ -167,8 +171,8 @@ def _carried(samples: Samples, number: int, named: set[str]) -> dict[str, tuple[
     carried = {}
     for owner in phase.held:
         if owner in named:
-            way = np.diff(rows[:, world.placement_columns(owner)][:, :3], axis=0)
-            carried[owner] = (float(np.linalg.norm(way, axis=1).sum()), "m")
+            moves = np.diff(rows[:, world.placement_columns(owner)][:, :3], axis=0)
+            carried[owner] = (float(np.linalg.norm(moves, axis=1).sum()), "m")
     return carried
 
 

@@ -53,8 +53,8 @@ def check_terms(samples: Samples, terms: Sequence[Term]) -> list[Violation]:
             name = f"entry {entry}: " if len(lower) > 1 else ""
             where = " between waypoints" if which is between else ""
             detail = f"{name}{value:.6g} is {side} by {amount:.3g}{where}"
-            time = float(samples.times[row])
-            found.append(Violation("term", term.name, samples.waypoint(row), time, amount, "", detail))
+            waypoint, time = samples.waypoint(row), float(samples.times[row])
+            found.append(Violation("term", term.name, waypoint=waypoint, time=time, amount=amount, unit="", detail=detail))
     return found
 
 

@@ -19,7 +19,7 @@ from vkc_pin.motion.world import World
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.scene import Scene
 from vkc_pin.validation.distances import Placed, Solids
-from vkc_pin.validation.travel import ways
+from vkc_pin.validation.travel import travelled
 
 __all__ = ["Hit", "PairTable"]
 
@@ -76,8 +76,8 @@ class PairTable:
         for joint in range(1, world.model.njoints):
             self.moved.append(self.moved[world.model.parents[joint]] or world.model.names[joint] in trajectory.names)
         held = {owner for phase in trajectory.phases for owner in phase.held}
-        self.carried = {name for name, placed in scene.objects.items() if placed.object.free and name in held}
-        for name in self.carried:
+        self.attached = {name for name, placed in scene.objects.items() if placed.object.free and name in held}
+        for name in self.attached:
             for joint in world.joints_of(name):
                 self.moved[joint] = True
         robots = len(scene.robot.collision.geometryObjects)
@@ -125,7 +125,7 @@ class PairTable:
         joints = [self.world.shapes[i].parentJoint for i in bodies]
         moving = [i for i in bodies if self.group[i] == "robot" or self.moved[joints[i]]]
         # Wheels stand on the floor, objects hang as their makers hung them.
-        above = [i for i in moving if self.group[i] in self.carried or (self.group[i] == "robot" and joints[i] > 1)]
+        above = [i for i in moving if self.group[i] in self.attached or (self.group[i] == "robot" and joints[i] > 1)]
         obstacles = range(self.solids.bodies, len(labels))
         found = [np.zeros((0, 2), int)]
         for floor, ones in ((False, moving), (True, above)):
@@ -134,7 +134,7 @@ class PairTable:
         return np.concatenate(found).astype(int)
 
     def _sort(self) -> None:
-        """Part the pairs of two things that move from those of which one stands still all along the motion."""
+        """Part the pairs of which both move from those of which one stands still all along the motion."""
         moves = np.array([self.group[i] == "robot" or self.moved[shape.parentJoint] for i, shape in enumerate(self.world.shapes)])
         both = moves[self.pairs].all(axis=1)
         self._both, mixed = np.flatnonzero(both), np.flatnonzero(~both)
@@ -159,11 +159,11 @@ class PairTable:
             for c in {int(np.argmin(at)), *np.flatnonzero(at < self.margins[near]).tolist()}:
                 yield self._hit(row, near[c], at[c], at_waypoint=True)
         smallest = max(RESOLUTION, smallest)  # what cannot come closer than that changes nothing
-        travelled = ways(self.solids, z)
+        moved = travelled(self.solids, z)
         for (first, here), (last, there) in itertools.pairwise(zip(waypoints.tolist(), placed, strict=True)):
-            pairs = self._active(here, there, travelled[last] - travelled[first], smallest)
+            pairs = self._active(here, there, moved[last] - moved[first], smallest)
             ends = here.distances(self.pairs[pairs]), there.distances(self.pairs[pairs])
-            yield from self._between(z, (first, last), pairs, ends, travelled, smallest)
+            yield from self._between(z, (first, last), pairs, ends, moved=moved, smallest=smallest)
 
     def _between(
         self,
@@ -171,7 +171,8 @@ class PairTable:
         rows: tuple[int, int],
         pairs: NDArray[np.int_],
         ends: tuple[NDArray[np.float64], NDArray[np.float64]],
-        travelled: NDArray[np.float64],
+        *,
+        moved: NDArray[np.float64],
         smallest: float,
     ) -> Iterator[Hit]:
         """Yield what comes closer than `smallest` at samples between two others, halves of which are left out where nothing can.
@@ -184,19 +185,19 @@ class PairTable:
             rows: The two samples.
             pairs: What may come so close, shape (n,).
             ends: Their distances at both [m].
-            travelled: See `ways`.
+            moved: See `travelled`.
             smallest: [m].
         """
         todo = [(rows, pairs, ends)]
         while todo:
             (low, high), pairs, (before, after) = todo.pop()
-            way = (travelled[high] - travelled[low])[self.pairs[pairs]].sum(axis=1)
-            some = (before + after - way < 2 * smallest) & ((way > STILL) | (before < 0))
-            pairs, before, after, way = pairs[some], before[some], after[some], way[some]
+            motion = (moved[high] - moved[low])[self.pairs[pairs]].sum(axis=1)
+            some = (before + after - motion < 2 * smallest) & ((motion > STILL) | (before < 0))
+            pairs, before, after, motion = pairs[some], before[some], after[some], motion[some]
             if not len(pairs):
                 continue
             if high - low == 1:
-                yield from self._slipping(z, low, pairs, (before, after), way)
+                yield from self._slipping(z, low, pairs, (before, after), motion)
                 continue
             middle = (low + high) // 2
             distances = self.solids.at(self.world.coordinates.q(z[middle])).distances(self.pairs[pairs])
@@ -210,7 +211,7 @@ class PairTable:
         row: int,
         pairs: NDArray[np.int_],
         ends: tuple[NDArray[np.float64], NDArray[np.float64]],
-        way: NDArray[np.float64],
+        motion: NDArray[np.float64],
     ) -> Iterator[Hit]:
         """Yield what overlaps between a sample and the next, at both of which it is free: nothing deeper than 1 mm can hide.
 
@@ -219,15 +220,15 @@ class PairTable:
             row: The first of the two samples.
             pairs: The pairs, shape (n,).
             ends: Their distances at both [m].
-            way: How far any two points of a pair can move relative to each other in between [m].
+            motion: How far any two points of a pair can move relative to each other in between [m].
         """
         overlap = self.contact[pairs]
-        free = (np.minimum(*ends) >= -overlap) & (ends[0] + ends[1] < way) & ~self.together[pairs]
+        free = (np.minimum(*ends) >= -overlap) & (ends[0] + ends[1] < motion) & ~self.together[pairs]
         for c in np.flatnonzero(free).tolist():
             stack = [(0.0, 1.0, ends[0][c], ends[1][c])]
             while stack:
                 low, high, before, after = stack.pop()
-                if (width := (high - low) * way[c]) <= 2 * RESOLUTION or before + after >= width:
+                if (width := (high - low) * motion[c]) <= 2 * RESOLUTION or before + after >= width:
                     continue
                 middle = (low + high) / 2
                 state = self.solids.at(self.world.coordinates.q((1 - middle) * z[row] + middle * z[row + 1]))
@@ -277,8 +278,6 @@ class PairTable:
         return some[floor < smallest]
 
     def _hit(self, row: int, k: int, distance: float, *, at_waypoint: bool = False) -> Hit:
-        first, second = self.pairs[k]
-        labels = self.world.collision_labels
-        return Hit(
-            int(row), labels[first], labels[second], float(distance), float(self.margins[k]), float(self.contact[k]), at_waypoint
-        )
+        first, second = (self.world.collision_labels[i] for i in self.pairs[k])
+        limits = {"margin": float(self.margins[k]), "contact": float(self.contact[k])}
+        return Hit(int(row), first, second, float(distance), **limits, at_waypoint=at_waypoint)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import KW_ONLY, asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
@@ -33,8 +33,9 @@ class Violation:
 
     constraint: str
     subject: str
-    waypoint: int
-    time: float
+    _: KW_ONLY
+    waypoint: int = 0
+    time: float = 0.0
     amount: float
     unit: str
     detail: str
@@ -53,15 +54,16 @@ class Report:
         closure_error: Largest drift of a held object's base or of the grasp [m].
         closure_angle: The same for orientation [rad].
         states: How many configurations were looked at.
-        notes: What stands in the way of the task as a whole, if planning failed; one line each.
+        notes: What prevents the task as a whole, if planning failed; one line each.
     """
 
     violations: tuple[Violation, ...] = ()
     clearance: float = float("inf")
+    _: KW_ONLY
     closure_error: float = 0.0
     closure_angle: float = 0.0
     states: int = 0
-    notes: tuple[str, ...] = field(default_factory=tuple)
+    notes: tuple[str, ...] = ()
 
     @property
     def ok(self) -> bool:

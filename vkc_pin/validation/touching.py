@@ -1,4 +1,4 @@
-"""Which pairs may touch: a hand and what it grasps, a thing and what it rests on, a frame and what it is told to touch."""
+"""Which pairs may touch: a hand and what it grasps, an object and what it stands on, a frame and what it is told to touch."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vkc_pin.validation.distances import Solids
 
 __all__ = ["may_touch"]
 
-CONTACT = 1e-4  # [m] of overlap that is contact: what rests on a table overlaps it by rounding
+CONTACT = 1e-4  # [m] of overlap that is contact: what stands on a table overlaps it by rounding
 
 
 def may_touch(

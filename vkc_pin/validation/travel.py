@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 
 from vkc_pin.validation.distances import Solids
 
-__all__ = ["ways"]
+__all__ = ["travelled"]
 
 
-def ways(solids: Solids, samples: NDArray[np.float64]) -> NDArray[np.float64]:
+def travelled(solids: Solids, samples: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return how far any point of each shape can have moved since the first sample, shape (S, G) [m].
 
     A joint's rotation moves a point by at most the angle times its distance from the axis, and that is at most the sum of the
@@ -28,25 +28,25 @@ def ways(solids: Solids, samples: NDArray[np.float64]) -> NDArray[np.float64]:
     for index, joint in enumerate(world.coordinates.joints):
         of_joint.setdefault(joint, []).append(index)
     prismatic = {j: model.joints[j].shortname().startswith("JointModelP") and j > 1 for j in of_joint}
-    travelled = np.zeros((len(samples), len(world.shapes)))
+    found = np.zeros((len(samples), len(world.shapes)))
     for g, shape in enumerate(world.shapes[: solids.bodies]):
         reach = float(np.linalg.norm(solids.half[g])) + float(np.linalg.norm(shape.placement.act(solids.center[g])))
-        joint, way = shape.parentJoint, np.zeros(len(steps))
+        joint, moved = shape.parentJoint, np.zeros(len(steps))
         while joint:
             columns = of_joint[joint]
             if len(columns) == 7:  # the free joint of what can be carried
-                way += _free(samples[:, columns], reach)
+                moved += _free(samples[:, columns], reach)
             elif len(columns) == 3:  # the planar base
-                way += spans + steps[:, columns[2]] * reach
+                moved += spans + steps[:, columns[2]] * reach
             elif prismatic[joint]:
-                way += steps[:, columns[0]]
+                moved += steps[:, columns[0]]
                 reach += float(np.abs(samples[:, columns[0]]).max())
             else:
-                way += steps[:, columns[0]] * reach
+                moved += steps[:, columns[0]] * reach
             reach += offset[joint]
             joint = model.parents[joint]
-        np.cumsum(way, out=travelled[1:, g])
-    return travelled
+        np.cumsum(moved, out=found[1:, g])
+    return found
 
 
 def _free(samples: NDArray[np.float64], reach: float) -> NDArray[np.float64]:

@@ -91,15 +91,17 @@ class _Check:
             if violation.constraint == "penetration":
                 worst.pop(("clearance", violation.subject, violation.unit), None)
         ordered = tuple(sorted(worst.values(), key=lambda v: (v.time, v.constraint, v.subject, v.unit)))
-        return Report(ordered, clearance, error, angle, len(self.samples.times))
+        return Report(ordered, clearance, closure_error=error, closure_angle=angle, states=len(self.samples.times))
 
     def _add(
-        self, constraint: str, subject: str, waypoint: int, amount: float, unit: str, detail: str, *, row: int | None = None
+        self, constraint: str, subject: str, amount: float, unit: str, detail: str, *, waypoint: int = 0, row: int | None = None
     ) -> None:
-        if row is not None:
-            waypoint = self.samples.waypoint(row)
-        time = self.trajectory.times[waypoint] if row is None else self.samples.times[row]
-        self.found.append(Violation(constraint, subject, int(waypoint), float(time), float(amount), unit, detail))
+        """Note a violation at a waypoint, or at a sample if `row` names one."""
+        at = waypoint if row is None else self.samples.waypoint(row)
+        time = self.trajectory.times[at] if row is None else self.samples.times[row]
+        self.found.append(
+            Violation(constraint, subject, waypoint=int(at), time=float(time), amount=float(amount), unit=unit, detail=detail)
+        )
 
     def _start(self) -> None:
         """The motion begins where the robot and the objects are."""
@@ -107,7 +109,7 @@ class _Check:
         for name, value in zip(self.trajectory.names, self.trajectory.positions[0], strict=True):
             right, unit = known.get(name, value), self.samples.unit(name)
             if not abs(value - right) <= START_TOLERANCE:
-                self._add("start", name, 0, abs(value - right), unit, f"{value:.6g} {unit} instead of {right:.6g} {unit}")
+                self._add("start", name, abs(value - right), unit, f"{value:.6g} {unit} instead of {right:.6g} {unit}")
 
     def _limits(self) -> None:
         for name, column in zip(self.trajectory.names, self.trajectory.positions.T, strict=True):
@@ -119,7 +121,7 @@ class _Check:
             if not excess[worst] <= LIMIT_TOLERANCE:
                 unit = self.samples.unit(name)
                 detail = f"{column[worst]:.4f} {unit} is outside {lower:.4f} to {upper:.4f} {unit} by {excess[worst]:.4f} {unit}"
-                self._add("limit", name, worst, excess[worst], unit, detail)
+                self._add("limit", name, excess[worst], unit, detail, waypoint=worst)
 
     def _rates(self) -> None:
         velocities, accelerations = self.trajectory.velocities(), self.trajectory.accelerations()
@@ -134,7 +136,7 @@ class _Check:
                 value = abs(float(values[worst]))
                 if not value <= limit * (1 + ACCEPTED_RATE_TOLERANCE) + 1e-9:
                     detail = f"{value:.3f} {unit}/{per} is more than {limit:.3f} {unit}/{per}"
-                    self._add(kind, name, worst, value - limit, f"{unit}/{per}", detail)
+                    self._add(kind, name, value - limit, f"{unit}/{per}", detail, waypoint=worst)
 
     def _slip(self) -> None:
         """A differential base does not move sideways, seen at the middle of each step."""
@@ -146,7 +148,7 @@ class _Check:
         worst = int(np.argmax(slip))
         if not slip[worst] <= SLIP_TOLERANCE:
             detail = f"the base slips sideways by {1e3 * slip[worst]:.2f} mm in a step"
-            self._add("slip", "base", worst, slip[worst], "m", detail)
+            self._add("slip", "base", slip[worst], "m", detail, waypoint=worst)
 
     def _unheld(self) -> None:
         """What no hand moves does not move."""
@@ -162,7 +164,7 @@ class _Check:
                     owner, unit = name.partition(".")[0], self.samples.unit(name)
                     why = "where it is held, nothing drives it" if owner in phase.held else f"nobody holds {owner}"
                     detail = f"moves by {moved[worst]:.4f} {unit} while {why}"
-                    self._add("unheld", name, phase.first + worst, moved[worst], unit, detail)
+                    self._add("unheld", name, moved[worst], unit, detail, waypoint=phase.first + worst)
 
     def _latches(self) -> None:
         """A latched joint leaves where it is held only while the joint that releases it is far enough.
@@ -191,7 +193,7 @@ class _Check:
                         f"leaves {latch.held_at:g} while {latch.released_by} is at {lowest[row]:.3f}, "
                         f"{short[row]:.3f} short of {latch.threshold:g}"
                     )
-                    self._add("latch", name, 0, short[row], self.samples.unit(release), detail, row=row)
+                    self._add("latch", name, short[row], self.samples.unit(release), detail, row=row)
 
     def _closure(self) -> tuple[float, float]:
         """The hand stays where it holds an object; return the largest drift, [m] and [rad]."""
@@ -207,7 +209,7 @@ class _Check:
                     if not column[worst] <= limit:
                         detail = f"the grasp drifts by {1e3 * column[worst]:.3f} m{unit}, more than {1e3 * limit:g} m{unit}"
                         subject = f"{hold.object}.{hold.attachment}"
-                        self._add("closure", subject, 0, column[worst] - limit, unit, detail, row=int(rows[worst]))
+                        self._add("closure", subject, column[worst] - limit, unit, detail, row=int(rows[worst]))
         return float(largest[0]), float(largest[1])
 
     def _slides(self) -> None:
@@ -221,7 +223,7 @@ class _Check:
                     worst = int(np.argmax(moved))
                     if not moved[worst] <= MOTION_TOLERANCE:
                         detail = f"the hand moves on '{owner}' by {moved[worst]:.4f} {unit} while it clamps it"
-                        self._add("slide", f"{owner}.{name}", phase.first + worst, moved[worst], unit, detail)
+                        self._add("slide", f"{owner}.{name}", moved[worst], unit, detail, waypoint=phase.first + worst)
 
     def _clearance(self) -> float:
         """Nothing comes too close at a waypoint or penetrates anywhere; return the smallest distance [m].
@@ -235,9 +237,9 @@ class _Check:
             smallest = min(smallest, hit.distance)
             subject, millimetres = f"{hit.first} – {hit.second}", 1e3 * abs(hit.distance)
             if hit.distance < -hit.contact:
-                self._add("penetration", subject, 0, -hit.distance, "m", f"overlap by {millimetres:.1f} mm", row=hit.row)
+                self._add("penetration", subject, -hit.distance, "m", f"overlap by {millimetres:.1f} mm", row=hit.row)
             elif hit.at_waypoint and hit.row > 0 and hit.distance < hit.margin - WAYPOINT_TOLERANCE:
                 detail = f"are only {millimetres:.1f} mm apart, {1e3 * hit.margin:.0f} mm are asked for"
                 short = hit.margin - WAYPOINT_TOLERANCE - hit.distance
-                self._add("clearance", subject, 0, short, "m", detail, row=hit.row)
+                self._add("clearance", subject, short, "m", detail, row=hit.row)
         return float(smallest)

@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any
 
 import meshcat
-import meshcat.animation as animation
 import meshcat.geometry as g
 import numpy as np
 import pinocchio as pin
+from meshcat.animation import Animation, AnimationClip
+from meshcat.animation import AnimationTrack as Track
 from meshcat.commands import SetAnimation
 from numpy.typing import NDArray
 
@@ -26,11 +27,11 @@ from vkc_pin.motion.world import World
 from vkc_pin.scene.scene import Scene
 from vkc_pin.validation.report import Report
 from vkc_pin.visualization.camera import FIELD_OF_VIEW, Viewpoint, choose_viewpoint
-from vkc_pin.visualization.elements import Ghost, Sun, Triangles, Unshadow, hexadecimal, material, node_name, track
+from vkc_pin.visualization.elements import Ghost, Sun, Triangles, Unshadow, hexadecimal, material, node_name
 from vkc_pin.visualization.room import Part, Room, drawn_parts
 from vkc_pin.visualization.solids import Solid, coarse, merge_solids, to_solid, tube
 
-__all__ = ["Drawing", "draw"]
+__all__ = ["Drawing"]
 
 _START, _END = (0.22, 0.42, 0.78), (0.10, 0.60, 0.38)  # of the ghosts
 _TOOL, _BASE = (0.88, 0.20, 0.35), (0.16, 0.42, 0.72)  # of the paths
@@ -44,40 +45,26 @@ _meshes: weakref.WeakKeyDictionary[Robot, list[Solid]] = weakref.WeakKeyDictiona
 
 @dataclass(frozen=True, eq=False)
 class Item:
-    """One thing to draw: its path in the viewer's tree, joint, placement in the joint's frame, shape, colour and label."""
+    """What to draw: its path in the viewer's tree, joint, placement in the joint's frame, shape, colour and label."""
 
     path: str
     joint: int
     placement: pin.SE3
     solid: Solid
+    _: KW_ONLY
     colour: tuple[float, ...]
     label: str
 
 
-def draw(
-    viewer: meshcat.Visualizer,
-    scene: Scene,
-    trajectory: Trajectory | None = None,
-    report: Report | None = None,
-    *,
-    play: bool = True,
-    frames: Mapping[str, pin.SE3] | None = None,
-) -> None:
-    """Draw `scene`, and a motion in it, into a viewer, instead of what was there.
+class Drawing:
+    """A scene, and a motion in it, as meshcat commands.
 
     Args:
         viewer: A meshcat viewer, or anything that takes its commands.
         scene: What to draw, as it is at its start.
         trajectory: The motion to animate; the start and the end appear as ghosts.
         report: Links that it says come too close turn red at that time.
-        play: Start playing at once.
-        frames: Name → placement in the world of a frame to draw; it stays there, whatever moves.
     """
-    Drawing(viewer, scene, trajectory, report).draw(play=play, frames=frames)
-
-
-class Drawing:
-    """A scene, and a motion, as meshcat commands."""
 
     def __init__(
         self, viewer: meshcat.Visualizer, scene: Scene, trajectory: Trajectory | None = None, report: Report | None = None
@@ -92,7 +79,12 @@ class Drawing:
         self.light: list[Solid | None] = []  # of what moves, for ghosts
 
     def draw(self, *, play: bool = True, frames: Mapping[str, pin.SE3] | None = None) -> None:
-        """Send everything; see the function `draw`."""
+        """Draw everything into the viewer, instead of what was there.
+
+        Args:
+            play: Start playing at once.
+            frames: Name → placement in the world of a frame to draw; it stays there, whatever moves.
+        """
         self.viewer.delete()
         self._surroundings()
         for item in self.items:
@@ -104,7 +96,8 @@ class Drawing:
         for part in self.room.parts():
             self._solid(replace(part, name=f"room/{part.name}"))
         for name, points, grey in self.room.lines():
-            self._lines(f"room/{name}", points, grey)
+            thin = g.LineBasicMaterial(color=hexadecimal((grey, grey, grey)))
+            self._unshadowed(f"room/{name}", g.LineSegments(g.PointsGeometry(points.astype(np.float32).T), thin))
         self._frames(frames or {})
         if self.trajectory is not None:
             self._paths()
@@ -148,7 +141,8 @@ class Drawing:
         for shape, solid in zip(robot.visual.geometryObjects, _meshes[robot], strict=True):
             link = str(robot.model.frames[shape.parentFrame].name)
             path = f"{self.nodes[shape.parentJoint]}/{node_name(link)}/{node_name(shape.name)}"
-            items.append(Item(path, shape.parentJoint, shape.placement, solid, tuple(map(float, shape.meshColor)), link))
+            colour = tuple(map(float, shape.meshColor))
+            items.append(Item(path, shape.parentJoint, shape.placement, solid, colour=colour, label=link))
         return items
 
     def _object_items(self) -> list[Item]:
@@ -161,20 +155,21 @@ class Drawing:
             root = self.nodes[shape.parentJoint] if shape.parentJoint else f"objects/{owner}"
             for k, (solid, colour) in enumerate(drawn_parts(shape)):
                 name = node_name(shape.name.partition(".")[2]) + (f"_{k}" if k else "")
-                items.append(Item(f"{root}/{node_name(link)}/{name}", shape.parentJoint, shape.placement, solid, colour, label))
+                path = f"{root}/{node_name(link)}/{name}"
+                items.append(Item(path, shape.parentJoint, shape.placement, solid, colour=colour, label=label))
         return items
 
     def _solid(self, part: Part) -> None:
-        node = self.viewer[part.name]
-        node.set_object(Triangles(part.solid), material(part.colour, part.opacity, one_sided=part.one_sided))
-        if not part.shadow:
-            self.viewer.window.send(Unshadow(node.path))
+        paint = material(part.colour, part.opacity, one_sided=part.one_sided)
+        if part.shadow:
+            self.viewer[part.name].set_object(Triangles(part.solid), paint)
+        else:
+            self._unshadowed(part.name, Triangles(part.solid), paint)
 
-    def _lines(self, path: str, points: NDArray[np.float64], grey: float) -> None:
-        node = self.viewer[path]
-        thin = g.LineBasicMaterial(color=hexadecimal((grey, grey, grey)))
-        node.set_object(g.LineSegments(g.PointsGeometry(points.astype(np.float32).T), thin))
-        self.viewer.window.send(Unshadow(node.path))
+    def _unshadowed(self, path: str, *what: Any) -> None:
+        """Draw an object, or a geometry and its material, that casts no shadow."""
+        self.viewer[path].set_object(*what)
+        self.viewer.window.send(Unshadow(self.viewer[path].path))
 
     def _frames(self, frames: Mapping[str, pin.SE3]) -> None:
         """Draw axes, red, green and blue, in front of everything: frames of joints are inside of bodies."""
@@ -185,9 +180,7 @@ class Drawing:
                 assert solid is not None
                 # Only what counts as translucent is drawn after the bodies.
                 seen = g.MeshBasicMaterial(color=hexadecimal(colour), transparent=True, depthTest=False)
-                node = self.viewer[f"{where}/{axis}"]
-                node.set_object(Triangles(solid), seen)
-                self.viewer.window.send(Unshadow(node.path))
+                self._unshadowed(f"{where}/{axis}", Triangles(solid), seen)
             self.viewer[where].set_transform(placement.homogeneous)
 
     def _paths(self) -> None:
@@ -200,9 +193,7 @@ class Drawing:
         ):
             solid = tube(points, radius)
             if solid is not None:
-                node = self.viewer[f"paths/{name}"]
-                node.set_object(Triangles(solid), g.MeshBasicMaterial(color=hexadecimal(colour)))
-                self.viewer.window.send(Unshadow(node.path))
+                self._unshadowed(f"paths/{name}", Triangles(solid), g.MeshBasicMaterial(color=hexadecimal(colour)))
 
     def _ghosts(self, name: str, row: int, colour: tuple[float, float, float]) -> None:
         """Draw what moves as it is at `row`, the robot and every object for itself."""
@@ -242,23 +233,23 @@ class Drawing:
         place["/Background"].set_property("top_color", [0.93, 0.95, 0.97])
         place["/Background"].set_property("bottom_color", [0.99, 0.99, 0.99])
 
-    def _animation(self) -> animation.Animation:
+    def _animation(self) -> Animation:
         """Return the motion with one key frame per time, in seconds, since the frame rate is 1."""
-        movie = animation.Animation(default_framerate=1)
+        movie = Animation(default_framerate=1)
         if self.trajectory is None:
             return movie
         times = (self.motion.times - self.motion.times[0]).tolist()
         for j in np.flatnonzero(self.motion.moving):
             local = self.motion.local[j]
             quaternions = [pin.Quaternion(placement.rotation).coeffs().tolist() for placement in local]
-            tracks = [track("quaternion", "quaternion", times, quaternions)]
+            tracks = [Track("quaternion", "quaternion", times, quaternions)]
             if np.ptp([placement.translation for placement in local], axis=0).max() > 1e-9:
-                tracks.append(track("position", "vector3", times, [placement.translation.tolist() for placement in local]))
+                tracks.append(Track("position", "vector3", times, [placement.translation.tolist() for placement in local]))
             self._clip(movie, self.nodes[j], tracks)
         for name, row in (("start", 0), ("end", -1)):
             for owner, joints in self.movers.items():
                 away = self.motion.away(joints, row).tolist()
-                self._clip(movie, f"ghosts/{name}/{owner}", [track("visible", "bool", times, away)])
+                self._clip(movie, f"ghosts/{name}/{owner}", [Track("visible", "bool", times, away)])
         for item in self.items:
             moments = [v.time for v in self._collisions() if item.label in v.subject.split(" – ")]
             if moments:
@@ -269,7 +260,7 @@ class Drawing:
         found = self.report.violations if self.report is not None else ()
         return [v for v in found if v.constraint in ("clearance", "penetration")]
 
-    def _alarm(self, item: Item, moments: list[float]) -> animation.AnimationTrack:
+    def _alarm(self, item: Item, moments: list[float]) -> Track:
         """Return a track that colours an item red around `moments` [s]."""
         first, last = self.motion.times[0], self.motion.times[-1]
         edges = {first, last}
@@ -278,8 +269,8 @@ class Drawing:
         times = sorted(edges)
         red = [any(abs(t - moment) < _ALARM_TIME - 0.02 for moment in moments) for t in times]
         colours = [[float(c) for c in (_ALARM if alarm else item.colour[:3])] for alarm in red]
-        return track("material.color", "color", [float(t - first) for t in times], colours)
+        return Track("material.color", "color", [float(t - first) for t in times], colours)
 
-    def _clip(self, movie: animation.Animation, path: str, tracks: list[animation.AnimationTrack]) -> None:
+    def _clip(self, movie: Animation, path: str, tracks: list[Track]) -> None:
         where = self.viewer[path].path
-        movie.clips[where] = animation.AnimationClip({track.name: track for track in tracks}, fps=1)
+        movie.clips[where] = AnimationClip({track.name: track for track in tracks}, fps=1)

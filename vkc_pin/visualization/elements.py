@@ -6,7 +6,6 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
-import meshcat.animation as animation
 import meshcat.geometry as g
 import numpy as np
 from meshcat.path import Path
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 
 from vkc_pin.visualization.solids import Solid
 
-__all__ = ["Ghost", "Sun", "Triangles", "Unshadow", "hexadecimal", "material", "node_name", "track"]
+__all__ = ["Ghost", "Sun", "Triangles", "Unshadow", "hexadecimal", "material", "node_name"]
 
 _GHOST_OPACITY = 0.30
 
@@ -100,7 +99,7 @@ class Unshadow:
 
 
 def material(colour: Sequence[float], opacity: float = 1.0, *, one_sided: bool = False) -> g.Material:
-    """Return a slightly shiny material; translucent things do not hide what is behind them."""
+    """Return a slightly shiny material; what is translucent does not hide what is behind them."""
     options = {"shininess": 25, "specular": 0x1A1A1A, "side": 0 if one_sided else 2}
     return g.MeshPhongMaterial(color=hexadecimal(colour), opacity=opacity, depthWrite=opacity >= 1.0, **options)
 
@@ -114,8 +113,3 @@ def hexadecimal(colour: Sequence[float]) -> int:
 def node_name(text: str) -> str:
     """Return `text` as it can stand in a path of the viewer's tree."""
     return re.sub(r"[^\w.\-]", "_", text)
-
-
-def track(name: str, kind: str, times: list[float], values: list[Any]) -> animation.AnimationTrack:
-    """Return key frames of one property: `times` [s] and three.js' type of it, e.g. "quaternion"."""
-    return animation.AnimationTrack(name, kind, times, values)

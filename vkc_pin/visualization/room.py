@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 
 import coal
@@ -37,6 +37,7 @@ class Part:
     solid: Solid
     colour: tuple[float, ...]
     opacity: float = 1.0
+    _: KW_ONLY
     shadow: bool = True
     one_sided: bool = False
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import atexit
+import contextlib
 import html
 import os
 import subprocess
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.files.writing import write_atomically
@@ -57,8 +58,7 @@ def show(
 
         page, name = html.escape(_page(scene, plan, frames)), html.escape(scene.name)
         style = f"width: 100%; height: {int(height)}px; border: none"
-        display: Any = HTML
-        return display(f'<div><iframe srcdoc="{page}" style="{style}" title="{name}"></iframe></div>')
+        return cast(Any, HTML)(f'<div><iframe srcdoc="{page}" style="{style}" title="{name}"></iframe></div>')
     viewer = open_viewer()
     _draw(viewer, scene, plan, frames=frames)
     sys.stdout.write(f"meshcat shows it at {viewer.url()}\n")
@@ -118,8 +118,6 @@ def open_viewer() -> meshcat.Visualizer:
         VkcError: The server does not start.
     """
     global _server
-    import contextlib
-
     import meshcat
 
     if _server is None or _server[0].poll() is not None:
@@ -157,12 +155,10 @@ def _parts(plan_or_scene: Any) -> tuple[Scene, Judged | None]:
 def _draw(
     viewer: Any, scene: Scene, plan: Judged | None, *, play: bool = True, frames: Mapping[str, pin.SE3] | None = None
 ) -> None:
-    from vkc_pin.visualization.drawing import draw
+    from vkc_pin.visualization.drawing import Drawing
 
-    if plan is None:
-        draw(viewer, scene, frames=frames)
-    else:
-        draw(viewer, scene, plan.trajectory, plan.validation, play=play, frames=frames)
+    motion = () if plan is None else (plan.trajectory, plan.validation)
+    Drawing(viewer, scene, *motion).draw(play=play, frames=frames)
 
 
 def _page(scene: Scene, plan: Judged | None, frames: Mapping[str, pin.SE3] | None = None) -> str:

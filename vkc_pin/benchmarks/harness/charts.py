@@ -55,9 +55,7 @@ def success_chart(
     (axes,) = figure.axes
     axes.set_ylim(0.0, 108.0)
     axes.set_yticks(range(0, 101, 20))
-    if path is not None:
-        save_figure(figure, Path(path))
-    return figure
+    return save_figure(figure, path)
 
 
 def means_chart(
@@ -110,9 +108,7 @@ def means_chart(
     figure = _grouped(names, methods, bar, label=label, form=".3g", title=title)
     (axes,) = figure.axes
     axes.set_ylim(0.0, 1.06 * axes.get_ylim()[1])
-    if path is not None:
-        save_figure(figure, Path(path))
-    return figure
+    return save_figure(figure, path)
 
 
 def criteria_chart(
@@ -152,18 +148,12 @@ def criteria_chart(
                 if values:
                     interval = _rate([value > 0.0 for value in values]) if field == "success" else quartiles(values)
                     _bar(axes, k, interval, COLOURS[k % len(COLOURS)], f"{interval[1]:{form}}", width=0.7)
-            axes.set_xticks(range(len(methods)), methods)
-            axes.set_xlim(-0.6, len(methods) - 0.4)
-            axes.tick_params(axis="x", length=0.0)
-            axes.grid(visible=False, axis="x")
-            axes.set_axisbelow(True)
+            _name_bars(axes, methods, 0.6)
             axes.set_ylim(0.0, 110.0 if field == "success" else 1.12 * axes.get_ylim()[1])
             axes.set_title(name, fontsize=9.5)
             axes.set_xlabel(about, fontsize=7.5, color="0.35")
         figure.suptitle(title, fontsize=10.5)
-        if path is not None:
-            save_figure(figure, Path(path))
-    return figure
+        return save_figure(figure, path)
 
 
 def motions_chart(plans: Mapping[str, Plan], path: str | Path | None, *, title: str = "") -> Figure:
@@ -207,9 +197,7 @@ def motions_chart(plans: Mapping[str, Plan], path: str | Path | None, *, title: 
         for axes in columns[-1][[0, 2]]:
             axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7.5)
         figure.suptitle(title, fontsize=10.5)
-        if path is not None:
-            save_figure(figure, Path(path))
-    return figure
+        return save_figure(figure, path)
 
 
 def _grouped(
@@ -234,11 +222,7 @@ def _grouped(
                 if interval is not None:
                     _bar(axes, place, interval, colour, f"{interval[1]:{form}}", width=0.9 * width)
             axes.bar(0.0, 0.0, color=colour, label=method)
-        axes.set_xticks(range(len(scenes)), list(scenes.values()))
-        axes.set_xlim(-0.5, len(scenes) - 0.5)
-        axes.tick_params(axis="x", length=0.0)
-        axes.grid(visible=False, axis="x")
-        axes.set_axisbelow(True)
+        _name_bars(axes, list(scenes.values()), 0.5)
         axes.set_ylabel(label)
         axes.set_title(title, fontsize=10)
         figure.legend(loc="outside lower center", ncols=len(methods))
@@ -258,6 +242,15 @@ def _bar(axes: Axes, place: float, interval: tuple[float, float, float], colour:
     error = np.clip([[height - low], [high - height]], 0.0, None)
     axes.errorbar(place, height, error, color="0.25", linewidth=0.9, capsize=2.5)
     axes.annotate(text, (place, high), (0, 2), textcoords="offset points", ha="center", fontsize=7.5)
+
+
+def _name_bars(axes: Axes, names: Sequence[str], margin: float) -> None:
+    """Write names below bars, or groups of them, that stand at 0, 1, ...; leave a margin on either side."""
+    axes.set_xticks(range(len(names)), names)
+    axes.set_xlim(-margin, len(names) - 1 + margin)
+    axes.tick_params(axis="x", length=0.0)
+    axes.grid(visible=False, axis="x")
+    axes.set_axisbelow(True)
 
 
 def _number(records: Sequence[Mapping[str, Any]], scene: str, methods: Sequence[str]) -> str:

@@ -1,0 +1,150 @@
+"""YAML with the lines of its fields, and errors that point into it."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.files.documents import Document, check, field_name, read_text, read_xml, read_yaml
+from vkc_pin.files.fields import Name, Number, Positive, Schema, Vector3
+
+NAMES = st.text("abcdefgh", min_size=1, max_size=4).filter(lambda name: name not in ("no", "off", "on", "yes"))
+LEAVES = st.integers(-9, 9) | st.floats(-1e3, 1e3) | st.booleans() | NAMES
+DATA = st.recursive(LEAVES, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(NAMES, inner, max_size=3), max_leaves=12)
+
+
+class Part(Schema):
+    size: Positive
+    at: Vector3 = (0.0, 0.0, 0.0)
+
+
+class Thing(Schema):
+    name: Name
+    mass: Number = 1.0
+    parts: tuple[Part, ...] = ()
+
+
+def written(folder: Path, text: str) -> Path:
+    file = folder / "thing.yaml"
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
+def paths(data: Any, path: tuple[str | int, ...] = ()) -> dict[tuple[str | int, ...], Any]:
+    """Return every field of nested data."""
+    items: Any = data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else ()
+    found = {path: data}
+    for key, value in items:
+        found.update(paths(value, (*path, key)))
+    return found
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.dictionaries(NAMES, DATA, min_size=1, max_size=4))
+def test_what_is_written_is_read_with_the_line_of_every_field(data: dict[str, Any]) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        text = yaml.safe_dump(data, default_flow_style=False, sort_keys=False)
+        document = read_yaml(written(Path(folder), text))
+    assert document.data == data
+    lines = text.splitlines()
+    for path, value in paths(data).items():
+        assert document.value(path) == value
+        assert document.line((*path, "nothing", 3)) == document.line(path)
+        if path and isinstance(path[-1], str):
+            where = document.line(path)
+            assert where is not None
+            assert f"{path[-1]}:" in lines[where - 1].replace("'", "")
+
+
+def test_fields_are_called_as_users_write_them() -> None:
+    assert field_name(("obstacles", 3, "size")) == "obstacles[3].size"
+    assert field_name((0, "a")) == "[0].a"
+    assert field_name(()) == ""
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "problem"),
+    [
+        ("a: 1\nb: 2\na: 3\n", 3, "twice"),
+        ("a: [1, 2\nb: 3\n", 2, "not valid YAML"),
+        ("a: 1\n\tb: 2\n", 2, "not valid YAML"),
+        ("a: &x [*x]\n", 1, "contains itself"),
+        ("a: 2020-13-45\n", None, "not valid YAML"),
+        ("a: !!python/object:os.system {}\n", 1, "not valid YAML"),
+    ],
+)
+def test_what_is_no_yaml(tmp_path: Path, text: str, line: int | None, problem: str) -> None:
+    file = written(tmp_path, text)
+    with pytest.raises(InputError, match=problem) as caught:
+        read_yaml(file)
+    assert (caught.value.file, caught.value.line) == (file, line)
+
+
+def test_an_empty_file_is_nothing(tmp_path: Path) -> None:
+    assert read_yaml(written(tmp_path, "# nothing\n")).data is None
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "field", "told"),
+    [
+        ("name: a\nmas: 2\n", 2, "mas", "did you mean 'mass'"),
+        ("mass: 2\n", None, "name", "missing"),
+        ("name: a\nmass: heavy\n", 2, "mass", "a number"),
+        ("name: a\nmass: yes\n", 2, "mass", "a number"),
+        ("name: a\nmass: .inf\n", 2, "mass", "a finite number"),
+        ("name: a/b\n", 1, "name", "not a name"),
+        ("name: a\nparts:\n  - size: 1\n  - size: -1\n", 4, "parts[1].size", "a number > 0"),
+        ("name: a\nparts:\n  - size: 1\n    at: [1, 2]\n", 4, "parts[0].at", "3 values"),
+        ("name: a\nparts: 3\n", 2, "parts", "a list"),
+        ("parts: [{size: 0}]\nname: 3\n", 1, "parts[0].size", "a number > 0"),  # the first in the file, not in the schema
+    ],
+)
+def test_the_first_wrong_field_is_told(tmp_path: Path, text: str, line: int | None, field: str, told: str) -> None:
+    with pytest.raises(InputError, match=told) as caught:
+        check(read_yaml(written(tmp_path, text)), Thing)
+    assert (caught.value.field, caught.value.file) == (field, tmp_path / "thing.yaml")
+    assert line is None or caught.value.line == line
+
+
+def test_what_fits_becomes_the_schema() -> None:
+    thing = check(Document({"name": "a", "parts": [{"size": 2, "at": [1, 2, 3]}]}), Thing)
+    assert thing == Thing(name="a", parts=(Part(size=2.0, at=(1.0, 2.0, 3.0)),))
+
+
+def test_errors_inside_get_the_place_unless_they_have_one(tmp_path: Path) -> None:
+    document = read_yaml(written(tmp_path, "a: 1\nb:\n  c: 2\n"))
+    with pytest.raises(InputError) as plain, document.at(("b", "c")):
+        raise InputError("too large", field="mass", expected=1, got=2)
+    assert (plain.value.line, plain.value.field, plain.value.problem) == (3, "b.c", "mass: too large")
+    with pytest.raises(UnknownNameError) as unknown, document.at(("b",)):
+        raise UnknownNameError("link", "armm", ["arm", "leg"])
+    assert (unknown.value.line, unknown.value.nearest) == (2, "arm")
+    elsewhere = InputError("too large", file="other.yaml", line=7)
+    with pytest.raises(InputError) as same, document.at(("b",)):
+        raise elsewhere
+    assert same.value is elsewhere
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    (tmp_path / "bytes").write_bytes(b"\xff\xfe\x00")
+    for name in ("none", "bytes", "."):
+        with pytest.raises(InputError, match="cannot read the YAML") as caught:
+            read_text(tmp_path / name, "YAML")
+        assert caught.value.file == tmp_path / name
+
+
+def test_xml_is_about_a_robot(tmp_path: Path) -> None:
+    text, root = read_xml(written(tmp_path, '<robot name="r"/>'), "SRDF")
+    assert (text, root.tag, root.get("name")) == ('<robot name="r"/>', "robot", "r")
+    with pytest.raises(InputError, match="this is no SRDF"):
+        read_xml(written(tmp_path, "<sdf/>"), "SRDF")
+    with pytest.raises(InputError, match="not valid XML") as caught:
+        read_xml(written(tmp_path, "<robot>\n<a>\n</robot>"), "SRDF")
+    assert caught.value.line == 3

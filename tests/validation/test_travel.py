@@ -63,7 +63,7 @@ def test_no_point_of_what_is_carried_moves_further_than_the_bound(seed: int, siz
     corners = [np.array(box_corners(shape)) for shape in world.shapes]
     carried = [i for i, label in enumerate(world.collision_labels) if label.partition(".")[0] in ("stick", "ball")]
     assert len(carried) == 6
-    travelled = 0.0
+    total = 0.0
     for t, (first, last) in enumerate(itertools.pairwise(samples.waypoint_rows)):
         path = np.zeros(len(corners))
         before: list[np.ndarray] = []
@@ -77,7 +77,7 @@ def test_no_point_of_what_is_carried_moves_further_than_the_bound(seed: int, siz
             before = now
         assert (path <= bounds[t] + 1e-6).all()
         assert (bounds[t][path == 0] <= 1e-6).all()
-        travelled += path[carried].max()
+        total += path[carried].max()
         for i in carried:  # and it is no idle bound
             assert bounds[t][i] <= 100 * path[i] + 1e-6
-    assert travelled > 0.0 or np.ptp(motion.positions, axis=0).max() == 0.0
+    assert total > 0.0 or np.ptp(motion.positions, axis=0).max() == 0.0

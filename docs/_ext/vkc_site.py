@@ -9,13 +9,13 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import api_pages
 from docutils import nodes
 from sphinx import addnodes
 from sphinx.application import Sphinx
 from sphinx.environment import BuildEnvironment
 from sphinx.util.nodes import make_refnode
 
-import api_pages
 import vkc_pin as vkc
 
 ROOT = Path(__file__).resolve().parents[2]

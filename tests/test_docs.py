@@ -7,6 +7,7 @@ import re
 import runpy
 import subprocess
 import sys
+import tomllib
 from fnmatch import fnmatch
 from html.parser import HTMLParser
 from pathlib import Path
@@ -189,6 +190,11 @@ def test_every_module_is_in_the_reference_once() -> None:
     assert len(found) == len(set(found))
     assert set(found) == {name.removesuffix(".__init__") for name in there} - {"vkc_pin", *pages["OPTIONAL"]}
     assert documented("automodule") == set()
+
+
+def test_citation_is_of_this_version() -> None:
+    found, project = yaml.safe_load(read("CITATION.cff")), tomllib.loads(read("pyproject.toml"))["project"]
+    assert (found["version"], found["license"]) == (project["version"], project["license"])
 
 
 def test_status_is_as_the_results_on_record_say() -> None:

@@ -18,7 +18,7 @@ version = release = __version__
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton", "svg_math", "vkc_site"]
 root_doc = "docs/index"
-include_patterns = ["docs/**", "notebooks/*.ipynb", "CHANGELOG.md", "robots/husky_ur5e/README.md"]
+include_patterns = ["docs/**", "notebooks/*.ipynb", "CHANGELOG.md", "robots/husky_ur5e/README.md", "tools/README.md"]
 exclude_patterns = ["docs/_*", "**/.ipynb_checkpoints", ".*", "out", "build", "dist", "tests", "vkc_pin", "scenes"]
 nitpicky = True
 # Names of other packages have no pages here; single backticks in docstrings are code first, and links where they happen to lead.

@@ -31,7 +31,7 @@ KITCHEN = (-2.1, 2.4, 0.7), (0.1, -1.0, 2.9)
 OPENED = {"door": ("hinge", 1.0), "drawer": ("slide", 0.22), "dishwasher": ("rack", 0.5), "refrigerator": ("hinge", 1.4)}
 
 sys.path.insert(0, str(ROOT / "tests"))
-from browser import screenshot  # noqa: E402
+from helpers.browser import screenshot  # noqa: E402
 
 
 def look(target: tuple[float, ...], position: tuple[float, ...]) -> None:

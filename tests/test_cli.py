@@ -3,6 +3,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import platform
 import subprocess
 import sys
 from pathlib import Path
@@ -191,7 +192,11 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         cli.main(["--version"])
     assert stop.value.code == 0
-    assert capsys.readouterr().out.strip() == vkc.__version__
+    found = dict(part.split() for part in " ".join(capsys.readouterr().out.split()).split(", "))
+    assert list(found) == ["vkc-pin", "pin", "coal", "casadi", "numpy", "Python"]
+    assert found["vkc-pin"] == vkc.__version__
+    assert found["Python"] == platform.python_version()
+    assert "unknown" not in found.values()
 
 
 def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import platform
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -150,10 +151,11 @@ def _srdf(arguments: argparse.Namespace) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    from vkc_pin import __version__
+    from vkc_pin.benchmarks.harness.record import versions
 
     parser = argparse.ArgumentParser(prog="vkc-pin", description="Whole-body planning on virtual kinematic chains.")
-    parser.add_argument("--version", action="version", version=__version__)
+    listed = ", ".join(f"{name} {number}" for name, number in {**versions(), "Python": platform.python_version()}.items())
+    parser.add_argument("--version", action="version", version=listed, help="show versions, also of what motions depend on")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     plan = commands.add_parser("plan", help="plan a motion", description="Plan a motion that brings joints of objects to values.")

@@ -1,4 +1,4 @@
-"""What the virtual kinematic chain is compared with: planners that treat base and arm one after the other."""
+"""Planners that treat base and arm one after the other: what the virtual kinematic chain is compared with."""
 
 from vkc_pin.baselines.separate import BASELINES, RETRIES, plan_separately
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from vkc_pin.baselines import BASELINES, RETRIES, plan_separately
+from vkc_pin.baselines.separate import BASELINES, RETRIES, plan_separately
 from vkc_pin.benchmarks.comparison_report import report
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.charts import motions_chart

@@ -1,4 +1,4 @@
-"""Pinocchio's algorithms as CasADi functions of a model's q, v, a.
+"""Pinocchio's algorithms as CasADi functions: their arguments are a model's q, v, a.
 
 Every function here takes a numeric `pinocchio.Model` and returns a `casadi.Function` built from SX expressions, with
 exact derivatives of any order. q is Pinocchio's configuration (a planar joint is x, y, cos θ, sin θ), v and a are in

@@ -1,1 +1,1 @@
-"""Robots and articulated objects as Pinocchio models with shapes and limits."""
+"""Robots and articulated objects: Pinocchio models with convex shapes and limits."""

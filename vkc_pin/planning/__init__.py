@@ -1,1 +1,1 @@
-"""Planning: from seed to seed and step to step, until the validation accepts a motion."""
+"""Tries seeds until the validation accepts a motion: steps one by one, all at once, or in a window that slides along."""

@@ -1,4 +1,4 @@
-"""Plots with matplotlib, views from above, and what a notebook shows of a scene or a plan."""
+"""Pictures with matplotlib: joints and clearance over time, motions from above, and what a notebook shows of a scene or plan."""
 
 from vkc_pin.plotting.plots import plot, plot_clearance, plot_joints, plot_top_view
 

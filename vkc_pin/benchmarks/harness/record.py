@@ -14,19 +14,13 @@ import numpy as np
 
 from vkc_pin.planning.plan import Plan
 
-__all__ = ["distribution", "meta", "peak_memory", "trial"]
+__all__ = ["distribution", "meta", "peak_memory", "trial", "versions"]
 
 PACKAGES = ("vkc-pin", "pin", "coal", "casadi", "numpy")
 
 
 def meta(**settings: Any) -> dict[str, Any]:
     """Return versions, machine and `settings` (seed, trials, ...)."""
-    versions = {}
-    for package in PACKAGES:
-        try:
-            versions[package] = version(package)
-        except PackageNotFoundError:
-            versions[package] = "unknown"
     machine = {
         "system": platform.system(),
         "machine": platform.machine(),
@@ -34,7 +28,18 @@ def meta(**settings: Any) -> dict[str, Any]:
         "cores": os.cpu_count(),
         "python": platform.python_version(),
     }
-    return {"versions": versions, "machine": machine, **settings}
+    return {"versions": versions(), "machine": machine, **settings}
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of the package and of what motions depend on."""
+    found = {}
+    for package in PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "unknown"
+    return found
 
 
 def _processor() -> str:

@@ -246,7 +246,6 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "html"
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_site(site: Path) -> None:
     pages = {page.resolve(): Links(page) for page in site.rglob("*.html") if page.parent.name != "animations"}

@@ -18,7 +18,6 @@ from vkc_pin.motion.world import World
 from vkc_pin.planning import chore
 from vkc_pin.planning.chore import _Chore, _cut
 from vkc_pin.planning.one_problem import OneProblem
-from vkc_pin.task.actions import actions_of
 
 A, G, P = vkc.Actuate, vkc.Grasp, vkc.Place
 TABLE = (-3.0, 1.3, 1.051)  # on the bar table
@@ -35,39 +34,6 @@ def home() -> vkc.Scene:
 def fridge() -> vkc.Plan:
     """Take the cup out of the refrigerator, and shut it again."""
     return vkc.plan_chore(home(), [OPEN, *CUP, SHUT])
-
-
-# --- actions ----------------------------------------------------------------------------------------------------------
-
-
-def test_what_is_done_with_one_thing_is_one_action() -> None:
-    steps = [
-        G("refrigerator"),
-        OPEN,
-        G("cold_cup"),
-        P("cold_cup", TABLE),
-        SHUT,
-        G("broom"),
-        G("litter", "pull", by="broom.bristles"),
-        P("litter", (1.1, -2.9, 0.036)),
-        vkc.Release(),
-        vkc.GoTo(0, 0),
-    ]
-    assert actions_of(steps) == [
-        tuple(steps[0:2]),
-        tuple(steps[2:4]),
-        (SHUT,),
-        (steps[5],),
-        tuple(steps[6:9]),
-        (steps[9],),
-    ]
-
-
-def test_no_step_is_lost() -> None:
-    steps = [vkc.Release(), vkc.Release(), G("cup"), vkc.GoTo(1, 0), G("door"), OPEN, OPEN, vkc.Release()]
-    actions = actions_of(steps)
-    assert [step for action in actions for step in action] == steps
-    assert len(actions) == 6  # a grasp of one thing is no part of what is done with another
 
 
 # --- what is foreseen -------------------------------------------------------------------------------------------------
@@ -107,7 +73,7 @@ def test_steps_are_a_list(steps: object) -> None:
 
 
 @pytest.mark.parametrize("window", [0, -1, 1.5, True, "2"])
-def test_window_is_a_number_ofactions_of(window: object) -> None:
+def test_window_is_a_number_of_actions(window: object) -> None:
     with pytest.raises(InputError, match="window: out of range"):
         vkc.plan_chore(home(), [OPEN], window=window)
 

@@ -1,0 +1,83 @@
+"""What is done together, and what cannot be done at its place."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import vkc_pin as vkc
+from vkc_pin.task.actions import actions_of, foresee
+
+A, G, P = vkc.Actuate, vkc.Grasp, vkc.Place
+
+
+TABLE = (-3.0, 1.3, 1.051)  # on the bar table
+
+
+OPEN, SHUT = A("refrigerator", {"hinge": 1.57}), A("refrigerator", {"hinge": 0.0})
+CUP = (G("cold_cup"), P("cold_cup", TABLE))
+
+
+def test_what_is_done_with_one_thing_is_one_action() -> None:
+    steps = [
+        G("refrigerator"),
+        OPEN,
+        G("cold_cup"),
+        P("cold_cup", TABLE),
+        SHUT,
+        G("broom"),
+        G("litter", "pull", by="broom.bristles"),
+        P("litter", (1.1, -2.9, 0.036)),
+        vkc.Release(),
+        vkc.GoTo(0, 0),
+    ]
+    assert actions_of(steps) == [
+        tuple(steps[0:2]),
+        tuple(steps[2:4]),
+        (SHUT,),
+        (steps[5],),
+        tuple(steps[6:9]),
+        (steps[9],),
+    ]
+
+
+def test_no_step_is_lost() -> None:
+    steps = [vkc.Release(), vkc.Release(), G("cup"), vkc.GoTo(1, 0), G("door"), OPEN, OPEN, vkc.Release()]
+    actions = actions_of(steps)
+    assert [step for action in actions for step in action] == steps
+    assert len(actions) == 6  # a grasp of one thing is no part of what is done with another
+
+
+def test_what_is_foreseen_is_what_each_step_asks_for_where_it_stands() -> None:
+    """Steps are compiled one by one, each in the scene that the steps before leave: an open door, a cup on the table."""
+    scene, options = vkc.load_scene("household"), vkc.Options()
+    steps = [OPEN, *CUP, SHUT]
+    tasks = foresee(scene, steps, options)
+    assert [task.steps for task in tasks] == [(step,) for step in steps]
+    assert [[phase.name for phase in task.phases] for task in tasks] == [
+        ["reach refrigerator.handle", "move refrigerator.hinge"],
+        ["reach cold_cup.side"],
+        ["place cold_cup"],
+        ["reach refrigerator.handle", "move refrigerator.hinge"],
+    ]
+    assert tasks[-1].state["refrigerator.hinge"] == pytest.approx(1.57), "it is open by then"
+    assert tasks[-1].phases[-1].values == {"refrigerator.hinge": 0.0}
+    assert [hold.object for hold in tasks[1].after] == ["cold_cup"]
+    assert scene.objects["refrigerator"].state[0] == 0.0
+    again = foresee(scene, [*steps, G("cold_cup")], options)[-1]
+    (grasp,) = again.phases
+    np.testing.assert_allclose(grasp.standing["cold_cup"].translation, TABLE, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("steps", "field", "problem"),
+    [
+        ([OPEN, G("cold_cup"), SHUT], "steps[2].object", "one hand"),
+        ([OPEN, *CUP, vkc.Release()], "steps[3]", "hand is empty"),
+        ([OPEN, G("no_cup")], "steps[1].object", "no object"),
+    ],
+)
+def test_the_first_step_that_cannot_be_done_is_named(steps: list[vkc.Step], field: str, problem: str) -> None:
+    with pytest.raises(vkc.InputError, match=problem) as caught:
+        foresee(vkc.load_scene("household"), steps, vkc.Options())
+    assert str(caught.value.field).startswith(field)

@@ -1,0 +1,77 @@
+"""Distances of a world's shapes: bounds that hold, and what is nearest, against coal asked about everything."""
+
+from __future__ import annotations
+
+import itertools
+from functools import cache
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.small_problems import door_scene, full_scene, random_configurations
+
+from vkc_pin.models.shapes import shape_distance
+from vkc_pin.motion.world import World
+from vkc_pin.validation.distances import POINT, Solids
+
+COAL = 1e-5  # [m]
+
+
+@cache
+def solids() -> Solids:
+    return Solids(World(full_scene()))
+
+
+def configuration(seed: int) -> np.ndarray:
+    world, rng = solids().world, np.random.default_rng(seed)
+    lower, upper = (np.full(world.coordinates.size, limit) for limit in (-1.0, 1.0))
+    return np.asarray(world.coordinates.q(random_configurations(lower, upper, 1, rng)[0]))
+
+
+def where(q: np.ndarray) -> list[pin.SE3]:
+    """Return where all shapes are, by Pinocchio."""
+    world = solids().world
+    placed = pin.GeometryData(world.collision)
+    pin.updateGeometryPlacements(world.model, world.model.createData(), world.collision, placed, q)
+    return list(placed.oMg)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_bounds_hold_and_the_nearest_is_the_nearest(seed: int) -> None:
+    shapes, q = solids().world.shapes, configuration(seed)
+    placed, at = solids().at(q), where(q)
+    pairs = np.array([(a, b) for a, b in itertools.combinations(range(len(shapes)), 2) if a < solids().bodies])
+    pairs = pairs[np.random.default_rng(seed).permutation(len(pairs))[:400]]
+    expected = np.array([shape_distance(shapes[a].geometry, at[a], shapes[b].geometry, at[b]) for a, b in pairs.tolist()])
+    np.testing.assert_allclose(placed.distances(pairs), expected, atol=COAL)
+    bounds = placed.bounds(pairs)
+    assert (bounds <= expected + COAL).all()
+    assert np.isfinite(bounds).mean() > 0.8, "and most say something"
+    best, least = placed.nearest(pairs)
+    assert least == pytest.approx(expected.min(), abs=COAL)
+    assert expected[best] == pytest.approx(least, abs=COAL)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_is_around_a_point(seed: int) -> None:
+    q, rng = configuration(seed), np.random.default_rng(seed)
+    placed, at = solids().at(q), where(q)
+    counted = 0
+    for point in [at[0].translation + rng.normal(scale=0.3, size=3) for _ in range(5)]:
+        ball, here = coal.Sphere(POINT), pin.SE3(np.eye(3), point)
+        distances = [shape_distance(ball, here, shape.geometry, at[k]) for k, shape in enumerate(solids().world.shapes)]
+        near = [k for k, distance in enumerate(distances) if distance < 0.2]
+        assert placed.around(point, 0.2) == near
+        counted += len(near)
+    assert counted > 0
+
+
+def test_only_what_may_be_nearest_is_asked_of_coal(monkeypatch: pytest.MonkeyPatch) -> None:
+    mine, asked = Solids(World(door_scene())), []
+    distance = mine.distance
+    monkeypatch.setattr(mine, "distance", lambda *pair: asked.append(pair) or distance(*pair))
+    pairs = np.array([(a, b) for a in range(mine.bodies) for b in range(mine.bodies, len(mine.world.shapes))])
+    q = np.asarray(mine.world.coordinates.q(np.zeros(mine.world.coordinates.size)))
+    mine.at(q).nearest(pairs)
+    assert 0 < len(asked) < 0.2 * len(pairs)

@@ -167,8 +167,8 @@ def _holds(document: Document, held: Mapping[str, schema.HeldSchema], objects: M
         with document.at(path):
             owner = by.get(name, "").partition(".")[0]
             both = {one: attachments[one] for one in (owner, name) if one in held}
-            alone = ({name: said[name]} if name in said else {} for said in (by, at))
-            checked_holds(objects, holds_of(both, *alone))
+            through, values = {name: by[name]} if name in by else {}, {name: at[name]} if name in at else {}
+            checked_holds(objects, holds_of(both, through, values))
     with document.at(("start", "held")):
         return checked_holds(objects, holds_of(attachments, by, at))
 

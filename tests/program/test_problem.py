@@ -203,7 +203,7 @@ def test_every_object_is_closed_while_it_is_held_and_goals_are_met_at_the_end(tw
 
 
 def test_what_is_held_at_the_start_is_closed_from_the_first_waypoint() -> None:
-    scene = dataclasses.replace(door_scene(), held={"door": "handle"})
+    scene = dataclasses.replace(door_scene(), holds=(HANDLE,))
     problem = program_of(scene, [Actuate("door", {"knob": 0.3})], options=SHORT)
     assert [phase.held for phase in problem.task.phases] == [(HANDLE,)]
     assert problem.transcription.structure.poses[0].waypoints == tuple(range(1, MOVE + 1))

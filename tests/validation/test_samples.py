@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
-from vkc_pin.scene.hold import Hold
+from vkc_pin.scene.hold import Hold, holds_of
 from vkc_pin.scene.scene import Scene
 from vkc_pin.validation.samples import ANGLE_STEP, LENGTH_STEP, Samples
 
@@ -91,6 +91,6 @@ def test_grasp_errors(seed: int, grasp: str) -> None:
 
 def test_what_a_hand_moves() -> None:
     samples = Samples(full_scene(), motion(full_scene(), 0))
-    assert samples.moved_by({}) == set()
-    assert samples.moved_by({"cabinet": "grip"}) == {"cabinet.swing", "cabinet.slide"}
-    assert samples.moved_by({"door": "handle", "drawer": "handle"}) == {"door.hinge", "door.knob", "drawer.slide"}
+    assert samples.moved_by(()) == set()
+    assert samples.moved_by(holds_of({"cabinet": "grip"})) == {"cabinet.swing", "cabinet.slide"}
+    assert samples.moved_by(holds_of({"door": "handle", "drawer": "handle"})) == {"door.hinge", "door.knob", "drawer.slide"}

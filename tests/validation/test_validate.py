@@ -15,6 +15,7 @@ import vkc_pin as vkc
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.options import Options
+from vkc_pin.scene.hold import holds_of
 from vkc_pin.scene.placed import PlacedObject
 from vkc_pin.scene.scene import Scene
 from vkc_pin.validation.clearance import clearance_curves
@@ -315,7 +316,7 @@ def latch_shortfall(base: Scene, hinge: list[float], knob: list[float], *, reach
 
 
 def test_nobody_holds_what_moves(door_plan: vkc.Plan) -> None:
-    let_go = tuple(dataclasses.replace(phase, held={}) for phase in door_plan.trajectory.phases)
+    let_go = tuple(dataclasses.replace(phase, holds=()) for phase in door_plan.trajectory.phases)
     report = check(door_plan, trajectory=dataclasses.replace(door_plan.trajectory, phases=let_go))
     unheld = {found.subject: found for found in report.violations if found.constraint == "unheld"}
     assert set(unheld) == {"door.hinge", "door.knob"}
@@ -443,12 +444,12 @@ def test_bad_trajectories(door_plan: vkc.Plan, empty: Scene) -> None:
         check(door_plan, trajectory=dataclasses.replace(motion, names=(motion.names[1], motion.names[0], *motion.names[2:])))
     assert other.value.field == "trajectory.names"
     for held, kind in (({"dor": "handle"}, "object"), ({"door": "handl"}, "attachment")):
-        phases = (*motion.phases[:-1], dataclasses.replace(motion.phases[-1], held=held))
+        phases = (*motion.phases[:-1], dataclasses.replace(motion.phases[-1], holds=holds_of(held)))
         with pytest.raises(UnknownNameError, match=kind) as caught:
             check(door_plan, trajectory=dataclasses.replace(motion, phases=phases))
         assert caught.value.field == "trajectory.phases[2].held"
         assert caught.value.nearest in ("door", "handle")
-    phases = (*motion.phases[:-1], dataclasses.replace(motion.phases[-1], held={"door": "handle_free"}))
+    phases = (*motion.phases[:-1], dataclasses.replace(motion.phases[-1], holds=holds_of({"door": "handle_free"})))
     with pytest.raises(InputError, match="missing") as other:
         check(door_plan, trajectory=dataclasses.replace(motion, phases=phases))
     assert other.value.expected == "door.handle_free"

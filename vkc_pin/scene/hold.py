@@ -91,9 +91,8 @@ def in_order(holds: Iterable[Hold]) -> tuple[Hold, ...]:
     """Return holds as they are, if each comes after the one it depends on. Raises `InputError` if one does not."""
     holds = tuple(holds)
     for number, hold in enumerate(holds):
-        if hold.by is not None and hold.by not in holds[:number]:
-            problem = "held through what is not held before it"
-            raise InputError(problem, field="holds", expected=str(hold.by), got=str(hold))
+        if hold.by not in (None, *holds[:number]):
+            raise InputError("held through what is not held before it", field="holds", got=str(hold))
     return holds
 
 

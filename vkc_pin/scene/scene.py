@@ -107,7 +107,7 @@ class Scene:
         from vkc_pin.scene.scene_file import scene_fields
 
         fields = scene_fields(Document(dict(document)), Path(folder))
-        return Scene(**fields).with_held_objects_in_the_hand()
+        return Scene(**fields)._with()
 
     def with_start(self, base: ArrayLike | None = None, arm: ArrayLike | None = None) -> Scene:
         """Return the scene with another start.
@@ -182,11 +182,9 @@ class Scene:
         return self.objects[name]
 
     def _with(self, **fields: Any) -> Scene:
-        return dataclasses.replace(self, **fields).with_held_objects_in_the_hand()
-
-    def with_held_objects_in_the_hand(self) -> Scene:
-        """Return the scene with every free object that is held placed where the robot holds it at the start."""
-        return dataclasses.replace(self, objects=in_hand(self.objects, self.tool_placement, self.holds))
+        """Return the scene with other attributes, and every free object that is held where the robot then holds it."""
+        changed = dataclasses.replace(self, **fields)
+        return dataclasses.replace(changed, objects=in_hand(changed.objects, changed.tool_placement, changed.holds))
 
     def tool_placement(self) -> pin.SE3:
         """Return the placement of the robot's tool frame in the world frame at the start."""
@@ -257,4 +255,4 @@ def load_scene(name_or_path: str | Path) -> Scene:
     text = str(name_or_path)
     by_path = isinstance(name_or_path, Path) or text.endswith((".yaml", ".yml")) or "/" in text
     file = Path(name_or_path) if by_path else find("scenes", "*.yaml", text, what="scene")
-    return Scene(**scene_fields(read_yaml(file), file.parent)).with_held_objects_in_the_hand()
+    return Scene(**scene_fields(read_yaml(file), file.parent))._with()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -85,11 +84,10 @@ def document_of(fields: Mapping[str, Any]) -> dict[str, Any]:
     """
     described, start, objects, region = (fields[key] for key in ("described", "start", "objects", "start_region"))
     plain = described.model_dump(mode="json", include={"robot", "obstacles", "objects"}, exclude_none=True)
-    held: dict[str, dict[str, Any]] = {}
+    held = {}
     for hold in fields["holds"]:
-        held[hold.object] = {"attachment": hold.attachment}
-        held[hold.object] |= {"by": hold.frame} if hold.by else {}
-        held[hold.object] |= {"at": list(hold.at)} if any(hold.at) else {}
+        said = {"attachment": hold.attachment, "by": hold.frame, "at": list(hold.at) if any(hold.at) else None}
+        held[hold.object] = {key: value for key, value in said.items() if value is not None}
     for item, entry in zip(described.objects, plain["objects"], strict=True):
         placed = objects[item.name]
         entry["state"] = dict(zip(placed.object.coordinates.names, placed.state.tolist(), strict=True))
@@ -99,14 +97,12 @@ def document_of(fields: Mapping[str, Any]) -> dict[str, Any]:
             entry["position"] = placed.placement.translation.tolist()
             entry["rpy"] = pin.rpy.matrixToRpy(placed.placement.rotation).tolist()
     at_home = described.start.arm is None and np.array_equal(start[3:], fields["robot"].home)
-    x_min, x_max, y_min, y_max = fields["arena"]
-    intervals = {} if region is None else dataclasses.asdict(region)
     return {
         "name": fields["name"],
         "robot": plain["robot"],
         "start": {"base": start[:3].tolist(), **({} if at_home else {"arm": start[3:].tolist()}), "held": held},
-        "arena": {"x": [x_min, x_max], "y": [y_min, y_max]},
-        **({"start_region": {key: list(value) for key, value in intervals.items() if value}} if intervals else {}),
+        "arena": {"x": list(fields["arena"][:2]), "y": list(fields["arena"][2:])},
+        **({"start_region": {key: list(value) for key, value in vars(region).items() if value}} if region else {}),
         "floor": fields["floor"],
         "obstacles": plain["obstacles"],
         "objects": plain["objects"],
@@ -169,12 +165,10 @@ def _holds(document: Document, held: Mapping[str, schema.HeldSchema], objects: M
         if name not in objects:
             raise document.unknown(path, "object", name, objects)
         with document.at(path):
-            alone = {name: attachments[name]}
-            checked_holds(objects, holds_of(alone, at={name: at[name]} if name in at else {}))
-            if name in by:
-                owner = by[name].partition(".")[0]
-                both = {owner: attachments[owner]} if owner in held else {}
-                checked_holds(objects, holds_of({**both, **alone}, {name: by[name]}))
+            owner = by.get(name, "").partition(".")[0]
+            both = {one: attachments[one] for one in (owner, name) if one in held}
+            through, values = {name: by[name]} if name in by else {}, {name: at[name]} if name in at else {}
+            checked_holds(objects, holds_of(both, through, values))
     with document.at(("start", "held")):
         return checked_holds(objects, holds_of(attachments, by, at))
 

@@ -129,7 +129,7 @@ def test_where_the_next_cannot_be_done_both_are_planned_anew(monkeypatch: pytest
     problems = Problems(monkeypatch, lambda steps: steps == (SHUT,))
     plan = vkc.plan_chore(home(), [OPEN, SHUT])
     assert plan.success, plan.report()
-    alone = [(SHUT,)] * chore._SINGLE
+    alone = [(SHUT,)] * chore._ACTION_SEARCHES
     assert [steps for steps, _ in problems.asked] == [(OPEN,), *alone, (OPEN, SHUT)]
     assert not problems.asked[-1][1]  # from seeds of its own
 
@@ -146,8 +146,8 @@ def test_a_decision_that_leads_nowhere_is_given_up(monkeypatch: pytest.MonkeyPat
 
 
 def test_what_fails_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(chore, "_TRIES", 1)
-    monkeypatch.setattr(chore, "_BACK", 0)
+    monkeypatch.setattr(chore, "_WINDOW_SEARCHES", 1)
+    monkeypatch.setattr(chore, "_BACKTRACKS", 0)
     Problems(monkeypatch, lambda steps: CUP[0] in steps)
     plan = vkc.plan_chore(home(), [vkc.GoTo(0.5, -0.5), OPEN, *CUP], window=1, options=vkc.Options(max_outer=1))
     assert not plan.success

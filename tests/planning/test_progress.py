@@ -82,7 +82,7 @@ def test_rounds_do_not_flood_it() -> None:
 
 
 def test_a_terminal_has_one_line(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_PAUSE", 0.0)  # however quick this is
+    monkeypatch.setattr(module, "_REFRESH_TIME", 0.0)  # however quick this is
     plan = vkc.plan(hall(), [vkc.GoTo(-1.0, 0.5)], progress=True)
     assert plan.success
     first, rest = terminal.lines()

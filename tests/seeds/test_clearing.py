@@ -139,14 +139,14 @@ def test_limits_hold(scattered: Scattered) -> None:
 def test_a_round_goes_no_further_than_the_linearisation_is_worth(
     scattered: Scattered, cleared: Scattered, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(clearing, "_ROUNDS", 1)
+    monkeypatch.setattr(clearing, "_CLEARING_ROUNDS", 1)
     far, near = (np.abs(some.cleared() - some.z).max(axis=1) for some in (scattered, cleared))
-    assert far.max() == pytest.approx(clearing._LONGEST)
-    assert np.any((near > 0.0) & (near < 0.5 * clearing._LONGEST))  # short steps stay as they are
+    assert far.max() == pytest.approx(clearing._MAX_STEP)
+    assert np.any((near > 0.0) & (near < 0.5 * clearing._MAX_STEP))  # short steps stay as they are
 
 
 def test_what_weighs_more_moves_less(scattered: Scattered, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(clearing, "_ROUNDS", 1)
+    monkeypatch.setattr(clearing, "_CLEARING_ROUNDS", 1)
     even = np.ones(scattered.problem.chain.size)
     heavy = even.copy()
     heavy[:3] = 100.0

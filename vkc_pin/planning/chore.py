@@ -28,10 +28,10 @@ from vkc_pin.task.terms import Term, check_active
 
 __all__ = ["plan_chore"]
 
-_SINGLE = 3  # searches, from different random numbers, for a motion of one more action
-_TRIES = 4  # searches, from different random numbers, for a motion of what is in the window
-_ROUNDS = 16  # of the solver from one seed: what takes more has mostly run into a dead end, and other seeds are at hand
-_BACK = 3  # how often, in all, what has been decided is given up since what follows cannot be done
+_ACTION_SEARCHES = 3  # searches, from different random numbers, for a motion of one more action
+_WINDOW_SEARCHES = 4  # searches, from different random numbers, for a motion of what is in the window
+_BACKTRACKS = 3  # how often, in all, what has been decided is given up since what follows cannot be done
+_SOLVER_ROUNDS = 16  # of the solver from one seed: what takes more has mostly run into a dead end, and other seeds are at hand
 _FINER = 1.6  # ratio of waypoints, in every search but the first, to what the options say: see `_left`
 _NOTHING = PhaseWaypoints((), (), (), "")
 _STOPPED = ("interrupted", "time limit")
@@ -139,7 +139,7 @@ class _Chore:
 
     def run(self) -> Plan:
         """Plan action after action, until all is done, one fails or Ctrl-C is pressed."""
-        window, back, failed = self.window, _BACK, None
+        window, back, failed = self.window, _BACKTRACKS, None
         while len(self.kept) < len(self.actions):
             failed = self._plan_window(window)
             if self._stopped:
@@ -185,7 +185,7 @@ class _Chore:
             plan = self._solved(first, one, lambda problem: seed_of(problem, pieces))
             if plan.success:
                 self.ahead = self._parts(one, plan, first, last)
-        for attempt in range(1, 1 + _TRIES):
+        for attempt in range(1, 1 + _WINDOW_SEARCHES):
             if alone is None or alone.status in _STOPPED:
                 break
             one = self._problem(self._now, first, last, attempt, fine=True)
@@ -215,7 +215,7 @@ class _Chore:
     def _look_ahead(self) -> Plan | None:
         """Plan one more action alone, from where those planned ahead end; return the plan if it fails."""
         number, scene = len(self.kept) + len(self.ahead), self.ahead[-1].after if self.ahead else self._now
-        for attempt in range(_SINGLE):
+        for attempt in range(_ACTION_SEARCHES):
             one = self._problem(scene, number, number + 1, attempt, fine=attempt > 0)
             if not one.task.phases:
                 self.ahead.append(_Part(None, _NOTHING, scene))
@@ -286,7 +286,7 @@ class _Chore:
         if limit is not None:
             limit = max(limit - sum(metrics["planning_time"] for metrics in self.spent), 1e-3)
         given = self.settings.options
-        options = dataclasses.replace(given, max_restarts=1, max_outer=min(given.max_outer, _ROUNDS))
+        options = dataclasses.replace(given, max_restarts=1, max_outer=min(given.max_outer, _SOLVER_ROUNDS))
         if fine:
             more = {name: round(_FINER * getattr(given, name)) for name in ("reach_waypoints", "move_waypoints")}
             options = dataclasses.replace(options, **more)

@@ -7,12 +7,13 @@ from numpy.typing import NDArray
 
 from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.program.problem import TrajectoryProblem
+from vkc_pin.seeds.clearing import KNOT_TOLERANCE
 from vkc_pin.seeds.knots import depth, scatter
 from vkc_pin.validation.report import Violation
 
 __all__ = ["explain", "impossible"]
 
-_DRAWS = 4  # times 192 random configurations before a goal counts as blocked
+_DRAWS = 4  # batches of `SCATTER` random configurations before a goal counts as blocked
 
 
 def impossible(problem: TrajectoryProblem) -> list[Violation]:
@@ -63,14 +64,14 @@ def explain(problem: TrajectoryProblem, seed: int, interrupt: Interrupt = NEVER)
         if tried is None:
             continue
         z, residual = tried
-        if residual.min() > 1e-4:
+        if residual.min() > KNOT_TOLERANCE:
             nearest = int(np.argmin(residual))
             lines.append(
                 f"{phase.name}: out of reach, none of {len(z)} configurations tried gets there; "
                 f"the nearest stays {residual[nearest]:.3f} m or rad short"
             )
             continue
-        reached = z[residual < 1e-4]
+        reached = z[residual < KNOT_TOLERANCE]
         contacts = problem.contacts.evaluate(reached, np.full(len(reached), int(end)), reach=problem.options.dist_safe)
         shortfall = contacts.shortfall(len(reached))
         if shortfall.min() > 0.0:
@@ -95,7 +96,7 @@ def _try(
         if tried is None:
             return None
         found.append(tried)
-        z = tried[0][tried[1] < 1e-4]
+        z = tried[0][tried[1] < KNOT_TOLERANCE]
         if interrupt.pressed or (len(z) and depth(problem, z, waypoint).min() <= 0.0):
             break
     return np.concatenate([z for z, _ in found]), np.concatenate([residual for _, residual in found])

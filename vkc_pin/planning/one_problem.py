@@ -29,7 +29,7 @@ from vkc_pin.validation.validate import validate
 
 __all__ = ["OneProblem"]
 
-_RACING = 3  # seeds of which the one to begin with is chosen
+_RACING_SEEDS = 3  # seeds that race for a few rounds; the best of them goes on
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +187,7 @@ class OneProblem:
         seeds = self._seeds(problem)
         if not self.settings.rough and any(phase.grasps for phase in problem.task.phases[:-1]):
             scored: list[tuple[float, int, Seed]] = []
-            for number, seed in enumerate(itertools.islice(seeds, _RACING)):
+            for number, seed in enumerate(itertools.islice(seeds, _RACING_SEEDS)):
                 if not seed.races:  # a round would not tell
                     scored.append((np.inf, number, seed))
                     continue

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Progress", "shown"]
 
-_PAUSE = 0.1  # [s] between two changes of the line
+_REFRESH_TIME = 0.1  # [s] between two changes of the line
 
 
 class Progress:
@@ -68,7 +68,7 @@ class Progress:
 
     def _show(self, *, always: bool = False) -> None:
         now = time.perf_counter()
-        if not self._ended and self.write is not None and (always or now - self._changed >= _PAUSE):
+        if not self._ended and self.write is not None and (always or now - self._changed >= _REFRESH_TIME):
             self._changed = now
             passed = f"{now - self._began:.0f} s"
             self.write(" · ".join(filter(None, [passed, self._part, self._doing, self._what])), False)

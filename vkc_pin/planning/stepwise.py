@@ -17,7 +17,7 @@ from vkc_pin.task.phases import Task
 
 __all__ = ["all_at_once", "stages", "step_by_step"]
 
-_ROUNDS = 10  # of the solver from one seed: what takes more has mostly run into a dead end
+_SOLVER_ROUNDS = 10  # of the solver from one seed: what takes more has mostly run into a dead end
 
 
 def step_by_step(scene: Scene, task: Task, settings: Settings) -> Plan:
@@ -82,7 +82,7 @@ def stages(scene: Scene, task: Task, settings: Settings, *, brief: bool = False)
         brief: Whether the motions are to be planned as one afterwards. Then they are rough, and all but the first step are given
             up soon: where the next cannot be done from where a step led, all seeds fail.
     """
-    options = dataclasses.replace(settings.options, max_restarts=1, max_outer=min(settings.options.max_outer, _ROUNDS))
+    options = dataclasses.replace(settings.options, max_restarts=1, max_outer=min(settings.options.max_outer, _SOLVER_ROUNDS))
     settings = dataclasses.replace(settings, rough=True) if brief else settings
     current, spent = scene, 0.0
     parts: list[tuple[OneProblem, Plan]] = []

@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 
 from vkc_pin.chain.inverse_kinematics import PoseSolver
 from vkc_pin.chain.pose import PoseRow
+from vkc_pin.seeds.clearing import KNOT_TOLERANCE
 from vkc_pin.seeds.knots import Knots
 from vkc_pin.task.phases import Phase
 
 __all__ = ["Approach"]
 
 LIFT = 0.1  # [m] to lift or lower what is carried
-_REACH = (0.1, 0.2, 0.3, 0.4, 0.5)  # [m] from what is touched, on the way to it
-_SHARES = (0.25, 0.5, 0.75, 1.0)  # of a way, from each to the next
-_TOLERANCE = 1e-4  # [m] and [rad]
+_STANDOFFS = (0.1, 0.2, 0.3, 0.4, 0.5)  # [m] from what is touched, on the way to it
+_WAY_SHARES = (0.25, 0.5, 0.75, 1.0)  # of a straight way, at which configurations are looked for
 
 
 class Approach:
@@ -48,7 +48,7 @@ class Approach:
             return self._way(z, np.array([0.0, 0.0, 1.0]), [LIFT])
         for goal in phase.frames:
             if goal.touches:
-                return self._way(z, -self._ahead(z, self.chain.frame(goal.frame, goal.hold)), _REACH)[::-1]
+                return self._way(z, -self._ahead(z, self.chain.frame(goal.frame, goal.hold)), _STANDOFFS)[::-1]
         return np.empty((0, len(z)))
 
     def after(self, z: NDArray[np.float64], phase: Phase, before: Phase | None) -> NDArray[np.float64]:
@@ -59,7 +59,7 @@ class Approach:
             return self._way(z, np.array([0.0, 0.0, 1.0]), [LIFT])
         for goal in before.frames if before else ():
             if goal.touches:
-                return self._way(z, -self._ahead(z, self.chain.frame(goal.frame, goal.hold)), _REACH)
+                return self._way(z, -self._ahead(z, self.chain.frame(goal.frame, goal.hold)), _STANDOFFS)
         return np.empty((0, len(z)))
 
     def away(self, z: NDArray[np.float64], phase: Phase) -> NDArray[np.float64]:
@@ -73,7 +73,7 @@ class Approach:
             direction, length = np.array([0.0, 0.0, 1.0]), LIFT
         else:
             return np.empty((0, len(z)))
-        return self._way(z, direction, [share * length for share in _SHARES], drives=False)
+        return self._way(z, direction, [share * length for share in _WAY_SHARES], drives=False)
 
     def _ahead(self, z: NDArray[np.float64], frame: tuple[int, pin.SE3]) -> NDArray[np.float64]:
         """Return the direction of a frame's z axis in the world, at `z`: in it a hand nears what it grasps."""
@@ -98,7 +98,7 @@ class Approach:
             target = pin.SE3(tool.rotation, tool.translation + length * direction)
             start = (found[-1] if found else z)[None]
             for low, high in (standing, (lower, upper)) if self.stands else ((lower, upper),):
-                near, ok = self.solver.solve(start, target, lower=low, upper=high, weights=weights, tolerance=_TOLERANCE)
+                near, ok = self.solver.solve(start, target, lower=low, upper=high, weights=weights, tolerance=KNOT_TOLERANCE)
                 if ok[0]:
                     break
             else:

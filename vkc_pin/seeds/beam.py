@@ -14,16 +14,19 @@ from vkc_pin.seeds.routes import Routes
 
 __all__ = ["Beam", "Found"]
 
-_DRAWS, _ENOUGH = 6, 60  # how often random seeds are drawn until so many are free: good grasps are rare
-_OTHERS = 3  # where a hand chooses how to grasp, so many times fewer of the others are kept than of the cheap ones
-_FEW = 12  # free configurations at a knot with which none are pushed out of collisions
-_BEAM, _QUICK_BEAM, _CHILDREN = 40, 24, 4  # configurations kept per knot, and tried from each for the next
+_DRAWS = 6  # batches of random seeds that are drawn at most: good grasps are rare
+_FREE_OPEN = 60  # free configurations at a knot with which no more are drawn, nor pushed out of collisions
+_FREE_HELD = 12  # the same at a knot at which something fixed is held
+_OTHERS = 3  # ratio of the beam to what is kept of other free grasps, where a hand chooses how to grasp
+_BEAM, _QUICK_BEAM = 40, 24  # configurations kept per knot
+_CHILDREN = 4  # configurations tried per knot, as a multiple of the beam
 _KNOT_TIME = 1.0  # [s] from knot to knot along a phase in which something fixed is held, at `Options.dt` a waypoint
-_APPROACH = 6  # configurations looked at on the way to a grasp
+_WAY_PIECES = 6  # pieces of a straight way, between which it is looked at for collisions
+_WAY_COLLISION = 1.0  # cost of a configuration in collision there
 _EASY = 0.5  # share of the beam that must go on freely for a knot to be easy
-_COLLISION, _DEPTH = 10.0, 300.0  # what a collision costs, and a metre of its depth, beside radians of motion
-_NOT_FOUND = 1e3
-_TOLERABLE = 60.0  # what the solver may be left to push apart: a graze or two
+_COLLISION, _DEPTH = 10.0, 300.0  # cost of a collision, and of its depth [1/m], a radian of a joint costing 1
+_NOT_FOUND = 1e3  # cost if there is no configuration, or no path of the base
+_TOLERABLE = 60.0  # cost of collisions that the solver may be left to push apart: a graze or two
 _JUMP = 0.5  # [m] of the base from knot to knot while something fixed is held: through something, no doubt
 _DRIVING = 2.0  # how many times more than in `Knots.weights` the base's way counts: on it hangs which side is gone to
 
@@ -190,7 +193,7 @@ class Beam:
                 z, found = knots.knot(paths[parents, -1], waypoint, "scatter")
                 price = cost[parents] + self._way(paths[parents, -1], z, phase)
                 draws.append(self._cheapest(price, parents, z, found, waypoint, mode.width))
-                if sum(np.count_nonzero(bad == 0) for _, _, bad in draws) >= _ENOUGH:
+                if sum(np.count_nonzero(bad == 0) for _, _, bad in draws) >= _FREE_OPEN:
                     break
             parents, z, bad = (np.concatenate(parts) for parts in zip(*draws, strict=True))
             return self._pushed(paths, cost, parents, z, bad, waypoint, phase, mode.width)
@@ -221,7 +224,7 @@ class Beam:
         width: int,
     ) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64]]:
         """Return continuations and, if few of them are free, the best of them pushed out of what they are in."""
-        if np.count_nonzero(bad == 0) >= (_FEW if self._closed_at(waypoint) else _ENOUGH):
+        if np.count_nonzero(bad == 0) >= (_FREE_HELD if self._closed_at(waypoint) else _FREE_OPEN):
             return parents, z, bad
         price = cost[parents] + self._way(paths[parents, -1], z, phase) + bad
         best = np.argsort(price, kind="stable")[: 2 * width]
@@ -262,10 +265,12 @@ class Beam:
 
     def _approach(self, first: NDArray[np.float64], last: NDArray[np.float64], begin: int, end: int) -> NDArray[np.float64]:
         """Return what the straight ways from `first` to `last`, both (B, n), cost in collisions, shape (B,)."""
-        s = np.arange(1, _APPROACH) / _APPROACH
+        s = np.arange(1, _WAY_PIECES) / _WAY_PIECES
         between = first[:, None] + s[:, None] * (last - first)[:, None]
         depth = self.knots.depth(between.reshape(-1, between.shape[-1]), min(begin + 1, end))
-        return np.asarray(np.sum(np.where(depth > 0, 1.0 + _DEPTH / _APPROACH * depth, 0.0).reshape(len(first), -1), axis=1))
+        return np.asarray(
+            np.sum(np.where(depth > 0, _WAY_COLLISION + _DEPTH / _WAY_PIECES * depth, 0.0).reshape(len(first), -1), axis=1)
+        )
 
 
 def _hits(depth: NDArray[np.float64]) -> NDArray[np.float64]:

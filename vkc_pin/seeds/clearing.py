@@ -12,11 +12,12 @@ from vkc_pin.program.problem import TrajectoryProblem
 
 __all__ = ["clear_out"]
 
-_ROUNDS = 10
-_ROWS = 6  # contacts of a configuration that are looked at in one round
-_SPARE = 1e-2  # [m] further than the margin
-_LONGEST = 0.25  # [m] and [rad], of one round's step in one coordinate
-_DAMPING = 3e-4
+KNOT_TOLERANCE = 1e-4  # [m] and [rad] largest residual of a pose at a knot; what is joined from knots is exact
+_CLEARING_ROUNDS = 10  # Gauss-Newton steps at most
+_CONTACTS = 6  # contacts of a configuration that count in a step, the nearest
+_EXTRA_CLEARANCE = 1e-2  # [m] more than the margin that is asked for
+_MAX_STEP = 0.25  # [m] and [rad] of a step in one coordinate
+_DAMPING = 3e-4  # added to the diagonal of the normal equations
 
 
 def clear_out(
@@ -47,12 +48,12 @@ def clear_out(
     """
     z, done = z.copy(), np.zeros(len(z), bool)
     free = (upper - lower > 1e-9) / weights
-    for _ in range(_ROUNDS):
+    for _ in range(_CLEARING_ROUNDS):
         at = np.flatnonzero(~done)
         if not len(at):
             break
-        reach = problem.options.dist_safe + _SPARE
-        contacts = problem.contacts.evaluate(z[at], np.full(len(at), waypoint), reach=reach, nearest=_ROWS)
+        reach = problem.options.dist_safe + _EXTRA_CLEARANCE
+        contacts = problem.contacts.evaluate(z[at], np.full(len(at), waypoint), reach=reach, nearest=_CONTACTS)
         short = contacts.shortfall(len(at))
         residual, pose_rows = solver.evaluate(z[at], target)
         done[at] = (short <= 0.0) & (np.abs(residual).max(axis=1) < 1e-4)
@@ -62,7 +63,7 @@ def clear_out(
         scaled = jacobian * free[at][:, None, :]
         system = scaled @ jacobian.transpose(0, 2, 1) + _DAMPING * np.eye(jacobian.shape[1])
         step = np.einsum("bij,bi->bj", scaled, np.linalg.solve(system, wanted[..., None])[..., 0])
-        step *= np.minimum(1.0, _LONGEST / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12))
+        step *= np.minimum(1.0, _MAX_STEP / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12))
         step[done[at]] = 0.0
         z[at] = np.clip(z[at] + step, lower[at], upper[at])
     return z
@@ -73,7 +74,7 @@ def _contact_rows(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return gradients of the nearest distances, shape (B, rows, n), and by how much they should grow, shape (B, rows) [m]."""
     order = np.arange(len(contacts.waypoint)) - np.searchsorted(contacts.waypoint, contacts.waypoint)
-    rows, wanted = np.zeros((len(z), _ROWS, z.shape[1])), np.zeros((len(z), _ROWS))
+    rows, wanted = np.zeros((len(z), _CONTACTS, z.shape[1])), np.zeros((len(z), _CONTACTS))
     rows[contacts.waypoint, order] = problem.contacts.gradients(z, contacts)
-    wanted[contacts.waypoint, order] = np.maximum(contacts.margin + _SPARE - contacts.distance, 0.0)
+    wanted[contacts.waypoint, order] = np.maximum(contacts.margin + _EXTRA_CLEARANCE - contacts.distance, 0.0)
     return rows, wanted

@@ -12,11 +12,13 @@ from vkc_pin.seeds.knots import depth
 
 __all__ = ["folded_arm"]
 
-_DRAWN, _ROUNDS = 256, 8  # configurations looked at in a round
-_KEPT, _LOOKED = 8, 32  # free ones from which the next round begins; how many are looked at in one go for them
-_SPREAD, _SHRINKS = 0.5, 0.7  # [m] and [rad] around these at first, and how that changes from round to round
-_OVERHANG, _HEIGHT, _TURN = 0.3, 0.2, 0.01  # metres of width that one before or behind the base, one up, or a radian is worth
-_LOW = 0.1  # [m] over the floor, at least
+_POSTURES, _SEARCH_ROUNDS = 256, 8  # postures in a round of the random search
+_PARENTS = 8  # free postures from which the next round begins
+_CHECKED = 32  # postures whose clearance is found at once
+_SPREAD, _SHRINK = 0.5, 0.7  # [m] and [rad] standard deviation of the first round; its ratio from round to round
+_OVERHANG, _HEIGHT = 0.3, 0.2  # [m/m] cost of a metre before or behind the base, and up, a metre of width costing 1
+_FROM_HOME = 0.01  # [m/rad] cost of the joint that is furthest from home
+_LOW, _LOW_COST = 0.1, 10.0  # [m] over the floor, at least; [m/m] cost of less
 
 
 def folded_arm(
@@ -40,22 +42,22 @@ def folded_arm(
     lower = np.where(turns, np.maximum(chain.lower[arm], home - np.pi), chain.lower[arm])
     upper = np.where(turns, np.minimum(chain.upper[arm], home + np.pi), chain.upper[arm])
     body = _Body(problem, phase)
-    z = np.tile(resting, (_DRAWN, 1))
+    z = np.tile(resting, (_POSTURES, 1))
     z[0, arm] = home
-    z[1:, arm] = rng.uniform(lower, upper, (_DRAWN - 1, len(home)))
+    z[1:, arm] = rng.uniform(lower, upper, (_POSTURES - 1, len(home)))
     best, spread = z[:1], _SPREAD
-    for _ in range(_ROUNDS):
+    for _ in range(_SEARCH_ROUNDS):
         if interrupt.pressed:
             break
-        z = z[np.argsort(body.price(z) + _TURN * np.abs(z[:, arm] - home).max(axis=1), kind="stable")]
-        best = body.free(z, _KEPT)
+        z = z[np.argsort(body.price(z) + _FROM_HOME * np.abs(z[:, arm] - home).max(axis=1), kind="stable")]
+        best = body.free(z, _PARENTS)
         if not len(best):
             return home.copy()
-        z = best[np.arange(_DRAWN) % len(best)]
-        off = spread * rng.uniform(0.0, 1.0, (_DRAWN, 1)) * rng.normal(size=(_DRAWN, len(home)))
+        z = best[np.arange(_POSTURES) % len(best)]
+        off = spread * rng.uniform(0.0, 1.0, (_POSTURES, 1)) * rng.normal(size=(_POSTURES, len(home)))
         off[: len(best)] = 0.0
         z[:, arm] = np.clip(z[:, arm] + off, lower, upper)
-        spread *= _SHRINKS
+        spread *= _SHRINK
     return best[0, arm].copy()
 
 
@@ -87,13 +89,15 @@ class _Body:
         )
         (back, right, bottom), (front, left, top) = at.min(axis=2).T, at.max(axis=2).T
         beyond = np.maximum(front - self.front, 0.0) + np.maximum(self.back - back, 0.0)
-        return np.asarray(np.maximum(left, -right) + _OVERHANG * beyond + _HEIGHT * top + 10.0 * np.maximum(_LOW - bottom, 0.0))
+        return np.asarray(
+            np.maximum(left, -right) + _OVERHANG * beyond + _HEIGHT * top + _LOW_COST * np.maximum(_LOW - bottom, 0.0)
+        )
 
     def free(self, z: NDArray[np.float64], count: int) -> NDArray[np.float64]:
         """Return the first `count` configurations at which the robot keeps its clearances from itself and what it carries."""
         found = z[:0]
-        for begin in range(0, len(z), _LOOKED):
-            part = z[begin : begin + _LOOKED]
+        for begin in range(0, len(z), _CHECKED):
+            part = z[begin : begin + _CHECKED]
             found = np.concatenate([found, part[depth(self.problem, part, self.waypoint, standing=False) <= 0.0]])
             if len(found) >= count:
                 break

@@ -22,13 +22,16 @@ from vkc_pin.seeds.seed import Seed
 __all__ = ["INITIALIZATIONS", "initialize"]
 
 INITIALIZATIONS = ("auto", "interpolated", "astar", "rrt", "stationary")
-# Shortfalls of a seed, summed over its waypoints [m]: nobody looks for a better one; trees are asked; others come first.
-_FREE, _POOR, _COLLIDING = 0.05, 0.5, 2.0
-_LOOKED, _GROWN = 8, 4  # paths whose seeds are compared; paths along which trees grow
-_HIT = 1e4  # cost that lets paths with knots in collision come last
-_WAVES = 6  # half waves of a perturbation over the whole motion
+_FREE = 0.05  # [m] shortfall of clearance of a seed, summed over its waypoints, below which no better one is looked for
+_POOR = 0.5  # [m] shortfall above which trees are asked
+_COLLIDING = 2.0  # [m] shortfall above which other seeds come first
+_COMPARED_PATHS = 8  # paths of the beam whose seeds are compared
+_TREE_PATHS = 4  # paths of the beam along which trees grow
+_COLLIDING_KNOT = 1e4  # cost that makes paths with knots in collision come last
+_HALF_WAVES = 6  # of a perturbation over the whole motion
 _DIFFERENT = 0.1  # [m] and [rad] by which the base must differ somewhere between two seeds
-_ELSEWHERE, _DEARER = 0.5, 1.4  # by so much in a second seed of one search, which may cost so much more than the cheapest
+_ELSEWHERE = 0.5  # [m] and [rad] by which it is to differ in a second seed of one search
+_COST_RATIO = 1.4  # of that second seed's path to the cheapest one, at most
 
 
 def initialize(
@@ -100,7 +103,7 @@ def _perturbed(
     problem: TrajectoryProblem, z: NDArray[np.float64], deviation: float, rng: np.random.Generator
 ) -> NDArray[np.float64]:
     """Return a seed with smooth noise on the robot's coordinates: half waves in time, of decreasing amplitude."""
-    robot, waves = problem.chain.robot.coordinates.size, np.arange(1, _WAVES + 1)
+    robot, waves = problem.chain.robot.coordinates.size, np.arange(1, _HALF_WAVES + 1)
     shape = np.sin(np.pi * np.outer(np.arange(1, len(z) + 1) / (len(z) + 1), waves)) / waves
     noise = shape @ rng.normal(0.0, deviation, (len(waves), robot)) / np.sqrt(np.sum(0.5 / waves**2))
     z = z.copy()
@@ -156,7 +159,7 @@ class _SeedSearch:
             if found is None:
                 continue
             order = self._order(found)
-            cheap = order[found.cost[order] <= _DEARER * found.cost[order[0]]]
+            cheap = order[found.cost[order] <= _COST_RATIO * found.cost[order[0]]]
             for apart, some in ((_DIFFERENT, order), (_ELSEWHERE, cheap)):
                 new = [k for k in some if all(_distance(found.paths[k], other) > apart for other in given)]
                 best = self._best(found.paths, new, found.at)
@@ -183,7 +186,7 @@ class _SeedSearch:
 
     def _tried(self, paths: NDArray[np.float64], candidates: list[int]) -> list[int]:
         """Return of candidates those of which one is to become a seed."""
-        return candidates[:_LOOKED]
+        return candidates[:_COMPARED_PATHS]
 
     def _best(
         self, paths: NDArray[np.float64], candidates: list[int], at: list[int]
@@ -257,7 +260,7 @@ class _Rrt(_SeedSearch):
         return found if found is not None and self.beam.tolerable(found) else None
 
     def _order(self, found: Found) -> NDArray[np.int_]:
-        return np.argsort(found.cost + _HIT * (found.trouble > 0), kind="stable")
+        return np.argsort(found.cost + _COLLIDING_KNOT * (found.trouble > 0), kind="stable")
 
     def _tried(self, paths: NDArray[np.float64], candidates: list[int]) -> list[int]:
         """Return a few candidates of which no two are alike: where no path leads to one, hardly one leads to the other."""
@@ -265,7 +268,7 @@ class _Rrt(_SeedSearch):
         for index in candidates:
             if all(_distance(paths[index], paths[other]) > _DIFFERENT for other in kept):
                 kept.append(index)
-        return kept[:_GROWN]
+        return kept[:_TREE_PATHS]
 
 
 _SEARCHES: dict[str, type[_Interpolated | _AStar | _Rrt]] = {search.method: search for search in (_Interpolated, _AStar, _Rrt)}

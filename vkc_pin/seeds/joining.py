@@ -17,7 +17,7 @@ from vkc_pin.task.phases import Phase
 
 __all__ = ["DrivenPaths", "Joiner", "Paths", "RrtPaths"]
 
-_LEAST = 8  # part of the usual tries that trees have at least, however often they failed before
+_HALVINGS = 3  # of the tries of trees, at most: what failed before is likely to fail again
 
 
 class Paths(Protocol):
@@ -83,7 +83,7 @@ class RrtPaths:
         ends = np.tile(last[:size], (1 if reaches else len(arms), 1))
         if not reaches:
             ends[:, 3:] = arms
-        tries = max(TRIES // 2 ** self.failed[phase], TRIES // _LEAST)  # what failed before is likely to fail again
+        tries = TRIES // 2 ** min(self.failed[phase], _HALVINGS)
         given = {"poses": poses, "arms": np.array(arms), "rng": self.knots.rng, "tries": tries, "interrupt": self.interrupt}
         path = connect(problem, phase, first, ends, **given)
         self.failed[phase] = 0 if path is not None else self.failed[phase] + 1

@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 
 from vkc_pin.chain.inverse_kinematics import PoseSolver
 from vkc_pin.program.problem import TrajectoryProblem
-from vkc_pin.seeds.clearing import clear_out
+from vkc_pin.seeds.clearing import KNOT_TOLERANCE, clear_out
 
 __all__ = ["CHOICE", "SCATTER", "Knots", "Known", "depth", "follow_objects", "scatter", "smooth"]
 
-SCATTER = 192  # random seeds for a configuration that nothing leads to
-CHOICE = 0.1  # what it costs to grasp elsewhere, beside radians of motion
-_ROUGH = 1e-4  # [m] and [rad], of knots; what is joined from them is exact
+SCATTER = 192  # random seeds of inverse kinematics for a configuration that nothing leads to
+CHOICE = 0.1  # [1/m] and [1/rad] what it costs to grasp elsewhere, a radian of a joint costing 1
 
 
 class Known:
@@ -121,7 +120,7 @@ class Knots:
             z = self._scatter(z, pose)
         elif how == "shake":
             z = self._shake(z, pose)
-        z, found = solver.solve(z, target, lower=lower, upper=upper, weights=self.weights, tolerance=_ROUGH)
+        z, found = solver.solve(z, target, lower=lower, upper=upper, weights=self.weights, tolerance=KNOT_TOLERANCE)
         if how == "scatter":
             z = self._unwind(z, before, lower, upper)
         return z, found
@@ -138,7 +137,7 @@ class Knots:
         solver, target = self.solver(pose)
         weights = self.weights
         pushed = clear_out(self.problem, z, waypoint, solver, target, lower=lower, upper=upper, weights=weights)
-        exact, _ = solver.solve(pushed, target, lower=lower, upper=upper, weights=weights, iterations=3, tolerance=_ROUGH)
+        exact, _ = solver.solve(pushed, target, lower=lower, upper=upper, weights=weights, iterations=3, tolerance=KNOT_TOLERANCE)
         return exact
 
     def _limits(self, before: NDArray[np.float64], waypoint: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -238,7 +237,7 @@ def scatter(
         pushed[found] = search.clear(z[found], waypoint)
         solver, target = search.solver(pose)
         before, after = (np.abs(solver.evaluate(rows, target)[0]).max(axis=1) for rows in (z, pushed))
-        kept = after < _ROUGH  # where being pushed did not cost what must hold there
+        kept = after < KNOT_TOLERANCE  # where being pushed did not cost what must hold there
         return np.where(kept[:, None], pushed, z), np.where(kept, after, before)
     if (problem.lower[row, :2] < problem.upper[row, :2]).any():
         return None

@@ -17,11 +17,12 @@ from vkc_pin.seeds.folded_arm import folded_arm
 
 __all__ = ["Routes", "grid_shapes"]
 
-_FOOT = 2  # the joint of the model that is the arm's first: joint 1 is the base
-_NEAR = 0.4  # [m] from the ends of a path: there the arm reaches in and out, and only the base counts
-_COARSE = 0.5  # [m]: starts closer together share their distances
-_BESIDE, _BESIDES = (0.4, 0.4, 0.6), 60  # how far from a goal a guide may end [m, m, rad], how many such places are tried,
-_DEARER = 3.0  # and what it costs for each metre or radian
+_ARM_BASE = 2  # the joint of the model that is the arm's first: joint 1 is the base
+_REACHING_RADIUS = 0.4  # [m] from the ends of a path within which the arm reaches in and out, and only the base counts
+_START_CELL = 0.5  # [m] size of the squares within which starts share their distances
+_BESIDE_GOAL = (0.4, 0.4, 0.6)  # [m, m, rad] standard deviations of where a guide may end beside a goal, at most
+_BESIDE_COUNT = 60  # places beside a goal that are tried
+_BESIDE_COST = 3.0  # [m/m] and [m/rad] what ending there costs
 
 
 class Routes:
@@ -54,12 +55,12 @@ class Routes:
                 z[self.arm] = self.folded_arm(phase)
             moving, standing = grid_shapes(self.problem, phase, z)
             # Where the arm stands on the base it is always: a low base does not go under a table that the arm does not.
-            base = [shape for joint, shape in moving if joint <= _FOOT]
-            carried = [shape for joint, shape in moving if joint > _FOOT]
+            base = [shape for joint, shape in moving if joint <= _ARM_BASE]
+            carried = [shape for joint, shape in moving if joint > _ARM_BASE]
             self._grids[key] = (
-                BaseGrid(base, carried, standing, arena, 0.0, near=_NEAR, cells=fine_cells(arena, margin), cache=cache)
+                BaseGrid(base, carried, standing, arena, 0.0, near=_REACHING_RADIUS, cells=fine_cells(arena, margin), cache=cache)
                 if folded
-                else BaseGrid(base, carried, standing, arena, margin, near=_NEAR, cache=cache)
+                else BaseGrid(base, carried, standing, arena, margin, near=_REACHING_RADIUS, cache=cache)
             )
         return self._grids[key]
 
@@ -83,7 +84,7 @@ class Routes:
     ) -> NDArray[np.float64]:
         """Return how far it is at least from starts to goals, both (B, 3), one by one, shape (B,) [m]; infinite: no path."""
         grid = self.grid(phase, folded=folded)
-        keys = [(phase, folded, *np.floor(start[:2] / _COARSE).astype(int).tolist()) for start in starts]
+        keys = [(phase, folded, *np.floor(start[:2] / _START_CELL).astype(int).tolist()) for start in starts]
         new = {key: start[:2] for key, start in zip(keys, starts, strict=True) if key not in self._distances}
         if new:
             self._distances |= dict(zip(new, grid.distances_from(np.array(list(new.values()))), strict=True))
@@ -107,12 +108,12 @@ class Routes:
         With the arm at home or, if there is no such path, with the arm folded. None if there is none either.
         """
         rng = np.random.default_rng(0)
-        beside = rng.normal(size=(_BESIDES, 3)) * rng.random((_BESIDES, 1)) * _BESIDE
+        beside = rng.normal(size=(_BESIDE_COUNT, 3)) * rng.random((_BESIDE_COUNT, 1)) * _BESIDE_GOAL
         beside[0] = 0.0
         for folded in (False, True):
             grid = self.grid(phase, folded=folded)  # the fine one only where it is needed
             for places in (beside[:1], beside[1:]):
-                costs = _DEARER * np.abs(places).sum(axis=1)
+                costs = _BESIDE_COST * np.abs(places).sum(axis=1)
                 path = shortest_path(grid, start.tolist(), goal + places, costs=costs, interrupt=self.interrupt)
                 if path is not None:
                     return poses_along(path, steps)

@@ -20,15 +20,17 @@ __all__ = ["TRIES", "connect", "spread"]
 TRIES = 1500
 """How often a tree may grow until they meet."""
 
-_BASE = 2.0  # radians of the arm that a metre of the base's path counts as much as
+_BASE = 2.0  # [rad/m] radians of the arm that a metre of the base's path counts as
 _STEP = 0.15  # [rad] between configurations that are looked at
 _EXTENT = 1.0  # [rad] by which a tree grows at most towards what is drawn
-_CHUNK = 6  # configurations looked at in one go: what lies behind the first that is blocked is of no use
-_GRAZE = 0.8  # share of a margin that may be missing: the solver pushes that apart
+_CHUNK = 6  # configurations looked at at once: what lies behind the first that is blocked is of no use
+_SHORTFALL_SHARE = 0.8  # share of a margin that may be missing: the solver pushes that apart
 _RUNS = 0.4  # share of tries in which a tree is to reach a free part of the base's path
-_GUIDED, _SHAKEN = 0.7, 0.4  # shares of bases drawn on its path, not around its ends, and of arms drawn around what is likely
-_BESIDE, _AROUND, _WILD = (0.1, 0.1, 0.15), (0.4, 0.4, 0.5), 0.6  # standard deviations [m, m, rad] and [rad]
-_SHORTCUTS = 60  # how often it is tried to go straight between places on the path
+_GUIDED = 0.7  # share of bases that are drawn on its path, the others around its ends
+_SHAKEN = 0.4  # share of arms that are drawn around likely postures, the others at them
+_BESIDE_PATH, _AROUND_ENDS = (0.1, 0.1, 0.15), (0.4, 0.4, 0.5)  # [m, m, rad] standard deviations of bases, at most
+_ARM_SPREAD = 0.6  # [m] and [rad] standard deviation of arms, at most
+_SHORTCUTS = 60  # tries to go straight between two places on the path
 
 
 def connect(
@@ -86,7 +88,7 @@ class _Search:
         self.problem, self.first, self.poses, self.arms, self.rng = problem, first, poses, arms, rng
         self.size = problem.chain.robot.coordinates.size
         self.waypoint = problem.contacts.inside(phase)
-        self.allowed = _GRAZE * problem.options.dist_safe
+        self.allowed = _SHORTFALL_SHARE * problem.options.dist_safe
         self.weights = _weights(self.size)
         limits = np.array([problem.limits(name) for name in problem.chain.names[: self.size]])
         self.lower, self.upper = limits.T
@@ -151,13 +153,13 @@ class _Search:
         """Return a configuration near the base's path, or near its beginning or end."""
         rng, goal = self.rng, np.empty(self.size)
         if rng.random() < _GUIDED:
-            goal[:3] = self.poses[rng.integers(len(self.poses))] + rng.random() * rng.normal(size=3) * _BESIDE
+            goal[:3] = self.poses[rng.integers(len(self.poses))] + rng.random() * rng.normal(size=3) * _BESIDE_PATH
         else:
             end = start if rng.random() < 0.5 else ends[rng.integers(len(ends))]
-            goal[:3] = end[:3] + rng.random() * rng.normal(size=3) * _AROUND
+            goal[:3] = end[:3] + rng.random() * rng.normal(size=3) * _AROUND_ENDS
         goal[3:] = self.arms[rng.integers(len(self.arms))]
         if rng.random() < _SHAKEN:
-            goal[3:] += rng.random() * _WILD * rng.normal(size=self.size - 3)
+            goal[3:] += rng.random() * _ARM_SPREAD * rng.normal(size=self.size - 3)
         return np.clip(goal, self.lower, self.upper)
 
     def _grow(self, tree: _Tree, goal: NDArray[np.float64], extent: float) -> int | None:

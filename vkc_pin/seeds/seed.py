@@ -14,7 +14,7 @@ from vkc_pin.task.phases import PhaseKey
 
 __all__ = ["PhaseWaypoints", "Seed", "seed_of"]
 
-_NEAR = 0.2  # [m] and [rad] that planes are believed at first: what is nearly free already is improved in smaller steps
+_WARM_RADIUS = 0.2  # [m] and [rad] trust region at first: what is nearly free already is improved in smaller steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ def seed_of(problem: TrajectoryProblem, parts: Sequence[PhaseWaypoints]) -> Seed
     z = filled(z)
     z = np.where(np.isnan(z), problem.start, z)  # no part moves it
     name = ", ".join(part.seed for part in parts) + ", then all at once"
-    return Seed(name, z, radius=np.full(problem.segments, _NEAR))
+    return Seed(name, z, radius=np.full(problem.segments, _WARM_RADIUS))
 
 
 def _resampled(waypoints: NDArray[np.float64], segments: int) -> NDArray[np.float64]:

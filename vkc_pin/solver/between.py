@@ -11,9 +11,10 @@ from vkc_pin.program.problem import TrajectoryProblem
 __all__ = ["collisions_between", "merge"]
 
 SPACING = 0.02  # [m] or [rad] between the states looked at first, in the coordinate that moves most
-CLOSE, FINER = 0.015, 8  # [m] where something is as close as that, so many times more states are looked at
 KEEP = 1e-2  # [m] clearance asked for between waypoints
-ENOUGH = 6e-4  # [m] clearance there that will do
+ENOUGH = 6e-4  # [m] clearance between waypoints that will do
+CLOSE = 0.015  # [m] beyond `KEEP` within which a state is looked at closer
+FINER = 8  # states there instead of one
 
 
 def collisions_between(problem: TrajectoryProblem, z: NDArray[np.float64]) -> tuple[Contacts, bool]:

@@ -39,19 +39,18 @@ _WARM: Mapping[str, Any] = {
     "ipopt.mu_init": 1e-3,
 }
 EARLY = 0.05  # [m] shortfall of clearance below which collisions between waypoints count
-NEARLY_FREE = 0.01  # [m] shortfall of clearance below which limits on rates count
-POSE_TOLERANCE = 1e-4  # [m] and [rad]
-SOLVED_RATE_TOLERANCE = 1e-4  # excess over a limit, relative; the check allows more
-DRIFT = 0.9  # of what a grasp may drift between waypoints
+NEARLY_FREE = 0.01  # [m] shortfall of clearance below which a motion is nearly free: before, limits on rates only cost time
+POSE_TOLERANCE = 1e-4  # [m] and [rad] largest residual of a solution
+SOLVED_RATE_TOLERANCE = 1e-4  # excess over a limit on velocity or acceleration, relative; the check allows more
+DRIFT = 0.9  # share of what a grasp may drift between waypoints that a solution may use
 SETTLING = 0.2  # relative decrease of the objective below which a motion that is nearly free is first made free
-GIVE_UP_ROUNDS, GIVE_UP_SHORTFALL = (
-    6,
-    0.1,
-)  # after so many rounds, motions whose worst waypoint falls short so much [m] are given up
-GIVE_UP_DRIFT = 2.0  # or which drift by so much more than they may: waypoints are too far apart for them
-INSIDE = 0.9  # of the trust region: steps that end there were not held back (Ipopt ends a little inside its bounds)
+GIVE_UP_ROUNDS = 6  # rounds after which motions that are far from free are given up:
+GIVE_UP_SHORTFALL = 0.1  # [m] shortfall of clearance of their worst waypoint
+GIVE_UP_DRIFT = 2.0  # or their drift, as a share of what it may be: waypoints are too far apart for them
+INSIDE = 0.9  # share of the trust region: steps that end there were not held back (Ipopt ends a little inside its bounds)
 WORTHWHILE = 0.05  # relative decrease of the objective for which a feasible motion is improved further
-PENALTY_GROWTH, PENALTY_LIMIT = 4.0, 2000.0
+PENALTY_GROWTH = 4.0  # ratio of the penalty on clearance to the one before
+PENALTY_LIMIT = 2000.0  # [1/m] largest penalty
 
 
 class _Loop:

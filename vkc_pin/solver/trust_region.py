@@ -12,7 +12,11 @@ from vkc_pin.chain.contacts import Contacts
 __all__ = ["Trial", "TrustRegion", "judge"]
 
 BLOCK_TIME = 2.5  # [s] of motion that share a radius, at `Options.dt` a waypoint
-FIRST_RADIUS, RESTART_RADIUS, SETTLE_RADIUS, MIN_RADIUS, SHRINK = 0.5, 0.2, 0.05, 5e-3, 0.4  # [m] and [rad]
+FIRST_RADIUS = 0.5  # [m] and [rad] of the trust region at first
+RESTART_RADIUS = 0.2  # [m] and [rad] after the penalty has been raised
+SETTLE_RADIUS = 0.05  # [m] and [rad] in which planes are as good as distances
+MIN_RADIUS = 5e-3  # [m] and [rad] below which nothing moves any more
+SHRINK = 0.4  # of the radius, or of the step if that was shorter, where a promise did not come true
 NO_MATTER = 2e-3  # [m] of shortfall, summed over a block, that does not matter
 CLOSE_ENOUGH = 5e-4  # [m] shortfall of clearance at a waypoint that is none
 FAR = 1e-3  # [m] and [rad] of residuals at which a motion cannot be compared with one at which they vanish

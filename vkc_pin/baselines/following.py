@@ -93,7 +93,7 @@ class _Arm:
         """Return what inverse kinematics, and refinement, lead to from `z`, and what is wrong with it."""
         found, closed = self.kinematics.solve(z, waypoint)
         if self.refine and not (closed and self._free(found, waypoint)):
-            found, closed = refined(self.problem, self.knots, found, z, waypoint, self.kinematics.columns)
+            found, closed = refined(self.problem, self.knots, found, wanted=z, waypoint=waypoint, columns=self.kinematics.columns)
         if not closed:
             return found, "no inverse kinematics"
         return found, "" if self._free(found, waypoint) else "collision"

@@ -27,6 +27,7 @@ def refined(
     problem: TrajectoryProblem,
     knots: Knots,
     z: NDArray[np.float64],
+    *,
     wanted: NDArray[np.float64],
     waypoint: int,
     columns: NDArray[np.int_],

@@ -20,7 +20,7 @@ _AT_ONCE = 1_000_000  # comparisons of boxes
 _ROWS = 128  # configurations: what is computed of so many stays in the processor's cache
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class PhaseGeometry:
     """Geometry and pairs of one phase.
 
@@ -66,7 +66,7 @@ class PhaseGeometry:
             shapes[geometry].placement = placement
             rotation[geometry], translation[geometry] = placement.rotation, placement.translation
         moved = replace(self, shapes=tuple(shapes), rotation=rotation, translation=translation)
-        for name in ("_moving_count", "_radius", "_half", "_own", "_groups", "_number"):  # the same wherever things stand
+        for name in ("_moving_count", "_radius", "_half", "_own", "_groups", "_number"):  # the same wherever they stand
             moved.__dict__[name] = getattr(self, name)
         return moved
 
@@ -109,9 +109,9 @@ class PhaseGeometry:
     ) -> tuple[NDArray[np.int_], NDArray[np.int_], NDArray[np.float64]]:
         """Return the same as `maybe_within`. From here on the axes of the world come first: that is several times as fast."""
         moving, joint = slice(self._moving_count), self.joint[: self._moving_count]
-        carried = rotations.transpose(2, 3, 0, 1).take(joint, axis=3)
-        turns = _products(carried, self._turn[:, :, None, moving])
-        centers = _turned(carried, self._local[:, None, moving]) + translations.transpose(2, 0, 1).take(joint, axis=2)
+        rotated = rotations.transpose(2, 3, 0, 1).take(joint, axis=3)
+        turns = _products(rotated, self._turn[:, :, None, moving])
+        centers = _turned(rotated, self._local[:, None, moving]) + translations.transpose(2, 0, 1).take(joint, axis=2)
         moves = self._moving_within(reach, centers)
         none = np.zeros(0, int), np.zeros(0, int)
         stands = self._standing_within(reach, centers, turns) if standing else none

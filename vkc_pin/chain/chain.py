@@ -44,7 +44,7 @@ class Closure:
     target: pin.SE3
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class VirtualKinematicChain:
     """C^V: one model of everything that moves together.
 

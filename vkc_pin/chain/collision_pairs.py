@@ -91,8 +91,8 @@ class _Pairing:
                 shape.name = f"{name}.{shape.name}"
                 shapes.append(shape)
                 labels.append(label)
-        carried = {i for hold in phase.held if scene.objects[hold.object].object.free for i in mine[hold.object]}
-        above = [i for i in moving if i in carried or (i in robots and shapes[i].parentJoint > 1)]
+        attached = {i for hold in phase.held if scene.objects[hold.object].object.free for i in mine[hold.object]}
+        above = [i for i in moving if i in attached or (i in robots and shapes[i].parentJoint > 1)]
         table = np.concatenate([np.array(pairs).reshape(-1, 3), self._with_obstacles(len(shapes), moving, above)])
         if not len(table):
             raise InputError(
@@ -102,8 +102,8 @@ class _Pairing:
         center, half, rotation, translation = (np.concatenate(parts) for parts in boxes)
         shapes += self._obstacles
         part = PhaseGeometry(
-            tuple(shapes),
-            (*labels, *scene.obstacle_labels),
+            shapes=tuple(shapes),
+            labels=(*labels, *scene.obstacle_labels),
             pairs=table[:, :2].astype(int),
             margins=table[:, 2],
             joint=np.array([shape.parentJoint for shape in shapes]),
@@ -113,7 +113,8 @@ class _Pairing:
             translation=translation,
             left=left,
         )
-        return dataclasses.replace(part, eased=eased_pairs(scene, chain, phase, part, int(self.first_waypoint[number]), before))
+        first = int(self.first_waypoint[number])
+        return dataclasses.replace(part, eased=eased_pairs(scene, chain, phase, part, before=before, first=first))
 
     def _with_obstacles(self, first: int, moving: Sequence[int], above: Sequence[int]) -> NDArray[np.float64]:
         """Return the pairs of what moves with the obstacles, the first of which is geometry `first`, and their margins.

@@ -178,7 +178,8 @@ class ContactModel:
         order = np.argsort(table[:, 0], kind="stable")
         table, stacked = table[order], np.array(vectors, float).reshape(len(rows), 3, 3)[order]
         index = table[:, :3].astype(int)
-        return Contacts(index[:, 0], index[:, 1:], table[:, 3], table[:, 4], stacked[:, 0], stacked[:, 1], stacked[:, 2])
+        places = {"normal": stacked[:, 0], "first": stacked[:, 1], "second": stacked[:, 2]}
+        return Contacts(index[:, 0], index[:, 1:], distance=table[:, 3], margin=table[:, 4], **places)
 
     def placements(self, z: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the same as the chain's `joint_placements`; in portions of one size, as CasADi prepares for each size anew."""

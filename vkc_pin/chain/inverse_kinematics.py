@@ -14,6 +14,8 @@ from vkc_pin.models.coordinates import Coordinates
 
 __all__ = ["PoseSolver"]
 
+_LONGEST = 0.5  # [m] or [rad] of one step in one coordinate
+
 
 class PoseSolver:
     """Brings one frame of a model to placements, for a batch of configurations.
@@ -48,7 +50,6 @@ class PoseSolver:
         weights: NDArray[np.float64],
         iterations: int = 12,
         tolerance: float = 1e-6,
-        max_step: float = 0.5,
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Return configurations that satisfy the pose within limits, near the given ones, and which of them do.
 
@@ -60,7 +61,6 @@ class PoseSolver:
             weights: What moving a coordinate costs, shape (n,).
             iterations: At most so many steps.
             tolerance: Largest residual of a solution, [m] and [rad].
-            max_step: Longest step in one coordinate.
 
         Returns:
             Configurations, shape (B, n), and a mask, shape (B,).
@@ -76,7 +76,7 @@ class PoseSolver:
             at, residual, jacobian = at[still], residual[still], jacobian[still]
             if not len(at) or not remaining:
                 break
-            z[at] += _step(z[at], residual, jacobian, lower[at], upper[at], weights, max_step)
+            z[at] += _step(z[at], residual, jacobian, weights, (lower[at], upper[at]))
             np.clip(z, lower, upper, out=z)
         return z, error < tolerance
 
@@ -85,12 +85,11 @@ def _step(
     z: NDArray[np.float64],
     residual: NDArray[np.float64],
     jacobian: NDArray[np.float64],
-    lower: NDArray[np.float64],
-    upper: NDArray[np.float64],
     weights: NDArray[np.float64],
-    longest: float,
+    limits: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> NDArray[np.float64]:
     """Return damped Gauss-Newton steps, shape (B, n); a coordinate that one pushes beyond its limit is taken out, once."""
+    lower, upper = limits
     free = upper - lower > 1e-9
     damping = 1e-8 + 1e-3 * np.minimum(1.0, np.sum(residual**2, axis=1))
     step = np.zeros_like(z)
@@ -98,7 +97,7 @@ def _step(
         scaled = jacobian * (free / weights)[:, None, :]
         system = scaled @ jacobian.transpose(0, 2, 1) + damping[:, None, None] * np.eye(residual.shape[1])
         step = -np.einsum("bij,bi->bj", scaled, np.linalg.solve(system, residual[..., None])[..., 0])
-        step *= np.minimum(1.0, longest / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12))
+        step *= np.minimum(1.0, _LONGEST / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12))
         blocked = free & ((z + step < lower - 1e-12) | (z + step > upper + 1e-12))
         if not blocked.any():
             break

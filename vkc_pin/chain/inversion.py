@@ -17,7 +17,7 @@ from vkc_pin.models.grafting import add_joint, clean
 __all__ = ["InvertedTree", "invert"]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class InvertedTree:
     """An object re-rooted at one of its links: `model`'s universe frame is that link's frame.
 
@@ -102,7 +102,14 @@ def invert(obj: ArticulatedObject, link: str, state: ArrayLike) -> InvertedTree:
             carried.addGeometryObject(copy)
         return carried
 
-    return InvertedTree(model, carry(obj.collision), carry(obj.visual), Coordinates(model), link, obj.base_link)
+    return InvertedTree(
+        model=model,
+        collision=carry(obj.collision),
+        visual=carry(obj.visual),
+        coordinates=Coordinates(model),
+        link=link,
+        base_link=obj.base_link,
+    )
 
 
 def _z_aligned(model: pin.Model, data: pin.Data, index: int) -> tuple[pin.JointModel, NDArray[np.float64]]:

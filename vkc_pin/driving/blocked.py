@@ -136,12 +136,12 @@ class _Supports:
         for first in range(0, len(order), _AT_ONCE):  # few at once stay in the processor's cache
             some = order[first : first + _AT_ONCE]
             self._known.update(zip(some, zip(*_support_of([new[key] for key in some], directions), strict=True), strict=True))
-        support, spare = (np.array(values) for values in zip(*(self._known[key] for key in keys), strict=True))
+        support, overshoot = (np.array(values) for values in zip(*(self._known[key] for key in keys), strict=True))
         for key in keys:
             self._known.move_to_end(key)
         while len(self._known) > _KEPT:
             self._known.popitem(last=False)
-        return support, spare
+        return support, overshoot
 
 
 _supports = _Supports()
@@ -194,9 +194,9 @@ def _fill(
     moving, standing = np.array(indices)
     cosine, sine = np.cos(lattice.yaws)[:, None], np.sin(lattice.yaws)[:, None]
     turned = -np.stack([cosine * FAN[:, 0] + sine * FAN[:, 1], cosine * FAN[:, 1] - sine * FAN[:, 0]], axis=-1)
-    support, spare = _supports.of([part for _, part in parts[0].values()], turned)
-    other_support, other_spare = _supports.of([part for _, part in parts[1].values()], FAN[None])
-    allowed = _SLANT * margin - spare[moving] - other_spare[standing] - _ROUNDING  # (pairs, H)
+    support, overshoot = _supports.of([part for _, part in parts[0].values()], turned)
+    other_support, other_overshoot = _supports.of([part for _, part in parts[1].values()], FAN[None])
+    allowed = _SLANT * margin - overshoot[moving] - other_overshoot[standing] - _ROUNDING  # (pairs, H)
     reach = (support[moving] + other_support[standing] + allowed[..., None]).reshape(-1, len(FAN)).astype(np.float32)
     return _rows(reach, np.tile(np.arange(count), len(moving)), lattice)
 

@@ -96,7 +96,7 @@ class Body:
             return True
         margins = self._margins if margins is None else margins
         rows = self._close(np.minimum(FAN @ a, FAN @ b))
-        return not len(rows) or self._drive(a, b, yaw, self._extents(yaw, yaw, rows), rows, margins)
+        return not len(rows) or self._drive(a, b, yaw, extents=self._extents(yaw, yaw, rows), rows=rows, margins=margins)
 
     def turned(self, at: NDArray[np.float64], start: float, end: float, margins: NDArray[np.float64] | None = None) -> bool:
         """Return whether the margins are kept while turning; see `BaseGrid.turned`."""
@@ -106,7 +106,7 @@ class Body:
         rows = self._close(along)
         yaws = np.linspace(start, end, 1 + max(1, int(np.ceil(abs(end - start) / _LONG_ARC)))).tolist()
         margins = self._margins if margins is None else margins
-        return not len(rows) or all(self._turn(at, along, p, q, rows, margins) for p, q in itertools.pairwise(yaws))
+        return not len(rows) or all(self._turn(at, along, p, q, rows=rows, margins=margins) for p, q in itertools.pairwise(yaws))
 
     def leaving(self, at: NDArray[np.float64], yaw: float) -> NDArray[np.float64]:
         """Return the margins kept at a pose; see `BaseGrid.leaving`."""
@@ -152,18 +152,20 @@ class Body:
         a: NDArray[np.float64],
         b: NDArray[np.float64],
         yaw: float,
+        *,
         extents: NDArray[np.float64],
         rows: NDArray[np.int_],
         margins: NDArray[np.float64],
     ) -> bool:
+        """Return whether pairs (`rows`) keep their margins along a line; `extents` as from `_extents`."""
         near = (np.minimum(FAN @ a, FAN @ b) - extents).max(axis=1) < margins[self.standing[rows]]
         rows, extents = rows[near], extents[near]
         if not len(rows):
             return True
         length = float(np.hypot(*(b - a)))
         if length > _STEP:
-            middle = (a + b) / 2
-            return self._drive(a, middle, yaw, extents, rows, margins) and self._drive(middle, b, yaw, extents, rows, margins)
+            ends = itertools.pairwise((a, (a + b) / 2, b))
+            return all(self._drive(*half, yaw, extents=extents, rows=rows, margins=margins) for half in ends)
         direction = (b - a) / max(length, 1e-12)
 
         def closing(row: int, at: float) -> tuple[float, float]:
@@ -178,17 +180,19 @@ class Body:
         along: NDArray[np.float64],
         start: float,
         end: float,
+        *,
         rows: NDArray[np.int_],
         margins: NDArray[np.float64],
     ) -> bool:
+        """Return whether pairs (`rows`) keep their margins during a turn at a place, that is `along` in the directions `FAN`."""
         gaps = (along - self._extents(start, end, rows)).max(axis=1)
         rows = rows[gaps < margins[self.standing[rows]]]
         if not len(rows):
             return True
         angle = abs(end - start)
         if angle > _ARC:
-            middle = (start + end) / 2
-            return self._turn(at, along, start, middle, rows, margins) and self._turn(at, along, middle, end, rows, margins)
+            ends = itertools.pairwise((start, (start + end) / 2, end))
+            return all(self._turn(at, along, *half, rows=rows, margins=margins) for half in ends)
 
         def closing(row: int, turned: float) -> tuple[float, float]:
             room, normal = self._distance(row, at, start + np.copysign(turned, end - start))

@@ -106,10 +106,7 @@ class BaseGrid:
 
     def free(self, i: int, j: int, heading: int, *, reaching: bool = False) -> bool:
         """Return whether everything keeps its margin in a cell at a heading, 0 to HEADINGS - 1; `reaching` as in `clear`."""
-        room = (self._room[0][i][j], self._room[1][i][j])
-        if room[0] >= 0.0 and (reaching or room[1] >= 0.0):
-            return True
-        return self.clear(*self.center(i, j), float(self.yaws[heading]), reaching=reaching)
+        return self._roomy(i, j, reaching) or self.clear(*self.center(i, j), float(self.yaws[heading]), reaching=reaching)
 
     def clear(self, x: float, y: float, yaw: float, *, reaching: bool = False) -> bool:
         """Return whether everything keeps its margin at a pose in the world.
@@ -129,7 +126,6 @@ class BaseGrid:
         yaw: float,
         *,
         reaching: bool = False,
-        margins: NDArray[np.float64] | None = None,
     ) -> bool:
         """Return whether everything keeps its margin all along a straight line.
 
@@ -138,10 +134,9 @@ class BaseGrid:
             b: Its end.
             yaw: [rad], the same everywhere.
             reaching: As in `clear`.
-            margins: Of the base from each of `standing`, if it differs [m].
         """
         begin, end = np.asarray(a, float), np.asarray(b, float)
-        return self.base.driven(begin, end, yaw, margins) and (reaching or self.carried.driven(begin, end, yaw))
+        return self.base.driven(begin, end, yaw) and (reaching or self.carried.driven(begin, end, yaw))
 
     def turned(
         self, at: ArrayLike, start: float, end: float, *, reaching: bool = False, margins: NDArray[np.float64] | None = None
@@ -176,14 +171,17 @@ class BaseGrid:
         """Return whether turning in a cell from `heading` to the next is free all along; remembered."""
         key = (i, j, heading, False, reaching)
         if key not in self._edges:
-            room = (self._room[0][i][j], self._room[1][i][j])
             end = float(self.yaws[heading + 1]) if heading + 1 < HEADINGS else 2 * np.pi
-            self._edges[key] = (room[0] >= 0.0 and (reaching or room[1] >= 0.0)) or self.turned(
+            self._edges[key] = self._roomy(i, j, reaching) or self.turned(
                 self.center(i, j), float(self.yaws[heading]), end, reaching=reaching
             )
         return self._edges[key]
 
     # -- bounds for all cells ---------------------------------------------------------------------------------------------
+
+    def _roomy(self, i: int, j: int, reaching: bool) -> bool:
+        """Return whether nothing can be hit from a cell at any heading."""
+        return self._room[0][i][j] >= 0.0 and (reaching or self._room[1][i][j] >= 0.0)
 
     @cached_property
     def _room(self) -> list[list[list[float]]]:

@@ -115,7 +115,9 @@ def _shortened(ground: Ground, drives: list[Drive], last: float) -> tuple[list[D
         best, low, high = None, 1, len(rest)
         tried = high
         while low < tried:
-            straight = _straight(ground, rest[0].a, rest[tried - 1].b, yaw, float(yaws[tried + 1]), float(cost[tried - 1]))
+            straight = _straight(
+                ground, rest[0].a, rest[tried - 1].b, before=yaw, after=float(yaws[tried + 1]), limit=float(cost[tried - 1])
+            )
             if straight is None:
                 high = tried - 1
             else:
@@ -134,7 +136,7 @@ def _shortened(ground: Ground, drives: list[Drive], last: float) -> tuple[list[D
 
 
 def _straight(
-    ground: Ground, a: NDArray[np.float64], b: NDArray[np.float64], before: float, after: float, limit: float
+    ground: Ground, a: NDArray[np.float64], b: NDArray[np.float64], *, before: float, after: float, limit: float
 ) -> tuple[Drive, float] | None:
     """Return a straight drive, and the yaw after turning at its end, if these, and the turn before it, cost less than `limit`."""
     found = []

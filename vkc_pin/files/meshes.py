@@ -22,7 +22,7 @@ from vkc_pin.files.hulls import outer_hull
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["MeshPart", "coarser", "convex_hull", "load_convex", "load_mesh", "load_parts", "to_bvh"]
+__all__ = ["MeshPart", "coarser", "convex_hull", "indices", "load_convex", "load_mesh", "load_parts", "to_bvh"]
 
 _NEIGHBOURS = 255  # coal's corners have no more
 _TOLERANCE = 1e-6  # how far, relatively, coal's volume and area may be from trimesh's
@@ -116,7 +116,7 @@ def convex_hull(points: ArrayLike) -> coal.Convex:
     if np.bincount(np.asarray(hull.faces).ravel()).max() > _NEIGHBOURS:  # the tip of a finely meshed cone, a fine disc
         hull = outer_hull(hull.vertices, vertices=60)
     shape = coal.Convex(_points(hull.vertices), _triangles(hull.faces))
-    corners = np.asarray(shape.points())[_indices(shape)]
+    corners = np.asarray(shape.points())[indices(shape)]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2.0
     for what, held, wanted in (("volume", shape.computeVolume(), hull.volume), ("area", area, hull.area)):
         if not abs(held - wanted) <= _TOLERANCE * abs(wanted) or wanted <= 0.0:
@@ -211,9 +211,11 @@ def _triangles(faces: Iterable[Sequence[int]]) -> Any:
     return vector
 
 
-def _indices(shape: coal.Convex) -> NDArray[np.int64]:
-    triangles = (shape.polygons(k) for k in range(shape.num_polygons))
-    return np.array([[triangle[i] for i in range(3)] for triangle in triangles], int)
+def indices(shape: coal.Convex | coal.BVHModelBase) -> NDArray[np.int64]:
+    """Return the corners of the triangles of a coal shape, shape (m, 3)."""
+    convex = isinstance(shape, coal.Convex)
+    count, item = (shape.num_polygons, shape.polygons) if convex else (shape.num_tris, shape.tri_indices)
+    return np.array([[triangle[i] for i in range(3)] for triangle in map(item, range(count))], np.int64).reshape(-1, 3)
 
 
 def _read_with_coal(file: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -221,8 +223,7 @@ def _read_with_coal(file: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]
         shape = coal.MeshLoader().load(str(file), np.ones(3))
     except (RuntimeError, ValueError) as error:
         raise InputError(f"cannot read the mesh: {error}", file=file, expected="a COLLADA file") from error
-    triangles = (shape.tri_indices(k) for k in range(shape.num_tris))
-    return np.array(shape.vertices()), np.array([[triangle[i] for i in range(3)] for triangle in triangles], int).reshape(-1, 3)
+    return np.array(shape.vertices()), indices(shape)
 
 
 def _colour(mesh: trimesh.Trimesh) -> tuple[float, float, float, float] | None:

@@ -1,11 +1,11 @@
-"""Reads URDF files: what they say about geometry, and things without a root joint as Pinocchio models."""
+"""Reads URDF files: what they say about geometry, and objects without a root joint as Pinocchio models."""
 
 from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -48,6 +48,7 @@ class Shape:
     placement: pin.SE3
     kind: str
     size: tuple[float, ...]
+    _: KW_ONLY
     file: Path | None = None
     colour: Colour | None = None
 
@@ -155,8 +156,8 @@ class UrdfFile:
         material = element.find("material")
         colour = None if material is None else self._colour(material) or colours.get(material.get("name", ""))
         if shape.tag == "mesh":
-            file = self.resolve(shape.get("filename", ""))
-            return Shape(link, name, placement, "mesh", self._numbers(shape, "scale", 3, "1 1 1", name), file, colour)
+            file, scale = self.resolve(shape.get("filename", "")), self._numbers(shape, "scale", 3, "1 1 1", name)
+            return Shape(link, name, placement, "mesh", scale, file=file, colour=colour)
         if shape.tag == "box":
             size = self._numbers(shape, "size", 3, None, name)
         elif shape.tag == "sphere":
@@ -168,7 +169,7 @@ class UrdfFile:
             raise InputError("this shape is not supported", file=self.path, field=name, expected=known, got=shape.tag)
         if min(size) <= 0.0:
             raise InputError("a shape without volume", file=self.path, field=name, expected="sizes above 0", got=size)
-        return Shape(link, name, placement, shape.tag, size, None, colour)
+        return Shape(link, name, placement, shape.tag, size, colour=colour)
 
     def _colour(self, material: ElementTree.Element) -> Colour | None:
         colour = material.find("color")

@@ -53,7 +53,7 @@ class Freedom:
         return pin.SE3(np.eye(3), self.axis * value)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Attachment:
     """A place where a tool can take hold of a link, and the freedom that this kind of grasp leaves.
 
@@ -133,9 +133,9 @@ class Latch:
     engaged_within: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ArticulatedObject:
-    """A thing with joints that can be grasped at its attachments. Its base link's frame is the model's universe frame.
+    """An object with joints that can be grasped at its attachments. Its base link's frame is the model's universe frame.
 
     Attributes:
         name: Its name.

@@ -21,7 +21,7 @@ __all__ = ["Base", "Robot"]
 Base = Literal["omni", "differential", "fixed"]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Robot:
     """A mobile manipulator.
 
@@ -37,7 +37,7 @@ class Robot:
         velocity, acceleration: Limits, shape (n,).
         home: Where the arm rests, shape (n − 3,).
         tool_frame: The frame of `model` that grasps: z is the approach direction, x the one in which fingers close.
-        base: How the base moves: "omni" any way, "differential" forwards and round, "fixed" not at all.
+        base: How the base moves: "omni" in any direction, "differential" forwards and round, "fixed" not at all.
         touch_links: The links that may touch what is grasped.
     """
 
@@ -54,7 +54,7 @@ class Robot:
     tool_frame: str
     base: Base
     touch_links: tuple[str, ...] = ()
-    file: UrdfFile = field(repr=False, kw_only=True)
+    file: UrdfFile = field(repr=False)
 
     @cached_property
     def visual(self) -> pin.GeometryModel:

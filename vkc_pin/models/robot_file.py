@@ -89,7 +89,7 @@ def load_robot(
 ) -> Robot:
     """Load a robot and put it on a planar virtual base.
 
-    The joints on the way from the root to the tool frame are planned. All others (wheels, heads, other arms, fingers) are
+    The joints between the root and the tool frame are planned. All others (wheels, heads, other arms, fingers) are
     locked, as are joints that mimic others and joints of a type other than revolute, continuous and prismatic.
 
     Limits come from the URDF and from a `robot.yaml` beside it. Where neither names a velocity or an acceleration they

@@ -1,4 +1,4 @@
-"""Builds the Pinocchio model of a robot: planar base, the joints on the way to the tool, all else locked; and its shapes."""
+"""Builds the Pinocchio model of a robot: planar base, the joints up to the tool, all else locked; and its shapes."""
 
 from __future__ import annotations
 
@@ -47,21 +47,21 @@ def full_model(file: UrdfFile) -> pin.Model:
 def planned_model(
     full: pin.Model, file: UrdfFile, tool_frame: str, rest: Mapping[str, float], locked: Mapping[str, float]
 ) -> pin.Model:
-    """Return `full` with all joints locked but those on the way to `tool_frame`.
+    """Return `full` with all joints locked but those between the base and `tool_frame`.
 
     Args:
         full: See `full_model`.
         file: Its file.
         tool_frame: A frame of it.
         rest: Where each joint is locked, [m] or [rad]; see `rest_positions`.
-        locked: Joints to lock though they are on the way, and where.
+        locked: Joints to lock though they are among these, and where.
 
     Raises:
         InputError: No joint is left.
     """
-    way = _way(full, full.frames[_frame(full, tool_frame)].parentJoint)
+    path = _path_to(full, full.frames[_frame(full, tool_frame)].parentJoint)
     planned = [
-        j for j in way if full.names[j] in rest and full.names[j] not in locked and full.names[j] not in _mimics(file.root)
+        j for j in path if full.names[j] in rest and full.names[j] not in locked and full.names[j] not in _mimics(file.root)
     ]
     if not planned:
         raise InputError(
@@ -141,7 +141,7 @@ def collision_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
     """
     geometry = pin.GeometryModel()
     for shape in file.shapes("collision"):
-        _add(geometry, model, shape, shape.name, shape.solid(), _GREY)
+        geometry.addGeometryObject(_geometry_object(model, shape, shape.name, shape.solid(), _GREY))
     if len(geometry.geometryObjects) == 0:
         raise InputError("nothing of this robot can collide", file=file.path, expected="<collision> elements", got="none")
     return geometry
@@ -161,12 +161,13 @@ def visual_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
     geometry = pin.GeometryModel()
     for shape in file.shapes("visual"):
         if shape.file is None:
-            _add(geometry, model, shape, shape.name, shape.solid(), shape.colour or _GREY)
+            geometry.addGeometryObject(_geometry_object(model, shape, shape.name, shape.solid(), shape.colour or _GREY))
             continue
         parts = load_parts(shape.file, shape.size, detail=_DETAIL)
         for k, part in enumerate(parts):
             name = shape.name if len(parts) == 1 else f"{shape.name}_{k}"
-            _add(geometry, model, shape, name, to_bvh(part), shape.colour or part.colour or _GREY)
+            colour = shape.colour or part.colour or _GREY
+            geometry.addGeometryObject(_geometry_object(model, shape, name, to_bvh(part), colour))
     return geometry
 
 
@@ -197,13 +198,9 @@ def _reduced(full: pin.Model, planned: Collection[int], q: NDArray[np.float64]) 
     return model
 
 
-def _way(model: pin.Model, joint: int) -> list[int]:
+def _path_to(model: pin.Model, joint: int) -> list[int]:
     """Return the joints from the root to `joint`, the planar one left out."""
-    way = []
-    while joint > 1:
-        way.append(joint)
-        joint = model.parents[joint]
-    return way[::-1]
+    return [index for index in model.supports[joint] if index > 1]
 
 
 def _frame(model: pin.Model, name: str) -> int:
@@ -218,24 +215,17 @@ def _mimics(root: ElementTree.Element) -> dict[str, tuple[str, float, float]]:
     for joint in root.findall("joint"):
         mimic = joint.find("mimic")
         if mimic is not None:
-            found[joint.get("name", "")] = (
-                mimic.get("joint", ""),
-                float(mimic.get("multiplier", "1")),
-                float(mimic.get("offset", "0")),
-            )
+            factor, offset = float(mimic.get("multiplier", "1")), float(mimic.get("offset", "0"))
+            found[joint.get("name", "")] = (mimic.get("joint", ""), factor, offset)
     return found
 
 
-def _add(
-    geometry: pin.GeometryModel,
-    model: pin.Model,
-    shape: Shape,
-    name: str,
-    solid: coal.CollisionGeometry,
-    colour: tuple[float, ...],
-) -> None:
+def _geometry_object(
+    model: pin.Model, shape: Shape, name: str, solid: coal.CollisionGeometry, colour: tuple[float, ...]
+) -> pin.GeometryObject:
+    """Return `solid` as the geometry of an element of the URDF, on the joint of its link."""
     frame = model.getFrameId(shape.link, pin.FrameType.BODY)
     parent = model.frames[frame]
     added = pin.GeometryObject(name, parent.parentJoint, frame, clean(parent.placement * shape.placement), solid)
     added.meshColor = np.array(colour)
-    geometry.addGeometryObject(added)
+    return added

@@ -85,7 +85,7 @@ def sample_allowed_pairs(robot: Robot, *, samples: int = _SAMPLES, seed: int = 0
         if links not in free:
             allowed[links] = "Always"
         elif links not in hit and not any(
-            _drive_together(distances, parts, np.array(z), low, high, rng) for _, z in closest[links]
+            _drive_together(distances, parts, np.array(z), (low, high), rng) for _, z in closest[links]
         ):
             allowed[links] = "Never"
     return dict(sorted(allowed.items()))
@@ -179,11 +179,11 @@ def _drive_together(
     distances: _Distances,
     parts: list[tuple[int, int]],
     z: NDArray[np.float64],
-    low: NDArray[np.float64],
-    high: NDArray[np.float64],
+    limits: tuple[NDArray[np.float64], NDArray[np.float64]],
     rng: np.random.Generator,
 ) -> bool:
     """Return whether random steps from `z` that lessen the distance end in a collision."""
+    low, high = limits
     distances.place(z)
     nearest = distances.between(parts)
     for width in np.geomspace(0.2, 0.002, _STEPS):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
 
 import coal
 import numpy as np
@@ -11,6 +10,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from vkc_pin.errors import InputError
+from vkc_pin.files.meshes import indices
 from vkc_pin.models.grafting import clean
 
 __all__ = [
@@ -124,11 +124,9 @@ def triangles(shape: coal.CollisionGeometry) -> tuple[NDArray[np.float64], NDArr
         length = 2.0 * shape.halfLength
         mesh = make.capsule(height=length, radius=shape.radius, count=(_SEGMENTS, _SEGMENTS))
         mesh.apply_translation([0.0, 0.0, -(mesh.bounds[0, 2] + mesh.bounds[1, 2]) / 2.0])
-    elif isinstance(shape, coal.BVHModelBase):
-        faces = [shape.tri_indices(k) for k in range(shape.num_tris)]
-        return np.array(shape.vertices(), float), _indices(faces)
-    elif isinstance(shape, coal.Convex):
-        return np.array(shape.points(), float), _indices([shape.polygons(k) for k in range(shape.num_polygons)])
+    elif isinstance(shape, coal.BVHModelBase | coal.Convex):
+        points = shape.points() if isinstance(shape, coal.Convex) else shape.vertices()
+        return np.array(points, float), indices(shape)
     else:
         raise InputError("this shape cannot be drawn", expected="a solid or a mesh", got=type(shape).__name__)
     return np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
@@ -148,7 +146,3 @@ def world_box(shape: coal.CollisionGeometry, placement: pin.SE3) -> tuple[NDArra
     centre = placement.act(np.asarray(box.center(), float))
     extent = np.abs(placement.rotation) @ np.array([box.width(), box.height(), box.depth()]) / 2
     return centre - extent, centre + extent
-
-
-def _indices(items: list[Any]) -> NDArray[np.int64]:
-    return np.array([(item[0], item[1], item[2]) for item in items], np.int64).reshape(-1, 3)

@@ -16,7 +16,7 @@ __all__ = ["Plane", "patterns", "planes", "sizes"]
 _FURTHER = 0.3  # [m]: pairs that much further apart than a plane's are not asked for
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Plane:
     """The witness plane of a pair at a waypoint: what the program knows of the pair's distance (eqs. 6 and 7).
 
@@ -73,7 +73,7 @@ def planes(problem: TrajectoryProblem, z: NDArray[np.float64], waypoint: int) ->
     coefficients, offsets = model.planes(z, contacts, slots=t.slots)
     x = np.column_stack([z, np.zeros(len(z))]).ravel()
     dt, targets = problem.timing_for(z).dt, problem.target_matrix()
-    parameters = t.parameter_vector(problem.start, coefficients, offsets, targets, problem.options.penalty, dt)
+    parameters = t.parameter_vector(problem.start, coefficients, offsets, targets, penalty=problem.options.penalty, dt=dt)
     _, jacobian = t.rows_at(x, parameters)
     columns = (waypoint - 1) * (t.n + 1) + np.arange(t.n)
     return [

@@ -1,4 +1,4 @@
-"""Which frames must be where and when: closures (eq. 2), grasps and the ways to them, and the steps' own goals (eq. 3)."""
+"""Which frames must be where and when: closures (eq. 2), grasps and the approaches to them, and the steps' own goals (eq. 3)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class PoseGoal:
     Attributes:
         row: The frame, and the waypoints at which it must be there.
         target: Where, in the world.
-        kind: "closure" of what stands fixed and is held; "grasp" of a free object; "approach": where the straight way to a grasp
+        kind: "closure" of what stands fixed and is held; "grasp" of a free object; "approach": where the straight path to a grasp
             begins; "goal" of a step.
         about: What it is about, for people: an object, a hold or a frame.
         object: The object that is held or grasped; None for the goal of a step.
@@ -43,13 +43,13 @@ class PoseGoal:
 
 
 def pose_goals(scene: Scene, chain: VirtualKinematicChain, task: Task, options: Options) -> tuple[PoseGoal, ...]:
-    """Return the frames that must be somewhere: grasps and closures, then the ways to grasps and the steps' own goals.
+    """Return the frames that must be somewhere: grasps and closures, then the approaches to grasps and the steps' own goals.
 
     Args:
-        scene: Where things stand.
+        scene: Where objects stand.
         chain: The chain.
         task: What is held when, and what must be where at the ends of its phases.
-        options: How long the straight way to a grasp is.
+        options: How long the straight approach to a grasp is.
     """
     goals: list[PoseGoal] = []
     ends = np.cumsum([phase.segments for phase in task.phases])

@@ -84,7 +84,7 @@ class TrajectoryProblem:
         weights = np.full(self.chain.size, o.velocity_weight_object)
         weights[:robot], weights[:2] = o.velocity_weight_arm, o.velocity_weight_base
         weights[2] = o.velocity_weight_heading
-        # From the straight way to the grasp on: there the hand must already be where it will close.
+        # From the straight approach to the grasp on: there the hand must already be where it will close.
         starts = np.concatenate([[0], self.ends[:-1]])
         begin = {int(end): int(start) for start, end in zip(starts, self.ends, strict=True)}
         clamped = tuple(
@@ -98,11 +98,18 @@ class TrajectoryProblem:
                 velocity[first:last, :2] *= o.velocity_weight_holding
         # The robot stands still while its gripper closes or opens.
         phases = zip(self.ends[:-1], self.task.phases[:-1], self.task.phases[1:], strict=True)
-        rests = tuple(int(end) for end, phase, after in phases if phase.grasps or after.leaves)
-        differential = self.chain.robot.base == "differential"
-        poses = tuple(goal.row for goal in self.pose_goals)
+        stops = tuple(int(end) for end, phase, after in phases if phase.grasps or after.leaves)
         return Structure(
-            self.chain.model, self.segments, poses, o.contact_slots, velocity, acceleration, rests, differential, clamped, terms
+            model=self.chain.model,
+            segments=self.segments,
+            poses=tuple(goal.row for goal in self.pose_goals),
+            slots=o.contact_slots,
+            weights_velocity=velocity,
+            weights_acceleration=acceleration,
+            stops=stops,
+            differential=self.chain.robot.base == "differential",
+            clamped=clamped,
+            terms=terms,
         )
 
     @cached_property
@@ -163,7 +170,7 @@ class TrajectoryProblem:
     def timing_for(self, z: NDArray[np.float64]) -> Timing:
         """Return how long steps take where z_1..z_N, shape (N, n), is the seed; see `time_for`. Terms may ask for more time."""
         structure, limits = self.transcription.structure, (self.chain.velocity, self.chain.acceleration)
-        runs = runs_between(structure.rests, self.segments)
+        runs = runs_between(structure.stops, self.segments)
         dt = time_for(self.waypoints(z), self.options.dt, runs, limits)
         if structure.timed:
             dt = self.term_numbers.slower(z, dt, runs)
@@ -200,7 +207,7 @@ class TrajectoryProblem:
         return self.contacts.settled(z).evaluate(z, np.arange(1, self.segments + 1), reach=reach, nearest=nearest)
 
     def rates(self, z: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the steps δz, shape (N, n), and their differences δδz, shape (N + 1 + rests, n); see `Transcription`."""
+        """Return the steps δz, shape (N, n), and their differences δδz, shape (N + 1 + stops, n); see `Transcription`."""
         t = self.transcription
         first = t.first @ z + np.outer(t.start_first, self.start)
         return first, t.second @ z + np.outer(t.start_second, self.start)

@@ -30,7 +30,7 @@ def term_goals(
     """Return what the program has of terms, and the terms that this is: those that can change something in this task.
 
     Args:
-        scene: Where things stand.
+        scene: Where objects stand.
         chain: The chain.
         task: What is held when.
         terms: Traced terms.
@@ -82,11 +82,11 @@ class _Whereabouts:
         if not dot or owner not in self.scene.objects:
             return self._on_chain(self.chain.frame(frame), waypoint)
         placed, phase = self.scene.objects[owner], self.phases[number]
-        thing = placed.object
-        if not thing.free:  # the same whether it is held or not; where it is held, the chain is closed
-            found = thing.model.frames[thing.model.getFrameId(link, pin.FrameType.BODY)]
-            values = tuple(self.value(f"{owner}.{name}") for name in thing.coordinates.names)
-            tree = Tree(thing.model.saveToString(), _numbers(placed.placement), values)
+        item = placed.object
+        if not item.free:  # the same whether it is held or not; where it is held, the chain is closed
+            found = item.model.frames[item.model.getFrameId(link, pin.FrameType.BODY)]
+            values = tuple(self.value(f"{owner}.{name}") for name in item.coordinates.names)
+            tree = Tree(item.model.saveToString(), _numbers(placed.placement), values)
             moves = found.parentJoint > 0 and any(value.column is not None for value in values)
             return FrameAt(_numbers(found.placement), found.parentJoint, waypoint if moves else -1, tree)
         hold = next((hold for hold in phase.held if hold.object == owner), None)
@@ -95,7 +95,7 @@ class _Whereabouts:
         if owner in phase.left:  # where the hand let go of it
             hold, last = phase.left[owner]
             return self._on_chain(self.chain.frame(link, hold), self.ends[last])
-        return FrameAt(_numbers(self._standing(phase, owner) * thing.link_placement(link, placed.state)))
+        return FrameAt(_numbers(self._standing(phase, owner) * item.link_placement(link, placed.state)))
 
     def _standing(self, phase: Phase, owner: str) -> pin.SE3:
         return phase.standing.get(owner, self.scene.objects[owner].placement)

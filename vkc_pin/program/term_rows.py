@@ -202,7 +202,7 @@ class TermProgram:
                 waypoints, kind = term.kind(at)
                 kinds.setdefault(kind, []).append((at.waypoint, waypoints))
             for (at, before), found in kinds.items():
-                functions = _term_functions(text, model, term, at, before, len(found[0][1]))
+                functions = _term_functions(text, model, term, at, before=before, waypoints=len(found[0][1]))
                 involved = np.array([waypoints for _, waypoints in found])
                 steps = [waypoint - 1 for waypoint, _ in found]
                 inputs = [ca.vertcat(*(z[:, columns.tolist()] for columns in involved.T)), dt[steps].T]
@@ -262,7 +262,7 @@ class TermProgram:
         return np.where(waypoint > 0, (waypoint - 1) * (self._n + 1) + coordinate, -1).ravel()
 
 
-def _term_functions(text: str, model: pin.Model, row: TermRow, at: TermAt, before: int, waypoints: int) -> TermFunctions:
+def _term_functions(text: str, model: pin.Model, row: TermRow, at: TermAt, *, before: int, waypoints: int) -> TermFunctions:
     """Return the functions of one kind of row, built if they are not there already."""
     key = (text, row.formula, row.values, at, before, waypoints)
     if key not in _functions:

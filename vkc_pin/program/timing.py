@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 __all__ = ["Timing", "runs_between", "time_for"]
 
 _PATIENCE = 1.5  # how much more time a motion may take before limits on its rates become rows of the program
-_SPARE = 1.15  # how much longer a motion may take than the profile 3s² − 2s³ along its seed
+_SLACK = 1.15  # how much longer a motion may take than the profile 3s² − 2s³ along its seed
 
 Runs = Sequence[tuple[int, int]]
 
 
 @dataclass(frozen=True, eq=False)
 class Timing:
-    """The time of every step, one value within each run between two rests.
+    """The time of every step, one value within each run between two stops.
 
     Attributes:
         dt: Time of every step [s], shape (N,).
@@ -41,7 +41,7 @@ class Timing:
 
     @cached_property
     def acceleration(self) -> NDArray[np.float64]:
-        """Bounds of the differences δδz, shape (N + 1 + rests, n): limits times dt²."""
+        """Bounds of the differences δδz, shape (N + 1 + stops, n): limits times dt²."""
         of_rows = np.concatenate([np.full(last - first + 1, self.dt[first]) for first, last in self.runs])
         return np.asarray(self.limits[1] * of_rows[:, None] ** 2)
 
@@ -59,9 +59,9 @@ class Timing:
         return replace(self, dt=dt)
 
 
-def runs_between(rests: Sequence[int], segments: int) -> Runs:
-    """Return the stretches between two rests, as first and last waypoint, of a motion of so many segments."""
-    return tuple(itertools.pairwise([0, *rests, segments]))
+def runs_between(stops: Sequence[int], segments: int) -> Runs:
+    """Return the stretches between two stops, as first and last waypoint, of a motion of so many segments."""
+    return tuple(itertools.pairwise([0, *stops, segments]))
 
 
 def time_for(
@@ -69,14 +69,14 @@ def time_for(
 ) -> NDArray[np.float64]:
     """Return the time of every step, shape (N,) [s]: `dt`, or more in runs where z_0..z_N, shape (N + 1, n), is too long for it.
 
-    The measure is the profile 3s² − 2s³ over the way that each coordinate goes between two rests: its speed is at most 1.5 times
-    the mean, its acceleration 6 times the way over the square of the duration.
+    The measure is the profile 3s² − 2s³ over the distance that each coordinate moves between two stops: its speed is at most 1.5
+    times the mean, its acceleration 6 times the distance over the square of the duration.
     """
     velocity, acceleration = limits
     steps = np.abs(np.diff(path, axis=0))
     times = np.full(len(steps), dt)
     for first, last in runs:
-        way = steps[first:last].sum(axis=0)
-        needed = max(np.max(1.5 * way / velocity), np.sqrt(np.max(6.0 * way / acceleration)))
-        times[first:last] = np.maximum(times[first:last], _SPARE * needed / (last - first))
+        distance = steps[first:last].sum(axis=0)
+        needed = max(np.max(1.5 * distance / velocity), np.sqrt(np.max(6.0 * distance / acceleration)))
+        times[first:last] = np.maximum(times[first:last], _SLACK * needed / (last - first))
     return times

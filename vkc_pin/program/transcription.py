@@ -87,6 +87,7 @@ class Transcription:
         planes: NDArray[np.float64],
         offsets: NDArray[np.float64],
         targets: NDArray[np.float64],
+        *,
         penalty: float,
         dt: NDArray[np.float64] | None = None,
     ) -> NDArray[np.float64]:
@@ -116,7 +117,7 @@ class Transcription:
         start_first = np.zeros(N)
         start_first[0] = -1.0
         # The velocity steps between segments, and from and to rest where the motion starts, pauses and ends.
-        stops = [0, *self.structure.rests, N]
+        stops = [0, *self.structure.stops, N]
         runs = [np.diff(np.eye(N)[begin:end], axis=0, prepend=0.0, append=0.0) for begin, end in itertools.pairwise(stops)]
         steps = np.vstack(runs)
         second, start_second = steps @ first, steps @ start_first

@@ -22,7 +22,7 @@ _KEPT = 48  # kinds of waypoints kept for reuse
 _functions: OrderedDict[tuple[Any, ...], WaypointFunctions] = OrderedDict()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Structure:
     """What a symbolic program depends on.
 
@@ -33,7 +33,7 @@ class Structure:
         slots: K, witness planes per waypoint.
         weights_velocity: Of eq. 1, on the squared differences, shape (N, n).
         weights_acceleration: The same for second differences, per coordinate, shape (n,).
-        rests: Waypoints inside the motion at which it comes to rest, as it does at start and end.
+        stops: Waypoints inside the motion at which it comes to rest, as it does at start and end.
         differential: Whether the base must not slip sideways.
         clamped: (column, first, last): coordinates that keep their value from waypoint `first` to `last`, as a hand does
             that clamps.
@@ -46,7 +46,7 @@ class Structure:
     slots: int
     weights_velocity: NDArray[np.float64]
     weights_acceleration: NDArray[np.float64]
-    rests: tuple[int, ...] = ()
+    stops: tuple[int, ...] = ()
     differential: bool = False
     clamped: tuple[tuple[int, int, int], ...] = ()
     terms: tuple[TermRow, ...] = ()
@@ -61,7 +61,7 @@ class Structure:
         """Equal for structures that share one program."""
         poses = tuple((*_key(pose), pose.waypoints) for pose in self.poses)
         weights = (self.weights_velocity.tobytes(), self.weights_acceleration.tobytes())
-        others = (self.rests, self.differential, self.clamped, self.terms)
+        others = (self.stops, self.differential, self.clamped, self.terms)
         return (self.model.saveToString(), self.segments, poses, self.slots, *weights, *others)
 
 

@@ -38,9 +38,7 @@ class ClearanceCurve:
         return float(self.distances[k]), float(self.times[k]), " – ".join(self.pairs[k])
 
 
-def clearance_curves(
-    scene: Scene, trajectory: Trajectory, times: ArrayLike, *, dist_safe: float, world: World | None = None
-) -> list[ClearanceCurve]:
+def clearance_curves(scene: Scene, trajectory: Trajectory, times: ArrayLike, *, dist_safe: float) -> list[ClearanceCurve]:
     """Return how close shapes come along a motion, for each kind of pair that there is.
 
     The kinds are the robot with itself, with articulated objects, with obstacles, objects with what stands around them,
@@ -51,9 +49,8 @@ def clearance_curves(
         trajectory: The motion.
         times: When to look, shape (K,) [s].
         dist_safe: The clearance asked for [m]; a pair that may touch is recognised by asking for less.
-        world: The scene's world, if there is one already.
     """
-    world = World(scene) if world is None else world
+    world = World(scene)
     touching = may_touch(scene, world, trajectory, (), dist_safe)
     table = PairTable(scene, world, trajectory, dist_safe, touching=touching)
     moments = np.atleast_1d(np.asarray(times, float))

@@ -16,6 +16,7 @@ from vkc_pin.models.shapes import triangles
 __all__ = ["Solid", "box_solid", "coarse", "merge_solids", "shade", "to_solid", "tube"]
 
 _CREASE = np.radians(35.0)  # faces that meet at a larger angle keep an edge between them
+_SIDES = 8  # of a tube
 _GRAIN = 2.0**-14  # [m]: vertices are rounded to this; numbers with few digits compress well
 
 
@@ -86,7 +87,7 @@ def box_solid(lower: NDArray[np.float64], upper: NDArray[np.float64], sides: tup
     return _solid(np.concatenate(vertices), np.concatenate(faces), np.concatenate(normals))
 
 
-def tube(points: NDArray[np.float64], radius: float, sections: int = 8) -> Solid | None:
+def tube(points: NDArray[np.float64], radius: float) -> Solid | None:
     """Return a tube of `radius` [m] along `points`, shape (n, 3) [m], since browsers draw lines one pixel wide.
 
     Returns:
@@ -108,12 +109,12 @@ def tube(points: NDArray[np.float64], radius: float, sections: int = 8) -> Solid
         side /= max(float(np.linalg.norm(side)), 1e-9)
         across[i] = side
     other = np.cross(along, across)
-    angle = 2.0 * np.pi * np.arange(sections) / sections
+    angle = 2.0 * np.pi * np.arange(_SIDES) / _SIDES
     normals = np.cos(angle)[None, :, None] * across[:, None] + np.sin(angle)[None, :, None] * other[:, None]
     vertices = line[:, None] + radius * normals
-    ring, k = np.meshgrid(np.arange(len(line) - 1) * sections, np.arange(sections), indexing="ij")
-    a, b = ring + k, ring + (k + 1) % sections
-    faces = np.concatenate([np.stack([a, b, b + sections], axis=-1), np.stack([a, b + sections, a + sections], axis=-1)])
+    ring, k = np.meshgrid(np.arange(len(line) - 1) * _SIDES, np.arange(_SIDES), indexing="ij")
+    a, b = ring + k, ring + (k + 1) % _SIDES
+    faces = np.concatenate([np.stack([a, b, b + _SIDES], axis=-1), np.stack([a, b + _SIDES, a + _SIDES], axis=-1)])
     return _solid(vertices.reshape(-1, 3), faces.reshape(-1, 3), normals.reshape(-1, 3))
 
 

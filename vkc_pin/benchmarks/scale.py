@@ -83,13 +83,7 @@ def specify(*, starts: int, seed: int, counts: Sequence[int]) -> list[dict[str, 
 
 
 def run(
-    *,
-    starts: int,
-    seed: int,
-    out: str | Path,
-    jobs: int = 1,
-    counts: Sequence[int] = COUNTS,
-    progress: bool = True,
+    *, starts: int, seed: int, out: str | Path, jobs: int = 1, counts: Sequence[int] = COUNTS, progress: bool = True
 ) -> dict[str, Any]:
     """Run the experiment, or what is left of it, and write results.json, results.csv, table.md and scale.png to `out`.
 

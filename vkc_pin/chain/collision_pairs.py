@@ -7,8 +7,8 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.chain.broadphase import PhaseGeometry
 from vkc_pin.chain.chain import VirtualKinematicChain
 from vkc_pin.chain.margins import eased_pairs
@@ -116,7 +116,7 @@ class _Pairing:
         first = int(self.first_waypoint[number])
         return dataclasses.replace(part, eased=eased_pairs(scene, chain, phase, part, before=before, first=first))
 
-    def _with_obstacles(self, first: int, moving: Sequence[int], above: Sequence[int]) -> NDArray[np.float64]:
+    def _with_obstacles(self, first: int, moving: Sequence[int], above: Sequence[int]) -> Floats:
         """Return the pairs of what moves with the obstacles, the first of which is geometry `first`, and their margins.
 
         Of `moving`, only those that are `above` the floor can hit it: wheels stand on it, and doors hang above it as their
@@ -137,7 +137,7 @@ class _Pairing:
         return self.scene.robot.touch_links if hold.frame is None else (hold.frame,)
 
 
-def _boxes(shapes: Sequence[pin.GeometryObject]) -> tuple[NDArray[np.float64], ...]:
+def _boxes(shapes: Sequence[pin.GeometryObject]) -> tuple[Floats, ...]:
     """Return centres and half extents of bounding boxes, and placements as rotations and translations; see `PhaseGeometry`."""
     boxes = [bounding_box(shape) for shape in shapes]
     return (

@@ -5,9 +5,9 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from vkc_pin import cpin
+from vkc_pin.arrays import Bools, Floats
 from vkc_pin.chain.pose import PoseRow, pose_residual, target_vector
 from vkc_pin.cpin.batch import BatchFunction
 from vkc_pin.models.coordinates import Coordinates
@@ -35,22 +35,22 @@ class PoseSolver:
         jacobian = ca.densify(ca.jacobian(residual, z))
         self._function = BatchFunction(ca.Function("pose", [z, target], [ca.densify(residual), jacobian], {"cse": True}))
 
-    def evaluate(self, z: NDArray[np.float64], target: pin.SE3) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def evaluate(self, z: Floats, target: pin.SE3) -> tuple[Floats, Floats]:
         """Return residuals, shape (B, m) ([m], [rad]), and their Jacobians, shape (B, m, n), at `z`, shape (B, n)."""
         residual, jacobian = self._function(z, target_vector(target))
         return residual, jacobian.reshape(len(z), self.size, self.rows).swapaxes(1, 2)
 
     def solve(
         self,
-        z: NDArray[np.float64],
+        z: Floats,
         target: pin.SE3,
         *,
-        lower: NDArray[np.float64],
-        upper: NDArray[np.float64],
-        weights: NDArray[np.float64],
+        lower: Floats,
+        upper: Floats,
+        weights: Floats,
         iterations: int = 12,
         tolerance: float = 1e-6,
-    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    ) -> tuple[Floats, Bools]:
         """Return configurations that satisfy the pose within limits, near the given ones, and which of them do.
 
         Args:
@@ -81,13 +81,7 @@ class PoseSolver:
         return z, error < tolerance
 
 
-def _step(
-    z: NDArray[np.float64],
-    residual: NDArray[np.float64],
-    jacobian: NDArray[np.float64],
-    weights: NDArray[np.float64],
-    limits: tuple[NDArray[np.float64], NDArray[np.float64]],
-) -> NDArray[np.float64]:
+def _step(z: Floats, residual: Floats, jacobian: Floats, weights: Floats, limits: tuple[Floats, Floats]) -> Floats:
     """Return damped Gauss-Newton steps, shape (B, n); a coordinate that one pushes beyond its limit is taken out, once."""
     lower, upper = limits
     free = upper - lower > 1e-9

@@ -22,13 +22,7 @@ SHARE = 0.5  # of the distance there is at the contact itself
 
 
 def eased_pairs(
-    scene: Scene,
-    chain: VirtualKinematicChain,
-    phase: Phase,
-    part: PhaseGeometry,
-    *,
-    first: int,
-    before: Phase | None,
+    scene: Scene, chain: VirtualKinematicChain, phase: Phase, part: PhaseGeometry, *, first: int, before: Phase | None
 ) -> dict[int, list[tuple[int, int, float]]]:
     """Return pair → (first waypoint, last waypoint, margin [m]) for what may be close for a while.
 

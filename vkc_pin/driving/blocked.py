@@ -16,6 +16,7 @@ import coal
 import numpy as np
 from numpy.typing import NDArray
 
+from vkc_pin.arrays import Bools, Floats, Ints
 from vkc_pin.driving.body import FAN, Shape, hull_points
 
 __all__ = ["Lattice", "stuck"]
@@ -30,16 +31,16 @@ _SLANT = float(np.cos(np.pi / len(FAN) * 1.2))  # of the angle between a directi
 class Lattice(NamedTuple):
     """Cells and headings: centre of cell (0, 0) and size of a cell, shape (2,) [m]; cells along a side; shape (H,) [rad]."""
 
-    origin: NDArray[np.float64]
-    step: NDArray[np.float64]
+    origin: Floats
+    step: Floats
     cells: int
-    yaws: NDArray[np.float64]
+    yaws: Floats
 
 
 class _Solid(NamedTuple):
     """Points whose hull a shape contains, shape (n, 3), its lowest and highest z [m], if it is a prism, and a name for it."""
 
-    points: NDArray[np.float64]
+    points: Floats
     bottom: float
     top: float
     prism: bool
@@ -48,13 +49,13 @@ class _Solid(NamedTuple):
 
 _Part = tuple[_Solid, float, float]
 """Of a solid, what is between two heights [m]."""
-_Reach = tuple[NDArray[np.float64], NDArray[np.float64]]
+_Reach = tuple[Floats, Floats]
 """Support functions, and how far beyond their hulls the polygons reach that they bound."""
 
 
 def stuck(
     base: Sequence[Shape], carried: Sequence[Shape], standing: Sequence[Shape], lattice: Lattice, margin: float
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+) -> tuple[Bools, Bools]:
     """Return where the base, and where what is carried, surely comes closer than `margin` [m] to an obstacle.
 
     Args:
@@ -89,14 +90,14 @@ def _solids(shapes: Sequence[Shape]) -> list[_Solid]:
     return solids
 
 
-def _meeting(first: Sequence[_Solid], second: Sequence[_Solid]) -> NDArray[np.int_]:
+def _meeting(first: Sequence[_Solid], second: Sequence[_Solid]) -> Ints:
     """Return which solids share heights with which, in the order of the first, shape (P, 2)."""
     one, other = (np.array([(solid.bottom, solid.top) for solid in solids]).reshape(-1, 2) for solids in (first, second))
     common = np.minimum(one[:, None, 1], other[:, 1]) - np.maximum(one[:, None, 0], other[:, 0])
     return np.argwhere(common > _FLAT)
 
 
-def _slice(solid: _Solid, low: float, high: float) -> NDArray[np.float64]:
+def _slice(solid: _Solid, low: float, high: float) -> Floats:
     """Return those points in the plan view of a solid between two heights that `FAN` touches, shape (n, 2) [m], n at most 32."""
     points = solid.points
     if solid.prism or (low <= solid.bottom and high >= solid.top):
@@ -109,7 +110,7 @@ def _slice(solid: _Solid, low: float, high: float) -> NDArray[np.float64]:
     return _touched(np.concatenate(parts))
 
 
-def _touched(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _touched(points: Floats) -> Floats:
     return points[np.flatnonzero(np.bincount((FAN @ points.T).argmax(axis=1)))]
 
 
@@ -119,7 +120,7 @@ class _Supports:
     def __init__(self) -> None:
         self._known: OrderedDict[tuple[bytes, float, float, bytes], _Reach] = OrderedDict()
 
-    def of(self, parts: Sequence[_Part], directions: NDArray[np.float64]) -> _Reach:
+    def of(self, parts: Sequence[_Part], directions: Floats) -> _Reach:
         """Return support functions of the plan views of parts of solids, and how far beyond their hulls these let polygons reach.
 
         Args:
@@ -147,9 +148,7 @@ class _Supports:
 _supports = _Supports()
 
 
-def _support_of(
-    outlines: list[NDArray[np.float64]], directions: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _support_of(outlines: list[Floats], directions: Floats) -> tuple[Floats, Floats]:
     size = max(len(points) for points in outlines)
     padded = np.array([np.concatenate([points, np.repeat(points[:1], size - len(points), axis=0)]) for points in outlines])
     along = (directions.reshape(-1, 2) @ padded.swapaxes(1, 2)).swapaxes(1, 2).reshape(len(padded), size, *directions.shape[:2])
@@ -174,9 +173,7 @@ def _support_of(
     return support, np.linalg.norm(offset - share[..., None] * edge, axis=-1).max(axis=2)
 
 
-def _fill(
-    first: Sequence[_Solid], second: Sequence[_Solid], pairs: NDArray[np.int_], lattice: Lattice, margin: float
-) -> NDArray[np.bool_]:
+def _fill(first: Sequence[_Solid], second: Sequence[_Solid], pairs: Ints, lattice: Lattice, margin: float) -> Bools:
     """Return where any of pairs of solids, shape (P, 2), surely come too close, shape (cells, cells, H)."""
     count, cells = len(lattice.yaws), lattice.cells
     if not len(pairs):
@@ -201,7 +198,7 @@ def _fill(
     return _rows(reach, np.tile(np.arange(count), len(moving)), lattice)
 
 
-def _rows(reach: NDArray[np.float32], heading: NDArray[np.int_], lattice: Lattice) -> NDArray[np.bool_]:
+def _rows(reach: NDArray[np.float32], heading: Ints, lattice: Lattice) -> Bools:
     """Return the cells inside any of many polygons, by heading, shape (cells, cells, H).
 
     Args:

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from vkc_pin.arrays import Bools, Floats, Ints
 from vkc_pin.driving.blocked import Lattice, stuck
 from vkc_pin.driving.body import FAN, Body, Shape, Standing
 from vkc_pin.errors import InputError
@@ -94,7 +95,7 @@ class BaseGrid:
         """Return the world position of a cell's centre [m]."""
         return float(self.origin[0] + i * self.step[0]), float(self.origin[1] + j * self.step[1])
 
-    def around(self, x: float, y: float, radius: float) -> NDArray[np.int_]:
+    def around(self, x: float, y: float, radius: float) -> Ints:
         """Return the cells whose centres are within `radius` [m] of a place, shape (C, 2)."""
         low = np.maximum(np.ceil((np.array([x, y]) - radius - self.origin) / self.step), 0).astype(int)
         high = np.minimum(np.floor((np.array([x, y]) + radius - self.origin) / self.step), self.cells - 1).astype(int) + 1
@@ -119,14 +120,7 @@ class BaseGrid:
         """
         return self.driven((x, y), (x, y), yaw, reaching=reaching)
 
-    def driven(
-        self,
-        a: ArrayLike,
-        b: ArrayLike,
-        yaw: float,
-        *,
-        reaching: bool = False,
-    ) -> bool:
+    def driven(self, a: ArrayLike, b: ArrayLike, yaw: float, *, reaching: bool = False) -> bool:
         """Return whether everything keeps its margin all along a straight line.
 
         Args:
@@ -138,14 +132,12 @@ class BaseGrid:
         begin, end = np.asarray(a, float), np.asarray(b, float)
         return self.base.driven(begin, end, yaw) and (reaching or self.carried.driven(begin, end, yaw))
 
-    def turned(
-        self, at: ArrayLike, start: float, end: float, *, reaching: bool = False, margins: NDArray[np.float64] | None = None
-    ) -> bool:
+    def turned(self, at: ArrayLike, start: float, end: float, *, reaching: bool = False, margins: Floats | None = None) -> bool:
         """Return whether everything keeps its margin while the base turns from one yaw to the other at a place [m], [rad]."""
         place = np.asarray(at, float)
         return self.base.turned(place, start, end, margins) and (reaching or self.carried.turned(place, start, end))
 
-    def leaving(self, x: float, y: float, yaw: float) -> NDArray[np.float64] | None:
+    def leaving(self, x: float, y: float, yaw: float) -> Floats | None:
         """Return the margins the base can keep when it leaves a blocked pose, None if the pose is not blocked.
 
         It comes no closer to what it is too close to; what it overlaps does not count.
@@ -203,20 +195,20 @@ class BaseGrid:
 
     # -- distances ------------------------------------------------------------------------------------------------------
 
-    def distances(self, start: ArrayLike) -> NDArray[np.float64]:
+    def distances(self, start: ArrayLike) -> Floats:
         """Return how far the base drives at least from a place [m] to every cell, shape (cells, cells) [m]; infinite: no path.
 
         Turns are free, and only what surely blocks the base is in the way.
         """
         return self.distances_from(np.asarray(start, float)[None, :2])[0]
 
-    def distances_from(self, starts: NDArray[np.float64]) -> NDArray[np.float64]:
+    def distances_from(self, starts: Floats) -> Floats:
         """Return `distances` for each of `starts`, shape (W, 2) [m]: shape (W, cells, cells) [m].
 
         Each start takes about a millisecond on 100 x 100 cells; for many of them, a grid of fewer cells will do.
         """
         blocked = np.asarray(self.stuck.all(axis=2))
-        entries: list[tuple[NDArray[np.int_], NDArray[np.float64]]] = []
+        entries: list[tuple[Ints, Floats]] = []
         for x, y in np.asarray(starts, float):
             for radius in (2.5 * float(self.step.max()), 2.0 * _ROOM, np.inf):
                 cells = self.around(x, y, radius)
@@ -226,9 +218,7 @@ class BaseGrid:
             entries.append((self.cells * cells[:, 0] + cells[:, 1], np.hypot(*(self.origin + cells * self.step - (x, y)).T)))
         return self.spread(entries, self.stuck)
 
-    def spread(
-        self, entries: Sequence[tuple[NDArray[np.int_], NDArray[np.float64]]], stuck: NDArray[np.bool_]
-    ) -> NDArray[np.float64]:
+    def spread(self, entries: Sequence[tuple[Ints, Floats]], stuck: Bools) -> Floats:
         """Return how far it is at least to every cell, shape (W, cells, cells) [m], if turns are free.
 
         Args:

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.driving.grid import BaseGrid
 from vkc_pin.driving.ground import TURNING, Drive, Ground, wrapped
 from vkc_pin.driving.search import cheapest
@@ -32,7 +32,7 @@ class BasePath:
             radians turned, plus the goal's extra cost [m].
     """
 
-    poses: NDArray[np.float64]
+    poses: Floats
     goal: int
     cost: float
 
@@ -40,9 +40,9 @@ class BasePath:
 def shortest_path(
     grid: BaseGrid,
     start: Sequence[float],
-    goals: NDArray[np.float64],
+    goals: Floats,
     *,
-    costs: Sequence[float] | NDArray[np.float64] | None = None,
+    costs: Sequence[float] | Floats | None = None,
     smooth: bool = True,
     interrupt: Interrupt = NEVER,
 ) -> BasePath | None:
@@ -80,7 +80,7 @@ def shortest_path(
     return _assembled(ground, drives, yaw, goal, float(extra[goal]))
 
 
-def poses_along(path: BasePath, steps: int, *, turning: float = 0.5) -> NDArray[np.float64]:
+def poses_along(path: BasePath, steps: int, *, turning: float = 0.5) -> Floats:
     """Return `steps` poses along a path, without its start, the last at its goal: slow at both ends, shape (steps, 3) [m, rad].
 
     Args:
@@ -135,9 +135,7 @@ def _shortened(ground: Ground, drives: list[Drive], last: float) -> tuple[list[D
     return result, last
 
 
-def _straight(
-    ground: Ground, a: NDArray[np.float64], b: NDArray[np.float64], *, before: float, after: float, limit: float
-) -> tuple[Drive, float] | None:
+def _straight(ground: Ground, a: Floats, b: Floats, *, before: float, after: float, limit: float) -> tuple[Drive, float] | None:
     """Return a straight drive, and the yaw after turning at its end, if these, and the turn before it, cost less than `limit`."""
     found = []
     if np.hypot(*(b - a)) < _SAME:

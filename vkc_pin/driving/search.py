@@ -11,8 +11,8 @@ from __future__ import annotations
 import heapq
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.driving.grid import HEADINGS
 from vkc_pin.driving.ground import BACKWARDS, TURNING, UNIT, Drive, Ground, wrapped
 from vkc_pin.driving.query import AHEAD, BACK, BEGIN, DIRECT, END, LEFT, RIGHT, Move, Query
@@ -31,9 +31,7 @@ _CURVES = 0.13  # by what share paths are longer, mostly, because of turns
 _PATIENCE = 8e-3  # share of all nodes that are looked at, after a surprise, before the heuristic is found again
 
 
-def cheapest(
-    ground: Ground, extra: NDArray[np.float64], interrupt: Interrupt = NEVER
-) -> tuple[float, int, list[Drive], float] | None:
+def cheapest(ground: Ground, extra: Floats, interrupt: Interrupt = NEVER) -> tuple[float, int, list[Drive], float] | None:
     """Return the cheapest path to a goal that is not blocked, or None if there is none.
 
     Args:
@@ -67,7 +65,7 @@ def cheapest(
 class _Round:
     """A* over some of the cells, from the goals back to the start: dead ends are mostly around goals, and small."""
 
-    def __init__(self, query: Query, before: NDArray[np.float64], after: NDArray[np.float64], bound: float) -> None:
+    def __init__(self, query: Query, before: Floats, after: Floats, bound: float) -> None:
         """Look at the cells over which a path may cost less than `bound` [m], given what it costs at least up to and from it."""
         self.query, self.ground, self.bound = query, query.ground, bound / UNIT
         grid = self.ground.grid

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vkc_pin.arrays import Floats
+
 if TYPE_CHECKING:
     import trimesh
 
@@ -59,7 +61,7 @@ def outer_hull(points: ArrayLike, *, vertices: int = 40) -> trimesh.Trimesh:
     return best
 
 
-def _directions(hull: trimesh.Trimesh) -> NDArray[np.float64]:
+def _directions(hull: trimesh.Trimesh) -> Floats:
     """Return the normals worth trying: those of the hull's faces, and some spread evenly over the sphere."""
     k = np.arange(_DIRECTIONS) + 0.5
     z, turn = 1.0 - 2.0 * k / _DIRECTIONS, np.pi * (1.0 + 5.0**0.5) * k

@@ -16,6 +16,7 @@ import coal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
 from vkc_pin.files.hulls import outer_hull
 
@@ -38,7 +39,7 @@ class MeshPart:
         colour: Red, green, blue, opacity in [0, 1], or None if the file names none.
     """
 
-    vertices: NDArray[np.float64]
+    vertices: Floats
     faces: NDArray[np.int64]
     colour: tuple[float, float, float, float] | None = None
 
@@ -190,7 +191,7 @@ def to_bvh(part: MeshPart) -> coal.BVHModelOBBRSS:
     return shape
 
 
-def _factors(file: Path, scale: ArrayLike) -> NDArray[np.float64]:
+def _factors(file: Path, scale: ArrayLike) -> Floats:
     factors = np.asarray(scale, float)
     if factors.shape not in ((), (1,), (3,)) or not (np.isfinite(factors).all() and (factors != 0.0).all()):
         raise InputError("wrong scale of a mesh", file=file, field="scale", expected="3 finite numbers other than 0", got=scale)
@@ -218,7 +219,7 @@ def indices(shape: coal.Convex | coal.BVHModelBase) -> NDArray[np.int64]:
     return np.array([[triangle[i] for i in range(3)] for triangle in map(item, range(count))], np.int64).reshape(-1, 3)
 
 
-def _read_with_coal(file: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _read_with_coal(file: Path) -> tuple[Floats, NDArray[np.int64]]:
     try:
         shape = coal.MeshLoader().load(str(file), np.ones(3))
     except (RuntimeError, ValueError) as error:

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import coal
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
 from vkc_pin.files import resources
 from vkc_pin.files.documents import read_xml
@@ -262,7 +262,7 @@ def _triangles(shape: Shape) -> coal.CollisionGeometry:
     return to_bvh(MeshPart(np.asarray(mesh.vertices), np.asarray(mesh.faces)))
 
 
-def _rotation(roll: float, pitch: float, yaw: float) -> NDArray[np.float64]:
+def _rotation(roll: float, pitch: float, yaw: float) -> Floats:
     """Return the rotation, shape (3, 3), of angles [rad] about fixed axes, to the last bit as Pinocchio's reader has it."""
     (a, u), (b, v), (c, w) = ((math.sin(angle / 2.0), math.cos(angle / 2.0)) for angle in (roll, pitch, yaw))
     x, y, z, s = a * v * w - u * b * c, u * b * w + a * v * c, u * v * c - a * b * w, u * v * w + a * b * c

@@ -11,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.models.coordinates import Coordinates
 
@@ -37,7 +38,7 @@ class Freedom:
 
     suffix: str
     kind: str
-    axis: NDArray[np.float64]
+    axis: Floats
     lower: float
     upper: float
 
@@ -159,10 +160,10 @@ class ArticulatedObject:
     collision: pin.GeometryModel
     visual: pin.GeometryModel
     coordinates: Coordinates
-    lower: NDArray[np.float64]
-    upper: NDArray[np.float64]
-    velocity: NDArray[np.float64]
-    acceleration: NDArray[np.float64]
+    lower: Floats
+    upper: Floats
+    velocity: Floats
+    acceleration: Floats
     attachments: Mapping[str, Attachment]
     latches: tuple[Latch, ...]
     base_link: str

@@ -89,12 +89,7 @@ def graft(model: pin.Model, tree: pin.Model, *, parent: int, placement: pin.SE3,
 
 
 def graft_geometry(
-    geometry: pin.GeometryModel,
-    objects: Iterable[pin.GeometryObject],
-    *,
-    joints: list[int],
-    placement: pin.SE3,
-    prefix: str = "",
+    geometry: pin.GeometryModel, objects: Iterable[pin.GeometryObject], *, joints: list[int], placement: pin.SE3, prefix: str = ""
 ) -> list[int]:
     """Add copies of `objects` to `geometry`, their parent joints mapped by `joints` (see `graft`).
 

@@ -7,10 +7,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.files.urdf import UrdfFile
 from vkc_pin.models.coordinates import Coordinates
 from vkc_pin.models.robot_model import visual_geometry
@@ -46,11 +45,11 @@ class Robot:
     model: pin.Model
     collision: pin.GeometryModel
     coordinates: Coordinates
-    lower: NDArray[np.float64]
-    upper: NDArray[np.float64]
-    velocity: NDArray[np.float64]
-    acceleration: NDArray[np.float64]
-    home: NDArray[np.float64]
+    lower: Floats
+    upper: Floats
+    velocity: Floats
+    acceleration: Floats
+    home: Floats
     tool_frame: str
     base: Base
     touch_links: tuple[str, ...] = ()

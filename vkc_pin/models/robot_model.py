@@ -8,8 +8,8 @@ from collections.abc import Collection, Mapping
 import coal
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
 from vkc_pin.files.urdf import Shape, UrdfFile
 from vkc_pin.models.grafting import add_joint, clean
@@ -105,9 +105,9 @@ def nearest_position(model: pin.Model, joint: str, position: float) -> float:
     return float(np.clip(position, low, high))
 
 
-def configuration(model: pin.Model, positions: Mapping[str, float]) -> NDArray[np.float64]:
+def configuration(model: pin.Model, positions: Mapping[str, float]) -> Floats:
     """Return the configuration, shape (nq,), with joints at `positions`; those not named are neutral."""
-    q: NDArray[np.float64] = pin.neutral(model)
+    q: Floats = pin.neutral(model)
     for j in range(1, model.njoints):
         joint, value = model.joints[j], positions.get(model.names[j])
         if value is not None and joint.nv == 1:
@@ -171,7 +171,7 @@ def visual_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
     return geometry
 
 
-def _reduced(full: pin.Model, planned: Collection[int], q: NDArray[np.float64]) -> pin.Model:
+def _reduced(full: pin.Model, planned: Collection[int], q: Floats) -> pin.Model:
     """Return `full` with the joints that are not `planned` locked at `q`.
 
     `pinocchio.buildReducedModel` refuses models in which a link is called like a joint, as many are. Here, the frame of

@@ -11,8 +11,8 @@ from xml.sax.saxutils import quoteattr
 import coal
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.files.writing import write_atomically
 from vkc_pin.models.robot import Robot
 
@@ -141,7 +141,7 @@ class _Distances:
         self._middles = np.array([place.act(solid.aabb_center) for place, solid in zip(self._locals, self._solids, strict=True)])
         self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
 
-    def place(self, z: NDArray[np.float64]) -> None:
+    def place(self, z: Floats) -> None:
         """Put the robot at coordinates `z`, shape (n,)."""
         pin.forwardKinematics(self._robot.model, self._data, self._robot.coordinates.q(z))
         rotations = np.array([place.rotation for place in self._data.oMi])[self._joints]
@@ -176,11 +176,7 @@ class _Distances:
 
 
 def _drive_together(
-    distances: _Distances,
-    parts: list[tuple[int, int]],
-    z: NDArray[np.float64],
-    limits: tuple[NDArray[np.float64], NDArray[np.float64]],
-    rng: np.random.Generator,
+    distances: _Distances, parts: list[tuple[int, int]], z: Floats, limits: tuple[Floats, Floats], rng: np.random.Generator
 ) -> bool:
     """Return whether random steps from `z` that lessen the distance end in a collision."""
     low, high = limits

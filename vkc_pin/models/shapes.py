@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
 from vkc_pin.files.meshes import indices
 from vkc_pin.models.grafting import clean
@@ -100,7 +101,7 @@ def shape_distance(
     return float(coal.distance(first, a, second, b, coal.DistanceRequest(), coal.DistanceResult()))
 
 
-def triangles(shape: coal.CollisionGeometry) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def triangles(shape: coal.CollisionGeometry) -> tuple[Floats, NDArray[np.int64]]:
     """Return the surface of a coal shape in its own frame: vertices, shape (n, 3) [m], and faces, shape (m, 3).
 
     Raises:
@@ -132,14 +133,14 @@ def triangles(shape: coal.CollisionGeometry) -> tuple[NDArray[np.float64], NDArr
     return np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
 
 
-def bounding_box(shape: pin.GeometryObject) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def bounding_box(shape: pin.GeometryObject) -> tuple[Floats, Floats]:
     """Return centre and half extents of a shape's bounding box in its own frame."""
     shape.geometry.computeLocalAABB()
     box = shape.geometry.aabb_local
     return np.asarray(box.center(), float), np.array([box.width(), box.height(), box.depth()]) / 2
 
 
-def world_box(shape: coal.CollisionGeometry, placement: pin.SE3) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def world_box(shape: coal.CollisionGeometry, placement: pin.SE3) -> tuple[Floats, Floats]:
     """Return the lower and upper corner, shape (3,) each [m], of a box along the world's axes around a shape."""
     shape.computeLocalAABB()
     box = shape.aabb_local

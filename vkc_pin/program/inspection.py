@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats, Ints
 from vkc_pin.chain.contacts import ContactModel
 from vkc_pin.program.problem import TrajectoryProblem
 
@@ -36,20 +36,20 @@ class Plane:
     contacts: ContactModel
     waypoint: int
     names: tuple[str, str]
-    pair: NDArray[np.int_]
+    pair: Ints
     distance: float
     margin: float
-    coefficients: NDArray[np.float64]
+    coefficients: Floats
     offset: float
-    gradient: NDArray[np.float64]
+    gradient: Floats
 
-    def values(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
+    def values(self, z: Floats) -> Floats:
         """Return the distance that the plane takes the pair to have, shape (W,) [m], at z, shape (W, n)."""
         rotations, translations = self.problem.chain.joint_placements(z)
         columns = np.concatenate([rotations[:, 1:].swapaxes(2, 3), translations[:, 1:, None]], axis=2)
         return np.asarray(self.margin + columns.reshape(len(z), -1) @ self.coefficients - self.offset)
 
-    def distances(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
+    def distances(self, z: Floats) -> Floats:
         """Return the pair's distance from coal, shape (W,) [m], at z, shape (W, n); NaN where it is far from this one."""
         reach = max(self.distance, 0.0) + _FURTHER
         found = self.contacts.evaluate(z, np.full(len(z), self.waypoint), reach=reach)
@@ -58,7 +58,7 @@ class Plane:
         return distances
 
 
-def planes(problem: TrajectoryProblem, z: NDArray[np.float64], waypoint: int) -> list[Plane]:
+def planes(problem: TrajectoryProblem, z: Floats, waypoint: int) -> list[Plane]:
     """Return the witness planes at a waypoint, those of the pairs that fall shortest of their margins, worst first.
 
     Args:

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.chain.chain import VirtualKinematicChain, consolidate
 from vkc_pin.chain.contacts import ContactModel, Contacts
 from vkc_pin.chain.pose import ROW_BOUNDS, target_vector
@@ -62,7 +62,7 @@ class TrajectoryProblem:
         self.term_numbers = TermNumbers(self.terms, self.transcription, self.start)
         self.term_numbers.check(self.still, np.full(self.segments, options.dt))
 
-    def with_bounds(self, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> TrajectoryProblem:
+    def with_bounds(self, lower: Floats, upper: Floats) -> TrajectoryProblem:
         """Return the same problem with other bounds of z_1..z_N, shape (N, n)."""
         other = copy.copy(self)
         other.lower, other.upper = lower.copy(), upper.copy()
@@ -75,7 +75,7 @@ class TrajectoryProblem:
         return int(self.ends[-1])
 
     @property
-    def still(self) -> NDArray[np.float64]:
+    def still(self) -> Floats:
         """z_1..z_N where nothing moves, shape (N, n)."""
         return np.tile(self.start, (self.segments, 1))
 
@@ -127,7 +127,7 @@ class TrajectoryProblem:
                 found += [(self.chain.index(name), int(self.ends[number]), int(self.ends[last])) for name in names]
         return tuple(found)
 
-    def _start(self) -> NDArray[np.float64]:
+    def _start(self) -> Floats:
         start = np.zeros(self.chain.size)
         start[: len(self.scene.start)] = self.scene.start
         for name, value in self.task.state.items():
@@ -138,7 +138,7 @@ class TrajectoryProblem:
                 start[self.chain.index(f"{hold.object}.{name}")] = value
         return start
 
-    def _bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _bounds(self) -> tuple[Floats, Floats]:
         lower, upper = np.tile(self.chain.lower, (self.segments, 1)), np.tile(self.chain.upper, (self.segments, 1))
         for column, name in enumerate(self.chain.names[:3]):
             lower[:, column], upper[:, column] = self.limits(name)
@@ -167,7 +167,7 @@ class TrajectoryProblem:
                     lower[:until, column] = upper[:until, column] = self.start[column]
         return lower, upper
 
-    def timing_for(self, z: NDArray[np.float64]) -> Timing:
+    def timing_for(self, z: Floats) -> Timing:
         """Return how long steps take where z_1..z_N, shape (N, n), is the seed; see `time_for`. Terms may ask for more time."""
         structure, limits = self.transcription.structure, (self.chain.velocity, self.chain.acceleration)
         runs = runs_between(structure.stops, self.segments)
@@ -194,32 +194,32 @@ class TrajectoryProblem:
         """Return "m" or "rad", the unit of a coordinate."""
         return self.chain.coordinates.units[self.chain.index(name)]
 
-    def waypoints(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
+    def waypoints(self, z: Floats) -> Floats:
         """Return `z`, shape (N, n), with the start before it, shape (N + 1, n)."""
         return np.vstack([self.start, z])
 
-    def clip(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
+    def clip(self, z: Floats) -> Floats:
         """Return `z` with every coordinate within its bounds."""
         return np.clip(z, self.lower, self.upper)
 
-    def evaluate_contacts(self, z: NDArray[np.float64], *, reach: float, nearest: int | None = None) -> Contacts:
+    def evaluate_contacts(self, z: Floats, *, reach: float, nearest: int | None = None) -> Contacts:
         """Return the pairs closer than `reach` [m] at z_1..z_N, shape (N, n); at most `nearest` a waypoint."""
         return self.contacts.settled(z).evaluate(z, np.arange(1, self.segments + 1), reach=reach, nearest=nearest)
 
-    def rates(self, z: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def rates(self, z: Floats) -> tuple[Floats, Floats]:
         """Return the steps δz, shape (N, n), and their differences δδz, shape (N + 1 + stops, n); see `Transcription`."""
         t = self.transcription
         first = t.first @ z + np.outer(t.start_first, self.start)
         return first, t.second @ z + np.outer(t.start_second, self.start)
 
-    def objective(self, z: NDArray[np.float64], dt: NDArray[np.float64]) -> float:
+    def objective(self, z: Floats, dt: Floats) -> float:
         """Return f of eq. 1, and the user's own costs, at z_1..z_N, shape (N, n), in steps that take dt, shape (N,) [s]."""
         structure = self.transcription.structure
         first, second = self.rates(z)
         efforts = np.sum(first**2 * structure.weights_velocity) + np.sum(second**2 @ structure.weights_acceleration)
         return float(efforts) + self.term_numbers.cost(z, dt)
 
-    def pose_error(self, z: NDArray[np.float64]) -> float:
+    def pose_error(self, z: Floats) -> float:
         """Return the largest residual of closure, goals and rolling, [m] or [rad], at z_1..z_N, shape (N, n)."""
         errors = [0.0]
         for goal, solver in zip(self.pose_goals, self.transcription.pose_solvers, strict=True):
@@ -228,11 +228,11 @@ class TrajectoryProblem:
                 errors.append(float(np.abs(residual).max()))
         return max(*errors, self.slip(z))
 
-    def row_error(self, z: NDArray[np.float64], dt: NDArray[np.float64]) -> float:
+    def row_error(self, z: Floats, dt: Floats) -> float:
         """Return `pose_error`, or how much the user's own constraints are violated if that is more; see `TermNumbers.error`."""
         return max(self.pose_error(z), self.term_numbers.error(z, dt))
 
-    def slip(self, z: NDArray[np.float64]) -> float:
+    def slip(self, z: Floats) -> float:
         """Return how far a differential base slips sideways in the worst step of z_1..z_N, shape (N, n) [m]; 0 for others."""
         if not self.transcription.structure.differential:
             return 0.0
@@ -241,7 +241,7 @@ class TrajectoryProblem:
         heading = path[:-1, 2] + step[:, 2] / 2
         return float(np.abs(np.cos(heading) * step[:, 1] - np.sin(heading) * step[:, 0]).max())
 
-    def drift(self, z: NDArray[np.float64]) -> float:
+    def drift(self, z: Floats) -> float:
         """Return how far grasps drift half-way between waypoints at most, relative to what `Options` allow."""
         path, worst = self.waypoints(z), 0.0
         between = (path[1:] + path[:-1]) / 2
@@ -254,7 +254,7 @@ class TrajectoryProblem:
                 worst = max(worst, float((amounts / allowed).max()))
         return worst
 
-    def row_bounds(self, timing: Timing | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def row_bounds(self, timing: Timing | None) -> tuple[Floats, Floats]:
         """Return the bounds of the program's rows, and with a timing those of its rates; shapes (rows,) and (rows,)."""
         t, terms = self.transcription, self.term_numbers
         lower, upper = np.zeros(t.rows), np.zeros(t.rows)
@@ -268,7 +268,7 @@ class TrajectoryProblem:
             lower, upper = np.concatenate([lower, -rates]), np.concatenate([upper, rates])
         return lower, upper
 
-    def target_matrix(self) -> NDArray[np.float64]:
+    def target_matrix(self) -> Floats:
         """Return the pose targets as parameters, shape (poses, 12)."""
         return np.array([target_vector(t) for t in self.targets]).reshape(-1, 12)
 
@@ -280,7 +280,7 @@ class TrajectoryProblem:
         )
 
 
-def _freeze(*arrays: NDArray[np.float64]) -> None:
+def _freeze(*arrays: Floats) -> None:
     for array in arrays:
         array.flags.writeable = False
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.chain.chain import VirtualKinematicChain
 from vkc_pin.chain.pose import target_vector
 from vkc_pin.errors import InputError
@@ -117,7 +117,7 @@ class TermNumbers:
         lower, upper: Their bounds, shape (R,).
     """
 
-    def __init__(self, terms: Sequence[Term], transcription: Transcription, start: NDArray[np.float64]) -> None:
+    def __init__(self, terms: Sequence[Term], transcription: Transcription, start: Floats) -> None:
         self.terms, self.transcription, self.start = terms, transcription, start
         rows, bounds, scales = [np.zeros(0, int)], [np.zeros((0, 2))], [np.zeros(0)]
         timed, names = [np.zeros(0, bool)], []
@@ -136,15 +136,15 @@ class TermNumbers:
         self._scale, self._timed = np.concatenate(scales)[order], np.concatenate(timed)[order]
         self._names = [names[k] for k in order]
 
-    def error(self, z: NDArray[np.float64], dt: NDArray[np.float64]) -> float:
+    def error(self, z: Floats, dt: Floats) -> float:
         """Return by how much constraints are violated at most at z_1..z_N, shape (N, n), 1e-3 being their tolerance."""
         return float(self._excess(z, dt).max(initial=0.0))
 
-    def cost(self, z: NDArray[np.float64], dt: NDArray[np.float64]) -> float:
+    def cost(self, z: Floats, dt: Floats) -> float:
         """Return the weighted sum of all costs."""
         return float(self._evaluated(z, dt)[2]) if self.terms else 0.0
 
-    def slower(self, z: NDArray[np.float64], dt: NDArray[np.float64], runs: Sequence[tuple[int, int]]) -> NDArray[np.float64]:
+    def slower(self, z: Floats, dt: Floats, runs: Sequence[tuple[int, int]]) -> Floats:
         """Return the time of every step, made longer until z_1..z_N satisfies what depends on it, as far as that helps.
 
         Args:
@@ -169,7 +169,7 @@ class TermNumbers:
             dt = np.concatenate([dt[:begin], best * dt[begin:end], dt[end:]])
         return dt
 
-    def check(self, z: NDArray[np.float64], dt: NDArray[np.float64]) -> None:
+    def check(self, z: Floats, dt: Floats) -> None:
         """Check that values and slopes exist at z_1..z_N.
 
         Raises:
@@ -189,14 +189,14 @@ class TermNumbers:
             expected = "a smooth expression, e.g. cos(a) >= 0.98 instead of a <= 0.2, or squares instead of roots"
             raise InputError("it has no value or no slope at the start", field=f"terms[{name!r}].expression", expected=expected)
 
-    def _excess(self, z: NDArray[np.float64], dt: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _excess(self, z: Floats, dt: Floats) -> Floats:
         if not len(self.rows):
             return np.zeros(0)
         values = self._evaluated(z, dt)[0]
         excess = np.maximum(np.maximum(self.lower - values, values - self.upper), 0.0) * self._scale
         return np.where(np.isnan(excess), np.inf, excess)
 
-    def _evaluated(self, z: NDArray[np.float64], dt: NDArray[np.float64]) -> tuple[NDArray[np.float64], Any, float, Any]:
+    def _evaluated(self, z: Floats, dt: Floats) -> tuple[Floats, Any, float, Any]:
         x = np.column_stack([z, np.zeros(len(z))]).ravel()
         values, jacobian, cost, gradient = self.transcription.term_values(x, self.start, dt)
         return np.asarray(values).ravel(), jacobian, float(cost), np.asarray(gradient.nonzeros())

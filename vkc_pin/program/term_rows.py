@@ -9,9 +9,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from vkc_pin import cpin
+from vkc_pin.arrays import Ints
 from vkc_pin.models.coordinates import Coordinates
 from vkc_pin.program.sparse import assemble
 from vkc_pin.task.formula import Formula
@@ -190,8 +190,8 @@ class TermProgram:
         """
         self._n = z.shape[0]
         self._size = (z.shape[1] - 1) * (self._n + 1)
-        self._hessians: list[tuple[ca.Function, list[Any], NDArray[np.int_], NDArray[np.int_], Any]] = []
-        self.rows, self.at = 0, [dict[int, NDArray[np.int_]]() for _ in terms]
+        self._hessians: list[tuple[ca.Function, list[Any], Ints, Ints, Any]] = []
+        self.rows, self.at = 0, [dict[int, Ints]() for _ in terms]
         text = model.saveToString()
         self.cost: Any = ca.MX(0)
         values, slopes, slopes_at = [], [], []
@@ -247,16 +247,14 @@ class TermProgram:
             at.append(place)
         return assemble(parts, at, self._size, self._size) if parts else ca.MX(self._size, self._size)
 
-    def _curvature(
-        self, function: ca.Function, inputs: list[Any], involved: NDArray[np.int_], pattern: Any, multipliers: Any
-    ) -> Any:
+    def _curvature(self, function: ca.Function, inputs: list[Any], involved: Ints, pattern: Any, multipliers: Any) -> Any:
         """Return nonzeros of the Hessian of all waypoints of a kind, and where they are; what is about the start is left out."""
         part = ca.vec(function.map(len(involved))(*inputs, multipliers))
         row, column = (self._place(involved, index) for index in pattern)
         kept = (row >= 0) & (column >= 0)
         return part[np.flatnonzero(kept).tolist()], np.stack([row[kept], column[kept]])
 
-    def _place(self, involved: NDArray[np.int_], index: NDArray[np.int_]) -> NDArray[np.int_]:
+    def _place(self, involved: Ints, index: Ints) -> Ints:
         """Return which variables entries of a kind's z are, for all its waypoints one after the other; -1 for the start's."""
         waypoint, coordinate = involved[:, index // self._n], index % self._n
         return np.where(waypoint > 0, (waypoint - 1) * (self._n + 1) + coordinate, -1).ravel()

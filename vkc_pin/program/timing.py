@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+
+from vkc_pin.arrays import Floats
 
 __all__ = ["Timing", "runs_between", "time_for"]
 
@@ -29,27 +30,27 @@ class Timing:
         limits: Of the velocities and accelerations of coordinates, shapes (n,), SI units.
     """
 
-    dt: NDArray[np.float64]
-    least: NDArray[np.float64]
+    dt: Floats
+    least: Floats
     runs: Runs
-    limits: tuple[NDArray[np.float64], NDArray[np.float64]]
+    limits: tuple[Floats, Floats]
 
     @cached_property
-    def velocity(self) -> NDArray[np.float64]:
+    def velocity(self) -> Floats:
         """Bounds of the steps δz, shape (N, n): limits times dt."""
         return np.asarray(self.limits[0] * self.dt[:, None])
 
     @cached_property
-    def acceleration(self) -> NDArray[np.float64]:
+    def acceleration(self) -> Floats:
         """Bounds of the differences δδz, shape (N + 1 + stops, n): limits times dt²."""
         of_rows = np.concatenate([np.full(last - first + 1, self.dt[first]) for first, last in self.runs])
         return np.asarray(self.limits[1] * of_rows[:, None] ** 2)
 
-    def violation(self, first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
+    def violation(self, first: Floats, second: Floats) -> float:
         """Return the largest excess of steps and their differences over their bounds, relative to these; see `rates`."""
         return float(max(np.max(np.abs(first) / self.velocity), np.max(np.abs(second) / self.acceleration)) - 1.0)
 
-    def stretched(self, first: NDArray[np.float64], second: NDArray[np.float64]) -> Timing:
+    def stretched(self, first: Floats, second: Floats) -> Timing:
         """Return a timing that gives runs up to `_PATIENCE` times the least time where steps or differences exceed a bound."""
         fast, strong = np.max(np.abs(first) / self.velocity, axis=1), np.max(np.abs(second) / self.acceleration, axis=1)
         dt = self.dt.copy()
@@ -64,9 +65,7 @@ def runs_between(stops: Sequence[int], segments: int) -> Runs:
     return tuple(itertools.pairwise([0, *stops, segments]))
 
 
-def time_for(
-    path: NDArray[np.float64], dt: float, runs: Runs, limits: tuple[NDArray[np.float64], NDArray[np.float64]]
-) -> NDArray[np.float64]:
+def time_for(path: Floats, dt: float, runs: Runs, limits: tuple[Floats, Floats]) -> Floats:
     """Return the time of every step, shape (N,) [s]: `dt`, or more in runs where z_0..z_N, shape (N + 1, n), is too long for it.
 
     The measure is the profile 3s² − 2s³ over the distance that each coordinate moves between two stops: its speed is at most 1.5

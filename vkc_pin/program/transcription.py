@@ -15,8 +15,8 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats, Ints
 from vkc_pin.chain.inverse_kinematics import PoseSolver
 from vkc_pin.models.coordinates import Coordinates
 from vkc_pin.program.deadline import Monitor
@@ -82,15 +82,8 @@ class Transcription:
         self.parameters = ca.veccat(self.start, self.planes, self.offsets, self.targets, self.penalty, *times)
 
     def parameter_vector(
-        self,
-        start: NDArray[np.float64],
-        planes: NDArray[np.float64],
-        offsets: NDArray[np.float64],
-        targets: NDArray[np.float64],
-        *,
-        penalty: float,
-        dt: NDArray[np.float64] | None = None,
-    ) -> NDArray[np.float64]:
+        self, start: Floats, planes: Floats, offsets: Floats, targets: Floats, *, penalty: float, dt: Floats | None = None
+    ) -> Floats:
         """Return the parameters: start (n,), planes (N, K, 12·joints), offsets (N, K), targets (poses, 12), penalty, dt (N,).
 
         The times of the steps only count where a term needs them.
@@ -100,7 +93,7 @@ class Transcription:
         times = [dt] if self.structure.timed and dt is not None else []
         return np.concatenate([start, planes, offsets.ravel(), padded, [penalty], *times])
 
-    def rows_at(self, x: NDArray[np.float64], parameters: NDArray[np.float64]) -> tuple[NDArray[np.float64], Any]:
+    def rows_at(self, x: Floats, parameters: Floats) -> tuple[Floats, Any]:
         """Return the rows at x, shape (rows,), and their Jacobian, a sparse matrix (SciPy) of shape (rows, size)."""
         rows, jacobian = ca.Function("rows", [self.x, self.parameters], [self.g, self.jacobian])(x, parameters)
         return np.asarray(rows).ravel(), jacobian.sparse().tocsr()
@@ -153,7 +146,7 @@ class Transcription:
         first_row = np.concatenate([[0], np.cumsum(count)])
         self.rows = int(first_row[-1])
         self.slot_rows = first_row[:-1, None] + np.arange(K)
-        self.pose_rows: list[dict[int, NDArray[np.int_]]] = [{} for _ in self.structure.poses]
+        self.pose_rows: list[dict[int, Ints]] = [{} for _ in self.structure.poses]
         values, jacobians, hessians = [], [], []
         value_rows, jacobian_at, hessian_at = [], [], []
         self.multipliers = ca.MX.sym("lam_g", self.rows)
@@ -186,7 +179,7 @@ class Transcription:
         if self.structure.differential:
             self._differential()
         self._clamp()
-        self.term_rows: list[dict[int, NDArray[np.int_]]] = []
+        self.term_rows: list[dict[int, Ints]] = []
         if self.structure.terms:
             self._terms()
 

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
-import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from vkc_pin import cpin
+from vkc_pin.arrays import Floats
 from vkc_pin.chain.pose import PoseRow, pose_rows
 from vkc_pin.models.coordinates import Coordinates
 from vkc_pin.program.term_rows import TermRow
@@ -44,8 +43,8 @@ class Structure:
     segments: int
     poses: tuple[PoseRow, ...]
     slots: int
-    weights_velocity: NDArray[np.float64]
-    weights_acceleration: NDArray[np.float64]
+    weights_velocity: Floats
+    weights_acceleration: Floats
     stops: tuple[int, ...] = ()
     differential: bool = False
     clamped: tuple[tuple[int, int, int], ...] = ()

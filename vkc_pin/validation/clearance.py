@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from vkc_pin.arrays import Floats, Ints
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.motion.world import World
 from vkc_pin.scene.scene import Scene
@@ -28,8 +29,8 @@ class ClearanceCurve:
     """
 
     name: str
-    times: NDArray[np.float64]
-    distances: NDArray[np.float64]
+    times: Floats
+    distances: Floats
     pairs: tuple[tuple[str, str], ...]
 
     def closest(self) -> tuple[float, float, str]:
@@ -72,7 +73,7 @@ def clearance_curves(scene: Scene, trajectory: Trajectory, times: ArrayLike, *, 
 _KINDS = ("robot – itself", "robot – objects", "robot – obstacles", "objects – surroundings", "gripper – what it grasps")
 
 
-def _kind(table: PairTable, pair: NDArray[np.int_], margin: float) -> str:
+def _kind(table: PairTable, pair: Ints, margin: float) -> str:
     first, second = (table.group[int(i)] for i in pair)
     if margin <= 0.0 and first == "robot":
         return _KINDS[4]

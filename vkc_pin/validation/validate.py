@@ -34,11 +34,7 @@ SLIP_TOLERANCE = 1e-4  # [m] per step
 
 
 def validate(
-    scene: Scene,
-    steps: Sequence[Step],
-    trajectory: Trajectory,
-    options: Options | None = None,
-    terms: Sequence[Term] = (),
+    scene: Scene, steps: Sequence[Step], trajectory: Trajectory, options: Options | None = None, terms: Sequence[Term] = ()
 ) -> Report:
     """Check a motion against everything that was asked of it.
 

@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.files.meshes import MeshPart, coarser
 from vkc_pin.models.shapes import triangles
 
@@ -46,7 +47,7 @@ def to_solid(shape: coal.CollisionGeometry) -> Solid:
     return shade(*triangles(shape))
 
 
-def shade(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Solid:
+def shade(vertices: Floats, faces: NDArray[np.int64]) -> Solid:
     """Return triangles with normals. Vertices on an edge are doubled, so that each side has its own normal."""
     import trimesh
 
@@ -69,11 +70,11 @@ def merge_solids(solids: list[Solid]) -> Solid:
     return Solid(np.concatenate([s.vertices for s in solids]), np.concatenate(faces), np.concatenate([s.normals for s in solids]))
 
 
-def box_solid(lower: NDArray[np.float64], upper: NDArray[np.float64], sides: tuple[int, ...] = (0, 1, 2, 3, 4, 5)) -> Solid:
+def box_solid(lower: Floats, upper: Floats, sides: tuple[int, ...] = (0, 1, 2, 3, 4, 5)) -> Solid:
     """Return the box between two corners, or some of its `sides`: 0, 1 face −x, +x; 2, 3 face −y, +y; 4, 5 face −z, +z."""
-    vertices: list[NDArray[np.float64]] = []
+    vertices: list[Floats] = []
     faces: list[NDArray[np.int64]] = []
-    normals: list[NDArray[np.float64]] = []
+    normals: list[Floats] = []
     for k, side in enumerate(sides):
         axis, positive = divmod(side, 2)
         u, v = (axis + 1) % 3, (axis + 2) % 3
@@ -87,7 +88,7 @@ def box_solid(lower: NDArray[np.float64], upper: NDArray[np.float64], sides: tup
     return _solid(np.concatenate(vertices), np.concatenate(faces), np.concatenate(normals))
 
 
-def tube(points: NDArray[np.float64], radius: float) -> Solid | None:
+def tube(points: Floats, radius: float) -> Solid | None:
     """Return a tube of `radius` [m] along `points`, shape (n, 3) [m], since browsers draw lines one pixel wide.
 
     Returns:

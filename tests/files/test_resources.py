@@ -35,7 +35,7 @@ def test_an_installed_package_has_them_inside(tmp_path: Path, monkeypatch: pytes
     inside = tmp_path / "site-packages" / "vkc_pin"
     (inside / "scenes").mkdir(parents=True)
     (inside / "scenes" / "own.yaml").write_text("")
-    monkeypatch.setattr("vkc_pin.files.resources.__file__", str(inside / "resources.py"))
+    monkeypatch.setattr("vkc_pin.files.resources.__file__", str(inside / "files" / "resources.py"))
     assert folder("scenes") == inside / "scenes"
     assert list(available("scenes", "*.yaml")) == ["own"]
     assert folder("robots") == inside.parent / "robots"  # a source tree has them beside the package

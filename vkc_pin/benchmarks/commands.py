@@ -27,13 +27,14 @@ def add_bench(commands: Any) -> None:
     door.add_argument("--quiet", action="store_true", help="no progress bar")
     door.set_defaults(run=_bench_door)
     about = (
-        "Compare ways of initialising the trajectory in three scenes, from the same random starts, and plan step after step too."
+        "Compare initialisations of the trajectory in three scenes, from the same random starts, and plan step after step too."
     )
-    initialization = benches.add_parser("initialization", help="ways of initialising, at a task with a tool", description=about)
+    initialization = benches.add_parser(
+        "initialization", help="methods of initialising, at a task with a tool", description=about
+    )
     _add_experiment_options(initialization, "--starts")
-    initialization.add_argument(
-        "--repeats", type=positive, default=1, metavar="R", help="trials per start and method (default 1)"
-    )
+    about = "trials per start and method (default 1)"
+    initialization.add_argument("--repeats", type=positive, default=1, metavar="R", help=about)
     initialization.add_argument("--scenes", nargs="+", metavar="SCENE", help="some of init_1 init_2 init_3 (default: all)")
     some = "some of stationary interpolated astar auto (default: all)"
     initialization.add_argument("--methods", nargs="+", metavar="METHOD", help=some)

@@ -19,7 +19,7 @@ from vkc_pin.benchmarks.comparison_report import report
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.charts import motions_chart
 from vkc_pin.benchmarks.harness.record import trial
-from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.errors import InputError
 from vkc_pin.files.writing import write_atomically
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.planning.plan import Plan
@@ -136,8 +136,8 @@ class Comparison:
             InputError: No trials, tasks or methods, or `out` has trials of other settings.
             KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
         """
-        tasks = _chosen("task", list(self.tasks) if tasks is None else tasks, list(self.tasks))
-        methods = _chosen("method", methods, COMPARED_PLANNERS)
+        tasks = runner.chosen("task", self.tasks if tasks is None else tasks, self.tasks)
+        methods = runner.chosen("method", methods, COMPARED_PLANNERS)
         if trials < 1:
             raise InputError("out of range", field="trials", expected="at least 1", got=trials)
         specs, out = self.specify(trials=trials, seed=seed, tasks=tasks, methods=methods), Path(out)
@@ -268,16 +268,6 @@ def shown(records: Sequence[Mapping[str, Any]], methods: Sequence[str]) -> int |
         if record["success"]:
             good.setdefault(int(record["number"]), set()).add(str(record["method"]))
     return max(sorted(good), key=lambda k: (len(good[k]) == len(methods), "VKC" in good[k], len(good[k])), default=None)
-
-
-def _chosen(kind: str, names: Sequence[str], choices: Sequence[str]) -> tuple[str, ...]:
-    """Return names without repetition, in the order of the choices; raise an error if one is none of them."""
-    for name in names:
-        if name not in choices:
-            raise UnknownNameError(kind, name, choices, field=f"{kind}s")
-    if not names:
-        raise InputError("nothing to compare", field=f"{kind}s", expected="at least one")
-    return tuple(choice for choice in choices if choice in names)
 
 
 @functools.cache

@@ -71,9 +71,8 @@ def stuck(
     """
     obstacles, below, above = _solids(standing), _solids(base), _solids(carried)
     pairs, over = _meeting(below, obstacles), _meeting(above, obstacles)
-    low, high = (
-        reduce(np.concatenate([solid.points for solid in below] or [np.zeros((1, 3))]), axis=0) for reduce in (np.min, np.max)
-    )
+    points = np.concatenate([solid.points for solid in below] or [np.zeros((1, 3))])
+    low, high = points.min(axis=0), points.max(axis=0)
     inside = [np.all((solid.points >= low) & (solid.points <= high), axis=0)[:2].all() for solid in above]
     hidden = np.array(inside, bool)[over[:, 0]] & np.isin(over[:, 1], pairs[:, 1])
     return _fill(below, obstacles, pairs, lattice, margin), _fill(above, obstacles, over[~hidden], lattice, margin)

@@ -77,7 +77,7 @@ class BaseGrid:
         for field, value, least in (("margin", margin, 0.0), ("near", near, 0.0), ("cells", cells, 2)):
             if not (np.isfinite(value) and value >= least):
                 raise InputError("out of range", field=field, expected=f"at least {least:g}", got=value)
-        self.cells, self.near, self.margin = int(cells), float(near), float(margin)
+        self.cells, self.near = int(cells), float(near)
         self.step = (high - low) / cells
         self.origin = low + self.step / 2
         self.moves = _MOVES

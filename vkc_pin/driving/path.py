@@ -115,9 +115,8 @@ def _shortened(ground: Ground, drives: list[Drive], last: float) -> tuple[list[D
         best, low, high = None, 1, len(rest)
         tried = high
         while low < tried:
-            straight = _straight(
-                ground, rest[0].a, rest[tried - 1].b, before=yaw, after=float(yaws[tried + 1]), limit=float(cost[tried - 1])
-            )
+            turns_to, limit = float(yaws[tried + 1]), float(cost[tried - 1])
+            straight = _straight(ground, rest[0].a, rest[tried - 1].b, before=yaw, after=turns_to, limit=limit)
             if straight is None:
                 high = tried - 1
             else:
@@ -127,11 +126,8 @@ def _shortened(ground: Ground, drives: list[Drive], last: float) -> tuple[list[D
         drive, end = best or (rest[0], after)
         result.append(drive)
         # The same turns from there on, counted from an equal angle.
-        yaw, rest, last = (
-            drive.yaw,
-            [Drive(other.a, other.b, other.yaw + end - after) for other in rest[low:]],
-            last + end - after,
-        )
+        rest = [Drive(other.a, other.b, other.yaw + end - after) for other in rest[low:]]
+        yaw, last = drive.yaw, last + end - after
     return result, last
 
 

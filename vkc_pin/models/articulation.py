@@ -99,9 +99,8 @@ class Attachment:
         """
         given = np.asarray(values, float)
         if given.shape != (len(self.freedoms),):
-            raise InputError(
-                "wrong number of values", field=self.name, expected=f"{len(self.freedoms)}, one a freedom", got=given
-            )
+            expected = f"{len(self.freedoms)}, one a freedom"
+            raise InputError("wrong number of values", field=self.name, expected=expected, got=given)
         placement = pin.SE3.Identity()
         for freedom, value in zip(self.freedoms, given, strict=True):
             placement = placement * freedom.motion(float(value))

@@ -76,12 +76,8 @@ class Coordinates:
                 lower.append(model.lowerPositionLimit[i])
                 upper.append(model.upperPositionLimit[i])
             else:
-                raise InputError(
-                    "this joint type is not supported",
-                    field=name,
-                    expected="a planar joint or one of 1 degree of freedom",
-                    got=kind,
-                )
+                expected = "a planar joint or one of 1 degree of freedom"
+                raise InputError("this joint type is not supported", field=name, expected=expected, got=kind)
             joints += [index] * (len(names) - len(joints))
         self.names: tuple[str, ...] = tuple(names)
         self.units: tuple[str, ...] = tuple(units)

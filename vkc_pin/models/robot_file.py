@@ -239,13 +239,8 @@ def _home(files: _Files, model: pin.Model, rest: Mapping[str, float], lower: Flo
     home = np.array([rest[joint] for joint in arm])
     if (outside := np.flatnonzero((home < lower - 1e-9) | (home > upper + 1e-9))).size:
         k = int(outside[0])
-        raise InputError(
-            "rests outside its limits",
-            file=files.document.file or files.urdf.path,
-            field=f"home.{arm[k]}",
-            expected=f"between {lower[k]:g} and {upper[k]:g}",
-            got=home[k],
-        )
+        file, expected = files.document.file or files.urdf.path, f"between {lower[k]:g} and {upper[k]:g}"
+        raise InputError("rests outside its limits", file=file, field=f"home.{arm[k]}", expected=expected, got=home[k])
     return home
 
 

@@ -59,18 +59,12 @@ def planned_model(
     Raises:
         InputError: No joint is left.
     """
-    path = _path_to(full, full.frames[_frame(full, tool_frame)].parentJoint)
-    planned = [
-        j for j in path if full.names[j] in rest and full.names[j] not in locked and full.names[j] not in _mimics(file.root)
-    ]
+    path = full.supports[full.frames[_frame(full, tool_frame)].parentJoint]  # from the world on
+    fixed = {*locked, *_mimics(file.root)}
+    planned = [j for j in path if j > 1 and full.names[j] in rest and full.names[j] not in fixed]
     if not planned:
-        raise InputError(
-            "no joint moves this frame",
-            file=file.path,
-            field="tool_frame",
-            expected="a frame at the end of an arm",
-            got=tool_frame,
-        )
+        expected = "a frame at the end of an arm"
+        raise InputError("no joint moves this frame", file=file.path, field="tool_frame", expected=expected, got=tool_frame)
     return _reduced(full, {1, *planned}, configuration(full, {**rest, **locked}))
 
 
@@ -196,11 +190,6 @@ def _reduced(full: pin.Model, planned: Collection[int], q: Floats) -> pin.Model:
             parent, placement = placed[frame.parentJoint]
             model.addFrame(pin.Frame(frame.name, parent, 0, clean(placement * frame.placement), frame.type))
     return model
-
-
-def _path_to(model: pin.Model, joint: int) -> list[int]:
-    """Return the joints from the root to `joint`, the planar one left out."""
-    return [index for index in model.supports[joint] if index > 1]
 
 
 def _frame(model: pin.Model, name: str) -> int:

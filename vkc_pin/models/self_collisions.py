@@ -84,10 +84,10 @@ def sample_allowed_pairs(robot: Robot, *, samples: int = _SAMPLES, seed: int = 0
     for links, parts in groups.items():
         if links not in free:
             allowed[links] = "Always"
-        elif links not in hit and not any(
-            _drive_together(distances, parts, np.array(z), (low, high), rng) for _, z in closest[links]
-        ):
-            allowed[links] = "Never"
+        elif links not in hit:
+            starts = (np.array(z) for _, z in closest[links])
+            if not any(_drive_together(distances, parts, z, (low, high), rng) for z in starts):
+                allowed[links] = "Never"
     return dict(sorted(allowed.items()))
 
 
@@ -157,14 +157,8 @@ class _Distances:
             bound = float(np.sqrt(gap @ gap) - self._radii[first] - self._radii[second])
             if bound <= min(smallest, worth):
                 self._result.clear()
-                bound = coal.distance(
-                    self._solids[first],
-                    self._place(first),
-                    self._solids[second],
-                    self._place(second),
-                    self._request,
-                    self._result,
-                )
+                one, other = ((self._solids[shape], self._place(shape)) for shape in (first, second))
+                bound = coal.distance(*one, *other, self._request, self._result)
             smallest = min(smallest, float(bound))
         return smallest
 

@@ -212,23 +212,22 @@ class TermProgram:
                 slope = ca.vec(functions.jacobian.map(count)(*inputs))
                 row, column = functions.jacobian_pattern
                 where = np.stack([(first[:, None] + row).ravel(), self._place(involved, column)])
+                kept = where[1] >= 0  # the others are about the start
+                where, slope = where[:, kept], slope[np.flatnonzero(kept).tolist()]
                 if term.weight is None:
                     values.append(value)
-                    kept = where[1] >= 0
-                    slopes.append(slope[np.flatnonzero(kept).tolist()])
-                    slopes_at.append(where[:, kept])
+                    slopes.append(slope)
+                    slopes_at.append(where)
                     rows = first[:, None] + np.arange(height)
                     rows_at.update(zip((waypoint for waypoint, _ in found), rows, strict=True))
                     self._hessians.append((functions.hessian, inputs, involved, rows, functions.hessian_pattern))
                     self.rows += height * count
                 else:
                     self.cost += term.weight * ca.sum1(value)
-                    kept = where[1] >= 0
-                    gradients.append(term.weight * slope[np.flatnonzero(kept).tolist()])
-                    gradients_at.append(np.stack([where[1][kept], np.zeros(kept.sum(), int)]))
-                    curvature, place = self._curvature(
-                        functions.hessian, inputs, involved, functions.hessian_pattern, ca.DM.ones(1, count) * term.weight
-                    )
+                    gradients.append(term.weight * slope)
+                    gradients_at.append(np.stack([where[1], np.zeros_like(where[1])]))
+                    weights, pattern = ca.DM.ones(1, count) * term.weight, functions.hessian_pattern
+                    curvature, place = self._curvature(functions.hessian, inputs, involved, pattern, weights)
                     curvatures.append(curvature)
                     curvatures_at.append(place)
         self.values = ca.vertcat(*values) if values else ca.MX(0, 1)

@@ -51,8 +51,7 @@ class Transcription:
     def __init__(self, structure: Structure) -> None:
         started = time.perf_counter()
         self.structure = structure
-        self.coordinates = Coordinates(structure.model)
-        self.n, self.segments, self.slots = self.coordinates.size, structure.segments, structure.slots
+        self.n, self.segments, self.slots = Coordinates(structure.model).size, structure.segments, structure.slots
         self.size = self.segments * (self.n + 1)
         self._symbols()
         self._objective()
@@ -183,22 +182,25 @@ class Transcription:
         if self.structure.terms:
             self._terms()
 
+    def _append(self, values: ca.MX, jacobian: ca.MX) -> ca.MX:
+        """Append rows with their Jacobian, and return their multipliers."""
+        rows = self.rows
+        self.g, self.jacobian, self.rows = ca.vertcat(self.g, values), ca.vertcat(self.jacobian, jacobian), rows + values.numel()
+        multipliers = ca.MX.sym("lam_g", self.rows)
+        (self.hessian,) = ca.substitute([self.hessian], [self.multipliers], [multipliers[:rows]])
+        self.multipliers = multipliers
+        return multipliers[rows:]
+
     def _differential(self) -> None:
         """Append −sin θ̄·δx + cos θ̄·δy at every segment's mid-heading: the base rolls, it does not slip."""
         z = ca.horzcat(self.start, self.z)
         heading, step = (z[2, 1:] + z[2, :-1]) / 2, z[:2, 1:] - z[:2, :-1]
         slip = (-ca.sin(heading) * step[0, :] + ca.cos(heading) * step[1, :]).T
-        extra = ca.MX.sym("lam_slip", self.segments)
         self.base_rows = self.rows + np.arange(self.segments)
-        self.g = ca.vertcat(self.g, slip)
-        self.jacobian = ca.vertcat(self.jacobian, ca.jacobian(slip, self.x))
-        curvature = ca.triu(ca.hessian(ca.dot(extra, slip), self.x)[0])
+        multipliers = self._append(slip, ca.jacobian(slip, self.x))
+        extra = ca.MX.sym("lam_slip", self.segments)
+        (curvature,) = ca.substitute([ca.triu(ca.hessian(ca.dot(extra, slip), self.x)[0])], [extra], [multipliers])
         self.hessian = self.hessian + curvature
-        self.rows += self.segments
-        both = ca.MX.sym("lam_g", self.rows)
-        split = [both[: -self.segments], both[-self.segments :]]
-        (self.hessian,) = ca.substitute([self.hessian], [self.multipliers, extra], split)
-        self.multipliers = both
 
     def _clamp(self) -> None:
         """Append z_t − z_{t−1} = 0 for what a clamping hand does not let slide."""
@@ -209,11 +211,7 @@ class Transcription:
         for row, (column, waypoint) in enumerate(pairs):
             difference[row, (waypoint - 1) * (self.n + 1) + column] = 1.0
             difference[row, (waypoint - 2) * (self.n + 1) + column] = -1.0
-        self.g = ca.vertcat(self.g, difference @ self.x)
-        self.jacobian = ca.vertcat(self.jacobian, difference)
-        both = ca.MX.sym("lam_g", self.rows + len(pairs))
-        (self.hessian,) = ca.substitute([self.hessian], [self.multipliers], [both[: self.rows]])
-        self.multipliers, self.rows = both, self.rows + len(pairs)
+        self._append(difference @ self.x, difference)
 
     def _terms(self) -> None:
         """Append the user's own constraints, and add their costs to the objective."""
@@ -222,11 +220,8 @@ class Transcription:
         self.term_rows = [{waypoint: self.rows + rows for waypoint, rows in at.items()} for at in part.at]
         outputs = [part.values, part.jacobian, part.cost, part.gradient]
         self.term_values = ca.Function("terms", [self.x, self.start, self.dt], outputs)
-        self.g, self.jacobian = ca.vertcat(self.g, part.values), ca.vertcat(self.jacobian, part.jacobian)
-        both = ca.MX.sym("lam_g", self.rows + part.rows)
-        (hessian,) = ca.substitute([self.hessian], [self.multipliers], [both[: self.rows]])
-        self.hessian = hessian + part.hessian(both[self.rows :])
-        self.multipliers, self.rows = both, self.rows + part.rows
+        multipliers = self._append(part.values, part.jacobian)
+        self.hessian = self.hessian + part.hessian(multipliers)
         self.f, self.gradient = self.f + part.cost, self.gradient + part.gradient
         self.objective_curvature = self.objective_curvature + part.cost_hessian
 

@@ -69,9 +69,8 @@ class Samples:
                     self.check_frame(phase.by[owner], field.replace("held", "by"))
                 for name in attachments[attachment].coordinates:
                     if f"{owner}.{name}" not in names:
-                        raise InputError(
-                            "this grasp's coordinate is missing", field="trajectory.names", expected=f"{owner}.{name}"
-                        )
+                        problem = "this grasp's coordinate is missing"
+                        raise InputError(problem, field="trajectory.names", expected=f"{owner}.{name}")
 
     def check_frame(self, frame: str, field: str) -> None:
         """Check that "<object>.<link>" exists. Raises `UnknownNameError` if it does not."""

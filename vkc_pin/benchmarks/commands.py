@@ -42,12 +42,12 @@ def add_bench(commands: Any) -> None:
     about = "Compare planning base and arm together with planning them apart, at a door and a drawer, from random starts."
     baselines = benches.add_parser("baselines", help="base and arm together or apart, at a door and a drawer", description=about)
     _add_comparison_options(baselines, "door drawer (default: both)")
-    baselines.set_defaults(run=_bench_baselines)
+    baselines.set_defaults(run=_bench_comparison, experiment="baselines")
     about = "Compare planning base and arm together with planning them apart, at six tasks in a home, from random starts."
     household = benches.add_parser("household", help="base and arm together or apart, at six tasks in a home", description=about)
     some = "cup door drawer dishwasher refrigerator cabinet (default: all)"
     _add_comparison_options(household, some, trials=20)
-    household.set_defaults(run=_bench_household)
+    household.set_defaults(run=_bench_comparison, experiment="household")
     about = "Plan two chores, of eighteen and of ten steps, each in one call, from random starts."
     chores = benches.add_parser("chores", help="chores of many steps, in a home and in an arena", description=about)
     _add_experiment_options(chores, "--trials", default=5, jobs=1)
@@ -106,20 +106,11 @@ def _bench_initialization(arguments: argparse.Namespace) -> int:
     )
 
 
-def _bench_baselines(arguments: argparse.Namespace) -> int:
-    from vkc_pin.benchmarks import baselines
-
-    return _comparison(arguments, baselines)
-
-
-def _bench_household(arguments: argparse.Namespace) -> int:
-    from vkc_pin.benchmarks import household
-
-    return _comparison(arguments, household)
-
-
-def _comparison(arguments: argparse.Namespace, experiment: Any) -> int:
+def _bench_comparison(arguments: argparse.Namespace) -> int:
     """Run an experiment that compares methods at tasks."""
+    from vkc_pin.benchmarks import baselines, household
+
+    experiment: Any = baselines if arguments.experiment == "baselines" else household
     return _experiment(
         arguments,
         experiment.run,
@@ -156,15 +147,13 @@ def _experiment(arguments: argparse.Namespace, run: Callable[..., Any], **settin
     return EXIT_OK
 
 
+def natural(text: str, least: int = 0) -> int:
+    """Return a whole number of at least 0, or what is the least."""
+    if not text.isdigit() or int(text) < least:
+        raise argparse.ArgumentTypeError(f"expected a whole number of at least {least}, got {text!r}")
+    return int(text)
+
+
 def positive(text: str) -> int:
     """Return a whole number of at least 1."""
-    if not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"expected a whole number of at least 1, got {text!r}")
-    return int(text)
-
-
-def natural(text: str) -> int:
-    """Return a whole number of at least 0."""
-    if not text.isdigit():
-        raise argparse.ArgumentTypeError(f"expected a whole number of at least 0, got {text!r}")
-    return int(text)
+    return natural(text, least=1)

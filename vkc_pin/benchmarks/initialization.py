@@ -62,18 +62,9 @@ def specify(*, starts: int, repeats: int, seed: int, scenes: Sequence[str], meth
             base = loaded.sample_start(rng).start[:3].tolist()
             for repeat in range(repeats):
                 for method in (*methods, *([STEPWISE] if "auto" in methods and repeat == 0 else [])):
-                    trials.append(
-                        {
-                            "key": f"{scene}/{start:04d}/{repeat:03d}/{method}",
-                            "scene": scene,
-                            "method": method,
-                            "number": start,
-                            "repeat": repeat,
-                            "base": base,
-                            "seed": seed + repeat,
-                            "perturbation": PERTURBATION if repeat else 0.0,
-                        }
-                    )
+                    key = f"{scene}/{start:04d}/{repeat:03d}/{method}"
+                    spec = {"key": key, "scene": scene, "method": method, "number": start, "repeat": repeat, "base": base}
+                    trials.append({**spec, "seed": seed + repeat, "perturbation": PERTURBATION if repeat else 0.0})
     return trials
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vkc_pin.benchmarks.harness import runner
-from vkc_pin.benchmarks.harness.record import distribution, trial
+from vkc_pin.benchmarks.harness.record import Record, distribution, trial
 from vkc_pin.benchmarks.harness.tables import TIMES, decimal, foot, markdown, quartiles
 from vkc_pin.errors import InputError
 from vkc_pin.files.writing import write_atomically
@@ -143,7 +143,7 @@ def report(result: Mapping[str, Any]) -> str:
     return "\n\n".join([*parts, foot(about)]) + "\n"
 
 
-def scale_chart(records: Sequence[Mapping[str, Any]], path: str | Path | None, *, title: str = "") -> Figure:
+def scale_chart(records: Sequence[Record], path: str | Path | None, *, title: str = "") -> Figure:
     """Draw planning time against the number of obstacles, and what it is spent on: medians, and quartiles of the whole.
 
     Args:

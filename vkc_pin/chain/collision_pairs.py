@@ -1,4 +1,4 @@
-"""Who can hit whom in each phase of a task, and how close they may come."""
+"""Who can hit whom in each phase of a task, and how close they may come: the pairs of eqs. 6 and 7."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Signed distances of collision pairs (coal) and witness planes.
+"""Signed distances of collision pairs (coal) and witness planes: the clearances of eqs. 6 and 7, linearised.
 
 For a pair (A, B) coal gives the witness points a, b and the normal n of the signed distance d = n·(b − a). With a
 fixed in A's body, b in B's and n in the world, n·(b(z) − a(z)) is smooth in z, and its value and gradient equal the
@@ -197,6 +197,11 @@ class ContactModel:
 
         C·vec(M(z)) − R ≥ 0 says that a contact keeps its margin; M are the placements of all joints (see `cpin`). Slots
         that nothing needs have C = 0, R = −1.
+
+        Args:
+            z: Configurations, shape (W, n).
+            contacts: What is close there.
+            slots: How many planes a configuration has; contacts beyond these are left out.
         """
         joints = self.chain.model.njoints - 1
         coefficients = np.zeros((len(z), slots, joints, 4, 3))  # per joint the columns of R, then t

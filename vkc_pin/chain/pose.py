@@ -1,4 +1,4 @@
-"""Residuals between placements, symbolically.
+"""Residuals between placements, symbolically: h_chain of eq. 2 and f_task of eq. 3.
 
 Three kinds of goal: "pose" is a whole placement; "point" only its translation; "upright" the translation, and the world's
 vertical as the target has it, at any heading.

@@ -7,7 +7,6 @@ another package, are read by coal.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -116,7 +115,9 @@ def convex_hull(points: ArrayLike) -> coal.Convex:
         raise InputError("the mesh has no convex hull: it is flat", expected="points that span a volume") from error
     if np.bincount(np.asarray(hull.faces).ravel()).max() > _NEIGHBOURS:  # the tip of a finely meshed cone, a fine disc
         hull = outer_hull(hull.vertices, vertices=60)
-    shape = coal.Convex(_points(hull.vertices), _triangles(hull.faces))
+    triangles = coal.StdVec_Triangle()
+    triangles.extend(coal.Triangle(*face) for face in np.asarray(hull.faces).tolist())
+    shape = coal.Convex(_points(hull.vertices), triangles)
     corners = np.asarray(shape.points())[indices(shape)]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2.0
     for what, held, wanted in (("volume", shape.computeVolume(), hull.volume), ("area", area, hull.area)):
@@ -202,13 +203,6 @@ def _points(points: ArrayLike) -> Any:
     vector = coal.StdVec_Vec3s()
     for point in np.asarray(points, float):
         vector.append(point)
-    return vector
-
-
-def _triangles(faces: Iterable[Sequence[int]]) -> Any:
-    vector = coal.StdVec_Triangle()
-    for face in faces:
-        vector.append(coal.Triangle(int(face[0]), int(face[1]), int(face[2])))
     return vector
 
 

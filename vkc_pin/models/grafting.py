@@ -82,7 +82,14 @@ def graft(model: pin.Model, tree: pin.Model, *, parent: int, placement: pin.SE3,
 def graft_geometry(
     geometry: pin.GeometryModel, objects: Iterable[pin.GeometryObject], *, joints: list[int], placement: pin.SE3, prefix: str = ""
 ) -> list[int]:
-    """Add copies of `objects` to `geometry`, their parent joints mapped by `joints` (see `graft`).
+    """Add copies of `objects` to `geometry`, their parent joints mapped.
+
+    Args:
+        geometry: Changed in place.
+        objects: The geometry of a tree that was grafted.
+        joints: For each joint of the tree its index in the model; see `graft`.
+        placement: Of the tree's universe frame in the frame of `joints[0]`.
+        prefix: Put before every name.
 
     Returns:
         The indices of the copies in `geometry`.

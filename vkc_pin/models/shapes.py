@@ -96,7 +96,7 @@ def clearance(
 def shape_distance(
     first: coal.CollisionGeometry, first_placement: pin.SE3, second: coal.CollisionGeometry, second_placement: pin.SE3
 ) -> float:
-    """Return the signed distance [m] between two shapes at placements in one frame."""
+    """Return the signed distance [m] between two shapes, each at its placement in a common frame; negative: they overlap."""
     a, b = (coal.Transform3s(where.rotation, where.translation) for where in (first_placement, second_placement))
     return float(coal.distance(first, a, second, b, coal.DistanceRequest(), coal.DistanceResult()))
 

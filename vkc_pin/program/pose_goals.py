@@ -14,7 +14,7 @@ from vkc_pin.options import Options
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.phases import Task
 
-__all__ = ["PoseGoal", "approach_at", "pose_goals"]
+__all__ = ["PoseGoal", "approach_at", "chosen_freedoms", "pose_goals"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,3 +86,24 @@ def pose_goals(scene: Scene, chain: VirtualKinematicChain, task: Task, options: 
 def approach_at(first: int, last: int, options: Options) -> int:
     """Return the waypoint from which a hand goes straight to a grasp, in a phase from waypoint `first` to `last`."""
     return max(first + 1, last - options.approach_waypoints)
+
+
+def chosen_freedoms(scene: Scene, chain: VirtualKinematicChain, task: Task) -> tuple[tuple[int, int, int], ...]:
+    """Return column, waypoint of the grasp and last waypoint of the hold, for every freedom that is chosen when a hand clamps.
+
+    Args:
+        scene: Whose objects they are.
+        chain: The chain.
+        task: What is held when.
+    """
+    found, ends = [], np.cumsum([phase.segments for phase in task.phases])
+    for hold, names in chain.virtual.items():
+        attachment = scene.objects[hold.object].object.attachments[hold.attachment]
+        for number, phase in enumerate(task.phases):
+            if not attachment.firm or hold not in phase.grasps:
+                continue
+            last = number
+            while last + 1 < len(task.phases) and hold in task.phases[last + 1].held:
+                last += 1
+            found += [(chain.index(name), int(ends[number]), int(ends[last])) for name in names]
+    return tuple(found)

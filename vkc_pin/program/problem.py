@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from functools import cached_property
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from vkc_pin.chain.contacts import ContactModel, Contacts
 from vkc_pin.chain.pose import ROW_BOUNDS, target_vector
 from vkc_pin.models.coordinates import wrapped
 from vkc_pin.options import Options
-from vkc_pin.program.pose_goals import pose_goals
+from vkc_pin.program.pose_goals import chosen_freedoms, pose_goals
 from vkc_pin.program.term_places import TermNumbers, term_goals
 from vkc_pin.program.term_rows import TermRow
 from vkc_pin.program.timing import Timing, runs_between, time_for
@@ -43,6 +42,7 @@ class TrajectoryProblem:
         lower, upper: Bounds of z_1..z_N, shape (N, n): joint limits (eq. 4), what stands still, joint goals.
         pose_goals: Which frames must be where (eqs. 2 and 3), one per `transcription.structure.poses`.
         targets: Their placements.
+        choices: What is chosen when a hand clamps: column, waypoint of the grasp and last waypoint of the hold.
         terms: The user's own constraints and costs that count here, one per `transcription.structure.terms`.
         term_numbers: Their values along a motion.
     """
@@ -53,6 +53,7 @@ class TrajectoryProblem:
         self.contacts = ContactModel(scene, self.chain, task, options)
         self.ends = np.cumsum([phase.segments for phase in task.phases])
         self.pose_goals = pose_goals(scene, self.chain, task, options)
+        self.choices = chosen_freedoms(scene, self.chain, task)
         self.targets = tuple(goal.target for goal in self.pose_goals)
         rows, self.terms = term_goals(scene, self.chain, task, terms)
         self.transcription = transcribe(self._structure(rows))
@@ -80,6 +81,7 @@ class TrajectoryProblem:
         return np.tile(self.start, (self.segments, 1))
 
     def _structure(self, terms: tuple[TermRow, ...]) -> Structure:
+        """Return what the symbolic program depends on: the weights of eq. 1, the frames of eqs. 2 and 3, stops and firm holds."""
         o, robot = self.options, self.chain.robot.coordinates.size
         weights = np.full(self.chain.size, o.velocity_weight_object)
         weights[:robot], weights[:2] = o.velocity_weight_arm, o.velocity_weight_base
@@ -112,21 +114,6 @@ class TrajectoryProblem:
             terms=terms,
         )
 
-    @cached_property
-    def choices(self) -> tuple[tuple[int, int, int], ...]:
-        """Column, waypoint of the grasp and last waypoint of the hold, for what is chosen when a hand clamps."""
-        found = []
-        for hold, names in self.chain.virtual.items():
-            attachment = self.scene.objects[hold.object].object.attachments[hold.attachment]
-            for number, phase in enumerate(self.task.phases):
-                if not attachment.firm or hold not in phase.grasps:
-                    continue
-                last = number
-                while last + 1 < len(self.task.phases) and hold in self.task.phases[last + 1].held:
-                    last += 1
-                found += [(self.chain.index(name), int(self.ends[number]), int(self.ends[last])) for name in names]
-        return tuple(found)
-
     def _start(self) -> Floats:
         start = np.zeros(self.chain.size)
         start[: len(self.scene.start)] = self.scene.start
@@ -139,6 +126,7 @@ class TrajectoryProblem:
         return start
 
     def _bounds(self) -> tuple[Floats, Floats]:
+        """Return the joint limits (eq. 4) at every waypoint, narrowed to what the phases and firm holds ask for."""
         lower, upper = np.tile(self.chain.lower, (self.segments, 1)), np.tile(self.chain.upper, (self.segments, 1))
         for column, name in enumerate(self.chain.names[:3]):
             lower[:, column], upper[:, column] = self.limits(name)
@@ -220,7 +208,7 @@ class TrajectoryProblem:
         return float(efforts) + self.term_numbers.cost(z, dt)
 
     def pose_error(self, z: Floats) -> float:
-        """Return the largest residual of closure, goals and rolling, [m] or [rad], at z_1..z_N, shape (N, n)."""
+        """Return the largest residual of closure (eq. 2), goals (eq. 3) and rolling, [m] or [rad], at z_1..z_N, shape (N, n)."""
         errors = [0.0]
         for goal, solver in zip(self.pose_goals, self.transcription.pose_solvers, strict=True):
             if goal.row.waypoints:

@@ -21,7 +21,14 @@ def unit(rows: int, columns: int, index: int) -> ca.DM:
 
 
 def assemble(parts: list[ca.MX], at: list[Ints], rows: int, columns: int) -> ca.MX:
-    """Return the sparse matrix whose nonzeros are `parts`, one after another, at (row, column) `at`; what meets is added up."""
+    """Return the sparse matrix whose nonzeros are `parts`, one after another, at (row, column) `at`; what meets is added up.
+
+    Args:
+        parts: Columns of nonzeros.
+        at: For each of these, rows and columns, shape (2, number of nonzeros).
+        rows: Number of rows of the matrix.
+        columns: Number of its columns.
+    """
     where = np.concatenate(at, axis=1)
     order = np.lexsort((where[0], where[1]))
     values = ca.vertcat(*parts)

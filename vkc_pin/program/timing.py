@@ -70,6 +70,12 @@ def time_for(path: Floats, dt: float, runs: Runs, limits: tuple[Floats, Floats])
 
     The measure is the profile 3s² − 2s³ over the distance that each coordinate moves between two stops: its speed is at most 1.5
     times the mean, its acceleration 6 times the distance over the square of the duration.
+
+    Args:
+        path: The waypoints, the start first.
+        dt: The shortest time of a step [s].
+        runs: See `runs_between`.
+        limits: Of velocity and acceleration (eq. 5), shape (n,) each, SI units.
     """
     velocity, acceleration = limits
     steps = np.abs(np.diff(path, axis=0))

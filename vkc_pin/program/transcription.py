@@ -135,6 +135,7 @@ class Transcription:
         return ca.DM(self.start_first**2 @ v + a * (self.start_second @ self.start_second))
 
     def _constraints(self) -> None:
+        """Make the rows of eqs. 2, 3, 6 and 7, waypoint by waypoint, their Jacobian and the Hessian of λᵀ·rows."""
         n, N, K = self.n, self.segments, self.slots
         poses_at: list[tuple[int, ...]] = [() for _ in range(N)]
         for index, pose in enumerate(self.structure.poses):
@@ -226,6 +227,7 @@ class Transcription:
         self.objective_curvature = self.objective_curvature + part.cost_hessian
 
     def _rates(self) -> None:
+        """Make the matrices of eq. 5: velocities and accelerations per step."""
         n = self.n
         select, identity = ca.horzcat(ca.DM.eye(n), ca.DM(n, 1)), ca.DM.eye(n)  # leaves the slack out
         self.rate_matrix = ca.vertcat(*(ca.kron(sparse(part), select) for part in (self.first, self.second)))

@@ -1,4 +1,4 @@
-"""The constraint rows of one waypoint, as SX functions: small, exact to second order, mapped over the waypoints."""
+"""The constraint rows of one waypoint (eqs. 2, 3, 6 and 7): SX functions, small, exact to second order, mapped over waypoints."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ class Solids:
         self.half = np.array([half for _, half in boxes]).reshape(-1, 3)
         obstacles = slice(self.bodies, None)
         self._obstacle_corners = self._corners([shape.placement for shape in world.shapes[obstacles]], obstacles)
-        self._obstacle_transforms: dict[int, coal.Transform3s] = {}
+        self._obstacle_transforms = [_transform(shape.placement) for shape in world.shapes[obstacles]]
         self._geometries = [shape.geometry for shape in world.shapes]
         self._data = world.model.createData()
         self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
@@ -67,15 +67,12 @@ class Solids:
 
     def obstacle_transform(self, shape: int) -> coal.Transform3s:
         """Return where an obstacle is, for coal."""
-        known = self._obstacle_transforms.get(shape)
-        if known is None:
-            known = self._obstacle_transforms[shape] = _transform(self.world.shapes[shape].placement)
-        return known
+        return self._obstacle_transforms[shape - self.bodies]
 
     def distance(
         self, first: int | coal.CollisionGeometry, here: coal.Transform3s, second: int, there: coal.Transform3s
     ) -> float:
-        """Return coal's signed distance of two shapes, or of anything else and a shape [m].
+        """Return coal's signed distance [m] of two shapes, or of any other and a shape, placed `here` and `there` in the world.
 
         Nothing is kept from one distance to the next, which would change its last digits.
         """
@@ -112,12 +109,10 @@ class Placed:
 
     def distance(self, first: int, second: int) -> float:
         """Return coal's signed distance of two shapes [m]."""
-        key = (first, second)
-        known = self._known.get(key)
-        if known is None:
+        if (first, second) not in self._known:
             here, there = self._transform(first), self._transform(second)
-            known = self._known[key] = self._solids.distance(first, here, second, there)
-        return known
+            self._known[first, second] = self._solids.distance(first, here, second, there)
+        return self._known[first, second]
 
     def distances(self, pairs: Ints) -> Floats:
         """Return coal's signed distances of pairs, shape (n, 2), shape (n,) [m]."""
@@ -145,10 +140,9 @@ class Placed:
     def _transform(self, shape: int) -> coal.Transform3s:
         if shape >= self._solids.bodies:
             return self._solids.obstacle_transform(shape)
-        known = self._transforms.get(shape)
-        if known is None:
-            known = self._transforms[shape] = _transform(self._where[shape])
-        return known
+        if shape not in self._transforms:
+            self._transforms[shape] = _transform(self._where[shape])
+        return self._transforms[shape]
 
 
 def _transform(placement: pin.SE3) -> coal.Transform3s:

@@ -150,7 +150,11 @@ class Samples:
     def grasp_errors(self, owner: str, name: str, rows: Ints, by: str | None = None) -> Floats:
         """Return how far the tool is from where attachment `name` has it, at some samples, shape (K, 2): [m] and [rad].
 
-        `by` is the frame that takes the tool's place, "<object>.<link>".
+        Args:
+            owner: The object.
+            name: Of one of its attachments.
+            rows: Which samples, shape (K,).
+            by: The frame that takes the tool's place, "<object>.<link>".
         """
         attachment = self.scene.objects[owner].object.attachments[name]
         tools = self.placements(rows, by or self.scene.robot.tool_frame)

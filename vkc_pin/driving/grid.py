@@ -198,7 +198,7 @@ class BaseGrid:
     def distances(self, start: ArrayLike) -> Floats:
         """Return how far the base drives at least from a place [m] to every cell, shape (cells, cells) [m]; infinite: no path.
 
-        Turns are free, and only what surely blocks the base is in the way.
+        Turns are free, and only what surely blocks the base counts.
         """
         return self.distances_from(np.asarray(start, float)[None, :2])[0]
 

@@ -1,7 +1,7 @@
 """A* for the mobile base over cells and headings.
 
 A move is asked for only when the search is about to take it. The heuristic is what the path from the start costs, with headings
-and turns, if nothing were in the way but what is known to be blocked; SciPy finds it for all cells and headings at once. It is
+and turns, if nothing blocked it but what is known to; SciPy finds it for all cells and headings at once. It is
 admissible and consistent, since what turns out to be blocked only makes paths longer. After surprises it is found again, with
 what has been learned.
 """
@@ -103,7 +103,7 @@ class _Round:
         self._look()
 
     def _look(self) -> None:
-        """Find the cost from the start to every node if nothing is in the way but what is known to be blocked."""
+        """Find the cost from the start to every node if nothing blocks the base but what is known to."""
         from scipy.sparse import csr_array
         from scipy.sparse.csgraph import dijkstra
 

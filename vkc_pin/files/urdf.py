@@ -22,7 +22,7 @@ from vkc_pin.files.meshes import MeshPart, load_convex, load_mesh, to_bvh
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["Shape", "UrdfFile", "UrdfTree", "load_urdf", "read_urdf"]
+__all__ = ["UrdfFile", "UrdfShape", "UrdfTree", "load_urdf", "read_urdf"]
 
 Colour = tuple[float, float, float, float]
 _LIGHT_GREY: Colour = (0.9, 0.9, 0.9, 1.0)
@@ -30,7 +30,7 @@ _JOINTS = ("revolute", "continuous", "prismatic", "fixed")
 
 
 @dataclass(frozen=True)
-class Shape:
+class UrdfShape:
     """One <visual> or <collision> element.
 
     Attributes:
@@ -101,7 +101,7 @@ class UrdfFile:
         """The names of the links, in the file's order."""
         return tuple(link.get("name", "") for link in self.root.findall("link"))
 
-    def shapes(self, kind: str) -> list[Shape]:
+    def shapes(self, kind: str) -> list[UrdfShape]:
         """Return all elements of `kind`, "visual" or "collision".
 
         Raises:
@@ -143,7 +143,7 @@ class UrdfFile:
             "there is no such mesh", file=self.path, field=address, expected="a mesh file", got=f"nothing at {tried}"
         )
 
-    def _shape(self, link: str, name: str, element: ElementTree.Element, colours: Mapping[str, Colour]) -> Shape:
+    def _shape(self, link: str, name: str, element: ElementTree.Element, colours: Mapping[str, Colour]) -> UrdfShape:
         geometry = element.find("geometry")
         shape = next(iter(geometry), None) if geometry is not None else None
         if shape is None:
@@ -157,7 +157,7 @@ class UrdfFile:
         colour = None if material is None else self._colour(material) or colours.get(material.get("name", ""))
         if shape.tag == "mesh":
             file, scale = self.resolve(shape.get("filename", "")), self._numbers(shape, "scale", 3, "1 1 1", name)
-            return Shape(link, name, placement, "mesh", scale, file=file, colour=colour)
+            return UrdfShape(link, name, placement, "mesh", scale, file=file, colour=colour)
         if shape.tag == "box":
             size = self._numbers(shape, "size", 3, None, name)
         elif shape.tag == "sphere":
@@ -169,7 +169,7 @@ class UrdfFile:
             raise InputError("this shape is not supported", file=self.path, field=name, expected=known, got=shape.tag)
         if min(size) <= 0.0:
             raise InputError("a shape without volume", file=self.path, field=name, expected="sizes above 0", got=size)
-        return Shape(link, name, placement, shape.tag, size, colour=colour)
+        return UrdfShape(link, name, placement, shape.tag, size, colour=colour)
 
     def _colour(self, material: ElementTree.Element) -> Colour | None:
         colour = material.find("color")
@@ -256,7 +256,7 @@ def _geometry(model: pin.Model, file: UrdfFile, kind: str) -> pin.GeometryModel:
     return geometry
 
 
-def _triangles(shape: Shape) -> coal.CollisionGeometry:
+def _triangles(shape: UrdfShape) -> coal.CollisionGeometry:
     assert shape.file is not None
     mesh = load_mesh(shape.file, shape.size)
     return to_bvh(MeshPart(np.asarray(mesh.vertices), np.asarray(mesh.faces)))

@@ -11,7 +11,7 @@ import pinocchio as pin
 
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
-from vkc_pin.files.urdf import Shape, UrdfFile
+from vkc_pin.files.urdf import UrdfFile, UrdfShape
 from vkc_pin.models.grafting import add_joint, clean
 
 __all__ = [
@@ -210,7 +210,7 @@ def _mimics(root: ElementTree.Element) -> dict[str, tuple[str, float, float]]:
 
 
 def _geometry_object(
-    model: pin.Model, shape: Shape, name: str, solid: coal.CollisionGeometry, colour: tuple[float, ...]
+    model: pin.Model, shape: UrdfShape, name: str, solid: coal.CollisionGeometry, colour: tuple[float, ...]
 ) -> pin.GeometryObject:
     """Return `solid` as the geometry of an element of the URDF, on the joint of its link."""
     frame = model.getFrameId(shape.link, pin.FrameType.BODY)

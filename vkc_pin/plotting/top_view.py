@@ -100,9 +100,9 @@ def _moments(trajectory: Trajectory) -> Floats:
     rows = trajectory.at(fine)
     objects = np.abs(np.diff(rows[:, trajectory.robot_size :], axis=0)).sum(axis=1)
     travel = np.hypot(*np.diff(rows[:, :2], axis=0).T) + 0.3 * np.abs(np.diff(rows[:, 2])) + 0.5 * objects
-    way = np.concatenate([[0.0], np.cumsum(travel)])
-    count = int(np.clip(np.ceil(way[-1] / _STEP), 1, 14))
-    return np.unique(np.interp(np.linspace(0.0, way[-1], count + 1), way, fine)) if way[-1] > 0.0 else fine[[0, -1]]
+    passed = np.concatenate([[0.0], np.cumsum(travel)])
+    count = int(np.clip(np.ceil(passed[-1] / _STEP), 1, 14))
+    return np.unique(np.interp(np.linspace(0.0, passed[-1], count + 1), passed, fine)) if passed[-1] > 0.0 else fine[[0, -1]]
 
 
 def _corners(world: World, index: int, joint: Floats, known: dict[int, Floats]) -> Floats:

@@ -35,8 +35,8 @@ def choose_viewpoint(points: Floats, boxes: Sequence[tuple[Floats, Floats, float
     """Return a camera for a motion.
 
     Args:
-        points: Where things happen, shape (n, 3) [m]; all of them get into the picture.
-        boxes: What may stand in the way: lower corner, upper corner, shape (3,) each [m], and opacity from 0 to 1.
+        points: Where the motion is, shape (n, 3) [m]; all of them get into the picture.
+        boxes: What may hide it: lower corner, upper corner, shape (3,) each [m], and opacity from 0 to 1.
     """
     lower, upper = points.min(axis=0), points.max(axis=0)
     target = (lower + upper) / 2.0

@@ -37,7 +37,7 @@ class Pulling:
 
     def refined(self, z: np.ndarray | None = None, wanted: np.ndarray | None = None) -> tuple[np.ndarray, bool]:
         start, near = self.z if z is None else z, self.z if wanted is None else wanted
-        return refined(self.problem, self.knots, start, near, self.waypoint, self.columns)
+        return refined(self.problem, self.knots, start, wanted=near, waypoint=self.waypoint, columns=self.columns)
 
     def spare(self, z: np.ndarray) -> float:
         return spare(self.scene, z, slide=z[SLIDE], held=True)
@@ -136,7 +136,7 @@ def test_out_of_reach() -> None:
 def test_where_nothing_must_hold() -> None:
     problem = program_of(drawer_scene(), [vkc.Grasp("drawer")])
     knots = Knots(problem, np.random.default_rng(0))
-    z, closed = refined(problem, knots, problem.start, problem.start, 1, np.arange(3, 9))
+    z, closed = refined(problem, knots, problem.start, wanted=problem.start, waypoint=1, columns=np.arange(3, 9))
     assert closed
     np.testing.assert_array_equal(z, problem.start)
 

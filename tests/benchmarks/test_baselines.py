@@ -357,7 +357,7 @@ def test_misuse(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError, match=r"there is no method 'B3'.*B1"):
         run(tmp_path, methods=["B3"])
     for nothing in ("tasks", "methods"):
-        with pytest.raises(InputError, match=f"{nothing}: nothing to compare"):
+        with pytest.raises(InputError, match=f"{nothing}: there is nothing to run"):
             run(tmp_path, **{nothing: []})
     with pytest.raises(InputError, match=r"trials: out of range.*at least 1.*got 0"):
         run(tmp_path, trials=0)

@@ -62,7 +62,7 @@ def test_every_trial_is_on_record(tmp_path: Path) -> None:
 def test_unknown_chores_are_named(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError, match="did you mean 'fetch'"):
         chores.run(trials=1, seed=0, out=tmp_path, chores=("fetsh",))
-    with pytest.raises(InputError, match="chores: nothing to plan"):
+    with pytest.raises(InputError, match="chores: there is nothing to run"):
         chores.run(trials=1, seed=0, out=tmp_path, chores=())
 
 

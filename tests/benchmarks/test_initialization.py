@@ -194,6 +194,6 @@ def test_names_that_do_not_exist(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError, match="init_1"):
         run(tmp_path, scenes=["door"], solve=initialization.plan_trial)  # there is no stick
     for nothing in ("scenes", "methods"):
-        with pytest.raises(InputError, match=f"{nothing}: nothing to compare"):
+        with pytest.raises(InputError, match=f"{nothing}: there is nothing to run"):
             run(tmp_path, **{nothing: []})
     assert not list(tmp_path.iterdir())

@@ -18,7 +18,7 @@ from vkc_pin.cli import main
 from vkc_pin.errors import InputError
 from vkc_pin.validation.report import Report, Violation
 
-BLAME = Violation("penetration", "forearm_link – thing_7", waypoint=3, time=1.0, amount=0.01, unit="m", detail="overlap by 10 mm")
+BLAME = Violation("penetration", "forearm_link – box_7", waypoint=3, time=1.0, amount=0.01, unit="m", detail="overlap by 10 mm")
 TIMES = {"initialization": 0.3, "coal": 0.1, "casadi": 0.2, "ipopt": 0.15, "validation": 0.05}
 
 

@@ -199,7 +199,7 @@ def test_every_object_is_closed_while_it_is_held_and_goals_are_met_at_the_end(tw
     assert targets["closure drawer"] == two_grasps.scene.objects["drawer"].placement
     assert two_grasps.targets[-1] == POSE
     assert two_grasps.target_matrix().shape == (5, 12)
-    assert two_grasps.transcription.structure.rests == (first, second, third)
+    assert two_grasps.transcription.structure.stops == (first, second, third)
 
 
 def test_what_is_held_at_the_start_is_closed_from_the_first_waypoint() -> None:
@@ -207,7 +207,7 @@ def test_what_is_held_at_the_start_is_closed_from_the_first_waypoint() -> None:
     problem = program_of(scene, [Actuate("door", {"knob": 0.3})], options=SHORT)
     assert [phase.held for phase in problem.task.phases] == [(HANDLE,)]
     assert problem.transcription.structure.poses[0].waypoints == tuple(range(1, MOVE + 1))
-    assert problem.transcription.structure.rests == ()
+    assert problem.transcription.structure.stops == ()
 
 
 def test_a_frame_of_the_robot_can_reach_too() -> None:
@@ -317,7 +317,7 @@ def test_free_objects_are_grasped_where_they_stand_and_closed_nowhere_else() -> 
         ("goal stick.stick", aside, (ends[2],), "pose"),
         ("approach stick.grip", aside, (ends[4] - way,), "pose"),
     ]
-    assert problem.transcription.structure.rests == (ends[0], ends[2])
+    assert problem.transcription.structure.stops == (ends[0], ends[2])
     assert not any(problem.closed(phase) for phase in problem.task.phases)
 
 
@@ -366,7 +366,7 @@ def test_rates_are_those_of_the_trajectory(two_grasps: TrajectoryProblem) -> Non
     trajectory = as_trajectory(two_grasps, z, np.full(two_grasps.segments, dt))
     steps, changes = two_grasps.rates(z)
     assert steps.shape == (two_grasps.segments, two_grasps.chain.size)
-    assert changes.shape == (two_grasps.segments + 1 + len(two_grasps.transcription.structure.rests), two_grasps.chain.size)
+    assert changes.shape == (two_grasps.segments + 1 + len(two_grasps.transcription.structure.stops), two_grasps.chain.size)
     velocities = trajectory.velocities()
     moving = np.isclose(np.diff(trajectory.times), dt)
     assert np.all(velocities[~moving] == 0.0)
@@ -409,7 +409,7 @@ def test_rate_violation_is_the_worst_excess(two_grasps: TrajectoryProblem, scale
 
 def runs(problem: TrajectoryProblem) -> list[slice]:
     """Return the steps between two rests."""
-    stops = [0, *problem.transcription.structure.rests, problem.segments]
+    stops = [0, *problem.transcription.structure.stops, problem.segments]
     return [slice(a, b) for a, b in itertools.pairwise(stops)]
 
 

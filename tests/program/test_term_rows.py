@@ -195,7 +195,7 @@ def test_derivatives_are_those_of_finite_differences(name: str) -> None:
     objective, constraints, lagrangian = (solver.get_function(f) for f in ("nlp_grad_f", "nlp_jac_g", "nlp_hess_l"))
     planes = rng.normal(size=(t.segments, t.slots, 12 * (p.chain.model.njoints - 1)))
     offsets = rng.normal(size=(t.segments, t.slots))
-    parameters = t.parameter_vector(p.start, planes, offsets, p.target_matrix(), PENALTY, times(p))
+    parameters = t.parameter_vector(p.start, planes, offsets, p.target_matrix(), penalty=PENALTY, dt=times(p))
     x = np.column_stack([random_path(p, 2)[1:], rng.uniform(size=p.segments)]).ravel()
     own, step, weight = p.term_numbers.rows, 1e-5, 0.7
     multipliers = np.zeros(t.rows)

@@ -73,7 +73,7 @@ class Point:
     @property
     def parameters(self) -> np.ndarray:
         p = self.problem
-        return p.transcription.parameter_vector(p.start, self.planes, self.offsets, p.target_matrix(), PENALTY)
+        return p.transcription.parameter_vector(p.start, self.planes, self.offsets, p.target_matrix(), penalty=PENALTY)
 
 
 def random_point(p: TrajectoryProblem, seed: int = 0) -> Point:

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats, Ints
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.knots import Knots
 
@@ -38,7 +38,7 @@ class ArmKinematics:
         self.columns = np.array([*range(3, knots.robot), *virtual], int)
         self._models: dict[int, pin.Model] = {}
 
-    def solve(self, z: NDArray[np.float64], waypoint: int) -> tuple[NDArray[np.float64], bool]:
+    def solve(self, z: Floats, waypoint: int) -> tuple[Floats, bool]:
         """Return the configuration that iterations from `z`, shape (n,), lead to, and whether it closes the chain there."""
         import pink
 
@@ -73,19 +73,17 @@ class ArmKinematics:
 class _Box:
     """A limit in Pink's sense: joint limits, no long steps, and everything but `columns` stays where it is."""
 
-    def __init__(
-        self, columns: NDArray[np.int_], lower: NDArray[np.float64], upper: NDArray[np.float64], z: NDArray[np.float64]
-    ) -> None:
+    def __init__(self, columns: Ints, lower: Floats, upper: Floats, z: Floats) -> None:
         self.columns, self.lower, self.upper, self.z = columns, lower, upper, z
         self._rows = np.vstack([np.eye(len(z)), -np.eye(len(z))])
 
-    def take(self, step: NDArray[np.float64]) -> None:
+    def take(self, step: Floats) -> None:
         """Go a step, shape (n,), without what the solver of quadratic programs leaves as rounding errors."""
         at, z = self.columns, self.z.copy()
         z[at] = np.clip(z[at] + step[at], self.lower[at], self.upper[at])
         self.z = z
 
-    def compute_qp_inequalities(self, configuration: Any, dt: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def compute_qp_inequalities(self, configuration: Any, dt: float) -> tuple[Floats, Floats]:
         """Return G and h of G·δz ≤ h, shapes (2n, n) and (2n,)."""
         most, least = np.zeros(len(self.z)), np.zeros(len(self.z))
         at = self.columns

@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.baselines.failure import FailedError
 from vkc_pin.baselines.following import follow
 from vkc_pin.baselines.paths import BasePaths, headings
@@ -124,10 +124,10 @@ class Attempt:
         poses = self._poses(self._problem(steps, scene=self.scene.with_held({})))
         self._drive_and_reach(steps, poses, _STANDS)
 
-    def _drive_and_reach(self, steps: Sequence[Step], poses: NDArray[np.float64], most: int) -> None:
+    def _drive_and_reach(self, steps: Sequence[Step], poses: Floats, most: int) -> None:
         """Drive to the first base poses of `poses`, shape (K, n), from where the arm then does its part; at most `most`."""
 
-        def at(pose: NDArray[np.float64]) -> None:
+        def at(pose: Floats) -> None:
             self._drive(pose[None, :3])
             self._reach(steps, pose)
 
@@ -139,15 +139,13 @@ class Attempt:
     def _withdrawn(self, stage: Callable[[], None], failure: FailedError) -> None:
         """Bring the arm to how it can be held while the base drives, with as little motion as will do, and go on with a stage."""
 
-        def held(path: NDArray[np.float64]) -> None:
+        def held(path: Floats) -> None:
             self._withdraw(path)
             stage()
 
         self._first(postures(self._problem([self._here()]), self.interrupt), held, failure)
 
-    def _first(
-        self, choices: Iterable[NDArray[np.float64]], stage: Callable[[NDArray[np.float64]], None], failure: FailedError
-    ) -> None:
+    def _first(self, choices: Iterable[Floats], stage: Callable[[Floats], None], failure: FailedError) -> None:
         """Do a stage with the first choice with which it works; if there is none, raise the failure that came furthest."""
         scene, before = self.scene, self.parts
         for choice in choices:
@@ -164,7 +162,7 @@ class Attempt:
                 self.scene, self.parts = scene, before
         raise failure
 
-    def _poses(self, problem: TrajectoryProblem) -> NDArray[np.float64]:
+    def _poses(self, problem: TrajectoryProblem) -> Floats:
         """Return configurations for the end of a problem, the nearest first."""
         began = time.perf_counter()
         poses = base_poses(problem, problem.segments, problem.start, self.rng, self.interrupt)
@@ -173,7 +171,7 @@ class Attempt:
             raise FailedError("no base pose")
         return poses
 
-    def _free(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _free(self, poses: Floats) -> Floats:
         """Return those whose base may stand there while the arm is still as it is."""
         stay = self._problem([self._here()])
         ends = np.tile(stay.start, (len(poses) + 1, 1))
@@ -181,7 +179,7 @@ class Attempt:
         depth = Knots(stay, self.rng).depth(ends, stay.segments)
         return np.asarray(poses[depth[:-1] <= min(depth[-1], CLOSE_ENOUGH)])  # the arm may be as close to the robot as it is
 
-    def _withdraw(self, path: NDArray[np.float64]) -> None:
+    def _withdraw(self, path: Floats) -> None:
         """Move the arm along configurations, shape (K, n), to the last of them, the base stands; nothing to do if K = 0."""
         if not len(path):
             return
@@ -191,7 +189,7 @@ class Attempt:
         seeds = [Seed("straight", through(problem, path[k:])) for k in (0, -1)[: len(path)]]  # along it, and directly
         self._take(problem, *self._solve(problem, iter(seeds), "arm does not reach"))
 
-    def _drive(self, goals: NDArray[np.float64]) -> None:
+    def _drive(self, goals: Floats) -> None:
         """Drive to where the base has to stand, or to one of several headings there, shape (G, 3), the arm as it is."""
         x, y, yaw = goals[0].tolist()
         problem = self._problem([GoTo(x, y, yaw if len(goals) == 1 else None)])
@@ -204,7 +202,7 @@ class Attempt:
         )
         self._take(problem, *self._solve(problem, seeds, "no base path"))
 
-    def _reach(self, steps: Sequence[Step], pose: NDArray[np.float64]) -> None:
+    def _reach(self, steps: Sequence[Step], pose: Floats) -> None:
         """Take hold of the object, or put it down, the base stands."""
         problem = _fixed(self._problem(steps), _BASE)
         last = np.append(problem.start[:3], pose[3:])
@@ -261,9 +259,7 @@ class Attempt:
         options, scene = options or self.options, scene or self.scene
         return TrajectoryProblem(scene, compile_task(scene, steps, options), options, cache=self.cache)
 
-    def _solve(
-        self, problem: TrajectoryProblem, seeds: Iterator[Seed], cause: str
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _solve(self, problem: TrajectoryProblem, seeds: Iterator[Seed], cause: str) -> tuple[Floats, Floats]:
         """Return the first solution from a seed: z_1..z_N, shape (N, n), and the time of every step, shape (N,) [s]."""
         failure = FailedError(cause)
         for seed in seeds:
@@ -280,7 +276,7 @@ class Attempt:
                 failure = FailedError(cause, as_trajectory(problem, solution.z, solution.dt))
         raise failure
 
-    def _take(self, problem: TrajectoryProblem, z: NDArray[np.float64], dt: NDArray[np.float64]) -> None:
+    def _take(self, problem: TrajectoryProblem, z: Floats, dt: Floats) -> None:
         """Append a motion, and go on from where it ends."""
         self.parts.append(as_trajectory(problem, z, dt))
         self.scene = scene_after(self.scene, self.parts[-1], problem.task.after)
@@ -290,7 +286,7 @@ class Attempt:
 
 
 def _fixed(
-    problem: TrajectoryProblem, columns: slice, values: NDArray[np.float64] | None = None, rows: slice | int = slice(None)
+    problem: TrajectoryProblem, columns: slice, values: Floats | None = None, rows: slice | int = slice(None)
 ) -> TrajectoryProblem:
     """Return a problem in which coordinates are at `values`, or else where they start, at some waypoints, by default all."""
     lower, upper = problem.lower.copy(), problem.upper.copy()

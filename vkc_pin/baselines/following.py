@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.baselines.arm_kinematics import ArmKinematics
 from vkc_pin.baselines.refining import CLEAR, refined
 from vkc_pin.interrupt import NEVER, Interrupt
@@ -31,18 +31,13 @@ class Followed:
         cause: "", "no inverse kinematics", "collision" if all there is is not free, or "interrupted".
     """
 
-    z: NDArray[np.float64]
+    z: Floats
     share: float
     cause: str
 
 
 def follow(
-    problem: TrajectoryProblem,
-    base: NDArray[np.float64],
-    rng: np.random.Generator,
-    *,
-    refine: bool,
-    interrupt: Interrupt = NEVER,
+    problem: TrajectoryProblem, base: Floats, rng: np.random.Generator, *, refine: bool, interrupt: Interrupt = NEVER
 ) -> Followed:
     """Find the arm for every waypoint from the one before.
 
@@ -79,7 +74,7 @@ class _Arm:
         self.problem, self.knots, self.refine = problem, knots, refine
         self.kinematics = ArmKinematics(problem, knots)
 
-    def at(self, z: NDArray[np.float64], waypoint: int) -> tuple[NDArray[np.float64], str]:
+    def at(self, z: Floats, waypoint: int) -> tuple[Floats, str]:
         """Return the free configuration nearest to `z`, shape (n,), or the nearest that is not, and what is wrong with it."""
         first, cause = self._candidate(z, waypoint)
         if not cause:
@@ -89,19 +84,19 @@ class _Arm:
         # The best kind, and of these the nearest.
         return min(found, key=lambda one: (_KINDS.index(one[1]), float(np.abs(one[0] - z).sum())))
 
-    def _candidate(self, z: NDArray[np.float64], waypoint: int) -> tuple[NDArray[np.float64], str]:
+    def _candidate(self, z: Floats, waypoint: int) -> tuple[Floats, str]:
         """Return what inverse kinematics, and refinement, lead to from `z`, and what is wrong with it."""
         found, closed = self.kinematics.solve(z, waypoint)
         if self.refine and not (closed and self._free(found, waypoint)):
-            found, closed = refined(self.problem, self.knots, found, z, waypoint, self.kinematics.columns)
+            found, closed = refined(self.problem, self.knots, found, wanted=z, waypoint=waypoint, columns=self.kinematics.columns)
         if not closed:
             return found, "no inverse kinematics"
         return found, "" if self._free(found, waypoint) else "collision"
 
-    def _free(self, z: NDArray[np.float64], waypoint: int) -> bool:
+    def _free(self, z: Floats, waypoint: int) -> bool:
         return bool(self.knots.depth(z[None], waypoint)[0] <= CLEAR)
 
-    def _seeds(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _seeds(self, z: Floats) -> Floats:
         """Return `z` with other arms, shape (SEEDS, n)."""
         columns, chain, rng = self.kinematics.columns, self.problem.chain, self.knots.rng
         lower, upper = np.maximum(chain.lower[columns], -np.pi), np.minimum(chain.upper[columns], np.pi)

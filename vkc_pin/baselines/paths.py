@@ -6,8 +6,8 @@ import functools
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.driving.grid import HEADINGS, BaseGrid, fine_cells
 from vkc_pin.driving.path import poses_along, shortest_path
 from vkc_pin.interrupt import NEVER, Interrupt
@@ -56,7 +56,7 @@ class BasePaths:
         """A grid of smaller cells, for narrow passages."""
         return self._finer()
 
-    def path(self, start: NDArray[np.float64], goals: NDArray[np.float64], steps: int) -> NDArray[np.float64] | None:
+    def path(self, start: Floats, goals: Floats, steps: int) -> Floats | None:
         """Return poses after the start, slow at both ends, the last at a goal, shape (steps, 3); None: there is no path.
 
         Args:
@@ -74,7 +74,7 @@ class BasePaths:
         found = find(self.grid) or find(self.finer)
         return None if found is None else poses_along(found, steps)
 
-    def along(self, problem: TrajectoryProblem, goal: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    def along(self, problem: TrajectoryProblem, goal: Floats) -> Floats | None:
         """Return the base at every waypoint, shape (N, 3): it stands while a latch is released; None: there is no path."""
         base = [problem.start[None, :3]]
         for phase in problem.task.phases:
@@ -85,7 +85,7 @@ class BasePaths:
             base.append(part)
         return np.concatenate(base[1:])
 
-    def seeds(self, problem: TrajectoryProblem, goals: NDArray[np.float64]) -> Iterator[Seed]:
+    def seeds(self, problem: TrajectoryProblem, goals: Floats) -> Iterator[Seed]:
         """Yield the path from a problem's start to one of `goals`, shape (G, 3), the arm at rest, if there is one."""
         path = self.path(problem.start[:3], goals, problem.segments)
         if path is not None:
@@ -94,7 +94,7 @@ class BasePaths:
             yield Seed("astar", problem.clip(z))
 
 
-def headings(step: GoTo, yaw: float) -> NDArray[np.float64]:
+def headings(step: GoTo, yaw: float) -> Floats:
     """Return the poses in which a step may end, shape (G, 3): one, or one per heading, those nearest to `yaw` [rad] first."""
     turns = np.linspace(0.0, 2.0 * np.pi, HEADINGS, endpoint=False) if step.yaw is None else np.array([step.yaw - yaw])
     turns = wrapped(turns)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.knots import SCATTER, Knots
@@ -18,12 +18,8 @@ TRIES = 20_000
 
 
 def base_poses(
-    problem: TrajectoryProblem,
-    waypoint: int,
-    near: NDArray[np.float64],
-    rng: np.random.Generator,
-    interrupt: Interrupt = NEVER,
-) -> NDArray[np.float64]:
+    problem: TrajectoryProblem, waypoint: int, near: Floats, rng: np.random.Generator, interrupt: Interrupt = NEVER
+) -> Floats:
     """Return configurations, the nearest first, that are what must hold at a waypoint and are free of collision.
 
     As in the code of Jiao et al. (IROS 2021): inverse kinematics of base and arm together from random seeds, up to `ENOUGH`
@@ -40,7 +36,7 @@ def base_poses(
         Configurations, shape (K, n); none if none is found.
     """
     knots = Knots(problem, rng)
-    found: list[NDArray[np.float64]] = []
+    found: list[Floats] = []
     for _ in range(-(-TRIES // SCATTER)):
         z, solved = knots.knot(np.tile(near, (SCATTER, 1)), waypoint, "scatter")
         z = z[solved]

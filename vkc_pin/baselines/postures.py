@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.approach import Approach
@@ -19,7 +19,7 @@ __all__ = ["at_home", "postures", "through"]
 _SAME = 1e-6  # [rad]
 
 
-def postures(problem: TrajectoryProblem, interrupt: Interrupt = NEVER) -> Iterator[NDArray[np.float64]]:
+def postures(problem: TrajectoryProblem, interrupt: Interrupt = NEVER) -> Iterator[Floats]:
     """Yield configurations, shape (n,), in which the base may drive away from where it is, and the ones that lead to them.
 
     Each is a path of the arm while the base stands, shape (K, n), and ends in what the base then drives in: nothing to do (K =
@@ -32,7 +32,7 @@ def postures(problem: TrajectoryProblem, interrupt: Interrupt = NEVER) -> Iterat
     """
     knots, robot = Knots(problem, np.random.default_rng(0)), problem.chain.robot  # nothing is drawn
 
-    def is_free(path: NDArray[np.float64]) -> bool:
+    def is_free(path: Floats) -> bool:
         end = path[-1:] if len(path) else problem.start[None]
         return bool(knots.depth(end, problem.segments)[0] <= CLOSE_ENOUGH)
 
@@ -54,7 +54,7 @@ def at_home(problem: TrajectoryProblem) -> bool:
     return bool(np.abs(problem.start[3 : robot.coordinates.size] - robot.home).max() < _SAME)
 
 
-def through(problem: TrajectoryProblem, path: NDArray[np.float64]) -> NDArray[np.float64]:
+def through(problem: TrajectoryProblem, path: Floats) -> Floats:
     """Return waypoints from a problem's start through configurations, shape (K, n), to the last of them, shape (N, n)."""
     knots = np.vstack([problem.start, path])
     lengths = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(knots, axis=0)).max(axis=1))])

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats, Ints
 from vkc_pin.baselines.arm_kinematics import QP
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.knots import Knots
@@ -24,13 +24,8 @@ _TOLERANCE = 1e-5  # [m] and [rad]
 
 
 def refined(
-    problem: TrajectoryProblem,
-    knots: Knots,
-    z: NDArray[np.float64],
-    wanted: NDArray[np.float64],
-    waypoint: int,
-    columns: NDArray[np.int_],
-) -> tuple[NDArray[np.float64], bool]:
+    problem: TrajectoryProblem, knots: Knots, z: Floats, *, wanted: Floats, waypoint: int, columns: Ints
+) -> tuple[Floats, bool]:
     """Return the configuration near `wanted` that rounds from `z` lead to, and whether the chain is closed there.
 
     Each round minimises Σ w (z − z*)² + slack over the arm, the freedoms of its grasps and the object's joints, so that the

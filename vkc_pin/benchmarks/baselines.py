@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from vkc_pin.benchmarks.comparison import COMPARED_PLANNERS, Assignment, Comparison
 from vkc_pin.benchmarks.harness.charts import criteria_chart
+from vkc_pin.benchmarks.harness.record import Record
 from vkc_pin.task.steps import Actuate
 
 __all__ = ["COMPARED_PLANNERS", "TASKS", "plan_trial", "run"]
@@ -18,7 +18,7 @@ TASKS = {
 }
 
 
-def _draw(records: Sequence[Mapping[str, Any]], out: Path, tasks: Mapping[str, str], methods: Sequence[str]) -> list[str]:
+def _draw(records: Sequence[Record], out: Path, tasks: Mapping[str, str], methods: Sequence[str]) -> list[str]:
     """Draw the criteria of every task as bars, <task>.png: success, efforts and planning time."""
     for task, name in tasks.items():
         own = [record for record in records if record["scene"] == task]

@@ -13,7 +13,6 @@ import numpy as np
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.record import distribution, trial
 from vkc_pin.benchmarks.harness.tables import decimal, failures, foot, markdown
-from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.files.writing import write_atomically
 from vkc_pin.planning.chore import plan_chore
 from vkc_pin.planning.plan import Plan
@@ -28,7 +27,7 @@ WINDOW = 2
 BAR_TABLE = (-3.0, 1.3, 1.051)  # [m], where the cup stands in between
 DESK = (1.75, 3.5, 0.741)
 CLEAR = (1.1, -2.9, 0.036)  # floor before the television
-BIN = (3.0, -3.6, 0.16)  # within its walls; from there things fall
+BIN = (3.0, -3.6, 0.16)  # within its walls; what is let go of there falls
 BEFORE_TABLE = (-0.9, 2.2, 0.036)  # floor before the low table
 SHELF = (-4.61, -1.0, 0.846)
 
@@ -114,12 +113,7 @@ def run(
         InputError: No chores, or `out` has trials of other settings.
         KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
     """
-    chores = tuple(dict.fromkeys(chores))
-    for name in chores:
-        if name not in CHORES:
-            raise UnknownNameError("chore", name, CHORES, field="chores")
-    if not chores:
-        raise InputError("nothing to plan", field="chores", expected="at least one")
+    chores = runner.chosen("chore", chores, CHORES)
     specs = []
     for chore in chores:
         scene = load_scene(CHORES[chore][0])

@@ -27,13 +27,14 @@ def add_bench(commands: Any) -> None:
     door.add_argument("--quiet", action="store_true", help="no progress bar")
     door.set_defaults(run=_bench_door)
     about = (
-        "Compare ways of initialising the trajectory in three scenes, from the same random starts, and plan step after step too."
+        "Compare initialisations of the trajectory in three scenes, from the same random starts, and plan step after step too."
     )
-    initialization = benches.add_parser("initialization", help="ways of initialising, at a task with a tool", description=about)
+    initialization = benches.add_parser(
+        "initialization", help="methods of initialising, at a task with a tool", description=about
+    )
     _add_experiment_options(initialization, "--starts")
-    initialization.add_argument(
-        "--repeats", type=positive, default=1, metavar="R", help="trials per start and method (default 1)"
-    )
+    about = "trials per start and method (default 1)"
+    initialization.add_argument("--repeats", type=positive, default=1, metavar="R", help=about)
     initialization.add_argument("--scenes", nargs="+", metavar="SCENE", help="some of init_1 init_2 init_3 (default: all)")
     some = "some of stationary interpolated astar auto (default: all)"
     initialization.add_argument("--methods", nargs="+", metavar="METHOD", help=some)
@@ -41,12 +42,12 @@ def add_bench(commands: Any) -> None:
     about = "Compare planning base and arm together with planning them apart, at a door and a drawer, from random starts."
     baselines = benches.add_parser("baselines", help="base and arm together or apart, at a door and a drawer", description=about)
     _add_comparison_options(baselines, "door drawer (default: both)")
-    baselines.set_defaults(run=_bench_baselines)
+    baselines.set_defaults(run=_bench_comparison, experiment="baselines")
     about = "Compare planning base and arm together with planning them apart, at six tasks in a home, from random starts."
     household = benches.add_parser("household", help="base and arm together or apart, at six tasks in a home", description=about)
     some = "cup door drawer dishwasher refrigerator cabinet (default: all)"
     _add_comparison_options(household, some, trials=20)
-    household.set_defaults(run=_bench_household)
+    household.set_defaults(run=_bench_comparison, experiment="household")
     about = "Plan two chores, of eighteen and of ten steps, each in one call, from random starts."
     chores = benches.add_parser("chores", help="chores of many steps, in a home and in an arena", description=about)
     _add_experiment_options(chores, "--trials", default=5, jobs=1)
@@ -105,20 +106,11 @@ def _bench_initialization(arguments: argparse.Namespace) -> int:
     )
 
 
-def _bench_baselines(arguments: argparse.Namespace) -> int:
-    from vkc_pin.benchmarks import baselines
-
-    return _comparison(arguments, baselines)
-
-
-def _bench_household(arguments: argparse.Namespace) -> int:
-    from vkc_pin.benchmarks import household
-
-    return _comparison(arguments, household)
-
-
-def _comparison(arguments: argparse.Namespace, experiment: Any) -> int:
+def _bench_comparison(arguments: argparse.Namespace) -> int:
     """Run an experiment that compares methods at tasks."""
+    from vkc_pin.benchmarks import baselines, household
+
+    experiment: Any = baselines if arguments.experiment == "baselines" else household
     return _experiment(
         arguments,
         experiment.run,
@@ -155,15 +147,13 @@ def _experiment(arguments: argparse.Namespace, run: Callable[..., Any], **settin
     return EXIT_OK
 
 
+def natural(text: str, least: int = 0) -> int:
+    """Return a whole number of at least 0, or what is the least."""
+    if not text.isdigit() or int(text) < least:
+        raise argparse.ArgumentTypeError(f"expected a whole number of at least {least}, got {text!r}")
+    return int(text)
+
+
 def positive(text: str) -> int:
     """Return a whole number of at least 1."""
-    if not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"expected a whole number of at least 1, got {text!r}")
-    return int(text)
-
-
-def natural(text: str) -> int:
-    """Return a whole number of at least 0."""
-    if not text.isdigit():
-        raise argparse.ArgumentTypeError(f"expected a whole number of at least 0, got {text!r}")
-    return int(text)
+    return natural(text, least=1)

@@ -18,8 +18,8 @@ from vkc_pin.baselines.separate import BASELINES, RETRIES, plan_separately
 from vkc_pin.benchmarks.comparison_report import report
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.charts import motions_chart
-from vkc_pin.benchmarks.harness.record import trial
-from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.benchmarks.harness.record import Record, trial
+from vkc_pin.errors import InputError
 from vkc_pin.files.writing import write_atomically
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.planning.plan import Plan
@@ -34,7 +34,7 @@ TIME_LIMIT = 20.0  # [s] of planning
 
 Solve = Callable[[Scene, Mapping[str, Any]], Plan]
 """What plans a trial: takes its scene and its specification."""
-Draw = Callable[[Sequence[Mapping[str, Any]], Path, Mapping[str, str], Sequence[str]], list[str]]
+Draw = Callable[[Sequence[Record], Path, Mapping[str, str], Sequence[str]], list[str]]
 """What draws an experiment's charts: takes records, folder, task → what is done in it, methods; returns them in Markdown."""
 
 
@@ -136,8 +136,8 @@ class Comparison:
             InputError: No trials, tasks or methods, or `out` has trials of other settings.
             KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
         """
-        tasks = _chosen("task", list(self.tasks) if tasks is None else tasks, list(self.tasks))
-        methods = _chosen("method", methods, COMPARED_PLANNERS)
+        tasks = runner.chosen("task", self.tasks if tasks is None else tasks, self.tasks)
+        methods = runner.chosen("method", methods, COMPARED_PLANNERS)
         if trials < 1:
             raise InputError("out of range", field="trials", expected="at least 1", got=trials)
         specs, out = self.specify(trials=trials, seed=seed, tasks=tasks, methods=methods), Path(out)
@@ -215,7 +215,7 @@ class _Trials:
         return trial(found, method=spec["method"], seed=spec["seed"], **own)
 
     def saved(
-        self, records: Sequence[Mapping[str, Any]], specs: Sequence[Mapping[str, Any]], *, again: bool, progress: bool
+        self, records: Sequence[Record], specs: Sequence[Mapping[str, Any]], *, again: bool, progress: bool
     ) -> dict[str, str]:
         """Return key → file of the failures whose plans are saved; with `again`, those that are not are planned again."""
         failed = {record["key"] for record in records if not record["success"] and record["status"] != "error"}
@@ -227,7 +227,7 @@ class _Trials:
                 found.save(files[spec["key"]])
         return {key: path.relative_to(self.out).as_posix() for key, path in files.items() if path.is_file()}
 
-    def motions(self, records: Sequence[Mapping[str, Any]], specs: Sequence[Mapping[str, Any]]) -> list[str]:
+    def motions(self, records: Sequence[Record], specs: Sequence[Mapping[str, Any]]) -> list[str]:
         """Draw the motions of one trial of every task in which a method succeeds in any; return the pictures in Markdown."""
         methods, pictures = tuple(dict.fromkeys(spec["method"] for spec in specs)), []
         for task in dict.fromkeys(spec["scene"] for spec in specs):
@@ -261,23 +261,13 @@ class _Trials:
         return self.out / folder / f"{spec['scene']}_{spec['number']:04d}_{spec['method']}.npz"
 
 
-def shown(records: Sequence[Mapping[str, Any]], methods: Sequence[str]) -> int | None:
+def shown(records: Sequence[Record], methods: Sequence[str]) -> int | None:
     """Return the first trial in which all methods succeed, or else VKC and most others, or else most; None: none ever does."""
     good: dict[int, set[str]] = {}
     for record in records:
         if record["success"]:
             good.setdefault(int(record["number"]), set()).add(str(record["method"]))
     return max(sorted(good), key=lambda k: (len(good[k]) == len(methods), "VKC" in good[k], len(good[k])), default=None)
-
-
-def _chosen(kind: str, names: Sequence[str], choices: Sequence[str]) -> tuple[str, ...]:
-    """Return names without repetition, in the order of the choices; raise an error if one is none of them."""
-    for name in names:
-        if name not in choices:
-            raise UnknownNameError(kind, name, choices, field=f"{kind}s")
-    if not names:
-        raise InputError("nothing to compare", field=f"{kind}s", expected="at least one")
-    return tuple(choice for choice in choices if choice in names)
 
 
 @functools.cache

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from vkc_pin.benchmarks.harness.record import Record
 from vkc_pin.benchmarks.harness.tables import (
     EFFORTS,
     common,
@@ -29,8 +30,6 @@ CRITERIA = {
 }
 """What motions are compared by: field → name."""
 _OWN = "VKC"
-
-Record = Mapping[str, Any]
 
 
 def report(

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from vkc_pin.benchmarks.comparison import COMPARED_PLANNERS, Assignment, Comparison
 from vkc_pin.benchmarks.harness.charts import means_chart, success_chart
+from vkc_pin.benchmarks.harness.record import Record
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.steps import Actuate, GoTo, Place
 
@@ -43,7 +43,7 @@ TASKS = {
 }
 
 
-def _draw(records: Sequence[Mapping[str, Any]], out: Path, tasks: Mapping[str, str], methods: Sequence[str]) -> list[str]:
+def _draw(records: Sequence[Record], out: Path, tasks: Mapping[str, str], methods: Sequence[str]) -> list[str]:
     """Draw success.png, base_effort.png, arm_effort.png and planning_time.png, each with all tasks and methods."""
     shown = {task: task for task in tasks}
     success_chart(records, out / "success.png", shown, methods, title="Success")

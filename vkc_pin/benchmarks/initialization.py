@@ -1,6 +1,6 @@
-"""Ways of initialising the trajectory, compared at a task with a tool: take a stick and touch a cube under a table with it.
+"""Methods of initialising the trajectory, compared at a task with a tool: take a stick and touch a cube under a table with it.
 
-Three scenes of growing difficulty, the same random starts for every way. For comparison, the same steps are planned one after
+Three scenes of growing difficulty, the same random starts for every method. For comparison, the same steps are planned one after
 the other instead of as one problem.
 """
 
@@ -17,7 +17,6 @@ from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.charts import success_chart
 from vkc_pin.benchmarks.harness.record import trial
 from vkc_pin.benchmarks.harness.tables import comparison_table, foot, methods_table
-from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.files.writing import write_atomically
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
@@ -63,18 +62,9 @@ def specify(*, starts: int, repeats: int, seed: int, scenes: Sequence[str], meth
             base = loaded.sample_start(rng).start[:3].tolist()
             for repeat in range(repeats):
                 for method in (*methods, *([STEPWISE] if "auto" in methods and repeat == 0 else [])):
-                    trials.append(
-                        {
-                            "key": f"{scene}/{start:04d}/{repeat:03d}/{method}",
-                            "scene": scene,
-                            "method": method,
-                            "number": start,
-                            "repeat": repeat,
-                            "base": base,
-                            "seed": seed + repeat,
-                            "perturbation": PERTURBATION if repeat else 0.0,
-                        }
-                    )
+                    key = f"{scene}/{start:04d}/{repeat:03d}/{method}"
+                    spec = {"key": key, "scene": scene, "method": method, "number": start, "repeat": repeat, "base": base}
+                    trials.append({**spec, "seed": seed + repeat, "perturbation": PERTURBATION if repeat else 0.0})
     return trials
 
 
@@ -108,17 +98,11 @@ def run(
 
     Raises:
         UnknownNameError: There is no such scene or method.
-        InputError: `out` has trials of other settings.
+        InputError: No scenes or methods, or `out` has trials of other settings.
         KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
     """
-    scenes, methods = tuple(dict.fromkeys(scenes)), tuple(dict.fromkeys(methods))
-    known = SCENES if solve is plan_trial else scenes
-    for kind, names, choices in (("scene", scenes, known), ("method", methods, COMPARED_INITIALIZATIONS)):
-        for name in names:
-            if name not in choices:
-                raise UnknownNameError(kind, name, choices, field=f"{kind}s")
-    if not scenes or not methods:
-        raise InputError("nothing to compare", field="methods" if scenes else "scenes", expected="at least one")
+    scenes = runner.chosen("scene", scenes, SCENES if solve is plan_trial else scenes)
+    methods = runner.chosen("method", methods, COMPARED_INITIALIZATIONS)
     trials = specify(starts=starts, repeats=repeats, seed=seed, scenes=scenes, methods=methods)
     settings = {
         "benchmark": "initialization",

@@ -1,4 +1,4 @@
-"""Planning time against the number of obstacles: the same task in the same room, with more and more things along its walls."""
+"""Planning time against the number of obstacles: the same task in the same room, with more and more boxes along its walls."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vkc_pin.benchmarks.harness import runner
-from vkc_pin.benchmarks.harness.record import distribution, trial
+from vkc_pin.benchmarks.harness.record import Record, distribution, trial
 from vkc_pin.benchmarks.harness.tables import TIMES, decimal, foot, markdown, quartiles
 from vkc_pin.errors import InputError
 from vkc_pin.files.writing import write_atomically
@@ -34,22 +34,22 @@ _WEST, _EAST, _SOUTH, _NORTH, _HALL, _CEILING = -2.5, 2.5, -2.0, 2.0, 5.1, 2.4  
 
 
 def crowded(count: int, *, seed: int = 0) -> Scene:
-    """Return scenes/door.yaml with so many obstacles: its walls, then its furniture, then small boxes that are in nobody's way.
+    """Return scenes/door.yaml with so many obstacles: its walls, then its furniture, then small boxes that obstruct nobody.
 
     These hang on walls and ceiling, stand along the walls or outside of the room. More of them come after the same ones.
 
     Args:
         count: Number of obstacles, without the floor.
-        seed: Of where things are.
+        seed: Of where they are.
     """
     scene = load_scene("door")
     own = sorted(scene.document["obstacles"], key=lambda item: "wall" not in item["name"])  # keeps the order otherwise
     rng = np.random.default_rng(seed)
-    things = [_thing(rng, number) for number in range(count - len(own))]
-    return Scene.from_document({**scene.document, "name": f"door_{count}", "obstacles": [*own, *things][:count]}, scene.folder)
+    boxes = [_box(rng, number) for number in range(count - len(own))]
+    return Scene.from_document({**scene.document, "name": f"door_{count}", "obstacles": [*own, *boxes][:count]}, scene.folder)
 
 
-def _thing(rng: np.random.Generator, number: int) -> dict[str, Any]:
+def _box(rng: np.random.Generator, number: int) -> dict[str, Any]:
     """Return a small box somewhere along the walls, under the ceiling or outside."""
     along, depth, height = rng.uniform((0.03, 0.01, 0.03), (0.15, 0.05, 0.15))
     x, y, z = rng.uniform((-2.3, -1.9, height / 2), (2.3, 1.9, _CEILING - height / 2))
@@ -65,7 +65,7 @@ def _thing(rng: np.random.Generator, number: int) -> dict[str, Any]:
         (flat, (x, y, _CEILING - depth / 2)),
         (in_y, outside),
     )[rng.integers(7)]
-    return {"name": f"thing_{number}", "type": "box", "size": list(map(float, size)), "position": list(map(float, position))}
+    return {"name": f"box_{number}", "type": "box", "size": list(map(float, size)), "position": list(map(float, position))}
 
 
 def specify(*, starts: int, seed: int, counts: Sequence[int]) -> list[dict[str, Any]]:
@@ -83,13 +83,7 @@ def specify(*, starts: int, seed: int, counts: Sequence[int]) -> list[dict[str, 
 
 
 def run(
-    *,
-    starts: int,
-    seed: int,
-    out: str | Path,
-    jobs: int = 1,
-    counts: Sequence[int] = COUNTS,
-    progress: bool = True,
+    *, starts: int, seed: int, out: str | Path, jobs: int = 1, counts: Sequence[int] = COUNTS, progress: bool = True
 ) -> dict[str, Any]:
     """Run the experiment, or what is left of it, and write results.json, results.csv, table.md and scale.png to `out`.
 
@@ -99,7 +93,7 @@ def run(
         starts: Number of random starts, the same for every number of obstacles.
         seed: Of the starts and of planning.
         out: The folder; if it has trials of the same settings already, they are not run again.
-        jobs: Number of processes. Several get in each other's way, and times are what this is about.
+        jobs: Number of processes. Several slow each other down, and times are what this is about.
         counts: Numbers of obstacles.
         progress: Whether to show a progress bar.
 
@@ -149,7 +143,7 @@ def report(result: Mapping[str, Any]) -> str:
     return "\n\n".join([*parts, foot(about)]) + "\n"
 
 
-def scale_chart(records: Sequence[Mapping[str, Any]], path: str | Path | None, *, title: str = "") -> Figure:
+def scale_chart(records: Sequence[Record], path: str | Path | None, *, title: str = "") -> Figure:
     """Draw planning time against the number of obstacles, and what it is spent on: medians, and quartiles of the whole.
 
     Args:

@@ -12,7 +12,8 @@ from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
+
+from vkc_pin.arrays import Floats, Ints
 
 __all__ = ["PhaseGeometry"]
 
@@ -20,7 +21,7 @@ _AT_ONCE = 1_000_000  # comparisons of boxes
 _ROWS = 128  # configurations: what is computed of so many stays in the processor's cache
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class PhaseGeometry:
     """Geometry and pairs of one phase.
 
@@ -38,17 +39,17 @@ class PhaseGeometry:
 
     shapes: Sequence[pin.GeometryObject]
     labels: tuple[str, ...]
-    pairs: NDArray[np.int_]
-    margins: NDArray[np.float64]
-    joint: NDArray[np.int_]
-    center: NDArray[np.float64]
-    half: NDArray[np.float64]
-    rotation: NDArray[np.float64]
-    translation: NDArray[np.float64]
+    pairs: Ints
+    margins: Floats
+    joint: Ints
+    center: Floats
+    half: Floats
+    rotation: Floats
+    translation: Floats
     eased: Mapping[int, Sequence[tuple[int, int, float]]] = field(default_factory=dict)
     left: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
-    def margins_at(self, pairs: NDArray[np.int_], waypoints: NDArray[np.int_]) -> NDArray[np.float64]:
+    def margins_at(self, pairs: Ints, waypoints: Ints) -> Floats:
         """Return the clearances that pairs must keep at waypoints, both of shape (n,), shape (n,) [m]."""
         margins = self.margins[pairs]
         for pair, moments in self.eased.items():
@@ -66,24 +67,24 @@ class PhaseGeometry:
             shapes[geometry].placement = placement
             rotation[geometry], translation[geometry] = placement.rotation, placement.translation
         moved = replace(self, shapes=tuple(shapes), rotation=rotation, translation=translation)
-        for name in ("_moving_count", "_radius", "_half", "_own", "_groups", "_number"):  # the same wherever things stand
+        for name in ("_moving_count", "_radius", "_half", "_own", "_groups", "_number"):  # the same wherever they stand
             moved.__dict__[name] = getattr(self, name)
         return moved
 
-    def within(self, reach: float, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> NDArray[np.int_]:
+    def within(self, reach: float, lower: Floats, upper: Floats) -> Ints:
         """Return what stands and may be within `reach` [m] of a box along the world's axes, corners of shape (3,) [m]."""
         lows, highs = self._boxes
         near = (lows < (upper + reach)[:, None]) & (highs > (lower - reach)[:, None])
         return np.flatnonzero(near.all(axis=0)) + self._moving_count
 
-    def pairs_of(self, first: int, seconds: NDArray[np.int_]) -> NDArray[np.int_]:
+    def pairs_of(self, first: int, seconds: Ints) -> Ints:
         """Return the pairs of a geometry that moves with some that stand, those that there are."""
         numbers = self._number[first, seconds - self._moving_count]
         return numbers[numbers >= 0]
 
     def maybe_within(
-        self, reach: float, rotations: NDArray[np.float64], translations: NDArray[np.float64], *, standing: bool = True
-    ) -> tuple[NDArray[np.int_], NDArray[np.int_], NDArray[np.float64]]:
+        self, reach: float, rotations: Floats, translations: Floats, *, standing: bool = True
+    ) -> tuple[Ints, Ints, Floats]:
         """Return (configuration, pair) of all pairs that bounding volumes cannot prove to be `reach` [m] apart, in this order.
 
         First balls (against boxes where they stand in the world), then what the face normals of both boxes separate. The third
@@ -104,14 +105,12 @@ class PhaseGeometry:
         at = np.concatenate([w + number * step for number, (w, _, _) in enumerate(parts)])
         return at, np.concatenate([k for _, k, _ in parts]), np.concatenate([gaps for _, _, gaps in parts])
 
-    def _near(
-        self, reach: float, rotations: NDArray[np.float64], translations: NDArray[np.float64], standing: bool
-    ) -> tuple[NDArray[np.int_], NDArray[np.int_], NDArray[np.float64]]:
+    def _near(self, reach: float, rotations: Floats, translations: Floats, standing: bool) -> tuple[Ints, Ints, Floats]:
         """Return the same as `maybe_within`. From here on the axes of the world come first: that is several times as fast."""
         moving, joint = slice(self._moving_count), self.joint[: self._moving_count]
-        carried = rotations.transpose(2, 3, 0, 1).take(joint, axis=3)
-        turns = _products(carried, self._turn[:, :, None, moving])
-        centers = _turned(carried, self._local[:, None, moving]) + translations.transpose(2, 0, 1).take(joint, axis=2)
+        rotated = rotations.transpose(2, 3, 0, 1).take(joint, axis=3)
+        turns = _products(rotated, self._turn[:, :, None, moving])
+        centers = _turned(rotated, self._local[:, None, moving]) + translations.transpose(2, 0, 1).take(joint, axis=2)
         moves = self._moving_within(reach, centers)
         none = np.zeros(0, int), np.zeros(0, int)
         stands = self._standing_within(reach, centers, turns) if standing else none
@@ -121,16 +120,14 @@ class PhaseGeometry:
         near = near[np.argsort(w[near] * len(self.pairs) + k[near])]
         return w[near], k[near], gaps[near]
 
-    def _moving_within(self, reach: float, centers: NDArray[np.float64]) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+    def _moving_within(self, reach: float, centers: Floats) -> tuple[Ints, Ints]:
         """Return (configuration, pair) of what moves and whose balls are within `reach` of each other."""
         own, a, b, radii = self._own
         between = centers.take(a, axis=2) - centers.take(b, axis=2)
         w, k = np.nonzero((between * between).sum(axis=0) < (radii + reach) ** 2)
         return w, own[k]
 
-    def _standing_within(
-        self, reach: float, centers: NDArray[np.float64], turns: NDArray[np.float64]
-    ) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+    def _standing_within(self, reach: float, centers: Floats, turns: Floats) -> tuple[Ints, Ints]:
         """Return (configuration, pair) of what moves and whose balls are within `reach` of boxes that stand.
 
         Args:
@@ -164,14 +161,7 @@ class PhaseGeometry:
         (balls,) = np.nonzero((outside * outside).sum(axis=0) < (self._radius[a] + reach) ** 2)
         return w[balls], k[balls]
 
-    def _gaps(
-        self,
-        w: NDArray[np.int_],
-        k: NDArray[np.int_],
-        moves: int,
-        centers: NDArray[np.float64],
-        turns: NDArray[np.float64],
-    ) -> NDArray[np.float64]:
+    def _gaps(self, w: Ints, k: Ints, moves: int, centers: Floats, turns: Floats) -> Floats:
         """Return by how much the face normals of either box separate pairs at configurations [m].
 
         That is a lower bound of their signed distance also where it is negative: moved apart by as much, they are separate.
@@ -198,34 +188,34 @@ class PhaseGeometry:
         return int(np.count_nonzero(self.joint))
 
     @cached_property
-    def _radius(self) -> NDArray[np.float64]:
+    def _radius(self) -> Floats:
         """Of the ball around each geometry's box, shape (G,) [m]."""
         return np.linalg.norm(self.half, axis=1)
 
     @cached_property
-    def _half(self) -> NDArray[np.float64]:
+    def _half(self) -> Floats:
         """The half extents of each geometry's box, shape (3, G) [m]."""
         return np.ascontiguousarray(self.half.T)
 
     @cached_property
-    def _turn(self) -> NDArray[np.float64]:
+    def _turn(self) -> Floats:
         """The rotation of each geometry in its joint's frame, shape (3, 3, G)."""
         return np.ascontiguousarray(self.rotation.transpose(1, 2, 0))
 
     @cached_property
-    def _local(self) -> NDArray[np.float64]:
+    def _local(self) -> Floats:
         """The centre of each geometry's box in its joint's frame, shape (3, G) [m]."""
         return np.ascontiguousarray((np.einsum("gij,gj->gi", self.rotation, self.center) + self.translation).T)
 
     @cached_property
-    def _own(self) -> tuple[NDArray[np.int_], NDArray[np.int_], NDArray[np.int_], NDArray[np.float64]]:
+    def _own(self) -> tuple[Ints, Ints, Ints, Floats]:
         """The pairs of which both move, the first and second of each, and the sum of their radii [m]."""
         own = np.flatnonzero(self.joint[self.pairs[:, 1]] != 0)
         a, b = np.ascontiguousarray(self.pairs[own].T)
         return own, a, b, self._radius[a] + self._radius[b]
 
     @cached_property
-    def _groups(self) -> tuple[NDArray[np.int_], NDArray[np.int_], NDArray[np.int_]]:
+    def _groups(self) -> tuple[Ints, Ints, Ints]:
         """What can hit something that stands, by the joint that carries it; where each group begins, and its size."""
         first = np.unique(self.pairs[self.joint[self.pairs[:, 1]] == 0, 0])
         members = first[np.argsort(self.joint[first], kind="stable")]
@@ -233,7 +223,7 @@ class PhaseGeometry:
         return members, starts, sizes
 
     @cached_property
-    def _number(self) -> NDArray[np.int_]:
+    def _number(self) -> Ints:
         """Which pair a geometry that moves is with one that stands, shape (M, S); -1: none."""
         moving = self._moving_count
         number = np.full((moving, len(self.joint) - moving), -1)
@@ -242,18 +232,18 @@ class PhaseGeometry:
         return number
 
     @cached_property
-    def _boxes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _boxes(self) -> tuple[Floats, Floats]:
         """The lower and upper corners of boxes along the world's axes around what stands, shape (3, S) each [m]."""
         standing = slice(self._moving_count, None)
         centers, extents = self._local[:, standing], _turned(np.abs(self._turn[..., standing]), self._half[:, standing])
         return centers - extents, centers + extents
 
 
-def _products(one: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
+def _products(one: Floats, other: Floats) -> Floats:
     """Return the products of matrices, shape (3, 3, ...)."""
     return np.asarray(one[:, 0, None] * other[0] + one[:, 1, None] * other[1] + one[:, 2, None] * other[2])
 
 
-def _turned(matrices: NDArray[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+def _turned(matrices: Floats, vectors: Floats) -> Floats:
     """Return the products of matrices, shape (3, 3, ...), with vectors, shape (3, ...)."""
     return np.asarray((matrices * vectors).sum(axis=1))

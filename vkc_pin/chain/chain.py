@@ -8,8 +8,8 @@ from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Bools, Floats, Ints
 from vkc_pin.cache import Cache
 from vkc_pin.chain.inversion import invert
 from vkc_pin.chain.kinematics import Kinematics, kinematics_of
@@ -43,7 +43,7 @@ class Closure:
     target: pin.SE3
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class VirtualKinematicChain:
     """C^V: one model of everything that moves together.
 
@@ -67,10 +67,10 @@ class VirtualKinematicChain:
     model: pin.Model
     coordinates: Coordinates
     names: tuple[str, ...]
-    lower: NDArray[np.float64]
-    upper: NDArray[np.float64]
-    velocity: NDArray[np.float64]
-    acceleration: NDArray[np.float64]
+    lower: Floats
+    upper: Floats
+    velocity: Floats
+    acceleration: Floats
     collision: pin.GeometryModel
     held_geometries: Mapping[Hold, tuple[int, ...]]
     closures: Mapping[Hold, Closure]
@@ -84,7 +84,7 @@ class VirtualKinematicChain:
         """Number of coordinates n."""
         return len(self.names)
 
-    def joint_placements(self, z: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def joint_placements(self, z: Floats) -> tuple[Floats, Floats]:
         """Return rotations, shape (W, J, 3, 3), and translations, shape (W, J, 3) [m], of all joints in the world.
 
         Args:
@@ -104,13 +104,13 @@ class VirtualKinematicChain:
         return kinematics_of(self.model, self.cache)
 
     @cached_property
-    def carries(self) -> NDArray[np.bool_]:
+    def carries(self) -> Bools:
         """Whether joint j moves when joint k does, shape (J, J)."""
         joints = range(self.model.njoints)
         return np.array([[k in self.model.supports[j] for k in joints] for j in joints])
 
     @cached_property
-    def motions(self) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    def motions(self) -> tuple[Ints, Floats, Floats, Bools]:
         """How joints move: for each coordinate its joint, and how that moves linearly and about which axis, in its frame.
 
         Shapes (n,), (n, 3) and (n, 3). The last array, shape (n,), says where the linear motion is along the world's axes: x and
@@ -129,9 +129,7 @@ class VirtualKinematicChain:
                 linear[column], angular[column] = motion[:3], motion[3:]
         return owner, linear, angular, fixed
 
-    def point_jacobians(
-        self, z: NDArray[np.float64], which: NDArray[np.int_], joint: NDArray[np.int_], point: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def point_jacobians(self, z: Floats, which: Ints, joint: Ints, point: Floats) -> Floats:
         """Return how points that are fixed in joints' frames move, shape (C, 3, n).
 
         Args:

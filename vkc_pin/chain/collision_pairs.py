@@ -1,4 +1,4 @@
-"""Who can hit whom in each phase of a task, and how close they may come."""
+"""Who can hit whom in each phase of a task, and how close they may come: the pairs of eqs. 6 and 7."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.chain.broadphase import PhaseGeometry
 from vkc_pin.chain.chain import VirtualKinematicChain
 from vkc_pin.chain.margins import EASED_TIME, eased_pairs
@@ -91,8 +91,8 @@ class _Pairing:
                 shape.name = f"{name}.{shape.name}"
                 shapes.append(shape)
                 labels.append(label)
-        carried = {i for hold in phase.held if scene.objects[hold.object].object.free for i in mine[hold.object]}
-        above = [i for i in moving if i in carried or (i in robots and shapes[i].parentJoint > 1)]
+        attached = {i for hold in phase.held if scene.objects[hold.object].object.free for i in mine[hold.object]}
+        above = [i for i in moving if i in attached or (i in robots and shapes[i].parentJoint > 1)]
         table = np.concatenate([np.array(pairs).reshape(-1, 3), self._with_obstacles(len(shapes), moving, above)])
         if not len(table):
             raise InputError(
@@ -102,8 +102,8 @@ class _Pairing:
         center, half, rotation, translation = (np.concatenate(parts) for parts in boxes)
         shapes += self._obstacles
         part = PhaseGeometry(
-            tuple(shapes),
-            (*labels, *scene.obstacle_labels),
+            shapes=tuple(shapes),
+            labels=(*labels, *scene.obstacle_labels),
             pairs=table[:, :2].astype(int),
             margins=table[:, 2],
             joint=np.array([shape.parentJoint for shape in shapes]),
@@ -114,9 +114,9 @@ class _Pairing:
             left=left,
         )
         first, steps = int(self.first_waypoint[number]), self.options.steps(EASED_TIME)
-        return dataclasses.replace(part, eased=eased_pairs(scene, chain, phase, part, first, before, steps))
+        return dataclasses.replace(part, eased=eased_pairs(scene, chain, phase, part, before=before, first=first, steps=steps))
 
-    def _with_obstacles(self, first: int, moving: Sequence[int], above: Sequence[int]) -> NDArray[np.float64]:
+    def _with_obstacles(self, first: int, moving: Sequence[int], above: Sequence[int]) -> Floats:
         """Return the pairs of what moves with the obstacles, the first of which is geometry `first`, and their margins.
 
         Of `moving`, only those that are `above` the floor can hit it: wheels stand on it, and doors hang above it as their
@@ -137,7 +137,7 @@ class _Pairing:
         return self.scene.robot.touch_links if hold.frame is None else (hold.frame,)
 
 
-def _boxes(shapes: Sequence[pin.GeometryObject]) -> tuple[NDArray[np.float64], ...]:
+def _boxes(shapes: Sequence[pin.GeometryObject]) -> tuple[Floats, ...]:
     """Return centres and half extents of bounding boxes, and placements as rotations and translations; see `PhaseGeometry`."""
     boxes = [bounding_box(shape) for shape in shapes]
     return (

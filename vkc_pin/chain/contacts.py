@@ -1,4 +1,4 @@
-"""Signed distances of collision pairs (coal) and witness planes.
+"""Signed distances of collision pairs (coal) and witness planes: the clearances of eqs. 6 and 7, linearised.
 
 For a pair (A, B) coal gives the witness points a, b and the normal n of the signed distance d = n·(b − a). With a
 fixed in A's body, b in B's and n in the world, n·(b(z) − a(z)) is smooth in z, and its value and gradient equal the
@@ -18,6 +18,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats, Ints
 from vkc_pin.chain.chain import VirtualKinematicChain
 from vkc_pin.chain.collision_pairs import phase_geometries
 from vkc_pin.chain.narrowphase import Distances
@@ -45,19 +46,19 @@ class Contacts:
         first, second: Witness points in the world, shape (C, 3) [m].
     """
 
-    waypoint: NDArray[np.int_]
-    pair: NDArray[np.int_]
-    distance: NDArray[np.float64]
-    margin: NDArray[np.float64]
-    normal: NDArray[np.float64]
-    first: NDArray[np.float64]
-    second: NDArray[np.float64]
+    waypoint: Ints
+    pair: Ints
+    distance: Floats
+    margin: Floats
+    normal: Floats
+    first: Floats
+    second: Floats
 
     def arrays(self) -> tuple[NDArray[Any], ...]:
         """Return its arrays in the order of the attributes."""
         return (self.waypoint, self.pair, self.distance, self.margin, self.normal, self.first, self.second)
 
-    def select(self, index: NDArray[np.int_]) -> Contacts:
+    def select(self, index: Ints) -> Contacts:
         """Return the contacts at `index`, in that order."""
         return Contacts(*(array[index] for array in self.arrays()))
 
@@ -65,7 +66,7 @@ class Contacts:
         """Return by how much the worst pair falls short of its margin [m]; 0 if none does."""
         return float(max(0.0, np.max(self.margin - self.distance, initial=0.0)))
 
-    def shortfall(self, segments: int) -> NDArray[np.float64]:
+    def shortfall(self, segments: int) -> Floats:
         """Return by how much the worst pair of each of `segments` configurations falls short [m], shape (segments,)."""
         worst = np.zeros(segments)
         np.maximum.at(worst, self.waypoint, self.margin - self.distance)
@@ -95,7 +96,7 @@ class ContactModel:
         own = [shape.parentJoint for shape in chain.collision.geometryObjects]
         self._joints = np.array(own + [0] * (max(len(part.labels) for part in self.phases) - len(own)))
 
-    def settled(self, z: NDArray[np.float64]) -> ContactModel:
+    def settled(self, z: Floats) -> ContactModel:
         """Return the same, where what the motion z_1..z_N, shape (N, n), leaves behind stands where that motion leaves it.
 
         Before, it stands where the task says, which is only nearly there where the motion chooses the place itself.
@@ -127,13 +128,7 @@ class ContactModel:
         return int(self.first_waypoint[phase]) + 1
 
     def evaluate(
-        self,
-        z: NDArray[np.float64],
-        waypoints: NDArray[np.int_],
-        *,
-        reach: float,
-        nearest: int | None = None,
-        standing: bool = True,
+        self, z: Floats, waypoints: Ints, *, reach: float, nearest: int | None = None, standing: bool = True
     ) -> Contacts:
         """Return the pairs closer than `reach` [m].
 
@@ -148,7 +143,7 @@ class ContactModel:
         rotations, translations = self.placements(z)
         phase_of = np.maximum(np.searchsorted(self.first_waypoint, waypoints) - 1, 0)
         rows: list[tuple[float, ...]] = []
-        vectors: list[NDArray[np.float64]] = []
+        vectors: list[Floats] = []
         for number in set(phase_of.tolist()):
             part, inside = self.phases[number], np.flatnonzero(phase_of == number)
             at, pairs, bounds = part.maybe_within(reach, rotations[inside], translations[inside], standing=standing)
@@ -178,31 +173,35 @@ class ContactModel:
         order = np.argsort(table[:, 0], kind="stable")
         table, stacked = table[order], np.array(vectors, float).reshape(len(rows), 3, 3)[order]
         index = table[:, :3].astype(int)
-        return Contacts(index[:, 0], index[:, 1:], table[:, 3], table[:, 4], stacked[:, 0], stacked[:, 1], stacked[:, 2])
+        places = {"normal": stacked[:, 0], "first": stacked[:, 1], "second": stacked[:, 2]}
+        return Contacts(index[:, 0], index[:, 1:], distance=table[:, 3], margin=table[:, 4], **places)
 
-    def placements(self, z: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def placements(self, z: Floats) -> tuple[Floats, Floats]:
         """Return the same as the chain's `joint_placements`; in portions of one size, as CasADi prepares for each size anew."""
         parts = [self.chain.joint_placements(z[row : row + _ROWS]) for row in range(0, max(len(z), 1), _ROWS)]
         return np.concatenate([rotations for rotations, _ in parts]), np.concatenate([moves for _, moves in parts])
 
-    def joints_of(self, geometries: NDArray[np.int_]) -> NDArray[np.int_]:
+    def joints_of(self, geometries: Ints) -> Ints:
         """Return the joints of the chain that carry `geometries`; 0 for what stands in the world."""
         return self._joints[geometries]
 
-    def gradients(self, z: NDArray[np.float64], contacts: Contacts) -> NDArray[np.float64]:
+    def gradients(self, z: Floats, contacts: Contacts) -> Floats:
         """Return the gradients of the distances of contacts at configurations `z`, shape (B, n): n·(∂b − ∂a), shape (C, n)."""
         joints = self.joints_of(contacts.pair)
         which, points = np.tile(contacts.waypoint, 2), np.concatenate([contacts.first, contacts.second])
         first, second = np.split(self.chain.point_jacobians(z, which, joints.T.ravel(), points), 2)
         return np.asarray(np.einsum("ci,cij->cj", contacts.normal, second - first))
 
-    def planes(
-        self, z: NDArray[np.float64], contacts: Contacts, *, slots: int
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def planes(self, z: Floats, contacts: Contacts, *, slots: int) -> tuple[Floats, Floats]:
         """Return the coefficients C, shape (W, slots, 12·joints), and offsets R, shape (W, slots), of the nearest contacts.
 
         C·vec(M(z)) − R ≥ 0 says that a contact keeps its margin; M are the placements of all joints (see `cpin`). Slots
         that nothing needs have C = 0, R = −1.
+
+        Args:
+            z: Configurations, shape (W, n).
+            contacts: What is close there.
+            slots: How many planes a configuration has; contacts beyond these are left out.
         """
         joints = self.chain.model.njoints - 1
         coefficients = np.zeros((len(z), slots, joints, 4, 3))  # per joint the columns of R, then t

@@ -5,14 +5,16 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Bools, Floats
 from vkc_pin.cache import Cache
 from vkc_pin.chain.kinematics import kinematics_of
 from vkc_pin.chain.pose import PoseRow, pose_residual, target_vector
 from vkc_pin.cpin.batch import BatchFunction
 
 __all__ = ["PoseSolver"]
+
+_LONGEST = 0.5  # [m] or [rad] of one step in one coordinate
 
 
 class PoseSolver:
@@ -37,23 +39,22 @@ class PoseSolver:
         """Its size in memory, estimated [bytes]."""
         return self._function.nbytes
 
-    def evaluate(self, z: NDArray[np.float64], target: pin.SE3) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def evaluate(self, z: Floats, target: pin.SE3) -> tuple[Floats, Floats]:
         """Return residuals, shape (B, m) ([m], [rad]), and their Jacobians, shape (B, m, n), at `z`, shape (B, n)."""
         residual, jacobian = self._function(z, target_vector(target))
         return residual, jacobian.reshape(len(z), self.size, self.rows).swapaxes(1, 2)
 
     def solve(
         self,
-        z: NDArray[np.float64],
+        z: Floats,
         target: pin.SE3,
         *,
-        lower: NDArray[np.float64],
-        upper: NDArray[np.float64],
-        weights: NDArray[np.float64],
+        lower: Floats,
+        upper: Floats,
+        weights: Floats,
         iterations: int = 12,
         tolerance: float = 1e-6,
-        max_step: float = 0.5,
-    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    ) -> tuple[Floats, Bools]:
         """Return configurations that satisfy the pose within limits, near the given ones, and which of them do.
 
         Args:
@@ -64,7 +65,6 @@ class PoseSolver:
             weights: What moving a coordinate costs, shape (n,).
             iterations: At most so many steps.
             tolerance: Largest residual of a solution, [m] and [rad].
-            max_step: Longest step in one coordinate.
 
         Returns:
             Configurations, shape (B, n), and a mask, shape (B,).
@@ -80,21 +80,14 @@ class PoseSolver:
             at, residual, jacobian = at[still], residual[still], jacobian[still]
             if not len(at) or not remaining:
                 break
-            z[at] += _step(z[at], residual, jacobian, lower[at], upper[at], weights, max_step)
+            z[at] += _step(z[at], residual, jacobian, weights, (lower[at], upper[at]))
             np.clip(z, lower, upper, out=z)
         return z, error < tolerance
 
 
-def _step(
-    z: NDArray[np.float64],
-    residual: NDArray[np.float64],
-    jacobian: NDArray[np.float64],
-    lower: NDArray[np.float64],
-    upper: NDArray[np.float64],
-    weights: NDArray[np.float64],
-    longest: float,
-) -> NDArray[np.float64]:
+def _step(z: Floats, residual: Floats, jacobian: Floats, weights: Floats, limits: tuple[Floats, Floats]) -> Floats:
     """Return damped Gauss-Newton steps, shape (B, n); a coordinate that one pushes beyond its limit is taken out, once."""
+    lower, upper = limits
     free = upper - lower > 1e-9
     damping = 1e-8 + 1e-3 * np.minimum(1.0, np.sum(residual**2, axis=1))
     step = np.zeros_like(z)
@@ -102,7 +95,7 @@ def _step(
         scaled = jacobian * (free / weights)[:, None, :]
         system = scaled @ jacobian.transpose(0, 2, 1) + damping[:, None, None] * np.eye(residual.shape[1])
         step = -np.einsum("bij,bi->bj", scaled, np.linalg.solve(system, residual[..., None])[..., 0])
-        step *= np.minimum(1.0, longest / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12))
+        step *= np.minimum(1.0, _LONGEST / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12))
         blocked = free & ((z + step < lower - 1e-12) | (z + step > upper + 1e-12))
         if not blocked.any():
             break

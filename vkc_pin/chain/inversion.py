@@ -7,8 +7,9 @@ from itertools import pairwise
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
 from vkc_pin.models.articulation import ArticulatedObject
 from vkc_pin.models.coordinates import Coordinates
@@ -17,7 +18,7 @@ from vkc_pin.models.grafting import add_joint, clean
 __all__ = ["InvertedTree", "invert"]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class InvertedTree:
     """An object re-rooted at one of its links: `model`'s universe frame is that link's frame.
 
@@ -102,10 +103,17 @@ def invert(obj: ArticulatedObject, link: str, state: ArrayLike) -> InvertedTree:
             carried.addGeometryObject(copy)
         return carried
 
-    return InvertedTree(model, carry(obj.collision), carry(obj.visual), Coordinates(model), link, obj.base_link)
+    return InvertedTree(
+        model=model,
+        collision=carry(obj.collision),
+        visual=carry(obj.visual),
+        coordinates=Coordinates(model),
+        link=link,
+        base_link=obj.base_link,
+    )
 
 
-def _z_aligned(model: pin.Model, data: pin.Data, index: int) -> tuple[pin.JointModel, NDArray[np.float64]]:
+def _z_aligned(model: pin.Model, data: pin.Data, index: int) -> tuple[pin.JointModel, Floats]:
     """Return the joint of the same kind about or along z, and the unit axis of joint `index` in its own frame."""
     kind = model.joints[index].shortname().removeprefix("JointModel")
     subspace = np.array(data.joints[index].S, float).ravel()  # linear part, then angular part
@@ -120,7 +128,7 @@ def _z_aligned(model: pin.Model, data: pin.Data, index: int) -> tuple[pin.JointM
     )
 
 
-def _z_to(axis: NDArray[np.float64]) -> NDArray[np.float64]:
+def _z_to(axis: Floats) -> Floats:
     """Return a rotation, shape (3, 3), that turns z into the unit vector `axis`, with as many zeros as possible."""
     others = np.eye(3)
     x = others[int(np.argmin(np.abs(axis)))]

@@ -26,6 +26,7 @@ def eased_pairs(
     chain: VirtualKinematicChain,
     phase: Phase,
     part: PhaseGeometry,
+    *,
     first: int,
     before: Phase | None,
     steps: int,
@@ -60,9 +61,9 @@ def eased_pairs(
     moments += [(h, p, last - steps, last) for h, p in phase.lowered.items()]
     for hold, placement, begin, end in moments:
         placed = dataclasses.replace(scene.objects[hold.object], placement=placement)
-        rests = {shape.name: shape.placement for shape in standing_geometry(placed)}
+        stands = {shape.name: shape.placement for shape in standing_geometry(placed)}
         for i in chain.held_geometries[hold]:
-            ease(i, shapes[i].geometry, rests[own_name(shapes[i].name)], begin, end)
+            ease(i, shapes[i].geometry, stands[own_name(shapes[i].name)], begin, end)
     touches = [(goal, last - steps, last) for goal in phase.frames]
     touches += [(goal, first, first + steps) for goal in (before.frames if before else ())]
     for goal, begin, end in touches:

@@ -1,4 +1,4 @@
-"""Residuals between placements, symbolically.
+"""Residuals between placements, symbolically: h_chain of eq. 2 and f_task of eq. 3.
 
 Three kinds of goal: "pose" is a whole placement; "point" only its translation; "upright" the translation, and the world's
 vertical as the target has it, at any heading.
@@ -13,11 +13,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
+
+from vkc_pin.arrays import Floats
 
 __all__ = ["ROW_BOUNDS", "PoseRow", "pose_residual", "pose_rows", "target_vector"]
 
-ROW_BOUNDS: Mapping[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = {
+ROW_BOUNDS: Mapping[str, tuple[Floats, Floats]] = {
     "pose": (np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]), np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.inf])),
     "point": (np.zeros(3), np.zeros(3)),
     "upright": (np.zeros(6), np.array([0.0, 0.0, 0.0, 0.0, 0.0, np.inf])),
@@ -113,6 +114,6 @@ def _tilt(rotation: Any, target: Any) -> tuple[Any, Any]:
     return vertical[:2], vertical[2]
 
 
-def target_vector(placement: pin.SE3) -> NDArray[np.float64]:
+def target_vector(placement: pin.SE3) -> Floats:
     """Return `placement` as the 12 numbers that targets are."""
     return np.concatenate([placement.rotation.T.ravel(), placement.translation])

@@ -92,9 +92,7 @@ def frame_placements(model: pin.Model, frames: Sequence[str | int]) -> casadi.Fu
 
 
 def frame_jacobian(
-    model: pin.Model,
-    frame: str | int,
-    reference: Literal["local_world_aligned", "local", "world"] = "local_world_aligned",
+    model: pin.Model, frame: str | int, reference: Literal["local_world_aligned", "local", "world"] = "local_world_aligned"
 ) -> casadi.Function:
     """Return the function q → J of the Jacobian of a frame: its spatial velocity is J·v.
 

@@ -7,7 +7,8 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
+
+from vkc_pin.arrays import Floats
 
 __all__ = ["BatchFunction", "size_of"]
 
@@ -25,9 +26,9 @@ class BatchFunction:
 
     def __init__(self, function: ca.Function) -> None:
         self.function = function
-        self._buffers: OrderedDict[int, tuple[Any, Any, list[NDArray[np.float64]], list[NDArray[np.float64]]]] = OrderedDict()
+        self._buffers: OrderedDict[int, tuple[Any, Any, list[Floats], list[Floats]]] = OrderedDict()
 
-    def __call__(self, *inputs: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    def __call__(self, *inputs: Floats) -> list[Floats]:
         """Return one array per output, shape (B, numel), entries column by column.
 
         Args:

@@ -16,6 +16,7 @@ import coal
 import numpy as np
 from numpy.typing import NDArray
 
+from vkc_pin.arrays import Bools, Floats, Ints
 from vkc_pin.driving.body import FAN, Shape, hull_points
 
 __all__ = ["Lattice", "PlanViews", "stuck"]
@@ -30,16 +31,16 @@ _SLANT = float(np.cos(np.pi / len(FAN) * 1.2))  # of the angle between a directi
 class Lattice(NamedTuple):
     """Cells and headings: centre of cell (0, 0) and size of a cell, shape (2,) [m]; cells along a side; shape (H,) [rad]."""
 
-    origin: NDArray[np.float64]
-    step: NDArray[np.float64]
+    origin: Floats
+    step: Floats
     cells: int
-    yaws: NDArray[np.float64]
+    yaws: Floats
 
 
 class _Solid(NamedTuple):
     """Points whose hull a shape contains, shape (n, 3), its lowest and highest z [m], if it is a prism, and a name for it."""
 
-    points: NDArray[np.float64]
+    points: Floats
     bottom: float
     top: float
     prism: bool
@@ -48,7 +49,7 @@ class _Solid(NamedTuple):
 
 _Part = tuple[_Solid, float, float]
 """Of a solid, what is between two heights [m]."""
-_Reach = tuple[NDArray[np.float64], NDArray[np.float64]]
+_Reach = tuple[Floats, Floats]
 """Support functions, and how far beyond their hulls the polygons reach that they bound."""
 
 
@@ -58,8 +59,9 @@ def stuck(
     standing: Sequence[Shape],
     lattice: Lattice,
     margin: float,
+    *,
     views: PlanViews | None = None,
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+) -> tuple[Bools, Bools]:
     """Return where the base, and where what is carried, surely comes closer than `margin` [m] to an obstacle.
 
     Args:
@@ -76,14 +78,13 @@ def stuck(
     """
     obstacles, below, above = _solids(standing), _solids(base), _solids(carried)
     pairs, over = _meeting(below, obstacles), _meeting(above, obstacles)
-    low, high = (
-        reduce(np.concatenate([solid.points for solid in below] or [np.zeros((1, 3))]), axis=0) for reduce in (np.min, np.max)
-    )
+    points = np.concatenate([solid.points for solid in below] or [np.zeros((1, 3))])
+    low, high = points.min(axis=0), points.max(axis=0)
     inside = [np.all((solid.points >= low) & (solid.points <= high), axis=0)[:2].all() for solid in above]
     hidden = np.array(inside, bool)[over[:, 0]] & np.isin(over[:, 1], pairs[:, 1])
     views = PlanViews() if views is None else views
-    carrying = _fill(above, obstacles, over[~hidden], lattice, margin, views)
-    return _fill(below, obstacles, pairs, lattice, margin, views), carrying
+    carrying = _fill(above, obstacles, over[~hidden], lattice, margin, views=views)
+    return _fill(below, obstacles, pairs, lattice, margin, views=views), carrying
 
 
 def _solids(shapes: Sequence[Shape]) -> list[_Solid]:
@@ -97,14 +98,14 @@ def _solids(shapes: Sequence[Shape]) -> list[_Solid]:
     return solids
 
 
-def _meeting(first: Sequence[_Solid], second: Sequence[_Solid]) -> NDArray[np.int_]:
+def _meeting(first: Sequence[_Solid], second: Sequence[_Solid]) -> Ints:
     """Return which solids share heights with which, in the order of the first, shape (P, 2)."""
     one, other = (np.array([(solid.bottom, solid.top) for solid in solids]).reshape(-1, 2) for solids in (first, second))
     common = np.minimum(one[:, None, 1], other[:, 1]) - np.maximum(one[:, None, 0], other[:, 0])
     return np.argwhere(common > _FLAT)
 
 
-def _slice(solid: _Solid, low: float, high: float) -> NDArray[np.float64]:
+def _slice(solid: _Solid, low: float, high: float) -> Floats:
     """Return those points in the plan view of a solid between two heights that `FAN` touches, shape (n, 2) [m], n at most 32."""
     points = solid.points
     if solid.prism or (low <= solid.bottom and high >= solid.top):
@@ -117,7 +118,7 @@ def _slice(solid: _Solid, low: float, high: float) -> NDArray[np.float64]:
     return _touched(np.concatenate(parts))
 
 
-def _touched(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _touched(points: Floats) -> Floats:
     return points[np.flatnonzero(np.bincount((FAN @ points.T).argmax(axis=1)))]
 
 
@@ -130,9 +131,9 @@ class PlanViews:
     @property
     def nbytes(self) -> int:
         """Its size in memory [bytes]."""
-        return sum(support.nbytes + spare.nbytes for support, spare in self._known.values())
+        return sum(support.nbytes + overshoot.nbytes for support, overshoot in self._known.values())
 
-    def of(self, parts: Sequence[_Part], directions: NDArray[np.float64]) -> _Reach:
+    def of(self, parts: Sequence[_Part], directions: Floats) -> _Reach:
         """Return support functions of the plan views of parts of solids, and how far beyond their hulls these let polygons reach.
 
         Args:
@@ -149,17 +150,15 @@ class PlanViews:
         for first in range(0, len(order), _AT_ONCE):  # few at once stay in the processor's cache
             some = order[first : first + _AT_ONCE]
             self._known.update(zip(some, zip(*_support_of([new[key] for key in some], directions), strict=True), strict=True))
-        support, spare = (np.array(values) for values in zip(*(self._known[key] for key in keys), strict=True))
+        support, overshoot = (np.array(values) for values in zip(*(self._known[key] for key in keys), strict=True))
         for key in keys:
             self._known.move_to_end(key)
         while len(self._known) > _KEPT:
             self._known.popitem(last=False)
-        return support, spare
+        return support, overshoot
 
 
-def _support_of(
-    outlines: list[NDArray[np.float64]], directions: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _support_of(outlines: list[Floats], directions: Floats) -> tuple[Floats, Floats]:
     size = max(len(points) for points in outlines)
     padded = np.array([np.concatenate([points, np.repeat(points[:1], size - len(points), axis=0)]) for points in outlines])
     # No matrix product: its last digits hang on what else is in the batch, and so on what was remembered.
@@ -188,11 +187,12 @@ def _support_of(
 def _fill(
     first: Sequence[_Solid],
     second: Sequence[_Solid],
-    pairs: NDArray[np.int_],
+    pairs: Ints,
     lattice: Lattice,
     margin: float,
+    *,
     views: PlanViews,
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Return where any of pairs of solids, shape (P, 2), surely come too close, shape (cells, cells, H)."""
     count, cells = len(lattice.yaws), lattice.cells
     if not len(pairs):
@@ -210,14 +210,14 @@ def _fill(
     moving, standing = np.array(indices)
     cosine, sine = np.cos(lattice.yaws)[:, None], np.sin(lattice.yaws)[:, None]
     turned = -np.stack([cosine * FAN[:, 0] + sine * FAN[:, 1], cosine * FAN[:, 1] - sine * FAN[:, 0]], axis=-1)
-    support, spare = views.of([part for _, part in parts[0].values()], turned)
-    other_support, other_spare = views.of([part for _, part in parts[1].values()], FAN[None])
-    allowed = _SLANT * margin - spare[moving] - other_spare[standing] - _ROUNDING  # (pairs, H)
+    support, overshoot = views.of([part for _, part in parts[0].values()], turned)
+    other_support, other_overshoot = views.of([part for _, part in parts[1].values()], FAN[None])
+    allowed = _SLANT * margin - overshoot[moving] - other_overshoot[standing] - _ROUNDING  # (pairs, H)
     reach = (support[moving] + other_support[standing] + allowed[..., None]).reshape(-1, len(FAN)).astype(np.float32)
     return _rows(reach, np.tile(np.arange(count), len(moving)), lattice)
 
 
-def _rows(reach: NDArray[np.float32], heading: NDArray[np.int_], lattice: Lattice) -> NDArray[np.bool_]:
+def _rows(reach: NDArray[np.float32], heading: Ints, lattice: Lattice) -> Bools:
     """Return the cells inside any of many polygons, by heading, shape (cells, cells, H).
 
     Args:

@@ -15,7 +15,8 @@ from collections.abc import Callable, Sequence
 import coal
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
+
+from vkc_pin.arrays import Floats, Ints
 
 __all__ = ["FAN", "Body", "Shape", "Standing", "hull_points"]
 
@@ -81,24 +82,22 @@ class Body:
         self._points = np.concatenate([points[:, :2] for points, _ in outlines]) if outlines else np.empty((0, 2))
         self._first = np.concatenate([[0], np.cumsum([len(points) for points, _ in outlines])[:-1]]).astype(int)
         self._radius = radius[:, None]
-        self._tables: dict[tuple[float, float], NDArray[np.float64]] = {}
+        self._tables: dict[tuple[float, float], Floats] = {}
         self._ask: dict[int, coal.ComputeDistance] = {}
         self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
         order = np.argsort(self.standing, kind="stable")
         self._of_standing = np.split(order, np.searchsorted(self.standing[order], np.arange(1, len(world.shapes))))
         self._margins = np.full(len(world.shapes), margin)
 
-    def driven(
-        self, a: NDArray[np.float64], b: NDArray[np.float64], yaw: float, margins: NDArray[np.float64] | None = None
-    ) -> bool:
+    def driven(self, a: Floats, b: Floats, yaw: float, margins: Floats | None = None) -> bool:
         """Return whether the margins are kept along a straight line; see `BaseGrid.driven`."""
         if not len(self.moving):
             return True
         margins = self._margins if margins is None else margins
         rows = self._close(np.minimum(FAN @ a, FAN @ b))
-        return not len(rows) or self._drive(a, b, yaw, self._extents(yaw, yaw, rows), rows, margins)
+        return not len(rows) or self._drive(a, b, yaw, extents=self._extents(yaw, yaw, rows), rows=rows, margins=margins)
 
-    def turned(self, at: NDArray[np.float64], start: float, end: float, margins: NDArray[np.float64] | None = None) -> bool:
+    def turned(self, at: Floats, start: float, end: float, margins: Floats | None = None) -> bool:
         """Return whether the margins are kept while turning; see `BaseGrid.turned`."""
         if not len(self.moving):
             return True
@@ -106,9 +105,9 @@ class Body:
         rows = self._close(along)
         yaws = np.linspace(start, end, 1 + max(1, int(np.ceil(abs(end - start) / _LONG_ARC)))).tolist()
         margins = self._margins if margins is None else margins
-        return not len(rows) or all(self._turn(at, along, p, q, rows, margins) for p, q in itertools.pairwise(yaws))
+        return not len(rows) or all(self._turn(at, along, p, q, rows=rows, margins=margins) for p, q in itertools.pairwise(yaws))
 
-    def leaving(self, at: NDArray[np.float64], yaw: float) -> NDArray[np.float64]:
+    def leaving(self, at: Floats, yaw: float) -> Floats:
         """Return the margins kept at a pose; see `BaseGrid.leaving`."""
         margins = self._margins.copy()
         for row in self._close(FAN @ at).tolist():
@@ -117,20 +116,20 @@ class Body:
             margins[self.standing[row]] = min(margins[self.standing[row]], least)
         return margins
 
-    def _close(self, along: NDArray[np.float64]) -> NDArray[np.int_]:
+    def _close(self, along: Floats) -> Ints:
         """Return the pairs that may meet where the base's origin is at least `along` in the directions `FAN`, shape (32,) [m]."""
         world = self.world
         near = np.flatnonzero((along[_AXES] - world.extent).max(axis=1) < self.span)
         near = near[(along - world.support[near]).max(axis=1) < self.span[near]]
         return np.sort(np.concatenate([self._of_standing[s] for s in near.tolist()])) if len(near) else near
 
-    def _extents(self, start: float, end: float, rows: NDArray[np.int_]) -> NDArray[np.float64]:
+    def _extents(self, start: float, end: float, rows: Ints) -> Floats:
         """Return by how much pairs extend against the directions `FAN` while the base turns, at most: shape (n, 32) [m]."""
         moving = self.moving[rows]
         extents = self._table(start, end)[moving] + self.world.support[self.standing[rows]]
         return extents if start == end else extents + (self.reach * (1.0 - np.cos((end - start) / 4)))[moving, None]
 
-    def _table(self, start: float, end: float) -> NDArray[np.float64]:
+    def _table(self, start: float, end: float) -> Floats:
         """Return by how much each shape extends against `FAN` at both yaws and half-way, at most: shape (M, 32) [m]."""
         key = (start, end)
         if key not in self._tables:
@@ -147,23 +146,16 @@ class Body:
             self._tables[key] = table
         return self._tables[key]
 
-    def _drive(
-        self,
-        a: NDArray[np.float64],
-        b: NDArray[np.float64],
-        yaw: float,
-        extents: NDArray[np.float64],
-        rows: NDArray[np.int_],
-        margins: NDArray[np.float64],
-    ) -> bool:
+    def _drive(self, a: Floats, b: Floats, yaw: float, *, extents: Floats, rows: Ints, margins: Floats) -> bool:
+        """Return whether pairs (`rows`) keep their margins along a line; `extents` as from `_extents`."""
         near = (np.minimum(FAN @ a, FAN @ b) - extents).max(axis=1) < margins[self.standing[rows]]
         rows, extents = rows[near], extents[near]
         if not len(rows):
             return True
         length = float(np.hypot(*(b - a)))
         if length > _STEP:
-            middle = (a + b) / 2
-            return self._drive(a, middle, yaw, extents, rows, margins) and self._drive(middle, b, yaw, extents, rows, margins)
+            ends = itertools.pairwise((a, (a + b) / 2, b))
+            return all(self._drive(*half, yaw, extents=extents, rows=rows, margins=margins) for half in ends)
         direction = (b - a) / max(length, 1e-12)
 
         def closing(row: int, at: float) -> tuple[float, float]:
@@ -172,23 +164,16 @@ class Body:
 
         return all(self._keeps(row, closing, length, _BLINK, margins) for row in rows.tolist())
 
-    def _turn(
-        self,
-        at: NDArray[np.float64],
-        along: NDArray[np.float64],
-        start: float,
-        end: float,
-        rows: NDArray[np.int_],
-        margins: NDArray[np.float64],
-    ) -> bool:
+    def _turn(self, at: Floats, along: Floats, start: float, end: float, *, rows: Ints, margins: Floats) -> bool:
+        """Return whether pairs (`rows`) keep their margins during a turn at a place, that is `along` in the directions `FAN`."""
         gaps = (along - self._extents(start, end, rows)).max(axis=1)
         rows = rows[gaps < margins[self.standing[rows]]]
         if not len(rows):
             return True
         angle = abs(end - start)
         if angle > _ARC:
-            middle = (start + end) / 2
-            return self._turn(at, along, start, middle, rows, margins) and self._turn(at, along, middle, end, rows, margins)
+            ends = itertools.pairwise((start, (start + end) / 2, end))
+            return all(self._turn(at, along, *half, rows=rows, margins=margins) for half in ends)
 
         def closing(row: int, turned: float) -> tuple[float, float]:
             room, normal = self._distance(row, at, start + np.copysign(turned, end - start))
@@ -197,12 +182,7 @@ class Body:
         return all(self._keeps(row, closing, angle, _BLINK / self.reach[self.moving[row]], margins) for row in rows.tolist())
 
     def _keeps(
-        self,
-        row: int,
-        closing: Callable[[int, float], tuple[float, float]],
-        end: float,
-        blink: float,
-        margins: NDArray[np.float64],
+        self, row: int, closing: Callable[[int, float], tuple[float, float]], end: float, blink: float, margins: Floats
     ) -> bool:
         """Return whether a pair keeps its margin up to `end`; `closing` says how far it is and at most how fast it comes closer.
 
@@ -218,7 +198,7 @@ class Body:
                 return True
             at = min(at + max(sure, blink), end)
 
-    def _distance(self, row: int, at: NDArray[np.float64], yaw: float) -> tuple[float, NDArray[np.float64]]:
+    def _distance(self, row: int, at: Floats, yaw: float) -> tuple[float, Floats]:
         """Return coal's distance [m] of a pair with the base at a pose, and the normal towards what stands, in the plane."""
         shape, placement = self.shapes[self.moving[row]]
         other, where = self.world.shapes[self.standing[row]]
@@ -237,7 +217,7 @@ def _transform(placement: pin.SE3) -> coal.Transform3s:
     return coal.Transform3s(placement.rotation, placement.translation)
 
 
-def hull_points(shape: coal.CollisionGeometry, placement: pin.SE3, *, outer: bool) -> tuple[NDArray[np.float64], float]:
+def hull_points(shape: coal.CollisionGeometry, placement: pin.SE3, *, outer: bool) -> tuple[Floats, float]:
     """Return points, shape (n, 3) [m], and a radius around them: their hull contains a shape or, if not `outer`, is inside it."""
     rim = np.column_stack([np.cos(_RIM), np.sin(_RIM), np.zeros(len(_RIM))]) / (np.cos(_RIM[1] / 2) if outer else 1.0)
     radius = shape.getSweptSphereRadius() if outer else 0.0

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from vkc_pin.arrays import Bools, Floats, Ints
 from vkc_pin.cache import Cache
 from vkc_pin.driving.blocked import Lattice, PlanViews, stuck
 from vkc_pin.driving.body import FAN, Body, Shape, Standing
@@ -79,7 +80,7 @@ class BaseGrid:
         for field, value, least in (("margin", margin, 0.0), ("near", near, 0.0), ("cells", cells, 2)):
             if not (np.isfinite(value) and value >= least):
                 raise InputError("out of range", field=field, expected=f"at least {least:g}", got=value)
-        self.cells, self.near, self.margin = int(cells), float(near), float(margin)
+        self.cells, self.near = int(cells), float(near)
         self.step = (high - low) / cells
         self.origin = low + self.step / 2
         self.moves = _MOVES
@@ -89,7 +90,7 @@ class BaseGrid:
         self.base, self.carried = Body(base, world, margin), Body(carried, world, margin)
         views = (cache or Cache()).get("plan views", PlanViews)
         lattice = Lattice(self.origin, self.step, self.cells, self.yaws)
-        self.stuck, self.stuck_carrying = stuck(base, carried, standing, lattice, margin, views)
+        self.stuck, self.stuck_carrying = stuck(base, carried, standing, lattice, margin, views=views)
         self._edges: dict[tuple[int, int, int, bool, bool], bool] = {}
 
     # -- places ---------------------------------------------------------------------------------------------------------
@@ -98,7 +99,7 @@ class BaseGrid:
         """Return the world position of a cell's centre [m]."""
         return float(self.origin[0] + i * self.step[0]), float(self.origin[1] + j * self.step[1])
 
-    def around(self, x: float, y: float, radius: float) -> NDArray[np.int_]:
+    def around(self, x: float, y: float, radius: float) -> Ints:
         """Return the cells whose centres are within `radius` [m] of a place, shape (C, 2)."""
         low = np.maximum(np.ceil((np.array([x, y]) - radius - self.origin) / self.step), 0).astype(int)
         high = np.minimum(np.floor((np.array([x, y]) + radius - self.origin) / self.step), self.cells - 1).astype(int) + 1
@@ -110,10 +111,7 @@ class BaseGrid:
 
     def free(self, i: int, j: int, heading: int, *, reaching: bool = False) -> bool:
         """Return whether everything keeps its margin in a cell at a heading, 0 to HEADINGS - 1; `reaching` as in `clear`."""
-        room = (self._room[0][i][j], self._room[1][i][j])
-        if room[0] >= 0.0 and (reaching or room[1] >= 0.0):
-            return True
-        return self.clear(*self.center(i, j), float(self.yaws[heading]), reaching=reaching)
+        return self._roomy(i, j, reaching) or self.clear(*self.center(i, j), float(self.yaws[heading]), reaching=reaching)
 
     def clear(self, x: float, y: float, yaw: float, *, reaching: bool = False) -> bool:
         """Return whether everything keeps its margin at a pose in the world.
@@ -126,15 +124,7 @@ class BaseGrid:
         """
         return self.driven((x, y), (x, y), yaw, reaching=reaching)
 
-    def driven(
-        self,
-        a: ArrayLike,
-        b: ArrayLike,
-        yaw: float,
-        *,
-        reaching: bool = False,
-        margins: NDArray[np.float64] | None = None,
-    ) -> bool:
+    def driven(self, a: ArrayLike, b: ArrayLike, yaw: float, *, reaching: bool = False) -> bool:
         """Return whether everything keeps its margin all along a straight line.
 
         Args:
@@ -142,19 +132,16 @@ class BaseGrid:
             b: Its end.
             yaw: [rad], the same everywhere.
             reaching: As in `clear`.
-            margins: Of the base from each of `standing`, if it differs [m].
         """
         begin, end = np.asarray(a, float), np.asarray(b, float)
-        return self.base.driven(begin, end, yaw, margins) and (reaching or self.carried.driven(begin, end, yaw))
+        return self.base.driven(begin, end, yaw) and (reaching or self.carried.driven(begin, end, yaw))
 
-    def turned(
-        self, at: ArrayLike, start: float, end: float, *, reaching: bool = False, margins: NDArray[np.float64] | None = None
-    ) -> bool:
+    def turned(self, at: ArrayLike, start: float, end: float, *, reaching: bool = False, margins: Floats | None = None) -> bool:
         """Return whether everything keeps its margin while the base turns from one yaw to the other at a place [m], [rad]."""
         place = np.asarray(at, float)
         return self.base.turned(place, start, end, margins) and (reaching or self.carried.turned(place, start, end))
 
-    def leaving(self, x: float, y: float, yaw: float) -> NDArray[np.float64] | None:
+    def leaving(self, x: float, y: float, yaw: float) -> Floats | None:
         """Return the margins the base can keep when it leaves a blocked pose, None if the pose is not blocked.
 
         It comes no closer to what it is too close to; what it overlaps does not count.
@@ -180,14 +167,17 @@ class BaseGrid:
         """Return whether turning in a cell from `heading` to the next is free all along; remembered."""
         key = (i, j, heading, False, reaching)
         if key not in self._edges:
-            room = (self._room[0][i][j], self._room[1][i][j])
             end = float(self.yaws[heading + 1]) if heading + 1 < HEADINGS else 2 * np.pi
-            self._edges[key] = (room[0] >= 0.0 and (reaching or room[1] >= 0.0)) or self.turned(
+            self._edges[key] = self._roomy(i, j, reaching) or self.turned(
                 self.center(i, j), float(self.yaws[heading]), end, reaching=reaching
             )
         return self._edges[key]
 
     # -- bounds for all cells ---------------------------------------------------------------------------------------------
+
+    def _roomy(self, i: int, j: int, reaching: bool) -> bool:
+        """Return whether nothing can be hit from a cell at any heading."""
+        return self._room[0][i][j] >= 0.0 and (reaching or self._room[1][i][j] >= 0.0)
 
     @cached_property
     def _room(self) -> list[list[list[float]]]:
@@ -209,20 +199,20 @@ class BaseGrid:
 
     # -- distances ------------------------------------------------------------------------------------------------------
 
-    def distances(self, start: ArrayLike) -> NDArray[np.float64]:
+    def distances(self, start: ArrayLike) -> Floats:
         """Return how far the base drives at least from a place [m] to every cell, shape (cells, cells) [m]; infinite: no path.
 
-        Turns are free, and only what surely blocks the base is in the way.
+        Turns are free, and only what surely blocks the base counts.
         """
         return self.distances_from(np.asarray(start, float)[None, :2])[0]
 
-    def distances_from(self, starts: NDArray[np.float64]) -> NDArray[np.float64]:
+    def distances_from(self, starts: Floats) -> Floats:
         """Return `distances` for each of `starts`, shape (W, 2) [m]: shape (W, cells, cells) [m].
 
         Each start takes about a millisecond on 100 x 100 cells; for many of them, a grid of fewer cells will do.
         """
         blocked = np.asarray(self.stuck.all(axis=2))
-        entries: list[tuple[NDArray[np.int_], NDArray[np.float64]]] = []
+        entries: list[tuple[Ints, Floats]] = []
         for x, y in np.asarray(starts, float):
             for radius in (2.5 * float(self.step.max()), 2.0 * _ROOM, np.inf):
                 cells = self.around(x, y, radius)
@@ -232,9 +222,7 @@ class BaseGrid:
             entries.append((self.cells * cells[:, 0] + cells[:, 1], np.hypot(*(self.origin + cells * self.step - (x, y)).T)))
         return self.spread(entries, self.stuck)
 
-    def spread(
-        self, entries: Sequence[tuple[NDArray[np.int_], NDArray[np.float64]]], stuck: NDArray[np.bool_]
-    ) -> NDArray[np.float64]:
+    def spread(self, entries: Sequence[tuple[Ints, Floats]], stuck: Bools) -> Floats:
         """Return how far it is at least to every cell, shape (W, cells, cells) [m], if turns are free.
 
         Args:

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Bools, Floats, Ints
 from vkc_pin.driving.grid import BaseGrid
 
 __all__ = ["BACKWARDS", "SIDEWAYS", "TURNING", "UNIT", "Connections", "Drive", "Ground", "wrapped"]
@@ -37,8 +37,8 @@ _SAME = 1e-9
 class Drive:
     """A straight drive from a to b in the world, shape (2,) [m], at one yaw [rad]."""
 
-    a: NDArray[np.float64]
-    b: NDArray[np.float64]
+    a: Floats
+    b: Floats
     yaw: float
 
     @property
@@ -66,12 +66,12 @@ class Connections:
         cost: [UNIT].
     """
 
-    cell: NDArray[np.int_]
-    heading: NDArray[np.int_]
-    yaw: NDArray[np.float64]
-    cost: NDArray[np.int_]
+    cell: Ints
+    heading: Ints
+    yaw: Floats
+    cost: Ints
 
-    def select(self, which: NDArray[np.bool_]) -> Connections:
+    def select(self, which: Bools) -> Connections:
         """Return some of them."""
         return Connections(self.cell[which], self.heading[which], self.yaw[which], self.cost[which])
 
@@ -86,7 +86,7 @@ class Ground:
         haste: What a metre costs when leaving the start.
     """
 
-    def __init__(self, grid: BaseGrid, start: NDArray[np.float64], goals: NDArray[np.float64]) -> None:
+    def __init__(self, grid: BaseGrid, start: Floats, goals: Floats) -> None:
         self.grid, self.start, self.goals = grid, start, goals
         places = np.concatenate([start[None, :2], goals[:, :2]])
         self._places = places if grid.near > 0.0 else places[:0]
@@ -99,21 +99,21 @@ class Ground:
 
     # -- what is free -------------------------------------------------------------------------------------------------------
 
-    def clear(self, pose: NDArray[np.float64]) -> bool:
+    def clear(self, pose: Floats) -> bool:
         """Return whether the base is free at a pose."""
         return self.grid.clear(*pose, reaching=self._reaching(pose[:2]))
 
-    def turned(self, at: NDArray[np.float64], start: float, end: float, margins: NDArray[np.float64] | None = None) -> bool:
+    def turned(self, at: Floats, start: float, end: float, margins: Floats | None = None) -> bool:
         """Return whether the base can turn at a place from one yaw to another."""
         return self.grid.turned(at, start, end, reaching=self._reaching(at), margins=margins)
 
-    def driven(self, drive: Drive, margins: NDArray[np.float64] | None = None) -> bool:
+    def driven(self, drive: Drive, margins: Floats | None = None) -> bool:
         """Return whether the base can drive there."""
         return self.grid.base.driven(drive.a, drive.b, drive.yaw, margins) and all(
             self.grid.carried.driven(a, b, drive.yaw) for a, b in self._outside(drive)
         )
 
-    def swept(self, before: float, drive: Drive, after: float, margins: NDArray[np.float64] | None = None) -> bool:
+    def swept(self, before: float, drive: Drive, after: float, margins: Floats | None = None) -> bool:
         """Return whether the base can turn to a drive from one yaw, drive, and turn to another; `margins` up to there."""
         return (
             self.turned(drive.a, before, drive.yaw, margins)
@@ -131,10 +131,10 @@ class Ground:
         heading = int(np.abs(wrapped(grid.yaws - drive.yaw)).argmin())
         return not self.stuck[cells[:, 0], cells[:, 1], heading].any()
 
-    def _reaching(self, at: NDArray[np.float64]) -> bool:
+    def _reaching(self, at: Floats) -> bool:
         return bool(np.any(np.hypot(*(self._places - at).T) <= self.grid.near))
 
-    def _outside(self, drive: Drive) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    def _outside(self, drive: Drive) -> Iterator[tuple[Floats, Floats]]:
         """Yield the parts of a drive that are not near the start or a goal."""
         along, from_place = drive.b - drive.a, drive.a - self._places
         # |a + t·along − place|² = near², a quadratic in t.
@@ -165,7 +165,7 @@ class Ground:
         """Return the connections to a goal from the cells around it."""
         return self._connections(self.goals[goal], -1.0, _ENTRY, 1.0)
 
-    def _connections(self, pose: NDArray[np.float64], sign: float, radius: float, haste: float) -> Connections:
+    def _connections(self, pose: Floats, sign: float, radius: float, haste: float) -> Connections:
         """Return those from a pose (`sign` 1), or to it (-1), within a radius [m], where a metre costs `haste`."""
         grid = self.grid
         step = float(grid.step.max())
@@ -180,9 +180,7 @@ class Ground:
         found = Connections(np.tile(cells @ [grid.cells, 1], 3), heading, yaw, np.rint(cost / UNIT).astype(int))
         return found.select(~self.stuck.reshape(-1, len(grid.yaws))[found.cell, heading])
 
-    def turnable(
-        self, pose: NDArray[np.float64], connections: Connections, margins: NDArray[np.float64] | None = None
-    ) -> NDArray[np.bool_]:
+    def turnable(self, pose: Floats, connections: Connections, margins: Floats | None = None) -> Bools:
         """Return for which connections the base can turn at the pose between its yaw and theirs, up to a few degrees more."""
         limits = []
         for side in (1.0, -1.0):
@@ -218,7 +216,7 @@ class Ground:
             return None
         return drive, float(yaw + wrapped(self.goals[goal, 2] - yaw))
 
-    def center(self, cell: int) -> NDArray[np.float64]:
+    def center(self, cell: int) -> Floats:
         """Return the centre of a cell, given as i·cells + j, shape (2,) [m]."""
         return np.array(self.grid.center(*divmod(int(cell), self.grid.cells)))
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.driving.grid import BaseGrid
 from vkc_pin.driving.ground import TURNING, Drive, Ground, wrapped
 from vkc_pin.driving.search import cheapest
@@ -32,7 +32,7 @@ class BasePath:
             radians turned, plus the goal's extra cost [m].
     """
 
-    poses: NDArray[np.float64]
+    poses: Floats
     goal: int
     cost: float
 
@@ -40,9 +40,9 @@ class BasePath:
 def shortest_path(
     grid: BaseGrid,
     start: Sequence[float],
-    goals: NDArray[np.float64],
+    goals: Floats,
     *,
-    costs: Sequence[float] | NDArray[np.float64] | None = None,
+    costs: Sequence[float] | Floats | None = None,
     smooth: bool = True,
     interrupt: Interrupt = NEVER,
 ) -> BasePath | None:
@@ -80,7 +80,7 @@ def shortest_path(
     return _assembled(ground, drives, yaw, goal, float(extra[goal]))
 
 
-def poses_along(path: BasePath, steps: int, *, turning: float = 0.5) -> NDArray[np.float64]:
+def poses_along(path: BasePath, steps: int, *, turning: float = 0.5) -> Floats:
     """Return `steps` poses along a path, without its start, the last at its goal: slow at both ends, shape (steps, 3) [m, rad].
 
     Args:
@@ -115,7 +115,8 @@ def _shortened(ground: Ground, drives: list[Drive], last: float) -> tuple[list[D
         best, low, high = None, 1, len(rest)
         tried = high
         while low < tried:
-            straight = _straight(ground, rest[0].a, rest[tried - 1].b, yaw, float(yaws[tried + 1]), float(cost[tried - 1]))
+            turns_to, limit = float(yaws[tried + 1]), float(cost[tried - 1])
+            straight = _straight(ground, rest[0].a, rest[tried - 1].b, before=yaw, after=turns_to, limit=limit)
             if straight is None:
                 high = tried - 1
             else:
@@ -125,17 +126,12 @@ def _shortened(ground: Ground, drives: list[Drive], last: float) -> tuple[list[D
         drive, end = best or (rest[0], after)
         result.append(drive)
         # The same turns from there on, counted from an equal angle.
-        yaw, rest, last = (
-            drive.yaw,
-            [Drive(other.a, other.b, other.yaw + end - after) for other in rest[low:]],
-            last + end - after,
-        )
+        rest = [Drive(other.a, other.b, other.yaw + end - after) for other in rest[low:]]
+        yaw, last = drive.yaw, last + end - after
     return result, last
 
 
-def _straight(
-    ground: Ground, a: NDArray[np.float64], b: NDArray[np.float64], before: float, after: float, limit: float
-) -> tuple[Drive, float] | None:
+def _straight(ground: Ground, a: Floats, b: Floats, *, before: float, after: float, limit: float) -> tuple[Drive, float] | None:
     """Return a straight drive, and the yaw after turning at its end, if these, and the turn before it, cost less than `limit`."""
     found = []
     if np.hypot(*(b - a)) < _SAME:

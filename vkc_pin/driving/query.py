@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.driving.ground import Ground, wrapped
 
 __all__ = ["AHEAD", "BACK", "BEGIN", "DIRECT", "END", "LEFT", "RIGHT", "Move", "Query"]
@@ -27,7 +27,7 @@ class Query:
         shut: Moves from node to node that are not free, as cell, heading, kind.
     """
 
-    def __init__(self, ground: Ground, extra: NDArray[np.float64]) -> None:
+    def __init__(self, ground: Ground, extra: Floats) -> None:
         self.ground, self.extra = ground, extra
         self.starts = ground.starts()
         self.ends = {g: ground.ends(g) for g, goal in enumerate(ground.goals) if ground.clear(goal)}

@@ -1,7 +1,7 @@
 """A* for the mobile base over cells and headings.
 
 A move is asked for only when the search is about to take it. The heuristic is what the path from the start costs, with headings
-and turns, if nothing were in the way but what is known to be blocked; SciPy finds it for all cells and headings at once. It is
+and turns, if nothing blocked it but what is known to; SciPy finds it for all cells and headings at once. It is
 admissible and consistent, since what turns out to be blocked only makes paths longer. After surprises it is found again, with
 what has been learned.
 """
@@ -11,8 +11,8 @@ from __future__ import annotations
 import heapq
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.driving.grid import HEADINGS
 from vkc_pin.driving.ground import BACKWARDS, TURNING, UNIT, Drive, Ground, wrapped
 from vkc_pin.driving.query import AHEAD, BACK, BEGIN, DIRECT, END, LEFT, RIGHT, Move, Query
@@ -31,9 +31,7 @@ _CURVES = 0.13  # by what share paths are longer, mostly, because of turns
 _PATIENCE = 8e-3  # share of all nodes that are looked at, after a surprise, before the heuristic is found again
 
 
-def cheapest(
-    ground: Ground, extra: NDArray[np.float64], interrupt: Interrupt = NEVER
-) -> tuple[float, int, list[Drive], float] | None:
+def cheapest(ground: Ground, extra: Floats, interrupt: Interrupt = NEVER) -> tuple[float, int, list[Drive], float] | None:
     """Return the cheapest path to a goal that is not blocked, or None if there is none.
 
     Args:
@@ -67,7 +65,7 @@ def cheapest(
 class _Round:
     """A* over some of the cells, from the goals back to the start: dead ends are mostly around goals, and small."""
 
-    def __init__(self, query: Query, before: NDArray[np.float64], after: NDArray[np.float64], bound: float) -> None:
+    def __init__(self, query: Query, before: Floats, after: Floats, bound: float) -> None:
         """Look at the cells over which a path may cost less than `bound` [m], given what it costs at least up to and from it."""
         self.query, self.ground, self.bound = query, query.ground, bound / UNIT
         grid = self.ground.grid
@@ -105,7 +103,7 @@ class _Round:
         self._look()
 
     def _look(self) -> None:
-        """Find the cost from the start to every node if nothing is in the way but what is known to be blocked."""
+        """Find the cost from the start to every node if nothing blocks the base but what is known to."""
         from scipy.sparse import csr_array
         from scipy.sparse.csgraph import dijkstra
 

@@ -33,6 +33,7 @@ _EXPECTED = {
     "string_type": "text",
     "tuple_type": "a list",
 }
+_SIGNS = {"greater_than": ">", "greater_than_equal": ">=", "less_than": "<", "less_than_equal": "<="}
 
 
 def field_name(path: tuple[Key, ...]) -> str:
@@ -179,13 +180,9 @@ def _locate(node: yaml.Node, path: tuple[Key, ...], lines: dict[tuple[Key, ...],
         for key, value in node.value:
             name, line = key.value if isinstance(key, yaml.ScalarNode) else str(key.value), key.start_mark.line + 1
             if name in seen:
-                raise InputError(
-                    "this field stands here twice",
-                    file=file,
-                    line=line,
-                    field=field_name((*path, name)),
-                    got=f"lines {seen[name]} and {line}",
-                )
+                lines_of = f"lines {seen[name]} and {line}"
+                problem = "this field stands here twice"
+                raise InputError(problem, file=file, line=line, field=field_name((*path, name)), got=lines_of)
             seen[name] = line
             lines[(*path, name)] = line
             _locate(value, (*path, name), lines, file, above)
@@ -226,8 +223,9 @@ def _translate(document: Document, path: tuple[Key, ...], error: Any) -> InputEr
         return document.unknown(path, str(path[-1]), context.get("tag", got), choices)
     if kind == "vkc":
         return document.error(path, context["problem"], expected=context["expected"], got=repr(got))
-    if kind in ("greater_than", "greater_than_equal", "less_than", "less_than_equal"):
-        sign = {"greater_than": ">", "greater_than_equal": ">=", "less_than": "<", "less_than_equal": "<="}[kind]
-        return document.error(path, "out of range", expected=f"a number {sign} {next(iter(context.values())):g}", got=repr(got))
+    if kind in _SIGNS:
+        return document.error(
+            path, "out of range", expected=f"a number {_SIGNS[kind]} {next(iter(context.values())):g}", got=repr(got)
+        )
     expected = _EXPECTED.get(kind, error["msg"])
     return document.error(path, "wrong value", expected=expected, got=repr(got))

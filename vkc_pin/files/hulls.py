@@ -7,13 +7,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vkc_pin.arrays import Floats
+
 if TYPE_CHECKING:
     import trimesh
 
 __all__ = ["outer_hull"]
 
+_GAP = 5e-4  # [m]: no cut takes away less
+_DIRECTIONS = 400  # of cuts, spread over the sphere
 
-def outer_hull(points: ArrayLike, *, vertices: int = 40, gap: float = 5e-4) -> trimesh.Trimesh:
+
+def outer_hull(points: ArrayLike, *, vertices: int = 40) -> trimesh.Trimesh:
     """Return a convex polytope of few vertices that contains `points`.
 
     It starts as the box along the principal axes of the hull and is cut, again and again, by the plane that touches
@@ -22,7 +27,6 @@ def outer_hull(points: ArrayLike, *, vertices: int = 40, gap: float = 5e-4) -> t
     Args:
         points: Shape (n, 3), [m].
         vertices: The largest number of its vertices.
-        gap: No cut takes away less than this [m]: where it ends before `vertices` is reached.
 
     Returns:
         The polytope; every point lies in it (up to rounding, 1e-9 m).
@@ -43,7 +47,7 @@ def outer_hull(points: ArrayLike, *, vertices: int = 40, gap: float = 5e-4) -> t
             depth = (np.asarray(polytope.vertices) @ normals.T).max(axis=0) - offsets
             order = np.argsort(-depth)[:12]
             trials = []
-            for k in order[depth[order] > gap]:
+            for k in order[depth[order] > _GAP]:
                 planes = np.vstack([chosen_normals, normals[k]]), np.append(chosen_offsets, offsets[k])
                 trial = _intersect(*planes, corners)
                 if len(trial.vertices) <= vertices:
@@ -57,10 +61,10 @@ def outer_hull(points: ArrayLike, *, vertices: int = 40, gap: float = 5e-4) -> t
     return best
 
 
-def _directions(hull: trimesh.Trimesh, count: int = 400) -> NDArray[np.float64]:
+def _directions(hull: trimesh.Trimesh) -> Floats:
     """Return the normals worth trying: those of the hull's faces, and some spread evenly over the sphere."""
-    k = np.arange(count) + 0.5
-    z, turn = 1.0 - 2.0 * k / count, np.pi * (1.0 + 5.0**0.5) * k
+    k = np.arange(_DIRECTIONS) + 0.5
+    z, turn = 1.0 - 2.0 * k / _DIRECTIONS, np.pi * (1.0 + 5.0**0.5) * k
     spread = np.stack([np.sqrt(1.0 - z**2) * np.cos(turn), np.sqrt(1.0 - z**2) * np.sin(turn), z], axis=1)
     _, first = np.unique(np.asarray(hull.face_normals).round(2), axis=0, return_index=True)
     return np.vstack([np.asarray(hull.face_normals)[np.sort(first)], spread])

@@ -7,7 +7,6 @@ another package, are read by coal.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,13 +15,14 @@ import coal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
 from vkc_pin.files.hulls import outer_hull
 
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["MeshPart", "coarser", "convex_hull", "load_convex", "load_mesh", "load_parts", "to_bvh"]
+__all__ = ["MeshPart", "coarser", "convex_hull", "indices", "load_convex", "load_mesh", "load_parts", "to_bvh"]
 
 _NEIGHBOURS = 255  # coal's corners have no more
 _TOLERANCE = 1e-6  # how far, relatively, coal's volume and area may be from trimesh's
@@ -38,7 +38,7 @@ class MeshPart:
         colour: Red, green, blue, opacity in [0, 1], or None if the file names none.
     """
 
-    vertices: NDArray[np.float64]
+    vertices: Floats
     faces: NDArray[np.int64]
     colour: tuple[float, float, float, float] | None = None
 
@@ -115,8 +115,10 @@ def convex_hull(points: ArrayLike) -> coal.Convex:
         raise InputError("the mesh has no convex hull: it is flat", expected="points that span a volume") from error
     if np.bincount(np.asarray(hull.faces).ravel()).max() > _NEIGHBOURS:  # the tip of a finely meshed cone, a fine disc
         hull = outer_hull(hull.vertices, vertices=60)
-    shape = coal.Convex(_points(hull.vertices), _triangles(hull.faces))
-    corners = np.asarray(shape.points())[_indices(shape)]
+    triangles = coal.StdVec_Triangle()
+    triangles.extend(coal.Triangle(*face) for face in np.asarray(hull.faces).tolist())
+    shape = coal.Convex(_points(hull.vertices), triangles)
+    corners = np.asarray(shape.points())[indices(shape)]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2.0
     for what, held, wanted in (("volume", shape.computeVolume(), hull.volume), ("area", area, hull.area)):
         if not abs(held - wanted) <= _TOLERANCE * abs(wanted) or wanted <= 0.0:
@@ -190,7 +192,7 @@ def to_bvh(part: MeshPart) -> coal.BVHModelOBBRSS:
     return shape
 
 
-def _factors(file: Path, scale: ArrayLike) -> NDArray[np.float64]:
+def _factors(file: Path, scale: ArrayLike) -> Floats:
     factors = np.asarray(scale, float)
     if factors.shape not in ((), (1,), (3,)) or not (np.isfinite(factors).all() and (factors != 0.0).all()):
         raise InputError("wrong scale of a mesh", file=file, field="scale", expected="3 finite numbers other than 0", got=scale)
@@ -204,25 +206,19 @@ def _points(points: ArrayLike) -> Any:
     return vector
 
 
-def _triangles(faces: Iterable[Sequence[int]]) -> Any:
-    vector = coal.StdVec_Triangle()
-    for face in faces:
-        vector.append(coal.Triangle(int(face[0]), int(face[1]), int(face[2])))
-    return vector
+def indices(shape: coal.Convex | coal.BVHModelBase) -> NDArray[np.int64]:
+    """Return the corners of the triangles of a coal shape, shape (m, 3)."""
+    convex = isinstance(shape, coal.Convex)
+    count, item = (shape.num_polygons, shape.polygons) if convex else (shape.num_tris, shape.tri_indices)
+    return np.array([[triangle[i] for i in range(3)] for triangle in map(item, range(count))], np.int64).reshape(-1, 3)
 
 
-def _indices(shape: coal.Convex) -> NDArray[np.int64]:
-    triangles = (shape.polygons(k) for k in range(shape.num_polygons))
-    return np.array([[triangle[i] for i in range(3)] for triangle in triangles], int)
-
-
-def _read_with_coal(file: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _read_with_coal(file: Path) -> tuple[Floats, NDArray[np.int64]]:
     try:
         shape = coal.MeshLoader().load(str(file), np.ones(3))
     except (RuntimeError, ValueError) as error:
         raise InputError(f"cannot read the mesh: {error}", file=file, expected="a COLLADA file") from error
-    triangles = (shape.tri_indices(k) for k in range(shape.num_tris))
-    return np.array(shape.vertices()), np.array([[triangle[i] for i in range(3)] for triangle in triangles], int).reshape(-1, 3)
+    return np.array(shape.vertices()), indices(shape)
 
 
 def _colour(mesh: trimesh.Trimesh) -> tuple[float, float, float, float] | None:

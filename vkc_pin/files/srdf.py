@@ -17,12 +17,10 @@ class Srdf:
     """What an SRDF says.
 
     Attributes:
-        file: The file.
         allowed: Pairs of links that need not be kept apart, each sorted, with the reason.
         states: Name → joint → position, [m] or [rad].
     """
 
-    file: Path
     allowed: dict[tuple[str, str], str]
     states: dict[str, dict[str, float]]
 
@@ -46,14 +44,13 @@ def read_srdf(path: str | Path, *, links: Collection[str]) -> Srdf:
         InputError: It cannot be read or is no SRDF.
         UnknownNameError: It names a link that the robot does not have.
     """
-    file = Path(path)
-    text, root = read_xml(file, "SRDF")
+    text, root = read_xml(path, "SRDF")
     allowed = {}
     for element in root.iter("disable_collisions"):
         pair = [element.get(key, "") for key in ("link1", "link2")]
         for name in pair:
             if name not in links:
-                raise UnknownNameError("link", name, links, file=file, line=_line(text, name), field="disable_collisions")
+                raise UnknownNameError("link", name, links, file=path, line=_line(text, name), field="disable_collisions")
         first, second = sorted(pair)
         allowed[first, second] = element.get("reason", "")
     states: dict[str, dict[str, float]] = {}
@@ -64,7 +61,7 @@ def read_srdf(path: str | Path, *, links: Collection[str]) -> Srdf:
                 state[joint.get("name", "")] = float(joint.get("value", ""))
             except ValueError:
                 continue  # joints of several coordinates: not ours
-    return Srdf(file, allowed, states)
+    return Srdf(allowed, states)
 
 
 def _line(text: str, name: str) -> int | None:

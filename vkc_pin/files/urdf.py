@@ -1,19 +1,19 @@
-"""Reads URDF files: what they say about geometry, and things without a root joint as Pinocchio models."""
+"""Reads URDF files: what they say about geometry, and objects without a root joint as Pinocchio models."""
 
 from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import coal
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
 from vkc_pin.files import resources
 from vkc_pin.files.documents import read_xml
@@ -22,7 +22,7 @@ from vkc_pin.files.meshes import MeshPart, load_convex, load_mesh, to_bvh
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["Shape", "UrdfFile", "UrdfTree", "load_urdf", "read_urdf"]
+__all__ = ["UrdfFile", "UrdfShape", "UrdfTree", "load_urdf", "read_urdf"]
 
 Colour = tuple[float, float, float, float]
 _LIGHT_GREY: Colour = (0.9, 0.9, 0.9, 1.0)
@@ -30,7 +30,7 @@ _JOINTS = ("revolute", "continuous", "prismatic", "fixed")
 
 
 @dataclass(frozen=True)
-class Shape:
+class UrdfShape:
     """One <visual> or <collision> element.
 
     Attributes:
@@ -48,6 +48,7 @@ class Shape:
     placement: pin.SE3
     kind: str
     size: tuple[float, ...]
+    _: KW_ONLY
     file: Path | None = None
     colour: Colour | None = None
 
@@ -100,7 +101,7 @@ class UrdfFile:
         """The names of the links, in the file's order."""
         return tuple(link.get("name", "") for link in self.root.findall("link"))
 
-    def shapes(self, kind: str) -> list[Shape]:
+    def shapes(self, kind: str) -> list[UrdfShape]:
         """Return all elements of `kind`, "visual" or "collision".
 
         Raises:
@@ -142,7 +143,7 @@ class UrdfFile:
             "there is no such mesh", file=self.path, field=address, expected="a mesh file", got=f"nothing at {tried}"
         )
 
-    def _shape(self, link: str, name: str, element: ElementTree.Element, colours: Mapping[str, Colour]) -> Shape:
+    def _shape(self, link: str, name: str, element: ElementTree.Element, colours: Mapping[str, Colour]) -> UrdfShape:
         geometry = element.find("geometry")
         shape = next(iter(geometry), None) if geometry is not None else None
         if shape is None:
@@ -155,8 +156,8 @@ class UrdfFile:
         material = element.find("material")
         colour = None if material is None else self._colour(material) or colours.get(material.get("name", ""))
         if shape.tag == "mesh":
-            file = self.resolve(shape.get("filename", ""))
-            return Shape(link, name, placement, "mesh", self._numbers(shape, "scale", 3, "1 1 1", name), file, colour)
+            file, scale = self.resolve(shape.get("filename", "")), self._numbers(shape, "scale", 3, "1 1 1", name)
+            return UrdfShape(link, name, placement, "mesh", scale, file=file, colour=colour)
         if shape.tag == "box":
             size = self._numbers(shape, "size", 3, None, name)
         elif shape.tag == "sphere":
@@ -168,7 +169,7 @@ class UrdfFile:
             raise InputError("this shape is not supported", file=self.path, field=name, expected=known, got=shape.tag)
         if min(size) <= 0.0:
             raise InputError("a shape without volume", file=self.path, field=name, expected="sizes above 0", got=size)
-        return Shape(link, name, placement, shape.tag, size, None, colour)
+        return UrdfShape(link, name, placement, shape.tag, size, colour=colour)
 
     def _colour(self, material: ElementTree.Element) -> Colour | None:
         colour = material.find("color")
@@ -255,13 +256,13 @@ def _geometry(model: pin.Model, file: UrdfFile, kind: str) -> pin.GeometryModel:
     return geometry
 
 
-def _triangles(shape: Shape) -> coal.CollisionGeometry:
+def _triangles(shape: UrdfShape) -> coal.CollisionGeometry:
     assert shape.file is not None
     mesh = load_mesh(shape.file, shape.size)
     return to_bvh(MeshPart(np.asarray(mesh.vertices), np.asarray(mesh.faces)))
 
 
-def _rotation(roll: float, pitch: float, yaw: float) -> NDArray[np.float64]:
+def _rotation(roll: float, pitch: float, yaw: float) -> Floats:
     """Return the rotation, shape (3, 3), of angles [rad] about fixed axes, to the last bit as Pinocchio's reader has it."""
     (a, u), (b, v), (c, w) = ((math.sin(angle / 2.0), math.cos(angle / 2.0)) for angle in (roll, pitch, yaw))
     x, y, z, s = a * v * w - u * b * c, u * b * w + a * v * c, u * v * c - a * b * w, u * v * w + a * b * c

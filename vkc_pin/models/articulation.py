@@ -11,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.models.coordinates import Coordinates
 
@@ -37,7 +38,7 @@ class Freedom:
 
     suffix: str
     kind: str
-    axis: NDArray[np.float64]
+    axis: Floats
     lower: float
     upper: float
 
@@ -53,7 +54,7 @@ class Freedom:
         return pin.SE3(np.eye(3), self.axis * value)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Attachment:
     """A place where a tool can take hold of a link, and the freedom that this kind of grasp leaves.
 
@@ -98,9 +99,8 @@ class Attachment:
         """
         given = np.asarray(values, float)
         if given.shape != (len(self.freedoms),):
-            raise InputError(
-                "wrong number of values", field=self.name, expected=f"{len(self.freedoms)}, one a freedom", got=given
-            )
+            expected = f"{len(self.freedoms)}, one a freedom"
+            raise InputError("wrong number of values", field=self.name, expected=expected, got=given)
         placement = pin.SE3.Identity()
         for freedom, value in zip(self.freedoms, given, strict=True):
             placement = placement * freedom.motion(float(value))
@@ -133,9 +133,9 @@ class Latch:
     engaged_within: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ArticulatedObject:
-    """A thing with joints that can be grasped at its attachments. Its base link's frame is the model's universe frame.
+    """An object with joints that can be grasped at its attachments. Its base link's frame is the model's universe frame.
 
     Attributes:
         name: Its name.
@@ -159,10 +159,10 @@ class ArticulatedObject:
     collision: pin.GeometryModel
     visual: pin.GeometryModel
     coordinates: Coordinates
-    lower: NDArray[np.float64]
-    upper: NDArray[np.float64]
-    velocity: NDArray[np.float64]
-    acceleration: NDArray[np.float64]
+    lower: Floats
+    upper: Floats
+    velocity: Floats
+    acceleration: Floats
     attachments: Mapping[str, Attachment]
     latches: tuple[Latch, ...]
     base_link: str

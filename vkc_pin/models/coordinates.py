@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError, UnknownNameError
 
 __all__ = ["Coordinates", "wrapped"]
@@ -75,20 +76,16 @@ class Coordinates:
                 lower.append(model.lowerPositionLimit[i])
                 upper.append(model.upperPositionLimit[i])
             else:
-                raise InputError(
-                    "this joint type is not supported",
-                    field=name,
-                    expected="a planar joint or one of 1 degree of freedom",
-                    got=kind,
-                )
+                expected = "a planar joint or one of 1 degree of freedom"
+                raise InputError("this joint type is not supported", field=name, expected=expected, got=kind)
             joints += [index] * (len(names) - len(joints))
         self.names: tuple[str, ...] = tuple(names)
         self.units: tuple[str, ...] = tuple(units)
         self.joints: tuple[int, ...] = tuple(joints)
         self.size = len(names)
-        self.lower: NDArray[np.float64] = np.array(lower, float)
-        self.upper: NDArray[np.float64] = np.array(upper, float)
-        self.velocity: NDArray[np.float64] = np.array(model.velocityLimit, float)
+        self.lower: Floats = np.array(lower, float)
+        self.upper: Floats = np.array(upper, float)
+        self.velocity: Floats = np.array(model.velocityLimit, float)
         self.nq = int(model.nq)
         self._plain_q = np.array([i for i, _ in plain], int)
         self._plain_z = np.array([j for _, j in plain], int)
@@ -96,7 +93,7 @@ class Coordinates:
         self._angle_q = np.array([i for i, _ in angles], int)
         self._angle_z = np.array([j for _, j in angles], int)
 
-    def q(self, z: ArrayLike) -> NDArray[np.float64]:
+    def q(self, z: ArrayLike) -> Floats:
         """Return Pinocchio's configuration(s), shape (..., nq), of minimal coordinates `z`, shape (..., n)."""
         z = np.asarray(z, float)
         if z.shape[-1:] != (self.size,):
@@ -109,7 +106,7 @@ class Coordinates:
             q[..., i : i + 4] = z[..., j : j + 4] / np.linalg.norm(z[..., j : j + 4], axis=-1, keepdims=True)
         return q
 
-    def z(self, q: ArrayLike) -> NDArray[np.float64]:
+    def z(self, q: ArrayLike) -> Floats:
         """Return the minimal coordinates, shape (..., n), of `q`, shape (..., nq); angles in (-π, π]."""
         q = np.asarray(q, float)
         if q.shape[-1:] != (self.nq,):

@@ -44,17 +44,8 @@ def add_joint(
     source, index = like
     twin = source.joints[index]
     q, v = slice(twin.idx_q, twin.idx_q + twin.nq), slice(twin.idx_v, twin.idx_v + twin.nv)
-    added = model.addJoint(
-        parent,
-        joint,
-        placement,
-        prefix + source.names[index],
-        source.effortLimit[v],
-        source.velocityLimit[v],
-        source.lowerPositionLimit[q],
-        source.upperPositionLimit[q],
-    )
-    return int(added)
+    limits = source.effortLimit[v], source.velocityLimit[v], source.lowerPositionLimit[q], source.upperPositionLimit[q]
+    return int(model.addJoint(parent, joint, placement, prefix + source.names[index], *limits))
 
 
 def graft(model: pin.Model, tree: pin.Model, *, parent: int, placement: pin.SE3, prefix: str = "") -> list[int]:
@@ -89,14 +80,16 @@ def graft(model: pin.Model, tree: pin.Model, *, parent: int, placement: pin.SE3,
 
 
 def graft_geometry(
-    geometry: pin.GeometryModel,
-    objects: Iterable[pin.GeometryObject],
-    *,
-    joints: list[int],
-    placement: pin.SE3,
-    prefix: str = "",
+    geometry: pin.GeometryModel, objects: Iterable[pin.GeometryObject], *, joints: list[int], placement: pin.SE3, prefix: str = ""
 ) -> list[int]:
-    """Add copies of `objects` to `geometry`, their parent joints mapped by `joints` (see `graft`).
+    """Add copies of `objects` to `geometry`, their parent joints mapped.
+
+    Args:
+        geometry: Changed in place.
+        objects: The geometry of a tree that was grafted.
+        joints: For each joint of the tree its index in the model; see `graft`.
+        placement: Of the tree's universe frame in the frame of `joints[0]`.
+        prefix: Put before every name.
 
     Returns:
         The indices of the copies in `geometry`.
@@ -105,11 +98,7 @@ def graft_geometry(
     for original in objects:
         local = original.placement if original.parentJoint else placement * original.placement
         twin = pin.GeometryObject(original)
-        twin.name, twin.parentJoint, twin.parentFrame, twin.placement = (
-            prefix + original.name,
-            joints[original.parentJoint],
-            0,
-            local,
-        )
+        twin.name, twin.parentJoint, twin.parentFrame = prefix + original.name, joints[original.parentJoint], 0
+        twin.placement = local
         added.append(geometry.addGeometryObject(twin))
     return added

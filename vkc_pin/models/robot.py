@@ -7,10 +7,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.files.urdf import UrdfFile
 from vkc_pin.models.coordinates import Coordinates
 from vkc_pin.models.robot_model import visual_geometry
@@ -21,7 +20,7 @@ __all__ = ["Base", "Robot"]
 Base = Literal["omni", "differential", "fixed"]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Robot:
     """A mobile manipulator.
 
@@ -37,7 +36,7 @@ class Robot:
         velocity, acceleration: Limits, shape (n,).
         home: Where the arm rests, shape (n − 3,).
         tool_frame: The frame of `model` that grasps: z is the approach direction, x the one in which fingers close.
-        base: How the base moves: "omni" any way, "differential" forwards and round, "fixed" not at all.
+        base: How the base moves: "omni" in any direction, "differential" forwards and round, "fixed" not at all.
         touch_links: The links that may touch what is grasped.
     """
 
@@ -46,15 +45,15 @@ class Robot:
     model: pin.Model
     collision: pin.GeometryModel
     coordinates: Coordinates
-    lower: NDArray[np.float64]
-    upper: NDArray[np.float64]
-    velocity: NDArray[np.float64]
-    acceleration: NDArray[np.float64]
-    home: NDArray[np.float64]
+    lower: Floats
+    upper: Floats
+    velocity: Floats
+    acceleration: Floats
+    home: Floats
     tool_frame: str
     base: Base
     touch_links: tuple[str, ...] = ()
-    file: UrdfFile = field(repr=False, kw_only=True)
+    file: UrdfFile = field(repr=False)
 
     @cached_property
     def visual(self) -> pin.GeometryModel:

@@ -9,8 +9,8 @@ from typing import Literal
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.files import resources
 from vkc_pin.files.documents import Document
@@ -89,7 +89,7 @@ def load_robot(
 ) -> Robot:
     """Load a robot and put it on a planar virtual base.
 
-    The joints on the way from the root to the tool frame are planned. All others (wheels, heads, other arms, fingers) are
+    The joints between the root and the tool frame are planned. All others (wheels, heads, other arms, fingers) are
     locked, as are joints that mimic others and joints of a type other than revolute, continuous and prismatic.
 
     Limits come from the URDF and from a `robot.yaml` beside it. Where neither names a velocity or an acceleration they
@@ -233,27 +233,18 @@ def _state(model: pin.Model, semantics: Srdf | None, given: Collection[str]) -> 
     return {joint: nearest_position(model, joint, state[joint]) for joint in arm if joint in state and joint not in given}
 
 
-def _home(
-    files: _Files, model: pin.Model, rest: Mapping[str, float], lower: NDArray[np.float64], upper: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _home(files: _Files, model: pin.Model, rest: Mapping[str, float], lower: Floats, upper: Floats) -> Floats:
     """Return where the planned joints rest, shape (n − 3,). Raises `InputError` if one rests outside its limits."""
     arm = list(model.names)[2:]
     home = np.array([rest[joint] for joint in arm])
     if (outside := np.flatnonzero((home < lower - 1e-9) | (home > upper + 1e-9))).size:
         k = int(outside[0])
-        raise InputError(
-            "rests outside its limits",
-            file=files.document.file or files.urdf.path,
-            field=f"home.{arm[k]}",
-            expected=f"between {lower[k]:g} and {upper[k]:g}",
-            got=home[k],
-        )
+        file, expected = files.document.file or files.urdf.path, f"between {lower[k]:g} and {upper[k]:g}"
+        raise InputError("rests outside its limits", file=file, field=f"home.{arm[k]}", expected=expected, got=home[k])
     return home
 
 
-def _limits(
-    model: pin.Model, settings: RobotSchema, base: Base
-) -> tuple[Coordinates, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _limits(model: pin.Model, settings: RobotSchema, base: Base) -> tuple[Coordinates, Floats, Floats, Floats, Floats]:
     """Write the limits into `model` and return its coordinates with (lower, upper, velocity, acceleration), shape (n,) each."""
     low, high = np.array(settings.base.position).T if base != "fixed" else (np.zeros(2), np.zeros(2))
     position_low, position_high, velocity = model.lowerPositionLimit, model.upperPositionLimit, model.velocityLimit

@@ -1,4 +1,4 @@
-"""Builds the Pinocchio model of a robot: planar base, the joints on the way to the tool, all else locked; and its shapes."""
+"""Builds the Pinocchio model of a robot: planar base, the joints up to the tool, all else locked; and its shapes."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from collections.abc import Collection, Mapping
 import coal
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
-from vkc_pin.files.urdf import Shape, UrdfFile
+from vkc_pin.files.urdf import UrdfFile, UrdfShape
 from vkc_pin.models.grafting import add_joint, clean
 
 __all__ = [
@@ -47,30 +47,24 @@ def full_model(file: UrdfFile) -> pin.Model:
 def planned_model(
     full: pin.Model, file: UrdfFile, tool_frame: str, rest: Mapping[str, float], locked: Mapping[str, float]
 ) -> pin.Model:
-    """Return `full` with all joints locked but those on the way to `tool_frame`.
+    """Return `full` with all joints locked but those between the base and `tool_frame`.
 
     Args:
         full: See `full_model`.
         file: Its file.
         tool_frame: A frame of it.
         rest: Where each joint is locked, [m] or [rad]; see `rest_positions`.
-        locked: Joints to lock though they are on the way, and where.
+        locked: Joints to lock though they are among these, and where.
 
     Raises:
         InputError: No joint is left.
     """
-    way = _way(full, full.frames[_frame(full, tool_frame)].parentJoint)
-    planned = [
-        j for j in way if full.names[j] in rest and full.names[j] not in locked and full.names[j] not in _mimics(file.root)
-    ]
+    path = full.supports[full.frames[_frame(full, tool_frame)].parentJoint]  # from the world on
+    fixed = {*locked, *_mimics(file.root)}
+    planned = [j for j in path if j > 1 and full.names[j] in rest and full.names[j] not in fixed]
     if not planned:
-        raise InputError(
-            "no joint moves this frame",
-            file=file.path,
-            field="tool_frame",
-            expected="a frame at the end of an arm",
-            got=tool_frame,
-        )
+        expected = "a frame at the end of an arm"
+        raise InputError("no joint moves this frame", file=file.path, field="tool_frame", expected=expected, got=tool_frame)
     return _reduced(full, {1, *planned}, configuration(full, {**rest, **locked}))
 
 
@@ -105,9 +99,9 @@ def nearest_position(model: pin.Model, joint: str, position: float) -> float:
     return float(np.clip(position, low, high))
 
 
-def configuration(model: pin.Model, positions: Mapping[str, float]) -> NDArray[np.float64]:
+def configuration(model: pin.Model, positions: Mapping[str, float]) -> Floats:
     """Return the configuration, shape (nq,), with joints at `positions`; those not named are neutral."""
-    q: NDArray[np.float64] = pin.neutral(model)
+    q: Floats = pin.neutral(model)
     for j in range(1, model.njoints):
         joint, value = model.joints[j], positions.get(model.names[j])
         if value is not None and joint.nv == 1:
@@ -141,7 +135,7 @@ def collision_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
     """
     geometry = pin.GeometryModel()
     for shape in file.shapes("collision"):
-        _add(geometry, model, shape, shape.name, shape.solid(), _GREY)
+        geometry.addGeometryObject(_geometry_object(model, shape, shape.name, shape.solid(), _GREY))
     if len(geometry.geometryObjects) == 0:
         raise InputError("nothing of this robot can collide", file=file.path, expected="<collision> elements", got="none")
     return geometry
@@ -161,16 +155,17 @@ def visual_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
     geometry = pin.GeometryModel()
     for shape in file.shapes("visual"):
         if shape.file is None:
-            _add(geometry, model, shape, shape.name, shape.solid(), shape.colour or _GREY)
+            geometry.addGeometryObject(_geometry_object(model, shape, shape.name, shape.solid(), shape.colour or _GREY))
             continue
         parts = load_parts(shape.file, shape.size, detail=_DETAIL)
         for k, part in enumerate(parts):
             name = shape.name if len(parts) == 1 else f"{shape.name}_{k}"
-            _add(geometry, model, shape, name, to_bvh(part), shape.colour or part.colour or _GREY)
+            colour = shape.colour or part.colour or _GREY
+            geometry.addGeometryObject(_geometry_object(model, shape, name, to_bvh(part), colour))
     return geometry
 
 
-def _reduced(full: pin.Model, planned: Collection[int], q: NDArray[np.float64]) -> pin.Model:
+def _reduced(full: pin.Model, planned: Collection[int], q: Floats) -> pin.Model:
     """Return `full` with the joints that are not `planned` locked at `q`.
 
     `pinocchio.buildReducedModel` refuses models in which a link is called like a joint, as many are. Here, the frame of
@@ -197,15 +192,6 @@ def _reduced(full: pin.Model, planned: Collection[int], q: NDArray[np.float64]) 
     return model
 
 
-def _way(model: pin.Model, joint: int) -> list[int]:
-    """Return the joints from the root to `joint`, the planar one left out."""
-    way = []
-    while joint > 1:
-        way.append(joint)
-        joint = model.parents[joint]
-    return way[::-1]
-
-
 def _frame(model: pin.Model, name: str) -> int:
     """Return the frame called `name`, that of a link before that of a joint."""
     found = [i for i, frame in enumerate(model.frames) if frame.name == name]
@@ -218,24 +204,17 @@ def _mimics(root: ElementTree.Element) -> dict[str, tuple[str, float, float]]:
     for joint in root.findall("joint"):
         mimic = joint.find("mimic")
         if mimic is not None:
-            found[joint.get("name", "")] = (
-                mimic.get("joint", ""),
-                float(mimic.get("multiplier", "1")),
-                float(mimic.get("offset", "0")),
-            )
+            factor, offset = float(mimic.get("multiplier", "1")), float(mimic.get("offset", "0"))
+            found[joint.get("name", "")] = (mimic.get("joint", ""), factor, offset)
     return found
 
 
-def _add(
-    geometry: pin.GeometryModel,
-    model: pin.Model,
-    shape: Shape,
-    name: str,
-    solid: coal.CollisionGeometry,
-    colour: tuple[float, ...],
-) -> None:
+def _geometry_object(
+    model: pin.Model, shape: UrdfShape, name: str, solid: coal.CollisionGeometry, colour: tuple[float, ...]
+) -> pin.GeometryObject:
+    """Return `solid` as the geometry of an element of the URDF, on the joint of its link."""
     frame = model.getFrameId(shape.link, pin.FrameType.BODY)
     parent = model.frames[frame]
     added = pin.GeometryObject(name, parent.parentJoint, frame, clean(parent.placement * shape.placement), solid)
     added.meshColor = np.array(colour)
-    geometry.addGeometryObject(added)
+    return added

@@ -68,10 +68,7 @@ def python_packages(names: tuple[str, ...], document: Document) -> dict[str, Pat
     for index, name in enumerate(names):
         spec = importlib.util.find_spec(name) if name.isidentifier() else None
         if spec is None or not spec.submodule_search_locations:
-            raise document.error(
-                ("packages", index),
-                "the Python package with the robot's meshes is not installed",
-                expected=f"pip install {name.replace('_', '-')}",
-            )
+            problem = "the Python package with the robot's meshes is not installed"
+            raise document.error(("packages", index), problem, expected=f"pip install {name.replace('_', '-')}")
         folders[name] = Path(next(iter(spec.submodule_search_locations)))
     return folders

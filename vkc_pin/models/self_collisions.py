@@ -11,8 +11,8 @@ from xml.sax.saxutils import quoteattr
 import coal
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.files.writing import write_atomically
 from vkc_pin.models.robot import Robot
 
@@ -84,10 +84,10 @@ def sample_allowed_pairs(robot: Robot, *, samples: int = _SAMPLES, seed: int = 0
     for links, parts in groups.items():
         if links not in free:
             allowed[links] = "Always"
-        elif links not in hit and not any(
-            _drive_together(distances, parts, np.array(z), low, high, rng) for _, z in closest[links]
-        ):
-            allowed[links] = "Never"
+        elif links not in hit:
+            starts = (np.array(z) for _, z in closest[links])
+            if not any(_drive_together(distances, parts, z, (low, high), rng) for z in starts):
+                allowed[links] = "Never"
     return dict(sorted(allowed.items()))
 
 
@@ -141,7 +141,7 @@ class _Distances:
         self._middles = np.array([place.act(solid.aabb_center) for place, solid in zip(self._locals, self._solids, strict=True)])
         self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
 
-    def place(self, z: NDArray[np.float64]) -> None:
+    def place(self, z: Floats) -> None:
         """Put the robot at coordinates `z`, shape (n,)."""
         pin.forwardKinematics(self._robot.model, self._data, self._robot.coordinates.q(z))
         rotations = np.array([place.rotation for place in self._data.oMi])[self._joints]
@@ -157,14 +157,8 @@ class _Distances:
             bound = float(np.sqrt(gap @ gap) - self._radii[first] - self._radii[second])
             if bound <= min(smallest, worth):
                 self._result.clear()
-                bound = coal.distance(
-                    self._solids[first],
-                    self._place(first),
-                    self._solids[second],
-                    self._place(second),
-                    self._request,
-                    self._result,
-                )
+                one, other = ((self._solids[shape], self._place(shape)) for shape in (first, second))
+                bound = coal.distance(*one, *other, self._request, self._result)
             smallest = min(smallest, float(bound))
         return smallest
 
@@ -176,14 +170,10 @@ class _Distances:
 
 
 def _drive_together(
-    distances: _Distances,
-    parts: list[tuple[int, int]],
-    z: NDArray[np.float64],
-    low: NDArray[np.float64],
-    high: NDArray[np.float64],
-    rng: np.random.Generator,
+    distances: _Distances, parts: list[tuple[int, int]], z: Floats, limits: tuple[Floats, Floats], rng: np.random.Generator
 ) -> bool:
     """Return whether random steps from `z` that lessen the distance end in a collision."""
+    low, high = limits
     distances.place(z)
     nearest = distances.between(parts)
     for width in np.geomspace(0.2, 0.002, _STEPS):

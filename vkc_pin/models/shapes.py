@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
 
 import coal
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
+from vkc_pin.files.meshes import indices
 from vkc_pin.models.grafting import clean
 
 __all__ = [
@@ -95,12 +96,12 @@ def clearance(
 def shape_distance(
     first: coal.CollisionGeometry, first_placement: pin.SE3, second: coal.CollisionGeometry, second_placement: pin.SE3
 ) -> float:
-    """Return the signed distance [m] between two shapes at placements in one frame."""
+    """Return the signed distance [m] between two shapes, each at its placement in a common frame; negative: they overlap."""
     a, b = (coal.Transform3s(where.rotation, where.translation) for where in (first_placement, second_placement))
     return float(coal.distance(first, a, second, b, coal.DistanceRequest(), coal.DistanceResult()))
 
 
-def triangles(shape: coal.CollisionGeometry) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def triangles(shape: coal.CollisionGeometry) -> tuple[Floats, NDArray[np.int64]]:
     """Return the surface of a coal shape in its own frame: vertices, shape (n, 3) [m], and faces, shape (m, 3).
 
     Raises:
@@ -124,31 +125,25 @@ def triangles(shape: coal.CollisionGeometry) -> tuple[NDArray[np.float64], NDArr
         length = 2.0 * shape.halfLength
         mesh = make.capsule(height=length, radius=shape.radius, count=(_SEGMENTS, _SEGMENTS))
         mesh.apply_translation([0.0, 0.0, -(mesh.bounds[0, 2] + mesh.bounds[1, 2]) / 2.0])
-    elif isinstance(shape, coal.BVHModelBase):
-        faces = [shape.tri_indices(k) for k in range(shape.num_tris)]
-        return np.array(shape.vertices(), float), _indices(faces)
-    elif isinstance(shape, coal.Convex):
-        return np.array(shape.points(), float), _indices([shape.polygons(k) for k in range(shape.num_polygons)])
+    elif isinstance(shape, coal.BVHModelBase | coal.Convex):
+        points = shape.points() if isinstance(shape, coal.Convex) else shape.vertices()
+        return np.array(points, float), indices(shape)
     else:
         raise InputError("this shape cannot be drawn", expected="a solid or a mesh", got=type(shape).__name__)
     return np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
 
 
-def bounding_box(shape: pin.GeometryObject) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def bounding_box(shape: pin.GeometryObject) -> tuple[Floats, Floats]:
     """Return centre and half extents of a shape's bounding box in its own frame."""
     shape.geometry.computeLocalAABB()
     box = shape.geometry.aabb_local
     return np.asarray(box.center(), float), np.array([box.width(), box.height(), box.depth()]) / 2
 
 
-def world_box(shape: coal.CollisionGeometry, placement: pin.SE3) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def world_box(shape: coal.CollisionGeometry, placement: pin.SE3) -> tuple[Floats, Floats]:
     """Return the lower and upper corner, shape (3,) each [m], of a box along the world's axes around a shape."""
     shape.computeLocalAABB()
     box = shape.aabb_local
     centre = placement.act(np.asarray(box.center(), float))
     extent = np.abs(placement.rotation) @ np.array([box.width(), box.height(), box.depth()]) / 2
     return centre - extent, centre + extent
-
-
-def _indices(items: list[Any]) -> NDArray[np.int64]:
-    return np.array([(item[0], item[1], item[2]) for item in items], np.int64).reshape(-1, 3)

@@ -254,7 +254,7 @@ class _Chore:
                 part = dataclasses.replace(plan, scene=scene, steps=steps, trajectory=trajectory, initialization=seed)
                 piece = PhaseWaypoints(whole.phases[begin:end], whole.names, whole.waypoints[begin:end], seed)
                 ends = one.problem.ends
-                rests = end == len(ends) or ends[end - 1] in one.problem.transcription.structure.rests
+                rests = end == len(ends) or ends[end - 1] in one.problem.transcription.structure.stops
                 scene = scene_after(scene, trajectory, task.after)
             parts.append(_Part(part, piece, scene, rests, fine))
             begin = end

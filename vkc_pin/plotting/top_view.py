@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.models.shapes import triangles
 from vkc_pin.motion.placements import sample_motion
 from vkc_pin.motion.trajectory import Trajectory
@@ -63,7 +63,7 @@ def _draw_motion(axes: Axes, world: World, trajectory: Trajectory | None) -> Non
     motion = sample_motion(world, trajectory, times)
     shades = LinearSegmentedColormap.from_list("time", [_START, _END])(np.linspace(0.0, 1.0, len(times)))
     robot, moving = [], []
-    known: dict[int, NDArray[np.float64]] = {}
+    known: dict[int, Floats] = {}
     for i, shape in enumerate(world.shapes):
         if shape.parentJoint == 1:
             robot.append(i)
@@ -94,18 +94,18 @@ def _draw_motion(axes: Axes, world: World, trajectory: Trajectory | None) -> Non
         axes.plot(*path[-1, :2], "s", color=name, markersize=4.5, zorder=5)
 
 
-def _moments(trajectory: Trajectory) -> NDArray[np.float64]:
+def _moments(trajectory: Trajectory) -> Floats:
     """Return times at which the base has moved by another step, and times between where it stands and only the arm moves."""
     fine = np.linspace(trajectory.times[0], trajectory.times[-1], 400)
     rows = trajectory.at(fine)
     objects = np.abs(np.diff(rows[:, trajectory.robot_size :], axis=0)).sum(axis=1)
     travel = np.hypot(*np.diff(rows[:, :2], axis=0).T) + 0.3 * np.abs(np.diff(rows[:, 2])) + 0.5 * objects
-    way = np.concatenate([[0.0], np.cumsum(travel)])
-    count = int(np.clip(np.ceil(way[-1] / _STEP), 1, 14))
-    return np.unique(np.interp(np.linspace(0.0, way[-1], count + 1), way, fine)) if way[-1] > 0.0 else fine[[0, -1]]
+    passed = np.concatenate([[0.0], np.cumsum(travel)])
+    count = int(np.clip(np.ceil(passed[-1] / _STEP), 1, 14))
+    return np.unique(np.interp(np.linspace(0.0, passed[-1], count + 1), passed, fine)) if passed[-1] > 0.0 else fine[[0, -1]]
 
 
-def _corners(world: World, index: int, joint: NDArray[np.float64], known: dict[int, NDArray[np.float64]]) -> NDArray[np.float64]:
+def _corners(world: World, index: int, joint: Floats, known: dict[int, Floats]) -> Floats:
     """Return the vertices of a collision shape, shape (n, 3) [m], with its joint placed at `joint`, shape (4, 4).
 
     Args:
@@ -122,7 +122,7 @@ def _corners(world: World, index: int, joint: NDArray[np.float64], known: dict[i
     return np.asarray(vertices @ np.asarray(placed.rotation).T + placed.translation)
 
 
-def outline(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def outline(points: Floats) -> Floats:
     """Return the corners, shape (k, 2), of the convex hull of points' x and y; `points` has shape (n, ≥ 2)."""
     from scipy.spatial import ConvexHull, QhullError
 
@@ -133,7 +133,7 @@ def outline(points: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(flat[[0, -1]])
 
 
-def _polygon(corners: NDArray[np.float64], **style: Any) -> Any:
+def _polygon(corners: Floats, **style: Any) -> Any:
     from matplotlib.patches import Polygon
 
     return Polygon(corners, closed=True, **style)

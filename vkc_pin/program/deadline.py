@@ -27,18 +27,6 @@ class Monitor(ca.Callback):
         """Return the number of inputs: what nlpsol puts out."""
         return int(ca.nlpsol_n_out())
 
-    def get_n_out(self) -> int:
-        """Return the number of outputs: whether to stop."""
-        return 1
-
-    def get_name_in(self, i: int) -> str:
-        """Return the name of an input."""
-        return str(ca.nlpsol_out(i))
-
-    def get_name_out(self, i: int) -> str:
-        """Return the name of the output."""
-        return "stop"
-
     def get_sparsity_in(self, i: int) -> ca.Sparsity:
         """Return the shape of an input."""
         return ca.Sparsity.dense(self._sizes[ca.nlpsol_out(i)], 1)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats, Ints
 from vkc_pin.cache import Cache
 from vkc_pin.chain.contacts import ContactModel
 from vkc_pin.options import Options
@@ -24,7 +24,7 @@ __all__ = ["Plane", "build", "patterns", "planes", "sizes"]
 _FURTHER = 0.3  # [m]: pairs that much further apart than a plane's are not asked for
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Plane:
     """The witness plane of a pair at a waypoint: what the program knows of the pair's distance (eqs. 6 and 7).
 
@@ -44,20 +44,20 @@ class Plane:
     contacts: ContactModel
     waypoint: int
     names: tuple[str, str]
-    pair: NDArray[np.int_]
+    pair: Ints
     distance: float
     margin: float
-    coefficients: NDArray[np.float64]
+    coefficients: Floats
     offset: float
-    gradient: NDArray[np.float64]
+    gradient: Floats
 
-    def values(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
+    def values(self, z: Floats) -> Floats:
         """Return the distance that the plane takes the pair to have, shape (W,) [m], at z, shape (W, n)."""
         rotations, translations = self.problem.chain.joint_placements(z)
         columns = np.concatenate([rotations[:, 1:].swapaxes(2, 3), translations[:, 1:, None]], axis=2)
         return np.asarray(self.margin + columns.reshape(len(z), -1) @ self.coefficients - self.offset)
 
-    def distances(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
+    def distances(self, z: Floats) -> Floats:
         """Return the pair's distance from coal, shape (W,) [m], at z, shape (W, n); NaN where it is far from this one."""
         reach = max(self.distance, 0.0) + _FURTHER
         found = self.contacts.evaluate(z, np.full(len(z), self.waypoint), reach=reach)
@@ -66,7 +66,7 @@ class Plane:
         return distances
 
 
-def planes(problem: TrajectoryProblem, z: NDArray[np.float64], waypoint: int) -> list[Plane]:
+def planes(problem: TrajectoryProblem, z: Floats, waypoint: int) -> list[Plane]:
     """Return the witness planes at a waypoint, those of the pairs that fall shortest of their margins, worst first.
 
     Args:
@@ -81,7 +81,7 @@ def planes(problem: TrajectoryProblem, z: NDArray[np.float64], waypoint: int) ->
     coefficients, offsets = model.planes(z, contacts, slots=t.slots)
     x = np.column_stack([z, np.zeros(len(z))]).ravel()
     dt, targets = problem.timing_for(z).dt, problem.target_matrix()
-    parameters = t.parameter_vector(problem.start, coefficients, offsets, targets, problem.options.penalty, dt)
+    parameters = t.parameter_vector(problem.start, coefficients, offsets, targets, penalty=problem.options.penalty, dt=dt)
     _, jacobian = t.rows_at(x, parameters)
     columns = (waypoint - 1) * (t.n + 1) + np.arange(t.n)
     return [

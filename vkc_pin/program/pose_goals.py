@@ -1,4 +1,4 @@
-"""Which frames must be where and when: closures (eq. 2), grasps and the ways to them, and the steps' own goals (eq. 3)."""
+"""Which frames must be where and when: closures (eq. 2), grasps and the approaches to them, and the steps' own goals (eq. 3)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vkc_pin.options import Options
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.phases import Task
 
-__all__ = ["PoseGoal", "approach_at", "pose_goals"]
+__all__ = ["PoseGoal", "approach_at", "chosen_freedoms", "pose_goals"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +24,7 @@ class PoseGoal:
     Attributes:
         row: The frame, and the waypoints at which it must be there.
         target: Where, in the world.
-        kind: "closure" of what stands fixed and is held; "grasp" of a free object; "approach": where the straight way to a grasp
+        kind: "closure" of what stands fixed and is held; "grasp" of a free object; "approach": where the straight path to a grasp
             begins; "goal" of a step.
         about: What it is about, for people: an object, a hold or a frame.
         object: The object that is held or grasped; None for the goal of a step.
@@ -43,13 +43,13 @@ class PoseGoal:
 
 
 def pose_goals(scene: Scene, chain: VirtualKinematicChain, task: Task, options: Options) -> tuple[PoseGoal, ...]:
-    """Return the frames that must be somewhere: grasps and closures, then the ways to grasps and the steps' own goals.
+    """Return the frames that must be somewhere: grasps and closures, then the approaches to grasps and the steps' own goals.
 
     Args:
-        scene: Where things stand.
+        scene: Where objects stand.
         chain: The chain.
         task: What is held when, and what must be where at the ends of its phases.
-        options: How long the straight way to a grasp is.
+        options: How long the straight approach to a grasp is.
     """
     goals: list[PoseGoal] = []
     ends = np.cumsum([phase.segments for phase in task.phases])
@@ -86,3 +86,24 @@ def pose_goals(scene: Scene, chain: VirtualKinematicChain, task: Task, options: 
 def approach_at(first: int, last: int, options: Options) -> int:
     """Return the waypoint from which a hand goes straight to a grasp, in a phase from waypoint `first` to `last`."""
     return max(first + 1, last - options.steps(options.approach_time))
+
+
+def chosen_freedoms(scene: Scene, chain: VirtualKinematicChain, task: Task) -> tuple[tuple[int, int, int], ...]:
+    """Return column, waypoint of the grasp and last waypoint of the hold, for every freedom that is chosen when a hand clamps.
+
+    Args:
+        scene: Whose objects they are.
+        chain: The chain.
+        task: What is held when.
+    """
+    found, ends = [], np.cumsum([phase.segments for phase in task.phases])
+    for hold, names in chain.virtual.items():
+        attachment = scene.objects[hold.object].object.attachments[hold.attachment]
+        for number, phase in enumerate(task.phases):
+            if not attachment.firm or hold not in phase.grasps:
+                continue
+            last = number
+            while last + 1 < len(task.phases) and hold in task.phases[last + 1].held:
+                last += 1
+            found += [(chain.index(name), int(ends[number]), int(ends[last])) for name in names]
+    return tuple(found)

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.cache import Cache
 from vkc_pin.chain.chain import VirtualKinematicChain, consolidate
 from vkc_pin.chain.contacts import ContactModel, Contacts
 from vkc_pin.chain.pose import ROW_BOUNDS, target_vector
 from vkc_pin.models.coordinates import wrapped
 from vkc_pin.options import Options
-from vkc_pin.program.pose_goals import approach_at, pose_goals
+from vkc_pin.program.pose_goals import approach_at, chosen_freedoms, pose_goals
 from vkc_pin.program.term_places import TermNumbers, term_goals
 from vkc_pin.program.term_rows import TermRow
 from vkc_pin.program.timing import Timing, runs_between, time_for
@@ -42,6 +41,7 @@ class TrajectoryProblem:
         lower, upper: Bounds of z_1..z_N, shape (N, n): joint limits (eq. 4), what stands still, joint goals.
         pose_goals: Which frames must be where (eqs. 2 and 3), one per `transcription.structure.poses`.
         targets: Their placements.
+        choices: What is chosen when a hand clamps: column, waypoint of the grasp and last waypoint of the hold.
         terms: The user's own constraints and costs that count here, one per `transcription.structure.terms`.
         term_numbers: Their values along a motion.
         cache: Where the symbolic program came from, and searches keep what they build.
@@ -55,6 +55,7 @@ class TrajectoryProblem:
         self.contacts = ContactModel(scene, self.chain, task, options)
         self.ends = np.cumsum([phase.segments for phase in task.phases])
         self.pose_goals = pose_goals(scene, self.chain, task, options)
+        self.choices = chosen_freedoms(scene, self.chain, task)
         self.targets = tuple(goal.target for goal in self.pose_goals)
         rows, self.terms = term_goals(scene, self.chain, task, terms)
         self.transcription = transcribe(self._structure(rows), self.cache)
@@ -64,7 +65,7 @@ class TrajectoryProblem:
         self.term_numbers = TermNumbers(self.terms, self.transcription, self.start)
         self.term_numbers.check(self.still, np.full(self.segments, options.dt))
 
-    def with_bounds(self, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> TrajectoryProblem:
+    def with_bounds(self, lower: Floats, upper: Floats) -> TrajectoryProblem:
         """Return the same problem with other bounds of z_1..z_N, shape (N, n)."""
         other = copy.copy(self)
         other.lower, other.upper = lower.copy(), upper.copy()
@@ -77,16 +78,17 @@ class TrajectoryProblem:
         return int(self.ends[-1])
 
     @property
-    def still(self) -> NDArray[np.float64]:
+    def still(self) -> Floats:
         """z_1..z_N where nothing moves, shape (N, n)."""
         return np.tile(self.start, (self.segments, 1))
 
     def _structure(self, terms: tuple[TermRow, ...]) -> Structure:
+        """Return what the symbolic program depends on: the weights of eq. 1, the frames of eqs. 2 and 3, stops and firm holds."""
         o, robot = self.options, self.chain.robot.coordinates.size
         weights = np.full(self.chain.size, o.velocity_weight_object)
         weights[:robot], weights[:2] = o.velocity_weight_arm, o.velocity_weight_base
         weights[2] = o.velocity_weight_heading
-        # From the straight way to the grasp on: there the hand must already be where it will close.
+        # From the straight approach to the grasp on: there the hand must already be where it will close.
         starts = np.concatenate([[0], self.ends[:-1]])
         begin = {int(end): int(start) for start, end in zip(starts, self.ends, strict=True)}
         clamped = tuple((column, approach_at(begin[grasp], grasp, o), last) for column, grasp, last in self.choices)
@@ -98,29 +100,21 @@ class TrajectoryProblem:
                 velocity[first:last, :2] *= o.velocity_weight_holding
         # The robot stands still while its gripper closes or opens.
         phases = zip(self.ends[:-1], self.task.phases[:-1], self.task.phases[1:], strict=True)
-        rests = tuple(int(end) for end, phase, after in phases if phase.grasps or after.leaves)
-        differential = self.chain.robot.base == "differential"
-        poses = tuple(goal.row for goal in self.pose_goals)
+        stops = tuple(int(end) for end, phase, after in phases if phase.grasps or after.leaves)
         return Structure(
-            self.chain.model, self.segments, poses, o.contact_slots, velocity, acceleration, rests, differential, clamped, terms
+            model=self.chain.model,
+            segments=self.segments,
+            poses=tuple(goal.row for goal in self.pose_goals),
+            slots=o.contact_slots,
+            weights_velocity=velocity,
+            weights_acceleration=acceleration,
+            stops=stops,
+            differential=self.chain.robot.base == "differential",
+            clamped=clamped,
+            terms=terms,
         )
 
-    @cached_property
-    def choices(self) -> tuple[tuple[int, int, int], ...]:
-        """Column, waypoint of the grasp and last waypoint of the hold, for what is chosen when a hand clamps."""
-        found = []
-        for hold, names in self.chain.virtual.items():
-            attachment = self.scene.objects[hold.object].object.attachments[hold.attachment]
-            for number, phase in enumerate(self.task.phases):
-                if not attachment.firm or hold not in phase.grasps:
-                    continue
-                last = number
-                while last + 1 < len(self.task.phases) and hold in self.task.phases[last + 1].held:
-                    last += 1
-                found += [(self.chain.index(name), int(self.ends[number]), int(self.ends[last])) for name in names]
-        return tuple(found)
-
-    def _start(self) -> NDArray[np.float64]:
+    def _start(self) -> Floats:
         start = np.zeros(self.chain.size)
         start[: len(self.scene.start)] = self.scene.start
         for name, value in self.task.state.items():
@@ -131,7 +125,8 @@ class TrajectoryProblem:
                 start[self.chain.index(f"{hold.object}.{name}")] = value
         return start
 
-    def _bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _bounds(self) -> tuple[Floats, Floats]:
+        """Return the joint limits (eq. 4) at every waypoint, narrowed to what the phases and firm holds ask for."""
         lower, upper = np.tile(self.chain.lower, (self.segments, 1)), np.tile(self.chain.upper, (self.segments, 1))
         for column, name in enumerate(self.chain.names[:3]):
             lower[:, column], upper[:, column] = self.limits(name)
@@ -160,10 +155,10 @@ class TrajectoryProblem:
                     lower[:until, column] = upper[:until, column] = self.start[column]
         return lower, upper
 
-    def timing_for(self, z: NDArray[np.float64]) -> Timing:
+    def timing_for(self, z: Floats) -> Timing:
         """Return how long steps take where z_1..z_N, shape (N, n), is the seed; see `time_for`. Terms may ask for more time."""
         structure, limits = self.transcription.structure, (self.chain.velocity, self.chain.acceleration)
-        runs = runs_between(structure.rests, self.segments)
+        runs = runs_between(structure.stops, self.segments)
         dt = time_for(self.waypoints(z), self.options.dt, runs, limits)
         if structure.timed:
             dt = self.term_numbers.slower(z, dt, runs)
@@ -187,33 +182,33 @@ class TrajectoryProblem:
         """Return "m" or "rad", the unit of a coordinate."""
         return self.chain.coordinates.units[self.chain.index(name)]
 
-    def waypoints(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
+    def waypoints(self, z: Floats) -> Floats:
         """Return `z`, shape (N, n), with the start before it, shape (N + 1, n)."""
         return np.vstack([self.start, z])
 
-    def clip(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
+    def clip(self, z: Floats) -> Floats:
         """Return `z` with every coordinate within its bounds."""
         return np.clip(z, self.lower, self.upper)
 
-    def evaluate_contacts(self, z: NDArray[np.float64], *, reach: float, nearest: int | None = None) -> Contacts:
+    def evaluate_contacts(self, z: Floats, *, reach: float, nearest: int | None = None) -> Contacts:
         """Return the pairs closer than `reach` [m] at z_1..z_N, shape (N, n); at most `nearest` a waypoint."""
         return self.contacts.settled(z).evaluate(z, np.arange(1, self.segments + 1), reach=reach, nearest=nearest)
 
-    def rates(self, z: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the steps δz, shape (N, n), and their differences δδz, shape (N + 1 + rests, n); see `Transcription`."""
+    def rates(self, z: Floats) -> tuple[Floats, Floats]:
+        """Return the steps δz, shape (N, n), and their differences δδz, shape (N + 1 + stops, n); see `Transcription`."""
         t = self.transcription
         first = t.first @ z + np.outer(t.start_first, self.start)
         return first, t.second @ z + np.outer(t.start_second, self.start)
 
-    def objective(self, z: NDArray[np.float64], dt: NDArray[np.float64]) -> float:
+    def objective(self, z: Floats, dt: Floats) -> float:
         """Return f of eq. 1, and the user's own costs, at z_1..z_N, shape (N, n), in steps that take dt, shape (N,) [s]."""
         structure = self.transcription.structure
         first, second = self.rates(z)
         efforts = np.sum(first**2 * structure.weights_velocity) + np.sum(second**2 @ structure.weights_acceleration)
         return float(efforts) + self.term_numbers.cost(z, dt)
 
-    def pose_error(self, z: NDArray[np.float64]) -> float:
-        """Return the largest residual of closure, goals and rolling, [m] or [rad], at z_1..z_N, shape (N, n)."""
+    def pose_error(self, z: Floats) -> float:
+        """Return the largest residual of closure (eq. 2), goals (eq. 3) and rolling, [m] or [rad], at z_1..z_N, shape (N, n)."""
         errors = [0.0]
         for goal, solver in zip(self.pose_goals, self.transcription.pose_solvers, strict=True):
             if goal.row.waypoints:
@@ -221,11 +216,11 @@ class TrajectoryProblem:
                 errors.append(float(np.abs(residual).max()))
         return max(*errors, self.slip(z))
 
-    def row_error(self, z: NDArray[np.float64], dt: NDArray[np.float64]) -> float:
+    def row_error(self, z: Floats, dt: Floats) -> float:
         """Return `pose_error`, or how much the user's own constraints are violated if that is more; see `TermNumbers.error`."""
         return max(self.pose_error(z), self.term_numbers.error(z, dt))
 
-    def slip(self, z: NDArray[np.float64]) -> float:
+    def slip(self, z: Floats) -> float:
         """Return how far a differential base slips sideways in the worst step of z_1..z_N, shape (N, n) [m]; 0 for others."""
         if not self.transcription.structure.differential:
             return 0.0
@@ -234,7 +229,7 @@ class TrajectoryProblem:
         heading = path[:-1, 2] + step[:, 2] / 2
         return float(np.abs(np.cos(heading) * step[:, 1] - np.sin(heading) * step[:, 0]).max())
 
-    def drift(self, z: NDArray[np.float64]) -> float:
+    def drift(self, z: Floats) -> float:
         """Return how far grasps drift half-way between waypoints at most, relative to what `Options` allow."""
         path, worst = self.waypoints(z), 0.0
         between = (path[1:] + path[:-1]) / 2
@@ -247,7 +242,7 @@ class TrajectoryProblem:
                 worst = max(worst, float((amounts / allowed).max()))
         return worst
 
-    def row_bounds(self, timing: Timing | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def row_bounds(self, timing: Timing | None) -> tuple[Floats, Floats]:
         """Return the bounds of the program's rows, and with a timing those of its rates; shapes (rows,) and (rows,)."""
         t, terms = self.transcription, self.term_numbers
         lower, upper = np.zeros(t.rows), np.zeros(t.rows)
@@ -261,7 +256,7 @@ class TrajectoryProblem:
             lower, upper = np.concatenate([lower, -rates]), np.concatenate([upper, rates])
         return lower, upper
 
-    def target_matrix(self) -> NDArray[np.float64]:
+    def target_matrix(self) -> Floats:
         """Return the pose targets as parameters, shape (poses, 12)."""
         return np.array([target_vector(t) for t in self.targets]).reshape(-1, 12)
 
@@ -273,6 +268,6 @@ class TrajectoryProblem:
         )
 
 
-def _freeze(*arrays: NDArray[np.float64]) -> None:
+def _freeze(*arrays: Floats) -> None:
     for array in arrays:
         array.flags.writeable = False

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
+
+from vkc_pin.arrays import Floats, Ints
 
 __all__ = ["assemble", "sparse", "unit"]
 
 
-def sparse(matrix: NDArray[np.float64]) -> ca.DM:
+def sparse(matrix: Floats) -> ca.DM:
     """Return a small matrix without its zeros."""
     return ca.sparsify(ca.DM(matrix))
 
@@ -19,8 +20,15 @@ def unit(rows: int, columns: int, index: int) -> ca.DM:
     return ca.DM.triplet([index], [index], ca.DM(1.0), rows, columns)
 
 
-def assemble(parts: list[ca.MX], at: list[NDArray[np.int_]], rows: int, columns: int) -> ca.MX:
-    """Return the sparse matrix whose nonzeros are `parts`, one after another, at (row, column) `at`; what meets is added up."""
+def assemble(parts: list[ca.MX], at: list[Ints], rows: int, columns: int) -> ca.MX:
+    """Return the sparse matrix whose nonzeros are `parts`, one after another, at (row, column) `at`; what meets is added up.
+
+    Args:
+        parts: Columns of nonzeros.
+        at: For each of these, rows and columns, shape (2, number of nonzeros).
+        rows: Number of rows of the matrix.
+        columns: Number of its columns.
+    """
     where = np.concatenate(at, axis=1)
     order = np.lexsort((where[0], where[1]))
     values = ca.vertcat(*parts)

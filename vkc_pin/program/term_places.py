@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.chain.chain import VirtualKinematicChain
 from vkc_pin.chain.pose import target_vector
 from vkc_pin.errors import InputError
@@ -30,7 +30,7 @@ def term_goals(
     """Return what the program has of terms, and the terms that this is: those that can change something in this task.
 
     Args:
-        scene: Where things stand.
+        scene: Where objects stand.
         chain: The chain.
         task: What is held when.
         terms: Traced terms.
@@ -82,11 +82,11 @@ class _Whereabouts:
         if not dot or owner not in self.scene.objects:
             return self._on_chain(self.chain.frame(frame), waypoint)
         placed, phase = self.scene.objects[owner], self.phases[number]
-        thing = placed.object
-        if not thing.free:  # the same whether it is held or not; where it is held, the chain is closed
-            found = thing.model.frames[thing.model.getFrameId(link, pin.FrameType.BODY)]
-            values = tuple(self.value(f"{owner}.{name}") for name in thing.coordinates.names)
-            tree = Tree(thing.model.saveToString(), _numbers(placed.placement), values)
+        item = placed.object
+        if not item.free:  # the same whether it is held or not; where it is held, the chain is closed
+            found = item.model.frames[item.model.getFrameId(link, pin.FrameType.BODY)]
+            values = tuple(self.value(f"{owner}.{name}") for name in item.coordinates.names)
+            tree = Tree(item.model.saveToString(), _numbers(placed.placement), values)
             moves = found.parentJoint > 0 and any(value.column is not None for value in values)
             return FrameAt(_numbers(found.placement), found.parentJoint, waypoint if moves else -1, tree)
         hold = next((hold for hold in phase.held if hold.object == owner), None)
@@ -95,7 +95,7 @@ class _Whereabouts:
         if owner in phase.left:  # where the hand let go of it
             hold, last = phase.left[owner]
             return self._on_chain(self.chain.frame(link, hold), self.ends[last])
-        return FrameAt(_numbers(self._standing(phase, owner) * thing.link_placement(link, placed.state)))
+        return FrameAt(_numbers(self._standing(phase, owner) * item.link_placement(link, placed.state)))
 
     def _standing(self, phase: Phase, owner: str) -> pin.SE3:
         return phase.standing.get(owner, self.scene.objects[owner].placement)
@@ -117,7 +117,7 @@ class TermNumbers:
         lower, upper: Their bounds, shape (R,).
     """
 
-    def __init__(self, terms: Sequence[Term], transcription: Transcription, start: NDArray[np.float64]) -> None:
+    def __init__(self, terms: Sequence[Term], transcription: Transcription, start: Floats) -> None:
         self.terms, self.transcription, self.start = terms, transcription, start
         rows, bounds, scales = [np.zeros(0, int)], [np.zeros((0, 2))], [np.zeros(0)]
         timed, names = [np.zeros(0, bool)], []
@@ -136,15 +136,15 @@ class TermNumbers:
         self._scale, self._timed = np.concatenate(scales)[order], np.concatenate(timed)[order]
         self._names = [names[k] for k in order]
 
-    def error(self, z: NDArray[np.float64], dt: NDArray[np.float64]) -> float:
+    def error(self, z: Floats, dt: Floats) -> float:
         """Return by how much constraints are violated at most at z_1..z_N, shape (N, n), 1e-3 being their tolerance."""
         return float(self._excess(z, dt).max(initial=0.0))
 
-    def cost(self, z: NDArray[np.float64], dt: NDArray[np.float64]) -> float:
+    def cost(self, z: Floats, dt: Floats) -> float:
         """Return the weighted sum of all costs."""
         return float(self._evaluated(z, dt)[2]) if self.terms else 0.0
 
-    def slower(self, z: NDArray[np.float64], dt: NDArray[np.float64], runs: Sequence[tuple[int, int]]) -> NDArray[np.float64]:
+    def slower(self, z: Floats, dt: Floats, runs: Sequence[tuple[int, int]]) -> Floats:
         """Return the time of every step, made longer until z_1..z_N satisfies what depends on it, as far as that helps.
 
         Args:
@@ -169,7 +169,7 @@ class TermNumbers:
             dt = np.concatenate([dt[:begin], best * dt[begin:end], dt[end:]])
         return dt
 
-    def check(self, z: NDArray[np.float64], dt: NDArray[np.float64]) -> None:
+    def check(self, z: Floats, dt: Floats) -> None:
         """Check that values and slopes exist at z_1..z_N.
 
         Raises:
@@ -189,14 +189,14 @@ class TermNumbers:
             expected = "a smooth expression, e.g. cos(a) >= 0.98 instead of a <= 0.2, or squares instead of roots"
             raise InputError("it has no value or no slope at the start", field=f"terms[{name!r}].expression", expected=expected)
 
-    def _excess(self, z: NDArray[np.float64], dt: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _excess(self, z: Floats, dt: Floats) -> Floats:
         if not len(self.rows):
             return np.zeros(0)
         values = self._evaluated(z, dt)[0]
         excess = np.maximum(np.maximum(self.lower - values, values - self.upper), 0.0) * self._scale
         return np.where(np.isnan(excess), np.inf, excess)
 
-    def _evaluated(self, z: NDArray[np.float64], dt: NDArray[np.float64]) -> tuple[NDArray[np.float64], Any, float, Any]:
+    def _evaluated(self, z: Floats, dt: Floats) -> tuple[Floats, Any, float, Any]:
         x = np.column_stack([z, np.zeros(len(z))]).ravel()
         values, jacobian, cost, gradient = self.transcription.term_values(x, self.start, dt)
         return np.asarray(values).ravel(), jacobian, float(cost), np.asarray(gradient.nonzeros())

@@ -9,8 +9,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Ints
 from vkc_pin.cache import Cache
 from vkc_pin.chain.kinematics import kinematics_of
 from vkc_pin.cpin.batch import size_of
@@ -191,8 +191,8 @@ class TermProgram:
         """
         self._n = z.shape[0]
         self._size = (z.shape[1] - 1) * (self._n + 1)
-        self._hessians: list[tuple[ca.Function, list[Any], NDArray[np.int_], NDArray[np.int_], Any]] = []
-        self.rows, self.at = 0, [dict[int, NDArray[np.int_]]() for _ in terms]
+        self._hessians: list[tuple[ca.Function, list[Any], Ints, Ints, Any]] = []
+        self.rows, self.at = 0, [dict[int, Ints]() for _ in terms]
         text = model.saveToString()
         self.cost: Any = ca.MX(0)
         values, slopes, slopes_at = [], [], []
@@ -215,23 +215,22 @@ class TermProgram:
                 slope = ca.vec(functions.jacobian.map(count)(*inputs))
                 row, column = functions.jacobian_pattern
                 where = np.stack([(first[:, None] + row).ravel(), self._place(involved, column)])
+                kept = where[1] >= 0  # the others are about the start
+                where, slope = where[:, kept], slope[np.flatnonzero(kept).tolist()]
                 if term.weight is None:
                     values.append(value)
-                    kept = where[1] >= 0
-                    slopes.append(slope[np.flatnonzero(kept).tolist()])
-                    slopes_at.append(where[:, kept])
+                    slopes.append(slope)
+                    slopes_at.append(where)
                     rows = first[:, None] + np.arange(height)
                     rows_at.update(zip((waypoint for waypoint, _ in found), rows, strict=True))
                     self._hessians.append((functions.hessian, inputs, involved, rows, functions.hessian_pattern))
                     self.rows += height * count
                 else:
                     self.cost += term.weight * ca.sum1(value)
-                    kept = where[1] >= 0
-                    gradients.append(term.weight * slope[np.flatnonzero(kept).tolist()])
-                    gradients_at.append(np.stack([where[1][kept], np.zeros(kept.sum(), int)]))
-                    curvature, place = self._curvature(
-                        functions.hessian, inputs, involved, functions.hessian_pattern, ca.DM.ones(1, count) * term.weight
-                    )
+                    gradients.append(term.weight * slope)
+                    gradients_at.append(np.stack([where[1], np.zeros_like(where[1])]))
+                    weights, pattern = ca.DM.ones(1, count) * term.weight, functions.hessian_pattern
+                    curvature, place = self._curvature(functions.hessian, inputs, involved, pattern, weights)
                     curvatures.append(curvature)
                     curvatures_at.append(place)
         self.values = ca.vertcat(*values) if values else ca.MX(0, 1)
@@ -250,16 +249,14 @@ class TermProgram:
             at.append(place)
         return assemble(parts, at, self._size, self._size) if parts else ca.MX(self._size, self._size)
 
-    def _curvature(
-        self, function: ca.Function, inputs: list[Any], involved: NDArray[np.int_], pattern: Any, multipliers: Any
-    ) -> Any:
+    def _curvature(self, function: ca.Function, inputs: list[Any], involved: Ints, pattern: Any, multipliers: Any) -> Any:
         """Return nonzeros of the Hessian of all waypoints of a kind, and where they are; what is about the start is left out."""
         part = ca.vec(function.map(len(involved))(*inputs, multipliers))
         row, column = (self._place(involved, index) for index in pattern)
         kept = (row >= 0) & (column >= 0)
         return part[np.flatnonzero(kept).tolist()], np.stack([row[kept], column[kept]])
 
-    def _place(self, involved: NDArray[np.int_], index: NDArray[np.int_]) -> NDArray[np.int_]:
+    def _place(self, involved: Ints, index: Ints) -> Ints:
         """Return which variables entries of a kind's z are, for all its waypoints one after the other; -1 for the start's."""
         waypoint, coordinate = involved[:, index // self._n], index % self._n
         return np.where(waypoint > 0, (waypoint - 1) * (self._n + 1) + coordinate, -1).ravel()

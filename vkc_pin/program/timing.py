@@ -8,19 +8,20 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+
+from vkc_pin.arrays import Floats
 
 __all__ = ["Timing", "runs_between", "time_for"]
 
 _PATIENCE = 1.5  # how much more time a motion may take before limits on its rates become rows of the program
-_SPARE = 1.15  # how much longer a motion may take than the profile 3s² − 2s³ along its seed
+_SLACK = 1.15  # how much longer a motion may take than the profile 3s² − 2s³ along its seed
 
 Runs = Sequence[tuple[int, int]]
 
 
 @dataclass(frozen=True, eq=False)
 class Timing:
-    """The time of every step, one value within each run between two rests.
+    """The time of every step, one value within each run between two stops.
 
     Attributes:
         dt: Time of every step [s], shape (N,).
@@ -29,27 +30,27 @@ class Timing:
         limits: Of the velocities and accelerations of coordinates, shapes (n,), SI units.
     """
 
-    dt: NDArray[np.float64]
-    least: NDArray[np.float64]
+    dt: Floats
+    least: Floats
     runs: Runs
-    limits: tuple[NDArray[np.float64], NDArray[np.float64]]
+    limits: tuple[Floats, Floats]
 
     @cached_property
-    def velocity(self) -> NDArray[np.float64]:
+    def velocity(self) -> Floats:
         """Bounds of the steps δz, shape (N, n): limits times dt."""
         return np.asarray(self.limits[0] * self.dt[:, None])
 
     @cached_property
-    def acceleration(self) -> NDArray[np.float64]:
-        """Bounds of the differences δδz, shape (N + 1 + rests, n): limits times dt²."""
+    def acceleration(self) -> Floats:
+        """Bounds of the differences δδz, shape (N + 1 + stops, n): limits times dt²."""
         of_rows = np.concatenate([np.full(last - first + 1, self.dt[first]) for first, last in self.runs])
         return np.asarray(self.limits[1] * of_rows[:, None] ** 2)
 
-    def violation(self, first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
+    def violation(self, first: Floats, second: Floats) -> float:
         """Return the largest excess of steps and their differences over their bounds, relative to these; see `rates`."""
         return float(max(np.max(np.abs(first) / self.velocity), np.max(np.abs(second) / self.acceleration)) - 1.0)
 
-    def stretched(self, first: NDArray[np.float64], second: NDArray[np.float64]) -> Timing:
+    def stretched(self, first: Floats, second: Floats) -> Timing:
         """Return a timing that gives runs up to `_PATIENCE` times the least time where steps or differences exceed a bound."""
         fast, strong = np.max(np.abs(first) / self.velocity, axis=1), np.max(np.abs(second) / self.acceleration, axis=1)
         dt = self.dt.copy()
@@ -59,24 +60,28 @@ class Timing:
         return replace(self, dt=dt)
 
 
-def runs_between(rests: Sequence[int], segments: int) -> Runs:
-    """Return the stretches between two rests, as first and last waypoint, of a motion of so many segments."""
-    return tuple(itertools.pairwise([0, *rests, segments]))
+def runs_between(stops: Sequence[int], segments: int) -> Runs:
+    """Return the stretches between two stops, as first and last waypoint, of a motion of so many segments."""
+    return tuple(itertools.pairwise([0, *stops, segments]))
 
 
-def time_for(
-    path: NDArray[np.float64], dt: float, runs: Runs, limits: tuple[NDArray[np.float64], NDArray[np.float64]]
-) -> NDArray[np.float64]:
+def time_for(path: Floats, dt: float, runs: Runs, limits: tuple[Floats, Floats]) -> Floats:
     """Return the time of every step, shape (N,) [s]: `dt`, or more in runs where z_0..z_N, shape (N + 1, n), is too long for it.
 
-    The measure is the profile 3s² − 2s³ over the way that each coordinate goes between two rests: its speed is at most 1.5 times
-    the mean, its acceleration 6 times the way over the square of the duration.
+    The measure is the profile 3s² − 2s³ over the distance that each coordinate moves between two stops: its speed is at most 1.5
+    times the mean, its acceleration 6 times the distance over the square of the duration.
+
+    Args:
+        path: The waypoints, the start first.
+        dt: The shortest time of a step [s].
+        runs: See `runs_between`.
+        limits: Of velocity and acceleration (eq. 5), shape (n,) each, SI units.
     """
     velocity, acceleration = limits
     steps = np.abs(np.diff(path, axis=0))
     times = np.full(len(steps), dt)
     for first, last in runs:
-        way = steps[first:last].sum(axis=0)
-        needed = max(np.max(1.5 * way / velocity), np.sqrt(np.max(6.0 * way / acceleration)))
-        times[first:last] = np.maximum(times[first:last], _SPARE * needed / (last - first))
+        distance = steps[first:last].sum(axis=0)
+        needed = max(np.max(1.5 * distance / velocity), np.sqrt(np.max(6.0 * distance / acceleration)))
+        times[first:last] = np.maximum(times[first:last], _SLACK * needed / (last - first))
     return times

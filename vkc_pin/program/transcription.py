@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats, Ints
 from vkc_pin.cache import Cache
 from vkc_pin.chain.inverse_kinematics import PoseSolver
 from vkc_pin.models.coordinates import Coordinates
@@ -55,8 +55,7 @@ class Transcription:
 
     def __init__(self, structure: Structure, cache: Cache) -> None:
         self.structure, self.cache = structure, cache
-        self.coordinates = Coordinates(structure.model)
-        self.n, self.segments, self.slots = self.coordinates.size, structure.segments, structure.slots
+        self.n, self.segments, self.slots = Coordinates(structure.model).size, structure.segments, structure.slots
         self.size = self.segments * (self.n + 1)
         self._symbols()
         self._objective()
@@ -84,14 +83,8 @@ class Transcription:
         self.parameters = ca.veccat(self.start, self.planes, self.offsets, self.targets, self.penalty, *times)
 
     def parameter_vector(
-        self,
-        start: NDArray[np.float64],
-        planes: NDArray[np.float64],
-        offsets: NDArray[np.float64],
-        targets: NDArray[np.float64],
-        penalty: float,
-        dt: NDArray[np.float64] | None = None,
-    ) -> NDArray[np.float64]:
+        self, start: Floats, planes: Floats, offsets: Floats, targets: Floats, *, penalty: float, dt: Floats | None = None
+    ) -> Floats:
         """Return the parameters: start (n,), planes (N, K, 12·joints), offsets (N, K), targets (poses, 12), penalty, dt (N,).
 
         The times of the steps only count where a term needs them.
@@ -101,7 +94,7 @@ class Transcription:
         times = [dt] if self.structure.timed and dt is not None else []
         return np.concatenate([start, planes, offsets.ravel(), padded, [penalty], *times])
 
-    def rows_at(self, x: NDArray[np.float64], parameters: NDArray[np.float64]) -> tuple[NDArray[np.float64], Any]:
+    def rows_at(self, x: Floats, parameters: Floats) -> tuple[Floats, Any]:
         """Return the rows at x, shape (rows,), and their Jacobian, a sparse matrix (SciPy) of shape (rows, size)."""
         rows, jacobian = ca.Function("rows", [self.x, self.parameters], [self.g, self.jacobian])(x, parameters)
         return np.asarray(rows).ravel(), jacobian.sparse().tocsr()
@@ -118,7 +111,7 @@ class Transcription:
         start_first = np.zeros(N)
         start_first[0] = -1.0
         # The velocity steps between segments, and from and to rest where the motion starts, pauses and ends.
-        stops = [0, *self.structure.rests, N]
+        stops = [0, *self.structure.stops, N]
         runs = [np.diff(np.eye(N)[begin:end], axis=0, prepend=0.0, append=0.0) for begin, end in itertools.pairwise(stops)]
         steps = np.vstack(runs)
         second, start_second = steps @ first, steps @ start_first
@@ -144,6 +137,7 @@ class Transcription:
         return ca.DM(self.start_first**2 @ v + a * (self.start_second @ self.start_second))
 
     def _constraints(self) -> None:
+        """Make the rows of eqs. 2, 3, 6 and 7, waypoint by waypoint, their Jacobian and the Hessian of λᵀ·rows."""
         n, N, K = self.n, self.segments, self.slots
         poses_at: list[tuple[int, ...]] = [() for _ in range(N)]
         for index, pose in enumerate(self.structure.poses):
@@ -154,7 +148,7 @@ class Transcription:
         first_row = np.concatenate([[0], np.cumsum(count)])
         self.rows = int(first_row[-1])
         self.slot_rows = first_row[:-1, None] + np.arange(K)
-        self.pose_rows: list[dict[int, NDArray[np.int_]]] = [{} for _ in self.structure.poses]
+        self.pose_rows: list[dict[int, Ints]] = [{} for _ in self.structure.poses]
         values, jacobians, hessians = [], [], []
         value_rows, jacobian_at, hessian_at = [], [], []
         self.multipliers = ca.MX.sym("lam_g", self.rows)
@@ -187,26 +181,29 @@ class Transcription:
         if self.structure.differential:
             self._differential()
         self._clamp()
-        self.term_rows: list[dict[int, NDArray[np.int_]]] = []
+        self.term_rows: list[dict[int, Ints]] = []
         if self.structure.terms:
             self._terms()
+
+    def _append(self, values: ca.MX, jacobian: ca.MX) -> ca.MX:
+        """Append rows with their Jacobian, and return their multipliers."""
+        rows = self.rows
+        self.g, self.jacobian, self.rows = ca.vertcat(self.g, values), ca.vertcat(self.jacobian, jacobian), rows + values.numel()
+        multipliers = ca.MX.sym("lam_g", self.rows)
+        (self.hessian,) = ca.substitute([self.hessian], [self.multipliers], [multipliers[:rows]])
+        self.multipliers = multipliers
+        return multipliers[rows:]
 
     def _differential(self) -> None:
         """Append −sin θ̄·δx + cos θ̄·δy at every segment's mid-heading: the base rolls, it does not slip."""
         z = ca.horzcat(self.start, self.z)
         heading, step = (z[2, 1:] + z[2, :-1]) / 2, z[:2, 1:] - z[:2, :-1]
         slip = (-ca.sin(heading) * step[0, :] + ca.cos(heading) * step[1, :]).T
-        extra = ca.MX.sym("lam_slip", self.segments)
         self.base_rows = self.rows + np.arange(self.segments)
-        self.g = ca.vertcat(self.g, slip)
-        self.jacobian = ca.vertcat(self.jacobian, ca.jacobian(slip, self.x))
-        curvature = ca.triu(ca.hessian(ca.dot(extra, slip), self.x)[0])
+        multipliers = self._append(slip, ca.jacobian(slip, self.x))
+        extra = ca.MX.sym("lam_slip", self.segments)
+        (curvature,) = ca.substitute([ca.triu(ca.hessian(ca.dot(extra, slip), self.x)[0])], [extra], [multipliers])
         self.hessian = self.hessian + curvature
-        self.rows += self.segments
-        both = ca.MX.sym("lam_g", self.rows)
-        split = [both[: -self.segments], both[-self.segments :]]
-        (self.hessian,) = ca.substitute([self.hessian], [self.multipliers, extra], split)
-        self.multipliers = both
 
     def _clamp(self) -> None:
         """Append z_t − z_{t−1} = 0 for what a clamping hand does not let slide."""
@@ -217,11 +214,7 @@ class Transcription:
         for row, (column, waypoint) in enumerate(pairs):
             difference[row, (waypoint - 1) * (self.n + 1) + column] = 1.0
             difference[row, (waypoint - 2) * (self.n + 1) + column] = -1.0
-        self.g = ca.vertcat(self.g, difference @ self.x)
-        self.jacobian = ca.vertcat(self.jacobian, difference)
-        both = ca.MX.sym("lam_g", self.rows + len(pairs))
-        (self.hessian,) = ca.substitute([self.hessian], [self.multipliers], [both[: self.rows]])
-        self.multipliers, self.rows = both, self.rows + len(pairs)
+        self._append(difference @ self.x, difference)
 
     def _terms(self) -> None:
         """Append the user's own constraints, and add their costs to the objective."""
@@ -230,15 +223,13 @@ class Transcription:
         self.term_rows = [{waypoint: self.rows + rows for waypoint, rows in at.items()} for at in part.at]
         outputs = [part.values, part.jacobian, part.cost, part.gradient]
         self.term_values = ca.Function("terms", [self.x, self.start, self.dt], outputs)
-        self.g, self.jacobian = ca.vertcat(self.g, part.values), ca.vertcat(self.jacobian, part.jacobian)
-        both = ca.MX.sym("lam_g", self.rows + part.rows)
-        (hessian,) = ca.substitute([self.hessian], [self.multipliers], [both[: self.rows]])
-        self.hessian = hessian + part.hessian(both[self.rows :])
-        self.multipliers, self.rows = both, self.rows + part.rows
+        multipliers = self._append(part.values, part.jacobian)
+        self.hessian = self.hessian + part.hessian(multipliers)
         self.f, self.gradient = self.f + part.cost, self.gradient + part.gradient
         self.objective_curvature = self.objective_curvature + part.cost_hessian
 
     def _rates(self) -> None:
+        """Make the matrices of eq. 5: velocities and accelerations per step."""
         n = self.n
         select, identity = ca.horzcat(ca.DM.eye(n), ca.DM(n, 1)), ca.DM.eye(n)  # leaves the slack out
         self.rate_matrix = ca.vertcat(*(ca.kron(sparse(part), select) for part in (self.first, self.second)))

@@ -1,4 +1,4 @@
-"""The constraint rows of one waypoint, as SX functions: small, exact to second order, mapped over the waypoints."""
+"""The constraint rows of one waypoint (eqs. 2, 3, 6 and 7): SX functions, small, exact to second order, mapped over waypoints."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from functools import cached_property
 from typing import Any
 
 import casadi as ca
-import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.cache import Cache
 from vkc_pin.chain.kinematics import kinematics_of
 from vkc_pin.chain.pose import PoseRow, pose_rows
@@ -21,7 +20,7 @@ from vkc_pin.program.term_rows import TermRow
 __all__ = ["Structure", "WaypointFunctions", "waypoint_functions"]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Structure:
     """What a symbolic program depends on.
 
@@ -32,7 +31,7 @@ class Structure:
         slots: K, witness planes per waypoint.
         weights_velocity: Of eq. 1, on the squared differences, shape (N, n).
         weights_acceleration: The same for second differences, per coordinate, shape (n,).
-        rests: Waypoints inside the motion at which it comes to rest, as it does at start and end.
+        stops: Waypoints inside the motion at which it comes to rest, as it does at start and end.
         differential: Whether the base must not slip sideways.
         clamped: (column, first, last): coordinates that keep their value from waypoint `first` to `last`, as a hand does
             that clamps.
@@ -43,9 +42,9 @@ class Structure:
     segments: int
     poses: tuple[PoseRow, ...]
     slots: int
-    weights_velocity: NDArray[np.float64]
-    weights_acceleration: NDArray[np.float64]
-    rests: tuple[int, ...] = ()
+    weights_velocity: Floats
+    weights_acceleration: Floats
+    stops: tuple[int, ...] = ()
     differential: bool = False
     clamped: tuple[tuple[int, int, int], ...] = ()
     terms: tuple[TermRow, ...] = ()
@@ -60,7 +59,7 @@ class Structure:
         """Equal for structures that share one program."""
         poses = tuple((*_key(pose), pose.waypoints) for pose in self.poses)
         weights = (self.weights_velocity.tobytes(), self.weights_acceleration.tobytes())
-        others = (self.rests, self.differential, self.clamped, self.terms)
+        others = (self.stops, self.differential, self.clamped, self.terms)
         return (self.model.saveToString(), self.segments, poses, self.slots, *weights, *others)
 
 

@@ -171,7 +171,7 @@ class _Loop:
             "ubx": np.column_stack([upper, np.full(t.segments, np.inf)]).ravel(),
             "lbg": bounds[0],
             "ubg": bounds[1],
-            "p": t.parameter_vector(problem.start, planes, offsets, self.targets, self.penalty, self.timing.dt),
+            "p": t.parameter_vector(problem.start, planes, offsets, self.targets, penalty=self.penalty, dt=self.timing.dt),
         }
         begin = time.perf_counter()
         result = solver(**arguments, **self.multipliers)

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from vkc_pin.arrays import Floats, Ints
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.motion.world import World
 from vkc_pin.scene.scene import Scene
@@ -28,8 +29,8 @@ class ClearanceCurve:
     """
 
     name: str
-    times: NDArray[np.float64]
-    distances: NDArray[np.float64]
+    times: Floats
+    distances: Floats
     pairs: tuple[tuple[str, str], ...]
 
     def closest(self) -> tuple[float, float, str]:
@@ -38,9 +39,7 @@ class ClearanceCurve:
         return float(self.distances[k]), float(self.times[k]), " – ".join(self.pairs[k])
 
 
-def clearance_curves(
-    scene: Scene, trajectory: Trajectory, times: ArrayLike, *, dist_safe: float, world: World | None = None
-) -> list[ClearanceCurve]:
+def clearance_curves(scene: Scene, trajectory: Trajectory, times: ArrayLike, *, dist_safe: float) -> list[ClearanceCurve]:
     """Return how close shapes come along a motion, for each kind of pair that there is.
 
     The kinds are the robot with itself, with articulated objects, with obstacles, objects with what stands around them,
@@ -51,9 +50,8 @@ def clearance_curves(
         trajectory: The motion.
         times: When to look, shape (K,) [s].
         dist_safe: The clearance asked for [m]; a pair that may touch is recognised by asking for less.
-        world: The scene's world, if there is one already.
     """
-    world = World(scene) if world is None else world
+    world = World(scene)
     touching = may_touch(scene, world, trajectory, (), dist_safe)
     table = PairTable(scene, world, trajectory, dist_safe, touching=touching)
     moments = np.atleast_1d(np.asarray(times, float))
@@ -75,7 +73,7 @@ def clearance_curves(
 _KINDS = ("robot – itself", "robot – objects", "robot – obstacles", "objects – surroundings", "gripper – what it grasps")
 
 
-def _kind(table: PairTable, pair: NDArray[np.int_], margin: float) -> str:
+def _kind(table: PairTable, pair: Ints, margin: float) -> str:
     first, second = (table.group[int(i)] for i in pair)
     if margin <= 0.0 and first == "robot":
         return _KINDS[4]

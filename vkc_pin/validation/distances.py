@@ -11,8 +11,8 @@ from functools import cached_property
 import coal
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats, Ints
 from vkc_pin.models.shapes import bounding_box
 from vkc_pin.motion.world import World
 
@@ -37,18 +37,18 @@ class Solids:
         self.half = np.array([half for _, half in boxes]).reshape(-1, 3)
         obstacles = slice(self.bodies, None)
         self._obstacle_corners = self._corners([shape.placement for shape in world.shapes[obstacles]], obstacles)
-        self._obstacle_transforms: dict[int, coal.Transform3s] = {}
+        self._obstacle_transforms = [_transform(shape.placement) for shape in world.shapes[obstacles]]
         self._geometries = [shape.geometry for shape in world.shapes]
         self._data = world.model.createData()
         self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
 
-    def at(self, q: NDArray[np.float64]) -> Placed:
+    def at(self, q: Floats) -> Placed:
         """Return the shapes as they are placed at Pinocchio's configuration `q` of the world."""
         placed = pin.GeometryData(self.world.bodies)
         pin.updateGeometryPlacements(self.world.model, self._data, self.world.bodies, placed, q)
         return Placed(self, placed)
 
-    def corners(self, where: Sequence[pin.SE3]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def corners(self, where: Sequence[pin.SE3]) -> tuple[Floats, Floats]:
         """Return lower and upper corners of boxes along the world's axes around all shapes, shape (G, 3) each [m].
 
         Args:
@@ -58,7 +58,7 @@ class Solids:
         lower, upper = (np.concatenate(parts) for parts in zip(bodies, self._obstacle_corners, strict=True))
         return lower, upper
 
-    def _corners(self, where: Sequence[pin.SE3], which: slice) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _corners(self, where: Sequence[pin.SE3], which: slice) -> tuple[Floats, Floats]:
         rotation = np.array([placement.rotation for placement in where]).reshape(-1, 3, 3)
         translation = np.array([placement.translation for placement in where]).reshape(-1, 3)
         middle = (rotation @ self.center[which, :, None])[..., 0] + translation
@@ -67,15 +67,12 @@ class Solids:
 
     def obstacle_transform(self, shape: int) -> coal.Transform3s:
         """Return where an obstacle is, for coal."""
-        known = self._obstacle_transforms.get(shape)
-        if known is None:
-            known = self._obstacle_transforms[shape] = _transform(self.world.shapes[shape].placement)
-        return known
+        return self._obstacle_transforms[shape - self.bodies]
 
     def distance(
         self, first: int | coal.CollisionGeometry, here: coal.Transform3s, second: int, there: coal.Transform3s
     ) -> float:
-        """Return coal's signed distance of two shapes, or of anything else and a shape [m].
+        """Return coal's signed distance [m] of two shapes, or of any other and a shape, placed `here` and `there` in the world.
 
         Nothing is kept from one distance to the next, which would change its last digits.
         """
@@ -98,11 +95,11 @@ class Placed:
         self._known: dict[tuple[int, int], float] = {}
 
     @cached_property
-    def corners(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def corners(self) -> tuple[Floats, Floats]:
         """Lower and upper corners of boxes along the world's axes around all shapes, shape (G, 3) each [m]."""
         return self._solids.corners(list(self._where))
 
-    def bounds(self, pairs: NDArray[np.int_]) -> NDArray[np.float64]:
+    def bounds(self, pairs: Ints) -> Floats:
         """Return lower bounds of the distances of pairs, shape (n, 2), shape (n,) [m]; -inf where the boxes overlap."""
         lower, upper = self.corners
         first, second = pairs.T
@@ -112,18 +109,16 @@ class Placed:
 
     def distance(self, first: int, second: int) -> float:
         """Return coal's signed distance of two shapes [m]."""
-        key = (first, second)
-        known = self._known.get(key)
-        if known is None:
+        if (first, second) not in self._known:
             here, there = self._transform(first), self._transform(second)
-            known = self._known[key] = self._solids.distance(first, here, second, there)
-        return known
+            self._known[first, second] = self._solids.distance(first, here, second, there)
+        return self._known[first, second]
 
-    def distances(self, pairs: NDArray[np.int_]) -> NDArray[np.float64]:
+    def distances(self, pairs: Ints) -> Floats:
         """Return coal's signed distances of pairs, shape (n, 2), shape (n,) [m]."""
         return np.array([self.distance(first, second) for first, second in pairs.tolist()], float)
 
-    def nearest(self, pairs: NDArray[np.int_]) -> tuple[int, float]:
+    def nearest(self, pairs: Ints) -> tuple[int, float]:
         """Return which of pairs, shape (n, 2), is nearest, and its distance [m]; only what may be is asked of coal."""
         bounds = self.bounds(pairs)
         best, least = -1, np.inf
@@ -135,7 +130,7 @@ class Placed:
                 best, least = k, distance
         return best, least
 
-    def around(self, point: NDArray[np.float64], reach: float) -> list[int]:
+    def around(self, point: Floats, reach: float) -> list[int]:
         """Return the shapes that are closer than `reach` [m] to a point, shape (3,) [m]; a point has a size here, 0.1 mm."""
         lower, upper = self.corners
         near = np.flatnonzero(((lower - point < reach + POINT) & (point - upper < reach + POINT)).all(axis=1)).tolist()
@@ -145,10 +140,9 @@ class Placed:
     def _transform(self, shape: int) -> coal.Transform3s:
         if shape >= self._solids.bodies:
             return self._solids.obstacle_transform(shape)
-        known = self._transforms.get(shape)
-        if known is None:
-            known = self._transforms[shape] = _transform(self._where[shape])
-        return known
+        if shape not in self._transforms:
+            self._transforms[shape] = _transform(self._where[shape])
+        return self._transforms[shape]
 
 
 def _transform(placement: pin.SE3) -> coal.Transform3s:

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats, Ints
 from vkc_pin.task.formula import Formula
 from vkc_pin.task.terms import Constraint, Term
 from vkc_pin.validation.report import Violation
@@ -58,7 +58,7 @@ def check_terms(samples: Samples, terms: Sequence[Term]) -> list[Violation]:
     return found
 
 
-def _rows(samples: Samples, term: Constraint) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+def _rows(samples: Samples, term: Constraint) -> tuple[Ints, Ints]:
     """Return the samples at which a constraint must hold: those that are waypoints, and those between two of them."""
     trajectory = samples.trajectory
     asked = np.zeros(len(trajectory.times), bool)
@@ -74,7 +74,7 @@ def _rows(samples: Samples, term: Constraint) -> tuple[NDArray[np.int_], NDArray
     return at, np.concatenate([np.zeros(0, int), *inner])
 
 
-def _inputs(samples: Samples, formula: Formula, rows: NDArray[np.int_]) -> NDArray[np.float64]:
+def _inputs(samples: Samples, formula: Formula, rows: Ints) -> Floats:
     """Return the inputs of a formula at some samples, shape (S, 2·half + 1)."""
     ends = np.searchsorted(samples.waypoint_rows, rows)  # the waypoint in which the segment of a sample ends
     dt = np.diff(samples.trajectory.times, prepend=samples.trajectory.times[0] - 1.0)[ends]
@@ -88,7 +88,7 @@ def _inputs(samples: Samples, formula: Formula, rows: NDArray[np.int_]) -> NDArr
     return np.column_stack([now, before, dt])
 
 
-def _half(samples: Samples, formula: Formula, z: NDArray[np.float64]) -> NDArray[np.float64]:
+def _half(samples: Samples, formula: Formula, z: Floats) -> Floats:
     """Return placements of a formula's frames and its coordinates at configurations of the world, shape (S, half)."""
     model, coordinates = samples.world.model, samples.world.coordinates
     data = model.createData()

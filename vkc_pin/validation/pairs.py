@@ -11,8 +11,8 @@ from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats, Ints
 from vkc_pin.errors import InputError
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.motion.world import World
@@ -119,7 +119,7 @@ class PairTable:
             return False
         return self.moved[shapes[i].parentJoint] or self.moved[shapes[j].parentJoint]
 
-    def _with_obstacles(self) -> NDArray[np.int_]:
+    def _with_obstacles(self) -> Ints:
         """Return the pairs of what moves with the obstacles, shape (n, 2), by obstacle."""
         bodies, labels = range(self.solids.bodies), self.world.collision_labels
         joints = [self.world.shapes[i].parentJoint for i in bodies]
@@ -144,7 +144,7 @@ class PairTable:
         self._number = np.full((len(self._moving), len(self._still)), -1)
         self._number[np.searchsorted(self._moving, pairs[:, 0]), np.searchsorted(self._still, pairs[:, 1])] = mixed
 
-    def sweep(self, z: NDArray[np.float64], waypoints: NDArray[np.int_]) -> Iterator[Hit]:
+    def sweep(self, z: Floats, waypoints: Ints) -> Iterator[Hit]:
         """Yield what is close along the motion, and at least the closest pair of every waypoint.
 
         Args:
@@ -166,14 +166,7 @@ class PairTable:
             yield from self._between(z, (first, last), pairs, ends, moved=moved, smallest=smallest)
 
     def _between(
-        self,
-        z: NDArray[np.float64],
-        rows: tuple[int, int],
-        pairs: NDArray[np.int_],
-        ends: tuple[NDArray[np.float64], NDArray[np.float64]],
-        *,
-        moved: NDArray[np.float64],
-        smallest: float,
+        self, z: Floats, rows: tuple[int, int], pairs: Ints, ends: tuple[Floats, Floats], *, moved: Floats, smallest: float
     ) -> Iterator[Hit]:
         """Yield what comes closer than `smallest` at samples between two others, halves of which are left out where nothing can.
 
@@ -205,14 +198,7 @@ class PairTable:
                 yield self._hit(middle, pairs[c], distances[c])
             todo += [((low, middle), pairs, (before, distances)), ((middle, high), pairs, (distances, after))]
 
-    def _slipping(
-        self,
-        z: NDArray[np.float64],
-        row: int,
-        pairs: NDArray[np.int_],
-        ends: tuple[NDArray[np.float64], NDArray[np.float64]],
-        motion: NDArray[np.float64],
-    ) -> Iterator[Hit]:
+    def _slipping(self, z: Floats, row: int, pairs: Ints, ends: tuple[Floats, Floats], motion: Floats) -> Iterator[Hit]:
         """Yield what overlaps between a sample and the next, at both of which it is free: nothing deeper than 1 mm can hide.
 
         Args:
@@ -238,7 +224,7 @@ class PairTable:
                     break
                 stack += [(low, middle, before, between), (middle, high, between, after)]
 
-    def _close(self, placed: Placed, reach: NDArray[np.float64]) -> NDArray[np.int_]:
+    def _close(self, placed: Placed, reach: Floats) -> Ints:
         """Return all pairs but those of which one stands still and the other is at least `reach` from it; shape (G,) [m]."""
         lower, upper = placed.corners
         low, high = lower[self._moving] - reach[self._moving, None], upper[self._moving] + reach[self._moving, None]
@@ -249,7 +235,7 @@ class PairTable:
         found = self._number[near]
         return np.sort(np.concatenate([self._both, found[found >= 0]]))
 
-    def _nearest(self, placed: Placed) -> tuple[NDArray[np.int_], NDArray[np.float64]]:
+    def _nearest(self, placed: Placed) -> tuple[Ints, Floats]:
         """Return pairs, the closest and all that fall short of their margins among them, and their distances [m]."""
         reach = max(float(self.margins.max()), RESOLUTION)
         while True:
@@ -260,7 +246,7 @@ class PairTable:
                 return near, distances
             reach *= 2.0
 
-    def _active(self, here: Placed, there: Placed, moved: NDArray[np.float64], smallest: float) -> NDArray[np.int_]:
+    def _active(self, here: Placed, there: Placed, moved: Floats, smallest: float) -> Ints:
         """Return all pairs but those that boxes prove to stay `smallest` apart between two waypoints [m].
 
         Where d(s) of `_between` is less, one of both distances is less than `smallest` and half the relative motion.

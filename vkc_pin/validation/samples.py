@@ -7,8 +7,8 @@ from collections.abc import Iterable
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats, Ints
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.models.articulation import Freedom
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
@@ -70,9 +70,8 @@ class Samples:
                     self.check_frame(hold.frame, field.replace("held", "by"))
                 for name in attachments[attachment].coordinates:
                     if f"{owner}.{name}" not in names:
-                        raise InputError(
-                            "this grasp's coordinate is missing", field="trajectory.names", expected=f"{owner}.{name}"
-                        )
+                        problem = "this grasp's coordinate is missing"
+                        raise InputError(problem, field="trajectory.names", expected=f"{owner}.{name}")
 
     def check_frame(self, frame: str, field: str) -> None:
         """Check that "<object>.<link>" exists. Raises `UnknownNameError` if it does not."""
@@ -85,7 +84,7 @@ class Samples:
         if link not in item.links:
             raise UnknownNameError(f"link of '{owner}'", link, item.links, field=field)
 
-    def _sample(self) -> tuple[NDArray[np.float64], NDArray[np.int_]]:
+    def _sample(self) -> tuple[Floats, Ints]:
         """Return the times to look at, and where among them the waypoints are."""
         steps = np.abs(np.diff(self.trajectory.positions, axis=0))
         units = np.array([LENGTH_STEP if self.unit(name) == "m" else ANGLE_STEP for name in self.trajectory.names])
@@ -124,7 +123,7 @@ class Samples:
         """Return the waypoint of a sample, between two the earlier."""
         return int(np.searchsorted(self.waypoint_rows, row, side="right")) - 1
 
-    def rows(self, phase: PhaseSpan) -> NDArray[np.int_]:
+    def rows(self, phase: PhaseSpan) -> Ints:
         """Return the samples of a phase, both ends among them."""
         return np.arange(self.waypoint_rows[phase.first], self.waypoint_rows[phase.last] + 1)
 
@@ -149,10 +148,14 @@ class Samples:
             found.append(pin.updateFramePlacement(model, data, index).copy())
         return found
 
-    def grasp_errors(self, owner: str, name: str, rows: NDArray[np.int_], by: str | None = None) -> NDArray[np.float64]:
+    def grasp_errors(self, owner: str, name: str, rows: Ints, by: str | None = None) -> Floats:
         """Return how far the tool is from where attachment `name` has it, at some samples, shape (K, 2): [m] and [rad].
 
-        `by` is the frame that takes the tool's place, "<object>.<link>".
+        Args:
+            owner: The object.
+            name: Of one of its attachments.
+            rows: Which samples, shape (K,).
+            by: The frame that takes the tool's place, "<object>.<link>".
         """
         attachment = self.scene.objects[owner].object.attachments[name]
         tools = self.placements(rows, by or self.scene.robot.tool_frame)

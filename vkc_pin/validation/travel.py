@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.validation.distances import Solids
 
 __all__ = ["travelled"]
 
 
-def travelled(solids: Solids, samples: NDArray[np.float64]) -> NDArray[np.float64]:
+def travelled(solids: Solids, samples: Floats) -> Floats:
     """Return how far any point of each shape can have moved since the first sample, shape (S, G) [m].
 
     A joint's rotation moves a point by at most the angle times its distance from the axis, and that is at most the sum of the
@@ -49,7 +49,7 @@ def travelled(solids: Solids, samples: NDArray[np.float64]) -> NDArray[np.float6
     return found
 
 
-def _free(samples: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
+def _free(samples: Floats, reach: float) -> Floats:
     """Return how far a point at `reach` [m] from a free joint moves from each sample to the next, shape (S − 1,) [m]."""
     turns = samples[:, 3:] / np.linalg.norm(samples[:, 3:], axis=1, keepdims=True)
     half = np.arccos(np.clip(np.abs(np.einsum("kc,kc->k", turns[1:], turns[:-1])), 0.0, 1.0))

@@ -34,11 +34,7 @@ SLIP_TOLERANCE = 1e-4  # [m] per step
 
 
 def validate(
-    scene: Scene,
-    steps: Sequence[Step],
-    trajectory: Trajectory,
-    options: Options | None = None,
-    terms: Sequence[Term] = (),
+    scene: Scene, steps: Sequence[Step], trajectory: Trajectory, options: Options | None = None, terms: Sequence[Term] = ()
 ) -> Report:
     """Check a motion against everything that was asked of it.
 
@@ -112,6 +108,7 @@ class _Check:
                 self._add("start", name, abs(value - right), unit, f"{value:.6g} {unit} instead of {right:.6g} {unit}")
 
     def _limits(self) -> None:
+        """Every coordinate stays within its limits (eq. 4)."""
         for name, column in zip(self.trajectory.names, self.trajectory.positions.T, strict=True):
             lower, upper, _, _ = self.samples.bounds(name)
             excess = np.maximum(lower - column, column - upper)
@@ -124,6 +121,7 @@ class _Check:
                 self._add("limit", name, excess[worst], unit, detail, waypoint=worst)
 
     def _rates(self) -> None:
+        """Velocities and accelerations stay within theirs (eq. 5)."""
         velocities, accelerations = self.trajectory.velocities(), self.trajectory.accelerations()
         for i, name in enumerate(self.trajectory.names):
             _, _, fastest, strongest = self.samples.bounds(name)
@@ -196,7 +194,7 @@ class _Check:
                     self._add("latch", name, short[row], self.samples.unit(release), detail, row=row)
 
     def _closure(self) -> tuple[float, float]:
-        """The hand stays where it holds an object; return the largest drift, [m] and [rad]."""
+        """The hand stays where it holds an object (eq. 2); return the largest drift, [m] and [rad]."""
         largest = np.zeros(2)
         for phase in self.trajectory.phases:
             rows = self.samples.rows(phase)
@@ -226,7 +224,7 @@ class _Check:
                         self._add("slide", f"{owner}.{name}", moved[worst], unit, detail, waypoint=phase.first + worst)
 
     def _clearance(self) -> float:
-        """Nothing comes too close at a waypoint or penetrates anywhere; return the smallest distance [m].
+        """Nothing comes too close at a waypoint (eqs. 6 and 7) or penetrates anywhere; return the smallest distance [m].
 
         The start is where the robot is: it may be close to something, but not inside.
         """

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+
+from vkc_pin.arrays import Bools, Floats
 
 __all__ = ["FIELD_OF_VIEW", "Viewpoint", "choose_viewpoint"]
 
@@ -26,18 +27,16 @@ class Viewpoint:
         position: Where it stands, shape (3,) [m].
     """
 
-    target: NDArray[np.float64]
-    position: NDArray[np.float64]
+    target: Floats
+    position: Floats
 
 
-def choose_viewpoint(
-    points: NDArray[np.float64], boxes: Sequence[tuple[NDArray[np.float64], NDArray[np.float64], float]]
-) -> Viewpoint:
+def choose_viewpoint(points: Floats, boxes: Sequence[tuple[Floats, Floats, float]]) -> Viewpoint:
     """Return a camera for a motion.
 
     Args:
-        points: Where things happen, shape (n, 3) [m]; all of them get into the picture.
-        boxes: What may stand in the way: lower corner, upper corner, shape (3,) each [m], and opacity from 0 to 1.
+        points: Where the motion is, shape (n, 3) [m]; all of them get into the picture.
+        boxes: What may hide it: lower corner, upper corner, shape (3,) each [m], and opacity from 0 to 1.
     """
     lower, upper = points.min(axis=0), points.max(axis=0)
     target = (lower + upper) / 2.0
@@ -64,13 +63,11 @@ def choose_viewpoint(
     return Viewpoint(target, target + towards * max(1.0, float(needed.max())))
 
 
-def _direction(azimuth: float) -> NDArray[np.float64]:
+def _direction(azimuth: float) -> Floats:
     return np.array([np.cos(azimuth) * np.cos(_ELEVATION), np.sin(azimuth) * np.cos(_ELEVATION), np.sin(_ELEVATION)])
 
 
-def _crosses(
-    points: NDArray[np.float64], direction: NDArray[np.float64], lower: NDArray[np.float64], upper: NDArray[np.float64]
-) -> NDArray[np.bool_]:
+def _crosses(points: Floats, direction: Floats, lower: Floats, upper: Floats) -> Bools:
     """Return for every point, shape (3, n), whether its ray along `direction` meets the box."""
     enter, leave = np.full(points.shape[1], -np.inf), np.full(points.shape[1], np.inf)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -18,8 +18,8 @@ import pinocchio as pin
 from meshcat.animation import Animation, AnimationClip
 from meshcat.animation import AnimationTrack as Track
 from meshcat.commands import SetAnimation
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Bools
 from vkc_pin.models.robot import Robot
 from vkc_pin.motion.placements import Motion, sample_motion
 from vkc_pin.motion.trajectory import Trajectory
@@ -206,10 +206,10 @@ class Drawing:
             if solids:
                 self.viewer[f"ghosts/{name}/{owner}"].set_object(Ghost(merge_solids(solids), colour))
 
-    def _movers(self) -> dict[str, NDArray[np.bool_]]:
+    def _movers(self) -> dict[str, Bools]:
         """Return the joints that move in the world, of the robot and of every object: name → shape (joints,)."""
         model, moves = self.world.model, self.motion.moving.copy()
-        owners: dict[str, NDArray[np.bool_]] = {}
+        owners: dict[str, Bools] = {}
         for j in range(1, model.njoints):
             moves[j] |= moves[model.parents[j]]
             if moves[j]:

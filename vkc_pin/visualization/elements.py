@@ -9,8 +9,8 @@ from typing import Any
 import meshcat.geometry as g
 import numpy as np
 from meshcat.path import Path
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.visualization.solids import Solid
 
 __all__ = ["Ghost", "Sun", "Triangles", "Unshadow", "hexadecimal", "material", "node_name"]
@@ -62,7 +62,7 @@ class Sun(g.Object):
         camera: From the camera's target to the camera, shape (3,): the light comes from the left of there, and from above.
     """
 
-    def __init__(self, centre: NDArray[np.float64], reach: float, camera: NDArray[np.float64]) -> None:
+    def __init__(self, centre: Floats, reach: float, camera: Floats) -> None:
         g.SceneElement.__init__(self)
         towards = np.array([camera[0], camera[1], 0.0]) / max(1e-9, float(np.hypot(camera[0], camera[1])))
         left = np.array([towards[1], -towards[0], 0.0])

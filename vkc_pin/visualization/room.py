@@ -9,8 +9,8 @@ from pathlib import Path
 import coal
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.models.shapes import bounding_box
 from vkc_pin.scene.scene import Scene
 from vkc_pin.visualization.solids import Solid, box_solid, shade, to_solid
@@ -77,7 +77,7 @@ class Room:
             parts += self._wall_parts(shape)
         return parts
 
-    def lines(self) -> list[tuple[str, NDArray[np.float64], float]]:
+    def lines(self) -> list[tuple[str, Floats, float]]:
         """Return line segments, shape (2·k, 3) [m], with name and brightness: the floor's grid and the walls' edges."""
         drawn = []
         if self.scene.floor:
@@ -91,7 +91,7 @@ class Room:
             drawn.append(("wall_edges", np.array(edges), 0.55))
         return drawn
 
-    def obstructions(self) -> list[tuple[NDArray[np.float64], NDArray[np.float64], float]]:
+    def obstructions(self) -> list[tuple[Floats, Floats, float]]:
         """Return boxes that hide what is behind them: lower and upper corner, shape (3,) each [m], and opacity."""
         boxes = []
         for shape in [*self._walls, *self._furniture]:
@@ -152,7 +152,7 @@ def _is_wall(shape: pin.GeometryObject) -> bool:
     return bool(upright and 2.0 * half[:2].min() <= _THIN and top >= _HIGH and half[:2].max() > 2.0 * half[:2].min())
 
 
-def _edges(shape: pin.GeometryObject) -> NDArray[np.float64]:
+def _edges(shape: pin.GeometryObject) -> Floats:
     """Return the twelve edges of a box, shape (24, 3) [m]."""
     half = np.asarray(shape.geometry.halfSide)
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)

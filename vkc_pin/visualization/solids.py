@@ -10,12 +10,14 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.files.meshes import MeshPart, coarser
 from vkc_pin.models.shapes import triangles
 
 __all__ = ["Solid", "box_solid", "coarse", "merge_solids", "shade", "to_solid", "tube"]
 
 _CREASE = np.radians(35.0)  # faces that meet at a larger angle keep an edge between them
+_SIDES = 8  # of a tube
 _GRAIN = 2.0**-14  # [m]: vertices are rounded to this; numbers with few digits compress well
 
 
@@ -45,7 +47,7 @@ def to_solid(shape: coal.CollisionGeometry) -> Solid:
     return shade(*triangles(shape))
 
 
-def shade(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Solid:
+def shade(vertices: Floats, faces: NDArray[np.int64]) -> Solid:
     """Return triangles with normals. Vertices on an edge are doubled, so that each side has its own normal."""
     import trimesh
 
@@ -68,11 +70,11 @@ def merge_solids(solids: list[Solid]) -> Solid:
     return Solid(np.concatenate([s.vertices for s in solids]), np.concatenate(faces), np.concatenate([s.normals for s in solids]))
 
 
-def box_solid(lower: NDArray[np.float64], upper: NDArray[np.float64], sides: tuple[int, ...] = (0, 1, 2, 3, 4, 5)) -> Solid:
+def box_solid(lower: Floats, upper: Floats, sides: tuple[int, ...] = (0, 1, 2, 3, 4, 5)) -> Solid:
     """Return the box between two corners, or some of its `sides`: 0, 1 face −x, +x; 2, 3 face −y, +y; 4, 5 face −z, +z."""
-    vertices: list[NDArray[np.float64]] = []
+    vertices: list[Floats] = []
     faces: list[NDArray[np.int64]] = []
-    normals: list[NDArray[np.float64]] = []
+    normals: list[Floats] = []
     for k, side in enumerate(sides):
         axis, positive = divmod(side, 2)
         u, v = (axis + 1) % 3, (axis + 2) % 3
@@ -86,7 +88,7 @@ def box_solid(lower: NDArray[np.float64], upper: NDArray[np.float64], sides: tup
     return _solid(np.concatenate(vertices), np.concatenate(faces), np.concatenate(normals))
 
 
-def tube(points: NDArray[np.float64], radius: float, sections: int = 8) -> Solid | None:
+def tube(points: Floats, radius: float) -> Solid | None:
     """Return a tube of `radius` [m] along `points`, shape (n, 3) [m], since browsers draw lines one pixel wide.
 
     Returns:
@@ -108,12 +110,12 @@ def tube(points: NDArray[np.float64], radius: float, sections: int = 8) -> Solid
         side /= max(float(np.linalg.norm(side)), 1e-9)
         across[i] = side
     other = np.cross(along, across)
-    angle = 2.0 * np.pi * np.arange(sections) / sections
+    angle = 2.0 * np.pi * np.arange(_SIDES) / _SIDES
     normals = np.cos(angle)[None, :, None] * across[:, None] + np.sin(angle)[None, :, None] * other[:, None]
     vertices = line[:, None] + radius * normals
-    ring, k = np.meshgrid(np.arange(len(line) - 1) * sections, np.arange(sections), indexing="ij")
-    a, b = ring + k, ring + (k + 1) % sections
-    faces = np.concatenate([np.stack([a, b, b + sections], axis=-1), np.stack([a, b + sections, a + sections], axis=-1)])
+    ring, k = np.meshgrid(np.arange(len(line) - 1) * _SIDES, np.arange(_SIDES), indexing="ij")
+    a, b = ring + k, ring + (k + 1) % _SIDES
+    faces = np.concatenate([np.stack([a, b, b + _SIDES], axis=-1), np.stack([a, b + _SIDES, a + _SIDES], axis=-1)])
     return _solid(vertices.reshape(-1, 3), faces.reshape(-1, 3), normals.reshape(-1, 3))
 
 

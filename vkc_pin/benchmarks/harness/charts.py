@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vkc_pin.benchmarks.harness.record import Record
 from vkc_pin.benchmarks.harness.tables import common, mean_and_deviation, quartiles, wilson
 from vkc_pin.planning.plan import Plan
 from vkc_pin.plotting.style import COLOURS, new_figure, save_figure, shade_phases, styled
@@ -24,12 +25,7 @@ _BASE = ("x [m/s]", "y [m/s]", "yaw [rad/s]")
 
 
 def success_chart(
-    records: Sequence[Mapping[str, Any]],
-    path: str | Path | None,
-    scenes: Mapping[str, str],
-    methods: Sequence[str],
-    *,
-    title: str = "",
+    records: Sequence[Record], path: str | Path | None, scenes: Mapping[str, str], methods: Sequence[str], *, title: str = ""
 ) -> Figure:
     """Draw success rates as bars, grouped by scene, with Wilson's intervals of 95 % confidence.
 
@@ -59,7 +55,7 @@ def success_chart(
 
 
 def means_chart(
-    records: Sequence[Mapping[str, Any]],
+    records: Sequence[Record],
     path: str | Path | None,
     scenes: Mapping[str, str],
     methods: Sequence[str],
@@ -111,9 +107,7 @@ def means_chart(
     return save_figure(figure, path)
 
 
-def criteria_chart(
-    records: Sequence[Mapping[str, Any]], path: str | Path | None, methods: Sequence[str], *, title: str = ""
-) -> Figure:
+def criteria_chart(records: Sequence[Record], path: str | Path | None, methods: Sequence[str], *, title: str = "") -> Figure:
     """Draw a task's success rate, base effort, arm effort and planning time as bars, side by side.
 
     Rates have Wilson's intervals of 95 % confidence. The other bars are medians with quartiles: times over all trials, efforts
@@ -253,7 +247,7 @@ def _name_bars(axes: Axes, names: Sequence[str], margin: float) -> None:
     axes.set_axisbelow(True)
 
 
-def _number(records: Sequence[Mapping[str, Any]], scene: str, methods: Sequence[str]) -> str:
+def _number(records: Sequence[Record], scene: str, methods: Sequence[str]) -> str:
     """Return how many trials each method has in a scene."""
     shown = [record["method"] for record in records if record["scene"] == scene and record["method"] in methods]
     numbers = sorted({shown.count(method) for method in shown})

@@ -14,8 +14,10 @@ import numpy as np
 
 from vkc_pin.planning.plan import Plan
 
-__all__ = ["distribution", "meta", "peak_memory", "trial", "versions"]
+__all__ = ["Record", "distribution", "meta", "peak_memory", "trial", "versions"]
 
+Record = Mapping[str, Any]
+"""What is kept of a trial, by field; see `trial`."""
 PACKAGES = ("vkc-pin", "pin", "coal", "casadi", "numpy")
 
 
@@ -68,10 +70,7 @@ def trial(plan: Plan, *, method: str, seed: int, **more: Any) -> dict[str, Any]:
         "seed": seed,
         "success": plan.success,
         "status": plan.status,
-        "planning_time": m["planning_time"],
-        "base_effort": m["base_effort"],
-        "base_effort_l1": m["base_effort_l1"],
-        "arm_effort": m["arm_effort"],
+        **{field: m[field] for field in ("planning_time", "base_effort", "base_effort_l1", "arm_effort")},
         "clearance": m["clearance"] if np.isfinite(m["clearance"]) else None,  # JSON knows no infinity
         "closure_error": m["closure_error"],
         "iterations": int(m["iterations"]),
@@ -86,7 +85,7 @@ def trial(plan: Plan, *, method: str, seed: int, **more: Any) -> dict[str, Any]:
     }
 
 
-def distribution(trials: Iterable[Mapping[str, Any]], field: str) -> tuple[float, float]:
+def distribution(trials: Iterable[Record], field: str) -> tuple[float, float]:
     """Return median and 95th percentile of a field; NaN for no trials."""
     values: Sequence[float] = [float(t[field]) for t in trials]
     return (float(np.median(values)), float(np.percentile(values, 95))) if values else (float("nan"), float("nan"))

@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -22,11 +22,11 @@ from tqdm import tqdm
 
 from vkc_pin.benchmarks.harness.record import meta, peak_memory
 from vkc_pin.benchmarks.harness.tables import to_csv
-from vkc_pin.errors import InputError, VkcError
+from vkc_pin.errors import InputError, UnknownNameError, VkcError
 from vkc_pin.files.resources import folder, package_folder
 from vkc_pin.files.writing import write_atomically
 
-__all__ = ["Function", "run"]
+__all__ = ["Function", "chosen", "run"]
 
 Function = Callable[[dict[str, Any]], Mapping[str, Any] | Sequence[Mapping[str, Any]]]
 """What runs one trial: takes its specification, returns its record, or several."""
@@ -99,6 +99,22 @@ def run(
     write_atomically(out / "results.csv", to_csv(records).encode())
     write_atomically(out / "results.json", (json.dumps(result, indent=1, allow_nan=False) + "\n").encode())
     return result
+
+
+def chosen(kind: str, names: Iterable[str], choices: Iterable[str]) -> tuple[str, ...]:
+    """Return names of a `kind` without repetition, in the order of the choices.
+
+    Raises:
+        UnknownNameError: One of them is none of the choices.
+        InputError: There are none.
+    """
+    names, choices = list(names), list(dict.fromkeys(choices))
+    for name in names:
+        if name not in choices:
+            raise UnknownNameError(kind, name, choices, field=f"{kind}s")
+    if not names:
+        raise InputError("there is nothing to run", field=f"{kind}s", expected="at least one")
+    return tuple(choice for choice in choices if choice in names)
 
 
 def _run(trials: Sequence[dict[str, Any]], function: Function, journal: _Journal, jobs: int, bar: Any) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.benchmarks.harness.record import distribution
+from vkc_pin.benchmarks.harness.record import Record, distribution
 
 __all__ = [
     "EFFORTS",
@@ -30,7 +30,6 @@ __all__ = [
     "wilson",
 ]
 
-Record = Mapping[str, Any]
 EFFORTS = {"base_effort": "base [m]", "base_effort_l1": "base |dx|+|dy| [m]", "arm_effort": "arm [rad]"}
 """What motions are compared by: field → name."""
 TIMES = {

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from vkc_pin.chain.contacts import Contacts
 from vkc_pin.solver.trust_region import (
-    BLOCK,
     CLOSE_ENOUGH,
     FAR,
     FIRST_RADIUS,
@@ -22,7 +21,7 @@ from vkc_pin.solver.trust_region import (
     judge,
 )
 
-SEGMENTS = 30  # three blocks
+SEGMENTS, BLOCK = 30, 10  # three blocks
 
 
 def trial(slack: Any = 0.0, shortfall: Any = 0.0, *, objective: float = 1.0, step: Any = 0.1) -> Trial:
@@ -73,7 +72,7 @@ def test_off_the_manifold_every_step_is_accepted() -> None:
 
 def test_blocks_are_alike_in_size() -> None:
     for segments in (1, 4, 9, 10, 14, 15, 16, 57, 100):
-        sizes = np.bincount(TrustRegion(segments).block)
+        sizes = np.bincount(TrustRegion(segments, BLOCK).block)
         assert sizes.sum() == segments
         assert len(sizes) == max(1, round(segments / BLOCK))
         assert np.ptp(sizes) <= 1
@@ -81,7 +80,7 @@ def test_blocks_are_alike_in_size() -> None:
 
 def test_each_block_learns_from_what_happened_in_it() -> None:
     """The first kept its promise, the second broke it, in the third nothing was to be done."""
-    region, before = TrustRegion(SEGMENTS), np.zeros(SEGMENTS)
+    region, before = TrustRegion(SEGMENTS, BLOCK), np.zeros(SEGMENTS)
     before[:20] = 0.01
     slack, shortfall, step = np.zeros((3, SEGMENTS))
     shortfall[10:20], step[:] = 0.02, 0.2
@@ -92,13 +91,13 @@ def test_each_block_learns_from_what_happened_in_it() -> None:
 
 
 def test_what_is_rejected_makes_steps_smaller() -> None:
-    region = TrustRegion(SEGMENTS)
+    region = TrustRegion(SEGMENTS, BLOCK)
     region.adapt(np.zeros(SEGMENTS), trial(step=0.3), False, -1.0)
     np.testing.assert_allclose(region.radius, 0.4 * 0.3)
 
 
 def test_what_is_accepted_but_bad_keeps_the_radius() -> None:
-    region = TrustRegion(SEGMENTS)
+    region = TrustRegion(SEGMENTS, BLOCK)
     region.adapt(np.zeros(SEGMENTS), trial(), True, 0.2)
     np.testing.assert_array_equal(region.radius, FIRST_RADIUS)
 
@@ -106,7 +105,7 @@ def test_what_is_accepted_but_bad_keeps_the_radius() -> None:
 @settings(max_examples=50, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_radii_stay_positive_and_one_to_a_block(seed: int) -> None:
-    rng, region = np.random.default_rng(seed), TrustRegion(SEGMENTS, np.repeat([0.5, 1e-3, 1e-6], 10))
+    rng, region = np.random.default_rng(seed), TrustRegion(SEGMENTS, BLOCK, np.repeat([0.5, 1e-3, 1e-6], 10))
     for _ in range(20):
         before, slack, after, step = rng.uniform(0.0, 0.02, (4, SEGMENTS))
         region.adapt(before, trial(slack, after, step=step), bool(rng.integers(2)), float(rng.uniform(-1.0, 1.0)))
@@ -115,7 +114,7 @@ def test_radii_stay_positive_and_one_to_a_block(seed: int) -> None:
 
 
 def test_stuck_is_where_something_is_in_the_way_and_does_not_move() -> None:
-    region, shortfall = TrustRegion(SEGMENTS), np.zeros(SEGMENTS)
+    region, shortfall = TrustRegion(SEGMENTS, BLOCK), np.zeros(SEGMENTS)
     shortfall[12] = 2 * CLOSE_ENOUGH
     step = np.full(SEGMENTS, 0.1)
     assert not region.stuck(trial(step=step), shortfall)
@@ -133,7 +132,7 @@ def test_stuck_is_where_something_is_in_the_way_and_does_not_move() -> None:
 
 def test_the_radii_of_another_solution_are_taken_over_and_left_alone() -> None:
     given_radii = np.full(SEGMENTS, 0.07)
-    region = TrustRegion(SEGMENTS, given_radii)
+    region = TrustRegion(SEGMENTS, BLOCK, given_radii)
     region.adapt(np.zeros(SEGMENTS), trial(), False, 0.0)
     np.testing.assert_array_equal(given_radii, 0.07)
     assert (region.radius < 0.07).all()

@@ -97,6 +97,7 @@ def task(seed: int) -> tuple[BaseGrid, NDArray[np.float64], NDArray[np.float64],
     return grid, start, poses[100:103], rng.choice([0.0, 1.0], 3)
 
 
+@pytest.mark.long
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_no_way_over_the_grid_is_cheaper(seed: int) -> None:

@@ -60,6 +60,7 @@ def fresh() -> dict[str, str]:
     return {task: elsewhere(task) for task in ("door", "stick")}
 
 
+@pytest.mark.long
 def test_after_a_hundred_other_plans(fresh: dict[str, str]) -> None:
     planner = vkc.Planner()
     scene = vkc.load_scene("door")
@@ -98,6 +99,7 @@ def test_in_threads_that_plan_at_once(fresh: dict[str, str]) -> None:
         assert found == {0: fresh["door"], 1: fresh["stick"], 2: fresh["door"], 3: fresh["stick"]}
 
 
+@pytest.mark.long
 def test_on_one_process_or_two(tmp_path: Path) -> None:
     records = []
     for jobs in (1, 2):

@@ -79,6 +79,7 @@ def speeds(plan: vkc.Plan, frame: str) -> tuple[np.ndarray, np.ndarray]:
     return np.linalg.norm(np.diff(where, axis=0), axis=1) / np.diff(plan.trajectory.times), where[1:]
 
 
+@pytest.mark.long
 def test_a_cup_stays_upright_that_otherwise_tilts() -> None:
     tilting = min((plain(seed) for seed in range(3)), key=steepest)
     assert steepest(tilting) < np.cos(np.radians(30.0))
@@ -182,6 +183,7 @@ def test_what_cannot_be_kept_is_reported() -> None:
     assert violation.amount > 7.0
 
 
+@pytest.mark.long
 def test_plans_are_saved_with_their_terms(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = upright().save(tmp_path / "cup.npz")
     loaded = vkc.Plan.load(file)

@@ -14,9 +14,10 @@ import pytest
 import vkc_pin as vkc
 from vkc_pin.benchmarks.initialization import TARGET
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.motion.splicing import cut
 from vkc_pin.motion.world import World
 from vkc_pin.planning import chore
-from vkc_pin.planning.chore import _Chore, _cut
+from vkc_pin.planning.chore import _Chore
 from vkc_pin.planning.one_problem import OneProblem
 
 A, G, P = vkc.Actuate, vkc.Grasp, vkc.Place
@@ -105,7 +106,7 @@ class Problems:
             self.asked.append((one.task.steps, seed is not None))
             if not fails(one.task.steps):
                 return plan
-            trajectory = _cut(plan.trajectory, plan.trajectory.names, 0, 1)
+            trajectory = cut(plan.trajectory, plan.trajectory.names, 0, 1)
             return dataclasses.replace(plan, status="not converged", trajectory=trajectory)
 
         patch.setattr(_Chore, "_solved", solve)

@@ -17,7 +17,8 @@ from vkc_pin.baselines.poses import base_poses
 from vkc_pin.baselines.postures import at_home, postures, through
 from vkc_pin.cache import Cache
 from vkc_pin.interrupt import NEVER, Interrupt
-from vkc_pin.motion.trajectory import Trajectory, join
+from vkc_pin.motion.splicing import join
+from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.motion.world import scene_after
 from vkc_pin.options import Options
 from vkc_pin.planning.outcome import TIMES

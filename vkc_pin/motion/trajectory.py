@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.scene.hold import Hold, holds_of, in_order
 
-__all__ = ["PhaseSpan", "Trajectory", "filled", "join"]
+__all__ = ["PhaseSpan", "Trajectory"]
 
 
 @dataclass(frozen=True)
@@ -244,59 +244,6 @@ class Trajectory:
         except (TypeError, ValueError, AttributeError, LookupError) as error:
             expected, got = "what Trajectory.to_dict returns", str(error)
             raise InputError("not a trajectory", file=file, field=inside or None, expected=expected, got=got) from error
-
-
-def join(parts: Sequence[Trajectory], *, pause: float) -> Trajectory:
-    """Return motions one after the other as one.
-
-    Args:
-        parts: Each begins where the one before it ends. A coordinate that a part does not have keeps its value there.
-        pause: How long the robot waits between two parts where the hand closes or opens [s].
-
-    Raises:
-        InputError: There is none, or one does not begin where the one before it ends.
-    """
-    if not parts:
-        raise InputError("nothing to join", field="parts", expected="at least one trajectory")
-    robot = parts[0].robot_size
-    names = list(dict.fromkeys(name for part in parts for name in part.names))
-    rows: list[NDArray[np.float64]] = []
-    times: list[float] = []
-    phases: list[PhaseSpan] = []
-    for number, part in enumerate(parts):
-        values = np.full((len(part.times), len(names)), np.nan)
-        values[:, [names.index(name) for name in part.names]] = part.positions
-        start, shift = 0.0 if not times else times[-1], 0
-        if number:
-            apart = np.abs(values[0, :robot] - rows[-1][:robot]).max()
-            if not apart <= 1e-6:
-                where = f"parts[{number}]"
-                raise InputError("a motion does not begin where the one before it ends", field=where, got=f"{apart:g} apart")
-            before, after = phases[-1], part.phases[0]
-            shift = len(rows) - 1
-            if set(before.holds) != set(after.holds):
-                rows.append(values[0])
-                times.append(start + pause)
-                start, shift = start + pause, shift + 1
-        rows += list(values[1:] if number else values)
-        times += (start + (part.times[1:] if number else part.times) - part.times[0]).tolist()
-        for k, phase in enumerate(part.phases):
-            first = phases[-1].last if phases else 0
-            phases.append(replace(phase, first=first if k == 0 else phase.first + shift, last=phase.last + shift))
-    return Trajectory(tuple(names), np.array(times), filled(np.array(rows)), tuple(phases), robot)
-
-
-def filled(table: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return waypoints, shape (T, n), with what is not known (NaN) as it was last, or else as it will be next.
-
-    A coordinate that is known nowhere stays so.
-    """
-    table = table.copy()
-    for column in table.T:
-        known = np.flatnonzero(~np.isnan(column))
-        if len(known):
-            column[:] = column[known[np.maximum(np.searchsorted(known, np.arange(len(column)), side="right") - 1, 0)]]
-    return table
 
 
 def _numbers(values: Any, name: str) -> NDArray[np.float64]:

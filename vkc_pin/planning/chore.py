@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from vkc_pin.errors import InputError
-from vkc_pin.motion.trajectory import Trajectory
+from vkc_pin.motion.splicing import cut
 from vkc_pin.motion.world import scene_after
 from vkc_pin.options import Options
 from vkc_pin.planning.one_problem import OneProblem
@@ -248,7 +248,7 @@ class _Chore:
             names = [*one.scene.robot.coordinates.names, *(name for hold in task.holds for name in one.problem.chain.added[hold])]
             part, piece, rests = None, _NOTHING, True
             if end > begin:
-                trajectory = _cut(plan.trajectory, names, begin, end if end < len(one.task.phases) else None)
+                trajectory = cut(plan.trajectory, names, begin, end if end < len(one.task.phases) else None)
                 steps = self._steps(number, number + 1)
                 seed = ahead[number].piece.seed if number in ahead else one.initialization  # where it came from at first
                 part = dataclasses.replace(plan, scene=scene, steps=steps, trajectory=trajectory, initialization=seed)
@@ -310,13 +310,3 @@ class _Chore:
             notes=notes,
             history=self.history,
         )
-
-
-def _cut(trajectory: Trajectory, names: Sequence[str], begin: int, end: int | None) -> Trajectory:
-    """Return the phases from `begin` to before `end` of a trajectory, of some of its coordinates."""
-    phases = trajectory.phases[begin:end]
-    first, last = phases[0].first, phases[-1].last
-    columns = [trajectory.names.index(name) for name in names]
-    spans = tuple(dataclasses.replace(phase, first=phase.first - first, last=phase.last - first) for phase in phases)
-    rows = slice(first, last + 1)
-    return Trajectory(tuple(names), trajectory.times[rows], trajectory.positions[rows][:, columns], spans, trajectory.robot_size)

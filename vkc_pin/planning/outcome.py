@@ -8,7 +8,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from vkc_pin.motion.trajectory import PhaseSpan, Trajectory, join
+from vkc_pin.motion.splicing import join
+from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.settings import Settings

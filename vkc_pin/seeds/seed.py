@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vkc_pin.motion.trajectory import filled
+from vkc_pin.motion.splicing import filled
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.task.phases import PhaseKey
 

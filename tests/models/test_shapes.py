@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable
 
 import coal
@@ -126,3 +128,23 @@ def test_copies_stand_in_the_world() -> None:
     )
     ((geometry, at),) = placed_shapes([copy])
     assert shape_distance(geometry, at, coal.Sphere(0.1), pin.SE3.Identity()) == pytest.approx(np.sqrt(14) - 0.2)
+
+
+FIRST = """
+import numpy as np, coal, vkc_pin
+def distance(shape, at, turned=np.eye(3)):
+    here, there = coal.Transform3s(), coal.Transform3s(turned, np.array(at))
+    return coal.distance(shape, here, coal.Box(1.0, 2.0, 0.04), there, coal.DistanceRequest(), coal.DistanceResult())
+turned = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
+if {first}:
+    distance(coal.Capsule(0.1, 0.5), (3.0, 0.0, 0.0))
+print(*(distance(coal.Capsule(0.1, 0.5), (x, 0.1, 0.2), turned).hex() for x in (0.1, 0.2, 0.3, 3.0)))
+"""
+
+
+def test_the_first_question_of_a_process_does_not_change_the_others() -> None:
+    found = []
+    for first in (False, True):
+        command = [sys.executable, "-c", FIRST.format(first=first)]
+        found.append(subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout)
+    assert found[0] == found[1]

@@ -83,7 +83,6 @@ class Body:
         self._first = np.concatenate([[0], np.cumsum([len(points) for points, _ in outlines])[:-1]]).astype(int)
         self._radius = radius[:, None]
         self._tables: dict[tuple[float, float], Floats] = {}
-        self._ask: dict[int, coal.ComputeDistance] = {}
         self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
         order = np.argsort(self.standing, kind="stable")
         self._of_standing = np.split(order, np.searchsorted(self.standing[order], np.arange(1, len(world.shapes))))
@@ -202,14 +201,11 @@ class Body:
         """Return coal's distance [m] of a pair with the base at a pose, and the normal towards what stands, in the plane."""
         shape, placement = self.shapes[self.moving[row]]
         other, where = self.world.shapes[self.standing[row]]
-        if row not in self._ask:
-            self._ask[row] = coal.ComputeDistance(shape, other)
         cosine, sine = math.cos(yaw), math.sin(yaw)
         turned = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
         self._result.clear()
-        distance = self._ask[row](
-            coal.Transform3s(turned, np.array([at[0], at[1], 0.0])) * placement, where, self._request, self._result
-        )
+        there = coal.Transform3s(turned, np.array([at[0], at[1], 0.0])) * placement
+        distance = coal.distance(shape, there, other, where, self._request, self._result)
         return distance, self._result.normal[:2].copy()
 
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+from vkc_pin.arrays import Bools, Floats, Ints
 
 __all__ = ["Bools", "Floats", "Ints"]
 
-Floats = NDArray[np.float64]
+Floats = Floats
 """Numbers of double precision."""
-Ints = NDArray[np.int_]
+Ints = Ints
 """Indices and counts."""
-Bools = NDArray[np.bool_]
+Bools = Bools
 """Masks."""

@@ -22,14 +22,7 @@ EASED_SHARE = 0.5  # margin, as a share of the distance at the contact itself
 
 
 def eased_pairs(
-    scene: Scene,
-    chain: VirtualKinematicChain,
-    phase: Phase,
-    part: PhaseGeometry,
-    *,
-    first: int,
-    before: Phase | None,
-    steps: int,
+    scene: Scene, chain: VirtualKinematicChain, phase: Phase, part: PhaseGeometry, *, first: int, before: Phase | None, steps: int
 ) -> dict[int, list[tuple[int, int, float]]]:
     """Return pair → (first waypoint, last waypoint, margin [m]) for what may be close for a while.
 

@@ -185,13 +185,7 @@ def _support_of(outlines: list[Floats], directions: Floats) -> tuple[Floats, Flo
 
 
 def _fill(
-    first: Sequence[_Solid],
-    second: Sequence[_Solid],
-    pairs: Ints,
-    lattice: Lattice,
-    margin: float,
-    *,
-    views: PlanViews,
+    first: Sequence[_Solid], second: Sequence[_Solid], pairs: Ints, lattice: Lattice, margin: float, *, views: PlanViews
 ) -> Bools:
     """Return where any of pairs of solids, shape (P, 2), surely come too close, shape (cells, cells, H)."""
     count, cells = len(lattice.yaws), lattice.cells

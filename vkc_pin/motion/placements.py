@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Bools, Floats
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.motion.world import World
 
@@ -29,14 +29,14 @@ class Motion:
         moving: For every joint, whether its placement in its parent changes.
     """
 
-    times: NDArray[np.float64]
+    times: Floats
     local: list[list[pin.SE3]]
-    world: NDArray[np.float64]
-    tool: NDArray[np.float64]
-    base: NDArray[np.float64]
-    moving: NDArray[np.bool_]
+    world: Floats
+    tool: Floats
+    base: Floats
+    moving: Bools
 
-    def away(self, joints: NDArray[np.bool_], row: int) -> NDArray[np.bool_]:
+    def away(self, joints: Bools, row: int) -> Bools:
         """Return at which times one of some joints is far from where it is at `row`, shape (K,).
 
         Far is 0.15 m, a rotation counted as what it moves at half a metre.
@@ -46,7 +46,7 @@ class Motion:
         return np.asarray((0.5 * turned.max(axis=(1, 2, 3)) > 0.15) | (shifted.max(axis=(1, 2)) > 0.15))
 
 
-def key_times(trajectory: Trajectory) -> NDArray[np.float64]:
+def key_times(trajectory: Trajectory) -> Floats:
     """Return the waypoints' times and as many in between that no coordinate changes by more than 1 rad or m, shape (K,) [s].
 
     Between these a viewer's own interpolation of positions and quaternions, joint by joint, is exact.
@@ -57,7 +57,7 @@ def key_times(trajectory: Trajectory) -> NDArray[np.float64]:
     return np.concatenate([*(np.linspace(a, b, n, endpoint=False) for a, b, n in edges), trajectory.times[-1:]])
 
 
-def sample_motion(world: World, trajectory: Trajectory | None, times: NDArray[np.float64] | None = None) -> Motion:
+def sample_motion(world: World, trajectory: Trajectory | None, times: Floats | None = None) -> Motion:
     """Return the world's motion at `times` [s], shape (K,), or at `key_times`; without a trajectory, its start."""
     if trajectory is None:
         times, rows = np.zeros(1), world.start[None]

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
 from vkc_pin.motion.tables import chosen_columns, one_phase, read_json, size_of_robot
 
@@ -136,7 +136,7 @@ def from_ros(
     return {"names": [str(name) for name in names], "times": times, "positions": rows, "robot_size": size, "phases": phases}
 
 
-def rates(times: NDArray[np.float64], positions: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def rates(times: Floats, positions: Floats) -> tuple[Floats, Floats]:
     """Return velocities and accelerations at waypoints, shape (T, n) each; it rests before the first and after the last.
 
     Velocities are those of SciPy's monotone cubics, but for the ends. Where a coordinate turns round, its velocity is zero; where
@@ -155,9 +155,7 @@ def rates(times: NDArray[np.float64], positions: NDArray[np.float64]) -> tuple[N
     return velocities, accelerations
 
 
-def along(
-    times: NDArray[np.float64], positions: NDArray[np.float64], velocities: NDArray[np.float64], moments: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def along(times: Floats, positions: Floats, velocities: Floats, moments: Floats) -> tuple[Floats, Floats, Floats]:
     """Return positions, velocities and accelerations at `moments` on the cubics through waypoints with these velocities."""
     from scipy.interpolate import CubicHermiteSpline
 

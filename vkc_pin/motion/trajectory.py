@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.scene.hold import Hold, holds_of, in_order
 
@@ -65,8 +66,8 @@ class Trajectory:
     """
 
     names: tuple[str, ...]
-    times: NDArray[np.float64]
-    positions: NDArray[np.float64]
+    times: Floats
+    positions: Floats
     phases: tuple[PhaseSpan, ...]
     robot_size: int
 
@@ -97,13 +98,13 @@ class Trajectory:
         for key, value in (("names", names), ("times", times), ("positions", positions), ("phases", phases)):
             object.__setattr__(self, key, value)
 
-    def at(self, time: ArrayLike) -> NDArray[np.float64]:
+    def at(self, time: ArrayLike) -> Floats:
         """Return the positions, shape (..., n), at `time` [s], shape (...,); outside the motion, its first or last."""
         time = np.asarray(time, float)
         columns = [np.interp(time, self.times, column) for column in self.positions.T]
         return np.stack(columns, axis=-1)
 
-    def column(self, name: str) -> NDArray[np.float64]:
+    def column(self, name: str) -> Floats:
         """Return one coordinate over the waypoints, shape (T,).
 
         Raises:
@@ -113,12 +114,12 @@ class Trajectory:
             raise UnknownNameError("coordinate", name, self.names)
         return np.array(self.positions[:, self.names.index(name)])
 
-    def velocities(self) -> NDArray[np.float64]:
+    def velocities(self) -> Floats:
         """Return the velocity of every segment, shape (T − 1, n), [m/s] and [rad/s]."""
         steps = np.diff(self.positions, axis=0) / np.diff(self.times)[:, None]
         return np.asarray(steps)
 
-    def accelerations(self) -> NDArray[np.float64]:
+    def accelerations(self) -> Floats:
         """Return the acceleration at every waypoint, shape (T, n), [m/s²] and [rad/s²].
 
         It is the velocity step there over the shorter of the two segments' durations; the motion starts and ends at rest.
@@ -246,7 +247,7 @@ class Trajectory:
             raise InputError("not a trajectory", file=file, field=inside or None, expected=expected, got=got) from error
 
 
-def _numbers(values: Any, name: str) -> NDArray[np.float64]:
+def _numbers(values: Any, name: str) -> Floats:
     """Return a copy of an array of finite numbers."""
     try:
         array = np.array(values, float)

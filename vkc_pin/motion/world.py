@@ -12,8 +12,9 @@ from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from vkc_pin.arrays import Floats
 from vkc_pin.models.coordinates import Coordinates
 from vkc_pin.models.grafting import graft, graft_geometry
 from vkc_pin.models.shapes import link_name
@@ -57,7 +58,7 @@ class World:
             np.concatenate([as_numbers(placed.placement) if placed.object.free else [], placed.state])
             for placed in scene.objects.values()
         ]
-        self.start: NDArray[np.float64] = np.concatenate([np.asarray(scene.start), *states])
+        self.start: Floats = np.concatenate([np.asarray(scene.start), *states])
 
     def _plant(self, placed: PlacedObject) -> list[int]:
         """Add an object's tree to the model; return its joints there."""
@@ -106,7 +107,7 @@ class World:
             graft_geometry(geometry, source.geometryObjects, joints=self._joints[name], placement=where, prefix=f"{name}.")
         return geometry
 
-    def positions(self, trajectory: Trajectory, times: ArrayLike | None = None) -> NDArray[np.float64]:
+    def positions(self, trajectory: Trajectory, times: ArrayLike | None = None) -> Floats:
         """Return minimal coordinates, shape (K, n), of the world along `trajectory`.
 
         Args:
@@ -123,7 +124,7 @@ class World:
         self._carry(trajectory, times, rows)
         return rows
 
-    def _carry(self, trajectory: Trajectory, times: NDArray[np.float64], rows: NDArray[np.float64]) -> None:
+    def _carry(self, trajectory: Trajectory, times: Floats, rows: Floats) -> None:
         """Write into `rows` where free objects are: with whatever holds them, from where they were when it took hold."""
         where = {name: placed.placement for name, placed in self.scene.objects.items() if placed.object.free}
         if not where:
@@ -146,7 +147,7 @@ class World:
             rows[:, columns.start + 3 : columns.stop] = turns * np.cumprod(np.where(flips == 0.0, 1.0, flips))[:, None]
 
     def _carried(
-        self, trajectory: Trajectory, phase: PhaseSpan, times: NDArray[np.float64], where: Mapping[str, pin.SE3]
+        self, trajectory: Trajectory, phase: PhaseSpan, times: Floats, where: Mapping[str, pin.SE3]
     ) -> dict[str, list[pin.SE3]]:
         """Return the placements at `times` of all free objects held in a phase, which are at `where` at the first of these."""
         values, robot = trajectory.at(times), self.scene.robot
@@ -184,7 +185,7 @@ class World:
         """Return the joints of the model that are an object's, with its free joint."""
         return [joint for joint in self._joints[name] if joint]
 
-    def placement(self, name: str, row: NDArray[np.float64]) -> pin.SE3:
+    def placement(self, name: str, row: Floats) -> pin.SE3:
         """Return where the base link of a free object is, of the world's coordinates, shape (n,)."""
         numbers = row[self.placement_columns(name)].copy()
         numbers[3:] /= np.linalg.norm(numbers[3:])
@@ -196,7 +197,7 @@ class World:
         return slice(first, first + 7)
 
 
-def as_numbers(placement: pin.SE3) -> NDArray[np.float64]:
+def as_numbers(placement: pin.SE3) -> Floats:
     """Return a placement as a free joint's seven coordinates."""
     return np.asarray(pin.SE3ToXYZQUAT(placement), float)
 

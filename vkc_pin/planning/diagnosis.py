@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.clearing import KNOT_TOLERANCE
@@ -88,9 +88,9 @@ def explain(problem: TrajectoryProblem, seed: int, interrupt: Interrupt = NEVER)
 
 def _try(
     problem: TrajectoryProblem, waypoint: int, rng: np.random.Generator, interrupt: Interrupt
-) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+) -> tuple[Floats, Floats] | None:
     """Return what `scatter` does, drawn again and again until something is free, up to `_DRAWS` times."""
-    found: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
+    found: list[tuple[Floats, Floats]] = []
     for _ in range(_DRAWS):
         tried = scatter(problem, waypoint, rng)
         if tried is None:

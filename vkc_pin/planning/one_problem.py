@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.planning.diagnosis import explain, impossible
 from vkc_pin.planning.outcome import TIMES, outcome, spent
@@ -45,7 +45,7 @@ class _Try:
     """
 
     name: str
-    z: NDArray[np.float64]
+    z: Floats
     trajectory: Trajectory
     report: Report
     status: str

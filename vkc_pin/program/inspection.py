@@ -131,12 +131,7 @@ def patterns(problem: TrajectoryProblem) -> tuple[Any, Any]:
 
 
 def build(
-    scene: Scene,
-    steps: Sequence[Step],
-    *,
-    options: Options | None = None,
-    terms: Sequence[Term] = (),
-    cache: Cache | None = None,
+    scene: Scene, steps: Sequence[Step], *, options: Options | None = None, terms: Sequence[Term] = (), cache: Cache | None = None
 ) -> TrajectoryProblem:
     """Return the nonlinear program of `steps` in `scene`, to look at before solving.
 

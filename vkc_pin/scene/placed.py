@@ -6,10 +6,9 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.errors import UnknownNameError
 from vkc_pin.models.articulation import ArticulatedObject
 from vkc_pin.models.shapes import copy_shape, within_limits
@@ -31,7 +30,7 @@ class PlacedObject:
     name: str
     object: ArticulatedObject
     placement: pin.SE3
-    state: NDArray[np.float64]
+    state: Floats
 
     def __repr__(self) -> str:
         state = ", ".join(f"{n}={v:.4g}" for n, v in zip(self.object.coordinates.names, self.state, strict=True))

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.files.resources import find
 from vkc_pin.models.shapes import clearance, placed_shapes, within_limits
@@ -59,7 +60,7 @@ class Scene:
     file: Path | None
     folder: Path
     robot: Robot
-    start: NDArray[np.float64]
+    start: Floats
     objects: Mapping[str, PlacedObject]
     obstacles: pin.GeometryModel
     obstacle_labels: tuple[str, ...]

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.files.documents import Document, check
 from vkc_pin.models.grafting import clean
 from vkc_pin.models.object_file import load_object
@@ -140,7 +140,7 @@ def _check_places(document: Document, description: schema.SceneSchema, arena: tu
             raise document.error(path, "outside the arena", expected=f"{axis} from {low:g} to {high:g}", got=list(interval))
 
 
-def _start(document: Document, item: schema.StartSchema, robot: Robot) -> NDArray[np.float64]:
+def _start(document: Document, item: schema.StartSchema, robot: Robot) -> Floats:
     arm = robot.home if item.arm is None else np.array(item.arm)
     names = robot.coordinates.names[3:]
     if len(arm) != len(names):

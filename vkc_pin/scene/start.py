@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+
+from vkc_pin.arrays import Floats
 
 if TYPE_CHECKING:
     from vkc_pin.models.robot import Robot
@@ -26,14 +27,14 @@ class StartRegion:
     y: tuple[float, float]
     yaw: tuple[float, float] | None = None
 
-    def draws(self, rng: np.random.Generator) -> Iterator[NDArray[np.float64]]:
+    def draws(self, rng: np.random.Generator) -> Iterator[Floats]:
         """Yield poses of the base, shape (3,): x, y [m] and yaw [rad], uniform in the region, without end."""
         low, high = self.yaw or (-np.pi, np.pi)
         while True:
             yield rng.uniform([self.x[0], self.y[0], low], [self.x[1], self.y[1], high])
 
 
-def start_limits(robot: Robot) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def start_limits(robot: Robot) -> tuple[Floats, Floats]:
     """Return the limits of a start, shape (n,), [m] and [rad]: the robot's; a base that cannot move may stand anywhere."""
     lower, upper = robot.lower.copy(), robot.upper.copy()
     if robot.base == "fixed":

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.chain.inverse_kinematics import PoseSolver
 from vkc_pin.chain.pose import PoseRow
 from vkc_pin.seeds.clearing import KNOT_TOLERANCE
@@ -40,7 +40,7 @@ class Approach:
         key = ("tool", model.saveToString(), joint, local.homogeneous.tobytes())
         self.solver = cache.get(key, lambda: PoseSolver(model, PoseRow(joint, local, ()), cache))
 
-    def before(self, z: NDArray[np.float64], phase: Phase) -> NDArray[np.float64]:
+    def before(self, z: Floats, phase: Phase) -> Floats:
         """Return configurations on the way to `z`, shape (n,), the end of a phase: shape (K, n), the last is the nearest."""
         if phase.grasps:
             return self._way(z, -self._ahead(z, self.chain.holder(phase.grasps[0])), [self.problem.options.approach])
@@ -51,7 +51,7 @@ class Approach:
                 return self._way(z, -self._ahead(z, self.chain.frame(goal.frame, goal.hold)), _STANDOFFS)[::-1]
         return np.empty((0, len(z)))
 
-    def after(self, z: NDArray[np.float64], phase: Phase, before: Phase | None) -> NDArray[np.float64]:
+    def after(self, z: Floats, phase: Phase, before: Phase | None) -> Floats:
         """Return configurations on the way from `z`, shape (n,), the start of a phase: shape (K, n), the first is the nearest."""
         if phase.leaves:
             return self._way(z, -self._ahead(z, self.chain.holder(phase.leaves[0])), [self.problem.options.approach])
@@ -62,7 +62,7 @@ class Approach:
                 return self._way(z, -self._ahead(z, self.chain.frame(goal.frame, goal.hold)), _STANDOFFS)
         return np.empty((0, len(z)))
 
-    def away(self, z: NDArray[np.float64], phase: Phase) -> NDArray[np.float64]:
+    def away(self, z: Floats, phase: Phase) -> Floats:
         """Return configurations on the way from `z`, shape (n,), the base where it is: shape (K, n), the last is the farthest.
 
         The hand goes back from what a phase lets go of at its start, or up with what is carried in it.
@@ -75,15 +75,13 @@ class Approach:
             return np.empty((0, len(z)))
         return self._way(z, direction, [share * length for share in _WAY_SHARES], drives=False)
 
-    def _ahead(self, z: NDArray[np.float64], frame: tuple[int, pin.SE3]) -> NDArray[np.float64]:
+    def _ahead(self, z: Floats, frame: tuple[int, pin.SE3]) -> Floats:
         """Return the direction of a frame's z axis in the world, at `z`: in it a hand nears what it grasps."""
         joint, local = frame
         rotations, _ = self.chain.joint_placements(z[None])
         return np.asarray((rotations[0, joint] @ local.rotation)[:, 2])
 
-    def _way(
-        self, z: NDArray[np.float64], direction: NDArray[np.float64], lengths: Sequence[float], *, drives: bool = True
-    ) -> NDArray[np.float64]:
+    def _way(self, z: Floats, direction: Floats, lengths: Sequence[float], *, drives: bool = True) -> Floats:
         """Return configurations with the tool `lengths` [m] along `direction` from where `z` has it, as far as there are."""
         rotations, translations = self.chain.joint_placements(z[None])
         carrier = pin.SE3(rotations[0, self.joint], translations[0, self.joint])
@@ -93,7 +91,7 @@ class Approach:
             if drives or column > 2:
                 lower[column], upper[column] = self.problem.limits(name)
         standing = np.concatenate([z[:3], lower[3:]]), np.concatenate([z[:3], upper[3:]])
-        weights, found = self.knots.weights, list[NDArray[np.float64]]()
+        weights, found = self.knots.weights, list[Floats]()
         for length in lengths:
             target = pin.SE3(tool.rotation, tool.translation + length * direction)
             start = (found[-1] if found else z)[None]

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Bools, Floats, Ints
 from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.program.pose_goals import approach_at
 from vkc_pin.seeds.knots import SCATTER, Knots
@@ -41,9 +41,9 @@ class Found(NamedTuple):
         at: The knots' waypoints.
     """
 
-    paths: NDArray[np.float64]
-    cost: NDArray[np.float64]
-    trouble: NDArray[np.float64]
+    paths: Floats
+    cost: Floats
+    trouble: Floats
     at: list[int]
 
 
@@ -144,7 +144,7 @@ class Beam:
         paths = np.concatenate([found.paths[parents[best]], z[best, None]], axis=1)
         return Found(paths, total[best], (found.trouble[parents] + bad)[best], [*found.at, knot])
 
-    def _kept(self, total: NDArray[np.float64], bad: NDArray[np.float64], knot: int, width: int) -> NDArray[np.int_]:
+    def _kept(self, total: Floats, bad: Floats, knot: int, width: int) -> Ints:
         """Return which continuations to keep: the cheapest and, where a hand chooses how to grasp, some of the other free ones.
 
         What is cheap to grasp may be what cannot be put where it is to be.
@@ -170,7 +170,7 @@ class Beam:
         cost = found.cost + self._way(start, grasp, phase) - self._way(start, end, phase)
         return Found(paths, cost, found.trouble, [*found.at[:known], *knots])
 
-    def _way(self, first: NDArray[np.float64], last: NDArray[np.float64], phase: int) -> NDArray[np.float64]:
+    def _way(self, first: Floats, last: Floats, phase: int) -> Floats:
         """Return what it costs to go from `first` to `last`, both (B, n), in a phase, shape (B,)."""
         weights = self.knots.weights.copy()
         weights[:2] *= _DRIVING
@@ -181,9 +181,7 @@ class Beam:
             np.minimum(way, _NOT_FOUND, out=way)  # where there is no way, others come first
         return np.asarray(way.sum(axis=1))
 
-    def _continue(
-        self, paths: NDArray[np.float64], cost: NDArray[np.float64], waypoint: int, phase: int, mode: _Mode
-    ) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64]]:
+    def _continue(self, paths: Floats, cost: Floats, waypoint: int, phase: int, mode: _Mode) -> tuple[Ints, Floats, Floats]:
         """Return continuations of `paths` to a waypoint: which path each goes on from, where to, and what is wrong there."""
         knots = self.knots
         if not self.problem.closed(self.problem.task.phases[phase]):
@@ -213,16 +211,8 @@ class Beam:
         return self._pushed(paths, cost, parents, z, bad, waypoint, phase, mode.width)
 
     def _pushed(
-        self,
-        paths: NDArray[np.float64],
-        cost: NDArray[np.float64],
-        parents: NDArray[np.int_],
-        z: NDArray[np.float64],
-        bad: NDArray[np.float64],
-        waypoint: int,
-        phase: int,
-        width: int,
-    ) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64]]:
+        self, paths: Floats, cost: Floats, parents: Ints, z: Floats, bad: Floats, waypoint: int, phase: int, width: int
+    ) -> tuple[Ints, Floats, Floats]:
         """Return continuations and, if few of them are free, the best of them pushed out of what they are in."""
         if np.count_nonzero(bad == 0) >= (_FREE_HELD if self._closed_at(waypoint) else _FREE_OPEN):
             return parents, z, bad
@@ -233,14 +223,8 @@ class Beam:
         return np.concatenate([parents, parents[best]]), np.concatenate([z, pushed]), np.concatenate([bad, more])
 
     def _cheapest(
-        self,
-        price: NDArray[np.float64],
-        parents: NDArray[np.int_],
-        z: NDArray[np.float64],
-        found: NDArray[np.bool_],
-        waypoint: int,
-        width: int,
-    ) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64]]:
+        self, price: Floats, parents: Ints, z: Floats, found: Bools, waypoint: int, width: int
+    ) -> tuple[Ints, Floats, Floats]:
         """Return continuations, the cheapest first; what the beam cannot keep anyway need not be looked at."""
         order = np.argsort(price + _NOT_FOUND * ~found, kind="stable")
         parents, z, found = parents[order], z[order], found[order]
@@ -250,7 +234,7 @@ class Beam:
             return parents[:half], z[:half], bad
         return parents, z, np.concatenate([bad, self._bad(z[half:], found[half:], waypoint)])
 
-    def _bad(self, z: NDArray[np.float64], found: NDArray[np.bool_], waypoint: int) -> NDArray[np.float64]:
+    def _bad(self, z: Floats, found: Bools, waypoint: int) -> Floats:
         """Return what is wrong with configurations at a waypoint, as a cost, shape (B,)."""
         bad = np.full(len(z), _NOT_FOUND)
         if found.any():
@@ -263,7 +247,7 @@ class Beam:
                 bad[free] += _hits(self.knots.depth(near, at)) + _NOT_FOUND * ~reached
         return bad
 
-    def _approach(self, first: NDArray[np.float64], last: NDArray[np.float64], begin: int, end: int) -> NDArray[np.float64]:
+    def _approach(self, first: Floats, last: Floats, begin: int, end: int) -> Floats:
         """Return what the straight ways from `first` to `last`, both (B, n), cost in collisions, shape (B,)."""
         s = np.arange(1, _WAY_PIECES) / _WAY_PIECES
         between = first[:, None] + s[:, None] * (last - first)[:, None]
@@ -273,6 +257,6 @@ class Beam:
         )
 
 
-def _hits(depth: NDArray[np.float64]) -> NDArray[np.float64]:
+def _hits(depth: Floats) -> Floats:
     """Return what collisions of some depth [m] cost, shape (B,)."""
     return np.where(depth > 0, _COLLISION + _DEPTH * depth, 0.0)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.chain.contacts import Contacts
 from vkc_pin.chain.inverse_kinematics import PoseSolver
 from vkc_pin.program.problem import TrajectoryProblem
@@ -22,15 +22,15 @@ _DAMPING = 3e-4  # added to the diagonal of the normal equations
 
 def clear_out(
     problem: TrajectoryProblem,
-    z: NDArray[np.float64],
+    z: Floats,
     waypoint: int,
     solver: PoseSolver,
     target: pin.SE3,
     *,
-    lower: NDArray[np.float64],
-    upper: NDArray[np.float64],
-    weights: NDArray[np.float64],
-) -> NDArray[np.float64]:
+    lower: Floats,
+    upper: Floats,
+    weights: Floats,
+) -> Floats:
     """Return configurations that are further from collision than `z`, as far as a few damped Gauss-Newton steps get them.
 
     Each step asks for the residuals of the pose to vanish and for the contacts that fall short of their margins to keep them,
@@ -69,9 +69,7 @@ def clear_out(
     return z
 
 
-def _contact_rows(
-    problem: TrajectoryProblem, z: NDArray[np.float64], contacts: Contacts
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _contact_rows(problem: TrajectoryProblem, z: Floats, contacts: Contacts) -> tuple[Floats, Floats]:
     """Return gradients of the nearest distances, shape (B, rows, n), and by how much they should grow, shape (B, rows) [m]."""
     order = np.arange(len(contacts.waypoint)) - np.searchsorted(contacts.waypoint, contacts.waypoint)
     rows, wanted = np.zeros((len(z), _CONTACTS, z.shape[1])), np.zeros((len(z), _CONTACTS))

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.driving.body import hull_points
 from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.program.problem import TrajectoryProblem
@@ -21,9 +21,7 @@ _FROM_HOME = 0.01  # [m/rad] cost of the joint that is furthest from home
 _LOW, _LOW_COST = 0.1, 10.0  # [m] over the floor, at least; [m/m] cost of less
 
 
-def folded_arm(
-    problem: TrajectoryProblem, phase: int, resting: NDArray[np.float64], interrupt: Interrupt = NEVER
-) -> NDArray[np.float64]:
+def folded_arm(problem: TrajectoryProblem, phase: int, resting: Floats, interrupt: Interrupt = NEVER) -> Floats:
     """Return the arm, shape (m - 3,) [m] and [rad], with which the robot is narrow: the best that a random search finds.
 
     What counts is how far the arm, and what is carried, reach to either side of the base's x axis; next, how far they reach
@@ -70,7 +68,7 @@ class _Body:
         shapes = problem.contacts.phases[phase].shapes
         moving = [*range(len(self.chain.robot.collision.geometryObjects))]
         moving += [i for hold in problem.task.phases[phase].held for i in self.chain.held_geometries[hold]]
-        points: dict[int, list[NDArray[np.float64]]] = {1: [np.zeros((1, 3))]}
+        points: dict[int, list[Floats]] = {1: [np.zeros((1, 3))]}
         for i in moving:
             corners, radius = hull_points(shapes[i].geometry, shapes[i].placement, outer=True)
             corners = np.concatenate([corners - radius, corners + radius]) if radius else corners
@@ -79,7 +77,7 @@ class _Body:
         self.front, self.back = base[:, 0].max(), base[:, 0].min()
         self.points = {joint: np.concatenate(corners).T for joint, corners in points.items()}
 
-    def price(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
+    def price(self, z: Floats) -> Floats:
         """Return how far what is carried reaches, weighted as in `folded_arm`, shape (B,) [m]."""
         rotations, translations = self.chain.joint_placements(z)
         turned = rotations[0, 1].T @ rotations
@@ -93,7 +91,7 @@ class _Body:
             np.maximum(left, -right) + _OVERHANG * beyond + _HEIGHT * top + _LOW_COST * np.maximum(_LOW - bottom, 0.0)
         )
 
-    def free(self, z: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    def free(self, z: Floats, count: int) -> Floats:
         """Return the first `count` configurations at which the robot keeps its clearances from itself and what it carries."""
         found = z[:0]
         for begin in range(0, len(z), _CHECKED):

@@ -8,8 +8,8 @@ from itertools import islice
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats, Ints
 from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.approach import Approach
@@ -99,9 +99,7 @@ def _in_turn(straight: Iterator[Seed], around: Iterator[Seed], trees: Iterator[S
     yield from trees
 
 
-def _perturbed(
-    problem: TrajectoryProblem, z: NDArray[np.float64], deviation: float, rng: np.random.Generator
-) -> NDArray[np.float64]:
+def _perturbed(problem: TrajectoryProblem, z: Floats, deviation: float, rng: np.random.Generator) -> Floats:
     """Return a seed with smooth noise on the robot's coordinates: half waves in time, of decreasing amplitude."""
     robot, waves = problem.chain.robot.coordinates.size, np.arange(1, _HALF_WAVES + 1)
     shape = np.sin(np.pi * np.outer(np.arange(1, len(z) + 1) / (len(z) + 1), waves)) / waves
@@ -151,7 +149,7 @@ class _SeedSearch:
 
     def seeds(self, count: int) -> Iterator[Seed]:
         """Yield seeds through the cheapest paths of knots: of one quick search if that is any good, then of thorough ones."""
-        given: list[NDArray[np.float64]] = []
+        given: list[Floats] = []
         for attempt in range(count + 1):
             if self.interrupt.pressed:
                 return
@@ -180,17 +178,15 @@ class _SeedSearch:
         self.found = found if self.beam.tolerable(found) else None
         return self.found if attempt == 0 else found
 
-    def _order(self, found: Found) -> NDArray[np.int_]:
+    def _order(self, found: Found) -> Ints:
         """Return the paths in the order in which they are to be joined."""
         return np.argsort(found.cost, kind="stable")
 
-    def _tried(self, paths: NDArray[np.float64], candidates: list[int]) -> list[int]:
+    def _tried(self, paths: Floats, candidates: list[int]) -> list[int]:
         """Return of candidates those of which one is to become a seed."""
         return candidates[:_COMPARED_PATHS]
 
-    def _best(
-        self, paths: NDArray[np.float64], candidates: list[int], at: list[int]
-    ) -> tuple[int, NDArray[np.float64], float] | None:
+    def _best(self, paths: Floats, candidates: list[int], at: list[int]) -> tuple[int, Floats, float] | None:
         """Return the path, of the cheapest, whose seed has the least l1 merit, that seed and its shortfall.
 
         The first that falls short of next to nothing will do. None if no path of the robot leads through any of them.
@@ -259,10 +255,10 @@ class _Rrt(_SeedSearch):
             found = self.beam.search(thorough=attempt > 0, backwards=attempt % 2 == 1)
         return found if found is not None and self.beam.tolerable(found) else None
 
-    def _order(self, found: Found) -> NDArray[np.int_]:
+    def _order(self, found: Found) -> Ints:
         return np.argsort(found.cost + _COLLIDING_KNOT * (found.trouble > 0), kind="stable")
 
-    def _tried(self, paths: NDArray[np.float64], candidates: list[int]) -> list[int]:
+    def _tried(self, paths: Floats, candidates: list[int]) -> list[int]:
         """Return a few candidates of which no two are alike: where no path leads to one, hardly one leads to the other."""
         kept: list[int] = []
         for index in candidates:
@@ -274,6 +270,6 @@ class _Rrt(_SeedSearch):
 _SEARCHES: dict[str, type[_Interpolated | _AStar | _Rrt]] = {search.method: search for search in (_Interpolated, _AStar, _Rrt)}
 
 
-def _distance(path: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+def _distance(path: Floats, other: Floats) -> float:
     """Return by how much the base differs somewhere between two paths, both (K, n) [m] or [rad]."""
     return float(np.abs(path - other)[:, :3].max())

@@ -6,8 +6,8 @@ from collections import Counter
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.seeds.approach import Approach
 from vkc_pin.seeds.knots import Knots, smooth
@@ -26,9 +26,7 @@ class Paths(Protocol):
     careful: bool
     """Whether configurations on the straight ways in and out are left out where they hit something."""
 
-    def path(
-        self, phase: int, first: NDArray[np.float64], last: NDArray[np.float64], steps: int, *, turns: bool, reaches: bool
-    ) -> NDArray[np.float64] | None:
+    def path(self, phase: int, first: Floats, last: Floats, steps: int, *, turns: bool, reaches: bool) -> Floats | None:
         """Return `steps` rows from `first` to `last`, both (n,), of the robot's first coordinates, shape (steps, c).
 
         The last row is as `last`, but with `turns` the heading may end whole turns further, and without `reaches` the arm may end
@@ -44,9 +42,7 @@ class DrivenPaths:
     def __init__(self, routes: Routes) -> None:
         self.routes = routes
 
-    def path(
-        self, phase: int, first: NDArray[np.float64], last: NDArray[np.float64], steps: int, *, turns: bool, reaches: bool
-    ) -> NDArray[np.float64] | None:
+    def path(self, phase: int, first: Floats, last: Floats, steps: int, *, turns: bool, reaches: bool) -> Floats | None:
         """See `Paths`."""
         path = self.routes.path(phase, first[:3], last[:3], steps)
         if path is not None and not turns:
@@ -63,9 +59,7 @@ class RrtPaths:
         self.knots, self.problem, self.routes, self.interrupt = knots, knots.problem, routes, interrupt
         self.failed: Counter[int] = Counter()  # how often in a row in each phase
 
-    def path(
-        self, phase: int, first: NDArray[np.float64], last: NDArray[np.float64], steps: int, *, turns: bool, reaches: bool
-    ) -> NDArray[np.float64] | None:
+    def path(self, phase: int, first: Floats, last: Floats, steps: int, *, turns: bool, reaches: bool) -> Floats | None:
         """See `Paths`."""
         problem, size = self.problem, self.knots.robot
         poses, last = first[None, :3], last.copy()
@@ -104,7 +98,7 @@ class Joiner:
         self.blocked: list[str] = []
         """A line for every phase in which there was no path."""
 
-    def join(self, through: NDArray[np.float64], at: list[int]) -> NDArray[np.float64] | None:
+    def join(self, through: Floats, at: list[int]) -> Floats | None:
         """Return waypoints through configurations, shape (K, n), at waypoints `at`; where something fixed is held, closed.
 
         None if there is no path somewhere.
@@ -122,15 +116,13 @@ class Joiner:
         self._close(z)
         return problem.clip(z)
 
-    def _straight(self, z: NDArray[np.float64], through: NDArray[np.float64], when: list[int]) -> None:
+    def _straight(self, z: Floats, through: Floats, when: list[int]) -> None:
         """Fill rows of z, shape (steps, n), with straight lines through configurations, `when` counted from the row before z."""
         s = np.concatenate([[0.0], smooth(len(z))])
         for column in range(z.shape[1]):
             z[:, column] = np.interp(s[1:], s[when], through[:, column])
 
-    def _open(
-        self, z: NDArray[np.float64], knots: NDArray[np.float64], inside: list[int], number: int, previous: Phase | None
-    ) -> bool:
+    def _open(self, z: Floats, knots: Floats, inside: list[int], number: int, previous: Phase | None) -> bool:
         """Fill the rows of a phase in which nothing fixed is held; turn the knots that follow as that ends. False: no path."""
         problem, phase = self.problem, self.problem.task.phases[number]
         end = int(problem.ends[number])
@@ -153,9 +145,7 @@ class Joiner:
             knots[inside[-1], : path.shape[1]] = z[-1, : path.shape[1]]
         return True
 
-    def _via(
-        self, ends: NDArray[np.float64], number: int, previous: Phase | None, segments: int
-    ) -> tuple[NDArray[np.float64], list[int], int, int]:
+    def _via(self, ends: Floats, number: int, previous: Phase | None, segments: int) -> tuple[Floats, list[int], int, int]:
         """Return configurations to go through from start to end of a phase, `ends`, shape (2, n), and when, counted from 0.
 
         The last two numbers say between which of them it is neither a straight way out nor one in.
@@ -172,10 +162,10 @@ class Joiner:
         when += [*(segments - spacing * (len(last) - k) for k in range(len(last))), segments]
         return np.vstack([ends[:1], first, last, ends[1:]]), when, len(first), len(first) + 1
 
-    def _free(self, z: NDArray[np.float64], waypoint: int) -> bool:
+    def _free(self, z: Floats, waypoint: int) -> bool:
         return not len(z) or bool(np.all(self.knots.depth(z, waypoint) < self.problem.options.dist_safe / 2))
 
-    def _close(self, z: NDArray[np.float64]) -> None:
+    def _close(self, z: Floats) -> None:
         """Move the objects' joints in z, shape (N, n), as they are driven, and the robot with what it holds."""
         problem, driven = self.problem, self.knots.driven
         z[:, driven] = self.knots.objects[:, driven]
@@ -187,7 +177,7 @@ class Joiner:
                 solver, target = self.knots.solver(pose)
                 z[rows], _ = solver.solve(z[rows], target, lower=lower, upper=upper, weights=self.knots.weights, iterations=6)
 
-    def _note(self, phase: Phase, first: NDArray[np.float64], last: NDArray[np.float64]) -> None:
+    def _note(self, phase: Phase, first: Floats, last: Floats) -> None:
         """Note, once a phase, that there is no path between two configurations, shape (n,)."""
         problem = f"{phase.name}: found no way for the base"
         if not any(note.startswith(problem) for note in self.blocked):

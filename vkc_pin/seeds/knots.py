@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Bools, Floats
 from vkc_pin.chain.inverse_kinematics import PoseSolver
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.clearing import KNOT_TOLERANCE, clear_out
@@ -29,20 +29,15 @@ class Known:
     """
 
     def __init__(self) -> None:
-        self.drawn: dict[tuple[str, int, bytes], tuple[NDArray[np.float64], NDArray[np.bool_], Any]] = {}
-        self.depths: dict[tuple[int, bytes], NDArray[np.float64]] = {}
-        self.cleared: dict[tuple[int, bytes], NDArray[np.float64]] = {}
+        self.drawn: dict[tuple[str, int, bytes], tuple[Floats, Bools, Any]] = {}
+        self.depths: dict[tuple[int, bytes], Floats] = {}
+        self.cleared: dict[tuple[int, bytes], Floats] = {}
 
 
-_Found = dict[tuple[int, bytes], NDArray[np.float64]]
+_Found = dict[tuple[int, bytes], Floats]
 
 
-def _row_by_row(
-    known: _Found,
-    find: Callable[[NDArray[np.float64], int], NDArray[np.float64]],
-    z: NDArray[np.float64],
-    waypoint: int,
-) -> NDArray[np.float64]:
+def _row_by_row(known: _Found, find: Callable[[Floats, int], Floats], z: Floats, waypoint: int) -> Floats:
     """Return `find(z, waypoint)`, each row of which belongs to one of z; rows that are known are not asked for again."""
     keys = [(waypoint, row.tobytes()) for row in z]
     new = [k for k, key in enumerate(keys) if key not in known]
@@ -90,7 +85,7 @@ class Knots:
         """Return the inverse kinematics of a pose, and its target."""
         return self.problem.transcription.pose_solvers[pose], self.problem.targets[pose]
 
-    def knot(self, before: NDArray[np.float64], waypoint: int, how: str) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    def knot(self, before: Floats, waypoint: int, how: str) -> tuple[Floats, Bools]:
         """Return configurations for a waypoint, shape (B, n), and which of them are what must hold there.
 
         Args:
@@ -107,7 +102,7 @@ class Knots:
         z, found, self.rng.bit_generator.state = self.known.drawn[key]
         return z.copy(), found.copy()
 
-    def _knot(self, before: NDArray[np.float64], waypoint: int, how: str) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    def _knot(self, before: Floats, waypoint: int, how: str) -> tuple[Floats, Bools]:
         z = before.copy()
         z[:, self.driven] = self.objects[waypoint - 1, self.driven]
         lower, upper = self._limits(before, waypoint)
@@ -125,14 +120,14 @@ class Knots:
             z = self._unwind(z, before, lower, upper)
         return z, found
 
-    def clear(self, z: NDArray[np.float64], waypoint: int) -> NDArray[np.float64]:
+    def clear(self, z: Floats, waypoint: int) -> Floats:
         """Return configurations for a waypoint, shape (B, n), pushed out of collision as far as that goes; see `clearing`."""
         pose = self.pose_at(waypoint)
         if pose is None:
             return z
         return _row_by_row(self.known.cleared, lambda rows, at: self._clear(rows, at, pose), z, waypoint)
 
-    def _clear(self, z: NDArray[np.float64], waypoint: int, pose: int) -> NDArray[np.float64]:
+    def _clear(self, z: Floats, waypoint: int, pose: int) -> Floats:
         lower, upper = self._limits(z, waypoint)
         solver, target = self.solver(pose)
         weights = self.weights
@@ -140,7 +135,7 @@ class Knots:
         exact, _ = solver.solve(pushed, target, lower=lower, upper=upper, weights=weights, iterations=3, tolerance=KNOT_TOLERANCE)
         return exact
 
-    def _limits(self, before: NDArray[np.float64], waypoint: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _limits(self, before: Floats, waypoint: int) -> tuple[Floats, Floats]:
         """Return the limits of what comes from `before`, shape (B, n), at a waypoint: lower and upper, shape (B, n)."""
         row = waypoint - 1
         lower, upper = (np.tile(limits[row], (len(before), 1)) for limits in (self.problem.lower, self.problem.upper))
@@ -150,14 +145,14 @@ class Knots:
                 lower[:, column] = upper[:, column] = before[:, column]
         return lower, upper
 
-    def _choose(self, z: NDArray[np.float64], waypoint: int) -> None:
+    def _choose(self, z: Floats, waypoint: int) -> None:
         """Grasp anywhere: draw the freedoms of what is grasped at a waypoint, in place."""
         problem = self.problem
         for hold in problem.task.phases[int(np.searchsorted(problem.ends, waypoint))].grasps:
             for column in map(self.chain.index, self.chain.virtual[hold]):
                 z[:, column] = self.rng.uniform(self.chain.lower[column], self.chain.upper[column], len(z))
 
-    def _scatter(self, z: NDArray[np.float64], pose: int) -> NDArray[np.float64]:
+    def _scatter(self, z: Floats, pose: int) -> Floats:
         """Return arms near home, and every other near where it comes from, with the base under them as `pose` needs it."""
         home = self.chain.robot.home
         spread = self.rng.uniform(0.1, 1.0, (len(z), 1))
@@ -166,13 +161,13 @@ class Knots:
         z[:, 3 : self.robot] += spread * self.rng.normal(0.0, 1.0, (len(z), len(home)))
         return self._stand(np.clip(z, self.problem.chain.lower, self.problem.chain.upper), pose)
 
-    def _shake(self, z: NDArray[np.float64], pose: int) -> NDArray[np.float64]:
+    def _shake(self, z: Floats, pose: int) -> Floats:
         spread = self.rng.uniform(0.05, 0.5, (len(z), 1))
         z = z.copy()
         z[:, 3 : self.robot] += spread * self.rng.normal(0.0, 1.0, (len(z), self.robot - 3))
         return self._stand(np.clip(z, self.problem.chain.lower, self.problem.chain.upper), pose)
 
-    def _stand(self, z: NDArray[np.float64], pose: int) -> NDArray[np.float64]:
+    def _stand(self, z: Floats, pose: int) -> Floats:
         """Move the bases so that pose `pose` fits in place and heading; its height and tilt are left to the arm.
 
         A base motion multiplies the frame's placement from the left, so the error T* T⁻¹, projected to the floor, is it.
@@ -193,9 +188,7 @@ class Knots:
         z[:, 2] += turn
         return z
 
-    def _unwind(
-        self, z: NDArray[np.float64], before: NDArray[np.float64], lower: NDArray[np.float64], upper: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def _unwind(self, z: Floats, before: Floats, lower: Floats, upper: Floats) -> Floats:
         """Replace each revolute robot joint's angle by the equal one nearest to where it comes from."""
         z = z.copy()
         for column in range(2, self.robot):
@@ -206,12 +199,12 @@ class Knots:
             z[:, column] = np.where(inside, nearest, z[:, column])
         return z
 
-    def depth(self, z: NDArray[np.float64], waypoint: int) -> NDArray[np.float64]:
+    def depth(self, z: Floats, waypoint: int) -> Floats:
         """Return how far each configuration falls short of its margins [m], shape (B,)."""
         return _row_by_row(self.known.depths, lambda rows, at: depth(self.problem, rows, at), z, waypoint)
 
 
-def depth(problem: TrajectoryProblem, z: NDArray[np.float64], waypoint: int, *, standing: bool = True) -> NDArray[np.float64]:
+def depth(problem: TrajectoryProblem, z: Floats, waypoint: int, *, standing: bool = True) -> Floats:
     """Return how far configurations at a waypoint, shape (B, n), fall short of their margins [m], shape (B,).
 
     Without `standing` only from the robot itself and what it carries.
@@ -221,9 +214,7 @@ def depth(problem: TrajectoryProblem, z: NDArray[np.float64], waypoint: int, *, 
     return contacts.shortfall(len(z))
 
 
-def scatter(
-    problem: TrajectoryProblem, waypoint: int, rng: np.random.Generator
-) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+def scatter(problem: TrajectoryProblem, waypoint: int, rng: np.random.Generator) -> tuple[Floats, Floats] | None:
     """Return random configurations that try to be at the goal of `waypoint`, shape (B, n), and their residuals, shape (B,).
 
     None if there is neither a pose to reach nor a place for the base there.
@@ -245,13 +236,13 @@ def scatter(
     return np.clip(z, problem.lower[row], problem.upper[row]), np.zeros(len(z))
 
 
-def smooth(steps: int) -> NDArray[np.float64]:
+def smooth(steps: int) -> Floats:
     """Return s at 1/steps, ..., 1 of the profile that starts and ends at rest, 3s² − 2s³, shape (steps,)."""
     s = np.arange(1, steps + 1) / steps
     return s * s * (3.0 - 2.0 * s)
 
 
-def follow_objects(problem: TrajectoryProblem, z: NDArray[np.float64]) -> NDArray[np.float64]:
+def follow_objects(problem: TrajectoryProblem, z: Floats) -> Floats:
     """Let the objects' joints run to their goals phase by phase."""
     begin, current = 0, problem.start.copy()
     for phase, end in zip(problem.task.phases, problem.ends, strict=True):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.driving.body import Shape
 from vkc_pin.driving.grid import BaseGrid, fine_cells
 from vkc_pin.driving.path import BasePath, poses_along, shortest_path
@@ -36,8 +36,8 @@ class Routes:
         self.problem, self.interrupt = problem, interrupt
         self.arm = slice(3, problem.chain.robot.coordinates.size)
         self._grids: dict[tuple[int, bool], BaseGrid] = {}
-        self._folded: dict[tuple[Hold, ...], NDArray[np.float64]] = {}
-        self._distances: dict[tuple[int, bool, int, int], NDArray[np.float64]] = {}
+        self._folded: dict[tuple[Hold, ...], Floats] = {}
+        self._distances: dict[tuple[int, bool, int, int], Floats] = {}
         self._paths: dict[tuple[int, bytes, bytes], BasePath | None] = {}
 
     def grid(self, phase: int, *, folded: bool = False) -> BaseGrid:
@@ -64,14 +64,14 @@ class Routes:
             )
         return self._grids[key]
 
-    def folded_arm(self, phase: int) -> NDArray[np.float64]:
+    def folded_arm(self, phase: int) -> Floats:
         """Return the arm folded with what is held in a phase, shape (m - 3,); see `compact.folded_arm`."""
         held = self.problem.task.phases[phase].held
         if held not in self._folded:
             self._folded[held] = folded_arm(self.problem, phase, self._resting(), self.interrupt)
         return self._folded[held]
 
-    def _resting(self) -> NDArray[np.float64]:
+    def _resting(self) -> Floats:
         """Return the arm at home on a base at the origin, with grasps as near to 0 as they go, shape (n,)."""
         chain, z = self.problem.chain, self.problem.start.copy()
         z[:3], z[self.arm] = 0.0, chain.robot.home
@@ -79,9 +79,7 @@ class Routes:
             z[column] = np.clip(0.0, chain.lower[column], chain.upper[column])
         return z
 
-    def distances(
-        self, phase: int, starts: NDArray[np.float64], goals: NDArray[np.float64], *, folded: bool = False
-    ) -> NDArray[np.float64]:
+    def distances(self, phase: int, starts: Floats, goals: Floats, *, folded: bool = False) -> Floats:
         """Return how far it is at least from starts to goals, both (B, 3), one by one, shape (B,) [m]; infinite: no path."""
         grid = self.grid(phase, folded=folded)
         keys = [(phase, folded, *np.floor(start[:2] / _START_CELL).astype(int).tolist()) for start in starts]
@@ -91,7 +89,7 @@ class Routes:
         cells = np.clip(np.floor((goals[:, :2] - grid.origin) / grid.step + 0.5).astype(int), 0, grid.cells - 1)
         return np.array([self._distances[key][i, j] for key, (i, j) in zip(keys, cells, strict=True)])
 
-    def path(self, phase: int, start: NDArray[np.float64], goal: NDArray[np.float64], steps: int) -> NDArray[np.float64] | None:
+    def path(self, phase: int, start: Floats, goal: Floats, steps: int) -> Floats | None:
         """Return `steps` poses of the base from start to goal, both (3,), the last at the goal's place: shape (steps, 3).
 
         The heading is continuous from the start's, and ends at one equal to the goal's. None if there is no path.
@@ -102,7 +100,7 @@ class Routes:
         path = self._paths[key]
         return None if path is None else poses_along(path, steps)
 
-    def guide(self, phase: int, start: NDArray[np.float64], goal: NDArray[np.float64], steps: int) -> NDArray[np.float64] | None:
+    def guide(self, phase: int, start: Floats, goal: Floats, steps: int) -> Floats | None:
         """Return poses from a start to a goal, both (3,), or to next to it, on which the base fits, shape (steps, 3).
 
         With the arm at home or, if there is no such path, with the arm folded. None if there is none either.
@@ -120,7 +118,7 @@ class Routes:
         return None
 
 
-def grid_shapes(problem: TrajectoryProblem, phase: int, z: NDArray[np.float64]) -> tuple[list[tuple[int, Shape]], list[Shape]]:
+def grid_shapes(problem: TrajectoryProblem, phase: int, z: Floats) -> tuple[list[tuple[int, Shape]], list[Shape]]:
     """Return what a grid of the base is made of: what rides on the base in a phase, and what stands in the world but the floor.
 
     Args:

@@ -9,8 +9,8 @@ from __future__ import annotations
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.knots import depth, smooth
@@ -36,15 +36,15 @@ _SHORTCUTS = 60  # tries to go straight between two places on the path
 def connect(
     problem: TrajectoryProblem,
     phase: int,
-    first: NDArray[np.float64],
-    ends: NDArray[np.float64],
+    first: Floats,
+    ends: Floats,
     *,
-    poses: NDArray[np.float64],
-    arms: NDArray[np.float64],
+    poses: Floats,
+    arms: Floats,
     rng: np.random.Generator,
     tries: int = TRIES,
     interrupt: Interrupt = NEVER,
-) -> NDArray[np.float64] | None:
+) -> Floats | None:
     """Return configurations of the robot, straight between which hardly anything is hit, shape (K, m), or None if none are found.
 
     Args:
@@ -61,7 +61,7 @@ def connect(
     return _Search(problem, phase, first, poses, arms, rng).run(ends, tries, interrupt)
 
 
-def spread(path: NDArray[np.float64], steps: int) -> NDArray[np.float64]:
+def spread(path: Floats, steps: int) -> Floats:
     """Return `steps` configurations along a path, shape (K, m), without its first: slow at both ends, shape (steps, m)."""
     lengths = np.linalg.norm(np.diff(path, axis=0) * _weights(path.shape[1]), axis=1)
     passed = np.concatenate([[0.0], np.cumsum(lengths + 1e-12)])
@@ -69,7 +69,7 @@ def spread(path: NDArray[np.float64], steps: int) -> NDArray[np.float64]:
     return np.column_stack([np.interp(at, passed, column) for column in path.T])
 
 
-def _weights(size: int) -> NDArray[np.float64]:
+def _weights(size: int) -> Floats:
     weights = np.ones(size)
     weights[:2] = _BASE
     return weights
@@ -77,13 +77,7 @@ def _weights(size: int) -> NDArray[np.float64]:
 
 class _Search:
     def __init__(
-        self,
-        problem: TrajectoryProblem,
-        phase: int,
-        first: NDArray[np.float64],
-        poses: NDArray[np.float64],
-        arms: NDArray[np.float64],
-        rng: np.random.Generator,
+        self, problem: TrajectoryProblem, phase: int, first: Floats, poses: Floats, arms: Floats, rng: np.random.Generator
     ) -> None:
         self.problem, self.first, self.poses, self.arms, self.rng = problem, first, poses, arms, rng
         self.size = problem.chain.robot.coordinates.size
@@ -93,7 +87,7 @@ class _Search:
         limits = np.array([problem.limits(name) for name in problem.chain.names[: self.size]])
         self.lower, self.upper = limits.T
 
-    def run(self, ends: NDArray[np.float64], tries: int, interrupt: Interrupt) -> NDArray[np.float64] | None:
+    def run(self, ends: Floats, tries: int, interrupt: Interrupt) -> Floats | None:
         """Return the path to one of `ends`."""
         start = self.first[: self.size]
         short = self._depth(ends)
@@ -119,7 +113,7 @@ class _Search:
         return None
 
     @cached_property
-    def runs(self) -> list[NDArray[np.float64]]:
+    def runs(self) -> list[Floats]:
         """The parts of the base's path that are free with each of the arms, each shape (R, m)."""
         runs = []
         for arm in self.arms:
@@ -149,7 +143,7 @@ class _Search:
                     parent = tree.add(row, parent)
         return node
 
-    def _draw(self, start: NDArray[np.float64], ends: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _draw(self, start: Floats, ends: Floats) -> Floats:
         """Return a configuration near the base's path, or near its beginning or end."""
         rng, goal = self.rng, np.empty(self.size)
         if rng.random() < _GUIDED:
@@ -162,7 +156,7 @@ class _Search:
             goal[3:] += rng.random() * _ARM_SPREAD * rng.normal(size=self.size - 3)
         return np.clip(goal, self.lower, self.upper)
 
-    def _grow(self, tree: _Tree, goal: NDArray[np.float64], extent: float) -> int | None:
+    def _grow(self, tree: _Tree, goal: Floats, extent: float) -> int | None:
         """Let a tree grow from its nearest node towards a configuration, as far as nothing is hit; return the new node."""
         near = tree.nearest(goal)
         start = tree.nodes[near]
@@ -176,7 +170,7 @@ class _Search:
             return None
         return tree.add(goal if reached == 1.0 else start + reached * (goal - start), near)
 
-    def _along(self, a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    def _along(self, a: Floats, b: Floats) -> float:
         """Return what share of the straight line from `a` to `b`, both (m,), is free."""
         count = max(1, int(np.ceil(np.abs((b - a) * self.weights).max() / _STEP)))
         s = np.arange(1, count + 1) / count
@@ -187,13 +181,13 @@ class _Search:
                 return float(s[begin + blocked[0] - 1]) if begin + blocked[0] else 0.0
         return 1.0
 
-    def _depth(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _depth(self, rows: Floats) -> Floats:
         """Return how far configurations of the robot, shape (B, m), fall short of their margins [m], shape (B,)."""
         z = np.tile(self.first, (len(rows), 1))
         z[:, : self.size] = rows
         return depth(self.problem, z, self.waypoint)
 
-    def _shortened(self, path: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _shortened(self, path: Floats) -> Floats:
         """Return a path that goes straight between random places on it where nothing is in the way."""
         for _ in range(_SHORTCUTS):
             if len(path) < 3:
@@ -212,19 +206,19 @@ class _Search:
 class _Tree:
     """Configurations, each with the one it was reached from."""
 
-    def __init__(self, roots: NDArray[np.float64], weights: NDArray[np.float64]) -> None:
+    def __init__(self, roots: Floats, weights: Floats) -> None:
         self._rows, self.parents, self.weights = roots.copy(), [-1] * len(roots), weights  # rows: those in use, and spare ones
         self.runs: set[int] = set()
 
     @property
-    def nodes(self) -> NDArray[np.float64]:
+    def nodes(self) -> Floats:
         """The configurations, shape (K, m)."""
         return self._rows[: len(self.parents)]
 
-    def nearest(self, goal: NDArray[np.float64]) -> int:
+    def nearest(self, goal: Floats) -> int:
         return int(np.argmin(np.linalg.norm((self.nodes - goal) * self.weights, axis=1)))
 
-    def add(self, node: NDArray[np.float64], parent: int) -> int:
+    def add(self, node: Floats, parent: int) -> int:
         number = len(self.parents)
         if number == len(self._rows):
             self._rows = np.concatenate([self._rows, np.empty_like(self._rows)])
@@ -232,7 +226,7 @@ class _Tree:
         self.parents.append(parent)
         return number
 
-    def path(self, node: int) -> NDArray[np.float64]:
+    def path(self, node: int) -> Floats:
         """Return the configurations from the root to a node, shape (K, m)."""
         found = []
         while node >= 0:

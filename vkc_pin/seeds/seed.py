@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.motion.splicing import filled
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.task.phases import PhaseKey
@@ -31,9 +31,9 @@ class Seed:
     """
 
     name: str
-    z: NDArray[np.float64]
+    z: Floats
     shortfall: float = float("nan")
-    radius: NDArray[np.float64] | None = None
+    radius: Floats | None = None
     penalty: float | None = None
     races: bool = True
 
@@ -51,7 +51,7 @@ class PhaseWaypoints:
 
     phases: tuple[PhaseKey, ...]
     names: tuple[str, ...]
-    waypoints: tuple[NDArray[np.float64], ...]
+    waypoints: tuple[Floats, ...]
     seed: str
 
 
@@ -77,7 +77,7 @@ def seed_of(problem: TrajectoryProblem, parts: Sequence[PhaseWaypoints]) -> Seed
     return Seed(name, z, radius=np.full(problem.segments, _WARM_RADIUS))
 
 
-def _resampled(waypoints: NDArray[np.float64], segments: int) -> NDArray[np.float64]:
+def _resampled(waypoints: Floats, segments: int) -> Floats:
     """Return `segments` waypoints after the first along those given, shape (K, n)."""
     if len(waypoints) == segments + 1:
         return waypoints[1:]

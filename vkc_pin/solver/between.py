@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats, Ints
 from vkc_pin.chain.contacts import Contacts
 from vkc_pin.program.problem import TrajectoryProblem
 
@@ -17,7 +17,7 @@ CLOSE = 0.015  # [m] beyond `KEEP` within which a state is looked at closer
 FINER = 8  # states there instead of one
 
 
-def collisions_between(problem: TrajectoryProblem, z: NDArray[np.float64]) -> tuple[Contacts, bool]:
+def collisions_between(problem: TrajectoryProblem, z: Floats) -> tuple[Contacts, bool]:
     """Return contacts at waypoints that stand for closeness inside the segments around them, and whether all is far enough.
 
     At a sub-state (1 − s)·z_t + s·z_{t+1} with distance d < KEEP (or than the pair's margin, where that is less), the witness
@@ -67,15 +67,13 @@ def collisions_between(problem: TrajectoryProblem, z: NDArray[np.float64]) -> tu
     return merge(*parts), bool(np.all(found.distance >= np.minimum(ENOUGH, keep)))
 
 
-def _states(
-    path: NDArray[np.float64], segment: NDArray[np.int_], s: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.int_]]:
+def _states(path: Floats, segment: Ints, s: Floats) -> tuple[Floats, Ints]:
     """Return the states at 0 < s < 1 of segments, and the waypoints whose phases they belong to."""
     share = s[:, None]
     return (1 - share) * path[segment] + share * path[segment + 1], segment + 1
 
 
-def _deepest(found: Contacts, segment: NDArray[np.int_]) -> Contacts:
+def _deepest(found: Contacts, segment: Ints) -> Contacts:
     """Return the contact of smallest distance for each segment and pair."""
     shapes = int(found.pair.max(initial=0)) + 1
     keys = (segment[found.waypoint] * shapes + found.pair[:, 0]) * shapes + found.pair[:, 1]

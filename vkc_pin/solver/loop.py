@@ -8,8 +8,8 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.chain.contacts import Contacts
 from vkc_pin.interrupt import Interrupt, interruptible
 from vkc_pin.program.problem import TrajectoryProblem
@@ -56,7 +56,7 @@ PENALTY_LIMIT = 2000.0  # [1/m] largest penalty
 class _Loop:
     """The state between rounds: the current waypoints, their contacts, multipliers and penalty."""
 
-    def __init__(self, problem: TrajectoryProblem, seed: NDArray[np.float64], deadline: float = np.inf) -> None:
+    def __init__(self, problem: TrajectoryProblem, seed: Floats, deadline: float = np.inf) -> None:
         self.deadline = deadline
         self.problem, self.options = problem, problem.options
         self.transcription = problem.transcription
@@ -73,7 +73,7 @@ class _Loop:
         self.objective = problem.objective(self.z, self.timing.dt)
         self.pose_error = problem.row_error(self.z, self.timing.dt)
 
-    def contacts(self, z: NDArray[np.float64]) -> tuple[Contacts, bool]:
+    def contacts(self, z: Floats) -> tuple[Contacts, bool]:
         """Return what is close at the waypoints and, once that was needed, between them, and whether that is far enough."""
         begin = time.perf_counter()
         found = self.problem.evaluate_contacts(z, reach=self.options.contact_reach, nearest=self.options.contact_slots)
@@ -97,7 +97,7 @@ class _Loop:
             self.shortfall = self.at.shortfall(self.problem.segments)
         return free
 
-    def try_step(self, radius: NDArray[np.float64]) -> Trial:
+    def try_step(self, radius: Floats) -> Trial:
         """Solve within `radius` of the current waypoints, and look at what is really there."""
         z, slack, objective, satisfied = self.run_ipopt(radius)
         contacts, clear = self.contacts(z)
@@ -155,7 +155,7 @@ class _Loop:
         self.penalty = min(self.penalty * PENALTY_GROWTH, PENALTY_LIMIT)
         self.multipliers = {}
 
-    def run_ipopt(self, radius: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], float, bool]:
+    def run_ipopt(self, radius: Floats) -> tuple[Floats, Floats, float, bool]:
         """Solve once with fixed planes; return waypoints, slack, objective and whether Ipopt was satisfied."""
         problem, t = self.problem, self.transcription
         begin = time.perf_counter()
@@ -189,12 +189,12 @@ class _Loop:
 
 def solve(
     problem: TrajectoryProblem,
-    seed: NDArray[np.float64],
+    seed: Floats,
     *,
     callback: Callable[[Iteration], None] | None = None,
     deadline: float = np.inf,
     rounds: int | None = None,
-    radius: NDArray[np.float64] | None = None,
+    radius: Floats | None = None,
     penalty: float | None = None,
     patient: bool = True,
     thorough: bool = True,
@@ -238,7 +238,7 @@ def _iterate(
 ) -> None:
     """Run rounds until everything holds, nothing helps any more, or time is up."""
     solution, started = loop.solution, time.perf_counter()
-    feasible: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+    feasible: tuple[Floats, Floats] | None = None
     good = float("inf")  # objective of the last motion at which everything held
     for _ in range(rounds):
         if time.perf_counter() > loop.deadline:

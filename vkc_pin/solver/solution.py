@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import numpy as np
-from numpy.typing import NDArray
+from vkc_pin.arrays import Floats
 
 __all__ = ["Iteration", "Resume", "Solution"]
 
@@ -50,7 +49,7 @@ class Resume:
         penalty: What clearance is to cost.
     """
 
-    radius: NDArray[np.float64]
+    radius: Floats
     penalty: float
 
 
@@ -70,11 +69,11 @@ class Solution:
         history: One `Iteration` per round.
     """
 
-    z: NDArray[np.float64]
-    dt: NDArray[np.float64]
+    z: Floats
+    dt: Floats
     converged: bool = False
     status: str = "not converged"
-    radius: NDArray[np.float64] | None = None
+    radius: Floats | None = None
     resume: Resume | None = None
     rounds: int = 0
     iterations: int = 0

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.program.problem import TrajectoryProblem
 
 __all__ = ["as_trajectory"]
 
 
-def as_trajectory(problem: TrajectoryProblem, z: NDArray[np.float64], dt: NDArray[np.float64]) -> Trajectory:
+def as_trajectory(problem: TrajectoryProblem, z: Floats, dt: Floats) -> Trajectory:
     """Return z_1..z_N, shape (N, n), as a trajectory; where something is grasped or let go, the robot waits for the gripper.
 
     Args:
@@ -43,7 +43,7 @@ def as_trajectory(problem: TrajectoryProblem, z: NDArray[np.float64], dt: NDArra
     return Trajectory(problem.chain.names, np.array(times), waypoints[rows], tuple(phases), robot)
 
 
-def _settle_choices(problem: TrajectoryProblem, waypoints: NDArray[np.float64]) -> None:
+def _settle_choices(problem: TrajectoryProblem, waypoints: Floats) -> None:
     """Give the freedom of a grasp, which means nothing while nothing is held, the value it has next, or else had last."""
     starts = [0, *problem.ends[:-1]]
     for hold, names in problem.chain.virtual.items():

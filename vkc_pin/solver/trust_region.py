@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.chain.contacts import Contacts
 
 __all__ = ["Trial", "TrustRegion", "judge"]
@@ -40,16 +40,16 @@ class Trial:
         satisfied: Whether Ipopt was.
     """
 
-    z: NDArray[np.float64]
-    slack: NDArray[np.float64]
+    z: Floats
+    slack: Floats
     objective: float
     pose_error: float
     contacts: Contacts
-    shortfall: NDArray[np.float64]
+    shortfall: Floats
     clear: bool
     between: bool
     rate: float
-    step: NDArray[np.float64]
+    step: Floats
     satisfied: bool
 
 
@@ -66,11 +66,11 @@ class TrustRegion:
         radius: Of each waypoint, shape (N,) [m] and [rad].
     """
 
-    def __init__(self, segments: int, length: int, radius: NDArray[np.float64] | None = None) -> None:
+    def __init__(self, segments: int, length: int, radius: Floats | None = None) -> None:
         self.block = np.arange(segments) * max(1, round(segments / length)) // segments
         self.radius = np.full(segments, FIRST_RADIUS) if radius is None else radius.copy()
 
-    def adapt(self, before: NDArray[np.float64], trial: Trial, accepted: bool, ratio: float) -> None:
+    def adapt(self, before: Floats, trial: Trial, accepted: bool, ratio: float) -> None:
         """Widen blocks where what was promised came true, narrow those where it did not.
 
         Args:
@@ -98,7 +98,7 @@ class TrustRegion:
         """Let waypoints move so little that planes are as good as distances."""
         self.radius = np.minimum(self.radius, SETTLE_RADIUS)
 
-    def stuck(self, trial: Trial, shortfall: NDArray[np.float64]) -> bool:
+    def stuck(self, trial: Trial, shortfall: Floats) -> bool:
         """Return whether nothing moves any more where something is in the way."""
         bad = shortfall > CLOSE_ENOUGH
         if not bad.any():
@@ -110,9 +110,7 @@ class TrustRegion:
         self.radius = np.full(len(self.radius), RESTART_RADIUS)
 
 
-def judge(
-    trial: Trial, objective: float, shortfall: NDArray[np.float64], *, penalty: float, pose_error: float
-) -> tuple[bool, float]:
+def judge(trial: Trial, objective: float, shortfall: Floats, *, penalty: float, pose_error: float) -> tuple[bool, float]:
     """Return whether to accept where a round led, and how much of the promised decrease of the ℓ1 merit came true.
 
     Args:

@@ -9,8 +9,8 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.errors import UnknownNameError
 
 __all__ = ["Formula", "State"]
@@ -152,7 +152,7 @@ class Formula:
                 work[written] = ca.SX.binary(numbers[name], *operands)
         return ca.Function("term", [inputs], [ca.vertcat(*results)])
 
-    def values(self, inputs: NDArray[np.float64]) -> NDArray[np.float64]:
+    def values(self, inputs: Floats) -> Floats:
         """Return its values, shape (S, rows), at inputs of shape (S, 2·half + 1)."""
         return np.asarray(self.function(np.ascontiguousarray(inputs.T)), float).reshape(self.rows, len(inputs)).T
 

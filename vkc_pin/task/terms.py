@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.task.formula import Formula, State
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Constraint", "Cost", "State", "Term", "check_active", "term_from_dict", "term_to_dict", "traced"]
 
-Numbers = float | Sequence[float] | NDArray[np.float64]
+Numbers = float | Sequence[float] | Floats
 
 
 Expression = Callable[[State], Any] | Formula
@@ -112,7 +112,7 @@ class Constraint(_Term):
             raise self.error("no such bound", field, "a number or a list of them", repr(value))
         return float(numbers) if numbers.ndim == 0 else tuple(numbers.tolist())
 
-    def box(self, rows: int | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def box(self, rows: int | None) -> tuple[Floats, Floats]:
         """Return both bounds, shape (rows,); None: as many as there are bounds.
 
         Raises:

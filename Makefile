@@ -1,21 +1,27 @@
-# make demo: plan the door and look at it; make test: lint, types, tests, documentation; make docs: the documentation alone.
+# make demo: plan the door and look at it; make test: lint, types, tests, documentation; make test-long: the tests that take
+# longest; make docs: the documentation alone.
 # Each sets up .venv first, where it is not yet.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
-.PHONY: demo test lint docs clean
+.PHONY: demo test test-long lint docs clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/installed.stamp
 	@mkdir -p out
 	$(BIN)/vkc-pin plan door --set door.hinge=1.2 --html out/door.html --save out/door.npz --json out/door.json --plots out
 
-# The tests leave the notebooks that they run in out/notebooks; the documentation shows them with what came out.
-test: lint $(VENV)/docs.stamp
-	$(BIN)/python -m pytest
-	$(MAKE) docs
+# One process a core, each with one thread; files stay whole, since their tests share problems and plans.
+PYTEST := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
+
+test: lint docs
+	$(PYTEST) -m "not long"
+
+# These leave the notebooks that they run in out/notebooks; the documentation shows them with what came out.
+test-long: $(VENV)/test.stamp $(VENV)/docs.stamp
+	$(PYTEST) -m long
 
 docs: $(VENV)/docs.stamp
 	$(BIN)/python -m sphinx -q -W --keep-going -c docs -d out/doctrees . out/site

@@ -86,7 +86,6 @@ def test_notebooks_are_kept_without_outputs(path: Path) -> None:
             assert (cell.outputs, cell.execution_count) == ([], None), cell.id
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_first_plan(tmp_path: Path) -> None:
     cells = executed("01_first_plan", tmp_path)
@@ -128,7 +127,7 @@ def test_first_plan(tmp_path: Path) -> None:
     assert result(cells["again"])["text/plain"].count("True") == 3
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(600)
 def test_virtual_kinematic_chain(tmp_path: Path) -> None:
     cells = executed("02_virtual_kinematic_chain", tmp_path)
@@ -162,7 +161,7 @@ def test_virtual_kinematic_chain(tmp_path: Path) -> None:
     assert [float(line.split()[-1]) for line in text(cells["axes"]).splitlines()] == [-1.0, -1.0]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(600)
 def test_optimisation_problem(tmp_path: Path) -> None:
     cells = executed("03_optimisation_problem", tmp_path)
@@ -203,7 +202,7 @@ def test_optimisation_problem(tmp_path: Path) -> None:
     assert result(cells["validation"])["text/plain"] == "True"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(600)
 def test_tools_and_grasps(tmp_path: Path) -> None:
     cells = executed("04_tools_and_grasps", tmp_path)
@@ -229,7 +228,7 @@ def test_tools_and_grasps(tmp_path: Path) -> None:
     assert rows[-1] == ("let go", "stick")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(600)
 def test_initialization(tmp_path: Path) -> None:
     cells = executed("05_initialization", tmp_path)
@@ -263,7 +262,7 @@ def test_initialization(tmp_path: Path) -> None:
     assert written == {"results.csv", "results.json", "success.png", "table.md", "trials.jsonl"}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(600)
 def test_baselines(tmp_path: Path) -> None:
     cells = executed("06_baselines", tmp_path)
@@ -284,7 +283,7 @@ def test_baselines(tmp_path: Path) -> None:
     assert {"results.csv", "results.json", "table.md", "trials.jsonl", "door.png"} <= written
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(600)
 def test_chores(tmp_path: Path) -> None:
     cells = executed("07_chores", tmp_path)
@@ -305,7 +304,7 @@ def test_chores(tmp_path: Path) -> None:
     assert (tmp_path / "fetch.html").stat().st_size > 100_000
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(600)
 def test_own_robot_and_object(tmp_path: Path) -> None:
     cells = executed("08_own_robot_and_object", tmp_path)
@@ -327,7 +326,7 @@ def test_own_robot_and_object(tmp_path: Path) -> None:
     assert "did you mean 'position'" in text(cells["error"])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(600)
 def test_when_planning_fails(tmp_path: Path) -> None:
     cells = executed("09_when_planning_fails", tmp_path)

@@ -66,7 +66,7 @@ def test_unknown_chores_are_named(tmp_path: Path) -> None:
         chores.run(trials=1, seed=0, out=tmp_path, chores=())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_ten_steps_in_one_call(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "chores", "--trials", "1", "--chores", "fetch", "--out", str(tmp_path / "out"), "--quiet"]) == 0
     (trial,) = json.loads((tmp_path / "out" / "results.json").read_text(encoding="utf-8"))["trials"]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vkc_pin.benchmarks import comparison
+from vkc_pin.benchmarks import comparison, initialization, scale
 from vkc_pin.benchmarks.initialization import TARGET
 from vkc_pin.cli import main
 from vkc_pin.motion.world import World
@@ -24,6 +24,13 @@ FIELDS = {
     *("initialization", "build_time", "failed_constraint", "violations"),
     *(f"time_{part}" for part in ("initialization", "coal", "casadi", "ipopt", "validation")),
 }
+
+
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let no motion be given up because the machine is busy."""
+    for module in (comparison, initialization, scale):
+        monkeypatch.setattr(module, "TIME_LIMIT", 300.0)
 
 
 def check(trial: dict[str, Any], method: str, number: int) -> None:
@@ -50,7 +57,6 @@ def check(trial: dict[str, Any], method: str, number: int) -> None:
     assert trial["iterations"] >= trial["rounds"] >= 1
 
 
-@pytest.mark.slow
 def test_initialization(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "tmp"
     command = ["bench", "initialization", "--starts", "2", "--scenes", "init_1", "--methods", "astar", "--jobs", "1", "--quiet"]
@@ -97,7 +103,7 @@ def test_initialization(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert "seed" in capsys.readouterr().err
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_auto_is_compared_with_step_after_step(tmp_path: Path) -> None:
     command = ["bench", "initialization", "--starts", "1", "--scenes", "init_1", "--methods", "auto", "--jobs", "1", "--quiet"]
     assert main([*command, "--out", str(tmp_path)]) == 0
@@ -114,7 +120,7 @@ def test_auto_is_compared_with_step_after_step(tmp_path: Path) -> None:
         assert cells[4] == f"{int(trials[0][field] < trials[1][field] - 1e-6)} of 1"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_baselines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["bench", "baselines", "--trials", "2", "--tasks", "drawer", "--methods", "B1", "VKC", "--jobs", "1", "--quiet"]
     command += ["--save-failures", "--out", str(tmp_path)]
@@ -161,7 +167,6 @@ def test_baselines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert {name: (tmp_path / name).read_bytes() for name in before} == before
 
 
-@pytest.mark.slow
 def test_scale(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["bench", "scale", "--starts", "2", "--obstacles", "10", "40", "--jobs", "1", "--quiet", "--out", str(tmp_path)]
     assert main(command) == 0
@@ -182,9 +187,8 @@ def test_scale(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert (tmp_path / "scale.png").read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
 
 
-@pytest.mark.slow
-def test_household(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(comparison, "TIME_LIMIT", 30.0)
+@pytest.mark.long
+def test_household(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["bench", "household", "--trials", "1", "--tasks", "cup", "cabinet", "--methods", "B1", "VKC", "--jobs", "1"]
     assert main([*command, "--quiet", "--out", str(tmp_path)]) == 0
     table = (tmp_path / "table.md").read_text(encoding="utf-8")

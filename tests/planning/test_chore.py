@@ -134,6 +134,7 @@ def test_where_the_next_cannot_be_done_both_are_planned_anew(monkeypatch: pytest
     assert not problems.asked[-1][1]  # from seeds of its own
 
 
+@pytest.mark.long
 def test_a_decision_that_leads_nowhere_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     """With a window of one nothing is foreseen: only a step back helps."""
     problems = Problems(monkeypatch, lambda steps: steps == (SHUT,))
@@ -145,6 +146,7 @@ def test_a_decision_that_leads_nowhere_is_given_up(monkeypatch: pytest.MonkeyPat
     assert len(plan.trajectory.phases) == 3  # reach, open, and shut without letting go
 
 
+@pytest.mark.long
 def test_what_fails_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(chore, "_TRIES", 1)
     monkeypatch.setattr(chore, "_BACK", 0)

@@ -30,7 +30,7 @@ def printed(outputs: list[dict[str, Any]]) -> str:
 
 
 def test_show_is_part_of_the_notebook(jupyter: Kernel) -> None:
-    (output,) = jupyter.run("from fake_plan import fake_plan\nfake_plan().show()")
+    (output,) = jupyter.run("from helpers.fake_plan import fake_plan\nfake_plan().show()")
     page = output["data"]["text/html"]
     assert "iframe srcdoc=" in page
     assert 500_000 < len(page) < 5_000_000

@@ -48,6 +48,7 @@ def test_the_tip_reaches_its_target_to_a_millimetre() -> None:
     assert [dict(phase.held) for phase in found.trajectory.phases] == [{}, {"stick": "grip"}]
 
 
+@pytest.mark.long
 def test_grasping_anywhere_costs_less_than_at_one_place() -> None:
     """From one motion, that found with the fixed grasp: what is minimised (eq. 1) falls further if the grasp may move.
 

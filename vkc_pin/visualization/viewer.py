@@ -129,7 +129,7 @@ def open_viewer() -> meshcat.Visualizer:
 
 
 def _start_server() -> tuple[subprocess.Popen[bytes], str, str]:
-    file = Path(__file__).with_name("viewer_server.py")
+    file = Path(__file__).with_name("server.py")
     # -P: the folder of that file is no place to import from.
     command = [sys.executable, "-P", "-u", str(file)]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}

@@ -36,9 +36,14 @@ def blocks(page: Path, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```$", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
 
 
+LONG = ("chores", "initialization", "own_terms", "robots", "tutorial")  # pages whose code plans much
+
+
 def snippets() -> list[object]:
     return [
-        pytest.param(code, id=f"{page.stem}-{number}") for page in PAGES for number, code in enumerate(blocks(page, "python"))
+        pytest.param(code, id=f"{page.stem}-{number}", marks=[pytest.mark.long] if page.stem in LONG else [])
+        for page in PAGES
+        for number, code in enumerate(blocks(page, "python"))
     ]
 
 
@@ -135,11 +140,12 @@ def test_shell_commands_are_understood() -> None:
 
 
 def test_help_of_every_command() -> None:
-    for name in commands():
-        command = [sys.executable, "-m", "vkc_pin.cli", *name.split(), "--help"]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-        assert done.returncode == 0, done.stderr
-        assert f"vkc-pin {name}" in done.stdout
+    for name, parser in commands().items():
+        assert f"vkc-pin {name}" in parser.format_help()
+    command = [sys.executable, "-m", "vkc_pin.cli", "plan", "--help"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "vkc-pin plan" in done.stdout
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -246,6 +252,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "html"
 
 
+@pytest.mark.long
 @pytest.mark.timeout(600)
 def test_site(site: Path) -> None:
     pages = {page.resolve(): Links(page) for page in site.rglob("*.html") if page.parent.name != "animations"}

@@ -86,7 +86,6 @@ def test_notebooks_are_kept_without_outputs(path: Path) -> None:
             assert (cell.outputs, cell.execution_count) == ([], None), cell.id
 
 
-@pytest.mark.long
 @pytest.mark.timeout(600)
 def test_first_plan(tmp_path: Path) -> None:
     cells = executed("01_first_plan", tmp_path)

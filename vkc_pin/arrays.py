@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from vkc_pin.arrays import Bools, Floats, Ints
+import numpy as np
+from numpy.typing import NDArray
 
 __all__ = ["Bools", "Floats", "Ints"]
 
-Floats = Floats
+Floats = NDArray[np.float64]
 """Numbers of double precision."""
-Ints = Ints
+Ints = NDArray[np.int_]
 """Indices and counts."""
-Bools = Bools
+Bools = NDArray[np.bool_]
 """Masks."""

@@ -57,7 +57,6 @@ def check(trial: dict[str, Any], method: str, number: int) -> None:
     assert trial["iterations"] >= trial["rounds"] >= 1
 
 
-@pytest.mark.long
 def test_initialization(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "tmp"
     command = ["bench", "initialization", "--starts", "2", "--scenes", "init_1", "--methods", "astar", "--jobs", "1", "--quiet"]
@@ -168,7 +167,6 @@ def test_baselines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert {name: (tmp_path / name).read_bytes() for name in before} == before
 
 
-@pytest.mark.long
 def test_scale(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["bench", "scale", "--starts", "2", "--obstacles", "10", "40", "--jobs", "1", "--quiet", "--out", str(tmp_path)]
     assert main(command) == 0

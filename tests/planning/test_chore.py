@@ -186,7 +186,7 @@ def test_ctrl_c_leaves_what_is_done() -> None:
         if len(seen) > 1 and row.round == 1 and row.objective != seen[0].objective:
             signal.raise_signal(signal.SIGINT)
 
-    plan = vkc.plan_chore(home(), [vkc.GoTo(0.5, -0.5), OPEN], callback=stop)
+    plan = vkc.plan_chore(home(), [vkc.GoTo(0.5, -0.5), OPEN, *CUP], callback=stop)
     assert (plan.status, plan.success) == ("interrupted", False)
     assert plan.trajectory.phases[0].name == "go to"
     assert plan.trajectory.positions[plan.trajectory.phases[0].last, :2] == pytest.approx([0.5, -0.5], abs=1e-3)

@@ -297,8 +297,7 @@ def cull_nothing(patch: pytest.MonkeyPatch) -> None:
         patch.setattr(module, "world_box", everywhere)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("task", ["door", "stick"])
+@pytest.mark.parametrize("task", ["door", pytest.param("stick", marks=pytest.mark.long)])
 def test_culling_changes_no_plan(task: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same motion and the same verdict, but for last digits that hang on what was planned before in this process."""
     steps: list[Step] = [Actuate("door", {"hinge": 1.2})]

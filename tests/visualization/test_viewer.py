@@ -297,7 +297,8 @@ def test_animate_into_a_viewer_of_ones_own(plan: Plan) -> None:
 
 
 def test_server_ends_with_its_process() -> None:
-    code = "from vkc_pin.visualization import viewer as v; v.open_viewer(); print(v._server[0].pid, flush=True); v.os._exit(1)"
+    start = "from vkc_pin.visualization import viewer as v; v.open_viewer()"
+    code = f"import os; {start}; print(v._server[0].pid, flush=True); os._exit(1)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     stat = Path(f"/proc/{int(done.stdout)}/stat")
     for _ in range(50):

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError, UnknownNameError
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Constraint", "Cost", "State", "Term", "check_active", "term_from_dict", "term_to_dict", "traced"]
 
-Numbers = float | Sequence[float] | Floats
+Numbers = float | Sequence[float] | NDArray[np.float64]
 
 
 Expression = Callable[[State], Any] | Formula

@@ -14,7 +14,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "vkc_pin"
-LONG = {"vkc_pin.planning.chore": 320, "vkc_pin.baselines.attempt": 320}  # lines: modules that are longer than they should be
+LONG = {"vkc_pin.planning.chore": 315}  # lines: modules that are longer than they should be
 SCRIPTS = {"vkc_pin.visualization.server"}  # run, and imported by nothing
 # The import linter as a command, blind to where an editable installation says that the package is.
 LINT = (
@@ -124,7 +124,7 @@ def test_the_page_names_every_wing() -> None:
     beside = set(re.findall(r"`(\w+)`", next(row for row in rows if row.startswith("| beside the wings"))))
     found = {name.split(".")[1] for name in modules() if "." in name}
     assert named == {name for name in found if (PACKAGE / name).is_dir()}
-    assert beside >= found - named
+    assert beside == found - named
 
 
 def test_the_diagram_shows_the_imports() -> None:

@@ -32,15 +32,15 @@ def random_geometry(rng: np.random.Generator, moving: int = 7, standing: int = 9
     pairs = np.array([pair for pair in every if rng.random() < 0.66]).reshape(-1, 2)
     boxes = [bounding_box(shape) for shape in shapes]
     return PhaseGeometry(
-        shapes,
-        tuple(shape.name for shape in shapes),
-        pairs,
-        rng.uniform(0.01, 0.05, len(pairs)),
-        np.array([shape.parentJoint for shape in shapes]),
-        np.array([center for center, _ in boxes]),
-        np.array([half for _, half in boxes]),
-        np.array([shape.placement.rotation for shape in shapes]),
-        np.array([shape.placement.translation for shape in shapes]),
+        shapes=shapes,
+        labels=tuple(shape.name for shape in shapes),
+        pairs=pairs,
+        margins=rng.uniform(0.01, 0.05, len(pairs)),
+        joint=np.array([shape.parentJoint for shape in shapes]),
+        center=np.array([center for center, _ in boxes]),
+        half=np.array([half for _, half in boxes]),
+        rotation=np.array([shape.placement.rotation for shape in shapes]),
+        translation=np.array([shape.placement.translation for shape in shapes]),
     )
 
 

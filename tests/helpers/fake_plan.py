@@ -27,7 +27,7 @@ def fake_plan(scene: Scene | None = None) -> Plan:
     positions = start + np.outer(done**2, end - start)
     phases = (PhaseSpan("reach door.handle", 0, 6), PhaseSpan("move door.hinge", 6, len(times) - 1, (Hold("door", "handle"),)))
     blame = Violation(
-        "penetration", "forearm_link â sofa", waypoint=9, time=4.0, amount=0.03, unit="m", detail="overlap by 30 mm"
+        "penetration", "forearm_link – sofa", waypoint=9, time=4.0, amount=0.03, unit="m", detail="overlap by 30 mm"
     )
     return Plan(
         scene=scene,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -10,10 +11,10 @@ import pinocchio as pin
 import pytest
 from helpers.small_problems import door_scene, full_scene, random_configurations
 
+from vkc_pin.cache import Cache
 from vkc_pin.chain.chain import VirtualKinematicChain, consolidate
 from vkc_pin.chain.pose import PoseRow, target_vector
 from vkc_pin.options import Options
-from vkc_pin.program import waypoint
 from vkc_pin.program.waypoint import Structure, WaypointFunctions, waypoint_functions
 from vkc_pin.task.compiler import compile_task
 from vkc_pin.task.steps import Actuate
@@ -83,7 +84,12 @@ def matrix(pattern: tuple[list[int], list[int]], values: ca.DM, shape: tuple[int
 @pytest.mark.parametrize("seed", range(4))
 def test_rows_and_their_derivatives(chain: VirtualKinematicChain, seed: int) -> None:
     poses = some_poses(chain)
-    functions, numbers, n, h = WaypointFunctions(chain.model, SLOTS, poses), Numbers(chain, poses, seed), chain.size, 1e-6
+    functions, numbers, n, h = (
+        WaypointFunctions(chain.model, SLOTS, poses, Cache()),
+        Numbers(chain, poses, seed),
+        chain.size,
+        1e-6,
+    )
     assert functions.pose_rows == [7, 6, 3]
     assert functions.rows == SLOTS + 16
     given = numbers.inputs(numbers.z, numbers.s)
@@ -102,32 +108,31 @@ def test_rows_and_their_derivatives(chain: VirtualKinematicChain, seed: int) -> 
     np.testing.assert_allclose(upper + np.triu(upper, 1).T, np.array(curvature), atol=1e-6)
 
 
-def test_functions_of_one_kind_are_built_once(chain: VirtualKinematicChain, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(waypoint, "_functions", type(waypoint._functions)())
-    monkeypatch.setattr(waypoint, "_KEPT", 2)
-    model, poses = door_scene().robot.model, some_poses(chain)[1:2]
-    first = waypoint_functions(model, 1, poses)
+def test_functions_of_one_kind_are_built_once(chain: VirtualKinematicChain) -> None:
+    model, poses, cache = door_scene().robot.model, some_poses(chain)[1:2], Cache(entries=3)
+    first = waypoint_functions(model, 1, poses, cache)
     later = (dataclasses.replace(poses[0], waypoints=(4, 5)),)
-    assert waypoint_functions(model.copy(), 1, later) is first, "at which waypoints does not matter"
-    second = waypoint_functions(model, 2, poses)
+    assert waypoint_functions(model.copy(), 1, later, cache) is first, "at which waypoints does not matter"
+    second = waypoint_functions(model, 2, poses, cache)
     assert second is not first
-    assert waypoint_functions(model, 1, poses) is first
+    assert waypoint_functions(model, 1, poses, cache) is first
     other = dataclasses.replace(poses[0], kind="point")
-    assert waypoint_functions(model, 1, (other,)) not in (first, second)
-    assert waypoint_functions(model, 1, poses) is first, "what was asked for last is kept"
-    assert waypoint_functions(model, 2, poses) is not second
+    assert waypoint_functions(model, 1, (other,), cache) not in (first, second)
+    assert waypoint_functions(model, 1, poses, cache) is first, "what was asked for last is kept"
+    assert waypoint_functions(model, 2, poses, cache) is not second
 
 
 def test_programs_are_shared_by_structures_that_are_equal(chain: VirtualKinematicChain) -> None:
-    weights = np.ones((5, chain.size)), np.ones(chain.size)
-    one = Structure(chain.model, 5, some_poses(chain), SLOTS, *weights)
-    assert Structure(chain.model.copy(), 5, some_poses(chain), SLOTS, *weights).key == one.key
+    given: dict[str, Any] = {"segments": 5, "poses": some_poses(chain), "slots": SLOTS}
+    given |= {"weights_velocity": np.ones((5, chain.size)), "weights_acceleration": np.ones(chain.size)}
+    one = Structure(model=chain.model, **given)
+    assert Structure(model=chain.model.copy(), **given).key == one.key
     for change in (
         {"segments": 6},
         {"slots": 2},
         {"poses": some_poses(chain)[:2]},
-        {"weights_acceleration": 2 * weights[1]},
-        {"rests": (2,)},
+        {"weights_acceleration": 2 * np.ones(chain.size)},
+        {"stops": (2,)},
         {"differential": True},
         {"clamped": ((3, 1, 4),)},
     ):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from hypothesis import HealthCheck, settings
@@ -45,3 +46,21 @@ def same(one: Trajectory, other: Trajectory) -> bool:
 def broken(path: Path, text: str) -> Path:
     path.write_text(text, encoding="utf-8")
     return path
+
+
+NAMES = ("base_x", "base_y", "base_yaw", "shoulder", "elbow", "door.hinge")
+ROWS = np.array(
+    [
+        [0.0, 0.0, 0.0, 0.0, 1.0, 0.0],
+        [3.0, 4.0, 0.5, 0.1, 0.8, 0.0],
+        [3.0, 4.0, 0.5, 0.1, 0.8, 0.0],
+        [2.0, 4.0, 4.0, -0.3, 0.9, 1.2],
+    ]
+)
+TIMES = np.array([0.0, 2.0, 2.5, 6.5])
+PHASES = (PhaseSpan("reach door.handle", 0, 2), PhaseSpan("move door.hinge", 2, 3, (Hold("door", "handle"),)))
+
+
+def example(**changes: Any) -> Trajectory:
+    fields = {"names": NAMES, "times": TIMES, "positions": ROWS, "phases": PHASES, "robot_size": 5, **changes}
+    return Trajectory(**fields)

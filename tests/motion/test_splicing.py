@@ -2,32 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
+from helpers.written import NAMES, PHASES, ROWS, TIMES, example
 
 from vkc_pin.errors import InputError
 from vkc_pin.motion.splicing import cut, filled, join
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.scene.hold import Hold, holds_of
-
-NAMES = ("base_x", "base_y", "base_yaw", "shoulder", "elbow", "door.hinge")
-ROWS = np.array(
-    [
-        [0.0, 0.0, 0.0, 0.0, 1.0, 0.0],
-        [3.0, 4.0, 0.5, 0.1, 0.8, 0.0],
-        [3.0, 4.0, 0.5, 0.1, 0.8, 0.0],
-        [2.0, 4.0, 4.0, -0.3, 0.9, 1.2],
-    ]
-)
-TIMES = np.array([0.0, 2.0, 2.5, 6.5])
-PHASES = (PhaseSpan("reach door.handle", 0, 2), PhaseSpan("move door.hinge", 2, 3, (Hold("door", "handle"),)))
-
-
-def example(**changes: Any) -> Trajectory:
-    fields = {"names": NAMES, "times": TIMES, "positions": ROWS, "phases": PHASES, "robot_size": 5, **changes}
-    return Trajectory(**fields)
 
 
 def test_what_is_not_known_is_as_it_was_or_as_it_will_be() -> None:

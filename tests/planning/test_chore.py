@@ -16,9 +16,9 @@ from vkc_pin.benchmarks.initialization import TARGET
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.motion.splicing import cut
 from vkc_pin.motion.world import World
-from vkc_pin.planning import chore
-from vkc_pin.planning.chore import _Chore
+from vkc_pin.planning import window as module
 from vkc_pin.planning.one_problem import OneProblem
+from vkc_pin.planning.window import SlidingWindow
 
 A, G, P = vkc.Actuate, vkc.Grasp, vkc.Place
 TABLE = (-3.0, 1.3, 1.051)  # on the bar table
@@ -99,9 +99,9 @@ class Problems:
 
     def __init__(self, patch: pytest.MonkeyPatch, fails: Callable[[tuple[vkc.Step, ...]], bool]) -> None:
         self.asked: list[tuple[tuple[vkc.Step, ...], bool]] = []
-        solved = _Chore._solved
+        solved = SlidingWindow._solved
 
-        def solve(chore: _Chore, first: int, one: OneProblem, seed: object = None) -> vkc.Plan:
+        def solve(chore: SlidingWindow, first: int, one: OneProblem, seed: object = None) -> vkc.Plan:
             plan = solved(chore, first, one, seed)
             self.asked.append((one.task.steps, seed is not None))
             if not fails(one.task.steps):
@@ -109,7 +109,7 @@ class Problems:
             trajectory = cut(plan.trajectory, plan.trajectory.names, 0, 1)
             return dataclasses.replace(plan, status="not converged", trajectory=trajectory)
 
-        patch.setattr(_Chore, "_solved", solve)
+        patch.setattr(SlidingWindow, "_solved", solve)
 
 
 def test_each_action_is_planned_once_alone_and_with_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -130,7 +130,7 @@ def test_where_the_next_cannot_be_done_both_are_planned_anew(monkeypatch: pytest
     problems = Problems(monkeypatch, lambda steps: steps == (SHUT,))
     plan = vkc.plan_chore(home(), [OPEN, SHUT])
     assert plan.success, plan.report()
-    alone = [(SHUT,)] * chore._ACTION_SEARCHES
+    alone = [(SHUT,)] * module._ACTION_SEARCHES
     assert [steps for steps, _ in problems.asked] == [(OPEN,), *alone, (OPEN, SHUT)]
     assert not problems.asked[-1][1]  # from seeds of its own
 
@@ -149,8 +149,8 @@ def test_a_decision_that_leads_nowhere_is_given_up(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.long
 def test_what_fails_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(chore, "_WINDOW_SEARCHES", 1)
-    monkeypatch.setattr(chore, "_BACKTRACKS", 0)
+    monkeypatch.setattr(module, "_WINDOW_SEARCHES", 1)
+    monkeypatch.setattr(module, "_BACKTRACKS", 0)
     Problems(monkeypatch, lambda steps: CUP[0] in steps)
     plan = vkc.plan_chore(home(), [vkc.GoTo(0.5, -0.5), OPEN, *CUP], window=1, options=vkc.Options(max_outer=1))
     assert not plan.success

@@ -2,40 +2,22 @@
 
 from __future__ import annotations
 
-import dataclasses
-import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 
 from vkc_pin.errors import InputError
-from vkc_pin.motion.splicing import cut
-from vkc_pin.motion.world import scene_after
 from vkc_pin.options import Options
-from vkc_pin.planning.one_problem import OneProblem
-from vkc_pin.planning.outcome import joined
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import Planner, guarded
 from vkc_pin.planning.settings import Settings, settings_for
-from vkc_pin.program.problem import TrajectoryProblem
+from vkc_pin.planning.window import SlidingWindow
 from vkc_pin.scene.scene import Scene
-from vkc_pin.seeds.seed import PhaseWaypoints, Seed, seed_of
 from vkc_pin.solver.solution import Iteration
-from vkc_pin.task.actions import actions_of, foresee
-from vkc_pin.task.compiler import compile_task
-from vkc_pin.task.phases import Task, stretches
+from vkc_pin.task.actions import foresee
+from vkc_pin.task.phases import stretches
 from vkc_pin.task.steps import Step
 from vkc_pin.task.terms import Term, check_active
 
 __all__ = ["plan_chore"]
-
-_ACTION_SEARCHES = 3  # searches, from different random numbers, for a motion of one more action
-_WINDOW_SEARCHES = 4  # searches, from different random numbers, for a motion of what is in the window
-_BACKTRACKS = 3  # how often, in all, what has been decided is given up since what follows cannot be done
-_SOLVER_ROUNDS = 16  # of the solver from one seed: what takes more has mostly run into a dead end, and other seeds are at hand
-_FINER = 1.6  # ratio of waypoints, in every search but the first, to what the options say: see `_left`
-_NOTHING = PhaseWaypoints((), (), (), "")
-_STOPPED = ("interrupted", "time limit")
-_FINAL = (*_STOPPED, "infeasible")
 
 
 def plan_chore(
@@ -94,219 +76,6 @@ def plan_chore(
     def run(settings: Settings) -> Plan:
         tasks = foresee(scene, steps, settings.options)
         check_active(settings.terms, [stretch for task in tasks for stretch in stretches(task)])
-        return _Chore(scene, tuple(steps), window, settings).run()
+        return SlidingWindow(scene, tuple(steps), window, settings).run()
 
     return guarded(run, settings, progress, planner)
-
-
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """One action's part of a motion.
-
-    Attributes:
-        plan: The motion of the action alone, from the scene in which it begins; None if nothing is to be done.
-        piece: Its waypoints.
-        after: The scene in which it ends.
-        rests: Whether the robot stands still at its end.
-        fine: Whether it has more waypoints than usual.
-    """
-
-    plan: Plan | None
-    piece: PhaseWaypoints
-    after: Scene
-    rests: bool = True
-    fine: bool = False
-
-
-class _Chore:
-    """A list of steps that is being planned.
-
-    Attributes:
-        actions: The steps of each action.
-        kept: What is decided: parts of the first actions.
-        ahead: Parts of the actions after those, from which the next problem starts.
-        spent, history: What every problem took, and every round of the solver.
-    """
-
-    def __init__(self, scene: Scene, steps: tuple[Step, ...], window: int, settings: Settings) -> None:
-        self.scene, self.steps, self.window, self.settings = scene, steps, window, settings
-        self.actions = actions_of(steps)
-        self.kept: list[_Part] = []
-        self.ahead: list[_Part] = []
-        self.spent: list[Mapping[str, float]] = []
-        self.history: list[Mapping[str, float]] = []
-        self.began = time.perf_counter()
-
-    def run(self) -> Plan:
-        """Plan action after action, until all is done, one fails or Ctrl-C is pressed."""
-        window, back, failed = self.window, _BACKTRACKS, None
-        while len(self.kept) < len(self.actions):
-            failed = self._plan_window(window)
-            if self._stopped:
-                self.kept, self.ahead = self.kept + self.ahead, []
-                break
-            if failed is None:
-                window = self.window
-            elif self.kept and back and failed.status not in _FINAL:
-                self.kept.pop()
-                while self.kept and not self.kept[-1].rests:
-                    self.kept.pop()
-                self.ahead, window, back = [], window + 1, back - 1
-            else:
-                self.kept, self.ahead = self.kept + self.ahead, []
-                break
-        return self._joined(failed)
-
-    @property
-    def _stopped(self) -> bool:
-        return self.settings.interrupt.pressed
-
-    @property
-    def _now(self) -> Scene:
-        return self.kept[-1].after if self.kept else self.scene
-
-    def _plan_window(self, window: int) -> Plan | None:
-        """Decide on the next action with those after it in mind.
-
-        If that is not possible, return the plan of the first action that could not be planned, from where those ahead end.
-        """
-        first = len(self.kept)
-        last = self._last(first, window)
-        self.ahead = self.ahead[: last - first]
-        alone = None
-        while alone is None and first + len(self.ahead) < last and not self._stopped:
-            alone = self._look_ahead()
-        if self._stopped:
-            return alone
-        if alone is None and sum(part.plan is not None for part in self.ahead) > 1:
-            pieces = [part.piece for part in self.ahead]
-            fine = any(part.fine for part in self.ahead)
-            one = self._problem(self._now, first, last, fine=fine)
-            plan = self._solved(first, one, lambda problem: seed_of(problem, pieces))
-            if plan.success:
-                self.ahead = self._parts(one, plan, first, last)
-        for attempt in range(1, 1 + _WINDOW_SEARCHES):
-            if alone is None or alone.status in _STOPPED:
-                break
-            one = self._problem(self._now, first, last, attempt, fine=True)
-            together = self._solved(first, one)
-            alone = None if together.success else dataclasses.replace(alone, status=together.status)
-            if together.success:
-                self.ahead = self._parts(one, together, first, last)
-            elif together.status in _FINAL:
-                break
-        if alone is None:
-            self.kept.append(self.ahead.pop(0))
-            while not self.kept[-1].rests:
-                self.kept.append(self.ahead.pop(0))
-        return alone
-
-    def _last(self, first: int, window: int) -> int:
-        """Return the end of a window: as wide as it may be, but without what can be said only once the rest is planned."""
-        last = first + 1
-        while last < min(first + window, len(self.actions)):
-            try:
-                self._task(self._now, first, last + 1, self.settings.options)
-            except InputError:
-                break
-            last += 1
-        return last
-
-    def _look_ahead(self) -> Plan | None:
-        """Plan one more action alone, from where those planned ahead end; return the plan if it fails."""
-        number, scene = len(self.kept) + len(self.ahead), self.ahead[-1].after if self.ahead else self._now
-        for attempt in range(_ACTION_SEARCHES):
-            one = self._problem(scene, number, number + 1, attempt, fine=attempt > 0)
-            if not one.task.phases:
-                self.ahead.append(_Part(None, _NOTHING, scene))
-                return None
-            plan = self._solved(number, one)
-            if plan.success:
-                self.ahead += self._parts(one, plan, number, number + 1)
-                return None
-            if plan.status in _FINAL:
-                break
-        return plan
-
-    def _solved(self, first: int, one: OneProblem, seed: Callable[[TrajectoryProblem], Seed] | None = None) -> Plan:
-        """Return the plan of a problem that begins with the action `first`."""
-        done = len(self._steps(0, first))
-        self.settings.progress.part(done + 1, len(one.task.steps), len(self.steps))
-        plan = one.run(seed)
-        self.spent.append(plan.metrics)
-        self.history += plan.history
-        return plan
-
-    def _parts(self, one: OneProblem, plan: Plan, first: int, last: int) -> list[_Part]:
-        """Return the parts of a solved problem's motion in which the actions from `first` to before `last` are done."""
-        scene, begin, parts, whole = one.scene, 0, [], one.piece()
-        fine = one.settings.options.reach_waypoints > self.settings.options.reach_waypoints
-        ahead = dict(enumerate(self.ahead, start=len(self.kept)))
-        for number in range(first, last):
-            task = one.task.until(len(self._steps(first, number + 1)))
-            end = len(task.phases)
-            names = [*one.scene.robot.coordinates.names, *(name for hold in task.holds for name in one.problem.chain.added[hold])]
-            part, piece, rests = None, _NOTHING, True
-            if end > begin:
-                trajectory = cut(plan.trajectory, names, begin, end if end < len(one.task.phases) else None)
-                steps = self._steps(number, number + 1)
-                seed = ahead[number].piece.seed if number in ahead else one.initialization  # where it came from at first
-                part = dataclasses.replace(plan, scene=scene, steps=steps, trajectory=trajectory, initialization=seed)
-                piece = PhaseWaypoints(whole.phases[begin:end], whole.names, whole.waypoints[begin:end], seed)
-                ends = one.problem.ends
-                rests = end == len(ends) or ends[end - 1] in one.problem.transcription.structure.stops
-                scene = scene_after(scene, trajectory, task.after)
-            parts.append(_Part(part, piece, scene, rests, fine))
-            begin = end
-        return parts
-
-    def _steps(self, first: int, last: int) -> tuple[Step, ...]:
-        return tuple(step for action in self.actions[first:last] for step in action)
-
-    def _task(self, scene: Scene, first: int, last: int, options: Options) -> Task:
-        """Compile actions anew: from where in the world they begin is known only once those before them are planned."""
-        return compile_task(scene, self._steps(first, last), options, nothing=True)
-
-    def _problem(self, scene: Scene, first: int, last: int, attempt: int = 0, *, fine: bool) -> OneProblem:
-        """Return the problem of the actions from `first` to before `last`; see `_left`."""
-        settings = self._left(attempt, fine)
-        return OneProblem(scene, self._task(scene, first, last, settings.options), settings)
-
-    def _left(self, attempt: int = 0, fine: bool = False) -> Settings:
-        """Return the settings with what is left of the time limit.
-
-        There are few seeds to an attempt: where an action cannot be done from where the last one ends, all others fail as well,
-        slowly, and to plan the two together is the way out.
-
-        Args:
-            attempt: Other random numbers for each.
-            fine: More waypoints, for ways that are long and narrow, and arcs along which hands would drift between few.
-        """
-        limit = self.settings.time_limit
-        if limit is not None:
-            limit = max(limit - sum(metrics["planning_time"] for metrics in self.spent), 1e-3)
-        given = self.settings.options
-        options = dataclasses.replace(given, max_restarts=1, max_outer=min(given.max_outer, _SOLVER_ROUNDS))
-        if fine:
-            more = {name: round(_FINER * getattr(given, name)) for name in ("reach_waypoints", "move_waypoints")}
-            options = dataclasses.replace(options, **more)
-        return dataclasses.replace(self.settings, options=options, seed=self.settings.seed + attempt, time_limit=limit)
-
-    def _joined(self, failed: Plan | None) -> Plan:
-        """Return one plan of all that is decided, and of what failed."""
-        parts = [part.plan for part in self.kept if part.plan is not None]
-        notes = []
-        if failed is not None:
-            parts.append(failed)
-            number = len(self._steps(0, len(self.kept)))
-            notes.append(f"steps[{number}], {self.steps[number]}, could not be planned: {failed.status}")
-        return joined(
-            self.scene,
-            self.steps,
-            self.settings,
-            parts,
-            began=self.began,
-            metrics=self.spent,
-            notes=notes,
-            history=self.history,
-        )

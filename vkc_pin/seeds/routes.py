@@ -65,7 +65,7 @@ class Routes:
         return self._grids[key]
 
     def folded_arm(self, phase: int) -> Floats:
-        """Return the arm folded with what is held in a phase, shape (m - 3,); see `compact.folded_arm`."""
+        """Return the arm folded with what is held in a phase, shape (m - 3,); see `folded_arm.folded_arm`."""
         held = self.problem.task.phases[phase].held
         if held not in self._folded:
             self._folded[held] = folded_arm(self.problem, phase, self._resting(), self.interrupt)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import ast
 import importlib
 import inspect
 import pkgutil
@@ -51,7 +52,21 @@ def test_options_are_keyword_only(name: str) -> None:
     assert len(positional) <= 2
 
 
-def test_importing_the_package_leaves_heavy_things_alone() -> None:
-    code = "import sys, vkc_pin; print([m for m in ('trimesh', 'meshcat', 'matplotlib', 'scipy', 'tqdm') if m in sys.modules])"
+def test_the_package_loads_what_is_asked_for_and_nothing_else() -> None:
+    heavy = ("casadi", "coal", "pinocchio", "pydantic", "trimesh", "meshcat", "matplotlib", "scipy", "tqdm")
+    loaded = f"[m for m in {heavy} if m in sys.modules]"
+    code = f"import sys, vkc_pin as vkc; print({loaded}); vkc.VkcError; print({loaded}); vkc.plan; print({loaded})"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60, check=True)
-    assert done.stdout.strip() == "[]"
+    assert done.stdout.splitlines() == ["[]", "[]", "['casadi', 'coal', 'pinocchio', 'pydantic']"]
+
+
+def test_the_stub_lists_what_the_package_gives() -> None:
+    tree = ast.parse((ROOT / "vkc_pin/__init__.pyi").read_text(encoding="utf-8"))
+    listed = next(ast.literal_eval(node.value) for node in tree.body if isinstance(node, ast.Assign))
+    assert sorted(listed) == sorted(vkc.__all__)
+    assert set(dir(vkc)) == set(listed) - {"__version__"}
+    names: dict[str, object] = {}
+    exec("from vkc_pin import *", names)
+    assert {name for name in names if name != "__builtins__"} == set(vkc.__all__)
+    with pytest.raises(AttributeError, match="plann"):
+        vkc.plann  # type: ignore[attr-defined]  # noqa: B018

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import inspect
 import re
 import runpy
 import subprocess
@@ -185,7 +186,7 @@ def documented(directive: str) -> set[str]:
 
 
 def test_every_public_name_is_in_the_reference() -> None:
-    assert documented("auto*") == set(vkc.__all__)
+    assert documented("auto*") == {name for name in vkc.__all__ if not inspect.ismodule(getattr(vkc, name))}
 
 
 def test_every_module_is_in_the_reference_once() -> None:
@@ -276,4 +277,4 @@ def test_site(site: Path) -> None:
     formulas = (site / "docs/formulation.html").read_text(encoding="utf-8")
     assert formulas.count('<svg class="formula"') > 100
     reference = "".join(page.read_text(encoding="utf-8") for page in (site / "docs/api").glob("*.html"))
-    assert [name for name in vkc.__all__ if f'id="vkc_pin.{name}"' not in reference] == []
+    assert [name for name in documented("auto*") if f'id="vkc_pin.{name}"' not in reference] == []

@@ -5,14 +5,29 @@ from __future__ import annotations
 import sys
 from functools import singledispatch
 from html import escape
+from importlib import import_module
 
-__all__ = ["card", "in_notebook"]
+__all__ = ["card", "cards_from", "in_notebook", "show"]
+
+_makers: list[str] = []  # modules that register cards, imported when the first one is shown
 
 
 @singledispatch
 def card(value: object) -> str:
     """Return what a notebook shows of `value`, as HTML: its text, unless a module registers something else for its type."""
     return f"<pre>{escape(repr(value))}</pre>"
+
+
+def cards_from(module: str) -> None:
+    """Name a module that registers cards, which is imported when a notebook shows the first one."""
+    _makers.append(module)
+
+
+def show(value: object) -> str:
+    """Return `value`'s card, as HTML."""
+    for module in _makers:
+        import_module(module)
+    return card(value)
 
 
 def in_notebook() -> bool:

@@ -18,7 +18,7 @@ from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.files.resources import find
 from vkc_pin.models.shapes import clearance, placed_shapes, within_limits
-from vkc_pin.notebook import card
+from vkc_pin.notebook import show
 from vkc_pin.scene.hold import Hold, checked_holds, holds_of, in_hand
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.placed import PlacedObject, standing_geometry
@@ -79,7 +79,7 @@ class Scene:
         )
 
     def _repr_html_(self) -> str:
-        return card(self)
+        return show(self)
 
     @property
     def held(self) -> dict[str, str]:

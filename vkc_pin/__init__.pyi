@@ -1,0 +1,77 @@
+from . import baselines, benchmarks, cpin, plotting, validation, visualization
+from .chain.chain import VirtualKinematicChain, consolidate
+from .chain.inversion import invert
+from .errors import BuildError, InputError, UnknownNameError, VkcError
+from .models.articulation import ArticulatedObject, Attachment, Freedom, Latch
+from .models.object_file import load_object
+from .models.robot import Robot
+from .models.robot_file import load_robot
+from .motion.trajectory import PhaseSpan, Trajectory
+from .options import Options
+from .planning.chore import plan_chore
+from .planning.plan import Plan
+from .planning.planner import Planner, plan
+from .program.inspection import build
+from .program.problem import TrajectoryProblem
+from .scene.hold import Hold
+from .scene.placed import PlacedObject
+from .scene.scene import Scene, load_scene
+from .solver.solution import Iteration
+from .task.formula import State
+from .task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Touch
+from .task.terms import Constraint, Cost
+from .validation.report import Report, Violation
+from .validation.validate import validate
+
+__version__: str
+
+__all__ = [
+    "Actuate",
+    "ArticulatedObject",
+    "Attachment",
+    "BuildError",
+    "Constraint",
+    "Cost",
+    "Freedom",
+    "GoTo",
+    "Grasp",
+    "Hold",
+    "InputError",
+    "Iteration",
+    "Latch",
+    "Options",
+    "PhaseSpan",
+    "Place",
+    "PlacedObject",
+    "Plan",
+    "Planner",
+    "Reach",
+    "Release",
+    "Report",
+    "Robot",
+    "Scene",
+    "State",
+    "Touch",
+    "Trajectory",
+    "TrajectoryProblem",
+    "UnknownNameError",
+    "Violation",
+    "VirtualKinematicChain",
+    "VkcError",
+    "__version__",
+    "baselines",
+    "benchmarks",
+    "build",
+    "consolidate",
+    "cpin",
+    "invert",
+    "load_object",
+    "load_robot",
+    "load_scene",
+    "plan",
+    "plan_chore",
+    "plotting",
+    "validate",
+    "validation",
+    "visualization",
+]

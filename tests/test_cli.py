@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import json
 import os
 import platform
@@ -271,9 +272,10 @@ def experiment(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """What `bench initialization` asks for; the experiment itself is at the door, and plans nothing."""
     asked: dict[str, Any] = {}
     real = initialization.run
+    defaults = {name: one.default for name, one in inspect.signature(real).parameters.items()}
 
     def run(**given: Any) -> dict[str, Any]:
-        asked.update(given)
+        asked.update(defaults | given)
         if "plan" not in asked:
             raise KeyboardInterrupt("2 of 6 trials are done and kept in out")
         return real(**{**given, "scenes": ["door"], "solve": lambda scene, spec: asked["plan"]})

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.benchmarks.harness import runner
-from vkc_pin.benchmarks.harness.record import distribution, trial
+from vkc_pin.benchmarks.harness.record import Solve, distribution, trial
 from vkc_pin.benchmarks.harness.tables import decimal, failures, foot, markdown
 from vkc_pin.files.writing import write_atomically
 from vkc_pin.planning.chore import plan_chore
@@ -30,8 +30,6 @@ CLEAR = (1.1, -2.9, 0.036)  # floor before the television
 BIN = (3.0, -3.6, 0.16)  # within its walls; what is let go of there falls
 BEFORE_TABLE = (-0.9, 2.2, 0.036)  # floor before the low table
 SHELF = (-4.61, -1.0, 0.846)
-
-Solve = Callable[[Scene, Mapping[str, Any]], Plan]
 
 
 def home(scene: Scene) -> list[Step]:
@@ -134,13 +132,12 @@ def report(result: Mapping[str, Any]) -> str:
     for chore in about["chores"]:
         own = [record for record in result["trials"] if record["scene"] == chore]
         good = [record for record in own if record["success"]]
-        timed = [record for record in own if record.get("wall_time") is not None]
-        planning, late = distribution(timed, "planning_time")
-        wall, _ = distribution(timed, "wall_time")
+        planning, late = distribution(own, "planning_time")
+        wall, _ = distribution(own, "wall_time")
         efforts = (decimal(distribution(good, field)[0]) for field in ("base_effort", "arm_effort", "duration"))
         number = str(len(about["steps"][chore]))
         times = (decimal(value) for value in (wall, planning, late))
-        rows.append([chore, number, f"{len(good)} of {len(own)}", *times, *efforts, failures(own) or "none"])
+        rows.append([chore, number, f"{len(good)} of {len(own)}", *times, *efforts, failures(own)])
     head = ["chore", "steps", "success", "in all, median [s]", "planning, median [s]", "95th percentile [s]"]
     head += ["base [m]", "arm [rad]", "duration [s]", "failures"]
     every = [

@@ -18,7 +18,7 @@ from vkc_pin.baselines.separate import BASELINES, RETRIES, plan_separately
 from vkc_pin.benchmarks.comparison_report import report
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.charts import motions_chart
-from vkc_pin.benchmarks.harness.record import Record, trial
+from vkc_pin.benchmarks.harness.record import Record, Solve, trial
 from vkc_pin.errors import InputError
 from vkc_pin.files.writing import write_atomically
 from vkc_pin.motion.trajectory import Trajectory
@@ -27,13 +27,11 @@ from vkc_pin.planning.planner import plan
 from vkc_pin.scene.scene import Scene, load_scene
 from vkc_pin.task.steps import Actuate, GoTo, Place, Step, as_placement
 
-__all__ = ["COMPARED_PLANNERS", "TIME_LIMIT", "Assignment", "Comparison", "Solve", "peaks"]
+__all__ = ["COMPARED_PLANNERS", "TIME_LIMIT", "Assignment", "Comparison", "peaks"]
 
 COMPARED_PLANNERS = (*BASELINES, "VKC")
 TIME_LIMIT = 20.0  # [s] of planning
 
-Solve = Callable[[Scene, Mapping[str, Any]], Plan]
-"""What plans a trial: takes its scene and its specification."""
 Draw = Callable[[Sequence[Record], Path, Mapping[str, str], Sequence[str]], list[str]]
 """What draws an experiment's charts: takes records, folder, task → what is done in it, methods; returns them in Markdown."""
 
@@ -270,10 +268,7 @@ def shown(records: Sequence[Record], methods: Sequence[str]) -> int | None:
     return max(sorted(good), key=lambda k: (len(good[k]) == len(methods), "VKC" in good[k], len(good[k])), default=None)
 
 
-@functools.cache
-def _scene(name: str) -> Scene:
-    """Return a scene, loaded once per process."""
-    return load_scene(name)
+_scene = functools.cache(load_scene)  # once per process
 
 
 @functools.cache

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import product
 from typing import Any
 
-import numpy as np
-
-from vkc_pin.benchmarks.harness.record import Record
+from vkc_pin.benchmarks.harness.record import Record, distribution, values
 from vkc_pin.benchmarks.harness.tables import (
     EFFORTS,
     common,
@@ -79,14 +78,12 @@ def report(
 
 def _success(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str]) -> str:
     rows = []
-    cases = [(task, method, _of(records, task, method)) for task, method in _cases(tasks, methods)]
-    if len(tasks) > 1:
-        cases += [("all", method, [record for record in records if record["method"] == method]) for method in methods]
-    for task, method, own in cases:
+    for task, method in product([*tasks, "all"] if len(tasks) > 1 else tasks, methods):
+        own = [record for record in records if record["method"] == method and task in ("all", record["scene"])]
         good = sum(bool(record["success"]) for record in own)
         low, high = (f"{100.0 * end:.0f}" for end in wilson(good, len(own)))
         rate = f"{100.0 * good / len(own):.0f}" if own else "–"
-        rows.append([task, method, f"{good} of {len(own)}", rate, f"{low}–{high}", failures(own) or "none"])
+        rows.append([task, method, f"{good} of {len(own)}", rate, f"{low}–{high}", failures(own)])
     head = ["task", "method", "success", "[%]", "95 % interval (Wilson)", "failures: cause (violated first)"]
     return markdown(head, rows, text=2)
 
@@ -94,11 +91,10 @@ def _success(records: Sequence[Record], tasks: Mapping[str, str], methods: Seque
 def _times(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str]) -> str:
     rows = []
     for name, good in (("all trials", False), ("successes", True)):
-        for task, method in _cases(tasks, methods):
-            times, own = (_values(_of(records, task, which, good=good), "planning_time") for which in (method, _OWN))
-            late = float(np.percentile(times, 95)) if times else float("nan")
-            median, reference = (float(np.median(values)) if values else float("nan") for values in (times, own))
-            cells = (median, late, *mean_and_deviation(times), median / reference)
+        for task, method in product(tasks, methods):
+            own, reference = (_of(records, task, which, good=good) for which in (method, _OWN))
+            (median, late), times = distribution(own, "planning_time"), values(own, "planning_time")
+            cells = (median, late, *mean_and_deviation(times), median / distribution(reference, "planning_time")[0])
             rows.append([name, task, method, str(len(times)), *map(decimal, cells)])
     head = ["over", "task", "method", "n", "median [s]", "95th percentile [s]", "mean [s]", "deviation [s]", f"to {_OWN}"]
     return markdown(head, rows, text=3)
@@ -125,7 +121,7 @@ def _criteria(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequ
         if not shared:
             rows.append([task, "n", *(str(len(good[method])) for method in methods)])
         for field, name in CRITERIA.items():
-            rows.append([task, name, *(_spread(_values(good[method], field)) for method in methods)])
+            rows.append([task, name, *(_spread(good[method], field) for method in methods)])
     return markdown(["task", "criterion", *methods], rows, text=2)
 
 
@@ -139,8 +135,7 @@ def _pairwise(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequ
         for task in tasks:
             both = common([record for record in records if record["scene"] == task], (_OWN, other))
             for field, name in {**CRITERIA, "planning_time": "planning time [s]"}.items():
-                one, two = (_values([row[k] for row in both], field) for k in (0, 1))
-                medians = (decimal(float(np.median(values))) if values else "–" for values in (one, two))
+                medians = (decimal(distribution([row[k] for row in both], field)[0]) for k in (0, 1))
                 rows.append([task, name, other, *medians, f"{lower(both, field)} of {len(both)}"])
     head = ["task", "criterion", "other", f"{_OWN}, median", "other, median", f"lower with {_OWN}"]
     text = f"Over the trials in which {_OWN} and the other method succeed, whatever the third does."
@@ -157,21 +152,13 @@ def _failed(records: Sequence[Record], saved: Mapping[str, str]) -> str:
     return markdown(["task", "trial", "method", "cause", "violated first", "file"], rows, text=6)
 
 
-def _cases(tasks: Mapping[str, str], methods: Sequence[str]) -> list[tuple[str, str]]:
-    return [(task, method) for task in tasks for method in methods]
-
-
 def _of(records: Sequence[Record], task: str, method: str, *, good: bool = False) -> list[Record]:
     """Return the records of a task and method, or its successes."""
     own = (record for record in records if (record["scene"], record["method"]) == (task, method))
     return [record for record in own if record["success"] or not good]
 
 
-def _values(records: Sequence[Record], field: str) -> list[float]:
-    """Return the values of a field; trials that ended with an error have none."""
-    return [float(record[field]) for record in records if record.get(field) is not None]
-
-
-def _spread(values: Sequence[float]) -> str:
-    mean, deviation = mean_and_deviation(values)
-    return f"{decimal(mean)} ± {decimal(deviation)}; {decimal(float(np.median(values)))}" if values else "–"
+def _spread(records: Sequence[Record], field: str) -> str:
+    found = values(records, field)
+    mean, deviation = map(decimal, mean_and_deviation(found))
+    return f"{mean} ± {deviation}; {decimal(distribution(records, field)[0])}" if found else "–"

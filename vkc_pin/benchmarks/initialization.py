@@ -7,7 +7,7 @@ the other instead of as one problem.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.charts import success_chart
-from vkc_pin.benchmarks.harness.record import trial
+from vkc_pin.benchmarks.harness.record import Solve, trial
 from vkc_pin.benchmarks.harness.tables import comparison_table, foot, methods_table
 from vkc_pin.files.writing import write_atomically
 from vkc_pin.planning.plan import Plan
@@ -34,8 +34,6 @@ TARGET = (-1.0, 3.897, 0.1)
 TIME_LIMIT = 20.0  # [s] of planning
 PERTURBATION = 0.05  # of the seed trajectory, in all repeats but the first
 _NAMES = {"init_1": "no obstacle", "init_2": "two small obstacles", "init_3": "one large obstacle"}
-
-Solve = Callable[[Scene, Mapping[str, Any]], Plan]
 
 
 def plan_trial(scene: Scene, spec: Mapping[str, Any]) -> Plan:
@@ -152,10 +150,7 @@ def _record(spec: dict[str, Any], solve: Solve) -> dict[str, Any]:
     return trial(solve(scene, spec), method=spec["method"], seed=spec["seed"], **own)
 
 
-@functools.lru_cache(maxsize=4)
-def _scene(name: str) -> Scene:
-    """Return a scene, loaded once per process."""
-    return load_scene(name)
+_scene = functools.cache(load_scene)  # once per process
 
 
 def _shown(scenes: Sequence[str]) -> dict[str, str]:

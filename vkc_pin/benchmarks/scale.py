@@ -122,8 +122,7 @@ def report(result: Mapping[str, Any]) -> str:
     few = {record["number"]: record["planning_time"] for record in timed if record["obstacles"] == FEW}
     rows = []
     for count in about["counts"]:
-        everyone = [record for record in result["trials"] if record["obstacles"] == count]
-        own = [record for record in timed if record["obstacles"] == count]
+        everyone, own = ([r for r in records if r["obstacles"] == count] for records in (result["trials"], timed))
         ratios = [record["planning_time"] / few[record["number"]] for record in own if record["number"] in few]
         numbers = (*distribution(own, "planning_time"), quartiles(ratios)[1], *(distribution(own, part)[0] for part in TIMES))
         success = f"{sum(record['success'] for record in everyone)} of {len(everyone)}"
@@ -202,7 +201,4 @@ def _warm(seed: int) -> None:
         raise KeyboardInterrupt
 
 
-@functools.cache
-def _crowded(count: int) -> Scene:
-    """Return a scene, made once per process."""
-    return crowded(count)
+_crowded = functools.cache(crowded)  # once per process

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vkc_pin.benchmarks.harness.record import Record
+from vkc_pin.benchmarks.harness.record import values as numbers
 from vkc_pin.benchmarks.harness.tables import common, mean_and_deviation, quartiles, wilson
 from vkc_pin.planning.plan import Plan
 from vkc_pin.plotting.style import COLOURS, new_figure, save_figure, shade_phases, styled
@@ -88,7 +89,7 @@ def means_chart(
             mine = [record for record in own if record["method"] == method]
             if shared:
                 mine = [row[k] for row in both] or [record for record in mine if record["success"]]
-            values[scene, method] = [float(record[field]) for record in mine if record.get(field) is not None]
+            values[scene, method] = numbers(mine, field)
         trials = f"{len(both)} trial{'s' * (len(both) != 1)}" if both else "own successes"
         names[scene] = f"{name}\n{trials if shared else _number(own, scene, methods)}"
 
@@ -138,7 +139,7 @@ def criteria_chart(records: Sequence[Record], path: str | Path | None, methods: 
                 own = [record for record in records if record["method"] == method]
                 if field in ("base_effort", "arm_effort"):
                     own = [row[k] for row in both] or [record for record in own if record["success"]]
-                values = [float(record[field]) for record in own if record.get(field) is not None]
+                values = numbers(own, field)
                 if values:
                     interval = _rate([value > 0.0 for value in values]) if field == "success" else quartiles(values)
                     _bar(axes, k, interval, COLOURS[k % len(COLOURS)], f"{interval[1]:{form}}", width=0.7)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import resource
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -13,11 +13,14 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.planning.plan import Plan
+from vkc_pin.scene.scene import Scene
 
-__all__ = ["Record", "distribution", "meta", "peak_memory", "trial", "versions"]
+__all__ = ["Record", "Solve", "distribution", "meta", "peak_memory", "trial", "values", "versions"]
 
 Record = Mapping[str, Any]
 """What is kept of a trial, by field; see `trial`."""
+Solve = Callable[[Scene, Mapping[str, Any]], Plan]
+"""What plans a trial: takes its scene and its specification."""
 PACKAGES = ("vkc-pin", "pin", "coal", "casadi", "numpy")
 
 
@@ -85,7 +88,12 @@ def trial(plan: Plan, *, method: str, seed: int, **more: Any) -> dict[str, Any]:
     }
 
 
+def values(trials: Iterable[Record], field: str) -> list[float]:
+    """Return the values of a field; trials that ended with an error have none."""
+    return [float(t[field]) for t in trials if t.get(field) is not None]
+
+
 def distribution(trials: Iterable[Record], field: str) -> tuple[float, float]:
-    """Return median and 95th percentile of a field; NaN for no trials."""
-    values: Sequence[float] = [float(t[field]) for t in trials]
-    return (float(np.median(values)), float(np.percentile(values, 95))) if values else (float("nan"), float("nan"))
+    """Return median and 95th percentile of a field; NaN for no values."""
+    found = values(trials, field)
+    return (float(np.median(found)), float(np.percentile(found, 95))) if found else (float("nan"), float("nan"))

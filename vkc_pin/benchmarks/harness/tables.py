@@ -97,7 +97,7 @@ def failures(records: Iterable[Record]) -> str:
         if not record["success"]:
             status, blame = str(record["status"]), str(record.get("failed_constraint") or "")
             kinds[status if blame in ("", status) else f"{status} ({blame.split()[0]})"] += 1
-    return ", ".join(f"{kind} {count}" for kind, count in sorted(kinds.items(), key=lambda item: (-item[1], item[0])))
+    return ", ".join(f"{kind} {count}" for kind, count in sorted(kinds.items(), key=lambda item: (-item[1], item[0]))) or "none"
 
 
 def methods_table(records: Sequence[Record], scenes: Mapping[str, str], methods: Sequence[str]) -> str:
@@ -117,11 +117,9 @@ def methods_table(records: Sequence[Record], scenes: Mapping[str, str], methods:
             if not own:
                 continue
             good = [record for record in own if record["success"]]
-            time, late = distribution([record for record in own if record.get("planning_time") is not None], "planning_time")
+            time, late = distribution(own, "planning_time")
             efforts = (decimal(distribution(good, field)[0]) for field in ("base_effort", "arm_effort"))
-            rows.append(
-                [name, method, f"{len(good)} of {len(own)}", decimal(time), decimal(late), *efforts, failures(own) or "none"]
-            )
+            rows.append([name, method, f"{len(good)} of {len(own)}", decimal(time), decimal(late), *efforts, failures(own)])
     head = ["scene", "method", "success", "time, median [s]", "95th percentile [s]", "base [m]", "arm [rad]", "failures"]
     return markdown(head, rows, text=2)
 

@@ -34,11 +34,8 @@ def interruptible(interrupt: Interrupt | None = None) -> Iterator[Interrupt]:
         interrupt: Where to note it; None: in a new one.
     """
     interrupt = Interrupt() if interrupt is None else interrupt
-    if threading.current_thread() is not threading.main_thread():
-        yield interrupt
-        return
-    before = signal.getsignal(signal.SIGINT)
-    if before is None:  # whoever embeds Python handles it, and could not be put back
+    before = signal.getsignal(signal.SIGINT)  # None: whoever embeds Python handles it, and could not be put back
+    if before is None or threading.current_thread() is not threading.main_thread():
         yield interrupt
         return
 

@@ -85,13 +85,11 @@ class Document:
         """Give errors raised inside the place `path`, unless they name a file of their own."""
         try:
             yield
-        except UnknownNameError as error:
-            if error.file is not None:
-                raise
-            raise self.unknown(path, error.kind, error.name, error.choices) from error
         except InputError as error:
             if error.file is not None:
                 raise
+            if isinstance(error, UnknownNameError):
+                raise self.unknown(path, error.kind, error.name, error.choices) from error
             where = f"{error.field}: " if error.field else ""
             raise self.error(path, where + error.problem, expected=error.expected, got=error.got) from error
 
@@ -224,8 +222,7 @@ def _translate(document: Document, path: tuple[Key, ...], error: Any) -> InputEr
     if kind == "vkc":
         return document.error(path, context["problem"], expected=context["expected"], got=repr(got))
     if kind in _SIGNS:
-        return document.error(
-            path, "out of range", expected=f"a number {_SIGNS[kind]} {next(iter(context.values())):g}", got=repr(got)
-        )
-    expected = _EXPECTED.get(kind, error["msg"])
-    return document.error(path, "wrong value", expected=expected, got=repr(got))
+        problem, expected = "out of range", f"a number {_SIGNS[kind]} {next(iter(context.values())):g}"
+    else:
+        problem, expected = "wrong value", _EXPECTED.get(kind, error["msg"])
+    return document.error(path, problem, expected=expected, got=repr(got))

@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-__all__ = ["JointSchema", "Name", "NotNegative", "Number", "Positive", "Schema", "Vector3", "count", "fail"]
+__all__ = [
+    "JointSchema",
+    "Name",
+    "NotNegative",
+    "Number",
+    "Positive",
+    "Schema",
+    "Vector3",
+    "count",
+    "fail",
+    "require",
+    "text_for",
+]
 
 
 def fail(problem: str, expected: str) -> PydanticCustomError:
@@ -21,10 +35,20 @@ def _number(value: Any) -> Any:
     return value
 
 
-def _name(value: str) -> str:
-    if not value or value != value.strip() or "." in value or "/" in value:
-        raise fail("not a name", "text without '.', '/' or spaces around it")
-    return value
+def require(holds: Callable[[Any], object], problem: str, expected: str) -> AfterValidator:
+    """Return the validator that refuses a value of which something does not hold."""
+
+    def required(value: Any) -> Any:
+        if not holds(value):
+            raise fail(problem, expected)
+        return value
+
+    return AfterValidator(required)
+
+
+def text_for(field: str) -> BeforeValidator:
+    """Return the validator that takes text for a schema with this field alone."""
+    return BeforeValidator(lambda value: {field: value} if isinstance(value, str) else value)
 
 
 def count(number: int) -> BeforeValidator:
@@ -44,7 +68,8 @@ Number = Annotated[float, BeforeValidator(_number), Field(allow_inf_nan=False)]
 Positive = Annotated[Number, Field(gt=0.0)]
 NotNegative = Annotated[Number, Field(ge=0.0)]
 Vector3 = Annotated[tuple[Number, Number, Number], count(3)]
-Name = Annotated[str, AfterValidator(_name)]
+_is_name = re.compile(r"[^\s./]([^./]*[^\s./])?").fullmatch
+Name = Annotated[str, require(_is_name, "not a name", "text without '.', '/' or spaces around it")]
 
 
 class Schema(BaseModel):

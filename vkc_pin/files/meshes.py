@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import coal
 import numpy as np
@@ -62,18 +62,18 @@ def load_mesh(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0)) -> trimesh.T
     factors = _factors(file, scale)
     if not file.is_file():
         raise InputError("there is no such mesh", file=file, expected="a mesh file")
-    if file.suffix.lower() == ".dae":
-        vertices, faces = _read_with_coal(file)
-        mesh = trimesh.Trimesh(vertices, faces)
-    else:
-        try:
+    by_coal = file.suffix.lower() == ".dae"
+    try:
+        if by_coal:
+            shape = coal.MeshLoader().load(str(file), np.ones(3))
+            mesh = trimesh.Trimesh(np.array(shape.vertices()), indices(shape))
+        else:
             mesh = trimesh.load_mesh(file, force="mesh", skip_materials=True)
             if isinstance(mesh, trimesh.Scene):
                 mesh = mesh.to_mesh()
-        except Exception as error:  # every format's reader raises what it likes
-            raise InputError(
-                f"cannot read the mesh: {error}", file=file, expected="an OBJ, STL, PLY, OFF, glTF or COLLADA file"
-            ) from error
+    except Exception as error:  # every format's reader raises what it likes
+        expected = "a COLLADA file" if by_coal else "an OBJ, STL, PLY, OFF, glTF or COLLADA file"
+        raise InputError(f"cannot read the mesh: {error}", file=file, expected=expected) from error
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise InputError("the mesh is empty", file=file, expected="at least one triangle")
     if not np.isfinite(mesh.vertices).all():
@@ -115,9 +115,10 @@ def convex_hull(points: ArrayLike) -> coal.Convex:
         raise InputError("the mesh has no convex hull: it is flat", expected="points that span a volume") from error
     if np.bincount(np.asarray(hull.faces).ravel()).max() > _NEIGHBOURS:  # the tip of a finely meshed cone, a fine disc
         hull = outer_hull(hull.vertices, vertices=60)
-    triangles = coal.StdVec_Triangle()
+    vertices, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
+    vertices.extend(np.asarray(hull.vertices, float))
     triangles.extend(coal.Triangle(*face) for face in np.asarray(hull.faces).tolist())
-    shape = coal.Convex(_points(hull.vertices), triangles)
+    shape = coal.Convex(vertices, triangles)
     corners = np.asarray(shape.points())[indices(shape)]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2.0
     for what, held, wanted in (("volume", shape.computeVolume(), hull.volume), ("area", area, hull.area)):
@@ -182,7 +183,7 @@ def coarser(part: MeshPart, detail: float) -> MeshPart:
     return MeshPart(means / count[:, None], faces[np.sort(first)], part.colour)
 
 
-def to_bvh(part: MeshPart) -> coal.BVHModelOBBRSS:
+def to_bvh(part: MeshPart | trimesh.Trimesh) -> coal.BVHModelOBBRSS:
     """Return the triangles of `part` as a coal shape, for display."""
     shape = coal.BVHModelOBBRSS()
     shape.beginModel(len(part.faces), len(part.vertices))
@@ -199,26 +200,11 @@ def _factors(file: Path, scale: ArrayLike) -> Floats:
     return np.broadcast_to(factors, (3,)).astype(float)
 
 
-def _points(points: ArrayLike) -> Any:
-    vector = coal.StdVec_Vec3s()
-    for point in np.asarray(points, float):
-        vector.append(point)
-    return vector
-
-
 def indices(shape: coal.Convex | coal.BVHModelBase) -> NDArray[np.int64]:
     """Return the corners of the triangles of a coal shape, shape (m, 3)."""
     convex = isinstance(shape, coal.Convex)
     count, item = (shape.num_polygons, shape.polygons) if convex else (shape.num_tris, shape.tri_indices)
     return np.array([[triangle[i] for i in range(3)] for triangle in map(item, range(count))], np.int64).reshape(-1, 3)
-
-
-def _read_with_coal(file: Path) -> tuple[Floats, NDArray[np.int64]]:
-    try:
-        shape = coal.MeshLoader().load(str(file), np.ones(3))
-    except (RuntimeError, ValueError) as error:
-        raise InputError(f"cannot read the mesh: {error}", file=file, expected="a COLLADA file") from error
-    return np.array(shape.vertices()), indices(shape)
 
 
 def _colour(mesh: trimesh.Trimesh) -> tuple[float, float, float, float] | None:

@@ -50,7 +50,8 @@ def read_srdf(path: str | Path, *, links: Collection[str]) -> Srdf:
         pair = [element.get(key, "") for key in ("link1", "link2")]
         for name in pair:
             if name not in links:
-                raise UnknownNameError("link", name, links, file=path, line=_line(text, name), field="disable_collisions")
+                line = next((number for number, line in enumerate(text.splitlines(), 1) if f'"{name}"' in line), None)
+                raise UnknownNameError("link", name, links, file=path, line=line, field="disable_collisions")
         first, second = sorted(pair)
         allowed[first, second] = element.get("reason", "")
     states: dict[str, dict[str, float]] = {}
@@ -62,7 +63,3 @@ def read_srdf(path: str | Path, *, links: Collection[str]) -> Srdf:
             except ValueError:
                 continue  # joints of several coordinates: not ours
     return Srdf(allowed, states)
-
-
-def _line(text: str, name: str) -> int | None:
-    return next((number for number, line in enumerate(text.splitlines(), 1) if f'"{name}"' in line), None)

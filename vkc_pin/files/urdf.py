@@ -17,7 +17,7 @@ from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
 from vkc_pin.files import resources
 from vkc_pin.files.documents import read_xml
-from vkc_pin.files.meshes import MeshPart, load_convex, load_mesh, to_bvh
+from vkc_pin.files.meshes import load_convex, load_mesh, to_bvh
 
 if TYPE_CHECKING:
     import trimesh
@@ -138,10 +138,8 @@ class UrdfFile:
         for candidate in candidates:
             if candidate.is_file():
                 return candidate
-        tried = str(candidates[0])
-        raise InputError(
-            "there is no such mesh", file=self.path, field=address, expected="a mesh file", got=f"nothing at {tried}"
-        )
+        tried = f"nothing at {candidates[0]}"
+        raise InputError("there is no such mesh", file=self.path, field=address, expected="a mesh file", got=tried)
 
     def _shape(self, link: str, name: str, element: ElementTree.Element, colours: Mapping[str, Colour]) -> UrdfShape:
         geometry = element.find("geometry")
@@ -185,9 +183,8 @@ class UrdfFile:
         except ValueError:
             values = ()
         if len(values) != count or not np.isfinite(values).all():
-            raise InputError(
-                "wrong numbers", file=self.path, field=f"{where}: {element.tag} {key}", expected=f"{count} numbers", got=text
-            )
+            field = f"{where}: {element.tag} {key}"
+            raise InputError("wrong numbers", file=self.path, field=field, expected=f"{count} numbers", got=text)
         return values
 
 
@@ -247,19 +244,13 @@ def _geometry(model: pin.Model, file: UrdfFile, kind: str) -> pin.GeometryModel:
     shapes = [(model.getFrameId(shape.link, pin.FrameType.BODY), shape) for shape in file.shapes(kind)]
     for index, shape in sorted(shapes, key=lambda pair: pair[0]):
         frame = model.frames[index]
-        solid = _triangles(shape) if kind == "visual" and shape.file is not None else shape.solid()
+        solid = to_bvh(load_mesh(shape.file, shape.size)) if kind == "visual" and shape.file is not None else shape.solid()
         added = pin.GeometryObject(shape.name, frame.parentJoint, index, frame.placement * shape.placement, solid)
         added.meshColor, added.overrideMaterial = np.array(shape.colour or _LIGHT_GREY), shape.colour is not None
         if shape.file is not None:  # viewers draw the file
             added.meshPath, added.meshScale = str(shape.file), np.array(shape.size)
         geometry.addGeometryObject(added)
     return geometry
-
-
-def _triangles(shape: UrdfShape) -> coal.CollisionGeometry:
-    assert shape.file is not None
-    mesh = load_mesh(shape.file, shape.size)
-    return to_bvh(MeshPart(np.asarray(mesh.vertices), np.asarray(mesh.faces)))
 
 
 def _rotation(roll: float, pitch: float, yaw: float) -> Floats:

@@ -47,38 +47,28 @@ class Coordinates:
         quaternions: list[tuple[int, int]] = []  # q[i:i + 4] = z[j:j + 4], made a unit
         lower, upper = [], []
         for index in range(1, model.njoints):
-            joint, name, i = model.joints[index], model.names[index], model.joints[index].idx_q
-            kind = joint.shortname()
+            joint, name, i, j = model.joints[index], model.names[index], model.joints[index].idx_q, len(names)
+            kind, limited, straight = joint.shortname(), 0, 0  # coordinates with limits, and those that are Pinocchio's own
             if kind == "JointModelPlanar":
-                plain += [(i, len(names)), (i + 1, len(names) + 1)]
-                angles.append((i + 2, len(names) + 2))
-                names += [f"{name}_x", f"{name}_y", f"{name}_yaw"]
-                units += ["m", "m", "rad"]
-                lower += [*model.lowerPositionLimit[i : i + 2], -np.inf]
-                upper += [*model.upperPositionLimit[i : i + 2], np.inf]
+                parts, limited, straight = {"_x": "m", "_y": "m", "_yaw": "rad"}, 2, 2
+                angles.append((i + 2, j + 2))
             elif kind == "JointModelFreeFlyer":
-                plain += [(i + k, len(names) + k) for k in range(3)]
-                quaternions.append((i + 3, len(names) + 3))
-                names += [f"{name}_{part}" for part in ("x", "y", "z", "qx", "qy", "qz", "qw")]
-                units += ["m"] * 3 + ["1"] * 4
-                lower += [-np.inf] * 7
-                upper += [np.inf] * 7
+                parts, straight = {"_x": "m", "_y": "m", "_z": "m", "_qx": "1", "_qy": "1", "_qz": "1", "_qw": "1"}, 3
+                quaternions.append((i + 3, j + 3))
             elif kind in _UNBOUNDED:
-                angles.append((i, len(names)))
-                names.append(name)
-                units.append("rad")
-                lower.append(-np.inf)
-                upper.append(np.inf)
+                parts = {"": "rad"}
+                angles.append((i, j))
             elif joint.nq == 1 and joint.nv == 1:
-                plain.append((i, len(names)))
-                names.append(name)
-                units.append("m" if kind in _SLIDING else "rad")
-                lower.append(model.lowerPositionLimit[i])
-                upper.append(model.upperPositionLimit[i])
+                parts, limited, straight = {"": "m" if kind in _SLIDING else "rad"}, 1, 1
             else:
                 expected = "a planar joint or one of 1 degree of freedom"
                 raise InputError("this joint type is not supported", field=name, expected=expected, got=kind)
-            joints += [index] * (len(names) - len(joints))
+            plain += [(i + k, j + k) for k in range(straight)]
+            names += [name + part for part in parts]
+            units += parts.values()
+            lower += [*model.lowerPositionLimit[i : i + limited], *[-np.inf] * (len(parts) - limited)]
+            upper += [*model.upperPositionLimit[i : i + limited], *[np.inf] * (len(parts) - limited)]
+            joints += [index] * len(parts)
         self.names: tuple[str, ...] = tuple(names)
         self.units: tuple[str, ...] = tuple(units)
         self.joints: tuple[int, ...] = tuple(joints)
@@ -87,11 +77,9 @@ class Coordinates:
         self.upper: Floats = np.array(upper, float)
         self.velocity: Floats = np.array(model.velocityLimit, float)
         self.nq = int(model.nq)
-        self._plain_q = np.array([i for i, _ in plain], int)
-        self._plain_z = np.array([j for _, j in plain], int)
+        self._plain_q, self._plain_z = np.array(plain, int).reshape(-1, 2).T
+        self._angle_q, self._angle_z = np.array(angles, int).reshape(-1, 2).T
         self._quaternions = quaternions
-        self._angle_q = np.array([i for i, _ in angles], int)
-        self._angle_z = np.array([j for _, j in angles], int)
 
     def q(self, z: ArrayLike) -> Floats:
         """Return Pinocchio's configuration(s), shape (..., nq), of minimal coordinates `z`, shape (..., n)."""

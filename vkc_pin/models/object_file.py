@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import pinocchio as pin
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from vkc_pin.errors import InputError
 from vkc_pin.files.documents import Document, check, read_yaml
-from vkc_pin.files.fields import JointSchema, Name, NotNegative, Number, Positive, Schema, Vector3, count, fail
+from vkc_pin.files.fields import JointSchema, Name, NotNegative, Number, Positive, Schema, Vector3, count, fail, require
 from vkc_pin.files.resources import find
 from vkc_pin.files.urdf import load_urdf
 from vkc_pin.models.articulation import DEFAULT_ACCELERATION, DEFAULT_VELOCITY, ArticulatedObject, Attachment, Freedom, Latch
@@ -23,26 +23,12 @@ from vkc_pin.models.grafting import clean
 __all__ = ["AttachmentSchema", "LatchSchema", "ObjectSchema", "load_object"]
 
 
-def _direction(value: tuple[float, float, float]) -> tuple[float, float, float]:
-    if np.linalg.norm(value) < 1e-6:
-        raise fail("a direction cannot be zero", "a vector of some length")
-    return value
-
-
-def _around_zero(value: tuple[float, float]) -> tuple[float, float]:
-    if not value[0] <= 0.0 <= value[1]:
-        raise fail("the limits do not contain 0", "limits [lower <= 0, upper >= 0]")
-    return value
-
-
-def _some(value: tuple[Any, ...]) -> tuple[Any, ...]:
-    if not value:
-        raise fail("nothing in the list", "at least one")
-    return value
-
-
-Limits = Annotated[tuple[Number, Number], count(2), AfterValidator(_around_zero)]
-Direction = Annotated[Vector3, AfterValidator(_direction)]
+_around_zero = require(
+    lambda value: value[0] <= 0.0 <= value[1], "the limits do not contain 0", "limits [lower <= 0, upper >= 0]"
+)
+_some_length = require(lambda value: np.linalg.norm(value) >= 1e-6, "a direction cannot be zero", "a vector of some length")
+Limits = Annotated[tuple[Number, Number], count(2), _around_zero]
+Direction = Annotated[Vector3, _some_length]
 
 
 class AttachmentSchema(Schema):
@@ -63,19 +49,24 @@ class AttachmentSchema(Schema):
 
     @model_validator(mode="after")
     def _consistent(self) -> AttachmentSchema:
-        if (self.approach is None) != (self.closing is None) or (self.rpy is not None and self.approach is not None):
-            raise fail("the tool's direction is not clear", "either rpy, or approach and closing")
-        if self.approach is not None and self.closing is not None and abs(np.dot(self.approach, self.closing)) > 1e-9:
-            raise fail("approach and closing are not perpendicular", "two perpendicular directions")
-        has_axis = self.joint in ("revolute", "prismatic", "cylindrical")
-        if has_axis != (self.axis is not None):
-            raise fail("axis and joint do not fit", "an axis with joint revolute, prismatic or cylindrical, and only there")
-        if has_axis and self.limits is None:
-            raise fail("limits missing", "limits [lower, upper] of the grasp's joint")
-        if self.joint == "fixed" and self.limits is not None:
-            raise fail("a fixed grasp has no limits", "no limits, or another joint")
-        if (self.joint == "cylindrical") != (self.turn is not None):
-            raise fail("turn and joint do not fit", "turn [lower, upper] with joint cylindrical, and only there")
+        unclear = (self.approach is None) != (self.closing is None) or (self.rpy is not None and self.approach is not None)
+        slanted = self.approach is not None and self.closing is not None and abs(np.dot(self.approach, self.closing)) > 1e-9
+        has_axis, axis = self.joint in ("revolute", "prismatic", "cylindrical"), "joint revolute, prismatic or cylindrical"
+        turns = self.joint == "cylindrical"
+        for wrong, problem, expected in (
+            (unclear, "the tool's direction is not clear", "either rpy, or approach and closing"),
+            (slanted, "approach and closing are not perpendicular", "two perpendicular directions"),
+            (has_axis != (self.axis is not None), "axis and joint do not fit", f"an axis with {axis}, and only there"),
+            (has_axis and self.limits is None, "limits missing", "limits [lower, upper] of the grasp's joint"),
+            (self.joint == "fixed" and self.limits is not None, "a fixed grasp has no limits", "no limits, or another joint"),
+            (
+                turns != (self.turn is not None),
+                "turn and joint do not fit",
+                "turn [lower, upper] with joint cylindrical, and only there",
+            ),
+        ):
+            if wrong:
+                raise fail(problem, expected)
         return self
 
 
@@ -95,7 +86,7 @@ class ObjectSchema(Schema):
     urdf: str
     free: bool = False
     joints: Mapping[str, JointSchema] = Field(default_factory=dict)
-    attachments: Annotated[tuple[AttachmentSchema, ...], AfterValidator(_some)]
+    attachments: Annotated[tuple[AttachmentSchema, ...], require(bool, "nothing in the list", "at least one")]
     latches: tuple[LatchSchema, ...] = ()
 
 
@@ -109,10 +100,6 @@ def load_object(name_or_path: str | Path) -> ArticulatedObject:
     text = str(name_or_path)
     by_path = isinstance(name_or_path, Path) or text.endswith((".yaml", ".yml")) or "/" in text
     file = Path(name_or_path) if by_path else find("scenes", "objects/*.yaml", text, what="object")
-    return _read(file)
-
-
-def _read(file: Path) -> ArticulatedObject:
     document = read_yaml(file)
     schema = check(document, ObjectSchema)
     urdf = file.parent / schema.urdf

@@ -123,7 +123,9 @@ def load_robot(
     semantics = read_srdf(beside, links=urdf.links) if beside is not None and pairs == "srdf" else None
 
     full = full_model(urdf)
-    tool = _tool_frame(full, files, tool_frame)
+    tool = tool_frame if tool_frame is not None else settings.tool_frame or default_tool_frame(full, urdf)
+    if tool not in (frames := dict.fromkeys(frame.name for frame in full.frames)):
+        raise UnknownNameError("frame", tool, frames, file=urdf.path, field="tool_frame")
     locked = {**settings.locked_joints, **(locked_joints or {})}
     given = {**settings.home, **(home or {}), **locked}
     rest = rest_positions(full, urdf, given)
@@ -201,14 +203,6 @@ def _read(name: str | Path, packages: Mapping[str, str | Path]) -> _Files:
     folders = {key: Path(folder) for key, folder in packages.items()}
     folders = {**python_packages(tuple(p for p in settings.packages if p not in folders), document), **folders}
     return _Files(source, settings, document, read_urdf(source.parent / settings.urdf, folders))
-
-
-def _tool_frame(full: pin.Model, files: _Files, stated: str | None) -> str:
-    """Return the frame that grasps: the stated one, that of robot.yaml, or the end of the arm."""
-    tool = stated if stated is not None else files.settings.tool_frame or default_tool_frame(full, files.urdf)
-    if tool not in (frames := dict.fromkeys(frame.name for frame in full.frames)):
-        raise UnknownNameError("frame", tool, frames, file=files.urdf.path, field="tool_frame")
-    return tool
 
 
 def _with_pairs(robot: Robot, allowed: Collection[tuple[str, str]] | None) -> Robot:

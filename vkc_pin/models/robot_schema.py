@@ -6,22 +6,18 @@ import importlib.util
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import AfterValidator, Field
+from pydantic import Field
 
 from vkc_pin.errors import InputError
 from vkc_pin.files.documents import Document, check, read_yaml
-from vkc_pin.files.fields import JointSchema, Number, Positive, Schema, fail
+from vkc_pin.files.fields import JointSchema, Number, Positive, Schema, require
 
 __all__ = ["BaseSchema", "RobotSchema", "python_packages", "read_robot"]
 
 
-def _ordered(value: tuple[float, float]) -> tuple[float, float]:
-    if value[0] > value[1]:
-        raise fail("lower limit above the upper one", "[lower, upper]")
-    return value
-
-
-Limits = Annotated[tuple[Number, Number], AfterValidator(_ordered)]
+Limits = Annotated[
+    tuple[Number, Number], require(lambda value: value[0] <= value[1], "lower limit above the upper one", "[lower, upper]")
+]
 
 
 class BaseSchema(Schema):

@@ -77,20 +77,17 @@ def clearance(
         second: The other group.
         reach: Distances above this do not matter [m]: the result is then some number ≥ `reach`.
     """
-    nearest, request, others = reach, coal.DistanceRequest(), list(second)
+    nearest, others = reach, list(second)
     boxes = np.array([world_box(shape, placement) for shape, placement in others]).reshape(-1, 2, 3)
     for shape, placement in first:
         low, high = world_box(shape, placement)
         # Moved apart by as much as their boxes overlap, shapes are separate: a bound also where it is negative.
         gaps = np.maximum(boxes[:, 0] - high, low - boxes[:, 1]).max(axis=1)
-        transform = coal.Transform3s(placement.rotation, placement.translation)
         for k in np.argsort(gaps, kind="stable").tolist():
             if gaps[k] >= nearest:
                 break
-            other, where = others[k]
-            there = coal.Transform3s(where.rotation, where.translation)
-            nearest = min(nearest, coal.distance(shape, transform, other, there, request, coal.DistanceResult()))
-    return float(nearest)
+            nearest = min(nearest, shape_distance(shape, placement, *others[k]))
+    return nearest
 
 
 def shape_distance(

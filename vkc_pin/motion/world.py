@@ -239,13 +239,10 @@ def scene_after(scene: Scene, trajectory: Trajectory, holds: Sequence[Hold]) -> 
 
 def units_of(scene: Scene) -> dict[str, str]:
     """Return coordinate → "m" or "rad" of everything that can move in a scene: robot, objects, and the freedoms of grasps."""
-    units: dict[str, str] = {}
-    things = [("", scene.robot.coordinates)]
-    things += [(f"{name}.", placed.object.coordinates) for name, placed in scene.objects.items()]
-    for prefix, coordinates in things:
-        units |= {prefix + name: unit for name, unit in zip(coordinates.names, coordinates.units, strict=True)}
+    units = dict(zip(scene.robot.coordinates.names, scene.robot.coordinates.units, strict=True))
     for owner, placed in scene.objects.items():
+        own = dict(zip(placed.object.coordinates.names, placed.object.coordinates.units, strict=True))
         for attachment in placed.object.attachments.values():
-            for name, freedom in zip(attachment.coordinates, attachment.freedoms, strict=True):
-                units[f"{owner}.{name}"] = freedom.unit
+            own |= {name: freedom.unit for name, freedom in zip(attachment.coordinates, attachment.freedoms, strict=True)}
+        units |= {f"{owner}.{name}": unit for name, unit in own.items()}
     return units

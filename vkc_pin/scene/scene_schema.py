@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
-from vkc_pin.files.fields import Name, Number, Positive, Schema, Vector3, count, fail
+from vkc_pin.files.fields import Name, Number, Positive, Schema, Vector3, count, fail, require, text_for
 
 __all__ = [
     "COLOURS",
@@ -60,14 +60,6 @@ def _triple(value: Any) -> Any:
     return (value, value, value) if isinstance(value, int | float) and not isinstance(value, bool) else value
 
 
-def _named(value: Any) -> Any:
-    return {"name": value} if isinstance(value, str) else value
-
-
-def _attached(value: Any) -> Any:
-    return {"attachment": value} if isinstance(value, str) else value
-
-
 def _arm(value: Any) -> Any:
     if isinstance(value, str) and value != "home":
         raise fail(f"unknown arm configuration '{value}'", "home, or a list of joint values [rad]")
@@ -82,16 +74,12 @@ def _heading(value: Any) -> Any:
     return None if value == "any" else value
 
 
-def _ordered(value: tuple[float, float] | None) -> tuple[float, float] | None:
-    if value is not None and value[0] > value[1]:
-        raise fail("the interval is empty", "[lowest, highest]")
-    return value
-
-
 Fraction = Annotated[Number, Field(ge=0.0, le=1.0)]
 Size = Annotated[tuple[Positive, Positive, Positive], count(3)]
 Colour = Annotated[tuple[Fraction, Fraction, Fraction, Fraction], count(4), BeforeValidator(_colour)]
-Interval = Annotated[tuple[Number, Number], count(2), AfterValidator(_ordered)]
+Interval = Annotated[
+    tuple[Number, Number], count(2), require(lambda value: value[0] <= value[1], "the interval is empty", "[lowest, highest]")
+]
 Scale = Annotated[Size, BeforeValidator(_triple)]
 
 
@@ -197,7 +185,7 @@ class StartSchema(Schema):
 
     base: Vector3
     arm: Annotated[tuple[Number, ...] | None, BeforeValidator(_arm)] = None
-    held: Mapping[str, Annotated[HeldSchema, BeforeValidator(_attached)]] = Field(default_factory=dict)
+    held: Mapping[str, Annotated[HeldSchema, text_for("attachment")]] = Field(default_factory=dict)
 
 
 class ArenaSchema(Schema):
@@ -219,7 +207,7 @@ class SceneSchema(Schema):
     """A scene file."""
 
     name: Name | None = None
-    robot: Annotated[SceneRobotSchema, BeforeValidator(_named)]
+    robot: Annotated[SceneRobotSchema, text_for("name")]
     start: StartSchema
     arena: ArenaSchema = ArenaSchema()
     start_region: RegionSchema | None = None

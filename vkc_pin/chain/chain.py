@@ -12,14 +12,13 @@ import pinocchio as pin
 from vkc_pin.arrays import Bools, Floats, Ints
 from vkc_pin.cache import Cache
 from vkc_pin.chain.inversion import invert
-from vkc_pin.chain.kinematics import Kinematics, kinematics_of
+from vkc_pin.chain.kinematics import kinematics_of
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.models.articulation import Attachment
 from vkc_pin.models.coordinates import Coordinates
 from vkc_pin.models.grafting import clean, graft, graft_geometry
 from vkc_pin.models.robot import Robot
 from vkc_pin.scene.hold import Hold, holds_of
-from vkc_pin.scene.placed import PlacedObject
 from vkc_pin.scene.scene import Scene
 
 __all__ = ["Closure", "VirtualKinematicChain", "consolidate"]
@@ -91,17 +90,13 @@ class VirtualKinematicChain:
             z: Configurations, shape (W, n). Joint 0, the world, is among the J.
         """
         batch, joints = len(z), self.model.njoints
-        (columns,) = self._kinematics.batch(z)
+        (columns,) = kinematics_of(self.model, self.cache).batch(z)
         columns = columns.reshape(batch, joints - 1, 12)
         rotations, translations = np.zeros((batch, joints, 3, 3)), np.zeros((batch, joints, 3))
         rotations[:, 0] = np.eye(3)
         rotations[:, 1:] = columns[..., :9].reshape(batch, joints - 1, 3, 3).swapaxes(2, 3)
         translations[:, 1:] = columns[..., 9:]
         return rotations, translations
-
-    @cached_property
-    def _kinematics(self) -> Kinematics:
-        return kinematics_of(self.model, self.cache)
 
     @cached_property
     def carries(self) -> Bools:
@@ -215,24 +210,25 @@ def consolidate(scene: Scene, holds: Iterable[Hold] | Mapping[str, str], *, cach
             for row, value in zip(limits, (low, high, VIRTUAL_VELOCITY, VIRTUAL_ACCELERATION), strict=True):
                 row.append(value)
         virtual[hold] = tuple(added)
-        tree = invert(placed.object, attachment.link, placed.state)
+        tree, shapes = invert(placed.object, attachment.link, placed.state)
         placement = clean(placement * attachment.placement.inverse())
-        joints = graft(model, tree.model, parent=parent, placement=placement, prefix=prefix)
+        joints = graft(model, tree, parent=parent, placement=placement, prefix=prefix)
         names += added
-        for joint_name in tree.model.names[1:]:
+        for joint_name in tree.names[1:]:
             names.append(f"{name}.{joint_name}")
             index = placed.object.coordinates.names.index(joint_name)
             stated = (placed.object.lower, placed.object.upper, placed.object.velocity, placed.object.acceleration)
             for row, values in zip(limits, stated, strict=True):
                 row.append(float(values[index]))
-        with_hold[hold] = (*added, *(f"{name}.{joint_name}" for joint_name in tree.model.names[1:]))
+        with_hold[hold] = (*added, *(f"{name}.{joint_name}" for joint_name in tree.names[1:]))
         base = model.frames[model.getFrameId(f"{prefix}{placed.object.base_link}")]
-        moving = list(tree.collision.geometryObjects)
+        moving = list(shapes.geometryObjects)
         if not placed.object.free:
             # What the joints in hand do not move (a door's frame, another door in it) stands in the world, closed or not.
             moving = [shape for shape in moving if joints[shape.parentJoint] != base.parentJoint]
         held_geometries[hold] = tuple(graft_geometry(collision, moving, joints=joints, placement=placement, prefix=prefix))
-        closures[hold] = Closure(base.parentJoint, pin.SE3(base.placement), _base_target(placed))
+        target = placed.link_placement(placed.object.base_link)
+        closures[hold] = Closure(base.parentJoint, pin.SE3(base.placement), target)
     for joint_name in names:
         if names.count(joint_name) > 1:
             problem = "two grasps, or an attachment and a joint of its object, share a name"
@@ -255,8 +251,3 @@ def consolidate(scene: Scene, holds: Iterable[Hold] | Mapping[str, str], *, cach
         prefixes=prefixes,
         cache=cache or Cache(),
     )
-
-
-def _base_target(placed: PlacedObject) -> pin.SE3:
-    base = placed.object.model.frames[placed.object.model.getFrameId(placed.object.base_link, pin.FrameType.BODY)]
-    return placed.placement * base.placement

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cache
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal
 
 from vkc_pin.errors import InputError, UnknownNameError
 
@@ -27,31 +27,19 @@ __all__ = ["backend_name", "center_of_mass", "frame_jacobian", "frame_placements
 _REFERENCES = {"world": 0, "local": 1, "local_world_aligned": 2}
 
 
-class _Backend(Protocol):
-    def joint_placements(self, model: pin.Model) -> casadi.Function: ...
-    def frame_placements(self, model: pin.Model, frames: list[int]) -> casadi.Function: ...
-    def frame_jacobian(self, model: pin.Model, frame: int, reference: int) -> casadi.Function: ...
-    def rnea(self, model: pin.Model) -> casadi.Function: ...
-    def center_of_mass(self, model: pin.Model) -> casadi.Function: ...
-
-
 @cache
-def _backend() -> _Backend:
+def _backend() -> Any:
     """Return the module that does the work, chosen at the first use: importing this package stays quick."""
     try:
         import_module("pinocchio.casadi")
     except ImportError:
-        chosen: Any = import_module("vkc_pin.cpin.compiled")
-    else:
-        chosen = import_module("vkc_pin.cpin.upstream")
-    backend: _Backend = chosen
-    return backend
+        return import_module("vkc_pin.cpin.compiled")
+    return import_module("vkc_pin.cpin.upstream")
 
 
 def backend_name() -> str:
     """Return what does the work here: "upstream" (`pinocchio.casadi`) or "compiled" (this package's own module)."""
-    name: str = getattr(_backend(), "__name__", "")
-    return name.rpartition(".")[2]
+    return str(_backend().__name__).rpartition(".")[2]
 
 
 def joint_placements(model: pin.Model) -> casadi.Function:
@@ -67,7 +55,7 @@ def joint_placements(model: pin.Model) -> casadi.Function:
     Raises:
         BuildError: The compiled module is missing or does not fit the installed packages.
     """
-    return _backend().joint_placements(_exact(model))
+    return _backend().build("joint_placements", _exact(model))
 
 
 def frame_placements(model: pin.Model, frames: Sequence[str | int]) -> casadi.Function:
@@ -88,7 +76,7 @@ def frame_placements(model: pin.Model, frames: Sequence[str | int]) -> casadi.Fu
     if isinstance(frames, str):
         frames = [frames]
     indices = [_frame_index(model, frame, f"frames[{i}]") for i, frame in enumerate(frames)]
-    return _backend().frame_placements(_exact(model), indices)
+    return _backend().build("frame_placements", _exact(model), indices)
 
 
 def frame_jacobian(
@@ -112,7 +100,8 @@ def frame_jacobian(
     """
     if reference not in _REFERENCES:
         raise UnknownNameError("reference", str(reference), _REFERENCES, field="reference")
-    return _backend().frame_jacobian(_exact(model), _frame_index(model, frame, "frame"), _REFERENCES[reference])
+    index = _frame_index(model, frame, "frame")
+    return _backend().build("frame_jacobian", _exact(model), index, _REFERENCES[reference])
 
 
 def rnea(model: pin.Model) -> casadi.Function:
@@ -127,7 +116,7 @@ def rnea(model: pin.Model) -> casadi.Function:
     Raises:
         BuildError: The compiled module is missing or does not fit the installed packages.
     """
-    return _backend().rnea(_exact(model))
+    return _backend().build("rnea", _exact(model))
 
 
 def center_of_mass(model: pin.Model) -> casadi.Function:
@@ -142,7 +131,7 @@ def center_of_mass(model: pin.Model) -> casadi.Function:
     Raises:
         BuildError: The compiled module is missing or does not fit the installed packages.
     """
-    return _backend().center_of_mass(_exact(model))
+    return _backend().build("center_of_mass", _exact(model))
 
 
 def _frame_index(model: pin.Model, frame: str | int, field: str) -> int:

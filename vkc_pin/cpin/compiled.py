@@ -13,34 +13,14 @@ import pinocchio as pin
 
 from vkc_pin.errors import BuildError
 
-__all__ = ["center_of_mass", "check_versions", "frame_jacobian", "frame_placements", "joint_placements", "rnea"]
+__all__ = ["build", "check_versions"]
 
 _REBUILD = "build vkc-pin again: pip install --force-reinstall --no-deps --no-cache-dir vkc-pin (in a checkout: '.')"
 
 
-def joint_placements(model: pin.Model) -> casadi.Function:
-    """Return q → M; see `vkc_pin.cpin.joint_placements`."""
-    return _unpack(_extension().joint_placements(_pack(model)))
-
-
-def frame_placements(model: pin.Model, frames: list[int]) -> casadi.Function:
-    """Return q → M; see `vkc_pin.cpin.frame_placements`."""
-    return _unpack(_extension().frame_placements(_pack(model), frames))
-
-
-def frame_jacobian(model: pin.Model, frame: int, reference: int) -> casadi.Function:
-    """Return q → J; see `vkc_pin.cpin.frame_jacobian`."""
-    return _unpack(_extension().frame_jacobian(_pack(model), frame, reference))
-
-
-def rnea(model: pin.Model) -> casadi.Function:
-    """Return (q, v, a) → tau; see `vkc_pin.cpin.rnea`."""
-    return _unpack(_extension().rnea(_pack(model)))
-
-
-def center_of_mass(model: pin.Model) -> casadi.Function:
-    """Return q → com; see `vkc_pin.cpin.center_of_mass`."""
-    return _unpack(_extension().center_of_mass(_pack(model)))
+def build(name: str, model: pin.Model, *arguments: Any) -> casadi.Function:
+    """Return the function of `vkc_pin.cpin` that is called so; frames and references among its arguments are numbers."""
+    return casadi.Function.deserialize(getattr(_extension(), name)(model.saveToString(), *arguments))
 
 
 def check_versions(built: dict[str, str], installed: dict[str, str]) -> None:
@@ -84,12 +64,3 @@ def _extension() -> Any:
         {"pin": pin.__version__, "casadi": casadi.__version__},
     )
     return extension
-
-
-def _pack(model: pin.Model) -> str:
-    text: str = model.saveToString()
-    return text
-
-
-def _unpack(text: str) -> casadi.Function:
-    return casadi.Function.deserialize(text)

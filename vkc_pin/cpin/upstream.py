@@ -2,64 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
 
 import casadi
 import pinocchio as pin
 
-__all__ = ["center_of_mass", "frame_jacobian", "frame_placements", "joint_placements", "rnea"]
+__all__ = ["build"]
 
 
-def joint_placements(model: pin.Model) -> casadi.Function:
-    """Return q → M; see `vkc_pin.cpin.joint_placements`."""
-    cpin, symbolic, data, q = _prepare(model)
-    cpin.forwardKinematics(symbolic, data, q)
-    return _function("joint_placements", {"q": q}, _columns([data.oMi[i] for i in range(1, model.njoints)]), "M")
-
-
-def frame_placements(model: pin.Model, frames: list[int]) -> casadi.Function:
-    """Return q → M; see `vkc_pin.cpin.frame_placements`."""
-    cpin, symbolic, data, q = _prepare(model)
-    cpin.forwardKinematics(symbolic, data, q)
-    cpin.updateFramePlacements(symbolic, data)
-    return _function("frame_placements", {"q": q}, _columns([data.oMf[i] for i in frames]), "M")
-
-
-def frame_jacobian(model: pin.Model, frame: int, reference: int) -> casadi.Function:
-    """Return q → J; see `vkc_pin.cpin.frame_jacobian`."""
-    cpin, symbolic, data, q = _prepare(model)
-    cpin.computeJointJacobians(symbolic, data, q)
-    cpin.updateFramePlacements(symbolic, data)
-    jacobian = cpin.getFrameJacobian(symbolic, data, frame, pin.ReferenceFrame.values[reference])
-    return _function("frame_jacobian", {"q": q}, jacobian, "J")
-
-
-def rnea(model: pin.Model) -> casadi.Function:
-    """Return (q, v, a) → tau; see `vkc_pin.cpin.rnea`."""
-    cpin, symbolic, data, q = _prepare(model)
-    v, a = casadi.SX.sym("v", model.nv, 1), casadi.SX.sym("a", model.nv, 1)
-    return _function("rnea", {"q": q, "v": v, "a": a}, cpin.rnea(symbolic, data, q, v, a), "tau")
-
-
-def center_of_mass(model: pin.Model) -> casadi.Function:
-    """Return q → com; see `vkc_pin.cpin.center_of_mass`."""
-    cpin, symbolic, data, q = _prepare(model)
-    return _function("center_of_mass", {"q": q}, cpin.centerOfMass(symbolic, data, q), "com")
-
-
-def _prepare(model: pin.Model) -> tuple[Any, Any, Any, casadi.SX]:
+def build(name: str, model: pin.Model, *arguments: Any) -> casadi.Function:
+    """Return the function of `vkc_pin.cpin` that is called so; frames and references among its arguments are numbers."""
     cpin = import_module("pinocchio.casadi")
-    symbolic = cpin.Model(model)
-    return cpin, symbolic, symbolic.createData(), casadi.SX.sym("q", model.nq, 1)
-
-
-def _columns(placements: Sequence[Any]) -> casadi.SX:
-    columns = [casadi.vertcat(casadi.vec(casadi.SX(m.rotation)), casadi.SX(m.translation)) for m in placements]
-    return casadi.horzcat(casadi.SX(12, 0), *columns)
-
-
-def _function(name: str, inputs: dict[str, casadi.SX], output: casadi.SX, output_name: str) -> casadi.Function:
+    symbolic, inputs = cpin.Model(model), {"q": casadi.SX.sym("q", model.nq, 1)}
+    data, q = symbolic.createData(), inputs["q"]
+    if name == "rnea":
+        inputs |= {part: casadi.SX.sym(part, model.nv, 1) for part in ("v", "a")}
+        output, result = cpin.rnea(symbolic, data, *inputs.values()), "tau"
+    elif name == "center_of_mass":
+        output, result = cpin.centerOfMass(symbolic, data, q), "com"
+    elif name == "frame_jacobian":
+        frame, reference = arguments
+        cpin.computeJointJacobians(symbolic, data, q)
+        cpin.updateFramePlacements(symbolic, data)
+        output, result = cpin.getFrameJacobian(symbolic, data, frame, pin.ReferenceFrame.values[reference]), "J"
+    else:
+        cpin.forwardKinematics(symbolic, data, q)
+        cpin.updateFramePlacements(symbolic, data)
+        joints = name == "joint_placements"
+        placements = [data.oMi[i] for i in range(1, model.njoints)] if joints else [data.oMf[i] for i in arguments[0]]
+        columns = [casadi.vertcat(casadi.vec(casadi.SX(m.rotation)), casadi.SX(m.translation)) for m in placements]
+        output, result = casadi.horzcat(casadi.SX(12, 0), *columns), "M"
     lean = casadi.cse(casadi.sparsify(casadi.SX(output)))
-    return casadi.Function(name, list(inputs.values()), [lean], list(inputs), [output_name])
+    return casadi.Function(name, list(inputs.values()), [lean], list(inputs), [result])

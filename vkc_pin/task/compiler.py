@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -246,16 +246,12 @@ class _Compiler:
             self.standing[hold.object] = where
 
     def add(self, step: Step, where: str) -> None:
-        if isinstance(step, Grasp):
+        own: dict[type, Callable[[Any, str], None]]
+        own = {Actuate: self.actuate, Touch: self.touch, Place: self.place, Release: self.release}
+        if type(step) in own:
+            own[type(step)](step, where)
+        elif isinstance(step, Grasp):
             self.grasp(step.object, step.attachment, where, step.by)
-        elif isinstance(step, Actuate):
-            self.actuate(step, where)
-        elif isinstance(step, Touch):
-            self.touch(step, where)
-        elif isinstance(step, Place):
-            self.place(step, where)
-        elif isinstance(step, Release):
-            self.release(step, where)
         elif isinstance(step, Reach):
             frame = robot_frame(self.scene, step.frame, f"{where}.frame")
             self._let_go_of_fixed()

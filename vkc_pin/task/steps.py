@@ -80,6 +80,16 @@ def as_target(target: Any, *, name: str) -> pin.SE3 | tuple[float, float, float]
     return (float(point[0]), float(point[1]), float(point[2]))
 
 
+def _finite(value: Any, field: str) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise InputError("not a number", field=field, got=repr(value)) from None
+    if not np.isfinite(number):
+        raise InputError("not finite", field=field, got=value)
+    return number
+
+
 @dataclass(frozen=True)
 class Reach:
     """Bring a frame of the robot to a pose.
@@ -130,14 +140,7 @@ class Actuate:
         if not isinstance(self.joints, Mapping) or not self.joints:
             expected = "a mapping such as {'hinge': 1.2}"
             raise InputError("nothing to actuate", field="Actuate.joints", expected=expected, got=repr(self.joints))
-        joints = {}
-        for name, value in self.joints.items():
-            try:
-                joints[str(name)] = float(value)
-            except (TypeError, ValueError):
-                raise InputError("not a number", field=f"Actuate.joints[{name!r}]", got=repr(value)) from None
-            if not np.isfinite(joints[str(name)]):
-                raise InputError("not finite", field=f"Actuate.joints[{name!r}]", got=value)
+        joints = {str(name): _finite(value, f"Actuate.joints[{name!r}]") for name, value in self.joints.items()}
         object.__setattr__(self, "joints", joints)
 
 
@@ -204,16 +207,8 @@ class GoTo:
 
     def __post_init__(self) -> None:
         for name in ("x", "y", "yaw"):
-            value = getattr(self, name)
-            if value is None and name == "yaw":
-                continue
-            try:
-                value = float(value)
-            except (TypeError, ValueError):
-                raise InputError("not a number", field=f"GoTo.{name}", got=repr(value)) from None
-            if not np.isfinite(value):
-                raise InputError("not finite", field=f"GoTo.{name}", got=value)
-            object.__setattr__(self, name, value)
+            if name != "yaw" or self.yaw is not None:
+                object.__setattr__(self, name, _finite(getattr(self, name), f"GoTo.{name}"))
 
 
 Step = Reach | Grasp | Actuate | GoTo | Touch | Place | Release

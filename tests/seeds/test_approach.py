@@ -49,8 +49,8 @@ def test_the_hand_goes_straight_back_from_a_handle(stands: bool) -> None:
 def test_the_base_drives_where_the_arm_alone_cannot_do_it() -> None:
     _, z = grasp()
     for metres in (0.6, 1.0):
-        (near,) = approach(stands=True)._way(z, np.array([0.0, -1.0, 0.0]), [metres])
-        alone = approach(stands=True)._way(z, np.array([0.0, -1.0, 0.0]), [metres], drives=False)
+        (near,) = approach(stands=True)._retreat(z, np.array([0.0, -1.0, 0.0]), [metres])
+        alone = approach(stands=True)._retreat(z, np.array([0.0, -1.0, 0.0]), [metres], drives=False)
         hand, there = (dataclasses.replace(door_scene(), start=row[:9]).tool_placement() for row in (z, near))
         np.testing.assert_allclose(there.translation - hand.translation, [0.0, -metres, 0.0], atol=1e-3)
         assert (len(alone) == 0) == bool(np.abs(near - z)[:3].max() > 0.0)

@@ -1,4 +1,4 @@
-"""Straight ways in and out: a hand nears what it grasps, and a stick what it touches, from where there is room."""
+"""Straight paths in and out: a hand nears what it grasps, and a stick what it touches, from where there is room."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from vkc_pin.task.phases import Phase
 __all__ = ["Approach"]
 
 LIFT = 0.1  # [m] to lift or lower what is carried
-_STANDOFFS = (0.1, 0.2, 0.3, 0.4, 0.5)  # [m] from what is touched, on the way to it
-_WAY_SHARES = (0.25, 0.5, 0.75, 1.0)  # of a straight way, at which configurations are looked for
+_STANDOFFS = (0.1, 0.2, 0.3, 0.4, 0.5)  # [m] from what is touched, on the path to it
+_PATH_SHARES = (0.25, 0.5, 0.75, 1.0)  # of a straight path, at which configurations are looked for
 
 
 class Approach:
-    """Finds configurations on straight ways to and from the ends of a problem's phases.
+    """Finds configurations on straight paths to and from the ends of a problem's phases.
 
-    A way is the tool's: back along its approach for what it grasps or lets go of, up for what is lifted or put down, back along
+    A path is the tool's: back along its approach for what it grasps or lets go of, up for what is lifted or put down, back along
     the frame's z axis for what a frame touches.
 
     Args:
@@ -41,29 +41,29 @@ class Approach:
         self.solver = cache.get(key, lambda: PoseSolver(model, PoseRow(joint, local, ()), cache))
 
     def before(self, z: Floats, phase: Phase) -> Floats:
-        """Return configurations on the way to `z`, shape (n,), the end of a phase: shape (K, n), the last is the nearest."""
+        """Return configurations on the path to `z`, shape (n,), a phase's end: shape (K, n), the last is the nearest."""
         if phase.grasps:
-            return self._way(z, -self._ahead(z, self.chain.holder(phase.grasps[0])), [self.problem.options.approach])
+            return self._retreat(z, -self._ahead(z, self.chain.holder(phase.grasps[0])), [self.problem.options.approach])
         if phase.lowered:
-            return self._way(z, np.array([0.0, 0.0, 1.0]), [LIFT])
+            return self._retreat(z, np.array([0.0, 0.0, 1.0]), [LIFT])
         for goal in phase.frames:
             if goal.touches:
-                return self._way(z, -self._ahead(z, self.chain.frame(goal.frame, goal.hold)), _STANDOFFS)[::-1]
+                return self._retreat(z, -self._ahead(z, self.chain.frame(goal.frame, goal.hold)), _STANDOFFS)[::-1]
         return np.empty((0, len(z)))
 
     def after(self, z: Floats, phase: Phase, before: Phase | None) -> Floats:
-        """Return configurations on the way from `z`, shape (n,), the start of a phase: shape (K, n), the first is the nearest."""
+        """Return configurations on the path from `z`, shape (n,), a phase's start: shape (K, n), the first is the nearest."""
         if phase.leaves:
-            return self._way(z, -self._ahead(z, self.chain.holder(phase.leaves[0])), [self.problem.options.approach])
+            return self._retreat(z, -self._ahead(z, self.chain.holder(phase.leaves[0])), [self.problem.options.approach])
         if phase.lifted:
-            return self._way(z, np.array([0.0, 0.0, 1.0]), [LIFT])
+            return self._retreat(z, np.array([0.0, 0.0, 1.0]), [LIFT])
         for goal in before.frames if before else ():
             if goal.touches:
-                return self._way(z, -self._ahead(z, self.chain.frame(goal.frame, goal.hold)), _STANDOFFS)
+                return self._retreat(z, -self._ahead(z, self.chain.frame(goal.frame, goal.hold)), _STANDOFFS)
         return np.empty((0, len(z)))
 
     def away(self, z: Floats, phase: Phase) -> Floats:
-        """Return configurations on the way from `z`, shape (n,), the base where it is: shape (K, n), the last is the farthest.
+        """Return configurations on the path from `z`, shape (n,), the base where it is: shape (K, n), the last is the farthest.
 
         The hand goes back from what a phase lets go of at its start, or up with what is carried in it.
         """
@@ -73,7 +73,7 @@ class Approach:
             direction, length = np.array([0.0, 0.0, 1.0]), LIFT
         else:
             return np.empty((0, len(z)))
-        return self._way(z, direction, [share * length for share in _WAY_SHARES], drives=False)
+        return self._retreat(z, direction, [share * length for share in _PATH_SHARES], drives=False)
 
     def _ahead(self, z: Floats, frame: tuple[int, pin.SE3]) -> Floats:
         """Return the direction of a frame's z axis in the world, at `z`: in it a hand nears what it grasps."""
@@ -81,7 +81,7 @@ class Approach:
         rotations, _ = self.chain.joint_placements(z[None])
         return np.asarray((rotations[0, joint] @ local.rotation)[:, 2])
 
-    def _way(self, z: Floats, direction: Floats, lengths: Sequence[float], *, drives: bool = True) -> Floats:
+    def _retreat(self, z: Floats, direction: Floats, lengths: Sequence[float], *, drives: bool = True) -> Floats:
         """Return configurations with the tool `lengths` [m] along `direction` from where `z` has it, as far as there are."""
         rotations, translations = self.chain.joint_placements(z[None])
         carrier = pin.SE3(rotations[0, self.joint], translations[0, self.joint])

@@ -1,4 +1,4 @@
-"""Beam search: from knot to knot along a task, keeping the cheapest ways, on the closure's manifold where something is held."""
+"""Beam search: from knot to knot along a task, keeping the cheapest paths, on the closure's manifold where something is held."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from vkc_pin.seeds.routes import Routes
 
 __all__ = ["Beam", "Found"]
 
-_DRAWS = 6  # batches of random seeds that are drawn at most: good grasps are rare
-_FREE_OPEN = 60  # free configurations at a knot with which no more are drawn, nor pushed out of collisions
+_BATCHES = 6  # batches of random samples at most: good grasps are rare
+_FREE_OPEN = 60  # free configurations at a knot with which no more are sampled, nor pushed out of collisions
 _FREE_HELD = 12  # the same at a knot at which something fixed is held
 _OTHERS = 3  # ratio of the beam to what is kept of other free grasps, where a hand chooses how to grasp
 _BEAM, _QUICK_BEAM = 40, 24  # configurations kept per knot
 _CHILDREN = 4  # configurations tried per knot, as a multiple of the beam
 _KNOT_TIME = 1.0  # [s] from knot to knot along a phase in which something fixed is held, at `Options.dt` a waypoint
-_WAY_PIECES = 6  # pieces of a straight way, between which it is looked at for collisions
-_WAY_COLLISION = 1.0  # cost of a configuration in collision there
+_PATH_PIECES = 6  # pieces of a straight path, between which it is checked for collisions
+_PATH_COLLISION = 1.0  # cost of a configuration in collision there
 _EASY = 0.5  # share of the beam that must go on freely for a knot to be easy
 _COLLISION, _DEPTH = 10.0, 300.0  # cost of a collision, and of its depth [1/m], a radian of a joint costing 1
 _NOT_FOUND = 1e3  # cost if there is no configuration, or no path of the base
 _TOLERABLE = 60.0  # cost of collisions that the solver may be left to push apart: a graze or two
-_JUMP = 0.5  # [m] of the base from knot to knot while something fixed is held: through something, no doubt
-_DRIVING = 2.0  # how many times more than in `Knots.weights` the base's way counts: on it hangs which side is gone to
+_JUMP = 0.5  # [m] of the base from knot to knot while something fixed is held: a path through an obstacle, no doubt
+_DRIVING = 2.0  # how many times more than in `Knots.weights` the base's path counts: it decides which side is driven to
 
 
 class Found(NamedTuple):
@@ -65,7 +65,7 @@ class Beam:
     Args:
         knots: Where configurations come from.
         routes: The paths that the base would drive; None: as if it drove straight.
-        careful: Whether grasps count as free only if the straight way to them is free, too, and paths of the base are those with
+        careful: Whether grasps count as free only if the straight path to them is free, too, and paths of the base are those with
             the arm folded: for narrow places.
         interrupt: Ends a search.
     """
@@ -86,10 +86,10 @@ class Beam:
 
         Args:
             thorough: Keep more, and shake the arms at every knot at which something fixed is held.
-            backwards: Where something fixed is held, begin where it is let go of, and go back to where it is grasped: a way may
-                be wide at its end only, and hardly anything that is free at its beginning leads there.
+            backwards: Where something fixed is held, begin where it is let go of, and go back to where it is grasped: a passage
+                may be wide at its end only, and hardly anything that is free at its beginning leads there.
         """
-        # A hand that chooses where to grasp, and then does not give way, chooses before it moves anything.
+        # A hand that chooses where to grasp, and then clamps, chooses before it moves anything.
         backwards = backwards and not any(self._closed_at(grasp + 1) for _, grasp, _ in self.problem.choices)
         mode = _Mode(thorough, backwards)
         problem = self.problem
@@ -117,7 +117,7 @@ class Beam:
         return found
 
     def tolerable(self, found: Found) -> bool:
-        """Return whether the cheapest path hits little and, if ways of the base count, never jumps while something is held."""
+        """Return whether the cheapest path hits little and, if paths of the base count, never jumps while something is held."""
         best = int(np.argmin(found.cost))
         held = [self._closed_at(knot) for knot in found.at[1:]]
         jumps = np.abs(np.diff(found.paths[best, :, :2], axis=0)).max(axis=1) > _JUMP
@@ -139,7 +139,7 @@ class Beam:
     def _go_on(self, found: Found, knot: int, phase: int, mode: _Mode) -> Found:
         """Return the cheapest paths to the next knot, to which something of a phase leads."""
         parents, z, bad = self._continue(found.paths, found.cost, knot, phase, mode)
-        total = found.cost[parents] + self._way(found.paths[parents, -1], z, phase) + bad
+        total = found.cost[parents] + self._path_cost(found.paths[parents, -1], z, phase) + bad
         best = self._kept(total, bad, knot, mode.width)
         paths = np.concatenate([found.paths[parents[best]], z[best, None]], axis=1)
         return Found(paths, total[best], (found.trouble[parents] + bad)[best], [*found.at, knot])
@@ -167,33 +167,33 @@ class Beam:
             found = self._go_on(found, knot, phase + 1, mode)
         paths = np.concatenate([found.paths[:, :known], found.paths[:, : known - 1 : -1]], axis=1)
         start, grasp, end = paths[:, known - 1], paths[:, known], paths[:, -1]
-        cost = found.cost + self._way(start, grasp, phase) - self._way(start, end, phase)
+        cost = found.cost + self._path_cost(start, grasp, phase) - self._path_cost(start, end, phase)
         return Found(paths, cost, found.trouble, [*found.at[:known], *knots])
 
-    def _way(self, first: Floats, last: Floats, phase: int) -> Floats:
+    def _path_cost(self, first: Floats, last: Floats, phase: int) -> Floats:
         """Return what it costs to go from `first` to `last`, both (B, n), in a phase, shape (B,)."""
         weights = self.knots.weights.copy()
         weights[:2] *= _DRIVING
-        way = np.abs(last - first) * weights
+        cost = np.abs(last - first) * weights
         if self.routes is not None and not self.problem.closed(self.problem.task.phases[phase]):
             distances = self.routes.distances(phase, first[:, :3], last[:, :3], folded=self.careful)
-            way[:, 0], way[:, 1] = weights[0] * distances, 0.0
-            np.minimum(way, _NOT_FOUND, out=way)  # where there is no way, others come first
-        return np.asarray(way.sum(axis=1))
+            cost[:, 0], cost[:, 1] = weights[0] * distances, 0.0
+            np.minimum(cost, _NOT_FOUND, out=cost)  # where there is no path, others come first
+        return np.asarray(cost.sum(axis=1))
 
     def _continue(self, paths: Floats, cost: Floats, waypoint: int, phase: int, mode: _Mode) -> tuple[Ints, Floats, Floats]:
         """Return continuations of `paths` to a waypoint: which path each goes on from, where to, and what is wrong there."""
         knots = self.knots
         if not self.problem.closed(self.problem.task.phases[phase]):
-            draws = []
-            for _ in range(_DRAWS):
+            samples = []
+            for _ in range(_BATCHES):
                 parents = np.arange(SCATTER if mode.thorough else SCATTER // 2) % len(paths)
                 z, found = knots.knot(paths[parents, -1], waypoint, "scatter")
-                price = cost[parents] + self._way(paths[parents, -1], z, phase)
-                draws.append(self._cheapest(price, parents, z, found, waypoint, mode.width))
-                if sum(np.count_nonzero(bad == 0) for _, _, bad in draws) >= _FREE_OPEN:
+                price = cost[parents] + self._path_cost(paths[parents, -1], z, phase)
+                samples.append(self._cheapest(price, parents, z, found, waypoint, mode.width))
+                if sum(np.count_nonzero(bad == 0) for _, _, bad in samples) >= _FREE_OPEN:
                     break
-            parents, z, bad = (np.concatenate(parts) for parts in zip(*draws, strict=True))
+            parents, z, bad = (np.concatenate(parts) for parts in zip(*samples, strict=True))
             return self._pushed(paths, cost, parents, z, bad, waypoint, phase, mode.width)
         parents = np.arange(len(paths))
         z, found = knots.knot(paths[:, -1], waypoint, "track")
@@ -204,7 +204,7 @@ class Beam:
         more = np.arange(mode.width * _CHILDREN - len(paths)) % len(paths)
         shaken, also = knots.knot(paths[more, -1], waypoint, "shake")
         parents, z, found = np.concatenate([parents, more]), np.concatenate([z, shaken]), np.concatenate([found, also])
-        price = cost[parents] + self._way(paths[parents, -1], z, phase)
+        price = cost[parents] + self._path_cost(paths[parents, -1], z, phase)
         parents, z, bad = self._cheapest(price, parents, z, found, waypoint, mode.width)
         if not mode.backwards:
             return parents, z, bad
@@ -216,7 +216,7 @@ class Beam:
         """Return continuations and, if few of them are free, the best of them pushed out of what they are in."""
         if np.count_nonzero(bad == 0) >= (_FREE_HELD if self._closed_at(waypoint) else _FREE_OPEN):
             return parents, z, bad
-        price = cost[parents] + self._way(paths[parents, -1], z, phase) + bad
+        price = cost[parents] + self._path_cost(paths[parents, -1], z, phase) + bad
         best = np.argsort(price, kind="stable")[: 2 * width]
         pushed = self.knots.clear(z[best], waypoint)
         more = self._bad(pushed, np.ones(len(pushed), bool), waypoint)
@@ -248,12 +248,12 @@ class Beam:
         return bad
 
     def _approach(self, first: Floats, last: Floats, begin: int, end: int) -> Floats:
-        """Return what the straight ways from `first` to `last`, both (B, n), cost in collisions, shape (B,)."""
-        s = np.arange(1, _WAY_PIECES) / _WAY_PIECES
+        """Return what the straight paths from `first` to `last`, both (B, n), cost in collisions, shape (B,)."""
+        s = np.arange(1, _PATH_PIECES) / _PATH_PIECES
         between = first[:, None] + s[:, None] * (last - first)[:, None]
         depth = self.knots.depth(between.reshape(-1, between.shape[-1]), min(begin + 1, end))
         return np.asarray(
-            np.sum(np.where(depth > 0, _WAY_COLLISION + _DEPTH / _WAY_PIECES * depth, 0.0).reshape(len(first), -1), axis=1)
+            np.sum(np.where(depth > 0, _PATH_COLLISION + _DEPTH / _PATH_PIECES * depth, 0.0).reshape(len(first), -1), axis=1)
         )
 
 

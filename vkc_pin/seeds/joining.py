@@ -24,7 +24,7 @@ class Paths(Protocol):
     """Finds paths of the robot where nothing fixed is held."""
 
     careful: bool
-    """Whether configurations on the straight ways in and out are left out where they hit something."""
+    """Whether configurations on the straight paths in and out are left out where they hit something."""
 
     def path(self, phase: int, first: Floats, last: Floats, steps: int, *, turns: bool, reaches: bool) -> Floats | None:
         """Return `steps` rows from `first` to `last`, both (n,), of the robot's first coordinates, shape (steps, c).
@@ -89,7 +89,7 @@ class Joiner:
 
     Args:
         knots: Of the problem.
-        approach: The straight ways in and out.
+        approach: The straight paths in and out.
         paths: The others, where nothing fixed is held; None: straight, too.
     """
 
@@ -148,7 +148,7 @@ class Joiner:
     def _via(self, ends: Floats, number: int, previous: Phase | None, segments: int) -> tuple[Floats, list[int], int, int]:
         """Return configurations to go through from start to end of a phase, `ends`, shape (2, n), and when, counted from 0.
 
-        The last two numbers say between which of them it is neither a straight way out nor one in.
+        The last two numbers say between which of them it is neither a straight path out nor one in.
         """
         phase = self.problem.task.phases[number]
         first = self.approach.after(ends[0], phase, previous)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import json
 import platform
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -67,24 +68,19 @@ def _plan(arguments: argparse.Namespace) -> int:
         callback=None if arguments.quiet else _progress,
     )
     sys.stdout.write(plan.report() + "\n")
-    if arguments.save:
-        plan.save(arguments.save)
-    if arguments.json:
-        plan.to_json(arguments.json)
-    if arguments.csv:
-        plan.to_csv(arguments.csv)
-    if arguments.ros:
-        _write_ros(plan, arguments.ros)
-    if arguments.html:
-        plan.to_html(arguments.html)
     if arguments.plots:
-        folder = Path(arguments.plots)
-        folder.mkdir(parents=True, exist_ok=True)
-        plan.plot(folder)
-    for option in ("save", "json", "csv", "ros", "html", "plots"):
-        if getattr(arguments, option):
-            sys.stdout.write(f"wrote {getattr(arguments, option)}\n")
+        Path(arguments.plots).mkdir(parents=True, exist_ok=True)
+    writers: dict[str, Callable[[str], object]] = {"save": plan.save, "json": plan.to_json, "csv": plan.to_csv}
+    _write(arguments, {**writers, "ros": functools.partial(_write_ros, plan), "html": plan.to_html, "plots": plan.plot})
     return EXIT_OK if plan.success else EXIT_FAILED
+
+
+def _write(arguments: argparse.Namespace, writers: Mapping[str, Callable[[str], object]]) -> None:
+    """Write the files that were asked for, by option, and say so."""
+    paths = {option: getattr(arguments, option) for option in writers if getattr(arguments, option)}
+    for option, path in paths.items():
+        writers[option](path)
+    sys.stdout.write("".join(f"wrote {path}\n" for path in paths.values()))
 
 
 def _write_ros(plan: Any, path: str, **options: Any) -> None:
@@ -97,22 +93,15 @@ def _export(arguments: argparse.Namespace) -> int:
     import vkc_pin as vkc
 
     plan = vkc.Plan.load(arguments.plan)
-    written = [name for name in ("csv", "json", "ros") if getattr(arguments, name)]
-    if not written:
+    if not (arguments.csv or arguments.json or arguments.ros):
         raise InputError("nothing to write", field="export", expected="--csv FILE, --json FILE or --ros FILE")
     if arguments.rate is not None and not arguments.ros:
         raise InputError("only ROS' points can be resampled", field="--rate", expected="--ros FILE as well")
     names = arguments.joints.split(",") if arguments.joints else None
     joints = names[0] if names is not None and len(names) == 1 and names[0] in GROUPS else names
     chosen = {} if joints is None else {"joints": joints}
-    if arguments.csv:
-        plan.to_csv(arguments.csv, **chosen)
-    if arguments.json:
-        plan.to_json(arguments.json)
-    if arguments.ros:
-        _write_ros(plan, arguments.ros, **chosen, rate=arguments.rate)
-    for name in written:
-        sys.stdout.write(f"wrote {getattr(arguments, name)}\n")
+    ros = functools.partial(_write_ros, plan, **chosen, rate=arguments.rate)
+    _write(arguments, {"csv": functools.partial(plan.to_csv, **chosen), "json": plan.to_json, "ros": ros})
     return EXIT_OK
 
 
@@ -213,12 +202,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments.given = list(sys.argv[1:] if argv is None else argv)
     try:
         return int(arguments.run(arguments))
-    except VkcError as error:
-        sys.stderr.write(f"vkc-pin: {error}\n")
-        return EXIT_MISUSE
     except BrokenPipeError:
         return EXIT_OK
-    except OSError as error:  # a file that cannot be written, a full disk
+    except (VkcError, OSError) as error:  # or a file that cannot be written, a full disk
         sys.stderr.write(f"vkc-pin: {error}\n")
         return EXIT_MISUSE
 

@@ -93,7 +93,7 @@ def test_what_is_known_is_not_worked_out_again(problem: vkc.TrajectoryProblem, m
     one, other, alone = knots(problem, 3, known), knots(problem, 3, known), knots(problem, 3)
     first = one.knot(start, grasp, "scatter")
     depths = one.depth(first[0], grasp)
-    monkeypatch.setattr(Knots, "_scatter", None)
+    monkeypatch.setattr(Knots, "_shaken", None)
     monkeypatch.setattr("vkc_pin.seeds.knots.depth", None)
     for values, same in zip(first, other.knot(start, grasp, "scatter"), strict=True):
         np.testing.assert_array_equal(values, same)

@@ -111,7 +111,10 @@ class PhaseGeometry:
         rotated = rotations.transpose(2, 3, 0, 1).take(joint, axis=3)
         turns = _products(rotated, self._turn[:, :, None, moving])
         centers = _turned(rotated, self._local[:, None, moving]) + translations.transpose(2, 0, 1).take(joint, axis=2)
-        moves = self._moving_within(reach, centers)
+        own, a, b, radii = self._own  # of which both move, whose balls are within reach of each other
+        between = centers.take(a, axis=2) - centers.take(b, axis=2)
+        w, k = np.nonzero((between * between).sum(axis=0) < (radii + reach) ** 2)
+        moves = w, own[k]
         none = np.zeros(0, int), np.zeros(0, int)
         stands = self._standing_within(reach, centers, turns) if standing else none
         w, k = (np.concatenate(parts) for parts in zip(moves, stands, strict=True))
@@ -119,13 +122,6 @@ class PhaseGeometry:
         near = np.flatnonzero(gaps < reach)
         near = near[np.argsort(w[near] * len(self.pairs) + k[near])]
         return w[near], k[near], gaps[near]
-
-    def _moving_within(self, reach: float, centers: Floats) -> tuple[Ints, Ints]:
-        """Return (configuration, pair) of what moves and whose balls are within `reach` of each other."""
-        own, a, b, radii = self._own
-        between = centers.take(a, axis=2) - centers.take(b, axis=2)
-        w, k = np.nonzero((between * between).sum(axis=0) < (radii + reach) ** 2)
-        return w, own[k]
 
     def _standing_within(self, reach: float, centers: Floats, turns: Floats) -> tuple[Ints, Ints]:
         """Return (configuration, pair) of what moves and whose balls are within `reach` of boxes that stand.

@@ -14,7 +14,6 @@ from vkc_pin.cache import Cache
 from vkc_pin.chain.inversion import invert
 from vkc_pin.chain.kinematics import kinematics_of
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.models.articulation import Attachment
 from vkc_pin.models.coordinates import Coordinates
 from vkc_pin.models.grafting import clean, graft, graft_geometry
 from vkc_pin.models.robot import Robot
@@ -157,16 +156,6 @@ class VirtualKinematicChain:
         return frame.parentJoint, pin.SE3(frame.placement)
 
 
-def _virtual_joints(attachment: Attachment, owner: str) -> list[tuple[str, pin.JointModel, float, float]]:
-    """Return the joints of J(v)⁻¹, tool to object: each joint's axis is negated, and their order reversed."""
-    models = {"revolute": pin.JointModelRevoluteUnaligned, "prismatic": pin.JointModelPrismaticUnaligned}
-    joints = [
-        (f"{owner}.{name}", models[freedom.kind](-freedom.axis), freedom.lower, freedom.upper)
-        for name, freedom in zip(attachment.coordinates, attachment.freedoms, strict=True)
-    ]
-    return joints[::-1]
-
-
 def consolidate(scene: Scene, holds: Iterable[Hold] | Mapping[str, str], *, cache: Cache | None = None) -> VirtualKinematicChain:
     """Merge the scene's robot with the objects it holds into one model (section III of the paper).
 
@@ -202,7 +191,10 @@ def consolidate(scene: Scene, holds: Iterable[Hold] | Mapping[str, str], *, cach
         tool = model.frames[model.getFrameId(holder)]
         parent, placement = tool.parentJoint, tool.placement * attachment.offset.inverse()
         added = []
-        for joint_name, joint, low, high in _virtual_joints(attachment, name):
+        # J(v)⁻¹, tool to object: each joint's axis is negated, and their order reversed.
+        for suffix, freedom in reversed([*zip(attachment.coordinates, attachment.freedoms, strict=True)]):
+            kind = pin.JointModelRevoluteUnaligned if freedom.kind == "revolute" else pin.JointModelPrismaticUnaligned
+            joint_name, joint, low, high = f"{name}.{suffix}", kind(-freedom.axis), freedom.lower, freedom.upper
             own = [np.array([value]) for value in (np.inf, VIRTUAL_VELOCITY, low, high)]
             parent = model.addJoint(parent, joint, clean(placement), joint_name, *own)
             placement = pin.SE3.Identity()

@@ -15,7 +15,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.program.term_rows import FrameAt, TermAt, TermRow, Tree, Value
 from vkc_pin.program.transcription import Transcription
 from vkc_pin.scene.scene import Scene
-from vkc_pin.task.phases import Phase, Task, stretches
+from vkc_pin.task.phases import Task, stretches
 from vkc_pin.task.terms import Cost, Term
 
 __all__ = ["TermNumbers", "term_goals"]
@@ -95,10 +95,8 @@ class _Whereabouts:
         if owner in phase.left:  # where the hand let go of it
             hold, last = phase.left[owner]
             return self._on_chain(self.chain.frame(link, hold), self.ends[last])
-        return FrameAt(_numbers(self._standing(phase, owner) * item.link_placement(link, placed.state)))
-
-    def _standing(self, phase: Phase, owner: str) -> pin.SE3:
-        return phase.standing.get(owner, self.scene.objects[owner].placement)
+        stands = phase.standing.get(owner, placed.placement)
+        return FrameAt(_numbers(stands * item.link_placement(link, placed.state)))
 
     def _on_chain(self, at: tuple[int, pin.SE3], waypoint: int) -> FrameAt:
         joint, local = at

@@ -65,11 +65,12 @@ def initialize(
     else:
         shared = _Shared(problem, seed, said, Routes(problem, interrupt), Known(), interrupt)
         if method == "auto":
-            around = _AStar(shared)
+            around = _SeedSearch(shared, "astar")
             trees = _Rrt(shared, around)
-            seeds = _in_turn(_Interpolated(shared).seeds(count), around.seeds(count), trees.seeds(max(count, 2)))
+            straight = _SeedSearch(shared, "interpolated")
+            seeds = _in_turn(straight.seeds(count), around.seeds(count), trees.seeds(max(count, 2)))
         else:
-            seeds = _SEARCHES[method](shared).seeds(count)
+            seeds = (_Rrt(shared) if method == "rrt" else _SeedSearch(shared, method)).seeds(count)
     rng = np.random.default_rng([seed, 1])
     for item in seeds:
         yield replace(item, z=_perturbed(problem, item.z, perturbation, rng)) if perturbation else item
@@ -133,19 +134,23 @@ class _Shared:
 class _SeedSearch:
     """Joins the knots of the cheapest paths.
 
+    Args:
+        shared: Problem, random numbers, notes.
+        method: "interpolated": straight from knot to knot; "astar": the base along the shortest path, the arm straight.
+
     Attributes:
-        method: Its name among `INITIALIZATIONS`.
         enough: Shortfalls with which nobody looks for a better seed, summed over waypoints [m].
         found: What its last search found, if that is any good.
     """
 
-    method: ClassVar[str]
     enough: ClassVar[float] = _FREE
 
-    def __init__(self, shared: _Shared, beam: Beam, joiner: Joiner) -> None:
-        self.problem, self.notes, self.beam, self.joiner = shared.problem, shared.notes, beam, joiner
-        self.interrupt = shared.interrupt
+    def __init__(self, shared: _Shared, method: str) -> None:
+        self.problem, self.notes, self.method, self.interrupt = shared.problem, shared.notes, method, shared.interrupt
         self.found: Found | None = None
+        knots, routes = shared.knots(), shared.driven if method == "astar" else None
+        self.beam = Beam(knots, routes, interrupt=shared.interrupt)
+        self.joiner = Joiner(knots, Approach(knots), None if routes is None else DrivenPaths(routes))
 
     def seeds(self, count: int) -> Iterator[Seed]:
         """Yield seeds through the cheapest paths of knots: of one quick search if that is any good, then of thorough ones."""
@@ -209,27 +214,6 @@ class _SeedSearch:
         return best
 
 
-class _Interpolated(_SeedSearch):
-    """Straight from knot to knot."""
-
-    method = "interpolated"
-
-    def __init__(self, shared: _Shared) -> None:
-        knots = shared.knots()
-        super().__init__(shared, Beam(knots, interrupt=shared.interrupt), Joiner(knots, Approach(knots), None))
-
-
-class _AStar(_SeedSearch):
-    """The base along the shortest path around what stands there, the arm straight."""
-
-    method = "astar"
-
-    def __init__(self, shared: _Shared) -> None:
-        knots, routes = shared.knots(), shared.driven
-        paths = None if routes is None else DrivenPaths(routes)
-        super().__init__(shared, Beam(knots, routes, interrupt=shared.interrupt), Joiner(knots, Approach(knots), paths))
-
-
 class _Rrt(_SeedSearch):
     """Base and arm together along what two random trees find; slow, so the first seed that is nearly free will do.
 
@@ -238,15 +222,14 @@ class _Rrt(_SeedSearch):
         around: Its search comes first, if what that found hits nothing.
     """
 
-    method = "rrt"
     enough = _POOR
 
-    def __init__(self, shared: _Shared, around: _AStar | None = None) -> None:
-        knots = shared.knots()
-        beam = Beam(knots, shared.driven, careful=True, interrupt=shared.interrupt)
+    def __init__(self, shared: _Shared, around: _SeedSearch | None = None) -> None:
+        super().__init__(shared, "rrt")
+        knots, self.around = shared.knots(), around
+        self.beam = Beam(knots, shared.driven, careful=True, interrupt=shared.interrupt)
         trees = RrtPaths(knots, shared.routes, shared.interrupt)
-        super().__init__(shared, beam, Joiner(knots, Approach(knots, stands=True), trees))
-        self.around = around
+        self.joiner = Joiner(knots, Approach(knots, stands=True), trees)
 
     def _search(self, attempt: int) -> Found | None:
         """Return what a search finds, None if it is no good: a quick one, then thorough ones, every other backwards."""
@@ -265,9 +248,6 @@ class _Rrt(_SeedSearch):
             if all(_distance(paths[index], paths[other]) > _DIFFERENT for other in kept):
                 kept.append(index)
         return kept[:_TREE_PATHS]
-
-
-_SEARCHES: dict[str, type[_Interpolated | _AStar | _Rrt]] = {search.method: search for search in (_Interpolated, _AStar, _Rrt)}
 
 
 def _distance(path: Floats, other: Floats) -> float:

@@ -110,11 +110,13 @@ class Knots:
         if pose is None:
             return np.clip(z, lower, upper), np.ones(len(z), bool)
         solver, target = self.solver(pose)
-        if how == "scatter":
-            self._choose(z, waypoint)
-            z = self._scatter(z, pose)
-        elif how == "shake":
-            z = self._shake(z, pose)
+        if how == "scatter":  # grasps anywhere, arms near home and every other near where it comes from
+            for hold in self.problem.task.phases[int(np.searchsorted(self.problem.ends, waypoint))].grasps:
+                for column in map(self.chain.index, self.chain.virtual[hold]):
+                    z[:, column] = self.rng.uniform(self.chain.lower[column], self.chain.upper[column], len(z))
+            z[::2, 3 : self.robot] = self.chain.robot.home
+        if how != "track":
+            z = self._shaken(z, pose, (0.1, 1.0) if how == "scatter" else (0.05, 0.5))
         z, found = solver.solve(z, target, lower=lower, upper=upper, weights=self.weights, tolerance=KNOT_TOLERANCE)
         if how == "scatter":
             z = self._unwind(z, before, lower, upper)
@@ -145,27 +147,11 @@ class Knots:
                 lower[:, column] = upper[:, column] = before[:, column]
         return lower, upper
 
-    def _choose(self, z: Floats, waypoint: int) -> None:
-        """Grasp anywhere: draw the freedoms of what is grasped at a waypoint, in place."""
-        problem = self.problem
-        for hold in problem.task.phases[int(np.searchsorted(problem.ends, waypoint))].grasps:
-            for column in map(self.chain.index, self.chain.virtual[hold]):
-                z[:, column] = self.rng.uniform(self.chain.lower[column], self.chain.upper[column], len(z))
-
-    def _scatter(self, z: Floats, pose: int) -> Floats:
-        """Return arms near home, and every other near where it comes from, with the base under them as `pose` needs it."""
-        home = self.chain.robot.home
-        spread = self.rng.uniform(0.1, 1.0, (len(z), 1))
-        z = z.copy()
-        z[::2, 3 : self.robot] = home
-        z[:, 3 : self.robot] += spread * self.rng.normal(0.0, 1.0, (len(z), len(home)))
-        return self._stand(np.clip(z, self.problem.chain.lower, self.problem.chain.upper), pose)
-
-    def _shake(self, z: Floats, pose: int) -> Floats:
-        spread = self.rng.uniform(0.05, 0.5, (len(z), 1))
-        z = z.copy()
+    def _shaken(self, z: Floats, pose: int, deviations: tuple[float, float]) -> Floats:
+        """Return other arms, of standard deviations between two [m] and [rad], with the base under them as `pose` needs it."""
+        spread, z = self.rng.uniform(*deviations, (len(z), 1)), z.copy()
         z[:, 3 : self.robot] += spread * self.rng.normal(0.0, 1.0, (len(z), self.robot - 3))
-        return self._stand(np.clip(z, self.problem.chain.lower, self.problem.chain.upper), pose)
+        return self._stand(np.clip(z, self.chain.lower, self.chain.upper), pose)
 
     def _stand(self, z: Floats, pose: int) -> Floats:
         """Move the bases so that pose `pose` fits in place and heading; its height and tilt are left to the arm.

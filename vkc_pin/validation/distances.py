@@ -28,6 +28,7 @@ class Solids:
         world: The world, with G shapes.
         bodies: How many of these, the first, belong to the robot or an object; the others are obstacles.
         center, half: Of a box around each in its own frame, centre and half extents, shape (G, 3) [m].
+        obstacle_corners, obstacle_transforms: See `corners`, and where they are, for coal.
     """
 
     def __init__(self, world: World) -> None:
@@ -36,8 +37,8 @@ class Solids:
         self.center = np.array([center for center, _ in boxes]).reshape(-1, 3)
         self.half = np.array([half for _, half in boxes]).reshape(-1, 3)
         obstacles = slice(self.bodies, None)
-        self._obstacle_corners = self._corners([shape.placement for shape in world.shapes[obstacles]], obstacles)
-        self._obstacle_transforms = [_transform(shape.placement) for shape in world.shapes[obstacles]]
+        self.obstacle_corners = self.corners([shape.placement for shape in world.shapes[obstacles]], obstacles)
+        self.obstacle_transforms = [_transform(shape.placement) for shape in world.shapes[obstacles]]
         self._geometries = [shape.geometry for shape in world.shapes]
         self._data = world.model.createData()
         self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
@@ -48,26 +49,18 @@ class Solids:
         pin.updateGeometryPlacements(self.world.model, self._data, self.world.bodies, placed, q)
         return Placed(self, placed)
 
-    def corners(self, where: Sequence[pin.SE3]) -> tuple[Floats, Floats]:
-        """Return lower and upper corners of boxes along the world's axes around all shapes, shape (G, 3) each [m].
+    def corners(self, where: Sequence[pin.SE3], which: slice) -> tuple[Floats, Floats]:
+        """Return lower and upper corners of boxes along the world's axes around some shapes, shape (k, 3) each [m].
 
         Args:
-            where: Placements of the shapes of robot and objects in the world.
+            where: Placements of these shapes in the world.
+            which: The shapes.
         """
-        bodies = self._corners(where, slice(self.bodies))
-        lower, upper = (np.concatenate(parts) for parts in zip(bodies, self._obstacle_corners, strict=True))
-        return lower, upper
-
-    def _corners(self, where: Sequence[pin.SE3], which: slice) -> tuple[Floats, Floats]:
         rotation = np.array([placement.rotation for placement in where]).reshape(-1, 3, 3)
         translation = np.array([placement.translation for placement in where]).reshape(-1, 3)
         middle = (rotation @ self.center[which, :, None])[..., 0] + translation
         extent = (np.abs(rotation) @ self.half[which, :, None])[..., 0]
         return middle - extent, middle + extent
-
-    def obstacle_transform(self, shape: int) -> coal.Transform3s:
-        """Return where an obstacle is, for coal."""
-        return self._obstacle_transforms[shape - self.bodies]
 
     def distance(
         self, first: int | coal.CollisionGeometry, here: coal.Transform3s, second: int, there: coal.Transform3s
@@ -97,7 +90,9 @@ class Placed:
     @cached_property
     def corners(self) -> tuple[Floats, Floats]:
         """Lower and upper corners of boxes along the world's axes around all shapes, shape (G, 3) each [m]."""
-        return self._solids.corners(list(self._where))
+        bodies = self._solids.corners(list(self._where), slice(self._solids.bodies))
+        lower, upper = (np.concatenate(parts) for parts in zip(bodies, self._solids.obstacle_corners, strict=True))
+        return lower, upper
 
     def bounds(self, pairs: Ints) -> Floats:
         """Return lower bounds of the distances of pairs, shape (n, 2), shape (n,) [m]; -inf where the boxes overlap."""
@@ -139,7 +134,7 @@ class Placed:
 
     def _transform(self, shape: int) -> coal.Transform3s:
         if shape >= self._solids.bodies:
-            return self._solids.obstacle_transform(shape)
+            return self._solids.obstacle_transforms[shape - self._solids.bodies]
         if shape not in self._transforms:
             self._transforms[shape] = _transform(self._where[shape])
         return self._transforms[shape]

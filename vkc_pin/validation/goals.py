@@ -143,25 +143,20 @@ def _check_order(samples: Samples, steps: Sequence[Step], hands: list[set[str]],
             last, phase = max(turns), phases[k]
             name = next(owner for owner in moved[k] if owner not in own[last])
             amount, unit = moved[k][name]
-            detail = (
-                f"moves by {amount:.4f} {unit} in '{phase.name}', when it is the turn of step {last + 1}, {_kind(steps[last])}"
-            )
+            instead = f"when it is the turn of step {last + 1}, {type(steps[last]).__name__}"
+            detail = f"moves by {amount:.4f} {unit} in '{phase.name}', {instead}"
             return [_violation(samples, "order", phase.first, Miss(name, amount, unit, detail))]
         turns = left
     if len(steps) - 1 in turns:
         return []
     first = max(turns)
-    detail = f"{_kind(steps[first])} is undone before the next step begins"
+    detail = f"{type(steps[first]).__name__} is undone before the next step begins"
     return [_violation(samples, "order", phases[-1].last, Miss(f"step {first + 1}", 1.0, "steps", detail))]
 
 
 def _violation(samples: Samples, constraint: str, waypoint: int, miss: Miss) -> Violation:
     """Return what is missed at a waypoint as a violation."""
     return Violation(constraint, waypoint=waypoint, time=float(samples.trajectory.times[waypoint]), **miss._asdict())
-
-
-def _kind(step: Step) -> str:
-    return type(step).__name__
 
 
 def _carried(samples: Samples, number: int, named: set[str]) -> dict[str, tuple[float, str]]:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vkc_pin.motion.trajectory import Trajectory
+from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.options import Options
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.steps import Step
@@ -155,14 +155,9 @@ class _Check:
             for i, name in enumerate(self.trajectory.names):
                 if i < self.trajectory.robot_size or name in driven or name in self.samples.virtual:
                     continue
-                column = self.trajectory.positions[phase.first : phase.last + 1, i]
-                moved = np.abs(column - column[0])
-                worst = int(np.argmax(moved))
-                if not moved[worst] <= MOTION_TOLERANCE:
-                    owner, unit = name.partition(".")[0], self.samples.unit(name)
-                    why = "where it is held, nothing drives it" if owner in phase.held else f"nobody holds {owner}"
-                    detail = f"moves by {moved[worst]:.4f} {unit} while {why}"
-                    self._add("unheld", name, moved[worst], unit, detail, waypoint=phase.first + worst)
+                owner = name.partition(".")[0]
+                why = "where it is held, nothing drives it" if owner in phase.held else f"nobody holds {owner}"
+                self._still(phase, "unheld", name, "moves by ", f" while {why}")
 
     def _latches(self) -> None:
         """A latched joint leaves where it is held only while the joint that releases it is far enough.
@@ -216,12 +211,17 @@ class _Check:
             for owner, attachment in phase.held.items():
                 grasp = self.scene.objects[owner].object.attachments[attachment]
                 for name in grasp.coordinates if grasp.firm else ():
-                    values = self.trajectory.column(f"{owner}.{name}")[phase.first : phase.last + 1]
-                    moved, unit = np.abs(values - values[0]), self.samples.unit(f"{owner}.{name}")
-                    worst = int(np.argmax(moved))
-                    if not moved[worst] <= MOTION_TOLERANCE:
-                        detail = f"the hand moves on '{owner}' by {moved[worst]:.4f} {unit} while it clamps it"
-                        self._add("slide", f"{owner}.{name}", moved[worst], unit, detail, waypoint=phase.first + worst)
+                    detail = f"the hand moves on '{owner}' by "
+                    self._still(phase, "slide", f"{owner}.{name}", detail, " while it clamps it")
+
+    def _still(self, phase: PhaseSpan, constraint: str, name: str, before: str, after: str) -> None:
+        """A coordinate does not change in a phase; what is said of it goes around by how much."""
+        values = self.trajectory.column(name)[phase.first : phase.last + 1]
+        moved, unit = np.abs(values - values[0]), self.samples.unit(name)
+        worst = int(np.argmax(moved))
+        if not moved[worst] <= MOTION_TOLERANCE:
+            detail = f"{before}{moved[worst]:.4f} {unit}{after}"
+            self._add(constraint, name, moved[worst], unit, detail, waypoint=phase.first + worst)
 
     def _clearance(self) -> float:
         """Nothing comes too close at a waypoint (eqs. 6 and 7) or penetrates anywhere; return the smallest distance [m].

@@ -250,23 +250,19 @@ class Drawing:
             for owner, joints in self.movers.items():
                 away = self.motion.away(joints, row).tolist()
                 self._clip(movie, f"ghosts/{name}/{owner}", [Track("visible", "bool", times, away)])
+        found = self.report.violations if self.report is not None else ()
+        collisions = [v for v in found if v.constraint in ("clearance", "penetration")]
         for item in self.items:
-            moments = [v.time for v in self._collisions() if item.label in v.subject.split(" – ")]
+            moments = [v.time for v in collisions if item.label in v.subject.split(" – ")]
             if moments:
                 self._clip(movie, f"{item.path}/<object>", [self._alarm(item, moments)])
         return movie
 
-    def _collisions(self) -> list[Any]:
-        found = self.report.violations if self.report is not None else ()
-        return [v for v in found if v.constraint in ("clearance", "penetration")]
-
     def _alarm(self, item: Item, moments: list[float]) -> Track:
         """Return a track that colours an item red around `moments` [s]."""
         first, last = self.motion.times[0], self.motion.times[-1]
-        edges = {first, last}
-        for moment in moments:
-            edges |= {t for d in (_ALARM_TIME, _ALARM_TIME - 0.05) for t in (moment - d, moment + d) if first < t < last}
-        times = sorted(edges)
+        edges = (moment + d for moment in moments for a in (_ALARM_TIME, _ALARM_TIME - 0.05) for d in (-a, a))
+        times = sorted({first, last, *(t for t in edges if first < t < last)})
         red = [any(abs(t - moment) < _ALARM_TIME - 0.02 for moment in moments) for t in times]
         colours = [[float(c) for c in (_ALARM if alarm else item.colour[:3])] for alarm in red]
         return Track("material.color", "color", [float(t - first) for t in times], colours)

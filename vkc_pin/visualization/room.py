@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.arrays import Floats
-from vkc_pin.models.shapes import bounding_box
+from vkc_pin.models.shapes import world_box
 from vkc_pin.scene.scene import Scene
 from vkc_pin.visualization.solids import Solid, box_solid, shade, to_solid
 
@@ -93,15 +92,11 @@ class Room:
 
     def obstructions(self) -> list[tuple[Floats, Floats, float]]:
         """Return boxes that hide what is behind them: lower and upper corner, shape (3,) each [m], and opacity."""
-        boxes = []
-        for shape in [*self._walls, *self._furniture]:
-            center, half = bounding_box(shape)
-            corners = itertools.product(*zip(center - half, center + half, strict=True))
-            placed = np.array([shape.placement.act(np.array(corner)) for corner in corners])
-            wall = any(shape is other for other in self._walls)
-            opacity = (0.6 if self._divides(shape) else 0.0) if wall else 1.0
-            boxes.append((placed.min(axis=0), placed.max(axis=0), opacity))
-        return boxes
+        opacities = [
+            *((wall, 0.6 if self._divides(wall) else 0.0) for wall in self._walls),
+            *((one, 1.0) for one in self._furniture),
+        ]
+        return [(*world_box(shape.geometry, shape.placement), opacity) for shape, opacity in opacities]
 
     def _inside(self, shape: pin.GeometryObject) -> tuple[int, float]:
         """Return the thin axis of a wall, in its own frame, and the sign of its side towards the middle of the arena."""

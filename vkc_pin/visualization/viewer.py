@@ -62,7 +62,8 @@ def show(
     viewer = open_viewer()
     _draw(viewer, scene, plan, frames=frames)
     sys.stdout.write(f"meshcat shows it at {viewer.url()}\n")
-    if _has_screen() if open_browser is None else open_browser:
+    screen = sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    if screen if open_browser is None else open_browser:
         import webbrowser
 
         webbrowser.open(viewer.url(), new=2)
@@ -127,9 +128,8 @@ def open_viewer() -> meshcat.Visualizer:
 
 
 def _start_server() -> tuple[subprocess.Popen[bytes], str, str]:
-    file = Path(__file__).with_name("server.py")
     # -P: the folder of that file is no place to import from.
-    command = [sys.executable, "-P", "-u", str(file)]
+    command = [sys.executable, "-P", "-u", str(Path(__file__).with_name("server.py"))]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     process = subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment, start_new_session=True
@@ -182,7 +182,3 @@ def _film(scene: Scene, plan: Judged | None) -> dict[str, Any]:
         "notes": [{"text": f"{v.constraint}: {v.subject}", "time": v.time} for v in plan.validation.violations],
         "headline": f"{scene.name}: {'success' if plan.success else 'FAILED, ' + plan.status}",
     }
-
-
-def _has_screen() -> bool:
-    return sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

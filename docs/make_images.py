@@ -15,7 +15,6 @@ import vkc_pin as vkc
 from vkc_pin.benchmarks import chores
 from vkc_pin.visualization import drawing
 from vkc_pin.visualization import viewer as visualization
-from vkc_pin.visualization.camera import Viewpoint
 
 ROOT = Path(__file__).parent.parent
 IMAGES = ROOT / "docs" / "images"
@@ -36,7 +35,7 @@ from helpers.browser import screenshot  # noqa: E402
 
 def look(target: tuple[float, ...], position: tuple[float, ...]) -> None:
     """Take this camera instead of one that is chosen for the motion as a whole."""
-    drawing.choose_viewpoint = lambda *_: Viewpoint(np.array(target), np.array(position))  # type: ignore[assignment]
+    drawing.choose_viewpoint = lambda *_: (np.array(target), np.array(position))  # type: ignore[assignment]
 
 
 def picture(shown: vkc.Plan | vkc.Scene, name: str, size: tuple[int, int], time: float | None = None) -> None:

@@ -53,7 +53,7 @@ def test_contracts_hold(copy: Path) -> None:
         ("files/writing.py", "from vkc_pin.models.robot import Robot", "Every import goes down"),
         ("models/robot.py", "def _late():\n    from vkc_pin.planning.plan import Plan", "Every import goes down"),
         ("scene/scene.py", "if TYPE_CHECKING:\n    from vkc_pin.planning.plan import Plan", "Every import goes down"),
-        ("validation/travel.py", "from vkc_pin.task.compiler import compile_task", "Validation and motion know neither"),
+        ("validation/distances.py", "from vkc_pin.task.compiler import compile_task", "Validation and motion know neither"),
         ("seeds/beam.py", "import casadi", "Few import CasADi"),
         ("models/coordinates.py", "from vkc_pin.models import robot", "No circles among siblings"),
         ("program/problem.py", "from vkc_pin.visualization.viewer import show", "Every import goes down"),

@@ -11,7 +11,7 @@ from helpers.small_problems import door_scene, program_of
 
 import vkc_pin as vkc
 from vkc_pin.baselines.arm_kinematics import ArmKinematics
-from vkc_pin.baselines.poses import base_poses
+from vkc_pin.baselines.postures import base_poses
 from vkc_pin.seeds.knots import Knots
 
 SLIDE = {"slide": 0.3}

@@ -16,7 +16,7 @@ from helpers.small_problems import program_of
 import vkc_pin as vkc
 from vkc_pin.baselines import BASELINES, attempt, plan_separately, poses
 from vkc_pin.baselines.attempt import Attempt
-from vkc_pin.baselines.failure import FailedError
+from vkc_pin.baselines.following import FailedError
 from vkc_pin.baselines.postures import postures
 from vkc_pin.motion.world import World
 from vkc_pin.seeds.routes import Routes

@@ -14,7 +14,7 @@ from helpers.small_problems import all_pairs, program_of
 import vkc_pin as vkc
 from vkc_pin.baselines import refining as module
 from vkc_pin.baselines.arm_kinematics import ArmKinematics
-from vkc_pin.baselines.poses import base_poses
+from vkc_pin.baselines.postures import base_poses
 from vkc_pin.baselines.refining import refined
 from vkc_pin.seeds.knots import Knots
 

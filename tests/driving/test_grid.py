@@ -74,7 +74,7 @@ def test_moves_between_cells_are_free_all_along(grid: BaseGrid, reaching: bool) 
 def test_distances_are_those_of_the_moves_that_are_not_known_to_be_blocked(grid: BaseGrid) -> None:
     """Against a graph built move by move; no way over moves that are really free is shorter."""
     start = grid.center(30, 20)
-    found = grid.distances(start)
+    found = grid.distances_from(np.array([start[:2]]))[0]
     rows, columns, lengths = [], [], []
     for i, j in np.ndindex(100, 100):
         for heading in range(HEADINGS):
@@ -97,7 +97,7 @@ def test_distances_are_those_of_the_moves_that_are_not_known_to_be_blocked(grid:
 def test_distances_around_a_wall() -> None:
     wall: list[Shape] = [(coal.Box(0.1, 8.0, 1.0), at(0.0, -1.0, 0.5))]
     grid = BaseGrid(chassis(), [], wall, HALL, MARGIN)
-    found = grid.distances((-2.0, -3.0))
+    found = grid.distances_from(np.array([(-2.0, -3.0)]))[0]
     corner = np.array([0.0, 3.0 + 0.335])
     around = np.hypot(*(corner - (-2.0, -3.0))) + np.hypot(*(corner - grid.center(69, 20)))
     assert around < found[69, 20] < 1.1 * around

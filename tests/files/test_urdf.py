@@ -109,10 +109,10 @@ def test_a_tree_is_as_pinocchio_reads_it(tmp_path: Path) -> None:
     <parent link="b"/><child link="c"/><origin xyz="0 0 1"/><axis xyz="1 0 0"/><limit lower="0" upper="1" velocity="1"
     effort="1"/></joint></robot>"""
     (tmp_path / "t.urdf").write_text(text)
-    tree, model = load_urdf(tmp_path / "t.urdf"), pin.buildModelFromXML(text)
-    assert tree.model == model
+    (own, collision, _), model = load_urdf(tmp_path / "t.urdf"), pin.buildModelFromXML(text)
+    assert own == model
     theirs = pin.buildGeomFromUrdfString(model, text, pin.GeometryType.COLLISION)
-    for ours, other in zip(tree.collision.geometryObjects, theirs.geometryObjects, strict=True):
+    for ours, other in zip(collision.geometryObjects, theirs.geometryObjects, strict=True):
         assert (ours.name, ours.parentJoint, ours.parentFrame) == (other.name, other.parentJoint, other.parentFrame)
         assert ours.placement.isApprox(other.placement, 1e-14)
         assert ours.geometry == other.geometry

@@ -168,10 +168,10 @@ def test_shapes_stand_where_pinocchio_has_them(tmp_path: Path) -> None:
         shapes += f"<collision>{origin}<geometry>{SHAPES[0]}</geometry></collision>"
     file = tmp_path / "thing.urdf"
     file.write_text(URDF.replace('<link name="panel"/>', f'<link name="panel">{shapes}</link>'))
-    tree = load_urdf(file)
-    theirs = pin.buildGeomFromUrdfString(tree.model, file.read_text(), pin.GeometryType.COLLISION).geometryObjects
-    assert [s.name for s in tree.collision.geometryObjects] == [s.name for s in theirs]
-    for ours, other in zip(tree.collision.geometryObjects, theirs, strict=True):
+    model, collision, _ = load_urdf(file)
+    theirs = pin.buildGeomFromUrdfString(model, file.read_text(), pin.GeometryType.COLLISION).geometryObjects
+    assert [s.name for s in collision.geometryObjects] == [s.name for s in theirs]
+    for ours, other in zip(collision.geometryObjects, theirs, strict=True):
         np.testing.assert_allclose(ours.placement.homogeneous, other.placement.homogeneous, rtol=0.0, atol=1e-15)
         assert (ours.parentJoint, ours.parentFrame) == (other.parentJoint, other.parentFrame)
 

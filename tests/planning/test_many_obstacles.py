@@ -19,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vkc_pin.benchmarks.scale import crowded
-from vkc_pin.chain import margins as easing
+from vkc_pin.chain import collision_pairs as easing
 from vkc_pin.chain.broadphase import PhaseGeometry
 from vkc_pin.chain.contacts import ContactModel
 from vkc_pin.driving.body import Body
@@ -35,11 +35,10 @@ from vkc_pin.scene.placed import standing_geometry
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step
 from vkc_pin.validation.clearance import clearance_curves
-from vkc_pin.validation.distances import Placed
+from vkc_pin.validation.distances import Placed, travelled
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.touching import may_touch
-from vkc_pin.validation.travel import travelled
 
 SEEDS = st.integers(0, 2**32 - 1)
 POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array([0.4, 0.2, 0.9]))

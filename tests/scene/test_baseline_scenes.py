@@ -16,8 +16,7 @@ from vkc_pin.models.robot import Robot
 from vkc_pin.models.shapes import clearance, link_name, placed_shapes
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.placed import PlacedObject, standing_geometry
-from vkc_pin.scene.scene import Scene, load_scene
-from vkc_pin.scene.start import START_CLEARANCE
+from vkc_pin.scene.scene import START_CLEARANCE, Scene, load_scene
 
 SCENES = ("corridor_door", "aisle_drawer")
 GOALS = {"corridor_door": ("door", {"hinge": 1.5}), "aisle_drawer": ("drawer", {"slide": 0.6})}

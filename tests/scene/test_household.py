@@ -22,8 +22,7 @@ from vkc_pin.models.robot import Robot
 from vkc_pin.models.shapes import clearance, link_name, placed_shapes
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.placed import PlacedObject, standing_geometry
-from vkc_pin.scene.scene import Scene, load_scene
-from vkc_pin.scene.start import START_CLEARANCE
+from vkc_pin.scene.scene import START_CLEARANCE, Scene, load_scene
 
 DIST_SAFE, GRASP_CLEARANCE = 0.02, 0.005  # [m], the planner's
 JOINTS = {  # joint → upper limit, velocity and acceleration; all start at 0

@@ -16,8 +16,7 @@ from vkc_pin.models.object_file import load_object
 from vkc_pin.models.robot import Robot
 from vkc_pin.models.shapes import clearance, placed_shapes
 from vkc_pin.scene.placed import standing_geometry
-from vkc_pin.scene.scene import Scene, load_scene
-from vkc_pin.scene.start import START_CLEARANCE
+from vkc_pin.scene.scene import START_CLEARANCE, Scene, load_scene
 
 SCENES = ("init_1", "init_2", "init_3")
 STICK = np.array([2.5, 1.0])

@@ -12,8 +12,7 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.models.shapes import clearance, placed_shapes
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.placed import standing_geometry
-from vkc_pin.scene.scene import Scene, load_scene
-from vkc_pin.scene.start import START_CLEARANCE
+from vkc_pin.scene.scene import START_CLEARANCE, Scene, load_scene
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from vkc_pin.models.robot_file import load_robot
-from vkc_pin.scene.start import StartRegion, start_limits
+from vkc_pin.scene.scene_schema import RegionSchema
 
 
 @pytest.mark.parametrize("yaw", [None, (0.5, 0.7)])
@@ -17,7 +17,7 @@ def test_draws_fill_the_region_and_nothing_else(yaw: tuple[float, float] | None)
     if yaw is not None:
         low[2], high[2] = yaw
     rng = np.random.default_rng(0)
-    drawn = np.array(list(itertools.islice(StartRegion((-1.0, 3.0), (2.0, 2.5), yaw).draws(rng), 2000)))
+    drawn = np.array(list(itertools.islice(RegionSchema(x=(-1.0, 3.0), y=(2.0, 2.5), yaw=yaw).draws(rng), 2000)))
     assert ((drawn >= low) & (drawn <= high)).all()
     shares = (drawn - low) / (high - low)
     counts = np.array([np.histogram(column, 4, (0.0, 1.0))[0] for column in shares.T])
@@ -26,17 +26,17 @@ def test_draws_fill_the_region_and_nothing_else(yaw: tuple[float, float] | None)
 
 
 def test_the_same_numbers_give_the_same_starts() -> None:
-    region = StartRegion((0.0, 1.0), (0.0, 1.0))
+    region = RegionSchema(x=(0.0, 1.0), y=(0.0, 1.0))
     one, other = (next(region.draws(np.random.default_rng(5))) for _ in range(2))
     np.testing.assert_array_equal(one, other)
 
 
 def test_limits_of_a_start_are_the_robots_unless_its_base_cannot_move() -> None:
     robot, fixed = load_robot("husky_ur5e"), load_robot("husky_ur5e", base="fixed")
-    for mine, its in zip(start_limits(robot), (robot.lower, robot.upper), strict=True):
+    for mine, its in zip(robot.start_limits, (robot.lower, robot.upper), strict=True):
         np.testing.assert_array_equal(mine, its)
         assert mine is not its
-    lower, upper = start_limits(fixed)
+    lower, upper = fixed.start_limits
     assert np.isneginf(lower[:3]).all()
     assert np.isposinf(upper[:3]).all()
     np.testing.assert_array_equal(lower[3:], fixed.lower[3:])

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vkc_pin.motion.world import World
+from vkc_pin.validation.distances import travelled
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.samples import Samples
-from vkc_pin.validation.travel import travelled
 
 
 @settings(max_examples=25, deadline=None)

@@ -220,7 +220,7 @@ def test_page_says_what_the_motion_is(page: Path, plan: Plan) -> None:
 def test_page_is_written_whole_or_not_at_all(plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     target = tmp_path / "door.html"
     target.write_text("before")
-    monkeypatch.setattr("vkc_pin.visualization.page._packed", lambda data: 1 / 0)
+    monkeypatch.setattr("vkc_pin.visualization.viewer._packed", lambda data: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         visualization.to_html(plan, target)
     assert [file.name for file in tmp_path.iterdir()] == ["door.html"]
@@ -228,7 +228,7 @@ def test_page_is_written_whole_or_not_at_all(plan: Plan, tmp_path: Path, monkeyp
 
 
 def test_names_cannot_break_out_of_the_page() -> None:
-    from vkc_pin.visualization.page import Recorder, render_page
+    from vkc_pin.visualization.viewer import Recorder, render_page
 
     text = render_page(Recorder(), title="<b>%FILM%", film={"headline": "</script><b>"})
     assert "<b>" not in text

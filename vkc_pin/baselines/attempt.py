@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -10,11 +11,9 @@ from dataclasses import replace
 import numpy as np
 
 from vkc_pin.arrays import Floats
-from vkc_pin.baselines.failure import FailedError
-from vkc_pin.baselines.following import follow
+from vkc_pin.baselines.following import FailedError, follow
 from vkc_pin.baselines.paths import BasePaths, headings
-from vkc_pin.baselines.poses import base_poses
-from vkc_pin.baselines.postures import at_home, postures, through
+from vkc_pin.baselines.postures import at_home, base_poses, postures, through
 from vkc_pin.cache import Cache
 from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.motion.splicing import join
@@ -89,8 +88,9 @@ class Attempt:
                     self._actuate(step)
                 elif isinstance(step, Place):
                     self._place(step)
-                else:
-                    self._go(step)
+                else:  # drive somewhere, at whichever heading is best if none is asked for
+                    goals = headings(step, float(self.scene.start[2]))
+                    self._withdrawn(functools.partial(self._drive, goals), FailedError("no base path"))
         except FailedError as error:
             came = len(self.parts) + error.came
             parts = [*self.parts, *error.parts]
@@ -114,11 +114,6 @@ class Attempt:
             self._take_hold([Grasp(step.object, step.attachment)])
         poses = self._poses(self._problem([step]))
         self._drive_and_reach([step], poses, _ENDS)
-
-    def _go(self, step: GoTo) -> None:
-        """Drive somewhere, at whichever heading is best if none is asked for."""
-        goals = headings(step, float(self.scene.start[2]))
-        self._withdrawn(lambda: self._drive(goals), FailedError("no base path"))
 
     def _take_hold(self, steps: Sequence[Step]) -> None:
         """Drive to the nearest base pose from which the arm reaches what is to be grasped, and reach for it."""
@@ -252,7 +247,6 @@ class Attempt:
             raise failure
 
     def _here(self) -> GoTo:
-        """Return the step of the base to where it is."""
         return GoTo(*self.scene.start[:3].tolist())
 
     def _problem(self, steps: Sequence[Step], options: Options | None = None, scene: Scene | None = None) -> TrajectoryProblem:

@@ -10,15 +10,36 @@ from vkc_pin.arrays import Floats
 from vkc_pin.baselines.arm_kinematics import ArmKinematics
 from vkc_pin.baselines.refining import CLEAR, refined
 from vkc_pin.interrupt import NEVER, Interrupt
+from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.knots import Knots
 
-__all__ = ["Followed", "follow"]
+__all__ = ["FailedError", "Followed", "follow"]
 
 SEEDS = 16
 """From so many random arms inverse kinematics is tried where it leads to nothing from the waypoint before."""
 _KINDS = ("", "collision", "no inverse kinematics")  # what may be wrong with a configuration, the best first
 _SPREAD = 1.0  # [rad], of half of them about the waypoint before; the others are anywhere within the limits
+
+
+class FailedError(Exception):
+    """A stage failed.
+
+    Attributes:
+        cause: Why; what becomes the plan's status.
+        parts: What was done before, and as much as there is of the stage.
+        share: How much of the stage works.
+    """
+
+    def __init__(self, cause: str, last: Trajectory | None = None, share: float = 0.0) -> None:
+        super().__init__(cause)
+        self.cause, self.share = cause, share
+        self.parts = [] if last is None else [last]
+
+    @property
+    def came(self) -> float:
+        """How many stages it came through."""
+        return len(self.parts) + self.share
 
 
 @dataclass(frozen=True, eq=False)

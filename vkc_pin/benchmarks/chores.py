@@ -164,7 +164,6 @@ def _steps(chore: str) -> list[str]:
 
 
 def _record(spec: dict[str, Any], solve: Solve) -> dict[str, Any]:
-    """Run one trial and return its record."""
     scene = load_scene(CHORES[spec["chore"]][0]).with_start(base=spec["base"])
     began = time.perf_counter()
     plan = solve(scene, spec)

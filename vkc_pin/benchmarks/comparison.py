@@ -204,7 +204,8 @@ class _Trials:
 
     def record(self, spec: dict[str, Any], *, save_failures: bool) -> dict[str, Any]:
         """Run one trial and return its record; a failure's plan is saved if asked for."""
-        _ready()
+        import pink  # noqa: F401 - planners import it when they are first called, which is no part of planning
+
         found = self._plan(spec)
         if save_failures and not found.success and found.status != "interrupted":
             found.save(self._file(spec, "failures"))
@@ -269,9 +270,3 @@ def shown(records: Sequence[Record], methods: Sequence[str]) -> int | None:
 
 
 _scene = functools.cache(load_scene)  # once per process
-
-
-@functools.cache
-def _ready() -> None:
-    """Import what planners import when they are first called, which is no part of planning."""
-    import pink  # noqa: F401

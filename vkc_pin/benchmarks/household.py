@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -47,19 +48,12 @@ def _draw(records: Sequence[Record], out: Path, tasks: Mapping[str, str], method
     """Draw success.png, base_effort.png, arm_effort.png and planning_time.png, each with all tasks and methods."""
     shown = {task: task for task in tasks}
     success_chart(records, out / "success.png", shown, methods, title="Success")
-    for field, label, shared in (
-        ("base_effort", "base effort [m]", True),
-        ("arm_effort", "arm effort [rad]", True),
-        ("planning_time", "planning time [s]", False),
-    ):
-        means_chart(records, out / f"{field}.png", shown, methods, field=field, label=label, shared=shared)
-    about = {
-        "success": "Success, with Wilson's intervals of 95 % confidence",
-        "base_effort": "Base effort: means and standard deviations",
-        "arm_effort": "Arm effort: means and standard deviations",
-        "planning_time": "Planning time: means and standard deviations",
-    }
-    return [f"![{text}]({name}.png)" for name, text in about.items()]
+    pictures = ["![Success, with Wilson's intervals of 95 % confidence](success.png)"]
+    for name, unit in (("base effort", "m"), ("arm effort", "rad"), ("planning time", "s")):
+        how: Any = {"field": name.replace(" ", "_"), "label": f"{name} [{unit}]", "shared": name.endswith("effort")}
+        means_chart(records, out / f"{how['field']}.png", shown, methods, **how)
+        pictures.append(f"![{name.capitalize()}: means and standard deviations]({how['field']}.png)")
+    return pictures
 
 
 COMPARISON = Comparison("household", "Six tasks in a home", TASKS, _draw)

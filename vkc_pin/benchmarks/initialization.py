@@ -144,7 +144,6 @@ def report(result: Mapping[str, Any]) -> str:
 
 
 def _record(spec: dict[str, Any], solve: Solve) -> dict[str, Any]:
-    """Run one trial and return its record."""
     scene = _scene(spec["scene"]).with_start(base=spec["base"])
     own = {key: spec[key] for key in ("scene", "number", "repeat", "perturbation")}
     return trial(solve(scene, spec), method=spec["method"], seed=spec["seed"], **own)

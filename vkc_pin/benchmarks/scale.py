@@ -184,7 +184,6 @@ def scale_chart(records: Sequence[Record], path: str | Path | None, *, title: st
 
 
 def _record(spec: dict[str, Any]) -> dict[str, Any]:
-    """Run one trial and return its record."""
     _warm(spec["seed"])
     scene = _crowded(spec["obstacles"]).with_start(base=spec["base"])
     return trial(_solve(scene, spec["seed"]), method="VKC", seed=spec["seed"], obstacles=spec["obstacles"], number=spec["number"])

@@ -176,8 +176,6 @@ class PhaseGeometry:
         gap_b = np.abs(_turned(turn_b.swapaxes(0, 1), between)) - half_b - _turned(mixed.swapaxes(0, 1), half_a)
         return np.asarray(np.maximum(gap_a, gap_b).max(axis=0))
 
-    # -- what does not change -------------------------------------------------------------------------------------------------
-
     @cached_property
     def _moving_count(self) -> int:
         """How many geometries, the first, are on joints; the others stand in the world."""

@@ -5,23 +5,26 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Collection, Sequence
 
+import coal
 import numpy as np
 import pinocchio as pin
 
 from vkc_pin.arrays import Floats
 from vkc_pin.chain.broadphase import PhaseGeometry
 from vkc_pin.chain.chain import VirtualKinematicChain
-from vkc_pin.chain.margins import EASED_TIME, eased_pairs
 from vkc_pin.errors import InputError
-from vkc_pin.models.shapes import bounding_box, link_name, own_name
+from vkc_pin.models.shapes import bounding_box, link_name, own_name, shape_distance, world_box
 from vkc_pin.options import Options
 from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.placed import standing_geometry
 from vkc_pin.scene.scene import Scene
-from vkc_pin.task.phases import Task
+from vkc_pin.task.phases import Phase, Task
 
-__all__ = ["phase_geometries"]
+__all__ = ["eased_pairs", "phase_geometries"]
+
+EASED_TIME = 1.0  # [s] before and after a contact in which the shapes may be close, at `Options.dt` a waypoint
+EASED_SHARE = 0.5  # margin, as a share of the distance at the contact itself
 
 
 def phase_geometries(scene: Scene, chain: VirtualKinematicChain, task: Task, options: Options) -> list[PhaseGeometry]:
@@ -95,9 +98,8 @@ class _Pairing:
         above = [i for i in moving if i in attached or (i in robots and shapes[i].parentJoint > 1)]
         table = np.concatenate([np.array(pairs).reshape(-1, 3), self._with_obstacles(len(shapes), moving, above)])
         if not len(table):
-            raise InputError(
-                "no pair of geometries can collide", field=phase.name, expected="collision geometry in robot or scene"
-            )
+            expected = "collision geometry in robot or scene"
+            raise InputError("no pair of geometries can collide", field=phase.name, expected=expected)
         boxes = zip(self._boxes[0], _boxes(shapes[own:]), self._boxes[1], strict=True)
         center, half, rotation, translation = (np.concatenate(parts) for parts in boxes)
         shapes += self._obstacles
@@ -146,3 +148,52 @@ def _boxes(shapes: Sequence[pin.GeometryObject]) -> tuple[Floats, ...]:
         np.array([shape.placement.rotation for shape in shapes]).reshape(-1, 3, 3),
         np.array([shape.placement.translation for shape in shapes]).reshape(-1, 3),
     )
+
+
+def eased_pairs(
+    scene: Scene, chain: VirtualKinematicChain, phase: Phase, part: PhaseGeometry, *, first: int, before: Phase | None, steps: int
+) -> dict[int, list[tuple[int, int, float]]]:
+    """Return pair → (first waypoint, last waypoint, margin [m]) for what may be close for a while.
+
+    A free object rests on something where it is lifted from and where it is put down; a frame that touches a target may
+    come close to what the target is on. The margin is half the distance at the contact.
+
+    Args:
+        scene: Where it happens.
+        chain: The chain.
+        phase: The phase.
+        part: Its geometry and pairs.
+        first: The waypoint at which the phase begins.
+        before: The phase before it.
+        steps: The waypoints of `EASED_TIME`.
+    """
+    shapes, last = part.shapes, first + phase.segments
+    eased: dict[int, list[tuple[int, int, float]]] = {}
+
+    def ease(moving: int, shape: coal.CollisionGeometry, where: pin.SE3, begin: int, end: int) -> None:
+        """Ease the pairs of a geometry that moves with what stands next to a shape."""
+        beside = part.within(float(part.margins.max()), *world_box(shape, where))
+        for k in part.pairs_of(moving, beside).tolist():
+            other = shapes[int(part.pairs[k, 1])]
+            distance = shape_distance(shape, where, other.geometry, other.placement)
+            if distance < part.margins[k]:
+                eased.setdefault(k, []).append((begin, end, EASED_SHARE * max(distance, 0.0)))
+
+    moments = [(h, p, first, first + steps) for h, p in phase.lifted.items()]
+    moments += [(h, p, last - steps, last) for h, p in phase.lowered.items()]
+    for hold, placement, begin, end in moments:
+        placed = dataclasses.replace(scene.objects[hold.object], placement=placement)
+        stands = {shape.name: shape.placement for shape in standing_geometry(placed)}
+        for i in chain.held_geometries[hold]:
+            ease(i, shapes[i].geometry, stands[own_name(shapes[i].name)], begin, end)
+    touches = [(goal, last - steps, last) for goal in phase.frames]
+    touches += [(goal, first, first + steps) for goal in (before.frames if before else ())]
+    for goal, begin, end in touches:
+        if not goal.touches:
+            continue
+        point, where = coal.Sphere(1e-4), pin.SE3(np.eye(3), goal.placement.translation)
+        joint, _ = chain.frame(goal.frame, goal.hold)
+        for i in range(len(chain.collision.geometryObjects)):
+            if part.labels[i] == str(goal) if goal.hold else shapes[i].parentJoint == joint:
+                ease(i, point, where, begin, end)
+    return eased

@@ -94,9 +94,8 @@ def _z_aligned(model: pin.Model, data: pin.Data, index: int) -> tuple[pin.JointM
         return pin.JointModelRUBZ(), subspace[3:]
     if kind in ("PX", "PY", "PZ", "PrismaticUnaligned"):
         return pin.JointModelPZ(), subspace[:3]
-    raise InputError(
-        "this joint cannot be inverted", field=model.names[index], expected="a revolute, continuous or prismatic joint", got=kind
-    )
+    expected = "a revolute, continuous or prismatic joint"
+    raise InputError("this joint cannot be inverted", field=model.names[index], expected=expected, got=kind)
 
 
 def _z_to(axis: Floats) -> Floats:

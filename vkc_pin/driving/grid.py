@@ -93,8 +93,6 @@ class BaseGrid:
         self.stuck, self.stuck_carrying = stuck(base, carried, standing, lattice, margin, views=views)
         self._edges: dict[tuple[int, int, int, bool, bool], bool] = {}
 
-    # -- places ---------------------------------------------------------------------------------------------------------
-
     def center(self, i: int, j: int) -> tuple[float, float]:
         """Return the world position of a cell's centre [m]."""
         return float(self.origin[0] + i * self.step[0]), float(self.origin[1] + j * self.step[1])
@@ -106,8 +104,6 @@ class BaseGrid:
         i, j = (grid.ravel() for grid in np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]), indexing="ij"))
         inside = np.hypot(self.origin[0] + i * self.step[0] - x, self.origin[1] + j * self.step[1] - y) <= radius
         return np.column_stack([i[inside], j[inside]])
-
-    # -- what is free ---------------------------------------------------------------------------------------------------
 
     def free(self, i: int, j: int, heading: int, *, reaching: bool = False) -> bool:
         """Return whether everything keeps its margin in a cell at a heading, 0 to HEADINGS - 1; `reaching` as in `clear`."""
@@ -173,8 +169,6 @@ class BaseGrid:
             )
         return self._edges[key]
 
-    # -- bounds for all cells ---------------------------------------------------------------------------------------------
-
     def _roomy(self, i: int, j: int, reaching: bool) -> bool:
         """Return whether nothing can be hit from a cell at any heading."""
         return self._room[0][i][j] >= 0.0 and (reaching or self._room[1][i][j] >= 0.0)
@@ -197,19 +191,11 @@ class BaseGrid:
                 np.minimum(room[rows, columns], distance - body.span[s], out=room[rows, columns])
         return [room.tolist() for room in rooms]
 
-    # -- distances ------------------------------------------------------------------------------------------------------
-
-    def distances(self, start: ArrayLike) -> Floats:
-        """Return how far the base drives at least from a place [m] to every cell, shape (cells, cells) [m]; infinite: no path.
-
-        Turns are free, and only what surely blocks the base counts.
-        """
-        return self.distances_from(np.asarray(start, float)[None, :2])[0]
-
     def distances_from(self, starts: Floats) -> Floats:
-        """Return `distances` for each of `starts`, shape (W, 2) [m]: shape (W, cells, cells) [m].
+        """Return how far the base drives at least from places, shape (W, 2) [m], to every cell, shape (W, cells, cells) [m].
 
-        Each start takes about a millisecond on 100 x 100 cells; for many of them, a grid of fewer cells will do.
+        Infinite: there is no path. Turns are free, and only what surely blocks the base counts. Each start takes about a
+        millisecond on 100 x 100 cells; for many of them, a grid of fewer cells will do.
         """
         blocked = np.asarray(self.stuck.all(axis=2))
         entries: list[tuple[Ints, Floats]] = []

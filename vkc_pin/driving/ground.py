@@ -97,8 +97,6 @@ class Ground:
         self.leaving = grid.leaving(*start)
         self.haste = 1.0 if self.leaving is None or np.all(np.isfinite(self.leaving)) else _AWAY
 
-    # -- what is free -------------------------------------------------------------------------------------------------------
-
     def clear(self, pose: Floats) -> bool:
         """Return whether the base is free at a pose."""
         return self.grid.clear(*pose, reaching=self._reaching(pose[:2]))
@@ -152,8 +150,6 @@ class Ground:
             if done < min(begin, 1.0):
                 yield drive.a + done * along, drive.a + min(begin, 1.0) * along
             done = max(done, end)
-
-    # -- between poses and cells --------------------------------------------------------------------------------------------
 
     def starts(self) -> Connections:
         """Return the connections from the start to the cells around it."""

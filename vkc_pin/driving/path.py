@@ -65,9 +65,8 @@ def shortest_path(
     extra = np.zeros(len(ends)) if costs is None else np.asarray(costs, float)
     for field, value, shape in (("start", begin, (3,)), ("goals", ends, (len(ends), 3)), ("costs", extra, (len(ends),))):
         if value.shape != shape or not np.all(np.isfinite(value)):
-            raise InputError(
-                "not what the search needs", field=field, expected=f"finite numbers, shape {shape}", got=value.tolist()
-            )
+            expected = f"finite numbers, shape {shape}"
+            raise InputError("not what the search needs", field=field, expected=expected, got=value.tolist())
     if np.any(extra < 0.0):
         raise InputError("a cost is negative", field="costs", expected="numbers >= 0", got=extra.tolist())
     ground = Ground(grid, begin, ends)

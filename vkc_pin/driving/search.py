@@ -193,7 +193,6 @@ class _Round:
         return queue
 
     def _free(self, entry: _Entry) -> bool:
-        """Return whether the move of an entry is free all along."""
         _, _, _, node, after, move = entry
         grid, kind = self.ground.grid, move[0]
         if kind not in _KINDS:

@@ -62,16 +62,6 @@ class Document:
             path = path[:-1]
         return self.lines.get(path)
 
-    def value(self, path: tuple[Key, ...]) -> Any:
-        """Return the data at `path`, or None if there is none."""
-        value = self.data
-        for key in path:
-            try:
-                value = value[key]
-            except (KeyError, IndexError, TypeError):
-                return None
-        return value
-
     def error(self, path: tuple[Key, ...], problem: str, *, expected: object = None, got: object = None) -> InputError:
         """Return (not raise) the error that says that the field at `path` is wrong."""
         return InputError(problem, file=self.file, line=self.line(path), field=field_name(path), expected=expected, got=got)

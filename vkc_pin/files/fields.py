@@ -83,9 +83,8 @@ class Schema(BaseModel):
         if isinstance(data, dict):
             for key in data:
                 if key not in cls.model_fields:
-                    raise PydanticCustomError(
-                        "unknown_field", "unknown field", {"name": str(key), "choices": list(cls.model_fields)}
-                    )
+                    context = {"name": str(key), "choices": list(cls.model_fields)}
+                    raise PydanticCustomError("unknown_field", "unknown field", context)
         return data
 
 

@@ -22,7 +22,7 @@ from vkc_pin.files.meshes import load_convex, load_mesh, to_bvh
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["UrdfFile", "UrdfShape", "UrdfTree", "load_urdf", "read_urdf"]
+__all__ = ["UrdfFile", "UrdfShape", "load_urdf", "read_urdf"]
 
 Colour = tuple[float, float, float, float]
 _LIGHT_GREY: Colour = (0.9, 0.9, 0.9, 1.0)
@@ -203,17 +203,8 @@ def read_urdf(path: str | Path, packages: Mapping[str, Path] | None = None) -> U
     return UrdfFile(file.resolve(), text, root, dict(packages or {}))
 
 
-@dataclass(frozen=True, eq=False)
-class UrdfTree:
-    """A URDF as Pinocchio models: `model`, its convex `collision` geometry and its `visual` geometry."""
-
-    model: pin.Model
-    collision: pin.GeometryModel
-    visual: pin.GeometryModel
-
-
-def load_urdf(path: str | Path) -> UrdfTree:
-    """Read a URDF without a root joint; its root link's frame is the model's universe frame.
+def load_urdf(path: str | Path) -> tuple[pin.Model, pin.GeometryModel, pin.GeometryModel]:
+    """Return model, collision and visual geometry of a URDF without a root joint; its root link's frame is the universe frame.
 
     Collision meshes become their convex hulls.
 
@@ -235,7 +226,7 @@ def load_urdf(path: str | Path) -> UrdfTree:
     collision, visual = _geometry(model, file, "collision"), _geometry(model, file, "visual")
     if len(visual.geometryObjects) > 0 and len(collision.geometryObjects) == 0:
         raise InputError("nothing in this URDF can collide", file=path, expected="<collision> elements", got="only <visual> ones")
-    return UrdfTree(model, collision, visual)
+    return model, collision, visual
 
 
 def _geometry(model: pin.Model, file: UrdfFile, kind: str) -> pin.GeometryModel:

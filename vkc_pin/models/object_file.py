@@ -104,9 +104,9 @@ def load_object(name_or_path: str | Path) -> ArticulatedObject:
     schema = check(document, ObjectSchema)
     urdf = file.parent / schema.urdf
     with document.at(("urdf",)):
-        tree = load_urdf(urdf)
-        coordinates = Coordinates(tree.model)
-    names, links = coordinates.names, [frame.name for frame in tree.model.frames if frame.type == pin.FrameType.BODY]
+        model, collision, visual = load_urdf(urdf)
+        coordinates = Coordinates(model)
+    names, links = coordinates.names, [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
     velocity, acceleration = coordinates.velocity.copy(), np.full(coordinates.size, DEFAULT_ACCELERATION)
     velocity[np.isinf(velocity)] = DEFAULT_VELOCITY
     for joint, limits in schema.joints.items():
@@ -117,9 +117,8 @@ def load_object(name_or_path: str | Path) -> ArticulatedObject:
         acceleration[index] = limits.acceleration or acceleration[index]
     if not (velocity > 0.0).all():
         slow = names[int(np.argmin(velocity))]
-        raise InputError(
-            "a joint without velocity cannot move", file=urdf, field=f"{slow}.limit.velocity", expected="> 0", got=velocity.min()
-        )
+        problem, field = "a joint without velocity cannot move", f"{slow}.limit.velocity"
+        raise InputError(problem, file=urdf, field=field, expected="> 0", got=velocity.min())
     attachments: dict[str, Attachment] = {}
     for index, item in enumerate(schema.attachments):
         if item.link not in links:
@@ -129,16 +128,15 @@ def load_object(name_or_path: str | Path) -> ArticulatedObject:
         attachment = _attachment(item, firm=schema.free)
         taken = {name for other in attachments.values() for name in other.coordinates}.intersection(attachment.coordinates)
         if taken:  # "grip_slide" beside a "grip" that slides
-            raise document.error(
-                ("attachments", index, "name"), "its coordinate's name is taken", expected="a new name", got=", ".join(taken)
-            )
+            problem, got = "its coordinate's name is taken", ", ".join(taken)
+            raise document.error(("attachments", index, "name"), problem, expected="a new name", got=got)
         attachments[item.name] = attachment
     return ArticulatedObject(
         name=file.stem,
         urdf=urdf,
-        model=tree.model,
-        collision=tree.collision,
-        visual=tree.visual,
+        model=model,
+        collision=collision,
+        visual=visual,
         coordinates=coordinates,
         lower=coordinates.lower,
         upper=coordinates.upper,
@@ -194,8 +192,7 @@ def _latches(document: Document, schema: ObjectSchema, coordinates: Coordinates)
                 what = "held_at" if role == "joint" else "threshold"
                 raise document.error((*at, what), f"outside the limits of {joint}", expected=f"{lower:g} to {upper:g}", got=value)
         if item.joint == item.released_by:
-            raise document.error(
-                (*at, "released_by"), "a joint cannot release itself", expected="another joint", got=item.released_by
-            )
+            problem = "a joint cannot release itself"
+            raise document.error((*at, "released_by"), problem, expected="another joint", got=item.released_by)
         latches.append(Latch(item.joint, item.held_at, item.released_by, item.threshold, item.engaged_within))
     return tuple(latches)

@@ -7,6 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import pinocchio as pin
 
 from vkc_pin.arrays import Floats
@@ -63,6 +64,14 @@ class Robot:
             InputError: A mesh cannot be read.
         """
         return visual_geometry(self.model, self.file)
+
+    @property
+    def start_limits(self) -> tuple[Floats, Floats]:
+        """Limits of a start, shape (n,), [m] and [rad]: the robot's own; a base that cannot move may stand anywhere."""
+        lower, upper = self.lower.copy(), self.upper.copy()
+        if self.base == "fixed":
+            lower[:3], upper[:3] = -np.inf, np.inf
+        return lower, upper
 
     def __repr__(self) -> str:
         return f"<Robot {self.name}: {len(self.home)} joints on a base that is {self.base}, tool frame {self.tool_frame}>"

@@ -173,7 +173,6 @@ def _duration(seconds: float) -> dict[str, int]:
 
 
 def _field(data: Any, key: str, kind: type, file: Path | None, where: str) -> Any:
-    """Return a field of a message."""
     expected = {list: "a list", dict: "an object", int: "a whole number"}[kind]
     if not isinstance(data, Mapping) or key not in data:
         raise InputError("this is missing from a JointTrajectory", file=file, field=where + key, expected=expected)

@@ -87,12 +87,9 @@ class Trajectory:
         if edges[-1] != len(times) - 1 or any(
             phase.first != before or phase.last <= before for phase, before in zip(phases, edges, strict=False)
         ):
-            raise InputError(
-                "phases do not follow one another from the first waypoint to the last",
-                field="Trajectory.phases",
-                expected=f"0 to {len(times) - 1}",
-                got=", ".join(f"{phase.first} to {phase.last}" for phase in phases) or "none",
-            )
+            problem = "phases do not follow one another from the first waypoint to the last"
+            got = ", ".join(f"{phase.first} to {phase.last}" for phase in phases) or "none"
+            raise InputError(problem, field="Trajectory.phases", expected=f"0 to {len(times) - 1}", got=got)
         for array in (times, positions):
             array.setflags(write=False)
         for key, value in (("names", names), ("times", times), ("positions", positions), ("phases", phases)):

@@ -42,7 +42,6 @@ def _folder_to_data(scene_folder: Path, plan: Path) -> dict[str, str]:
 
 
 def _folder_from_data(data: Mapping[str, str], plan: Path) -> Path:
-    """Return the folder that `_folder_to_data` described."""
     if "package" in data:
         return folder(data["package"])
     beside = plan.resolve().parent / data["relative"]

@@ -53,7 +53,10 @@ class Planner:
     def info(self) -> CacheInfo:
         """Return how much is kept, and how often something was there when it was asked for; not of plans that are running."""
         with self._lock:
-            every = [dataclasses.astuple(cache.info()) for cache in self._idle]
+            return self._total()
+
+    def _total(self) -> CacheInfo:
+        every = [dataclasses.astuple(cache.info()) for cache in self._idle]
         return CacheInfo(*(sum(column) for column in zip(*every, strict=True)))
 
     def clear(self) -> None:
@@ -72,15 +75,11 @@ class Planner:
             cache.trim()
             with self._lock:
                 self._idle.append(cache)
-                self._make_room()
-
-    def _make_room(self) -> None:
-        """Let go of caches, those first that were used longest ago, until all of them together are within the bounds."""
-        sizes = [cache.info() for cache in self._idle]
-        while len(sizes) > 1 and (
-            sum(info.entries for info in sizes) > self.entries or sum(info.nbytes for info in sizes) > 1e6 * self.megabytes
-        ):
-            del sizes[0], self._idle[0]
+                while len(self._idle) > 1:  # those go first that were used longest ago
+                    total = self._total()
+                    if total.entries <= self.entries and total.nbytes <= 1e6 * self.megabytes:
+                        break
+                    del self._idle[0]
 
 
 _shared = Planner()

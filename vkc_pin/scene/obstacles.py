@@ -72,11 +72,11 @@ def _from_urdf(item: schema.UrdfSchema, pose: pin.SE3, file: Path) -> tuple[list
     """Return what to draw and what collides of a URDF, with all of its joints at zero."""
     from vkc_pin.files.urdf import load_urdf
 
-    tree = load_urdf(file)
-    data = tree.model.createData()
-    pin.forwardKinematics(tree.model, data, pin.neutral(tree.model))
+    model, collision, visual = load_urdf(file)
+    data = model.createData()
+    pin.forwardKinematics(model, data, pin.neutral(model))
     both = []
-    for geometry in (tree.visual, tree.collision):
+    for geometry in (visual, collision):
         shapes = geometry.geometryObjects
         names = [item.name] if len(shapes) == 1 else [f"{item.name}_{k}" for k in range(len(shapes))]
         both.append(

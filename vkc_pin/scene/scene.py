@@ -22,14 +22,15 @@ from vkc_pin.notebook import show
 from vkc_pin.scene.hold import Hold, checked_holds, holds_of, in_hand
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.placed import PlacedObject, standing_geometry
-from vkc_pin.scene.start import START_CLEARANCE, StartRegion, start_limits
 
 if TYPE_CHECKING:
     from vkc_pin.models.robot import Robot
-    from vkc_pin.scene.scene_schema import SceneSchema
+    from vkc_pin.scene.scene_schema import RegionSchema, SceneSchema
 
-__all__ = ["Scene", "load_scene"]
+__all__ = ["START_CLEARANCE", "Scene", "load_scene"]
 
+START_CLEARANCE = 0.03
+"""Random starts keep the robot at least this far from everything but the floor [m]."""
 _TRIES = 2000  # random starts that may be in the way of something
 
 
@@ -68,7 +69,7 @@ class Scene:
     obstacle_visual: pin.GeometryModel
     floor: bool
     arena: tuple[float, float, float, float]
-    start_region: StartRegion | None
+    start_region: RegionSchema | None
     holds: tuple[Hold, ...]
     described: SceneSchema
 
@@ -127,7 +128,7 @@ class Scene:
             given = np.asarray(values, float)
             if given.shape != start[part].shape:
                 raise InputError("wrong number of values", field=part_name, expected=start[part].shape, got=given.shape)
-            lower, upper = (limits[part] for limits in start_limits(self.robot))
+            lower, upper = (limits[part] for limits in self.robot.start_limits)
             start[part] = [
                 within_limits(value, low, high, f"{part_name}.{name}")
                 for value, low, high, name in zip(given, lower, upper, names[part], strict=True)

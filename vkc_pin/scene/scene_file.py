@@ -19,7 +19,6 @@ from vkc_pin.scene import scene_schema as schema
 from vkc_pin.scene.hold import Hold, checked_holds, holds_of
 from vkc_pin.scene.obstacles import FLOOR, floor_shape, obstacle_shapes
 from vkc_pin.scene.placed import PlacedObject
-from vkc_pin.scene.start import StartRegion, start_limits
 
 if TYPE_CHECKING:
     from vkc_pin.models.robot import Robot
@@ -53,7 +52,6 @@ def scene_fields(document: Document, folder: Path) -> dict[str, Any]:
     if description.floor:
         obstacles.addGeometryObject(floor_shape(arena))
         labels.append(FLOOR)
-    region = description.start_region
     _check_places(document, description, arena)
     return {
         "name": description.name or (document.file.stem if document.file else "scene"),
@@ -68,7 +66,7 @@ def scene_fields(document: Document, folder: Path) -> dict[str, Any]:
         "obstacle_visual": visual,
         "floor": description.floor,
         "arena": arena,
-        "start_region": StartRegion(region.x, region.y, region.yaw) if region else None,
+        "start_region": description.start_region,
         "holds": _holds(document, description.start.held, objects),
         "described": description,
     }
@@ -113,7 +111,7 @@ def _robot(document: Document, item: schema.SceneRobotSchema, folder: Path) -> R
     from vkc_pin.models.robot_file import load_robot
 
     by_path = item.name.endswith((".urdf", ".yaml", ".yml")) or "/" in item.name
-    short = isinstance(document.value(("robot",)), str)  # robot: husky_ur5e
+    short = isinstance(document.data["robot"], str)  # robot: husky_ur5e
     with document.at(("robot",) if short else ("robot", "name")):
         return load_robot(folder / item.name if by_path else item.name, base=item.base, tool_frame=item.tool_frame)
 
@@ -147,7 +145,7 @@ def _start(document: Document, item: schema.StartSchema, robot: Robot) -> Floats
         expected = f"{len(names)} values: {', '.join(names)}"
         raise document.error(("start", "arm"), "wrong number of arm joints", expected=expected, got=len(arm))
     start = np.concatenate([item.base, arm])
-    lower, upper = start_limits(robot)
+    lower, upper = robot.start_limits
     for index, name in enumerate(robot.coordinates.names):
         path = ("start", "base", index) if index < 3 else ("start", "arm", index - 3)
         with document.at(path):
@@ -156,7 +154,6 @@ def _start(document: Document, item: schema.StartSchema, robot: Robot) -> Floats
 
 
 def _holds(document: Document, held: Mapping[str, schema.HeldSchema], objects: Mapping[str, PlacedObject]) -> tuple[Hold, ...]:
-    """Return what the robot is said to hold."""
     attachments = {name: item.attachment for name, item in held.items()}
     by = {name: item.by for name, item in held.items() if item.by is not None}
     at = {name: item.at for name, item in held.items() if item.at is not None}
@@ -200,7 +197,6 @@ def _object(document: Document, path: tuple[str | int, ...], item: schema.Placed
 def _obstacle(
     document: Document, path: tuple[str | int, ...], item: schema.ObstacleSchema, folder: Path
 ) -> tuple[list[pin.GeometryObject], list[pin.GeometryObject]]:
-    """Return what to draw of an obstacle and what collides, in the world frame."""
     if isinstance(item, schema.UrdfSchema | schema.MeshSchema):
         _file(document, (*path, "file"), folder, item.file)
     with document.at((*path, "file")):

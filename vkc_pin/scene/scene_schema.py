@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
+from vkc_pin.arrays import Floats
 from vkc_pin.files.fields import Name, Number, Positive, Schema, Vector3, count, fail, require, text_for
 
 __all__ = [
@@ -18,6 +20,7 @@ __all__ = [
     "MeshSchema",
     "ObstacleSchema",
     "PlacedObjectSchema",
+    "RegionSchema",
     "SceneRobotSchema",
     "SceneSchema",
     "SphereSchema",
@@ -196,11 +199,17 @@ class ArenaSchema(Schema):
 
 
 class RegionSchema(Schema):
-    """Where random starts of the base are drawn from; `yaw` is any heading or an interval."""
+    """Where random starts of the base are drawn from: intervals of x and y [m] and of the heading [rad] (None: any)."""
 
     x: Interval
     y: Interval
     yaw: Annotated[Interval | None, BeforeValidator(_heading)] = None
+
+    def draws(self, rng: np.random.Generator) -> Iterator[Floats]:
+        """Yield poses of the base, shape (3,): x, y [m] and yaw [rad], uniform in the region, without end."""
+        low, high = zip(self.x, self.y, self.yaw or (-np.pi, np.pi), strict=True)
+        while True:
+            yield rng.uniform(low, high)
 
 
 class SceneSchema(Schema):

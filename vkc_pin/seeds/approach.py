@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Sized
 
 import numpy as np
 import pinocchio as pin
@@ -10,9 +10,10 @@ import pinocchio as pin
 from vkc_pin.arrays import Floats
 from vkc_pin.chain.inverse_kinematics import PoseSolver
 from vkc_pin.chain.pose import PoseRow
+from vkc_pin.scene.hold import Hold
 from vkc_pin.seeds.clearing import KNOT_TOLERANCE
 from vkc_pin.seeds.knots import Knots
-from vkc_pin.task.phases import Phase
+from vkc_pin.task.phases import FrameGoal, Phase
 
 __all__ = ["Approach"]
 
@@ -42,22 +43,19 @@ class Approach:
 
     def before(self, z: Floats, phase: Phase) -> Floats:
         """Return configurations on the path to `z`, shape (n,), a phase's end: shape (K, n), the last is the nearest."""
-        if phase.grasps:
-            return self._retreat(z, -self._ahead(z, self.chain.holder(phase.grasps[0])), [self.problem.options.approach])
-        if phase.lowered:
-            return self._retreat(z, np.array([0.0, 0.0, 1.0]), [LIFT])
-        for goal in phase.frames:
-            if goal.touches:
-                return self._retreat(z, -self._ahead(z, self.chain.frame(goal.frame, goal.hold)), _STANDOFFS)[::-1]
-        return np.empty((0, len(z)))
+        return self._leaving(z, phase.grasps, phase.lowered, phase.frames)[::-1]
 
     def after(self, z: Floats, phase: Phase, before: Phase | None) -> Floats:
         """Return configurations on the path from `z`, shape (n,), a phase's start: shape (K, n), the first is the nearest."""
-        if phase.leaves:
-            return self._retreat(z, -self._ahead(z, self.chain.holder(phase.leaves[0])), [self.problem.options.approach])
-        if phase.lifted:
+        return self._leaving(z, phase.leaves, phase.lifted, before.frames if before else ())
+
+    def _leaving(self, z: Floats, holds: Sequence[Hold], lifted: Sized, frames: Sequence[FrameGoal]) -> Floats:
+        """Return configurations on the path away from a grasp, from where something stands, or from what a frame touches."""
+        if holds:
+            return self._retreat(z, -self._ahead(z, self.chain.holder(holds[0])), [self.problem.options.approach])
+        if lifted:
             return self._retreat(z, np.array([0.0, 0.0, 1.0]), [LIFT])
-        for goal in before.frames if before else ():
+        for goal in frames:
             if goal.touches:
                 return self._retreat(z, -self._ahead(z, self.chain.frame(goal.frame, goal.hold)), _STANDOFFS)
         return np.empty((0, len(z)))

@@ -127,7 +127,6 @@ class Beam:
         return self.problem.closed(self.problem.task.phases[self.problem.contacts.phase_of(waypoint)])
 
     def _knots(self, first: int, last: int) -> list[int]:
-        """Return the waypoints of the knots of some phases."""
         problem, knots = self.problem, list[int]()
         for number in range(first, last + 1):
             begin, end = int(problem.ends[number - 1]) if number else 0, int(problem.ends[number])

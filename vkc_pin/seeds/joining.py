@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import Protocol
 
 import numpy as np
 
@@ -20,11 +19,14 @@ __all__ = ["DrivenPaths", "Joiner", "Paths", "RrtPaths"]
 _HALVINGS = 3  # of the tries of trees, at most: what failed before is likely to fail again
 
 
-class Paths(Protocol):
-    """Finds paths of the robot where nothing fixed is held."""
+class DrivenPaths:
+    """The base along the shortest path around what stands there where nothing fixed is held; the arm straight."""
 
-    careful: bool
+    careful = False
     """Whether configurations on the straight paths in and out are left out where they hit something."""
+
+    def __init__(self, routes: Routes) -> None:
+        self.routes = routes
 
     def path(self, phase: int, first: Floats, last: Floats, steps: int, *, turns: bool, reaches: bool) -> Floats | None:
         """Return `steps` rows from `first` to `last`, both (n,), of the robot's first coordinates, shape (steps, c).
@@ -32,18 +34,6 @@ class Paths(Protocol):
         The last row is as `last`, but with `turns` the heading may end whole turns further, and without `reaches` the arm may end
         elsewhere. None if there is no path.
         """
-
-
-class DrivenPaths:
-    """The base along the shortest path around what stands there; the arm straight."""
-
-    careful = False
-
-    def __init__(self, routes: Routes) -> None:
-        self.routes = routes
-
-    def path(self, phase: int, first: Floats, last: Floats, steps: int, *, turns: bool, reaches: bool) -> Floats | None:
-        """See `Paths`."""
         path = self.routes.path(phase, first[:3], last[:3], steps)
         if path is not None and not turns:
             path[:, 2] -= (path[-1, 2] - last[2]) * np.arange(1, steps + 1) / steps
@@ -60,7 +50,7 @@ class RrtPaths:
         self.failed: Counter[int] = Counter()  # how often in a row in each phase
 
     def path(self, phase: int, first: Floats, last: Floats, steps: int, *, turns: bool, reaches: bool) -> Floats | None:
-        """See `Paths`."""
+        """See `DrivenPaths.path`."""
         problem, size = self.problem, self.knots.robot
         poses, last = first[None, :3], last.copy()
         if problem.chain.robot.base != "fixed":
@@ -82,6 +72,9 @@ class RrtPaths:
         path = connect(problem, phase, first, ends, **given)
         self.failed[phase] = 0 if path is not None else self.failed[phase] + 1
         return None if path is None else spread(path, steps)
+
+
+Paths = DrivenPaths | RrtPaths
 
 
 class Joiner:

@@ -93,18 +93,13 @@ class _Compiler:
         if not placed.object.free:
             other = next((h for h in self.holds if h.object == name and h != hold), None)
             if other is not None:
-                raise InputError(
-                    f"object '{name}' is grasped by two different attachments in one plan",
-                    field=f"{where}.attachment",
-                    expected=str(other).partition(".")[2],
-                    got=str(hold).partition(".")[2],
-                )
+                problem = f"object '{name}' is grasped by two different attachments in one plan"
+                expected, got = (str(one).partition(".")[2] for one in (other, hold))
+                raise InputError(problem, field=f"{where}.attachment", expected=expected, got=got)
         elif name in self.left:
-            raise InputError(
-                f"where '{name}' stands by then is known only after planning",
-                field=f"{where}.object",
-                expected="Place with a full pose before, or a second plan from where the first ends",
-            )
+            problem = f"where '{name}' stands by then is known only after planning"
+            expected = "Place with a full pose before, or a second plan from where the first ends"
+            raise InputError(problem, field=f"{where}.object", expected=expected)
         if hold not in self.holds:
             self.holds.append(hold)
         self._enter(placed, attachment.name)
@@ -135,20 +130,15 @@ class _Compiler:
             if joint not in names:
                 raise UnknownNameError(f"joint of '{step.object}'", joint, names, field=f"{where}.joints")
         if placed.object.free:
-            raise InputError(
-                f"'{step.object}' stands free: its joints are not driven by a hand",
-                field=f"{where}.object",
-                expected="a fixed object",
-            )
+            problem = f"'{step.object}' stands free: its joints are not driven by a hand"
+            raise InputError(problem, field=f"{where}.object", expected="a fixed object")
         attachment = placed.object.attachments[self.grasp(step.object, step.attachment, where).attachment]
         path = path_joints(placed, attachment)
         for joint in step.joints:
             if joint not in path:
-                raise InputError(
-                    f"joint '{joint}' does not move when '{step.object}' is held at '{attachment.name}'",
-                    field=f"{where}.joints",
-                    expected=f"one of {', '.join(path)}" if path else "an attachment that moves with it",
-                )
+                problem = f"joint '{joint}' does not move when '{step.object}' is held at '{attachment.name}'"
+                expected = f"one of {', '.join(path)}" if path else "an attachment that moves with it"
+                raise InputError(problem, field=f"{where}.joints", expected=expected)
         values = {f"{step.object}.{joint}": value for joint, value in step.joints.items()}
         ranges = {coordinate: joint_limits(placed, coordinate) for coordinate in values}
         after: dict[str, float] = {}  # what must wait until the latch is left behind
@@ -161,12 +151,9 @@ class _Compiler:
             if latch.released_by not in path:
                 if placed.state[names.index(latch.released_by)] >= latch.threshold:
                     continue
-                raise InputError(
-                    f"'{latch.joint}' is latched, and '{latch.released_by}', which releases it, does not move when "
-                    f"'{step.object}' is held at '{attachment.name}'",
-                    field=f"{where}.attachment",
-                    expected=f"an attachment that moves '{latch.released_by}'",
-                )
+                problem = f"'{latch.joint}' is latched, and '{latch.released_by}', which releases it, does not move when "
+                problem += f"'{step.object}' is held at '{attachment.name}'"
+                raise InputError(problem, field=f"{where}.attachment", expected=f"an attachment that moves '{latch.released_by}'")
             lower, upper = joint_limits(placed, release)
             turned = min(latch.threshold + LATCH_MARGIN, upper)
             if self.state[release] < turned:

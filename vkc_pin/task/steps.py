@@ -45,9 +45,8 @@ def as_placement(pose: Any, *, name: str = "pose") -> pin.SE3:
     except (TypeError, ValueError):
         raise InputError("not a pose", field=name, expected=expected, got=repr(pose)) from None
     if array.shape not in ((6,), (4, 4)):
-        raise InputError(
-            "not a pose", field=name, expected=expected, got=f"an array of shape {array.shape}" if array.ndim else repr(pose)
-        )
+        got = f"an array of shape {array.shape}" if array.ndim else repr(pose)
+        raise InputError("not a pose", field=name, expected=expected, got=got)
     if not np.all(np.isfinite(array)):
         raise InputError("not finite", field=name, expected=expected, got=array.tolist())
     if array.shape == (6,):

@@ -155,7 +155,6 @@ def _check_order(samples: Samples, steps: Sequence[Step], hands: list[set[str]],
 
 
 def _violation(samples: Samples, constraint: str, waypoint: int, miss: Miss) -> Violation:
-    """Return what is missed at a waypoint as a violation."""
     return Violation(constraint, waypoint=waypoint, time=float(samples.trajectory.times[waypoint]), **miss._asdict())
 
 

@@ -18,8 +18,7 @@ from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.motion.world import World
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.scene import Scene
-from vkc_pin.validation.distances import Placed, Solids
-from vkc_pin.validation.travel import travelled
+from vkc_pin.validation.distances import Placed, Solids, travelled
 
 __all__ = ["Hit", "PairTable"]
 

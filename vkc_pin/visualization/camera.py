@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from vkc_pin.arrays import Bools, Floats
 
-__all__ = ["FIELD_OF_VIEW", "Viewpoint", "choose_viewpoint"]
+__all__ = ["FIELD_OF_VIEW", "choose_viewpoint"]
 
 FIELD_OF_VIEW = 40.0
 """Vertical opening angle of the camera [degrees]."""
@@ -18,21 +17,8 @@ _ELEVATION = np.radians(38.0)
 _AZIMUTHS = np.radians(np.arange(-90.0, 270.0, 15.0))  # the first wins where all are as good: x to the right, y away
 
 
-@dataclass(frozen=True)
-class Viewpoint:
-    """A camera in the world frame.
-
-    Attributes:
-        target: The point it looks at and is orbited around, shape (3,) [m].
-        position: Where it stands, shape (3,) [m].
-    """
-
-    target: Floats
-    position: Floats
-
-
-def choose_viewpoint(points: Floats, boxes: Sequence[tuple[Floats, Floats, float]]) -> Viewpoint:
-    """Return a camera for a motion.
+def choose_viewpoint(points: Floats, boxes: Sequence[tuple[Floats, Floats, float]]) -> tuple[Floats, Floats]:
+    """Return the point that a camera looks at and is orbited around, and where it stands, shape (3,) each [m], in the world.
 
     Args:
         points: Where the motion is, shape (n, 3) [m]; all of them get into the picture.
@@ -60,7 +46,7 @@ def choose_viewpoint(points: Floats, boxes: Sequence[tuple[Floats, Floats, float
     tangent = np.tan(np.radians(FIELD_OF_VIEW) / 2.0) * 0.80  # some air around, and room for the bar below
     depth = offsets @ towards
     needed = np.maximum(np.abs(offsets @ up) / tangent, np.abs(offsets @ right) / (tangent * _ASPECT)) + depth
-    return Viewpoint(target, target + towards * max(1.0, float(needed.max())))
+    return target, target + towards * max(1.0, float(needed.max()))
 
 
 def _direction(azimuth: float) -> Floats:

@@ -19,14 +19,14 @@ from meshcat.animation import Animation, AnimationClip
 from meshcat.animation import AnimationTrack as Track
 from meshcat.commands import SetAnimation
 
-from vkc_pin.arrays import Bools
+from vkc_pin.arrays import Bools, Floats
 from vkc_pin.models.robot import Robot
 from vkc_pin.motion.placements import Motion, sample_motion
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.motion.world import World
 from vkc_pin.scene.scene import Scene
 from vkc_pin.validation.report import Report
-from vkc_pin.visualization.camera import FIELD_OF_VIEW, Viewpoint, choose_viewpoint
+from vkc_pin.visualization.camera import FIELD_OF_VIEW, choose_viewpoint
 from vkc_pin.visualization.elements import Ghost, Sun, Triangles, Unshadow, hexadecimal, material, node_name
 from vkc_pin.visualization.room import Part, Room, drawn_parts
 from vkc_pin.visualization.solids import Solid, coarse, merge_solids, to_solid, tube
@@ -107,8 +107,8 @@ class Drawing:
             self._ghosts("end", -1, _END)
         self.viewer.window.send(SetAnimation(self._animation(), play=play, repetitions=1))
 
-    def viewpoint(self) -> Viewpoint:
-        """Return the camera's place: all of the motion is in the picture, and the objects it could be about."""
+    def viewpoint(self) -> tuple[Floats, Floats]:
+        """Return what the camera looks at, and where it is: the motion is in the picture, and objects that it could be about."""
         motion, around = self.motion, np.array([[x, y, 0.0] for x in (-0.6, 0.6) for y in (-0.6, 0.6)])
         high = np.array([0.0, 0.0, 1.0])
         points = [(motion.base[:, None] * (1.0 - high) + around).reshape(-1, 3), motion.base + high, motion.tool]
@@ -219,17 +219,17 @@ class Drawing:
 
     def _surroundings(self) -> None:
         """Camera, lights, background; meshcat's own grid and axes give way to the room's floor."""
-        view, place = self.viewpoint(), self.viewer
+        (target, position), place = self.viewpoint(), self.viewer
         # meshcat's camera turns about the origin of its world, so the drawing moves there, not the camera.
-        place.set_transform(pin.SE3(np.eye(3), -view.target).homogeneous)
-        x, y, z = view.position - view.target
+        place.set_transform(pin.SE3(np.eye(3), -target).homogeneous)
+        x, y, z = position - target
         lens = place["/Cameras/default/rotated/<object>"]
         lens.set_property("fov", FIELD_OF_VIEW)
         lens.set_property("position", [float(x), float(z), float(-y)])
         for name in ("/Grid", "/Axes", "/Lights/PointLightNegativeX", "/Lights/PointLightPositiveX", "/Lights/FillLight"):
             place[name].set_property("visible", False)
         place["/Lights/AmbientLight/<object>"].set_property("intensity", 0.62)
-        place["/Lights/Sun"].set_object(Sun(self.room.centre - view.target, self.room.reach, view.position - view.target))
+        place["/Lights/Sun"].set_object(Sun(self.room.centre - target, self.room.reach, position - target))
         place["/Background"].set_property("top_color", [0.93, 0.95, 0.97])
         place["/Background"].set_property("bottom_color", [0.99, 0.99, 0.99])
 

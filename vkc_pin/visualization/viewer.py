@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import atexit
+import base64
 import contextlib
+import gzip
 import html
+import json
 import os
+import re
+import struct
 import subprocess
 import sys
 from collections.abc import Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -22,7 +28,7 @@ if TYPE_CHECKING:
     import meshcat
     import pinocchio as pin
 
-__all__ = ["animate", "open_viewer", "show", "to_html"]
+__all__ = ["Recorder", "animate", "open_viewer", "render_page", "show", "to_html"]
 
 _server: tuple[subprocess.Popen[bytes], str, str] | None = None  # the process, its address for commands, and for browsers
 
@@ -164,15 +170,13 @@ def _draw(
 def _page(scene: Scene, plan: Judged | None, frames: Mapping[str, pin.SE3] | None = None) -> str:
     import meshcat
 
-    from vkc_pin.visualization.page import Recorder, render_page
-
     recorder = Recorder()
     _draw(meshcat.Visualizer(window=recorder), scene, plan, play=False, frames=frames)
     return render_page(recorder, title=f"{scene.name} – vkc_pin", film=_film(scene, plan))
 
 
 def _film(scene: Scene, plan: Judged | None) -> dict[str, Any]:
-    """Return what the page's bar shows; see `page.render_page`."""
+    """Return what the page's bar shows; see `render_page`."""
     if plan is None:
         return {"duration": 0.0, "phases": [], "notes": [], "headline": scene.name}
     times = plan.trajectory.times - plan.trajectory.times[0]
@@ -182,3 +186,50 @@ def _film(scene: Scene, plan: Judged | None) -> dict[str, Any]:
         "notes": [{"text": f"{v.constraint}: {v.subject}", "time": v.time} for v in plan.validation.violations],
         "headline": f"{scene.name}: {'success' if plan.success else 'FAILED, ' + plan.status}",
     }
+
+
+class Recorder:
+    """Takes a viewer's commands instead of a server; give it as `window` to `meshcat.Visualizer`.
+
+    Attributes:
+        commands: The commands so far.
+    """
+
+    def __init__(self) -> None:
+        self.commands: list[dict[str, Any]] = []
+
+    def send(self, command: Any) -> None:
+        """Take one of meshcat's commands."""
+        self.commands.append(command.lower())
+
+
+def render_page(recorder: Recorder, *, title: str, film: dict[str, Any]) -> str:
+    """Return a web page with a drawing: meshcat's viewer, the drawing's commands, and a bar with play and time.
+
+    Args:
+        recorder: What to draw.
+        title: Of the page.
+        film: What the bar shows: "duration" [s], "phases" ("name", "last" [s]), "notes" ("text", "time" [s]), "headline".
+    """
+    import meshcat
+    import umsgpack  # type: ignore[import-untyped]
+
+    viewer = Path(meshcat.__file__).parent / "viewer" / "dist" / "main.min.js"
+    packed = [umsgpack.packb(command) for command in recorder.commands]
+    template = (Path(__file__).parent / "page.html").read_text(encoding="utf-8")
+    pieces = {
+        "TITLE": html.escape(title),
+        "FILM": json.dumps(film).replace("<", "\\u003c"),
+        "VIEWER": _packed_file(viewer),
+        "COMMANDS": _packed(b"".join(struct.pack("<I", len(command)) + command for command in packed)),
+    }
+    return re.sub(r"%(TITLE|FILM|VIEWER|COMMANDS)%", lambda match: pieces[match[1]], template)
+
+
+@lru_cache(maxsize=1)
+def _packed_file(file: Path) -> str:
+    return _packed(file.read_bytes())
+
+
+def _packed(data: bytes) -> str:
+    return base64.b64encode(gzip.compress(data, 9, mtime=0)).decode("ascii")

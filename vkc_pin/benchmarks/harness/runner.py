@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -84,7 +84,8 @@ def run(
     about["versions"]["sources"] = _sources()
     described = json.dumps([todo[key] for key in sorted(todo)], sort_keys=True).encode()
     header = {"settings": dict(settings), **about, "specification": hashlib.sha256(described).hexdigest()[:12]}
-    with _journal(out / "trials.jsonl", header) as journal:
+    with (out / "trials.jsonl").open("a+b") as stream:
+        journal = _Journal(out / "trials.jsonl", stream, header)
         left = [trial for key, trial in todo.items() if key not in journal.lines]
         if left:
             done = len(todo) - len(left)
@@ -182,7 +183,8 @@ def _attempt(function: Function, trial: dict[str, Any]) -> dict[str, Any]:
     try:
         result = function(dict(trial))
         found = [result] if isinstance(result, Mapping) else list(result)
-        records = json.loads(json.dumps([{"key": key, **_plain(record)} for record in found], allow_nan=False))
+        text = json.dumps([{"key": key, **record} for record in found], default=_plain)
+        records = json.loads(text, parse_constant=lambda _: None)  # numbers that JSON does not know
     except Exception as error:
         message = f"{type(error).__name__}: {error}"
         failure = {"success": False, "status": "error", "failed_constraint": "error", "violations": [message]}
@@ -191,14 +193,10 @@ def _attempt(function: Function, trial: dict[str, Any]) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Return `value` without NumPy's types and without numbers that JSON does not know."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray | np.generic):
-        return _plain(value.tolist())
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+    """Return what JSON makes of a mapping, or of NumPy's types."""
+    if not isinstance(value, Mapping | np.ndarray | np.generic):
+        raise TypeError(f"Object of type {type(value).__name__} is not JSON serializable")
+    return dict(value) if isinstance(value, Mapping) else value.tolist()
 
 
 def _sources() -> str:
@@ -224,6 +222,10 @@ class _Journal:
     """
 
     def __init__(self, path: Path, stream: Any, header: Mapping[str, Any]) -> None:
+        try:  # for this process alone
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError("another run is writing to this folder; wait for it, or use another", file=path) from None
         self._path, self._stream = path, stream
         self.lines: dict[str, list[dict[str, Any]]] = {}
         self.sessions: list[dict[str, Any]] = []
@@ -276,17 +278,6 @@ class _Journal:
             problem = f"the trials in this folder were run otherwise; use another folder than {self._path.parent}"
             was, now = (", ".join(f"{name.rpartition('.')[2]} {side.get(name)}" for name in named) for side in (old, new))
             raise InputError(problem, file=self._path, field=", ".join(named), expected=was, got=now)
-
-
-@contextlib.contextmanager
-def _journal(path: Path, header: Mapping[str, Any]) -> Iterator[_Journal]:
-    """Open the journal for this process alone."""
-    with path.open("a+b") as stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError("another run is writing to this folder; wait for it, or use another", file=path) from None
-        yield _Journal(path, stream, header)
 
 
 def _flat(data: Mapping[str, Any]) -> dict[str, Any]:

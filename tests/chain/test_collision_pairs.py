@@ -11,7 +11,7 @@ import pytest
 from helpers.carrying import STICK, TOP, above, box, lifted, moved_base, reaching, room, table, tool_at
 from helpers.small_problems import SHORT, program_of
 
-from vkc_pin.chain.margins import EASED_SHARE, EASED_TIME
+from vkc_pin.chain.collision_pairs import EASED_SHARE, EASED_TIME
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.scene import Scene

@@ -11,8 +11,8 @@ from helpers.drawers import SHORT, changed, drawer_scene, handle, holding, off, 
 from helpers.small_problems import program_of
 
 import vkc_pin as vkc
-from vkc_pin.baselines import poses as module
-from vkc_pin.baselines.poses import base_poses
+from vkc_pin.baselines import postures as module
+from vkc_pin.baselines.postures import base_poses
 from vkc_pin.seeds.knots import SCATTER, Knots
 
 

@@ -26,8 +26,6 @@ def _submodules(name: str) -> set[str]:
 
 @pytest.mark.parametrize("name", ["vkc_pin", *MODULES])
 def test_every_module_lists_its_public_names(name: str) -> None:
-    if name.endswith(".upstream"):
-        pytest.importorskip("pinocchio.casadi")
     module = importlib.import_module(name)
     assert module.__doc__
     if Path(str(module.__file__)).name == "__init__.py" and set(vars(module)) <= BARE | _submodules(name):

@@ -14,7 +14,7 @@ import pinocchio as pin
 import pytest
 
 from vkc_pin import cpin
-from vkc_pin.cpin import compiled, upstream
+from vkc_pin.cpin import backends
 from vkc_pin.errors import BuildError, InputError, UnknownNameError
 from vkc_pin.models.coordinates import Coordinates
 
@@ -246,24 +246,24 @@ def test_ambiguous_frame_names_are_refused(arm: pin.Model) -> None:
 @pytest.mark.parametrize("installed", ["4.10.0", "5.1.0", "4.0.3"])
 def test_another_release_is_refused(installed: str) -> None:
     with pytest.raises(BuildError, match=rf"pin 4\.1\.0, but {installed} is installed.*pip install 'pin==4\.1\.\*'"):
-        compiled.check_versions({"pin": "4.1.0", "casadi": "3.8.2"}, {"pin": installed, "casadi": "3.8.2"})
+        backends.check_versions({"pin": "4.1.0", "casadi": "3.8.2"}, {"pin": installed, "casadi": "3.8.2"})
 
 
 def test_a_patch_release_is_accepted() -> None:
-    compiled.check_versions({"pin": "4.1.0", "casadi": "3.8.2"}, {"pin": "4.1.12", "casadi": "3.8.2+local"})
+    backends.check_versions({"pin": "4.1.0", "casadi": "3.8.2"}, {"pin": "4.1.12", "casadi": "3.8.2+local"})
 
 
 def test_an_unreadable_version_is_a_build_error() -> None:
     with pytest.raises(BuildError, match="cannot read the version 'unknown'"):
-        compiled.check_versions({"pin": "4.1.0"}, {"pin": "unknown"})
+        backends.check_versions({"pin": "4.1.0"}, {"pin": "unknown"})
 
 
 def test_a_missing_extension_says_what_to_install(monkeypatch: pytest.MonkeyPatch, arm: pin.Model) -> None:
     monkeypatch.setitem(sys.modules, "vkc_pin.cpin._cpin", None)
-    compiled._extension.cache_clear()
+    backends._extension.cache_clear()
     with pytest.raises(BuildError, match=r"apt install g\+\+"):
-        compiled.build("joint_placements", arm)
-    compiled._extension.cache_clear()
+        backends.compiled("joint_placements", arm)
+    backends._extension.cache_clear()
 
 
 def test_backend_is_upstreams_where_it_can_be_imported(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -285,11 +285,11 @@ def test_upstream_equals_compiled(arm: pin.Model) -> None:
         ("rnea", (), (q, v, a)),
         ("center_of_mass", (), (q,)),
     ):
-        one, other = (backend.build(name, arm, *arguments)(*inputs).full() for backend in (upstream, compiled))
+        one, other = (backend(name, arm, *arguments)(*inputs).full() for backend in (backends.upstream, backends.compiled))
         np.testing.assert_allclose(one, other, atol=TOLERANCE)
 
 
-@pytest.mark.parametrize("first", ["casadi", "pinocchio", "vkc_pin.cpin", "vkc_pin.cpin.compiled"])
+@pytest.mark.parametrize("first", ["casadi", "pinocchio", "vkc_pin.cpin", "vkc_pin.cpin.backends"])
 def test_any_order_of_import_works(first: str) -> None:
     code = f"""
 import {first}

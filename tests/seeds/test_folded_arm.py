@@ -11,8 +11,8 @@ from helpers.small_problems import program_of
 
 import vkc_pin as vkc
 from vkc_pin.seeds import folded_arm as compact
-from vkc_pin.seeds.folded_arm import folded_arm
 from vkc_pin.seeds.knots import depth
+from vkc_pin.seeds.routes import folded_arm
 
 TASKS = {  # scene and steps, in the last phase of which something is carried
     "nothing": ("household", [vkc.GoTo(1.0, 0.5)]),

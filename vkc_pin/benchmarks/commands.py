@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import importlib
 import json
 import os
@@ -116,6 +117,5 @@ def natural(text: str, least: int = 0) -> int:
     return int(text)
 
 
-def positive(text: str) -> int:
-    """Return a whole number of at least 1."""
-    return natural(text, least=1)
+positive = functools.partial(natural, least=1)
+"""Returns a whole number of at least 1."""

@@ -139,17 +139,10 @@ class Comparison:
         if trials < 1:
             raise InputError("out of range", field="trials", expected="at least 1", got=trials)
         specs, out = self.specify(trials=trials, seed=seed, tasks=tasks, methods=methods), Path(out)
-        settings = {
-            "benchmark": self.benchmark,
-            "seed": seed,
-            "starts": trials,
-            "tasks": tasks,
-            "methods": methods,
-            "scenes": {name: self.tasks[name].scene for name in tasks},
-            "goals": {name: goals(self.tasks[name].steps) for name in tasks},
-            "time_limit": TIME_LIMIT,
-            "retries": RETRIES,
-        }
+        settings = {"benchmark": self.benchmark, "seed": seed, "starts": trials, "tasks": tasks, "methods": methods}
+        settings["scenes"] = {name: self.tasks[name].scene for name in tasks}
+        settings["goals"] = {name: goals(self.tasks[name].steps) for name in tasks}
+        settings |= {"time_limit": TIME_LIMIT, "retries": RETRIES}
         trials_of = _Trials(self.tasks, out, solve or self.plan_trial)
         function = functools.partial(trials_of.record, save_failures=save_failures)
         result = runner.run(specs, function, out, settings=settings, jobs=jobs, progress=progress)

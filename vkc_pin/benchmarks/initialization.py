@@ -102,17 +102,8 @@ def run(
     scenes = runner.chosen("scene", scenes, SCENES if solve is plan_trial else scenes)
     methods = runner.chosen("method", methods, COMPARED_INITIALIZATIONS)
     trials = specify(starts=starts, repeats=repeats, seed=seed, scenes=scenes, methods=methods)
-    settings = {
-        "benchmark": "initialization",
-        "seed": seed,
-        "starts": starts,
-        "repeats": repeats,
-        "scenes": scenes,
-        "methods": methods,
-        "target": TARGET,
-        "time_limit": TIME_LIMIT,
-        "perturbation": PERTURBATION,
-    }
+    settings = {"benchmark": "initialization", "seed": seed, "starts": starts, "repeats": repeats, "scenes": scenes}
+    settings |= {"methods": methods, "target": TARGET, "time_limit": TIME_LIMIT, "perturbation": PERTURBATION}
     function = functools.partial(_record, solve=solve)
     result = runner.run(trials, function, out, settings=settings, jobs=jobs, progress=progress)
     write_atomically(Path(out) / "table.md", report(result).encode())

@@ -10,10 +10,10 @@ compiled when this package is installed.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from vkc_pin.errors import InputError, UnknownNameError
 
@@ -28,18 +28,20 @@ _REFERENCES = {"world": 0, "local": 1, "local_world_aligned": 2}
 
 
 @cache
-def _backend() -> Any:
-    """Return the module that does the work, chosen at the first use: importing this package stays quick."""
+def _backend() -> Callable[..., casadi.Function]:
+    """Return what does the work, chosen at the first use: importing this package stays quick."""
+    from vkc_pin.cpin import backends
+
     try:
         import_module("pinocchio.casadi")
     except ImportError:
-        return import_module("vkc_pin.cpin.compiled")
-    return import_module("vkc_pin.cpin.upstream")
+        return backends.compiled
+    return backends.upstream
 
 
 def backend_name() -> str:
     """Return what does the work here: "upstream" (`pinocchio.casadi`) or "compiled" (this package's own module)."""
-    return str(_backend().__name__).rpartition(".")[2]
+    return _backend().__name__
 
 
 def joint_placements(model: pin.Model) -> casadi.Function:
@@ -55,7 +57,7 @@ def joint_placements(model: pin.Model) -> casadi.Function:
     Raises:
         BuildError: The compiled module is missing or does not fit the installed packages.
     """
-    return _backend().build("joint_placements", _exact(model))
+    return _backend()("joint_placements", _exact(model))
 
 
 def frame_placements(model: pin.Model, frames: Sequence[str | int]) -> casadi.Function:
@@ -76,7 +78,7 @@ def frame_placements(model: pin.Model, frames: Sequence[str | int]) -> casadi.Fu
     if isinstance(frames, str):
         frames = [frames]
     indices = [_frame_index(model, frame, f"frames[{i}]") for i, frame in enumerate(frames)]
-    return _backend().build("frame_placements", _exact(model), indices)
+    return _backend()("frame_placements", _exact(model), indices)
 
 
 def frame_jacobian(
@@ -101,7 +103,7 @@ def frame_jacobian(
     if reference not in _REFERENCES:
         raise UnknownNameError("reference", str(reference), _REFERENCES, field="reference")
     index = _frame_index(model, frame, "frame")
-    return _backend().build("frame_jacobian", _exact(model), index, _REFERENCES[reference])
+    return _backend()("frame_jacobian", _exact(model), index, _REFERENCES[reference])
 
 
 def rnea(model: pin.Model) -> casadi.Function:
@@ -116,7 +118,7 @@ def rnea(model: pin.Model) -> casadi.Function:
     Raises:
         BuildError: The compiled module is missing or does not fit the installed packages.
     """
-    return _backend().build("rnea", _exact(model))
+    return _backend()("rnea", _exact(model))
 
 
 def center_of_mass(model: pin.Model) -> casadi.Function:
@@ -131,7 +133,7 @@ def center_of_mass(model: pin.Model) -> casadi.Function:
     Raises:
         BuildError: The compiled module is missing or does not fit the installed packages.
     """
-    return _backend().build("center_of_mass", _exact(model))
+    return _backend()("center_of_mass", _exact(model))
 
 
 def _frame_index(model: pin.Model, frame: str | int, field: str) -> int:

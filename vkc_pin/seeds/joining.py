@@ -127,7 +127,10 @@ class Joiner:
             turns = problem.lower[end - 1, 2] < problem.upper[end - 1, 2]  # unless the goal says how far to turn
             path = self.paths.path(number, through[leave], through[arrive], steps, turns=turns, reaches=reaches)
             if path is None:
-                self._note(phase, through[leave], through[arrive])
+                blocked = f"{phase.name}: found no way for the base"
+                (x, y), (u, v) = through[[leave, arrive], :2]
+                if not any(note.startswith(blocked) for note in self.blocked):
+                    self.blocked.append(f"{blocked} from ({x:.2f}, {y:.2f}) to ({u:.2f}, {v:.2f})")
                 return False
             turned = path[-1, 2] - through[arrive, 2]  # what follows goes on from there
             through[arrive:, 2] += turned
@@ -169,9 +172,3 @@ class Joiner:
                 lower[:, driven] = upper[:, driven] = self.knots.objects[np.ix_(rows, driven)]
                 solver, target = self.knots.solver(pose)
                 z[rows], _ = solver.solve(z[rows], target, lower=lower, upper=upper, weights=self.knots.weights, iterations=6)
-
-    def _note(self, phase: Phase, first: Floats, last: Floats) -> None:
-        """Note, once a phase, that there is no path between two configurations, shape (n,)."""
-        problem = f"{phase.name}: found no way for the base"
-        if not any(note.startswith(problem) for note in self.blocked):
-            self.blocked.append(f"{problem} from ({first[0]:.2f}, {first[1]:.2f}) to ({last[0]:.2f}, {last[1]:.2f})")

@@ -83,7 +83,8 @@ class PairTable:
         self._robot_pairs = {frozenset((p.first, p.second)) for p in scene.robot.collision.collisionPairs}
         labels, self.solids = world.collision_labels, Solids(world)
         bodies = range(self.solids.bodies)
-        self.group = ["robot" if i < robots else self._owner(label) for i, label in enumerate(labels)]
+        owners = [label.partition(".")[0] if "." in label else "" for label in labels]
+        self.group = ["robot" if i < robots else name if name in scene.objects else "" for i, name in enumerate(owners)]
         self.pairs = np.concatenate(
             [
                 np.array([(i, j) for j in bodies for i in range(j) if self._counts(i, j)], int).reshape(-1, 2),
@@ -102,10 +103,6 @@ class PairTable:
             first, second = self.pairs.T
             self.together |= (ones[first] & others[second]) | (others[first] & ones[second])
         self._sort()
-
-    def _owner(self, label: str) -> str:
-        owner = label.partition(".")[0]
-        return owner if owner in self.scene.objects and "." in label else ""
 
     def _counts(self, i: int, j: int) -> bool:
         """Return whether two bodies i < j (robot first, then objects) can collide at all."""

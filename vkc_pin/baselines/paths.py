@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -45,16 +46,15 @@ class BasePaths:
         moving, standing = grid_shapes(problem, len(problem.task.phases) - 1, z)
         base = [shape for joint, shape in moving if whole or joint == 1]
         arena, margin = problem.scene.arena, problem.options.dist_safe
-        self.grid = BaseGrid(base, [], standing, arena, margin, cache=problem.cache)
+        self._grid = functools.partial(BaseGrid, base, [], standing, arena, cache=problem.cache)
+        self.grid = self._grid(margin)
         # Without margins where an optimisation follows: it restores them.
-        cells = fine_cells(arena, margin)
-        slack = 0.0 if whole else margin
-        self._finer = functools.partial(BaseGrid, base, [], standing, arena, slack, cells=cells, cache=problem.cache)
+        self._fine: dict[str, Any] = {"margin": 0.0 if whole else margin, "cells": fine_cells(arena, margin)}
 
     @functools.cached_property
     def finer(self) -> BaseGrid:
         """A grid of smaller cells, for narrow passages."""
-        return self._finer()
+        return self._grid(**self._fine)
 
     def path(self, start: Floats, goals: Floats, steps: int) -> Floats | None:
         """Return poses after the start, slow at both ends, the last at a goal, shape (steps, 3); None: there is no path.

@@ -221,17 +221,13 @@ class _Round:
         index, heading = divmod(node, HEADINGS)
         self.query.shut.add((self.cell[index], heading, kind))
         self._shut(node, kind)
-        neighbours = [*self.targets[node].tolist(), *self._beside(index, heading)]
+        cells = self.ground.grid.cells  # and, with the same heading, in the four cells around this one
+        i, j = divmod(self.cell[index], cells)
+        around = [(k, m) for k, m in ((i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1)) if 0 <= k < cells and 0 <= m < cells]
+        neighbours = [*self.targets[node].tolist(), *(int(self.node[k * cells + m, heading]) for k, m in around)]
         if self._blocked(node):  # then its neighbours may well be, too
             for neighbour in neighbours:
                 self._blocked(neighbour)
-
-    def _beside(self, index: int, heading: int) -> list[int]:
-        """Return the nodes with the same heading in the four cells around one."""
-        cells = self.ground.grid.cells
-        i, j = divmod(self.cell[index], cells)
-        around = [(i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1)]
-        return [int(self.node[k * cells + m, heading]) for k, m in around if 0 <= k < cells and 0 <= m < cells]
 
     def _blocked(self, node: int) -> bool:
         """Return whether the base is blocked at a node, and take it out if so."""

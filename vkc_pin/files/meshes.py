@@ -92,16 +92,11 @@ def load_convex(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0)) -> coal.Co
     Raises:
         InputError: The mesh cannot be read, is empty or flat, or coal does not hold what the file holds.
     """
-    try:
-        return convex_hull(load_mesh(path, scale).vertices)
-    except InputError as error:
-        if error.file is not None:
-            raise
-        raise InputError(error.problem, file=path, expected=error.expected, got=error.got) from error
+    return convex_hull(load_mesh(path, scale).vertices, file=path)
 
 
-def convex_hull(points: ArrayLike) -> coal.Convex:
-    """Return the convex hull of `points`, shape (n, 3), [m], as a coal shape.
+def convex_hull(points: ArrayLike, *, file: str | Path | None = None) -> coal.Convex:
+    """Return the convex hull of `points`, shape (n, 3), [m], as a coal shape; errors name the file that they are of.
 
     Raises:
         InputError: The points lie in one plane, or coal's volume or area is not that of the hull.
@@ -112,7 +107,8 @@ def convex_hull(points: ArrayLike) -> coal.Convex:
     try:
         hull = trimesh.convex.convex_hull(np.asarray(points, float))
     except (QhullError, ValueError, IndexError) as error:
-        raise InputError("the mesh has no convex hull: it is flat", expected="points that span a volume") from error
+        expected = "points that span a volume"
+        raise InputError("the mesh has no convex hull: it is flat", file=file, expected=expected) from error
     if np.bincount(np.asarray(hull.faces).ravel()).max() > _NEIGHBOURS:  # the tip of a finely meshed cone, a fine disc
         hull = outer_hull(hull.vertices, vertices=60)
     vertices, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
@@ -123,7 +119,7 @@ def convex_hull(points: ArrayLike) -> coal.Convex:
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2.0
     for what, held, wanted in (("volume", shape.computeVolume(), hull.volume), ("area", area, hull.area)):
         if not abs(held - wanted) <= _TOLERANCE * abs(wanted) or wanted <= 0.0:
-            raise InputError(f"coal does not hold this hull: wrong {what}", expected=wanted, got=held)
+            raise InputError(f"coal does not hold this hull: wrong {what}", file=file, expected=wanted, got=held)
     shape.computeLocalAABB()
     return shape
 

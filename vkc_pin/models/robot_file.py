@@ -152,7 +152,13 @@ def load_robot(
         touch_links=settings.touch_links,
         file=urdf,
     )
-    return _with_pairs(robot, () if pairs == "all" else None if semantics is None else semantics.allowed)
+    if pairs != "all" and semantics is None:
+        return with_collision_pairs(robot, sample_allowed_pairs(robot, samples=_SAMPLES))
+    robot = with_collision_pairs(robot, () if pairs == "all" or semantics is None else semantics.allowed)
+    if len(robot.collision.collisionPairs) == 0:
+        expected = "<collision> elements, and an SRDF that fits"
+        raise InputError("no pair of links is left that could collide", file=robot.urdf, expected=expected)
+    return robot
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,21 +209,6 @@ def _read(name: str | Path, packages: Mapping[str, str | Path]) -> _Files:
     folders = {key: Path(folder) for key, folder in packages.items()}
     folders = {**python_packages(tuple(p for p in settings.packages if p not in folders), document), **folders}
     return _Files(source, settings, document, read_urdf(source.parent / settings.urdf, folders))
-
-
-def _with_pairs(robot: Robot, allowed: Collection[tuple[str, str]] | None) -> Robot:
-    """Return `robot` with collision pairs; pairs of links that may touch are `allowed`, or found by sampling if that is None.
-
-    Raises:
-        InputError: No pair is left by an `allowed` that was given.
-    """
-    if allowed is None:
-        return with_collision_pairs(robot, sample_allowed_pairs(robot, samples=_SAMPLES))
-    robot = with_collision_pairs(robot, allowed)
-    if len(robot.collision.collisionPairs) == 0:
-        expected = "<collision> elements, and an SRDF that fits"
-        raise InputError("no pair of links is left that could collide", file=robot.urdf, expected=expected)
-    return robot
 
 
 def _state(model: pin.Model, semantics: Srdf | None, given: Collection[str]) -> dict[str, float]:

@@ -11,6 +11,7 @@ import pinocchio as pin
 
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
+from vkc_pin.files.meshes import load_parts, to_bvh
 from vkc_pin.files.urdf import UrdfFile, UrdfShape
 from vkc_pin.models.grafting import add_joint, clean
 
@@ -59,7 +60,9 @@ def planned_model(
     Raises:
         InputError: No joint is left.
     """
-    path = full.supports[full.frames[_frame(full, tool_frame)].parentJoint]  # from the world on
+    named = [frame for frame in full.frames if frame.name == tool_frame]
+    frame = next((frame for frame in named if frame.type == pin.FrameType.BODY), named[0])  # a link before a joint
+    path = full.supports[frame.parentJoint]  # from the world on
     fixed = {*locked, *_mimics(file.root)}
     planned = [j for j in path if j > 1 and full.names[j] in rest and full.names[j] not in fixed]
     if not planned:
@@ -150,8 +153,6 @@ def visual_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
     Raises:
         InputError: A shape is not understood, or a mesh cannot be read.
     """
-    from vkc_pin.files.meshes import load_parts, to_bvh
-
     geometry = pin.GeometryModel()
     for shape in file.shapes("visual"):
         if shape.file is None:
@@ -190,12 +191,6 @@ def _reduced(full: pin.Model, planned: Collection[int], q: Floats) -> pin.Model:
             parent, placement = placed[frame.parentJoint]
             model.addFrame(pin.Frame(frame.name, parent, 0, clean(placement * frame.placement), frame.type))
     return model
-
-
-def _frame(model: pin.Model, name: str) -> int:
-    """Return the frame called `name`, that of a link before that of a joint."""
-    found = [i for i, frame in enumerate(model.frames) if frame.name == name]
-    return next((i for i in found if model.frames[i].type == pin.FrameType.BODY), found[0])
 
 
 def _mimics(root: ElementTree.Element) -> dict[str, tuple[str, float, float]]:

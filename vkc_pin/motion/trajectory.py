@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.motion import ros, tables
 from vkc_pin.scene.hold import Hold, holds_of, in_order
 
 __all__ = ["PhaseSpan", "Trajectory"]
@@ -174,20 +175,14 @@ class Trajectory:
 
     def to_csv(self, path: str | Path, **options: Any) -> Path:
         """Write a table with a line a waypoint: times [s], positions [m] and [rad], phases; see `tables.write_csv`."""
-        from vkc_pin.motion import tables
-
         return tables.write_csv(self.to_dict(), path, **options)
 
     def to_json(self, path: str | Path) -> Path:
         """Write `to_dict` as JSON, whole or not at all; return the path."""
-        from vkc_pin.motion import tables
-
         return tables.write_json(self.to_dict(), path)
 
     def to_ros(self, **options: Any) -> dict[str, Any]:
         """Return plain data with the fields of ROS' `trajectory_msgs/JointTrajectory`; see `ros.to_ros`."""
-        from vkc_pin.motion import ros
-
         return ros.to_ros(self.to_dict(), **options)
 
     @classmethod
@@ -197,8 +192,6 @@ class Trajectory:
         Raises:
             InputError: The file is missing, or something in it does not fit; the error names line and column.
         """
-        from vkc_pin.motion import tables
-
         return cls._read(tables.read_csv(path, **options), path)
 
     @classmethod
@@ -208,8 +201,6 @@ class Trajectory:
         Raises:
             InputError: The file is missing, is no JSON, or something in it does not fit; the error names line or field.
         """
-        from vkc_pin.motion import tables
-
         data = tables.read_json(path)
         if isinstance(data, dict) and "trajectory" in data:
             return cls._read(data["trajectory"], path, "trajectory")
@@ -224,8 +215,6 @@ class Trajectory:
         Raises:
             InputError: Something is missing or does not fit; the error names the field.
         """
-        from vkc_pin.motion import ros
-
         data = ros.from_ros(message, like=None if like is None else like.to_dict(), robot_size=robot_size)
         return cls._read(data, None if isinstance(message, Mapping) else message)
 

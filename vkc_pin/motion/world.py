@@ -20,7 +20,6 @@ from vkc_pin.models.grafting import graft, graft_geometry
 from vkc_pin.models.shapes import link_name
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.scene.hold import Hold
-from vkc_pin.scene.placed import PlacedObject
 from vkc_pin.scene.scene import Scene
 
 __all__ = ["FREE_JOINT", "World", "as_numbers", "scene_after", "units_of"]
@@ -48,7 +47,13 @@ class World:
         robot = scene.robot
         self.scene = scene
         self.model = pin.Model(robot.model)
-        self._joints = {name: self._plant(placed) for name, placed in scene.objects.items()}
+        self._joints: dict[str, list[int]] = {}
+        for name, placed in scene.objects.items():
+            parent, placement = 0, placed.placement
+            if placed.object.free:
+                parent = self.model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), f"{name}.{FREE_JOINT}")
+                placement = pin.SE3.Identity()
+            self._joints[name] = graft(self.model, placed.object.model, parent=parent, placement=placement, prefix=f"{name}.")
         objects = {name: placed.object.collision for name, placed in scene.objects.items()}
         self.bodies = self._geometry(robot.collision, objects)
         self.shapes = (*self.bodies.geometryObjects, *scene.obstacles.geometryObjects)
@@ -59,14 +64,6 @@ class World:
             for placed in scene.objects.values()
         ]
         self.start: Floats = np.concatenate([np.asarray(scene.start), *states])
-
-    def _plant(self, placed: PlacedObject) -> list[int]:
-        """Add an object's tree to the model; return its joints there."""
-        parent, placement, prefix = 0, placed.placement, f"{placed.name}."
-        if placed.object.free:
-            parent = self.model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), prefix + FREE_JOINT)
-            placement = pin.SE3.Identity()
-        return graft(self.model, placed.object.model, parent=parent, placement=placement, prefix=prefix)
 
     @cached_property
     def collision(self) -> pin.GeometryModel:

@@ -20,10 +20,13 @@ from vkc_pin.files.writing import write_atomically
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.motion.world import units_of
 from vkc_pin.options import Options
+from vkc_pin.plotting import plots as plotting
+from vkc_pin.plotting.cards import motion_html
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.steps import Step, step_from_dict, step_to_dict
 from vkc_pin.task.terms import Term, term_from_dict, term_to_dict
 from vkc_pin.validation.report import Report
+from vkc_pin.visualization import viewer as visualization
 
 if TYPE_CHECKING:
     import meshcat
@@ -136,32 +139,22 @@ class Plan:
         return f"<Plan {self.status}: base {m['base_effort']:.2f} m, arm {m['arm_effort']:.2f} rad, {m['planning_time']:.2f} s>"
 
     def _repr_html_(self) -> str:
-        from vkc_pin.plotting.cards import motion_html
-
         return motion_html(self)
 
     def show(self, **options: Any) -> Any:
         """Show the motion with meshcat: inline in a notebook, otherwise in the browser; see `visualization.show`."""
-        from vkc_pin.visualization import viewer as visualization
-
         return visualization.show(self, **options)
 
     def animate(self, viewer: meshcat.Visualizer | None = None) -> Any:
         """Put the motion into a meshcat viewer with play, pause and a time slider; return the viewer."""
-        from vkc_pin.visualization import viewer as visualization
-
         return visualization.animate(self, viewer)
 
     def to_html(self, path: str | Path) -> Path:
         """Write one self-contained page with the animation; return its path."""
-        from vkc_pin.visualization import viewer as visualization
-
         return visualization.to_html(self, path)
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Draw joints, velocities, clearance and a top view; see `plotting.plot`."""
-        from vkc_pin.plotting import plots as plotting
-
         return plotting.plot(self, path)
 
     def save(self, path: str | Path) -> Path:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TypeGuard
 
 import numpy as np
@@ -44,6 +44,13 @@ class Settings:
     progress: Progress = field(default_factory=Progress)
     interrupt: Interrupt = field(default_factory=Interrupt)
     cache: Cache = field(default_factory=Cache)
+
+    def after(self, spent: Iterable[Mapping[str, float]]) -> Settings:
+        """Return the settings with what problems that were planned, by their metrics, have left of the time limit."""
+        if self.time_limit is None:
+            return self
+        used = sum(metrics["planning_time"] for metrics in spent)
+        return replace(self, time_limit=max(self.time_limit - used, 1e-3))
 
 
 def settings_for(

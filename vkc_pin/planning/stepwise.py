@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
 
 from vkc_pin.motion.world import scene_after
 from vkc_pin.planning.one_problem import OneProblem
@@ -60,14 +59,14 @@ def all_at_once(scene: Scene, task: Task, settings: Settings) -> Plan:
     result = plans[-1]
     if result.success:
         pieces = [one.piece() for one, _ in parts]
-        result = OneProblem(scene, task, _left(settings, spent)).run(lambda problem: seed_of(problem, pieces))
+        result = OneProblem(scene, task, settings.after(spent)).run(lambda problem: seed_of(problem, pieces))
         spent.append(result.metrics)
         if not result.success:  # what the steps came to on their own is a motion all the same
             apart = joined(scene, task.steps, settings, plans)
             spent = [apart.metrics, spent[-1]]
             result = apart if apart.success else result
     if not result.success and not settings.interrupt.pressed:
-        result = OneProblem(scene, task, _left(settings, spent)).run()
+        result = OneProblem(scene, task, settings.after(spent)).run()
         spent.append(result.metrics)
     return charged(result, spent)
 
@@ -84,28 +83,18 @@ def stages(scene: Scene, task: Task, settings: Settings, *, brief: bool = False)
     """
     options = dataclasses.replace(settings.options, max_restarts=1, max_outer=min(settings.options.max_outer, _SOLVER_ROUNDS))
     settings = dataclasses.replace(settings, rough=True) if brief else settings
-    current, spent = scene, 0.0
+    current = scene
     parts: list[tuple[OneProblem, Plan]] = []
     for number, step in enumerate(task.steps, start=1):
         # Where a step ends is known only once it is planned; the first begins where all do.
         own = task.until(1) if number == 1 else compile_task(current, [step], settings.options, nothing=True)
         if not own.phases:
             continue
-        left = None if settings.time_limit is None else max(settings.time_limit - spent, 1e-3)
-        chosen = options if brief and parts else settings.options
+        chosen = dataclasses.replace(settings, options=options) if brief and parts else settings
         settings.progress.part(number, 1, len(task.steps))
-        one = OneProblem(current, own, dataclasses.replace(settings, options=chosen, time_limit=left))
+        one = OneProblem(current, own, chosen.after(plan.metrics for _, plan in parts))
         parts.append((one, one.run()))
         if not parts[-1][1].success or settings.interrupt.pressed:
             break
-        spent += parts[-1][1].metrics["planning_time"]
         current = scene_after(current, parts[-1][1].trajectory, own.after)
     return parts
-
-
-def _left(settings: Settings, spent: Sequence[Mapping[str, float]]) -> Settings:
-    """Return the settings with what is left of the time limit."""
-    if settings.time_limit is None:
-        return settings
-    used = sum(metrics["planning_time"] for metrics in spent)
-    return dataclasses.replace(settings, time_limit=max(settings.time_limit - used, 1e-3))

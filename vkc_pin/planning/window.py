@@ -218,15 +218,12 @@ class SlidingWindow:
             attempt: Other random numbers for each.
             fine: More waypoints, for ways that are long and narrow, and arcs along which hands would drift between few.
         """
-        limit = self.settings.time_limit
-        if limit is not None:
-            limit = max(limit - sum(metrics["planning_time"] for metrics in self.spent), 1e-3)
-        given = self.settings.options
+        left, given = self.settings.after(self.spent), self.settings.options
         options = dataclasses.replace(given, max_restarts=1, max_outer=min(given.max_outer, _SOLVER_ROUNDS))
         if fine:
             more = {name: round(_FINER * getattr(given, name)) for name in ("reach_waypoints", "move_waypoints")}
             options = dataclasses.replace(options, **more)
-        return dataclasses.replace(self.settings, options=options, seed=self.settings.seed + attempt, time_limit=limit)
+        return dataclasses.replace(left, options=options, seed=left.seed + attempt)
 
     def _joined(self, failed: Plan | None) -> Plan:
         """Return one plan of all that is decided, and of what failed."""

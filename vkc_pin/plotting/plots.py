@@ -14,6 +14,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.motion.world import World
 from vkc_pin.plotting.style import COLOURS, new_figure, save_figure, shade_phases, styled
 from vkc_pin.plotting.top_view import draw_top_view
+from vkc_pin.validation.clearance import clearance_curves
 from vkc_pin.validation.report import Judged
 
 if TYPE_CHECKING:
@@ -144,8 +145,6 @@ def _draw_joints(figure: FigureBase, plan: Judged) -> None:
 
 
 def _draw_clearance(figure: FigureBase, plan: Judged) -> None:
-    from vkc_pin.validation.clearance import clearance_curves
-
     axes, trajectory = figure.subplots(), plan.trajectory
     times = np.unique(np.concatenate([np.linspace(trajectory.times[0], trajectory.times[-1], _SAMPLES), trajectory.times]))
     safe = plan.options.dist_safe

@@ -106,20 +106,12 @@ def _moments(trajectory: Trajectory) -> Floats:
 
 
 def _corners(world: World, index: int, joint: Floats, known: dict[int, Floats]) -> Floats:
-    """Return the vertices of a collision shape, shape (n, 3) [m], with its joint placed at `joint`, shape (4, 4).
-
-    Args:
-        world: The scene.
-        index: Of the shape.
-        joint: The placement of its joint.
-        known: Keeps the vertices of shapes that were asked for before.
-    """
+    """Return a collision shape's vertices, shape (n, 3) [m], with its joint at `joint`, shape (4, 4); `known` keeps its own."""
     shape = world.shapes[index]
-    vertices = known.get(index)
-    if vertices is None:
-        vertices = known[index] = triangles(shape.geometry)[0]
+    if index not in known:
+        known[index] = triangles(shape.geometry)[0]
     placed = pin.SE3(joint) * shape.placement
-    return np.asarray(vertices @ np.asarray(placed.rotation).T + placed.translation)
+    return np.asarray(known[index] @ np.asarray(placed.rotation).T + placed.translation)
 
 
 def outline(points: Floats) -> Floats:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -14,14 +14,13 @@ from vkc_pin.arrays import Floats
 from vkc_pin.files.documents import Document, check
 from vkc_pin.models.grafting import clean
 from vkc_pin.models.object_file import load_object
+from vkc_pin.models.robot import Robot
+from vkc_pin.models.robot_file import load_robot
 from vkc_pin.models.shapes import within_limits
 from vkc_pin.scene import scene_schema as schema
 from vkc_pin.scene.hold import Hold, checked_holds, holds_of
 from vkc_pin.scene.obstacles import FLOOR, floor_shape, obstacle_shapes
 from vkc_pin.scene.placed import PlacedObject
-
-if TYPE_CHECKING:
-    from vkc_pin.models.robot import Robot
 
 __all__ = ["document_of", "scene_fields"]
 
@@ -108,8 +107,6 @@ def document_of(fields: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _robot(document: Document, item: schema.SceneRobotSchema, folder: Path) -> Robot:
-    from vkc_pin.models.robot_file import load_robot
-
     by_path = item.name.endswith((".urdf", ".yaml", ".yml")) or "/" in item.name
     short = isinstance(document.data["robot"], str)  # robot: husky_ur5e
     with document.at(("robot",) if short else ("robot", "name")):

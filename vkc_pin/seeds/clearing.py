@@ -6,7 +6,6 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.arrays import Floats
-from vkc_pin.chain.contacts import Contacts
 from vkc_pin.chain.inverse_kinematics import PoseSolver
 from vkc_pin.program.problem import TrajectoryProblem
 
@@ -57,9 +56,12 @@ def clear_out(
         short = contacts.shortfall(len(at))
         residual, pose_rows = solver.evaluate(z[at], target)
         done[at] = (short <= 0.0) & (np.abs(residual).max(axis=1) < 1e-4)
-        rows, wanted = _contact_rows(problem, z[at], contacts)
-        jacobian = np.concatenate([pose_rows, rows], axis=1)
-        wanted = np.concatenate([-residual, wanted], axis=1)
+        # Gradients of the nearest distances, and by how much they should grow [m].
+        order = np.arange(len(contacts.waypoint)) - np.searchsorted(contacts.waypoint, contacts.waypoint)
+        rows, growth = np.zeros((len(at), _CONTACTS, z.shape[1])), np.zeros((len(at), _CONTACTS))
+        rows[contacts.waypoint, order] = problem.contacts.gradients(z[at], contacts)
+        growth[contacts.waypoint, order] = np.maximum(contacts.margin + _EXTRA_CLEARANCE - contacts.distance, 0.0)
+        jacobian, wanted = np.concatenate([pose_rows, rows], axis=1), np.concatenate([-residual, growth], axis=1)
         scaled = jacobian * free[at][:, None, :]
         system = scaled @ jacobian.transpose(0, 2, 1) + _DAMPING * np.eye(jacobian.shape[1])
         step = np.einsum("bij,bi->bj", scaled, np.linalg.solve(system, wanted[..., None])[..., 0])
@@ -67,12 +69,3 @@ def clear_out(
         step[done[at]] = 0.0
         z[at] = np.clip(z[at] + step, lower[at], upper[at])
     return z
-
-
-def _contact_rows(problem: TrajectoryProblem, z: Floats, contacts: Contacts) -> tuple[Floats, Floats]:
-    """Return gradients of the nearest distances, shape (B, rows, n), and by how much they should grow, shape (B, rows) [m]."""
-    order = np.arange(len(contacts.waypoint)) - np.searchsorted(contacts.waypoint, contacts.waypoint)
-    rows, wanted = np.zeros((len(z), _CONTACTS, z.shape[1])), np.zeros((len(z), _CONTACTS))
-    rows[contacts.waypoint, order] = problem.contacts.gradients(z, contacts)
-    wanted[contacts.waypoint, order] = np.maximum(contacts.margin + _EXTRA_CLEARANCE - contacts.distance, 0.0)
-    return rows, wanted

@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.arrays import Floats
+from vkc_pin.files.meshes import load_parts
 from vkc_pin.models.shapes import world_box
 from vkc_pin.scene.scene import Scene
 from vkc_pin.visualization.solids import Solid, box_solid, shade, to_solid
@@ -130,8 +131,6 @@ def drawn_parts(shape: pin.GeometryObject) -> list[tuple[Solid, tuple[float, ...
     """Return the solids, in the shape's own frame, and colours that a shape is drawn as: from its mesh file, if it has one."""
     colour = tuple(float(c) for c in shape.meshColor)
     if shape.meshPath and Path(shape.meshPath).is_file():
-        from vkc_pin.files.meshes import load_parts
-
         parts = load_parts(shape.meshPath, np.asarray(shape.meshScale).ravel(), detail=_DETAIL)
         own = bool(shape.overrideMaterial)
         return [(shade(part.vertices, part.faces), colour if own else part.colour or colour) for part in parts]

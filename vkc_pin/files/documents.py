@@ -184,9 +184,8 @@ def _path(data: Any, error: Any) -> tuple[Key, ...]:
     path: list[Key] = []
     location = error["loc"]
     for position, key in enumerate(location):
-        inside = isinstance(data, dict) and key in data
-        inside = inside or (isinstance(data, list | tuple) and isinstance(key, int) and key < len(data))
-        if inside:
+        listed = isinstance(data, list | tuple) and isinstance(key, int) and key < len(data)
+        if listed or (isinstance(data, dict) and key in data):
             path.append(key)
             data = data[key]
         elif position == len(location) - 1 and error["type"] == "missing":

@@ -38,7 +38,7 @@ def outer_hull(points: ArrayLike, *, vertices: int = 40) -> trimesh.Trimesh:
     normals = _directions(hull)
     offsets = (corners @ normals.T).max(axis=0)
     axes = np.linalg.eigh(np.cov(corners.T))[1].T
-    best = None
+    found = []
     for frame in (np.eye(3), axes):
         box = np.vstack([frame, -frame])
         chosen_normals, chosen_offsets = box, (corners @ box.T).max(axis=0)
@@ -55,10 +55,8 @@ def outer_hull(points: ArrayLike, *, vertices: int = 40) -> trimesh.Trimesh:
             if not trials:
                 break
             polytope, (chosen_normals, chosen_offsets) = min(trials, key=lambda trial: trial[0].volume)
-        if best is None or polytope.volume < best.volume:
-            best = polytope
-    assert best is not None
-    return best
+        found.append(polytope)
+    return min(found, key=lambda polytope: polytope.volume)
 
 
 def _directions(hull: trimesh.Trimesh) -> Floats:

@@ -114,8 +114,7 @@ class Trajectory:
 
     def velocities(self) -> Floats:
         """Return the velocity of every segment, shape (T − 1, n), [m/s] and [rad/s]."""
-        steps = np.diff(self.positions, axis=0) / np.diff(self.times)[:, None]
-        return np.asarray(steps)
+        return np.asarray(np.diff(self.positions, axis=0) / np.diff(self.times)[:, None])
 
     def accelerations(self) -> Floats:
         """Return the acceleration at every waypoint, shape (T, n), [m/s²] and [rad/s²].

@@ -70,8 +70,7 @@ class Progress:
         now = time.perf_counter()
         if not self._ended and self.write is not None and (always or now - self._changed >= _REFRESH_TIME):
             self._changed = now
-            passed = f"{now - self._began:.0f} s"
-            self.write(" · ".join(filter(None, [passed, self._part, self._doing, self._what])), False)
+            self.write(" · ".join(filter(None, [f"{now - self._began:.0f} s", self._part, self._doing, self._what])), False)
 
     def _last(self, text: str) -> None:
         if not self._ended and self.write is not None:

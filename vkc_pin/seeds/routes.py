@@ -5,6 +5,8 @@ For passages that are too narrow for the robot as it is, the arm is folded over 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pinocchio as pin
 
@@ -67,11 +69,8 @@ class Routes:
             # Where the arm stands on the base it is always: a low base does not go under a table that the arm does not.
             base = [shape for joint, shape in moving if joint <= _ARM_BASE]
             carried = [shape for joint, shape in moving if joint > _ARM_BASE]
-            self._grids[key] = (
-                BaseGrid(base, carried, standing, arena, 0.0, near=_REACHING_RADIUS, cells=fine_cells(arena, margin), cache=cache)
-                if folded
-                else BaseGrid(base, carried, standing, arena, margin, near=_REACHING_RADIUS, cache=cache)
-            )
+            how: dict[str, Any] = {"margin": 0.0, "cells": fine_cells(arena, margin)} if folded else {"margin": margin}
+            self._grids[key] = BaseGrid(base, carried, standing, arena, near=_REACHING_RADIUS, cache=cache, **how)
         return self._grids[key]
 
     def folded_arm(self, phase: int) -> Floats:

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 __all__ = ["Constraint", "Cost", "State", "Term", "check_active", "term_from_dict", "term_to_dict", "traced"]
 
 Numbers = float | Sequence[float] | NDArray[np.float64]
-
-
 Expression = Callable[[State], Any] | Formula
 
 

@@ -29,9 +29,7 @@ def check_terms(samples: Samples, terms: Sequence[Term]) -> list[Violation]:
     of the last step's time: between waypoints, of a time as long as the present step, so that nothing jumps at a waypoint.
     """
     found = []
-    for term in terms:
-        if not isinstance(term, Constraint):
-            continue
+    for term in (term for term in terms if isinstance(term, Constraint)):
         at, between = _rows(samples, term)
         rows = np.sort(np.concatenate([at, between]))
         if not len(rows):

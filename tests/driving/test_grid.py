@@ -110,9 +110,9 @@ def test_distances_around_a_wall() -> None:
 def test_distances_from_where_the_base_cannot_be() -> None:
     block: list[Shape] = [(coal.Box(2.0, 2.0, 1.0), at(0.0, 0.0, 0.5))]
     grid = BaseGrid(chassis(), [], block, HALL, MARGIN)
-    assert np.isfinite(grid.distances((0.7, 0.0))).any()
+    assert np.isfinite(grid.distances_from(np.array([(0.7, 0.0)]))).any()
     everywhere = BaseGrid(chassis(), [], [(coal.Box(20.0, 20.0, 1.0), at(0.0, 0.0, 0.5))], HALL, MARGIN)
-    assert np.isinf(everywhere.distances((0.0, 0.0))).all()
+    assert np.isinf(everywhere.distances_from(np.zeros((1, 2)))).all()
 
 
 def test_an_arena_that_is_not_square() -> None:

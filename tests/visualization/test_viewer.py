@@ -287,7 +287,7 @@ def test_server_serves_the_motion(viewer: Any, plan: Plan) -> None:
 def test_animate_into_a_viewer_of_ones_own(plan: Plan) -> None:
     import meshcat
 
-    from vkc_pin.visualization.page import Recorder
+    from vkc_pin.visualization.viewer import Recorder
 
     recorder = Recorder()
     mine = meshcat.Visualizer(window=recorder)["mine"]

@@ -7,7 +7,6 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE, FOLDER = ROOT / "vkc_pin", ROOT / "docs" / "api" / "wings"
-OPTIONAL = {"vkc_pin.cpin.upstream"}  # can be imported only where pinocchio.casadi can
 
 
 def wings() -> dict[str, dict[str, Path]]:
@@ -16,7 +15,7 @@ def wings() -> dict[str, dict[str, Path]]:
     for file in sorted(PACKAGE.rglob("*.py"), key=lambda file: (file.parent, file.name != "__init__.py", file.name)):
         parts = file.relative_to(ROOT).with_suffix("").parts
         name = ".".join(part for part in parts if part != "__init__")
-        if name != "vkc_pin" and name not in OPTIONAL:
+        if name != "vkc_pin":
             found.setdefault(parts[1] if len(parts) > 2 else "package", {})[name] = file
     return found
 

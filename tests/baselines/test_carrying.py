@@ -14,7 +14,8 @@ from helpers.drives import hall
 from helpers.small_problems import program_of
 
 import vkc_pin as vkc
-from vkc_pin.baselines import BASELINES, attempt, plan_separately, poses
+from vkc_pin.baselines import BASELINES, attempt, plan_separately
+from vkc_pin.baselines import postures as poses
 from vkc_pin.baselines.attempt import Attempt
 from vkc_pin.baselines.following import FailedError
 from vkc_pin.baselines.postures import postures

@@ -19,7 +19,8 @@ from helpers.drawers import changed, drawer_scene, handle, holding, off, open_sc
 from helpers.small_problems import door_scene
 
 import vkc_pin as vkc
-from vkc_pin.baselines import BASELINES, attempt, plan_separately, poses, separate
+from vkc_pin.baselines import BASELINES, attempt, plan_separately, separate
+from vkc_pin.baselines import postures as poses
 from vkc_pin.baselines.attempt import FINER
 from vkc_pin.baselines.following import Followed, follow
 from vkc_pin.baselines.paths import BasePaths

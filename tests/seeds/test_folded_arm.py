@@ -10,7 +10,7 @@ import pytest
 from helpers.small_problems import program_of
 
 import vkc_pin as vkc
-from vkc_pin.seeds import folded_arm as compact
+from vkc_pin.seeds import routes as compact
 from vkc_pin.seeds.knots import depth
 from vkc_pin.seeds.routes import folded_arm
 

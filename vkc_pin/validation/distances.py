@@ -1,8 +1,7 @@
 """How far a world's shapes are from each other at one configuration, and how far they move along a motion, at most.
 
-There are lower bounds of distances from boxes, and coal's own.
-
-Nothing of it is the planner's, so that what its culling overlooked would be found here.
+There are lower bounds of distances from boxes, and coal's own. Nothing of it is the planner's, so that what its culling
+overlooked would be found here.
 """
 
 from __future__ import annotations

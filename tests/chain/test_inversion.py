@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from vkc_pin.chain.inversion import invert
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.models.coordinates import Coordinates
 from vkc_pin.models.object_file import load_object
 
 KINDS = ("revolute", "continuous", "prismatic", "fixed")
@@ -60,25 +59,26 @@ def test_every_frame_and_shape_of_the_inverted_tree_is_where_it_was(tree: tuple[
     urdf, root = tree
     thing = load_text(urdf, "urdf: thing.urdf\nattachments: [{name: a, link: l0}]")
     link, z = f"l{root}", np.random.default_rng(seed).uniform(-3.0, 3.0, thing.coordinates.size)
-    model, collision = invert(thing, link, z)
-    coordinates = Coordinates(model)
-    assert set(coordinates.names) <= set(thing.coordinates.names)
-    q = coordinates.q(np.array([z[thing.coordinates.index(name)] for name in coordinates.names]))
-    bodies, shapes = placements(thing.model, thing.collision, thing.coordinates.q(z))
-    new_bodies, new_shapes = placements(model, collision, q)
-    assert new_bodies.keys() == bodies.keys()
-    assert new_shapes.keys() == shapes.keys()
-    to_root = bodies[link].inverse()
-    for old, new in ((bodies, new_bodies), (shapes, new_shapes)):
-        for name in old:
-            np.testing.assert_allclose(new[name].homogeneous, (to_root * old[name]).homogeneous, atol=1e-12, rtol=0.0)
-    for name in coordinates.names:
-        old, new = thing.coordinates.index(name), coordinates.index(name)
+    inverted = invert(thing, link, z)
+    moving = inverted.coordinates.names
+    assert set(moving) <= set(thing.coordinates.names)
+    q = inverted.coordinates.q(np.array([z[thing.coordinates.index(name)] for name in moving]))
+    for old_geometry, new_geometry in ((thing.collision, inverted.collision), (thing.visual, inverted.visual)):
+        bodies, shapes = placements(thing.model, old_geometry, thing.coordinates.q(z))
+        new_bodies, new_shapes = placements(inverted.model, new_geometry, q)
+        assert new_bodies.keys() == bodies.keys()
+        assert new_shapes.keys() == shapes.keys()
+        to_root = bodies[link].inverse()
+        for old, new in ((bodies, new_bodies), (shapes, new_shapes)):
+            for name in old:
+                np.testing.assert_allclose(new[name].homogeneous, (to_root * old[name]).homogeneous, atol=1e-12, rtol=0.0)
+    for name in moving:
+        old, new = thing.coordinates.index(name), inverted.coordinates.index(name)
         for attribute in ("lower", "upper", "velocity"):
-            assert getattr(coordinates, attribute)[new] == getattr(thing.coordinates, attribute)[old]
-    assert sum(i.mass for i in model.inertias) == pytest.approx(sum(i.mass for i in thing.model.inertias))
-    for shape in collision.geometryObjects:
-        frame = model.frames[shape.parentFrame]
+            assert getattr(inverted.coordinates, attribute)[new] == getattr(thing.coordinates, attribute)[old]
+    assert sum(i.mass for i in inverted.model.inertias) == pytest.approx(sum(i.mass for i in thing.model.inertias))
+    for shape in inverted.collision.geometryObjects:
+        frame = inverted.model.frames[shape.parentFrame]
         assert frame.parentJoint == shape.parentJoint
         assert shape.name.startswith(frame.name)
 
@@ -94,21 +94,20 @@ def test_only_the_path_to_the_base_moves_and_side_branches_keep_their_state() ->
     urdf = f'<robot name="t">{links}{joints}</robot>'
     thing = load_text(urdf, "urdf: thing.urdf\nattachments: [{name: a, link: hand}]")
     state = dict(zip(thing.coordinates.names, [0.0] * 4, strict=True)) | {"flap": 0.4, "lid": -0.3}
-    model, collision = invert(thing, "hand", np.array([state[name] for name in thing.coordinates.names]))
-    coordinates = Coordinates(model)
-    assert coordinates.names == ("wrist", "shoulder")
-    bodies, _ = placements(model, collision, coordinates.q([0.7, 0.2]))
+    inverted = invert(thing, "hand", np.array([state[name] for name in thing.coordinates.names]))
+    assert inverted.coordinates.names == ("wrist", "shoulder")
+    bodies, _ = placements(inverted.model, inverted.collision, inverted.coordinates.q([0.7, 0.2]))
     np.testing.assert_allclose(bodies["arm"].actInv(bodies["side"]).rotation, pin.utils.rotate("y", 0.4), atol=1e-12)
     np.testing.assert_allclose(bodies["base"].actInv(bodies["back"]).rotation, pin.utils.rotate("x", -0.3), atol=1e-12)
     np.testing.assert_allclose(bodies["arm"].translation, [-0.7, 0.0, 0.0], atol=1e-12)
-    assert invert(thing, "base", [0.0] * 4)[0].nq == 0
+    assert invert(thing, "base", [0.0] * 4).model.nq == 0
 
 
 def test_inverting_aligned_joints_leaves_exact_zeros_and_ones() -> None:
-    model, _ = invert(load_object("door"), "lever", [0.0, 0.0])
-    for placement in model.jointPlacements:
+    inverted = invert(load_object("door"), "lever", [0.0, 0.0])
+    for placement in inverted.model.jointPlacements:
         assert set(np.abs(placement.rotation).ravel()) <= {0.0, 1.0}
-    assert [joint.shortname() for joint in model.joints][1:] == ["JointModelRZ", "JointModelRZ"]
+    assert [joint.shortname() for joint in inverted.model.joints][1:] == ["JointModelRZ", "JointModelRZ"]
 
 
 def test_invert_refuses_unknown_links_and_wrong_states() -> None:

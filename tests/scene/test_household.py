@@ -16,7 +16,6 @@ from vkc_pin.chain.inversion import invert
 from vkc_pin.chain.pose import PoseRow
 from vkc_pin.files.resources import folder
 from vkc_pin.models.articulation import ArticulatedObject, Freedom
-from vkc_pin.models.coordinates import Coordinates
 from vkc_pin.models.object_file import load_object
 from vkc_pin.models.robot import Robot
 from vkc_pin.models.shapes import clearance, link_name, placed_shapes
@@ -143,13 +142,13 @@ def test_object_turned_round_is_the_same_object(name: str) -> None:
     obj, rng = thing(name), np.random.default_rng(0)
     for link in obj.links:
         state = rng.uniform(obj.lower, obj.upper)
-        model, collision = invert(obj, link, state)
-        data, coordinates = model.createData(), Coordinates(model)
-        z = [state[obj.coordinates.index(joint)] for joint in coordinates.names]
-        pin.framesForwardKinematics(model, data, coordinates.q(np.array(z)))
-        base = data.oMf[model.getFrameId(obj.base_link)]
+        tree = invert(obj, link, state)
+        data = tree.model.createData()
+        z = [state[obj.coordinates.index(joint)] for joint in tree.coordinates.names]
+        pin.framesForwardKinematics(tree.model, data, tree.coordinates.q(np.array(z)))
+        base = data.oMf[tree.model.getFrameId(obj.base_link)]
         np.testing.assert_allclose(base.homogeneous, obj.link_placement(link, state).inverse().homogeneous, atol=1e-12)
-        assert len(collision.geometryObjects) == len(obj.collision.geometryObjects)
+        assert len(tree.collision.geometryObjects) == len(obj.collision.geometryObjects)
 
 
 @pytest.mark.parametrize("name", JOINTS)

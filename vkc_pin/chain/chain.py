@@ -202,19 +202,19 @@ def consolidate(scene: Scene, holds: Iterable[Hold] | Mapping[str, str], *, cach
             for row, value in zip(limits, (low, high, VIRTUAL_VELOCITY, VIRTUAL_ACCELERATION), strict=True):
                 row.append(value)
         virtual[hold] = tuple(added)
-        tree, shapes = invert(placed.object, attachment.link, placed.state)
+        tree = invert(placed.object, attachment.link, placed.state)
         placement = clean(placement * attachment.placement.inverse())
-        joints = graft(model, tree, parent=parent, placement=placement, prefix=prefix)
+        joints = graft(model, tree.model, parent=parent, placement=placement, prefix=prefix)
         names += added
-        for joint_name in tree.names[1:]:
+        for joint_name in tree.model.names[1:]:
             names.append(f"{name}.{joint_name}")
             index = placed.object.coordinates.names.index(joint_name)
             stated = (placed.object.lower, placed.object.upper, placed.object.velocity, placed.object.acceleration)
             for row, values in zip(limits, stated, strict=True):
                 row.append(float(values[index]))
-        with_hold[hold] = (*added, *(f"{name}.{joint_name}" for joint_name in tree.names[1:]))
+        with_hold[hold] = (*added, *(f"{name}.{joint_name}" for joint_name in tree.model.names[1:]))
         base = model.frames[model.getFrameId(f"{prefix}{placed.object.base_link}")]
-        moving = list(shapes.geometryObjects)
+        moving = list(tree.collision.geometryObjects)
         if not placed.object.free:
             # What the joints in hand do not move (a door's frame, another door in it) stands in the world, closed or not.
             moving = [shape for shape in moving if joints[shape.parentJoint] != base.parentJoint]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -11,13 +12,35 @@ from numpy.typing import ArrayLike
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
 from vkc_pin.models.articulation import ArticulatedObject
+from vkc_pin.models.coordinates import Coordinates
 from vkc_pin.models.grafting import add_joint, clean
 
-__all__ = ["invert"]
+__all__ = ["InvertedTree", "invert"]
 
 
-def invert(obj: ArticulatedObject, link: str, state: ArrayLike) -> tuple[pin.Model, pin.GeometryModel]:
-    """Re-root `obj` at `link`: the model's universe frame is then that link's frame.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class InvertedTree:
+    """An object re-rooted at one of its links: `model`'s universe frame is that link's frame.
+
+    Attributes:
+        model: The joints on the path from the link to the base link, each with its name, coordinate and limits; a body
+            frame for every link of the object, by its name.
+        collision, visual: The object's geometry, with its names, on the bodies of `model`.
+        coordinates: The minimal coordinates of `model`.
+        link: The link that is now the root.
+        base_link: The object's base link, a body frame of `model`.
+    """
+
+    model: pin.Model
+    collision: pin.GeometryModel
+    visual: pin.GeometryModel
+    coordinates: Coordinates
+    link: str
+    base_link: str
+
+
+def invert(obj: ArticulatedObject, link: str, state: ArrayLike) -> InvertedTree:
+    """Re-root `obj` at `link`.
 
     With placement P and motion J(q) of a joint, parent → child is P·J(q), so child → parent is J(q)⁻¹·P⁻¹. For revolute
     and prismatic joints J(q)⁻¹ is the same joint with the axis negated. The axis is then turned into z by a constant
@@ -29,10 +52,6 @@ def invert(obj: ArticulatedObject, link: str, state: ArrayLike) -> tuple[pin.Mod
         link: The link that becomes the root.
         state: Joint values, shape (n,), [rad] or [m]. Joints beside the path from `link` to the base link are locked at
             these; the values of those on the path do not matter.
-
-    Returns:
-        The joints on the path from the link to the base link, each with its name, coordinate and limits, with a body frame for
-        every link of the object, by its name; and the object's collision geometry, with its names, on the bodies of that model.
 
     Raises:
         UnknownNameError: The object has no such link.
@@ -75,13 +94,23 @@ def invert(obj: ArticulatedObject, link: str, state: ArrayLike) -> tuple[pin.Mod
             new, placement = place(frame.parentJoint, frame.placement)
             frames[index] = model.addFrame(pin.Frame(frame.name, new, 0, placement, pin.FrameType.BODY), False)
 
-    collision = pin.GeometryModel()
-    for shape in obj.collision.geometryObjects:
-        copy = pin.GeometryObject(shape)
-        copy.parentJoint, copy.placement = place(shape.parentJoint, shape.placement)
-        copy.parentFrame = frames[shape.parentFrame]
-        collision.addGeometryObject(copy)
-    return model, collision
+    def carry(geometry: pin.GeometryModel) -> pin.GeometryModel:
+        carried = pin.GeometryModel()
+        for shape in geometry.geometryObjects:
+            copy = pin.GeometryObject(shape)
+            copy.parentJoint, copy.placement = place(shape.parentJoint, shape.placement)
+            copy.parentFrame = frames[shape.parentFrame]
+            carried.addGeometryObject(copy)
+        return carried
+
+    return InvertedTree(
+        model=model,
+        collision=carry(obj.collision),
+        visual=carry(obj.visual),
+        coordinates=Coordinates(model),
+        link=link,
+        base_link=obj.base_link,
+    )
 
 
 def _z_aligned(model: pin.Model, data: pin.Data, index: int) -> tuple[pin.JointModel, Floats]:

@@ -127,8 +127,6 @@ def write_srdf(robot: Robot, path: str | Path, *, samples: int = _SAMPLES, seed:
 
 
 class _Distances:
-    """Distances between the shapes of a robot in one configuration."""
-
     def __init__(self, robot: Robot) -> None:
         shapes = robot.collision.geometryObjects
         self._robot, self._data = robot, robot.model.createData()

@@ -75,14 +75,8 @@ def to_ros(
             positions = np.stack([np.interp(moments, times, column) for column in positions.T], axis=-1)
             velocities, accelerations = rates(moments, positions)
         times = moments
-    empty: list[list[float]] = [[] for _ in times]
-    points = zip(
-        times.tolist(),
-        positions.tolist(),
-        velocities.tolist() if derivatives > 0 else empty,
-        accelerations.tolist() if derivatives > 1 else empty,
-        strict=True,
-    )
+    parts = [positions, *(rows[:, : len(columns) * (derivatives > k)] for k, rows in enumerate((velocities, accelerations)))]
+    points = zip(times.tolist(), *(part.tolist() for part in parts), strict=True)
     return {
         "header": {"stamp": _duration(stamp), "frame_id": frame},
         "joint_names": [motion["names"][k] for k in columns],

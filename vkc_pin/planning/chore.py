@@ -62,13 +62,7 @@ def plan_chore(
         InputError: A step names something that is not there, or cannot be done at its place in the list; the error names it.
     """
     settings = settings_for(
-        scene,
-        initialization=initialization,
-        options=options,
-        callback=callback,
-        time_limit=time_limit,
-        seed=seed,
-        terms=terms,
+        scene, initialization=initialization, options=options, callback=callback, time_limit=time_limit, seed=seed, terms=terms
     )
     if not isinstance(window, int) or isinstance(window, bool) or window < 1:
         raise InputError("out of range", field="window", expected="a whole number of at least 1", got=repr(window))

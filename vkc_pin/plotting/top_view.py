@@ -34,6 +34,8 @@ def draw_top_view(figure: FigureBase, world: World, trajectory: Trajectory | Non
         trajectory: The motion; None: robot and objects as they are at the scene's start.
         columns: Of the legend.
     """
+    from matplotlib.patches import Polygon
+
     axes = figure.subplots()
     for i, shape in enumerate(world.shapes):
         if shape.parentJoint or world.collision_labels[i] == FLOOR:
@@ -42,7 +44,7 @@ def draw_top_view(figure: FigureBase, world: World, trajectory: Trajectory | Non
         high = points[:, 2].min() > _ROBOT_HEIGHT
         paint = (*np.clip(shape.meshColor[:3], 0.0, 1.0), 0.75)
         style: dict[str, Any] = {"fill": False, "linestyle": "--"} if high else {"facecolor": paint}
-        axes.add_patch(_polygon(outline(points), edgecolor="0.45", linewidth=0.7, zorder=1, **style))
+        axes.add_patch(Polygon(outline(points), edgecolor="0.45", linewidth=0.7, zorder=1, **style))
 
     _draw_motion(axes, world, trajectory)
     x_min, x_max, y_min, y_max = world.scene.arena
@@ -58,6 +60,7 @@ def draw_top_view(figure: FigureBase, world: World, trajectory: Trajectory | Non
 def _draw_motion(axes: Axes, world: World, trajectory: Trajectory | None) -> None:
     """Draw what moves, at several times, and the paths of base and tool."""
     from matplotlib.colors import LinearSegmentedColormap
+    from matplotlib.patches import Polygon
 
     times = np.zeros(1) if trajectory is None else _moments(trajectory)
     motion = sample_motion(world, trajectory, times)
@@ -74,7 +77,7 @@ def _draw_motion(axes: Axes, world: World, trajectory: Trajectory | None) -> Non
         base = np.concatenate([_corners(world, i, motion.world[k, 1], known) for i in robot])
         drawn = {"edgecolor": colour, "linewidth": 1.6 if ends else 0.8, "zorder": 3}
         label = "start" if k == 0 else "end" if k == len(times) - 1 else None
-        axes.add_patch(_polygon(outline(base), facecolor=(*colour[:3], 0.22 if ends else 0.05), label=label, **drawn))
+        axes.add_patch(Polygon(outline(base), facecolor=(*colour[:3], 0.22 if ends else 0.05), label=label, **drawn))
         if ends:
             tail, nose = (motion.world[k, 1] @ np.array([[0.0, 0.0, 0.0, 1.0], [0.45, 0.0, 0.0, 1.0]]).T)[:2].T
             axes.annotate("", nose, tail, arrowprops={"arrowstyle": "->", "color": colour, "linewidth": 1.6}, zorder=4)
@@ -83,7 +86,7 @@ def _draw_motion(axes: Axes, world: World, trajectory: Trajectory | None) -> Non
             if not ends and np.allclose(motion.world[k, joint], motion.world[k - 1, joint], atol=1e-3):
                 continue
             corners = _corners(world, i, motion.world[k, joint], known)
-            axes.add_patch(_polygon(outline(corners), facecolor=(*colour[:3], 0.35 if ends else 0.1), **drawn))
+            axes.add_patch(Polygon(outline(corners), facecolor=(*colour[:3], 0.35 if ends else 0.1), **drawn))
     if trajectory is None:
         return
     fine = sample_motion(world, trajectory, np.linspace(trajectory.times[0], trajectory.times[-1], 400))
@@ -123,9 +126,3 @@ def outline(points: Floats) -> Floats:
         return np.asarray(flat[ConvexHull(flat).vertices])
     except QhullError:  # all on one line
         return np.asarray(flat[[0, -1]])
-
-
-def _polygon(corners: Floats, **style: Any) -> Any:
-    from matplotlib.patches import Polygon
-
-    return Polygon(corners, closed=True, **style)

@@ -67,12 +67,8 @@ class _Check:
 
     def report(self) -> Report:
         """Run every check."""
-        self._start()
-        self._limits()
-        self._rates()
-        self._slip()
-        self._unheld()
-        self._latches()
+        for check in (self._start, self._limits, self._rates, self._slip, self._unheld, self._latches):
+            check()
         self.found += check_goals(self.samples, self.steps, self.options)
         self.found += check_terms(self.samples, self.terms)
         error, angle = self._closure()

@@ -176,7 +176,6 @@ def _page(scene: Scene, plan: Judged | None, frames: Mapping[str, pin.SE3] | Non
 
 
 def _film(scene: Scene, plan: Judged | None) -> dict[str, Any]:
-    """Return what the page's bar shows; see `render_page`."""
     if plan is None:
         return {"duration": 0.0, "phases": [], "notes": [], "headline": scene.name}
     times = plan.trajectory.times - plan.trajectory.times[0]

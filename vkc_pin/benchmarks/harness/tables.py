@@ -49,12 +49,10 @@ def to_csv(records: Sequence[Record]) -> str:
     writer = csv.writer(stream, lineterminator="\n")
     columns = list(dict.fromkeys(field for record in records for field in record))
     writer.writerow(columns)
-    writer.writerows([_cell(record.get(column)) for column in columns] for record in records)
+    for values in ([record.get(column) for column in columns] for record in records):
+        texts = [json.dumps(value, ensure_ascii=False) if value is not None else "" for value in values]
+        writer.writerow([value if isinstance(value, str) else text for value, text in zip(values, texts, strict=True)])
     return stream.getvalue()
-
-
-def _cell(value: Any) -> str:
-    return value if isinstance(value, str) else "" if value is None else json.dumps(value, ensure_ascii=False)
 
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[str]], *, text: int = 1) -> str:

@@ -132,6 +132,7 @@ def test_copies_stand_in_the_world() -> None:
 
 FIRST = """
 import numpy as np, coal, vkc_pin
+vkc_pin.load_scene
 def distance(shape, at, turned=np.eye(3)):
     here, there = coal.Transform3s(), coal.Transform3s(turned, np.array(at))
     return coal.distance(shape, here, coal.Box(1.0, 2.0, 0.04), there, coal.DistanceRequest(), coal.DistanceResult())

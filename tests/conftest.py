@@ -14,6 +14,9 @@ settings.register_profile("repeatable", derandomize=True)
 settings.register_profile("random", derandomize=False)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeatable"))
 
+# Nothing is compiled in the background and nothing is written to the user's home; tests of that name folders of their own.
+os.environ["VKC_PIN_CACHE"] = "off"
+
 
 @pytest.fixture(scope="session")
 def door_plan() -> vkc.Plan:

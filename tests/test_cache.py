@@ -38,6 +38,14 @@ def test_the_last_used_are_kept(asked: list[int], entries: int) -> None:
     assert info.hits == len(asked) - len(built)
 
 
+def test_what_begins_alike_can_be_dropped() -> None:
+    cache = Cache()
+    for key in [("program", 1), ("solver", 1, "a"), ("solver", 1, "b"), ("solver", 2, "a"), "solver"]:
+        cache.get(key, lambda: sized(1))
+    cache.drop("solver", 1)
+    assert list(cache._kept) == [("program", 1), ("solver", 2, "a"), "solver"]
+
+
 @given(st.lists(st.integers(0, 100), min_size=1, unique=True), st.integers(0, 300))
 def test_trimming_lets_go_of_the_oldest_until_it_fits(sizes: list[int], nbytes: int) -> None:
     cache = Cache(nbytes=nbytes)

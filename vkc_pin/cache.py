@@ -74,6 +74,11 @@ class Cache:
             self._kept.popitem(last=False)
         return value
 
+    def drop(self, *beginning: Hashable) -> None:
+        """Let go of what is kept under keys that begin like this."""
+        for key in [key for key in self._kept if isinstance(key, tuple) and key[: len(beginning)] == beginning]:
+            del self._kept[key]
+
     def trim(self) -> None:
         """Let go of what there is no room for: objects grow while they are used."""
         total = self.info().nbytes

@@ -9,11 +9,13 @@ import casadi as ca
 import numpy as np
 
 from vkc_pin.arrays import Floats
+from vkc_pin.cpin.machine_code import MachineCode
 
 __all__ = ["BatchFunction", "size_of"]
 
 _KEPT = 16  # batch sizes whose buffers are kept
 _ROUND = 16  # they are multiples of this
+_WORTH = 2_000_000  # instructions, 20 ms, after which a function is used enough to be asked for as machine code
 _INSTRUCTION = 70  # [bytes] that each instruction of a function takes, measured on those of waypoints
 
 
@@ -27,6 +29,7 @@ class BatchFunction:
     def __init__(self, function: ca.Function) -> None:
         self.function = function
         self._buffers: OrderedDict[int, tuple[Any, Any, list[Floats], list[Floats]]] = OrderedDict()
+        self._code, self._instructions, self._worked = MachineCode(function), function.n_instructions(), 0
 
     def __call__(self, *inputs: Floats) -> list[Floats]:
         """Return one array per output, shape (B, numel), entries column by column.
@@ -35,6 +38,11 @@ class BatchFunction:
             inputs: One array per input: the first of shape (B, numel), others too, or (numel,) for the same in every row.
         """
         rows = len(inputs[0])
+        self._worked += rows * self._instructions
+        if self._worked > _WORTH and not self._code.compiled:
+            self._worked = 0
+            if self._code.look():
+                self._buffers.clear()
         batch = max(-(-rows // _ROUND), 1) * _ROUND
         if batch not in self._buffers:
             self._allocate(batch)
@@ -46,7 +54,7 @@ class BatchFunction:
         return [result[:rows].copy() for result in results]
 
     def _allocate(self, batch: int) -> None:
-        mapped = self.function.map(batch)
+        mapped = self._code.functions[0].map(batch)
         buffer, trigger = mapped.buffer()
         arguments = [np.zeros((batch, self.function.nnz_in(i))) for i in range(self.function.n_in())]
         results = [np.zeros((batch, self.function.nnz_out(i))) for i in range(self.function.n_out())]

@@ -7,7 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from vkc_pin.chain.pose import ROW_BOUNDS, pose_residual, pose_rows, target_vector
+from vkc_pin.chain.pose import AWAY, ROW_BOUNDS, PoseRow, away_from, pose_residual, pose_rows, receded, target_vector
 
 _R, _p, _target = ca.SX.sym("R", 3, 3), ca.SX.sym("p", 3), ca.SX.sym("W", 12)
 RESIDUAL = ca.Function("residual", [_R, _p, _target], [pose_residual("pose", _R, _p, _target)])
@@ -294,3 +294,183 @@ def test_what_is_bound_to_a_value_and_what_only_from_below() -> None:
         assert (upper[fixed:] == np.inf).all()
         assert (lower[fixed:] >= 0.0).all()
         assert len(lower) == fixed + (kind != "point")
+
+
+# --- targets that recede ------------------------------------------------------------------------------------------------
+
+_away, _share = ca.SX.sym("D", AWAY), ca.SX.sym("e")
+RECEDED = ca.Function("receded", [_target, _away, _share], [receded(_target, _away, _share)])
+TURNS = [0.0, 1e-9, 1e-6, 1e-3, 0.5, np.pi / 2, 2.5, np.pi - 0.01, np.pi - 1e-3, np.pi - 1e-4, np.pi - 1e-6, np.pi - 1e-9, np.pi]
+SHARES = [0.0, 1e-3, 0.25, 0.5, 0.9, 1.0]
+
+
+def moved_back(target: pin.SE3, away: np.ndarray, share: float) -> pin.SE3:
+    vector = np.asarray(RECEDED(target_vector(target), away, share)).ravel()
+    assert np.isfinite(vector).all()
+    return pin.SE3(vector[:9].reshape(3, 3).T, vector[9:])
+
+
+def angle_between(first: np.ndarray, second: np.ndarray) -> float:
+    """Return the angle of the turn between two rotations, exact at all of them."""
+    quaternion = pin.Quaternion(first.T @ second).coeffs()
+    return float(2.0 * np.arctan2(np.linalg.norm(quaternion[:3]), abs(quaternion[3])))
+
+
+def away_of(kind: str, target: pin.SE3, *placements: pin.SE3) -> np.ndarray:
+    rotations, translations = (np.array([getattr(p, part) for p in placements]) for part in ("rotation", "translation"))
+    found = away_from(kind, rotations, translations, target)
+    assert found.shape == (len(placements), AWAY)
+    assert np.isfinite(found).all()
+    np.testing.assert_allclose(np.linalg.norm(found[:, 3:6], axis=1), 1.0, rtol=0.0, atol=1e-12)
+    assert ((found[:, 6] >= 0.0) & (found[:, 6] <= np.pi + 1e-12)).all()
+    return np.asarray(found)
+
+
+def some_placement(kind: str, target: pin.SE3, angle: float, rng: np.random.Generator) -> pin.SE3:
+    """Return a placement that is off by an angle and by an offset; of a point, by any turn."""
+    if kind == "upright":
+        placement = tilted(target, rng.uniform(-np.pi, np.pi), angle, rng.uniform(-np.pi, np.pi))
+    else:
+        placement = turned(target, angle, random_axis(rng))
+    return pin.SE3(placement.rotation, target.translation + rng.normal(size=3))
+
+
+@pytest.mark.parametrize("axis", [*np.eye(3), *-np.eye(3), None], ids=["x", "y", "z", "-x", "-y", "-z", "random"])
+@pytest.mark.parametrize("angle", TURNS)
+def test_how_far_a_pose_is_away_is_its_offset_and_its_logarithm(angle: float, axis: np.ndarray | None) -> None:
+    rng, target = np.random.default_rng(10), pin.SE3.Random()
+    for _ in range(10):
+        about, shift = random_axis(rng) if axis is None else axis, rng.normal(size=3)
+        placement = turned(target, angle, about)
+        placement.translation = target.translation + shift
+        (found,) = away_of("pose", target, placement)
+        np.testing.assert_allclose(found[:3], shift, rtol=0.0, atol=1e-12)
+        assert found[6] == pytest.approx(angle, abs=1e-12 if angle == 0.0 else 1e-9)
+        log = pin.log3(target.rotation.T @ placement.rotation)
+        if angle < np.pi - 1e-3:
+            np.testing.assert_allclose(found[6] * found[3:6], log, rtol=0.0, atol=1e-8)
+        np.testing.assert_allclose(pin.exp3(found[6] * found[3:6]), target.rotation.T @ placement.rotation, rtol=0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("angle", TURNS)
+def test_how_far_something_upright_is_away_is_its_offset_and_its_tilt(angle: float) -> None:
+    """About a level axis, so that it is the shortest turn; the heading counts for nothing."""
+    rng, vertical = np.random.default_rng(11), np.array([0.0, 0.0, 1.0])
+    for _ in range(20):
+        target = pin.SE3.Random()
+        placement = some_placement("upright", target, angle, rng)
+        (found,) = away_of("upright", target, placement)
+        np.testing.assert_allclose(found[:3], placement.translation - target.translation, rtol=0.0, atol=1e-12)
+        assert found[6] == pytest.approx(angle, abs=1e-9)
+        if angle > 1e-6:  # where it is all but upright the axis is anything
+            assert (target.rotation @ found[3:6])[2] == pytest.approx(0.0, abs=1e-9)
+        back = target.rotation @ pin.exp3(found[6] * found[3:6])  # the frame, but for its heading
+        np.testing.assert_allclose(back.T @ vertical, placement.rotation.T @ vertical, rtol=0.0, atol=1e-9)
+
+
+def test_how_far_a_point_is_away_is_its_offset() -> None:
+    target, placements = pin.SE3.Random(), [pin.SE3.Random() for _ in range(5)]
+    found = away_of("point", target, *placements)
+    np.testing.assert_allclose(found[:, :3], [p.translation - target.translation for p in placements], rtol=0.0, atol=1e-15)
+    np.testing.assert_array_equal(found[:, 6], np.zeros(5))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_how_far_many_are_away_is_how_far_each_is(kind: str) -> None:
+    rng, target = np.random.default_rng(12), pin.SE3.Random()
+    placements = [some_placement(kind, target, angle, rng) for angle in TURNS]
+    each = [away_of(kind, target, placement)[0] for placement in placements]
+    np.testing.assert_allclose(away_of(kind, target, *placements), each, rtol=0.0, atol=1e-12)
+    assert away_from(kind, np.zeros((0, 3, 3)), np.zeros((0, 3)), target).shape == (0, AWAY)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("angle", [1e-6, 1e-3, 0.5, 2.5, np.pi - 2e-3])
+def test_how_far_they_are_away_agrees_with_the_residual(kind: str, angle: float) -> None:
+    rng = np.random.default_rng(13)
+    for _ in range(10):
+        target = pin.SE3.Random()
+        placement = some_placement(kind, target, angle, rng)
+        (found,), residual = away_of(kind, target, placement), value(RESIDUALS[kind], placement, target)
+        np.testing.assert_allclose(found[:3], residual[:3], rtol=0.0, atol=1e-12)
+        size = 0.0 if kind == "point" else np.linalg.norm(residual[3:])
+        assert 2.0 * np.sin(found[6] / 2.0) == pytest.approx(size, abs=1e-8)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("angle", TURNS)
+def test_a_target_that_is_all_the_way_back_holds_where_the_frame_is(kind: str, angle: float) -> None:
+    rng, vertical = np.random.default_rng(14), np.array([0.0, 0.0, 1.0])
+    for _ in range(10):
+        target = pin.SE3.Random()
+        placement = some_placement(kind, target, angle, rng)
+        (away,) = away_of(kind, target, placement)
+        back = moved_back(target, away, 1.0)
+        np.testing.assert_allclose(back.translation, placement.translation, rtol=0.0, atol=1e-12)
+        if kind == "pose":
+            np.testing.assert_allclose(back.rotation, placement.rotation, rtol=0.0, atol=1e-9)
+        elif kind == "upright":
+            np.testing.assert_allclose(back.rotation.T @ vertical, placement.rotation.T @ vertical, rtol=0.0, atol=1e-9)
+        else:
+            np.testing.assert_allclose(back.rotation, target.rotation, rtol=0.0, atol=1e-12)
+        assert outside(kind, placement, back) < 1e-9
+        if angle > 0.0:
+            assert outside(kind, placement, target) > 1e-10
+        at_target = moved_back(target, away, 0.0)
+        np.testing.assert_array_equal(at_target.translation, target.translation)
+        np.testing.assert_allclose(at_target.rotation, target.rotation, rtol=0.0, atol=1e-15)
+
+
+@pytest.mark.parametrize("kind", ["pose", "upright"])
+@pytest.mark.parametrize("angle", [1e-3, 0.5, 2.5, np.pi - 1e-4, np.pi])
+def test_on_the_way_a_target_goes_straight_and_turns_evenly(kind: str, angle: float) -> None:
+    rng, target = np.random.default_rng(15), pin.SE3.Random()
+    for _ in range(10):
+        placement = some_placement(kind, target, angle, rng)
+        (away,) = away_of(kind, target, placement)
+        way = [moved_back(target, away, share) for share in SHARES]
+        for share, there in zip(SHARES, way, strict=True):
+            expected = (1.0 - share) * target.translation + share * placement.translation
+            np.testing.assert_allclose(there.translation, expected, rtol=0.0, atol=1e-12)
+            np.testing.assert_allclose(there.rotation.T @ there.rotation, np.eye(3), rtol=0.0, atol=1e-12)
+            assert np.linalg.det(there.rotation) > 0.0
+            assert angle_between(target.rotation, there.rotation) == pytest.approx(share * angle, abs=1e-9)
+            assert angle_between(there.rotation, way[-1].rotation) == pytest.approx((1.0 - share) * angle, abs=1e-9)
+        if angle < np.pi - 1e-3 and kind == "pose":
+            halfway = target.rotation @ pin.exp3(0.5 * pin.log3(target.rotation.T @ placement.rotation))
+            np.testing.assert_allclose(way[3].rotation, halfway, rtol=0.0, atol=1e-8)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("angle", [0.0, 0.5, np.pi - 1e-4, np.pi])
+def test_slopes_of_rows_with_a_target_that_recedes(kind: str, angle: float) -> None:
+    """By finite differences of the share; a half turn is no worse than any other."""
+    rng, target = np.random.default_rng(16), pin.SE3.Random()
+    rows = pose_rows(kind, _R, _p, receded(_target, _away, _share))
+    function = ca.Function("rows", [_R, _p, _target, _away, _share], [rows, ca.jacobian(rows, _share)])
+    placement = some_placement(kind, target, angle, rng)
+    (away,) = away_of(kind, target, placement)
+    for share in SHARES:
+        given = (placement.rotation, placement.translation, target_vector(target), away)
+        slope = np.asarray(function(*given, share)[1]).ravel()
+        ahead, behind = (np.asarray(function(*given, share + sign * 1e-5)[0]).ravel() for sign in (1.0, -1.0))
+        np.testing.assert_allclose(slope, (ahead - behind) / 2e-5, rtol=0.0, atol=1e-8)
+
+
+@pytest.mark.parametrize("shift", [None, (2, (0.1, -0.2, 0.3))], ids=["plain", "shifted"])
+def test_frames_are_placed_in_numbers_as_in_symbols(shift: tuple[int, tuple[float, float, float]] | None) -> None:
+    row = PoseRow(3, pin.SE3.Random(), (1,), "pose", shift)
+    joints = [[pin.SE3.Identity(), *(pin.SE3.Random() for _ in range(4))] for _ in range(6)]
+    found = row.placed(
+        np.array([[joint.rotation for joint in each] for each in joints]),
+        np.array([[joint.translation for joint in each] for each in joints]),
+    )
+    assert [part.shape for part in found] == [(6, 3, 3), (6, 3)]
+    for k, each in enumerate(joints):
+        rotation, translation = row.placement(ca.DM(np.column_stack([target_vector(joint) for joint in each[1:]])))
+        expected = each[3] * row.local
+        offset = np.zeros(3) if shift is None else each[shift[0]].rotation @ np.array(shift[1])
+        np.testing.assert_allclose(found[0][k], expected.rotation, rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(found[1][k], expected.translation + offset, rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(np.asarray(rotation), found[0][k], rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(np.asarray(translation).ravel(), found[1][k], rtol=0.0, atol=1e-12)

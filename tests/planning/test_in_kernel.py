@@ -63,7 +63,7 @@ def test_progress_is_one_line_that_is_written_over(jupyter: Kernel) -> None:
     ("where", "code"),
     [
         ("seeds", "vkc_pin.seeds.initialization._SeedSearch, '_search'"),
-        ("solver", "vkc_pin.solver.loop._Loop, 'run_ipopt'"),
+        ("solver", "vkc_pin.solver.subproblem.Subproblem, 'solve'"),
         ("validation", "vkc_pin.planning.one_problem, 'validate'"),
         ("building", "vkc_pin.planning.one_problem, 'TrajectoryProblem'"),
     ],

@@ -30,6 +30,9 @@ def test_sizes_add_up(problem: TrajectoryProblem) -> None:
     assert sum(size for kind, size in found.items() if kind.startswith("rows")) == t.rows
     assert sum(size for kind, size in found.items() if kind.startswith("only")) == t.rate_matrix.size1()
     assert found["rows: witness planes"] == problem.segments * problem.options.contact_slots
+    assert found["variables: slacks"] == found["rows: witness planes"]
+    shares = [size for kind, size in found.items() if kind.startswith("variables: shares")]
+    assert shares == [problem.segments]
     assert found["rows: closure door"] % 7 == 0
     assert found["rows: rolling"] == found["rows: clamped freedoms"] == found["rows: own constraints"] == 0
 
@@ -67,9 +70,11 @@ def test_patterns_have_the_entries_that_numbers_show(problem: TrajectoryProblem,
     assert abs(hessian - hessian.T).nnz == 0
     (plane,) = planes(problem, z, 60)[:1]
     row = jacobian[int(t.slot_rows[59, 0])].toarray().ravel()
-    assert not row[: 59 * (t.n + 1)].any()  # a waypoint's rows are its own
-    assert not row[60 * (t.n + 1) :].any()
-    assert (row[59 * (t.n + 1) + np.flatnonzero(plane.gradient)] != 0).all()
+    assert not row[: 59 * t.width].any()  # a waypoint's rows are its own
+    assert not row[60 * t.width :].any()
+    assert (row[59 * t.width + np.flatnonzero(plane.gradient)] != 0).all()
+    # Of slacks and share its own slack alone.
+    np.testing.assert_array_equal(np.flatnonzero(row[59 * t.width + t.n : 60 * t.width]), [0])
 
 
 def test_planes_are_distances_to_first_order(problem: TrajectoryProblem, z: np.ndarray) -> None:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 import itertools
 
+import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.carrying import STICK, lifted, room, stand, table
+from helpers.relaxed import check_relaxation, iterates
 from helpers.small_problems import SHORT, door_scene, full_scene, program_of, random_configurations
 
 from vkc_pin.errors import InputError, UnknownNameError
@@ -20,6 +22,7 @@ from vkc_pin.scene.scene import load_scene
 from vkc_pin.solver.to_trajectory import as_trajectory
 from vkc_pin.task.compiler import LATCH_MARGIN
 from vkc_pin.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
+from vkc_pin.task.terms import Constraint
 
 POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array([0.4, 0.2, 0.9]))
 HANDLE = Hold("door", "handle")
@@ -357,6 +360,97 @@ def test_what_is_held_through_something_is_closed_by_its_holder(fetching: Trajec
     np.testing.assert_allclose(data.oMi[pose.shift[0]].rotation @ np.array(pose.shift[1]), SHORT.approach * direction, atol=1e-9)
 
 
+# --- what is not of one waypoint alone --------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def carrying() -> TrajectoryProblem:
+    """A robot that rolls, a grasp that is clamped, own constraints of bounds and an equality, some with the time of a step."""
+    scene = dataclasses.replace(room(table()), robot=load_robot("husky_ur5e", base="differential"))
+    terms = [
+        Constraint("tip", lambda s: s.position("stick.tip"), lower=[-0.1, -0.2, 0.0], upper=0.3, tolerance=0.02),
+        Constraint("level", lambda s: s.rotation("stick.stick")[2, :2].T, lower=0.0, upper=0.0, during="place stick"),
+        Constraint("slow", lambda s: ca.norm_2(s.velocity("tool")) ** 2, upper=0.5, tolerance=0.004),
+    ]
+    steps = [Touch("stick.tip", (0.8, 0.9, 0.7)), Place("stick", (0.8, 0.5, 0.56))]
+    return program_of(scene, steps, options=SHORT, terms=terms)
+
+
+def test_excess_is_how_far_rows_are_outside_their_bounds(carrying: TrajectoryProblem) -> None:
+    """With a sign: what must be taken away to bring them to the nearest bound; nothing where they are within."""
+    p, t = carrying, carrying.transcription
+    dt = np.random.default_rng(1).uniform(0.1, 0.4, p.segments)
+    for seed, scale in ((0, 1.0), (1, 0.1), (2, 5.0)):
+        z = random_path(p, seed, scale)
+        found, lower, upper = p.excess(z, dt), *(bound[t.firm_rows :] for bound in p.row_bounds(None))
+        assert found.shape == (t.rows - t.firm_rows,)
+        values = np.full(t.rows, np.nan)
+        path = p.waypoints(z)
+        step, heading = np.diff(path[:, :2], axis=0), (path[1:, 2] + path[:-1, 2]) / 2
+        values[t.base_rows] = np.cos(heading) * step[:, 1] - np.sin(heading) * step[:, 0]
+        steps = [(column, k) for column, first, last in t.structure.clamped for k in range(first + 1, last + 1)]
+        clamped = np.flatnonzero(p.row_kinds["clamped"]) + t.firm_rows
+        values[clamped] = [path[k, column] - path[k - 1, column] for column, k in steps]
+        values[p.term_numbers.rows] = np.asarray(t.term_values(t.pack(z), p.start, dt)[0]).ravel()
+        values = values[t.firm_rows :]
+        assert np.isfinite(values).all()
+        np.testing.assert_allclose(np.clip(values - found, lower, upper), values - found, rtol=0.0, atol=1e-12)
+        inside = (values >= lower) & (values <= upper)
+        np.testing.assert_array_equal(found[inside], np.zeros(inside.sum()))
+        low, high = values < lower - 1e-9, values > upper + 1e-9
+        np.testing.assert_allclose(found[low], (values - lower)[low], rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(found[high], (values - upper)[high], rtol=0.0, atol=1e-12)
+        if scale == 1.0:
+            assert low.any()
+            assert high.any()
+            assert inside.any()
+        equal = lower == upper
+        np.testing.assert_allclose(found[equal], values[equal], rtol=0.0, atol=1e-12)
+
+
+def test_what_has_only_rows_of_waypoints_has_no_excess(opened: TrajectoryProblem) -> None:
+    z = random_path(opened)
+    assert opened.excess(z, opened.timing_for(z).dt).shape == (0,)
+    assert all(of.shape == (0,) for of in opened.row_kinds.values())
+
+
+def test_every_row_of_several_waypoints_is_of_one_kind(carrying: TrajectoryProblem) -> None:
+    p, t, count = carrying, carrying.transcription, carrying.transcription.rows - carrying.transcription.firm_rows
+    assert set(p.row_kinds) == {"rolling", "clamped", "terms"}
+    assert all(of.shape == (count,) and (of >= 0.0).all() for of in p.row_kinds.values())
+    np.testing.assert_array_equal(sum((of > 0.0).astype(int) for of in p.row_kinds.values()), np.ones(count, int))
+    np.testing.assert_array_equal(np.flatnonzero(p.row_kinds["rolling"]) + t.firm_rows, t.base_rows)
+    assert len(t.base_rows) == p.segments
+    clamped = sum(last - first for _, first, last in t.structure.clamped)
+    assert np.count_nonzero(p.row_kinds["clamped"]) == clamped > 0
+    np.testing.assert_array_equal(np.flatnonzero(p.row_kinds["terms"]) + t.firm_rows, p.term_numbers.rows)
+    for kind in ("rolling", "clamped"):
+        assert set(p.row_kinds[kind]) == {0.0, 1.0}
+    # Of own constraints 1e-3 is the tolerance.
+    tolerances = {"tip": 0.02, "level": 1e-3, "slow": 0.004}
+    for term, at in zip(p.terms, t.term_rows, strict=True):
+        for rows in at.values():
+            np.testing.assert_allclose(p.row_kinds["terms"][rows - t.firm_rows], 1e-3 / tolerances[term.name])
+
+
+def test_rows_of_several_waypoints_belong_to_the_last_of_them(carrying: TrajectoryProblem) -> None:
+    p, t = carrying, carrying.transcription
+    owner = np.full(t.rows, -1)
+    owner[t.base_rows] = np.arange(p.segments)
+    steps = [k for _, first, last in t.structure.clamped for k in range(first + 1, last + 1)]
+    owner[np.flatnonzero(p.row_kinds["clamped"]) + t.firm_rows] = np.array(steps) - 1
+    for at in t.term_rows:
+        for waypoint, rows in at.items():
+            owner[rows] = waypoint - 1
+    np.testing.assert_array_equal(t.owners, owner[t.firm_rows :])
+
+
+def test_a_program_with_all_kinds_of_rows_is_feasible_where_it_is_set_up(carrying: TrajectoryProblem) -> None:
+    missing = [check_relaxation(carrying, z) for z in iterates(carrying)]
+    for kind in ("clearance", "poses", "rolling", "clamped", "terms", "rates"):
+        assert max(each[kind] for each in missing) > 0.1, kind
+
+
 # --- rates ----------------------------------------------------------------------------------------------------------
 
 
@@ -500,7 +594,7 @@ def test_it_says_what_it_is(opened: TrajectoryProblem) -> None:
     for part in (
         "reach door.handle → turn door.knob → move door.hinge, door.knob → go to",
         f"{opened.segments} steps in {0.25 * opened.segments:g} s",
-        f"{opened.segments * (opened.chain.size + 1)} variables",
+        f"{opened.segments * (opened.chain.size + opened.options.contact_slots + 1)} variables",
         f"{opened.transcription.rows} rows",
         f"{sum(len(part.pairs) for part in opened.contacts.phases)} collision pairs",
     ):

@@ -10,9 +10,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.carrying import room, stand, table
+from helpers.relaxed import check_relaxation, iterates
 from helpers.small_problems import full_scene, program_of, random_configurations
 
 import vkc_pin as vkc
+from vkc_pin.chain.pose import AWAY
 from vkc_pin.program.term_rows import TermProgram
 from vkc_pin.task.phases import Phase
 from vkc_pin.task.terms import Constraint, Cost
@@ -162,7 +164,7 @@ def expected_values(p: vkc.TrajectoryProblem, term: Constraint | Cost, path: np.
 def test_rows_and_costs_are_the_expressions_at_the_waypoints(name: str) -> None:
     p = problem(name)
     path, dt, t = random_path(p), times(p), p.transcription
-    x = np.column_stack([path[1:], np.zeros(p.segments)]).ravel()
+    x = t.pack(path[1:], 0.3, 0.4)
     values, _, cost, _ = t.term_values(x, p.start, dt)
     values, first, total, seen = np.asarray(values).ravel(), t.rows - values.numel(), 0.0, 0
     by_name = {term.name: at for term, at in zip(p.terms, t.term_rows, strict=True)}
@@ -195,8 +197,12 @@ def test_derivatives_are_those_of_finite_differences(name: str) -> None:
     objective, constraints, lagrangian = (solver.get_function(f) for f in ("nlp_grad_f", "nlp_jac_g", "nlp_hess_l"))
     planes = rng.normal(size=(t.segments, t.slots, 12 * (p.chain.model.njoints - 1)))
     offsets = rng.normal(size=(t.segments, t.slots))
-    parameters = t.parameter_vector(p.start, planes, offsets, p.target_matrix(), penalty=PENALTY, dt=times(p))
-    x = np.column_stack([random_path(p, 2)[1:], rng.uniform(size=p.segments)]).ravel()
+    away = rng.normal(size=(t.segments, len(p.pose_goals), AWAY))
+    excess, prices = rng.normal(size=t.rows - t.firm_rows), rng.uniform(0.0, 50.0, t.segments)
+    taken = {"away": away, "excess": excess, "prices": prices}
+    parameters = t.parameter_vector(p.start, planes, offsets, p.target_matrix(), penalty=PENALTY, dt=times(p), **taken)
+    slack, shares = rng.uniform(size=(t.segments, t.slots)), rng.uniform(0.05, 0.95, t.segments)
+    x = t.pack(random_path(p, 2)[1:], slack, shares)
     own, step, weight = p.term_numbers.rows, 1e-5, 0.7
     multipliers = np.zeros(t.rows)
     multipliers[own] = rng.normal(size=len(own))
@@ -214,8 +220,24 @@ def test_derivatives_are_those_of_finite_differences(name: str) -> None:
     assert not np.tril(half, -1).any()
     curvature = np.array([(a[1] - b[1]) / (2 * step) for a, b in sides]).T
     np.testing.assert_allclose(half + np.triu(half, 1).T, curvature, rtol=1e-5, atol=1e-3)
-    f, z = objective(x, parameters)[0], x.reshape(p.segments, -1)
-    assert p.objective(z[:, :-1], times(p)) == pytest.approx(float(f) - PENALTY * z[:, -1].sum(), rel=1e-9)
+    f, z = objective(x, parameters)[0], random_path(p, 2)[1:]
+    assert p.objective(z, times(p)) == pytest.approx(float(f) - PENALTY * slack.sum() - prices @ shares, rel=1e-9)
+    # A share takes away the excess of what its waypoint is asked for.
+    owner = np.zeros(t.rows, int)
+    for at in t.term_rows:
+        for waypoint, rows in at.items():
+            owner[rows] = waypoint - 1
+    values = np.asarray(t.term_values(x, p.start, times(p))[0]).ravel()
+    expected = values - shares[owner[own]] * excess[own - t.firm_rows]
+    np.testing.assert_allclose(np.asarray(constraints(x, parameters)[0]).ravel()[own], expected, rtol=0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_with_shares_of_one_own_constraints_hold_wherever_it_is_set_up(name: str) -> None:
+    p = problem(name)
+    missing = [check_relaxation(p, z) for z in iterates(p)]
+    assert max(each["terms"] for each in missing) > 0.1
+    assert max(each["poses"] for each in missing) > 0.1
 
 
 def test_a_hand_left_where_it_was_counts_after_it_was_let_go_of() -> None:
@@ -227,7 +249,7 @@ def test_a_hand_left_where_it_was_counts_after_it_was_let_go_of() -> None:
     first = t.rows - jacobian.shape[0]
     pattern = np.asarray(ca.DM(jacobian.sparsity(), 1.0).full())
     for waypoint, rows in at.items():
-        touched = {int(c) // (t.n + 1) + 1 for c in np.flatnonzero(pattern[rows - first].any(axis=0))}
+        touched = {int(c) // t.width + 1 for c in np.flatnonzero(pattern[rows - first].any(axis=0))}
         assert touched == ({waypoint, release} if waypoint > release else {waypoint}), waypoint
 
 
@@ -246,10 +268,10 @@ def test_programs_with_different_terms_are_told_apart() -> None:
     assert first.transcription.rows == without.transcription.rows + OPTIONS.reach_waypoints
     assert first.term_numbers.upper.tolist() == [1.0] * OPTIONS.reach_waypoints
     parameters = [p.transcription.parameters.numel() for p in (first, without)]
-    assert parameters[0] == parameters[1]  # no term needs the time of a step
+    assert parameters[0] == parameters[1] + OPTIONS.reach_waypoints  # an excess each, but no term needs the time of a step
     fast = vkc.Cost("fast", lambda s: ca.sumsqr(s.velocity("tool")))
     timed = program_of(room(table()), [vkc.GoTo(0.5, 0.5)], options=OPTIONS, terms=[fast])
-    assert timed.transcription.parameters.numel() == parameters[0] + OPTIONS.reach_waypoints
+    assert timed.transcription.parameters.numel() == parameters[1] + OPTIONS.reach_waypoints  # a cost has no excess
 
 
 def test_errors_count_in_tolerances() -> None:
@@ -301,6 +323,7 @@ def test_what_nothing_can_change_is_no_row() -> None:
 
 def test_an_empty_program() -> None:
     p = problem("furniture")
-    part = TermProgram(p.chain.model, (), ca.MX.sym("z", p.chain.size, 4), ca.MX.sym("dt", 3), p.cache)
-    assert part.rows == 0
-    assert part.jacobian.shape == (0, 3 * (p.chain.size + 1))
+    for width in (None, p.chain.size + 5):
+        part = TermProgram(p.chain.model, (), ca.MX.sym("z", p.chain.size, 4), ca.MX.sym("dt", 3), p.cache, width=width)
+        assert part.rows == 0
+        assert part.jacobian.shape == (0, 3 * (width or p.chain.size))

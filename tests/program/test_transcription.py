@@ -12,11 +12,13 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.carrying import room, stand, table
+from helpers.relaxed import Relaxed, check_relaxation, iterates
 from helpers.small_problems import CACHE, door_scene, full_scene, program_of, random_configurations
 
 from vkc_pin.cache import Cache
 from vkc_pin.models.robot_file import load_robot
 from vkc_pin.options import Options
+from vkc_pin.program.inspection import patterns
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.program.transcription import transcribe
 from vkc_pin.program.waypoint import waypoint_functions
@@ -62,25 +64,71 @@ class Point:
 
     problem: TrajectoryProblem
     z: np.ndarray  # (N, n)
-    slack: np.ndarray  # (N,)
+    slack: np.ndarray  # (N, K)
+    shares: np.ndarray  # (N,)
     planes: np.ndarray  # (N, K, 12·joints)
     offsets: np.ndarray  # (N, K)
+    away: np.ndarray  # (N, poses, 7)
+    excess: np.ndarray  # (rows after those of poses,)
+    rate_excess: np.ndarray  # (rows of rates,)
+    prices: np.ndarray  # (N,)
+    dt: np.ndarray  # (N,)
 
     @property
     def x(self) -> np.ndarray:
-        return np.column_stack([self.z, self.slack]).ravel()
+        return np.column_stack([self.z, self.slack, self.shares]).ravel()
 
     @property
-    def parameters(self) -> np.ndarray:
+    def penalties(self) -> float:
+        """What slacks and shares cost."""
+        return float(PENALTY * self.slack.sum() + self.prices @ self.shares)
+
+    def parameters(self, *, rates: bool = False) -> np.ndarray:
         p = self.problem
-        return p.transcription.parameter_vector(p.start, self.planes, self.offsets, p.target_matrix(), penalty=PENALTY)
+        vector = p.transcription.parameter_vector(
+            p.start,
+            self.planes,
+            self.offsets,
+            p.target_matrix(),
+            penalty=PENALTY,
+            dt=self.dt,
+            away=self.away,
+            excess=self.excess,
+            prices=self.prices,
+        )
+        return np.concatenate([vector, self.rate_excess]) if rates else vector
+
+    def receded(self, waypoint: int, number: int) -> pin.SE3:
+        """Return where the target of a pose has gone at a waypoint, by Pinocchio."""
+        target, away, share = self.problem.targets[number], self.away[waypoint - 1, number], self.shares[waypoint - 1]
+        turn = pin.exp3(share * away[6] * away[3:6])
+        return pin.SE3(target.rotation @ turn, target.translation + share * away[:3])
+
+    def at_shares(self, shares: float) -> Point:
+        """Return the same point with all shares the same."""
+        return dataclasses.replace(self, shares=np.full(self.problem.segments, shares))
 
 
 def random_point(p: TrajectoryProblem, seed: int = 0) -> Point:
+    """Return a point at which shares are between 0 and 1, and everything there is for them to take away is random."""
     rng, t = np.random.default_rng(seed), p.transcription
-    z = random_configurations(p.chain.lower, p.chain.upper, t.segments, rng)
-    planes = rng.normal(size=(t.segments, t.slots, 12 * (p.chain.model.njoints - 1)))
-    return Point(p, z, rng.uniform(0.0, 1.0, t.segments), planes, rng.normal(size=(t.segments, t.slots)))
+    N, K = t.segments, t.slots
+    axes = rng.normal(size=(N, len(p.pose_goals), 3))
+    axes /= np.linalg.norm(axes, axis=2, keepdims=True)
+    turns = rng.uniform(0.0, np.pi, (N, len(p.pose_goals), 1))
+    return Point(
+        problem=p,
+        z=random_configurations(p.chain.lower, p.chain.upper, N, rng),
+        slack=rng.uniform(0.0, 1.0, (N, K)),
+        shares=rng.uniform(0.05, 0.95, N),
+        planes=rng.normal(size=(N, K, 12 * (p.chain.model.njoints - 1))),
+        offsets=rng.normal(size=(N, K)),
+        away=np.concatenate([rng.normal(size=axes.shape), axes, turns], axis=2),
+        excess=rng.normal(size=t.rows - t.firm_rows),
+        rate_excess=rng.normal(size=t.rate_matrix.size1()),
+        prices=rng.uniform(0.0, 50.0, N),
+        dt=rng.uniform(0.1, 0.4, N),
+    )
 
 
 def functions(p: TrajectoryProblem, *, rates: bool) -> tuple[ca.Function, ca.Function, ca.Function]:
@@ -90,8 +138,19 @@ def functions(p: TrajectoryProblem, *, rates: bool) -> tuple[ca.Function, ca.Fun
 
 
 def rows(point: Point, *, rates: bool = False) -> np.ndarray:
-    value, _ = functions(point.problem, rates=rates)[1](point.x, point.parameters)
+    value, _ = functions(point.problem, rates=rates)[1](point.x, point.parameters(rates=rates))
     return np.asarray(value).ravel()
+
+
+def taken_away(point: Point, waypoints: list[int], excess: np.ndarray) -> np.ndarray:
+    """Return the share of the excess of rows, given the waypoint that each row belongs to."""
+    assert len(waypoints) == len(excess)
+    return np.asarray(point.shares[np.array(waypoints, int) - 1] * excess)
+
+
+def excess_at(point: Point, which: np.ndarray) -> np.ndarray:
+    """Return the excess of these rows."""
+    return np.asarray(point.excess[which - point.problem.transcription.firm_rows])
 
 
 def differences(function, x: np.ndarray, step: float = 1e-5) -> np.ndarray:  # type: ignore[no-untyped-def]
@@ -149,16 +208,16 @@ def test_the_objective_is_equation_1(name: str) -> None:
     )
     weight[[column for column, _, _ in clamped(p)]] = 1e-3  # chosen once, and not moved
     path = np.vstack([p.start, point.z])
-    expected = PENALTY * point.slack.sum()
+    expected = point.penalties
     for stretch in stretches(p):
         step = np.diff(path[stretch], axis=0)
         bend = np.diff(np.vstack([np.zeros(p.chain.size), step, np.zeros(p.chain.size)]), axis=0) / o.dt
         holding = np.array([p.closed(p.task.phases[p.contacts.phase_of(int(t))]) for t in stretch[1:]])
         heavier = np.where(holding[:, None] & (np.arange(p.chain.size) < 2), o.velocity_weight_holding, 1.0)
         expected += np.sum(heavier * weight * step**2) + o.acceleration_weight * np.sum(weight * bend**2)
-    value, _ = functions(p, rates=False)[0](point.x, point.parameters)
+    value, _ = functions(p, rates=False)[0](point.x, point.parameters())
     assert float(value) == pytest.approx(expected, rel=1e-10)
-    assert p.objective(point.z, p.timing_for(point.z).dt) == pytest.approx(expected - PENALTY * point.slack.sum(), rel=1e-10)
+    assert p.objective(point.z, p.timing_for(point.z).dt) == pytest.approx(expected - point.penalties, rel=1e-10)
 
 
 def test_there_are_rests_where_a_hand_closes_or_opens() -> None:
@@ -176,19 +235,21 @@ def test_witness_rows_are_planes_over_the_placements_plus_slack(name: str) -> No
         stacked = np.concatenate(
             [np.r_[data.oMi[j].rotation.T.ravel(), data.oMi[j].translation] for j in range(1, model.njoints)]
         )
-        expected = point.planes[t] @ stacked - point.offsets[t] + point.slack[t]
+        expected = point.planes[t] @ stacked - point.offsets[t] + point.slack[t]  # each plane has a slack of its own
         np.testing.assert_allclose(g[p.transcription.slot_rows[t]], expected, rtol=0.0, atol=1e-10)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_pose_rows_are_what_is_missing_to_the_pose(name: str) -> None:
+    """To where the target has receded."""
     p = problem(name)
     point, model = random_point(p), p.chain.model
     g, data, t = rows(point), model.createData(), p.transcription
     assert len(t.pose_rows) == len(t.structure.poses) == len(p.targets) == len(p.pose_goals)
-    for pose, at, target in zip(t.structure.poses, t.pose_rows, p.targets, strict=True):
+    for number, (pose, at) in enumerate(zip(t.structure.poses, t.pose_rows, strict=True)):
         assert tuple(sorted(at)) == pose.waypoints
         for waypoint, which in at.items():
+            target = point.receded(waypoint, number)
             pin.forwardKinematics(model, data, p.chain.coordinates.q(point.z[waypoint - 1]))
             placement = data.oMi[pose.joint] * pose.local
             shift = np.zeros(3) if pose.shift is None else data.oMi[pose.shift[0]].rotation @ np.array(pose.shift[1])
@@ -216,7 +277,9 @@ def test_clamped_coordinates_keep_their_values(name: str) -> None:
     p = problem(name)
     point = random_point(p)
     path = p.waypoints(point.z)
-    expected = [path[t, column] - path[t - 1, column] for column, first, last in clamped(p) for t in range(first + 1, last + 1)]
+    steps = [(column, t) for column, first, last in clamped(p) for t in range(first + 1, last + 1)]
+    expected = np.array([path[t, column] - path[t - 1, column] for column, t in steps])
+    expected -= taken_away(point, [t for _, t in steps], excess_at(point, clamp_rows(p)))
     np.testing.assert_allclose(rows(point)[clamp_rows(p)], expected, rtol=0.0, atol=1e-12)
     assert p.transcription.structure.clamped == tuple(clamped(p))
     assert len(expected) == {"stick": 2 * 8, "fetch": 3 * 5}.get(name, 0)
@@ -228,6 +291,7 @@ def test_slip_rows_are_the_sideways_motion_at_the_middle_heading() -> None:
     path = p.waypoints(point.z)
     step, heading = np.diff(path[:, :2], axis=0), (path[1:, 2] + path[:-1, 2]) / 2
     expected = np.cos(heading) * step[:, 1] - np.sin(heading) * step[:, 0]
+    expected -= taken_away(point, list(range(1, p.segments + 1)), excess_at(point, p.transcription.base_rows))
     np.testing.assert_allclose(rows(point)[p.transcription.base_rows], expected, rtol=0.0, atol=1e-12)
     for name in set(NAMES) - {"differential"}:
         assert problem(name).transcription.base_rows.size == 0
@@ -245,6 +309,12 @@ def test_rate_rows_are_steps_and_their_changes(name: str) -> None:
         np.diff(np.vstack([np.zeros(t.n), np.diff(path[stretch], axis=0), np.zeros(t.n)]), axis=0) for stretch in stretches(p)
     ]
     expected = np.concatenate([steps.ravel(), *(change.ravel() for change in changes)])
+    # A step belongs to the waypoint that it leads to, a change to the one at which it happens, at the start to the first after.
+    owners = [*range(1, p.segments + 1), *(max(int(t), 1) for stretch in stretches(p) for t in stretch)]
+    raw = point.at_shares(0.0)
+    np.testing.assert_allclose(rows(raw, rates=True)[t.rows :], expected, rtol=0.0, atol=1e-12)
+    np.testing.assert_array_equal(t.rate_owners, np.repeat(np.array(owners) - 1, t.n))
+    expected = expected - taken_away(point, np.repeat(owners, t.n).tolist(), point.rate_excess)
     np.testing.assert_allclose(g[t.rows :], expected, rtol=0.0, atol=1e-12)
     assert len(expected) == p.chain.size * (p.segments + p.segments + len(changes))
 
@@ -255,7 +325,11 @@ def test_every_row_has_one_meaning(name: str) -> None:
     parts = [t.slot_rows.ravel(), t.base_rows, *(which for at in t.pose_rows for which in at.values())]
     parts.append(clamp_rows(problem(name)))
     np.testing.assert_array_equal(np.sort(np.concatenate(parts)), np.arange(t.rows))
-    assert t.size == t.segments * (t.n + 1)
+    assert t.width == t.n + t.slots + 1
+    assert t.size == t.segments * t.width
+    firm = np.concatenate([t.slot_rows.ravel(), *(which for at in t.pose_rows for which in at.values())])
+    np.testing.assert_array_equal(np.sort(firm), np.arange(t.firm_rows))
+    assert len(t.owners) == t.rows - t.firm_rows
 
 
 # --- derivatives ----------------------------------------------------------------------------------------------------
@@ -267,11 +341,12 @@ def test_gradient_and_jacobian_are_those_of_finite_differences(name: str) -> Non
     p = problem(name)
     point = random_point(p, seed=1)
     objective, constraints, _ = functions(p, rates=True)
-    _, gradient = objective(point.x, point.parameters)
-    expected = differences(lambda x: np.asarray(objective(x, point.parameters)[0]).ravel(), point.x)
+    parameters = point.parameters(rates=True)
+    _, gradient = objective(point.x, parameters)
+    expected = differences(lambda x: np.asarray(objective(x, parameters)[0]).ravel(), point.x)
     np.testing.assert_allclose(np.asarray(gradient).ravel(), expected[0], rtol=1e-6, atol=1e-5)
-    _, jacobian = constraints(point.x, point.parameters)
-    expected = differences(lambda x: np.asarray(constraints(x, point.parameters)[0]).ravel(), point.x)
+    _, jacobian = constraints(point.x, parameters)
+    expected = differences(lambda x: np.asarray(constraints(x, parameters)[0]).ravel(), point.x)
     np.testing.assert_allclose(np.asarray(jacobian.full()), expected, rtol=1e-6, atol=1e-6)
 
 
@@ -282,12 +357,13 @@ def test_hessian_of_the_lagrangian_is_that_of_finite_differences(name: str, rate
     point = random_point(p, seed=2)
     objective, constraints, lagrangian = functions(p, rates=rates)
     multipliers, weight = np.random.default_rng(3).normal(size=len(rows(point, rates=rates))), 0.7
+    parameters = point.parameters(rates=rates)
 
     def slope(x: np.ndarray) -> np.ndarray:
-        gradient, jacobian = objective(x, point.parameters)[1], constraints(x, point.parameters)[1]
+        gradient, jacobian = objective(x, parameters)[1], constraints(x, parameters)[1]
         return weight * np.asarray(gradient).ravel() + np.asarray(jacobian.full()).T @ multipliers
 
-    half = np.asarray(lagrangian(point.x, point.parameters, weight, multipliers).full())
+    half = np.asarray(lagrangian(point.x, parameters, weight, multipliers).full())
     assert not np.tril(half, -1).any()
     expected = differences(slope, point.x)
     np.testing.assert_allclose(half + np.triu(half, 1).T, expected, rtol=1e-5, atol=2e-5)
@@ -301,11 +377,12 @@ def test_patterns_hold_everywhere(name: str) -> None:
     sizes = set()
     for seed in range(4, 7):
         point = random_point(p, seed=seed)
-        jacobian = constraints(point.x, point.parameters)[1]
-        hessian = lagrangian(point.x, point.parameters, 1.0, np.ones(p.transcription.rows))
+        parameters = point.parameters()
+        jacobian = constraints(point.x, parameters)[1]
+        hessian = lagrangian(point.x, parameters, 1.0, np.ones(p.transcription.rows))
         sizes.add((jacobian.nnz(), hessian.nnz()))
         probe = np.random.default_rng(seed).normal(size=p.transcription.size)
-        ahead, behind = (np.asarray(constraints(point.x + s * 1e-6 * probe, point.parameters)[0]).ravel() for s in (1.0, -1.0))
+        ahead, behind = (np.asarray(constraints(point.x + s * 1e-6 * probe, parameters)[0]).ravel() for s in (1.0, -1.0))
         np.testing.assert_allclose(np.asarray(jacobian @ probe).ravel(), (ahead - behind) / 2e-6, rtol=1e-5, atol=1e-5)
     assert len(sizes) == 1
     # Waypoints hang together by rates, and what is clamped, alone: all other rows of one touch no other's variables.
@@ -318,7 +395,65 @@ def test_patterns_hold_everywhere(name: str) -> None:
         for at in p.transcription.pose_rows:
             for waypoint, which in at.items():
                 owner[which] = waypoint - 1
-        np.testing.assert_array_equal(owner[row], column // (p.chain.size + 1))
+        np.testing.assert_array_equal(owner[row], column // p.transcription.width)
+    # A slack is for its own plane, and a share for all rows of its waypoint but those of planes.
+    t = p.transcription
+    pattern, curved = (matrix.toarray() != 0.0 for matrix in patterns(p))
+    assert not (np.asarray(jacobian.full()) != 0.0)[~pattern].any()
+    for k in range(p.segments):
+        columns = k * t.width + np.arange(t.n, t.width)
+        np.testing.assert_array_equal(
+            np.argwhere(pattern[:, columns[:-1]]), np.column_stack([t.slot_rows[k], np.arange(t.slots)])
+        )
+        assert not curved[columns[:-1]].any()
+        touched = [which for at in t.pose_rows for waypoint, which in at.items() if waypoint == k + 1]
+        touched.append(t.firm_rows + np.flatnonzero(t.owners == k))
+        np.testing.assert_array_equal(np.flatnonzero(pattern[:, columns[-1]]), np.sort(np.concatenate(touched)))
+
+
+# --- relaxation -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_wherever_it_is_set_up_it_is_feasible_there_with_shares_of_one(name: str) -> None:
+    p, missing = problem(name), dict.fromkeys(("poses", "rolling", "clamped", "rates", "clearance"), 0.0)
+    for z in iterates(p):
+        for kind, amount in check_relaxation(p, z).items():
+            missing[kind] = max(missing.get(kind, 0.0), amount)
+    there = {kind for kind, amount in missing.items() if amount > 0.1}
+    expected = {"poses", "clearance", "rates"}
+    expected |= {"differential": {"rolling"}, "stick": {"clamped"}, "fetch": {"clamped"}}.get(name, set())
+    assert there == expected, "a test in which nothing is missing says nothing"
+
+
+@pytest.mark.parametrize("off", [0.0, 1e-9, 1e-6, 1e-4, 1e-3, 0.01])
+@pytest.mark.parametrize("axis", [*np.eye(3), None], ids=["x", "y", "z", "random"])
+def test_what_is_turned_round_is_feasible_there_too(axis: np.ndarray | None, off: float) -> None:
+    """Next to a half turn the rows themselves all but vanish, and the residual has two signs."""
+    p, rng = problem("reach"), np.random.default_rng(22)
+    for z in iterates(p, 3)[:3]:
+        about = rng.normal(size=3) if axis is None else axis
+        pose, data = p.transcription.structure.poses[0], p.chain.model.createData()
+        pin.forwardKinematics(p.chain.model, data, p.chain.coordinates.q(z[-1]))
+        turn = pin.AngleAxis(np.pi - off, about / np.linalg.norm(about)).matrix()
+        there = data.oMi[pose.joint] * pose.local * pin.SE3(turn, np.array([0.1, -0.2, 0.3]))
+        turned = program_of(door_scene(), [Reach(there)], options=OPTIONS)
+        assert turned.transcription is p.transcription
+        check_relaxation(turned, z)
+        found = Relaxed(turned, z).found
+        assert found.amounts["poses"][-1] == pytest.approx(np.pi - off + np.linalg.norm([0.1, -0.2, 0.3]), abs=1e-8)
+
+
+def test_where_poses_hold_there_is_nothing_to_take_away() -> None:
+    p = problem("reach")
+    z = iterates(p, 1)[0]
+    pose, data = p.transcription.structure.poses[0], p.chain.model.createData()
+    pin.forwardKinematics(p.chain.model, data, p.chain.coordinates.q(z[-1]))
+    there = program_of(door_scene(), [Reach(data.oMi[pose.joint] * pose.local)], options=OPTIONS)
+    at = Relaxed(there, z)
+    assert at.found.amounts["poses"].max() < 1e-9
+    rows = there.transcription.pose_rows[0][there.segments]
+    np.testing.assert_allclose(at.rows(1.0)[rows], at.rows(0.0)[rows], rtol=0.0, atol=1e-9)
 
 
 # --- reuse ----------------------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from helpers.small_problems import door_scene, full_scene, random_configurations
 
 from vkc_pin.cache import Cache
 from vkc_pin.chain.chain import VirtualKinematicChain, consolidate
-from vkc_pin.chain.pose import PoseRow, target_vector
+from vkc_pin.chain.pose import AWAY, PoseRow, target_vector
 from vkc_pin.options import Options
 from vkc_pin.program.waypoint import Structure, WaypointFunctions, waypoint_functions
 from vkc_pin.task.compiler import compile_task
@@ -45,23 +45,34 @@ class Numbers:
     def __init__(self, chain: VirtualKinematicChain, poses: tuple[PoseRow, ...], seed: int) -> None:
         self.chain, self.poses, rng = chain, poses, np.random.default_rng(seed)
         self.z = random_configurations(chain.lower, chain.upper, 1, rng)[0]
-        self.s = float(rng.normal())
+        self.s, self.share = rng.normal(size=SLOTS), float(rng.uniform(0.1, 0.9))
         self.planes = rng.normal(size=(SLOTS, 12 * (chain.model.njoints - 1)))
         self.offsets = rng.normal(size=SLOTS)
         self.targets = [pin.SE3(pin.exp3(rng.normal(size=3)), rng.normal(size=3)) for _ in poses]
         self.multipliers = rng.normal(size=SLOTS + sum(pose.rows for pose in poses))
+        axes = rng.normal(size=(len(poses), 3))
+        axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+        self.away = np.column_stack([rng.normal(size=(len(poses), 3)), axes, rng.uniform(0.0, np.pi, len(poses))])
 
-    def inputs(self, z: np.ndarray, s: float) -> list[np.ndarray | float]:
+    @property
+    def own(self) -> np.ndarray:
+        """Its variables: z, slacks and share."""
+        return np.concatenate([self.z, self.s, [self.share]])
+
+    def inputs(self, own: np.ndarray) -> list[np.ndarray]:
         targets = np.column_stack([target_vector(target) for target in self.targets])
-        return [z, s, self.planes.ravel(order="F"), self.offsets, targets.ravel(order="F")]
+        return [own, self.planes.ravel(order="F"), self.offsets, targets.ravel(order="F"), self.away.ravel()]
 
-    def rows(self, z: np.ndarray, s: float) -> np.ndarray:
+    def rows(self, own: np.ndarray) -> np.ndarray:
         """Return the rows as they are defined."""
+        z, s, share = np.split(own, [self.chain.size, self.chain.size + SLOTS])
         model, data = self.chain.model, self.chain.model.createData()
         pin.forwardKinematics(model, data, self.chain.coordinates.q(z))
         stacked = np.concatenate([target_vector(placement) for placement in list(data.oMi)[1:]])
         rows = [self.planes @ stacked - self.offsets + s]
-        for pose, target in zip(self.poses, self.targets, strict=True):
+        for pose, there, away in zip(self.poses, self.targets, self.away, strict=True):
+            turn = pin.exp3(float(share[0]) * away[6] * away[3:6])
+            target = pin.SE3(there.rotation @ turn, there.translation + share * away[:3])
             at = data.oMi[pose.joint] * pose.local
             if pose.shift is not None:
                 at.translation = at.translation + data.oMi[pose.shift[0]].rotation @ np.array(pose.shift[1])
@@ -84,28 +95,34 @@ def matrix(pattern: tuple[list[int], list[int]], values: ca.DM, shape: tuple[int
 @pytest.mark.parametrize("seed", range(4))
 def test_rows_and_their_derivatives(chain: VirtualKinematicChain, seed: int) -> None:
     poses = some_poses(chain)
-    functions, numbers, n, h = (
-        WaypointFunctions(chain.model, SLOTS, poses, Cache()),
-        Numbers(chain, poses, seed),
-        chain.size,
-        1e-6,
-    )
+    functions, numbers = WaypointFunctions(chain.model, SLOTS, poses, Cache()), Numbers(chain, poses, seed)
+    x, width, h = numbers.own, chain.size + SLOTS + 1, 1e-6
+    assert x.shape == (width,)
     assert functions.pose_rows == [7, 6, 3]
     assert functions.rows == SLOTS + 16
-    given = numbers.inputs(numbers.z, numbers.s)
-    np.testing.assert_allclose(np.array(functions.value(*given)).ravel(), numbers.rows(numbers.z, numbers.s), atol=1e-12)
+    np.testing.assert_allclose(np.array(functions.value(*numbers.inputs(x))).ravel(), numbers.rows(x), atol=1e-12)
 
     def jacobian(x: np.ndarray) -> np.ndarray:
-        return matrix(functions.jacobian_pattern, functions.jacobian(*numbers.inputs(x[:-1], x[-1])), (functions.rows, n + 1))
+        return matrix(functions.jacobian_pattern, functions.jacobian(*numbers.inputs(x)), (functions.rows, width))
 
-    x = np.append(numbers.z, numbers.s)
-    steps = h * np.eye(n + 1)
-    slopes = [(numbers.rows((x + e)[:-1], (x + e)[-1]) - numbers.rows((x - e)[:-1], (x - e)[-1])) / (2 * h) for e in steps]
+    steps = h * np.eye(width)
+    slopes = [(numbers.rows(x + e) - numbers.rows(x - e)) / (2 * h) for e in steps]
     np.testing.assert_allclose(jacobian(x), np.column_stack(slopes), atol=1e-7)
-    upper = matrix(functions.hessian_pattern, functions.hessian(*given, numbers.multipliers), (n, n))
+    upper = matrix(functions.hessian_pattern, functions.hessian(*numbers.inputs(x), numbers.multipliers), (width, width))
     assert (np.tril(upper, -1) == 0.0).all()
-    curvature = [numbers.multipliers @ (jacobian(x + e) - jacobian(x - e))[:, :n] / (2 * h) for e in steps[:n]]
+    assert upper[:, -1].any(), "shares bend what they turn"
+    curvature = [numbers.multipliers @ (jacobian(x + e) - jacobian(x - e)) / (2 * h) for e in steps]
     np.testing.assert_allclose(upper + np.triu(upper, 1).T, np.array(curvature), atol=1e-6)
+
+
+def test_without_poses_only_slacks_help(chain: VirtualKinematicChain) -> None:
+    """Each helps its own plane, and the share none."""
+    functions, numbers = WaypointFunctions(chain.model, SLOTS, (), Cache()), Numbers(chain, (), 0)
+    inputs = [numbers.own, numbers.planes.ravel(order="F"), numbers.offsets, np.ones(12), np.ones(AWAY)]
+    np.testing.assert_allclose(np.array(functions.value(*inputs)).ravel(), numbers.rows(numbers.own), atol=1e-12)
+    jacobian = matrix(functions.jacobian_pattern, functions.jacobian(*inputs), (SLOTS, chain.size + SLOTS + 1))
+    np.testing.assert_array_equal(jacobian[:, chain.size :], np.eye(SLOTS, SLOTS + 1))
+    assert max(functions.hessian_pattern[1]) < chain.size
 
 
 def test_functions_of_one_kind_are_built_once(chain: VirtualKinematicChain) -> None:

@@ -16,7 +16,7 @@ import pinocchio as pin
 
 from vkc_pin.arrays import Floats
 
-__all__ = ["ROW_BOUNDS", "PoseRow", "pose_residual", "pose_rows", "target_vector"]
+__all__ = ["AWAY", "ROW_BOUNDS", "PoseRow", "away_from", "pose_residual", "pose_rows", "receded", "target_vector"]
 
 ROW_BOUNDS: Mapping[str, tuple[Floats, Floats]] = {
     "pose": (np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]), np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.inf])),
@@ -60,6 +60,15 @@ class PoseRow:
             translation = translation + ca.reshape(placements[:9, joint - 1], 3, 3) @ ca.DM(vector)
         return rotation @ self.local.rotation, translation
 
+    def placed(self, rotations: Floats, translations: Floats) -> tuple[Floats, Floats]:
+        """Return rotations, shape (B, 3, 3), and translations, shape (B, 3), of the frame, given those of all joints."""
+        rotation = rotations[:, self.joint]
+        translation = rotation @ self.local.translation + translations[:, self.joint]
+        if self.shift is not None:
+            joint, vector = self.shift
+            translation = translation + rotations[:, joint] @ np.array(vector)
+        return rotation @ self.local.rotation, translation
+
 
 _HALF_TURN = 1e-6  # of (2 cos(θ/2))²
 _GENERIC = ca.DM([0.3, 0.55, 0.78])  # perpendicular to no axis that anybody turns about
@@ -85,7 +94,8 @@ def pose_residual(kind: str, rotation: Any, translation: Any, target: Any) -> An
     error = ca.reshape(target[:9], 3, 3).T @ rotation
     vee = ca.vertcat(error[2, 1] - error[1, 2], error[0, 2] - error[2, 0], error[1, 0] - error[0, 1])
     squared = 1.0 + error[0, 0] + error[1, 1] + error[2, 2]  # (2 cos(θ/2))²
-    turned = error @ _GENERIC + _GENERIC + vee
+    turned = error @ _GENERIC + _GENERIC  # 2(a·g)a
+    turned = 2.0 * turned / ca.sqrt(ca.fmax(ca.sumsqr(turned), _HALF_TURN)) + vee
     angle = ca.if_else(squared > _HALF_TURN, vee / ca.sqrt(ca.fmax(squared, _HALF_TURN)), turned)
     return ca.vertcat(offset, angle)
 
@@ -106,6 +116,46 @@ def pose_rows(kind: str, rotation: Any, translation: Any, target: Any) -> Any:
     error = ca.reshape(target[:9], 3, 3).T @ rotation
     vee = ca.vertcat(error[2, 1] - error[1, 2], error[0, 2] - error[2, 0], error[1, 0] - error[0, 1]) / 2
     return ca.vertcat(offset, vee, error[0, 0] + error[1, 1] + error[2, 2])
+
+
+AWAY = 7  # numbers that say how far a frame is from its target: offset [m], axis and angle [rad] of the turn
+
+
+def away_from(kind: str, rotations: Floats, translations: Floats, target: pin.SE3) -> Floats:
+    """Return how far frames are from their target, shape (B, 7): p − p* [m], and axis a and angle θ [rad] of exp(θa) = R*ᵀR.
+
+    For "upright" the turn is the shortest that makes the vertical the target's, for "point" there is none; see `receded`. It is
+    as exact next to half turns as anywhere else, which `pose_residual` is not.
+
+    Args:
+        kind: Of the goal.
+        rotations: Of the frames, shape (B, 3, 3).
+        translations: Theirs, shape (B, 3).
+        target: Where they are to be.
+    """
+    turn, along = np.zeros((len(rotations), 3)), np.ones(len(rotations))  # a·sin and cos of θ, or of θ/2
+    if kind == "upright":  # the vertical leans over by θ, as the world sees it; what stands on its head, about any level axis
+        vertical = rotations[:, 2] @ target.rotation.T
+        turn = np.column_stack([vertical[:, 1], -vertical[:, 0], np.zeros(len(turn))])
+        turn, along = np.where(turn.any(axis=1, keepdims=True), turn, [1e-99, 0.0, 0.0]) @ target.rotation, vertical[:, 2]
+    elif kind == "pose":
+        quaternions = np.array([pin.Quaternion(error).coeffs() for error in target.rotation.T @ rotations]).reshape(-1, 4)
+        turn, along = quaternions[:, :3] * np.where(quaternions[:, 3:] < 0.0, -1.0, 1.0), np.abs(quaternions[:, 3])
+    size = np.linalg.norm(turn, axis=1, keepdims=True)
+    axis = np.where(size > 0.0, turn / np.maximum(size, np.finfo(float).tiny), [0.0, 0.0, 1.0])
+    angle = (2.0 if kind == "pose" else 1.0) * np.arctan2(size[:, 0], along)
+    return np.column_stack([translations - target.translation, axis, angle])
+
+
+def receded(target: Any, away: Any, share: Any) -> Any:
+    """Return a target moved back along the way to it, R*·exp(share·θ·a) and p* + share·(p − p*), shape (12, 1).
+
+    At a share of 1 it is where the frame was from which `away`, shape (7, 1), was taken, see `away_from`; at 0 the target itself.
+    On the way orientations turn about one axis (a geodesic), so that a half turn is as good as any other.
+    """
+    skew = ca.skew(away[3:6])
+    turn = ca.DM.eye(3) + ca.sin(share * away[6]) * skew + (1.0 - ca.cos(share * away[6])) * (skew @ skew)
+    return ca.vertcat(ca.vec(ca.reshape(target[:9], 3, 3) @ turn), target[9:] + share * away[:3])
 
 
 def _tilt(rotation: Any, target: Any) -> tuple[Any, Any]:

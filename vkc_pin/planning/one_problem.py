@@ -29,8 +29,6 @@ from vkc_pin.validation.validate import validate
 
 __all__ = ["OneProblem"]
 
-_RACING_SEEDS = 3  # seeds that race for a few rounds; the best of them goes on
-
 
 @dataclass(frozen=True, eq=False)
 class _Try:
@@ -77,7 +75,6 @@ class OneProblem:
         self.rounds = self.iterations = 0
         self.history: list[dict[str, float]] = []
         self.blocked: list[str] = []  # phases in which there is no way for the base
-        self._leading: Seed | None = None
 
     def run(self, seed: Callable[[TrajectoryProblem], Seed] | None = None) -> Plan:
         """Try seeds until validation accepts a motion, there are no more, time is up, or Ctrl-C is pressed.
@@ -98,7 +95,7 @@ class OneProblem:
             best = dataclasses.replace(best, report=best.report.with_reasons(reasons))
         else:
             deadline = np.inf if limit is None else began + cache.building - built + limit
-            seeds = self._raced(problem, deadline) if seed is None else iter([seed(problem)])
+            seeds = self._seeds(problem) if seed is None else iter([seed(problem)])
             best, status = self._try_seeds(problem, seeds, deadline, searched=seed is None)
         self.z, self.initialization = best.z, best.name
         build_time = cache.building - built
@@ -117,14 +114,10 @@ class OneProblem:
         """Return the best try, with what is in the way of the task if it is no success, and the plan's status."""
         best: _Try | None = None
         notes: list[str] = []
-        stuck: list[tuple[float, int, Seed]] = []
         ended = ""  # why nothing else is to be tried
         for number, seed in enumerate(seeds, start=1):
             solution, found = self._try(problem, seed, deadline)
             best = found if best is None or found.better(best) else best
-            if searched and solution.resume is not None:
-                again = Seed(seed.name, solution.z, radius=solution.resume.radius, penalty=solution.resume.penalty)
-                stuck.append((found.amount, number, again))
             ended = self._ended(best, solution)
             if ended:
                 break
@@ -132,14 +125,6 @@ class OneProblem:
                 notes = explain(problem, self.settings.seed, self.settings.interrupt)
             elif notes:  # two seeds failed, and random configurations find no free one at a goal either
                 break
-        else:
-            if stuck and not self.settings.interrupt.pressed:  # no other seeds: now with patience, what violates least
-                solution, found = self._try(problem, min(stuck)[-1], deadline, patient=True)
-                best = found if best is None or found.better(best) else best
-                ended = self._ended(best, solution)
-        if best is None and self._leading is not None:
-            leading = self._leading
-            best = self._judge(problem, Solution(leading.z, problem.timing_for(leading.z).dt), leading.name)
         if best is None:
             best, notes = self._stationary(problem), notes + self.blocked
         if not ended and self.settings.interrupt.pressed:
@@ -149,9 +134,9 @@ class OneProblem:
             best = dataclasses.replace(best, report=dataclasses.replace(best.report, notes=tuple(notes)))
         return best, ended
 
-    def _try(self, problem: TrajectoryProblem, seed: Seed, deadline: float, *, patient: bool = False) -> tuple[Solution, _Try]:
+    def _try(self, problem: TrajectoryProblem, seed: Seed, deadline: float) -> tuple[Solution, _Try]:
         """Return what the solver makes of a seed, and what that is worth."""
-        solution = self._solve(problem, seed, deadline, patient=patient)
+        solution = self._solve(problem, seed, deadline)
         return solution, self._judge(problem, solution, seed.name)
 
     def _ended(self, best: _Try, solution: Solution) -> str:
@@ -182,40 +167,13 @@ class OneProblem:
                 return
             yield seed
 
-    def _raced(self, problem: TrajectoryProblem, deadline: float) -> Iterator[Seed]:
-        """Yield seeds; where a grasp is chosen with what follows in mind, first those that look best after one round."""
-        seeds = self._seeds(problem)
-        if not self.settings.rough and any(phase.grasps for phase in problem.task.phases[:-1]):
-            scored: list[tuple[float, int, Seed]] = []
-            for number, seed in enumerate(itertools.islice(seeds, _RACING_SEEDS)):
-                if not seed.races:  # a round would not tell
-                    scored.append((np.inf, number, seed))
-                    continue
-                solution = self._solve(problem, seed, deadline, rounds=1)
-                if solution.status == "time limit" and self._leading is not None:
-                    break
-                better = dataclasses.replace(seed, z=solution.z, radius=solution.radius)
-                scored.append((problem.objective(solution.z, solution.dt), number, better))
-                self._leading = min(scored)[-1]
-                if self.settings.interrupt.pressed:
-                    return
-            if self.settings.interrupt.pressed:
-                return
-            yield from (seed for _, _, seed in sorted(scored))
-        yield from seeds
-
-    def _solve(
-        self, problem: TrajectoryProblem, seed: Seed, deadline: float, *, rounds: int | None = None, patient: bool = True
-    ) -> Solution:
+    def _solve(self, problem: TrajectoryProblem, seed: Seed, deadline: float) -> Solution:
         solution = solve(
             problem,
             seed.z,
             callback=self._report,
             deadline=deadline,
-            rounds=rounds,
             radius=seed.radius,
-            penalty=seed.penalty,
-            patient=patient,
             thorough=not self.settings.rough,
             interrupt=self.settings.interrupt,
         )

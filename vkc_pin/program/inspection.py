@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from vkc_pin.arrays import Floats, Ints
@@ -79,11 +80,11 @@ def planes(problem: TrajectoryProblem, z: Floats, waypoint: int) -> list[Plane]:
     waypoints = np.arange(1, problem.segments + 1)
     contacts = model.evaluate(z, waypoints, reach=problem.options.contact_reach, nearest=t.slots)
     coefficients, offsets = model.planes(z, contacts, slots=t.slots)
-    x = np.column_stack([z, np.zeros(len(z))]).ravel()
+    x = t.pack(z)
     dt, targets = problem.timing_for(z).dt, problem.target_matrix()
     parameters = t.parameter_vector(problem.start, coefficients, offsets, targets, penalty=problem.options.penalty, dt=dt)
-    _, jacobian = t.rows_at(x, parameters)
-    columns = (waypoint - 1) * (t.n + 1) + np.arange(t.n)
+    jacobian = ca.Function("slopes", [t.x, t.parameters], [t.jacobian])(x, parameters).sparse().tocsr()
+    columns = (waypoint - 1) * t.width + np.arange(t.n)
     return [
         Plane(
             problem=problem,
@@ -111,7 +112,8 @@ def sizes(problem: TrajectoryProblem) -> dict[str, int]:
     found = {
         "variables: coordinates": problem.lower.size - fixed,
         "variables: coordinates, fixed by bounds": fixed,
-        "variables: slacks": t.segments,
+        "variables: slacks": t.slot_rows.size,
+        "variables: shares of what is not reached yet": t.segments,
     }
     for goal, at in zip(problem.pose_goals, t.pose_rows, strict=True):
         kind = f"rows: {goal.name}"
@@ -127,7 +129,9 @@ def sizes(problem: TrajectoryProblem) -> dict[str, int]:
 
 def patterns(problem: TrajectoryProblem) -> tuple[Any, Any]:
     """Return where the rows' Jacobian and the Lagrangian's Hessian can differ from zero, as sparse matrices (SciPy)."""
-    return problem.transcription.patterns()
+    t = problem.transcription
+    upper = ca.triu(t.objective_hessian).sparsity() + t.hessian.sparsity()
+    return ca.DM(t.jacobian.sparsity(), 1.0).sparse(), ca.DM(upper + upper.T, 1.0).sparse()
 
 
 def build(

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import cached_property
 
 import numpy as np
 
@@ -219,6 +220,25 @@ class TrajectoryProblem:
     def row_error(self, z: Floats, dt: Floats) -> float:
         """Return `pose_error`, or how much the user's own constraints are violated if that is more; see `TermNumbers.error`."""
         return max(self.pose_error(z), self.term_numbers.error(z, dt))
+
+    def excess(self, z: Floats, dt: Floats) -> Floats:
+        """Return by how much rolling, clamping and own constraints are out of their bounds, with a sign; see `Transcription`."""
+        t = self.transcription
+        if t.rows == t.firm_rows:
+            return np.zeros(0)
+        values = np.asarray(t.other_values(t.pack(z), self.start, dt)).ravel()
+        lower, upper = (bound[t.firm_rows :] for bound in self.row_bounds(None))
+        return np.asarray(values - np.clip(values, lower, upper))
+
+    @cached_property
+    def row_kinds(self) -> Mapping[str, Floats]:
+        """For every kind of these rows, what of their excess counts, 0 for rows of other kinds."""
+        t = self.transcription
+        rolling, terms = np.zeros(t.rows), np.zeros(t.rows)
+        rolling[t.base_rows] = 1.0
+        terms[self.term_numbers.rows] = self.term_numbers.scale
+        clamped = np.where((rolling == 0.0) & (terms == 0.0), 1.0, 0.0)
+        return {kind: own[t.firm_rows :] for kind, own in (("rolling", rolling), ("clamped", clamped), ("terms", terms))}
 
     def slip(self, z: Floats) -> float:
         """Return how far a differential base slips sideways in the worst step of z_1..z_N, shape (N, n) [m]; 0 for others."""

@@ -1,13 +1,16 @@
-"""Sparse matrices for the program, put together from the nonzeros of many waypoints."""
+"""Matrices for the program: differences of waypoints, and sparse ones, put together from the nonzeros of many waypoints."""
 
 from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
 
 import casadi as ca
 import numpy as np
 
 from vkc_pin.arrays import Floats, Ints
 
-__all__ = ["assemble", "sparse", "unit"]
+__all__ = ["assemble", "differences", "sparse", "unit"]
 
 
 def sparse(matrix: Floats) -> ca.DM:
@@ -45,3 +48,20 @@ def assemble(parts: list[ca.MX], at: list[Ints], rows: int, columns: int) -> ca.
     pointers = np.concatenate([[0], np.cumsum(np.bincount(column, minlength=columns))])
     pattern = ca.Sparsity(rows, columns, pointers.tolist(), row.tolist())
     return ca.MX(pattern, values)
+
+
+def differences(segments: int, stops: Sequence[int]) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return matrices D, E and vectors d, e: D·z + d·z_0 are the steps of waypoints z_1..z_N, E·z + e·z_0 the steps' changes.
+
+    Changes are those between steps, and from and to rest where the motion starts, pauses and ends.
+
+    Args:
+        segments: N.
+        stops: Waypoints inside the motion at which it pauses.
+    """
+    first = np.eye(segments) - np.eye(segments, k=-1)  # δz_t = z_t − z_{t−1}
+    start = np.zeros(segments)
+    start[0] = -1.0
+    ends = itertools.pairwise([0, *stops, segments])
+    changes = np.vstack([np.diff(np.eye(segments)[begin:end], axis=0, prepend=0.0, append=0.0) for begin, end in ends])
+    return first, changes @ first, start, changes @ start

@@ -113,6 +113,7 @@ class TermNumbers:
     Attributes:
         rows: Which rows of the program they are, shape (R,).
         lower, upper: Their bounds, shape (R,).
+        scale: What an excess of 1 counts as, shape (R,).
     """
 
     def __init__(self, terms: Sequence[Term], transcription: Transcription, start: Floats) -> None:
@@ -131,7 +132,7 @@ class TermNumbers:
         order = np.argsort(np.concatenate(rows))
         self.rows = np.concatenate(rows)[order]
         self.lower, self.upper = np.concatenate(bounds)[order].T
-        self._scale, self._timed = np.concatenate(scales)[order], np.concatenate(timed)[order]
+        self.scale, self._timed = np.concatenate(scales)[order], np.concatenate(timed)[order]
         self._names = [names[k] for k in order]
 
     def error(self, z: Floats, dt: Floats) -> float:
@@ -191,10 +192,10 @@ class TermNumbers:
         if not len(self.rows):
             return np.zeros(0)
         values = self._evaluated(z, dt)[0]
-        excess = np.maximum(np.maximum(self.lower - values, values - self.upper), 0.0) * self._scale
+        excess = np.maximum(np.maximum(self.lower - values, values - self.upper), 0.0) * self.scale
         return np.where(np.isnan(excess), np.inf, excess)
 
     def _evaluated(self, z: Floats, dt: Floats) -> tuple[Floats, Any, float, Any]:
-        x = np.column_stack([z, np.zeros(len(z))]).ravel()
+        x = self.transcription.pack(z)
         values, jacobian, cost, gradient = self.transcription.term_values(x, self.start, dt)
         return np.asarray(values).ravel(), jacobian, float(cost), np.asarray(gradient.nonzeros())

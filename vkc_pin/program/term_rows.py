@@ -175,11 +175,14 @@ class TermProgram:
     Attributes:
         rows: Number of constraint rows.
         at: For each term, waypoint → its rows; costs have none.
+        owners: The waypoint of each row, counted from 0, shape (rows,).
         values, jacobian: Of the constraints.
         cost, gradient, cost_hessian: Of the weighted sum of all costs.
     """
 
-    def __init__(self, model: pin.Model, terms: tuple[TermRow, ...], z: Any, dt: Any, cache: Cache) -> None:
+    def __init__(
+        self, model: pin.Model, terms: tuple[TermRow, ...], z: Any, dt: Any, cache: Cache, *, width: int | None = None
+    ) -> None:
         """Put the terms together.
 
         Args:
@@ -188,9 +191,11 @@ class TermProgram:
             z: z_0..z_N as columns, shape (n, N + 1).
             dt: Time of every step, shape (N, 1).
             cache: Where the functions are kept.
+            width: How many variables a waypoint has, z first; None: n.
         """
         self._n = z.shape[0]
-        self._size = (z.shape[1] - 1) * (self._n + 1)
+        self._width = width or self._n
+        self._size = (z.shape[1] - 1) * self._width
         self._hessians: list[tuple[ca.Function, list[Any], Ints, Ints, Any]] = []
         self.rows, self.at = 0, [dict[int, Ints]() for _ in terms]
         text = model.saveToString()
@@ -233,6 +238,9 @@ class TermProgram:
                     curvature, place = self._curvature(functions.hessian, inputs, involved, pattern, weights)
                     curvatures.append(curvature)
                     curvatures_at.append(place)
+        self.owners = np.zeros(self.rows, int)
+        for waypoint, rows in ((waypoint, rows) for rows_at in self.at for waypoint, rows in rows_at.items()):
+            self.owners[rows] = waypoint - 1
         self.values = ca.vertcat(*values) if values else ca.MX(0, 1)
         self.jacobian = assemble(slopes, slopes_at, self.rows, self._size) if slopes else ca.MX(self.rows, self._size)
         self.gradient = assemble(gradients, gradients_at, self._size, 1) if gradients else ca.MX(self._size, 1)
@@ -259,4 +267,4 @@ class TermProgram:
     def _place(self, involved: Ints, index: Ints) -> Ints:
         """Return which variables entries of a kind's z are, for all its waypoints one after the other; -1 for the start's."""
         waypoint, coordinate = involved[:, index // self._n], index % self._n
-        return np.where(waypoint > 0, (waypoint - 1) * (self._n + 1) + coordinate, -1).ravel()
+        return np.where(waypoint > 0, (waypoint - 1) * self._width + coordinate, -1).ravel()

@@ -1,15 +1,16 @@
 """The symbolic nonlinear program of a trajectory, built once per structure and kept.
 
-Variables are the waypoints after the start, each with one clearance slack: x = (z_1, s_1, ..., z_N, s_N). Everything
-that differs between two tasks of one structure is a parameter or a bound: start, placements to reach, witness planes,
-penalty. Rows belong to one waypoint each and derive from one small SX function per kind of waypoint, mapped over the
-waypoints; its exact Hessian is that of λᵀ·C·vec(M(z)) plus the pose rows, whatever the number of witness planes.
+Variables are the waypoints after the start, each with a clearance slack for every witness plane and a share e of what it is
+away from all else that is asked for there: x = (z_1, s_1, e_1, ..., z_N, s_N, e_N). At a share of 1 the waypoint may stay as
+far away as the iterate is at which the program was set up, at 0 everything holds; both cost in the objective, so that it is an
+exact ℓ1 penalty function of them. What differs between two tasks of one structure is a parameter or a bound: start, targets,
+witness planes, penalties. Rows derive from one small SX function per kind of waypoint, mapped over the waypoints; its exact
+Hessian is that of λᵀ·C·vec(M(z)) plus the pose rows, whatever the number of witness planes.
 """
 
 from __future__ import annotations
 
-import itertools
-from typing import Any, NamedTuple
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -17,23 +18,16 @@ import numpy as np
 from vkc_pin.arrays import Floats, Ints
 from vkc_pin.cache import Cache
 from vkc_pin.chain.inverse_kinematics import PoseSolver
+from vkc_pin.chain.pose import AWAY
+from vkc_pin.cpin.machine_code import MachineCode
 from vkc_pin.models.coordinates import Coordinates
-from vkc_pin.program.deadline import Monitor
-from vkc_pin.program.sparse import assemble, sparse, unit
+from vkc_pin.program.ipopt import ENTRY, Ipopt, ipopt
+from vkc_pin.program.sparse import assemble, differences, sparse, unit
 from vkc_pin.program.term_rows import TermProgram
+from vkc_pin.program.timing import runs_between
 from vkc_pin.program.waypoint import Structure, waypoint_functions
 
 __all__ = ["Transcription", "transcribe"]
-
-_ENTRY = 600  # [bytes] that an entry of Jacobian or Hessian takes, in a program and in a solver, measured at the door
-
-
-class _Ipopt(NamedTuple):
-    """A solver, and what stops it."""
-
-    solver: ca.Function
-    monitor: Monitor | None
-    nbytes: int
 
 
 class Transcription:
@@ -42,7 +36,7 @@ class Transcription:
     Attributes:
         structure: What it was built of.
         n, segments, slots: Sizes n, N and K.
-        size: Number of variables N·(n + 1).
+        width, size: Numbers of variables n + K + 1 of a waypoint and N·(n + K + 1) of all.
         rows: Number of constraint rows without the rate rows.
         slot_rows: Rows of the witness planes, shape (N, K).
         pose_rows: For each pose, waypoint → its rows; see `pose.pose_rows`.
@@ -50,13 +44,19 @@ class Transcription:
         term_rows: For each of the user's own constraints, waypoint → its rows; costs have none. They are the last rows.
         term_values: x, z_0 and times of all steps → values of these rows, their Jacobian, and the sum and slope of the costs.
         pose_solvers: Inverse kinematics of each pose.
+        firm_rows: Where the rows begin that are not of one waypoint's functions: of rolling, clamping and own constraints.
+        owners, rate_owners: The waypoints, counted from 0, whose shares lengthen the bounds of these and of the rate rows.
+        other_values: x, z_0 and times of all steps → their values.
+        interpreted: Functions of waypoints that were not yet machine code when it was built.
         rate_matrix, rate_start: Velocities and accelerations per step are rate_matrix·x + rate_start·z_0.
     """
 
     def __init__(self, structure: Structure, cache: Cache) -> None:
         self.structure, self.cache = structure, cache
         self.n, self.segments, self.slots = Coordinates(structure.model).size, structure.segments, structure.slots
-        self.size = self.segments * (self.n + 1)
+        self.width = self.n + self.slots + 1
+        self.size = self.segments * self.width
+        self.interpreted: list[MachineCode] = []
         self._symbols()
         self._objective()
         self._constraints()
@@ -66,84 +66,83 @@ class Transcription:
     @property
     def nbytes(self) -> int:
         """Its size in memory, estimated [bytes]."""
-        return _ENTRY * (self.jacobian.nnz() + self.hessian.nnz()) + sum(solver.nbytes for solver in self.pose_solvers)
+        return ENTRY * (self.jacobian.nnz() + self.hessian.nnz()) + sum(solver.nbytes for solver in self.pose_solvers)
 
     def _symbols(self) -> None:
-        n, N, K, joints = self.n, self.segments, self.slots, self.structure.model.njoints - 1
+        n, N, K = self.n, self.segments, self.slots
+        joints, poses = self.structure.model.njoints - 1, max(len(self.structure.poses), 1)
         self.x = ca.MX.sym("x", self.size)
-        blocks = ca.reshape(self.x, n + 1, N)
-        self.z, self.s = blocks[:n, :], blocks[n, :]
-        self.start = ca.MX.sym("z0", n)
-        self.planes = ca.MX.sym("C", K * 12 * joints, N)
-        self.offsets = ca.MX.sym("R", K, N)
-        self.targets = ca.MX.sym("W", 12, max(len(self.structure.poses), 1))
-        self.penalty = ca.MX.sym("rho")
-        self.dt = ca.MX.sym("dt", N)
-        times = [self.dt] if self.structure.timed else []
-        self.parameters = ca.veccat(self.start, self.planes, self.offsets, self.targets, self.penalty, *times)
+        self.own = ca.reshape(self.x, self.width, N)  # a column for every waypoint
+        self.z, self.start, self.dt = self.own[:n, :], ca.MX.sym("z0", n), ca.MX.sym("dt", N)
+        self.planes, self.offsets = ca.MX.sym("C", K * 12 * joints, N), ca.MX.sym("R", K, N)
+        self.targets, self.away = ca.MX.sym("W", 12, poses), ca.MX.sym("D", AWAY * poses, N)
+        self.penalty, self.prices = ca.MX.sym("rho"), ca.MX.sym("p", N)
 
     def parameter_vector(
-        self, start: Floats, planes: Floats, offsets: Floats, targets: Floats, *, penalty: float, dt: Floats | None = None
+        self,
+        start: Floats,
+        planes: Floats,
+        offsets: Floats,
+        targets: Floats,
+        *,
+        penalty: float,
+        dt: Floats | None = None,
+        away: Floats | None = None,
+        excess: Floats | None = None,
+        prices: Floats | None = None,
     ) -> Floats:
-        """Return the parameters: start (n,), planes (N, K, 12·joints), offsets (N, K), targets (poses, 12), penalty, dt (N,).
+        """Return the parameters. The times of the steps only count where a term needs them.
 
-        The times of the steps only count where a term needs them.
+        Args:
+            start: z_0, shape (n,).
+            planes: Witness planes C, shape (N, K, 12·joints).
+            offsets: Theirs, R, shape (N, K).
+            targets: Of the poses, shape (poses, 12).
+            penalty: What a metre of clearance slack costs.
+            dt: Times of the steps, shape (N,).
+            away: How far frames are from these at the iterate, shape (N, poses, 7), see `pose.away_from`; None: not at all.
+            excess: By how much other rows are out of their bounds there, shape (rows after those of poses,); None: not at all.
+            prices: What all of that costs at a waypoint, shape (N,).
         """
         planes = planes.transpose(0, 2, 1).ravel()  # the K × 12J matrix of a waypoint, column by column
         padded = targets.ravel() if len(targets) else np.zeros(12)
+        away = np.zeros(self.away.numel()) if away is None or not away.size else away.ravel()
+        excess = np.zeros(self.excess.numel()) if excess is None else excess
+        prices = np.zeros(self.segments) if prices is None else prices
         times = [dt] if self.structure.timed and dt is not None else []
-        return np.concatenate([start, planes, offsets.ravel(), padded, [penalty], *times])
+        return np.concatenate([start, planes, offsets.ravel(), padded, [penalty], away, prices, excess, *times])
 
-    def rows_at(self, x: Floats, parameters: Floats) -> tuple[Floats, Any]:
-        """Return the rows at x, shape (rows,), and their Jacobian, a sparse matrix (SciPy) of shape (rows, size)."""
-        rows, jacobian = ca.Function("rows", [self.x, self.parameters], [self.g, self.jacobian])(x, parameters)
-        return np.asarray(rows).ravel(), jacobian.sparse().tocsr()
-
-    def patterns(self) -> tuple[Any, Any]:
-        """Return where the rows' Jacobian and the Lagrangian's Hessian have entries, as sparse matrices (SciPy) of ones."""
-        upper = ca.triu(self.objective_hessian).sparsity() + self.hessian.sparsity()
-        return ca.DM(self.jacobian.sparsity(), 1.0).sparse(), ca.DM(upper + upper.T, 1.0).sparse()
+    def pack(self, z: Floats, slack: Floats | float = 0.0, shares: Floats | float = 0.0) -> Floats:
+        """Return x of waypoints, shape (N, n), their slacks, shape (N, K), and their shares, shape (N,); or the same for all."""
+        slack = np.broadcast_to(slack, (len(z), self.slots))
+        return np.column_stack([z, slack, shares * np.ones(len(z))]).ravel()
 
     def _objective(self) -> None:
         """Make the objective of eq. 1: f = ½ xᵀHx + gᵀx + c."""
-        n, N = self.n, self.segments
-        first = np.eye(N) - np.eye(N, k=-1)  # δz_t = z_t − z_{t−1}
-        start_first = np.zeros(N)
-        start_first[0] = -1.0
-        # The velocity steps between segments, and from and to rest where the motion starts, pauses and ends.
-        stops = [0, *self.structure.stops, N]
-        runs = [np.diff(np.eye(N)[begin:end], axis=0, prepend=0.0, append=0.0) for begin, end in itertools.pairwise(stops)]
-        steps = np.vstack(runs)
-        second, start_second = steps @ first, steps @ start_first
+        n, N, velocity, acceleration = self.n, self.segments, self.structure.weights_velocity, self.structure.weights_acceleration
+        first, second, start_first, start_second = differences(N, self.structure.stops)
         self.first, self.second, self.start_first, self.start_second = first, second, start_first, start_second
         hessian, linear = ca.DM(self.size, self.size), ca.DM(self.size, n)
-        for i, (v, a) in enumerate(zip(self.structure.weights_velocity.T, self.structure.weights_acceleration, strict=True)):
+        for i, (v, a) in enumerate(zip(velocity.T, acceleration, strict=True)):
             curvature = first.T @ (v[:, None] * first) + a * second.T @ second
             slope = first.T @ (v * start_first) + a * second.T @ start_second
-            hessian += ca.kron(sparse(2 * curvature), unit(n + 1, n + 1, i))
-            linear += ca.kron(sparse(2 * slope[:, None]), unit(n + 1, n, i))
-        self.objective_hessian, linear_matrix = hessian, linear
-        self.objective_curvature: Any = ca.triu(hessian)
-        slack = np.zeros((N, n + 1))
-        slack[:, n] = 1.0
-        gradient = linear_matrix @ self.start + self.penalty * ca.DM(slack.ravel())
-        constant = ca.dot(self.start, self._start_weight() * self.start)
-        product = ca.mtimes(self.objective_hessian, self.x)
-        self.f = 0.5 * ca.dot(self.x, product) + ca.dot(gradient, self.x) + constant
+            hessian += ca.kron(sparse(2 * curvature), unit(self.width, self.width, i))
+            linear += ca.kron(sparse(2 * slope[:, None]), unit(self.width, n, i))
+        self.objective_hessian, self.objective_curvature = hessian, ca.triu(hessian)
+        linear_costs = ca.vertcat(ca.MX(n, N), ca.repmat(self.penalty, self.slots, N), self.prices.T)
+        gradient = linear @ self.start + ca.vec(linear_costs)
+        rest = start_first**2 @ velocity + acceleration * (start_second @ start_second)
+        product = hessian @ self.x
+        self.f = 0.5 * ca.dot(self.x, product) + ca.dot(gradient, self.x) + ca.dot(self.start, ca.DM(rest) * self.start)
         self.gradient = product + gradient
-
-    def _start_weight(self) -> ca.DM:
-        v, a = self.structure.weights_velocity, self.structure.weights_acceleration
-        return ca.DM(self.start_first**2 @ v + a * (self.start_second @ self.start_second))
 
     def _constraints(self) -> None:
         """Make the rows of eqs. 2, 3, 6 and 7, waypoint by waypoint, their Jacobian and the Hessian of λᵀ·rows."""
-        n, N, K = self.n, self.segments, self.slots
+        N, K = self.segments, self.slots
         poses_at: list[tuple[int, ...]] = [() for _ in range(N)]
         for index, pose in enumerate(self.structure.poses):
             for waypoint in pose.waypoints:
                 poses_at[waypoint - 1] += (index,)
-        kinds = sorted(set(poses_at))
         count = [K + sum(self.structure.poses[k].rows for k in poses) for poses in poses_at]
         first_row = np.concatenate([[0], np.cumsum(count)])
         self.rows = int(first_row[-1])
@@ -152,18 +151,20 @@ class Transcription:
         values, jacobians, hessians = [], [], []
         value_rows, jacobian_at, hessian_at = [], [], []
         self.multipliers = ca.MX.sym("lam_g", self.rows)
-        for poses in kinds:
+        for poses in sorted(set(poses_at)):
             at = [t for t in range(N) if poses_at[t] == poses]
             kind = waypoint_functions(self.structure.model, K, tuple(self.structure.poses[k] for k in poses), self.cache)
+            self.interpreted += kind.hasten(len(at))
             targets = ca.repmat(ca.vec(self.targets[:, list(poses)] if poses else self.targets[:, 0]), 1, len(at))
-            inputs = [self.z[:, at], self.s[:, at], self.planes[:, at], self.offsets[:, at], targets]
+            away = self.away[[AWAY * k + i for k in poses or (0,) for i in range(AWAY)], at]
+            inputs = [self.own[:, at], self.planes[:, at], self.offsets[:, at], targets, away]
             rows = first_row[at][:, None] + np.arange(kind.rows)
             multipliers = ca.reshape(self.multipliers[rows.ravel().tolist()], kind.rows, len(at))
             values.append(ca.vec(kind.value.map(len(at))(*inputs)))
             jacobians.append(ca.vec(kind.jacobian.map(len(at))(*inputs)))
             hessians.append(ca.vec(kind.hessian.map(len(at))(*inputs, multipliers)))
             value_rows.append(rows.ravel())
-            offset = np.array(at)[:, None] * (n + 1)
+            offset = np.array(at)[:, None] * self.width
             row, column = (np.array(part) for part in kind.jacobian_pattern)
             jacobian_at.append(np.stack([(first_row[at][:, None] + row).ravel(), (offset + column).ravel()]))
             row, column = (np.array(part) for part in kind.hessian_pattern)
@@ -178,16 +179,20 @@ class Transcription:
         self.jacobian = assemble(jacobians, jacobian_at, self.rows, self.size)
         self.hessian = assemble(hessians, hessian_at, self.size, self.size)
         self.base_rows = np.zeros(0, int)
+        self.firm_rows = self.rows  # those after it are not of one waypoint's functions
+        self.owners, self.others = np.zeros(0, int), ca.MX(0, 1)
         if self.structure.differential:
             self._differential()
         self._clamp()
         self.term_rows: list[dict[int, Ints]] = []
         if self.structure.terms:
             self._terms()
+        self._relax()
 
-    def _append(self, values: ca.MX, jacobian: ca.MX) -> ca.MX:
-        """Append rows with their Jacobian, and return their multipliers."""
-        rows = self.rows
+    def _append(self, values: ca.MX, jacobian: ca.MX, owners: Ints) -> ca.MX:
+        """Append rows with their Jacobian and the waypoints they belong to, counted from 0; return their multipliers."""
+        rows, self.owners = self.rows, np.concatenate([self.owners, owners])
+        self.others = ca.vertcat(self.others, values)
         self.g, self.jacobian, self.rows = ca.vertcat(self.g, values), ca.vertcat(self.jacobian, jacobian), rows + values.numel()
         multipliers = ca.MX.sym("lam_g", self.rows)
         (self.hessian,) = ca.substitute([self.hessian], [self.multipliers], [multipliers[:rows]])
@@ -200,7 +205,7 @@ class Transcription:
         heading, step = (z[2, 1:] + z[2, :-1]) / 2, z[:2, 1:] - z[:2, :-1]
         slip = (-ca.sin(heading) * step[0, :] + ca.cos(heading) * step[1, :]).T
         self.base_rows = self.rows + np.arange(self.segments)
-        multipliers = self._append(slip, ca.jacobian(slip, self.x))
+        multipliers = self._append(slip, ca.jacobian(slip, self.x), np.arange(self.segments))
         extra = ca.MX.sym("lam_slip", self.segments)
         (curvature,) = ca.substitute([ca.triu(ca.hessian(ca.dot(extra, slip), self.x)[0])], [extra], [multipliers])
         self.hessian = self.hessian + curvature
@@ -212,27 +217,46 @@ class Transcription:
             return
         difference = ca.DM(len(pairs), self.size)
         for row, (column, waypoint) in enumerate(pairs):
-            difference[row, (waypoint - 1) * (self.n + 1) + column] = 1.0
-            difference[row, (waypoint - 2) * (self.n + 1) + column] = -1.0
-        self._append(difference @ self.x, difference)
+            difference[row, (waypoint - 1) * self.width + column] = 1.0
+            difference[row, (waypoint - 2) * self.width + column] = -1.0
+        self._append(difference @ self.x, difference, np.array([t - 1 for _, t in pairs]))
 
     def _terms(self) -> None:
         """Append the user's own constraints, and add their costs to the objective."""
-        dt = self.dt if self.structure.timed else ca.MX.zeros(self.segments)
-        part = TermProgram(self.structure.model, self.structure.terms, ca.horzcat(self.start, self.z), dt, self.cache)
+        dt, terms = self.dt if self.structure.timed else ca.MX.zeros(self.segments), self.structure.terms
+        part = TermProgram(self.structure.model, terms, ca.horzcat(self.start, self.z), dt, self.cache, width=self.width)
         self.term_rows = [{waypoint: self.rows + rows for waypoint, rows in at.items()} for at in part.at]
         outputs = [part.values, part.jacobian, part.cost, part.gradient]
         self.term_values = ca.Function("terms", [self.x, self.start, self.dt], outputs)
-        multipliers = self._append(part.values, part.jacobian)
+        multipliers = self._append(part.values, part.jacobian, part.owners)
         self.hessian = self.hessian + part.hessian(multipliers)
         self.f, self.gradient = self.f + part.cost, self.gradient + part.gradient
         self.objective_curvature = self.objective_curvature + part.cost_hessian
 
+    def _relax(self) -> None:
+        """Let the shares of their waypoints lengthen the bounds of the rows that are not of one waypoint's functions."""
+        self.excess = ca.MX.sym("r", self.rows - self.firm_rows)
+        self.other_values = ca.Function("others", [self.x, self.start, self.dt], [self.others])
+        if len(self.owners):
+            rows = np.arange(self.firm_rows, self.rows)
+            self.g, self.jacobian = self._relaxed(self.g, self.jacobian, rows, self.owners, self.excess)
+        given = [self.start, self.planes, self.offsets, self.targets, self.penalty, self.away, self.prices, self.excess]
+        self.parameters = ca.veccat(*given, *([self.dt] if self.structure.timed else []))
+
+    def _relaxed(self, g: ca.MX, jacobian: ca.MX, rows: Ints, owners: Ints, excess: ca.MX) -> tuple[ca.MX, ca.MX]:
+        """Return rows and Jacobian, where from `rows` excess times their waypoint's share is taken away."""
+        place = np.stack([rows, owners * self.width + self.width - 1])
+        less = assemble([excess], [place], g.numel(), self.size)
+        return g - less @ self.x, jacobian - less
+
     def _rates(self) -> None:
         """Make the matrices of eq. 5: velocities and accelerations per step."""
         n = self.n
-        select, identity = ca.horzcat(ca.DM.eye(n), ca.DM(n, 1)), ca.DM.eye(n)  # leaves the slack out
+        select, identity = ca.horzcat(ca.DM.eye(n), ca.DM(n, self.slots + 1)), ca.DM.eye(n)  # leaves slack and share out
         self.rate_matrix = ca.vertcat(*(ca.kron(sparse(part), select) for part in (self.first, self.second)))
+        runs = runs_between(self.structure.stops, self.segments)
+        changes = [max(waypoint, 1) - 1 for begin, end in runs for waypoint in range(begin, end + 1)]
+        self.rate_owners = np.repeat([*range(self.segments), *changes], n)
         starts = (self.start_first[:, None], self.start_second[:, None])
         self.rate_start = ca.vertcat(*(ca.kron(sparse(part), identity) for part in starts))
 
@@ -240,7 +264,7 @@ class Transcription:
         """Return Ipopt on this program.
 
         Args:
-            rates: Whether velocity and acceleration rows follow the others.
+            rates: Whether velocity and acceleration rows follow the others, and their excess the other parameters.
             options: For CasADi's nlpsol.
             deadline: Value of `time.perf_counter()` at which it stops; applies to the solver's next call.
         """
@@ -251,32 +275,26 @@ class Transcription:
             found.monitor.deadline = deadline
         return found.solver
 
-    def _make_solver(self, rates: bool, timed: bool, options: dict[str, Any]) -> _Ipopt:
-        g, jacobian, multipliers = self.g, self.jacobian, self.multipliers
+    def _make_solver(self, rates: bool, timed: bool, options: dict[str, Any]) -> Ipopt:
+        g, jacobian, multipliers, parameters = self.g, self.jacobian, self.multipliers, self.parameters
+        weight, firm = ca.MX.sym("lam_f"), self.rows
+        hessian = weight * self.objective_curvature + self.hessian
         if rates:
             g = ca.vertcat(g, self.rate_matrix @ self.x + self.rate_start @ self.start)
             jacobian = ca.vertcat(jacobian, self.rate_matrix)
-            multipliers = ca.MX.sym("lam", g.numel())
-        weight = ca.MX.sym("lam_f")
-        hessian = weight * self.objective_curvature + self.hessian
-        if rates:
-            (hessian,) = ca.substitute([hessian], [self.multipliers], [multipliers[: self.rows]])
-        inputs = [self.x, self.parameters]
-        functions = {
-            "grad_f": ca.Function("nlp_grad_f", inputs, [self.f, self.gradient], ["x", "p"], ["f", "grad_f_x"]),
-            "jac_g": ca.Function("nlp_jac_g", inputs, [g, jacobian], ["x", "p"], ["g", "jac_g_x"]),
-            "hess_lag": ca.Function(
-                "nlp_hess_l", [*inputs, weight, multipliers], [hessian], ["x", "p", "lam_f", "lam_g"], ["triu_hess_gamma_x_x"]
-            ),
-        }
-        quiet = {"print_time": False, "record_time": True, "calc_lam_p": False, "no_nlp_grad": True}
-        program = {"x": self.x, "p": self.parameters, "f": self.f, "g": g}
-        monitor = Monitor(self.size, g.numel(), self.parameters.numel()) if timed else None
-        callback = {"iteration_callback": monitor} if timed else {}
-        solver = ca.nlpsol("trajectory", "ipopt", program, {**quiet, **functions, **callback, **options})
-        return _Ipopt(solver, monitor, _ENTRY * (jacobian.nnz() + hessian.nnz()))
+            multipliers, excess = ca.MX.sym("lam", g.numel()), ca.MX.sym("r", g.numel() - firm)
+            g, jacobian = self._relaxed(g, jacobian, np.arange(firm, g.numel()), self.rate_owners, excess)
+            parameters = ca.vertcat(parameters, excess)
+            (hessian,) = ca.substitute([hessian], [self.multipliers], [multipliers[:firm]])
+        lagrangian = (weight, multipliers, hessian)
+        return ipopt(self.x, parameters, (self.f, self.gradient), (g, jacobian), lagrangian, options, timed=timed)
 
 
 def transcribe(structure: Structure, cache: Cache) -> Transcription:
-    """Return the program of `structure`, built if it is not in the cache."""
-    return cache.get(("program", structure.key), lambda: Transcription(structure, cache))
+    """Return the program of `structure`, built if it is not in the cache, or if machine code has come since it was built."""
+    program = cache.get(key := ("program", structure.key), lambda: Transcription(structure, cache))
+    if not program.interpreted or not all(code.look() for code in program.interpreted):
+        return program
+    cache.drop(*key)
+    cache.drop("ipopt", structure.key)
+    return cache.get(key, lambda: Transcription(structure, cache))

@@ -12,12 +12,15 @@ import pinocchio as pin
 from vkc_pin.arrays import Floats
 from vkc_pin.cache import Cache
 from vkc_pin.chain.kinematics import kinematics_of
-from vkc_pin.chain.pose import PoseRow, pose_rows
+from vkc_pin.chain.pose import AWAY, PoseRow, pose_rows, receded
 from vkc_pin.cpin.batch import size_of
+from vkc_pin.cpin.machine_code import MachineCode
 from vkc_pin.models.coordinates import Coordinates
 from vkc_pin.program.term_rows import TermRow
 
 __all__ = ["Structure", "WaypointFunctions", "waypoint_functions"]
+
+_WORTH = 4  # waypoints of one kind from which on it is compiled: most kinds have one, at a grasp, or some thirty
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -80,37 +83,45 @@ class WaypointFunctions:
     def __init__(self, model: pin.Model, slots: int, poses: tuple[PoseRow, ...], cache: Cache) -> None:
         coordinates = Coordinates(model)
         n, joints = coordinates.size, model.njoints - 1
-        z, s = ca.SX.sym("z", n), ca.SX.sym("s")
+        z, s, share = ca.SX.sym("z", n), ca.SX.sym("s", slots), ca.SX.sym("e")
         planes, offsets = ca.SX.sym("C", slots, 12 * joints), ca.SX.sym("R", slots)
-        targets = ca.SX.sym("W", 12, max(len(poses), 1))
+        targets, away = ca.SX.sym("W", 12, max(len(poses), 1)), ca.SX.sym("D", AWAY, max(len(poses), 1))
         placements = kinematics_of(model, cache).symbolic(z)
         stacked = ca.vec(placements)
         # Every row is linear in the placements: rows = L·vec(M) + const, so one sweep of the kinematics serves them all.
         parts = []
         for k, pose in enumerate(poses):
-            parts.append(pose_rows(pose.kind, *pose.placement(placements), targets[:, k]))
+            target = receded(targets[:, k], away[:, k], share)
+            parts.append(pose_rows(pose.kind, *pose.placement(placements), target))
         pose_values = ca.vertcat(*parts) if parts else ca.SX(0, 1)
         self.pose_rows = [pose.rows for pose in poses]
         self.rows = slots + sum(self.pose_rows)
         rows = ca.vertcat(planes @ stacked - offsets + s, pose_values)
         multipliers = ca.SX.sym("lam", self.rows)
-        pose_jacobian = ca.jacobian(pose_values, z)
-        jacobian = ca.vertcat(
-            ca.horzcat(_slopes(model, coordinates, z, placements, planes), ca.SX.ones(slots, 1)),
-            ca.horzcat(pose_jacobian, ca.SX(pose_values.numel(), 1)),
-        )
+        own = ca.vertcat(z, s, share)
+        slopes = ca.horzcat(_slopes(model, coordinates, z, placements, planes), ca.SX.eye(slots), ca.SX(slots, 1))
+        jacobian = ca.vertcat(slopes, ca.jacobian(pose_values, own))
         w = ca.SX.sym("w", 12 * joints)
-        hessian = ca.triu(ca.hessian(ca.dot(w, stacked) + ca.dot(multipliers[slots:], pose_values), z)[0])
-        inner = ca.Function("inner", [z, targets, w, multipliers], [hessian])
-        hessian = inner(z, targets, planes.T @ multipliers[:slots], multipliers)
-        inputs = [z, s, ca.vec(planes), offsets, ca.vec(targets)]
+        hessian = ca.triu(ca.hessian(ca.dot(w, stacked) + ca.dot(multipliers[slots:], pose_values), own)[0])
+        inner = ca.Function("inner", [z, share, targets, away, w, multipliers], [hessian])
+        hessian = inner(z, share, targets, away, planes.T @ multipliers[:slots], multipliers)
+        inputs = [own, ca.vec(planes), offsets, ca.vec(targets), ca.vec(away)]
         options = {"cse": True}
         self.value = ca.Function("g", inputs, [rows], options)
         self.jacobian = ca.Function("rows_jacobian", inputs, [ca.vertcat(*jacobian.nonzeros())], options)
         self.jacobian_pattern = jacobian.sparsity().get_triplet()
         self.hessian = ca.Function("lagrangian_hessian", [*inputs, multipliers], [ca.vertcat(*hessian.nonzeros())], options)
         self.hessian_pattern = hessian.sparsity().get_triplet()
+        self.code = MachineCode(self.value, self.jacobian, self.hessian)
         self.nbytes = size_of(self.value, self.jacobian, self.hessian)
+
+    def hasten(self, waypoints: int) -> list[MachineCode]:
+        """Become machine code if there is some and so many waypoints are worth it; return what is worth waiting for."""
+        if waypoints < _WORTH:
+            return []
+        self.code.look()
+        self.value, self.jacobian, self.hessian = self.code.functions
+        return [] if self.code.compiled else [self.code]
 
 
 def _slopes(model: pin.Model, coordinates: Coordinates, z: Any, placements: Any, planes: Any) -> Any:

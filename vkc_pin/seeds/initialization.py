@@ -29,9 +29,8 @@ _COMPARED_PATHS = 8  # paths of the beam whose seeds are compared
 _TREE_PATHS = 4  # paths of the beam along which trees grow
 _COLLIDING_KNOT = 1e4  # cost that makes paths with knots in collision come last
 _HALF_WAVES = 6  # of a perturbation over the whole motion
+_SWAY = 0.3  # [m] and [rad] standard deviation of what is added to a stationary seed that led nowhere
 _DIFFERENT = 0.1  # [m] and [rad] by which the base must differ somewhere between two seeds
-_ELSEWHERE = 0.5  # [m] and [rad] by which it is to differ in a second seed of one search
-_COST_RATIO = 1.4  # of that second seed's path to the cheapest one, at most
 
 
 def initialize(
@@ -48,11 +47,11 @@ def initialize(
 
     Args:
         problem: What is to be solved.
-        method: "stationary": the robot stays at its start, only the objects' joints go to their goals. "interpolated":
-            straight to a configuration at each goal, found by inverse kinematics from random seeds; where something fixed is
-            held, the seed follows its motion. "astar": to such configurations, the base along the shortest way around what
-            stands there, heading along it. "rrt": to such configurations, base and arm together along what two random trees find.
-            "auto": these three in turn, the last first where the others hit things.
+        method: "stationary": the robot stays at its start, only the objects' joints go to their goals; seeds after the first
+            sway. "interpolated": straight to a configuration at each goal, found by inverse kinematics from random seeds; where
+            something fixed is held, the seed follows its motion. "astar": to such configurations, the base along the shortest
+            way around what stands there, heading along it. "rrt": to such configurations, base and arm together along what two
+            random trees find. "auto": these three in turn, the last first where the others hit things.
         seed: Of the random numbers.
         count: How many different seeds to return.
         perturbation: Standard deviation of what is added to the robot's coordinates, smoothly over time, [m] and [rad].
@@ -61,7 +60,7 @@ def initialize(
     """
     said: list[str] = [] if notes is None else notes
     if method == "stationary":
-        seeds = iter([Seed(method, follow_objects(problem, np.tile(problem.start, (problem.segments, 1))))])
+        seeds = _stationary(problem, count, np.random.default_rng([seed, 2]))
     else:
         shared = _Shared(problem, seed, said, Routes(problem, interrupt), Known(), interrupt)
         if method == "auto":
@@ -80,15 +79,13 @@ def _in_turn(straight: Iterator[Seed], around: Iterator[Seed], trees: Iterator[S
     """Yield from all in turn, first what goes straight, unless that collides everywhere.
 
     Where what goes straight hits things, and so does what goes around, or does not get there, base and arm are looked for
-    together; that comes first then, and the others do not race it.
+    together; that comes first then.
     """
     for seed in straight:
         other = next(around, None) if seed.shortfall > _POOR else None
         if seed.shortfall > _POOR and (other is None or other.shortfall > _POOR):
             poor = sorted([seed] if other is None else [seed, other], key=lambda one: one.shortfall)
-            for good in trees:
-                yield good
-                poor = [replace(one, races=False) for one in poor]
+            yield from trees
             yield from poor
         elif other is not None and seed.shortfall > _COLLIDING:
             yield other
@@ -98,6 +95,14 @@ def _in_turn(straight: Iterator[Seed], around: Iterator[Seed], trees: Iterator[S
             yield from islice(around, 1) if other is None else [other]
     yield from around
     yield from trees
+
+
+def _stationary(problem: TrajectoryProblem, count: int, rng: np.random.Generator) -> Iterator[Seed]:
+    """Yield a seed in which the robot stands still, then others in which it sways about its start."""
+    z = follow_objects(problem, problem.still)
+    yield Seed("stationary", z)
+    for number in range(2, count + 1):
+        yield Seed(f"stationary {number}", _perturbed(problem, z, _SWAY, rng))
 
 
 def _perturbed(problem: TrajectoryProblem, z: Floats, deviation: float, rng: np.random.Generator) -> Floats:
@@ -161,19 +166,15 @@ class _SeedSearch:
             found = self._search(attempt)
             if found is None:
                 continue
-            order = self._order(found)
-            cheap = order[found.cost[order] <= _COST_RATIO * found.cost[order[0]]]
-            for apart, some in ((_DIFFERENT, order), (_ELSEWHERE, cheap)):
-                new = [k for k in some if all(_distance(found.paths[k], other) > apart for other in given)]
-                best = self._best(found.paths, new, found.at)
-                if best is None:  # nor elsewhere: that is some of the same
-                    break
-                index, z, short = best
-                given.append(found.paths[index])
-                name = self.method if len(given) == 1 else f"{self.method} {len(given)}"
-                yield Seed(name, z, short, races=short <= _COLLIDING)
-                if len(given) == count:
-                    return
+            new = [k for k in self._order(found) if all(_distance(found.paths[k], other) > _DIFFERENT for other in given)]
+            best = self._best(found.paths, new, found.at)
+            if best is None:
+                continue
+            index, z, short = best
+            given.append(found.paths[index])
+            yield Seed(self.method if len(given) == 1 else f"{self.method} {len(given)}", z, short)
+            if len(given) == count:
+                return
 
     def _search(self, attempt: int) -> Found | None:
         """Return what a search finds: a quick one, None if it is no good, then thorough ones."""

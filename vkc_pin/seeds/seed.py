@@ -26,16 +26,12 @@ class Seed:
         z: z_1..z_N, shape (N, n).
         shortfall: By how much waypoints fall short of their clearances, summed [m]; NaN if nobody looked.
         radius: How far the solver believes planes at first, shape (N,); None: as usual.
-        penalty: What clearance costs the solver at first; None: as usual.
-        races: Whether one round of the solver tells how good it is beside others; if not, others come first.
     """
 
     name: str
     z: Floats
     shortfall: float = float("nan")
     radius: Floats | None = None
-    penalty: float | None = None
-    races: bool = True
 
 
 @dataclass(frozen=True, eq=False)

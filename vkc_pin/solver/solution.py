@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from vkc_pin.arrays import Floats
 
-__all__ = ["Iteration", "Resume", "Solution"]
+__all__ = ["Iteration", "Solution"]
 
 
 @dataclass(frozen=True)
@@ -40,19 +40,6 @@ class Iteration:
     time: float
 
 
-@dataclass(frozen=True, eq=False)
-class Resume:
-    """With what to go on from where the solver got stuck and had no patience.
-
-    Attributes:
-        radius: How far planes are to be believed, shape (N,).
-        penalty: What clearance is to cost.
-    """
-
-    radius: Floats
-    penalty: float
-
-
 @dataclass
 class Solution:
     """What the solver found; whether it is a success only `validation` can say.
@@ -63,7 +50,6 @@ class Solution:
         converged: Whether the loop ended by its own criteria.
         status: "converged", "not converged", "time limit" or "interrupted".
         radius: How far planes were believed in the end, shape (N,).
-        resume: How to go on where it got stuck and had no patience; None: it did not.
         rounds, iterations: Of the outer loop and of Ipopt.
         timings: Seconds in "coal", "casadi" (evaluating functions) and "ipopt" (all the rest of it).
         history: One `Iteration` per round.
@@ -74,7 +60,6 @@ class Solution:
     converged: bool = False
     status: str = "not converged"
     radius: Floats | None = None
-    resume: Resume | None = None
     rounds: int = 0
     iterations: int = 0
     timings: dict[str, float] = field(default_factory=lambda: {"coal": 0.0, "casadi": 0.0, "ipopt": 0.0})

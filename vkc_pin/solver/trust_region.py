@@ -8,18 +8,20 @@ import numpy as np
 
 from vkc_pin.arrays import Floats
 from vkc_pin.chain.contacts import Contacts
+from vkc_pin.solver.merit import Infeasibility
 
 __all__ = ["Trial", "TrustRegion", "judge"]
 
 BLOCK_TIME = 2.5  # [s] of motion that share a radius, at `Options.dt` a waypoint
 FIRST_RADIUS = 0.5  # [m] and [rad] of the trust region at first
 RESTART_RADIUS = 0.2  # [m] and [rad] after the penalty has been raised
+MAX_RADIUS = 1.0  # [m] and [rad]
+INSIDE = 0.9
 SETTLE_RADIUS = 0.05  # [m] and [rad] in which planes are as good as distances
 MIN_RADIUS = 5e-3  # [m] and [rad] below which nothing moves any more
 SHRINK = 0.4  # of the radius, or of the step if that was shorter, where a promise did not come true
-NO_MATTER = 2e-3  # [m] of shortfall, summed over a block, that does not matter
+NO_MATTER = 0.4  # of the merit, in a block: 2 mm of shortfall at the weight that it has at first
 CLOSE_ENOUGH = 5e-4  # [m] shortfall of clearance at a waypoint that is none
-FAR = 1e-3  # [m] and [rad] of residuals at which a motion cannot be compared with one at which they vanish
 
 
 @dataclass(frozen=True)
@@ -28,11 +30,11 @@ class Trial:
 
     Attributes:
         z: z_1..z_N, shape (N, n).
-        slack: What the planes let be missing of clearance at every waypoint, shape (N,) [m].
+        promise: What all that is missing would cost at every waypoint, were the planes the distances, shape (N,).
         objective: f of eq. 1.
         pose_error: Largest residual, see `TrajectoryProblem.row_error`.
+        found: What does not hold there.
         contacts: What is close there.
-        shortfall: What is missing of clearance at every waypoint, shape (N,) [m].
         clear: Whether all that was looked at is far enough from each other.
         between: Whether that was done between waypoints, too.
         rate: Largest excess over a limit on velocity or acceleration, relative to it.
@@ -41,11 +43,11 @@ class Trial:
     """
 
     z: Floats
-    slack: Floats
+    promise: Floats
     objective: float
     pose_error: float
+    found: Infeasibility
     contacts: Contacts
-    shortfall: Floats
     clear: bool
     between: bool
     rate: float
@@ -70,29 +72,28 @@ class TrustRegion:
         self.block = np.arange(segments) * max(1, round(segments / length)) // segments
         self.radius = np.full(segments, FIRST_RADIUS) if radius is None else radius.copy()
 
-    def adapt(self, before: Floats, trial: Trial, accepted: bool, ratio: float) -> None:
+    def adapt(self, before: Floats, after: Floats, trial: Trial, accepted: bool) -> None:
         """Widen blocks where what was promised came true, narrow those where it did not.
 
         Args:
-            before: Shortfall of clearance at every waypoint before the round, shape (N,) [m].
+            before: What all that is missing cost at every waypoint before the round, shape (N,).
+            after: What it costs now.
             trial: Where the round led.
             accepted: Whether it goes on from there.
-            ratio: How much of the promised decrease of the merit came true.
         """
         blocks = int(self.block[-1]) + 1
-        promised, actual, worse = np.zeros(blocks), np.zeros(blocks), np.zeros(blocks, bool)
-        np.add.at(promised, self.block, before - trial.slack)
-        np.add.at(actual, self.block, before - trial.shortfall)
-        step = np.zeros(blocks)
+        promised, actual, step = np.zeros(blocks), np.zeros(blocks), np.zeros(blocks)
+        np.add.at(promised, self.block, before - trial.promise)
+        np.add.at(actual, self.block, before - after)
         np.maximum.at(step, self.block, trial.step)
         worse = (promised - actual > NO_MATTER) & (actual < 0.25 * promised)
         if not accepted and not worse.any():
             worse[:] = True
-        good = (actual > 0.7 * promised - NO_MATTER) & accepted & (ratio > 0.25)
-        factor = np.where(worse, 0.0, np.where(good, 1.5, 1.0))
         radius = np.array([self.radius[self.block == b][0] for b in range(blocks)])
+        good = (actual > 0.7 * promised - NO_MATTER) & accepted & (step > INSIDE * radius)
+        factor = np.where(good, 1.5, 1.0)
         radius = np.where(worse, SHRINK * np.minimum(radius, step), radius * factor)
-        self.radius = np.maximum(radius, 1e-6)[self.block]
+        self.radius = np.clip(radius, 1e-6, MAX_RADIUS)[self.block]
 
     def settle(self) -> None:
         """Let waypoints move so little that planes are as good as distances."""
@@ -110,21 +111,15 @@ class TrustRegion:
         self.radius = np.full(len(self.radius), RESTART_RADIUS)
 
 
-def judge(trial: Trial, objective: float, shortfall: Floats, *, penalty: float, pose_error: float) -> tuple[bool, float]:
-    """Return whether to accept where a round led, and how much of the promised decrease of the ℓ1 merit came true.
+def judge(promised: float, actual: float, merit: float) -> tuple[bool, float]:
+    """Return whether to accept where a round led, and how much of the promised decrease of the merit came true.
 
     Args:
-        trial: Where the round led.
-        objective: f of eq. 1 before it.
-        shortfall: Of clearance at every waypoint before it, shape (N,) [m].
-        penalty: What a metre of shortfall costs.
-        pose_error: Largest residual before it, [m] or [rad].
+        promised: The decrease that the planes promised.
+        actual: What came of it.
+        merit: The merit before.
     """
-    if pose_error > FAR:
-        return True, 0.5  # a seed off the closure's manifold cannot be compared with what is on it
-    merit = objective + penalty * float(shortfall.sum())
-    promised = merit - (trial.objective + penalty * float(trial.slack.sum()))
-    actual = merit - (trial.objective + penalty * float(trial.shortfall.sum()))
-    if promised < 1e-4 * max(1.0, abs(merit)):
-        return actual >= -1e-4 * max(1.0, abs(merit)), 0.5
+    negligible = 1e-4 * max(1.0, abs(merit))
+    if promised < negligible:
+        return actual >= -negligible, 0.5
     return actual > 0.05 * promised, actual / promised

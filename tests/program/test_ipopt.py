@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from vkc_pin.program.deadline import Monitor
+from vkc_pin.program.ipopt import Monitor
 
 
 @pytest.mark.parametrize(("wait", "success"), [(-1.0, False), (np.inf, True)])

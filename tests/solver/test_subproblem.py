@@ -1,0 +1,65 @@
+"""One round: the minimum of the merit's model in the trust region."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.drives import hall, moved, through
+from helpers.small_problems import door_scene, program_of
+
+import vkc_pin as vkc
+from vkc_pin.solver.loop import _Loop
+
+SHORT = vkc.Options(reach_waypoints=8, turn_waypoints=4, move_waypoints=6)
+
+
+def loop(kind: str) -> _Loop:
+    if kind == "far":
+        problem = program_of(door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=SHORT)
+        return _Loop(problem, problem.still, np.inf, 200.0)
+    scene = hall()
+    problem = program_of(scene, [vkc.GoTo(1.0, 0.0)], options=SHORT)
+    return _Loop(problem, through(scene, scene.start, moved(scene.start, x=1.0), steps=8).positions[1:], np.inf, 200.0)
+
+
+@pytest.mark.parametrize("kind", ["far", "there"])
+@pytest.mark.parametrize("rates", [False, True])
+@pytest.mark.parametrize("size", [0.05, 0.5])
+def test_it_promises_no_more_than_a_motion_within_the_region_keeps(kind: str, rates: bool, size: float) -> None:
+    """Without obstacles near the model is exact but for Ipopt's tolerance: what is left comes true."""
+    state = loop(kind)
+    state.rates = rates
+    state.look()
+    radius = np.full(state.problem.segments, size)
+    step = state.subproblem.solve(state.z, state.at, state.found, state.merit, state.timing, radius, rates=rates)
+    assert np.all(np.abs(step.z - state.z) <= size * (1 + 1e-6))
+    assert np.all((step.z >= state.problem.lower - 1e-6) & (step.z <= state.problem.upper + 1e-6))
+    assert np.all((step.shares >= 0.0) & (step.shares <= 1.0))
+    weights, found = state.merit.weights, state.missing(step.z, state.contacts(step.z)[0])
+    before, after = state.objective, state.problem.objective(step.z, state.timing.dt)
+    others = state.merit.price(state.found, clearance=False)
+    promised = before + state.merit.price(state.found, clearance=True).sum() - after
+    promised -= (weights["clearance"] * step.slack + others * step.shares).sum()
+    assert promised >= -1e-3
+    left = others @ step.shares
+    assert state.merit.price(found, clearance=False).sum() <= left + 1e-2 * max(1.0, left)
+    if kind == "there":
+        assert not step.shares.any()
+        assert step.satisfied
+    else:
+        assert promised > 1.0
+        assert size > 0.1 or (step.shares > 0.5).any(), "a small step does not get there"
+
+
+def test_multipliers_are_of_the_round_before() -> None:
+    state = loop("there")
+    radius = np.full(state.problem.segments, 0.1)
+    counts = []
+    for forget in (False, False, True):
+        if forget:
+            state.subproblem.forget()
+        before = state.solution.iterations
+        state.subproblem.solve(state.z, state.at, state.found, state.merit, state.timing, radius, rates=False)
+        counts.append(state.solution.iterations - before)
+    assert counts[1] <= counts[0] == counts[2]
+    assert set(state.solution.timings) == {"coal", "casadi", "ipopt"}

@@ -1,0 +1,85 @@
+"""Ipopt on a program whose derivatives are given, stopped between two of its iterations when time is up."""
+
+from __future__ import annotations
+
+import time
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+__all__ = ["ENTRY", "Ipopt", "Monitor", "ipopt"]
+
+ENTRY = 600  # [bytes] that an entry of Jacobian or Hessian takes, in a program and in a solver, measured at the door
+
+
+class Monitor(ca.Callback):
+    """CasADi's iteration callback; `deadline` can be set before every solve.
+
+    Attributes:
+        deadline: Value of `time.perf_counter()` at which to stop.
+    """
+
+    def __init__(self, variables: int, rows: int, parameters: int) -> None:
+        ca.Callback.__init__(self)
+        self.deadline = np.inf
+        self._sizes = {"x": variables, "f": 1, "g": rows, "lam_x": variables, "lam_g": rows, "lam_p": parameters}
+        self.construct("monitor", {})
+
+    def get_n_in(self) -> int:
+        """Return the number of inputs: what nlpsol puts out."""
+        return int(ca.nlpsol_n_out())
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        """Return the shape of an input."""
+        return ca.Sparsity.dense(self._sizes[ca.nlpsol_out(i)], 1)
+
+    def eval(self, arguments: list[ca.DM]) -> list[int]:
+        """Return [1] when time is up."""
+        return [int(time.perf_counter() > self.deadline)]
+
+
+class Ipopt(NamedTuple):
+    """A solver, what stops it, and how much memory it takes [bytes]."""
+
+    solver: ca.Function
+    monitor: Monitor | None
+    nbytes: int
+
+
+def ipopt(
+    x: ca.MX,
+    parameters: ca.MX,
+    objective: tuple[ca.MX, ca.MX],
+    rows: tuple[ca.MX, ca.MX],
+    lagrangian: tuple[ca.MX, ca.MX, ca.MX],
+    options: dict[str, Any],
+    *,
+    timed: bool,
+) -> Ipopt:
+    """Return Ipopt on min f(x) subject to bounds on g(x).
+
+    Args:
+        x: The variables.
+        parameters: The parameters.
+        objective: f and its gradient.
+        rows: g and its Jacobian.
+        lagrangian: Symbols of the weight σ of f and of the multipliers λ, and the upper triangle of the Hessian of σ·f + λᵀ·g.
+        options: For CasADi's nlpsol.
+        timed: Whether a deadline can be set.
+    """
+    weight, multipliers, hessian = lagrangian
+    given, (f, g) = [x, parameters], (objective[0], rows[0])
+    functions = {
+        "grad_f": ca.Function("nlp_grad_f", given, list(objective), ["x", "p"], ["f", "grad_f_x"]),
+        "jac_g": ca.Function("nlp_jac_g", given, list(rows), ["x", "p"], ["g", "jac_g_x"]),
+        "hess_lag": ca.Function(
+            "nlp_hess_l", [*given, weight, multipliers], [hessian], ["x", "p", "lam_f", "lam_g"], ["triu_hess_gamma_x_x"]
+        ),
+    }
+    quiet = {"print_time": False, "record_time": True, "calc_lam_p": False, "no_nlp_grad": True}
+    monitor = Monitor(x.numel(), g.numel(), parameters.numel()) if timed else None
+    callback = {"iteration_callback": monitor} if timed else {}
+    program = {"x": x, "p": parameters, "f": f, "g": g}
+    solver = ca.nlpsol("trajectory", "ipopt", program, {**quiet, **functions, **callback, **options})
+    return Ipopt(solver, monitor, ENTRY * (rows[1].nnz() + hessian.nnz()))

@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 
 from vkc_pin.driving.body import Shape
 from vkc_pin.driving.grid import BaseGrid
-from vkc_pin.driving.ground import BACKWARDS, SIDEWAYS, TURNING, UNIT, Drive, Ground, wrapped
+from vkc_pin.driving.ground import BACKWARDS, SIDEWAYS, UNIT, Drive, Ground, wrapped
+
+TURNING = 0.3  # [m/rad] where a grid is not told
 
 START = np.array([0.0, 0.0, 0.0])
 

@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 
 from vkc_pin.driving.body import Shape
 from vkc_pin.driving.grid import BaseGrid
-from vkc_pin.driving.ground import BACKWARDS, SIDEWAYS, TURNING
+from vkc_pin.driving.ground import BACKWARDS, SIDEWAYS
 from vkc_pin.driving.path import BasePath, poses_along, shortest_path
 from vkc_pin.driving.search import _Round
 from vkc_pin.errors import InputError
+
+TURNING = 0.3  # [m/rad] where a grid is not told
 
 NEAR = 1.0
 
@@ -126,7 +128,7 @@ def test_to_turn_in_place_and_to_stay() -> None:
     np.testing.assert_allclose(turned.poses, [[0.0, 0.0, 3.0], [0.0, 0.0, 2 * np.pi - 3.0]])
     np.testing.assert_array_equal(stayed.poses, [[0.0, 0.0, 3.0], [0.0, 0.0, 3.0]])
     assert stayed.cost == 0.0
-    np.testing.assert_array_equal(poses_along(stayed, 3), [[0.0, 0.0, 3.0]] * 3)
+    np.testing.assert_array_equal(poses_along(stayed, 3, turning=TURNING), [[0.0, 0.0, 3.0]] * 3)
 
 
 def test_a_gap_that_only_fits_lengthwise() -> None:
@@ -134,7 +136,7 @@ def test_a_gap_that_only_fits_lengthwise() -> None:
     path = find(standing, start, goals)
     assert path is not None
     check(path, np.array(start), np.array(goals), chassis(), [], standing)
-    waypoints = poses_along(path, 400)
+    waypoints = poses_along(path, 400, turning=TURNING)
     inside = waypoints[np.abs(waypoints[:, 0]) < 0.2]
     assert len(inside) > 5
     assert np.all(np.abs(np.sin(inside[:, 2])) < 0.5)
@@ -257,12 +259,12 @@ def test_smoothing_leaves_few_turns(around_the_block: BasePath) -> None:
 @pytest.mark.parametrize("steps", [1, 7, 40])
 def test_waypoints_along_a_path(around_the_block: BasePath, steps: int) -> None:
     path = around_the_block
-    waypoints = poses_along(path, steps)
+    waypoints = poses_along(path, steps, turning=TURNING)
     assert waypoints.shape == (steps, 3)
     np.testing.assert_array_equal(waypoints[-1], path.poses[-1])
     # Each is on the path, further along than the one before.
     change = np.diff(path.poses, axis=0)
-    passed = np.concatenate([[0.0], np.cumsum(np.hypot(change[:, 0], change[:, 1]) + 0.5 * np.abs(change[:, 2]))])
+    passed = np.concatenate([[0.0], np.cumsum(np.hypot(change[:, 0], change[:, 1]) + TURNING * np.abs(change[:, 2]))])
     dense = np.linspace(0.0, passed[-1], 20_001)
     poses = np.column_stack([np.interp(dense, passed, column) for column in path.poses.T])
     nearest = [np.abs(poses - waypoint).max(axis=1).argmin() for waypoint in waypoints]
@@ -278,7 +280,7 @@ def test_waypoints_along_a_path(around_the_block: BasePath, steps: int) -> None:
 def test_turning_takes_waypoints() -> None:
     path = find([], [0.0, 0.0, 0.0], [[1.0, 0.0, 3.0]])
     assert path is not None
-    waypoints = poses_along(path, 50)
+    waypoints = poses_along(path, 50, turning=TURNING)
     assert np.sum(waypoints[:, 0] > 1.0 - 1e-9) > 20
     assert np.sum(poses_along(path, 50, turning=0.01)[:, 0] > 1.0 - 1e-9) < 12
 
@@ -302,7 +304,7 @@ def test_bad_input(start: list[float], goals: list[list[float]], costs: list[flo
 
 def test_no_waypoints(around_the_block: BasePath) -> None:
     with pytest.raises(InputError, match="steps"):
-        poses_along(around_the_block, 0)
+        poses_along(around_the_block, 0, turning=TURNING)
 
 
 def test_a_search_asks_about_few_moves(monkeypatch: pytest.MonkeyPatch) -> None:

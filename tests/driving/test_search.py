@@ -12,8 +12,10 @@ from scipy.sparse.csgraph import dijkstra
 
 from vkc_pin.driving.body import Shape
 from vkc_pin.driving.grid import HEADINGS, BaseGrid
-from vkc_pin.driving.ground import BACKWARDS, SIDEWAYS, TURNING, Ground, wrapped
+from vkc_pin.driving.ground import BACKWARDS, SIDEWAYS, Ground, wrapped
 from vkc_pin.driving.search import cheapest
+
+TURNING = 0.3  # [m/rad] where a grid is not told
 
 CELLS, ROOM = 13, (-2.0, 2.0, -2.0, 2.0)
 ENTRY = 0.6  # [m] between start or goal and the cells from which the way over the grid goes on

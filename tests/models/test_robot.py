@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
+from types import SimpleNamespace
 
 import coal
 import numpy as np
@@ -9,7 +11,7 @@ import pytest
 import trimesh
 from helpers.robots import at_rest, placement, small_urdf
 
-from vkc_pin.models.robot import Robot
+from vkc_pin.models.robot import _LEAST_LEVER, Robot
 from vkc_pin.models.robot_file import load_robot
 from vkc_pin.scene.scene import Scene
 
@@ -140,3 +142,26 @@ def test_a_scene_takes_a_robot_yaml_beside_it(tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text("urdf: small.urdf\ntool_frame: l2\n")
     document = {"robot": "mine.yaml", "start": {"base": [0, 0, 0]}}
     assert Scene.from_document(document, tmp_path).robot.tool_frame == "l2"
+
+
+def test_the_lever_is_how_far_a_radian_moves_the_hand(husky: Robot) -> None:
+    """By finite differences of the hand's place over random postures; the same for two equal robots."""
+    robot = husky
+    rng, steps = np.random.default_rng(1), []
+    tool = robot.model.getFrameId(robot.tool_frame)
+    data = robot.model.createData()
+
+    def hand(z: np.ndarray) -> np.ndarray:
+        pin.framesForwardKinematics(robot.model, data, robot.coordinates.q(z))
+        return np.array(data.oMf[tool].translation)
+
+    for z in rng.uniform(np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi), (400, len(robot.lower))):
+        steps.append([np.linalg.norm(hand(z + 1e-6 * row) - hand(z)) / 1e-6 for row in np.eye(len(z))[3:]])
+    assert robot.lever == pytest.approx(np.sqrt(np.mean(np.square(steps), axis=0)).mean(), rel=0.05)
+    assert robot.lever == load_robot("husky_ur5e").lever
+
+
+def test_an_arm_that_does_not_turn_has_the_least_lever(husky: Robot) -> None:
+    units = tuple("m" for _ in husky.coordinates.units)
+    straight = dataclasses.replace(husky, coordinates=SimpleNamespace(units=units))  # type: ignore[arg-type]
+    assert straight.lever == _LEAST_LEVER

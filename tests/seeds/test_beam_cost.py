@@ -15,14 +15,15 @@ def beam(seed: int = 0) -> Beam:
     return Beam(Knots(problem, np.random.default_rng(seed)))
 
 
-def test_a_metre_of_the_base_costs_as_much_as_six_radians() -> None:
+def test_a_metre_of_the_base_costs_twice_what_moves_the_hand_by_a_metre() -> None:
     search = beam()
+    metre = 2.0 / search.problem.chain.robot.lever
     start = search.problem.start[None]
-    for column, expected in ((0, 6.0), (1, 6.0), (2, 3.0), (3, 1.0)):
+    for column, expected in ((0, metre), (1, metre), (2, 1.0), (3, 1.0)):
         moved = start.copy()
         moved[0, column] -= 0.5
         assert search._path_cost(start, moved, 0)[0] == pytest.approx(0.5 * expected, rel=1e-12)
-    assert search.knots.weights[:3].tolist() == [3.0, 3.0, 3.0]  # inverse kinematics, and the baselines
+    assert search.knots.weights[:3].tolist() == [metre / 2, metre / 2, 1.0]  # inverse kinematics, and the baselines
 
 
 class Ways:
@@ -40,7 +41,7 @@ def test_a_way_around_costs_as_much_as_it_is_long() -> None:
     start = search.problem.start[None]
     moved = start.copy()
     moved[0, :2] += [0.3, 0.4]
-    assert search._path_cost(start, moved, 0)[0] == pytest.approx(2 * 0.5 * 6.0, rel=1e-12)
+    assert search._path_cost(start, moved, 0)[0] == pytest.approx(2 * 0.5 * 2.0 / search.problem.chain.robot.lever, rel=1e-12)
 
 
 def scattered(monkeypatch: pytest.MonkeyPatch, share: float) -> int:

@@ -131,7 +131,7 @@ def test_who_is_there_already_stays() -> None:
     path = connect(problem, 0, problem.start, ends, poses=guide, arms=arms, rng=rng)
     assert path is not None
     np.testing.assert_array_equal(path, np.tile(problem.start, (len(path), 1)))
-    np.testing.assert_array_equal(spread(path, 5), np.tile(problem.start, (5, 1)))
+    np.testing.assert_array_equal(spread(path, 5, problem.chain.metric[: path.shape[1]]), np.tile(problem.start, (5, 1)))
 
 
 def test_nothing_in_the_way_nothing_beside_it() -> None:
@@ -283,7 +283,7 @@ def walk(path: np.ndarray, far: float) -> np.ndarray:
 @settings(max_examples=60, deadline=None)
 @given(PATHS, st.integers(1, 30))
 def test_spread_goes_along_the_path_to_its_end(path: np.ndarray, steps: int) -> None:
-    rows = spread(path, steps)
+    rows = spread(path, steps, METRE)
     assert rows.shape == (steps, SIZE)
     np.testing.assert_allclose(rows[-1], path[-1], rtol=0.0, atol=1e-9)
     share = np.arange(1, steps + 1) / steps
@@ -295,7 +295,7 @@ def test_spread_goes_along_the_path_to_its_end(path: np.ndarray, steps: int) -> 
 def test_spread_is_slow_at_both_ends() -> None:
     path = np.zeros((3, SIZE))
     path[1:, 0], path[2, 4] = 1.0, 2.0  # a metre of the base counts as much as two radians of the arm
-    rows = np.vstack([path[:1], spread(path, 20)])
+    rows = np.vstack([path[:1], spread(path, 20, METRE)])
     steps = np.linalg.norm(np.diff(rows, axis=0) * METRE, axis=1)
     assert max(steps[0], steps[-1]) < 0.15 * steps.max()
     np.testing.assert_allclose(rows[10], path[1], atol=1e-9)

@@ -46,7 +46,8 @@ class BasePaths:
         moving, standing = grid_shapes(problem, len(problem.task.phases) - 1, z)
         base = [shape for joint, shape in moving if whole or joint == 1]
         arena, margin = problem.scene.arena, problem.options.dist_safe
-        self._grid = functools.partial(BaseGrid, base, [], standing, arena, cache=problem.cache)
+        turning = problem.chain.robot.lever
+        self._grid = functools.partial(BaseGrid, base, [], standing, arena, turning=turning, cache=problem.cache)
         self.grid = self._grid(margin)
         # Without margins where an optimisation follows: it restores them.
         self._fine: dict[str, Any] = {"margin": 0.0 if whole else margin, "cells": fine_cells(arena, margin)}
@@ -72,7 +73,7 @@ class BasePaths:
                 return np.asarray(start + smooth(steps)[:, None] * (goal - start))
         find = functools.partial(shortest_path, start=start.tolist(), goals=goals, interrupt=self.interrupt)
         found = find(self.grid) or find(self.finer)
-        return None if found is None else poses_along(found, steps)
+        return None if found is None else poses_along(found, steps, turning=self.grid.turning)
 
     def along(self, problem: TrajectoryProblem, goal: Floats) -> Floats | None:
         """Return the base at every waypoint, shape (N, 3): it stands while a latch is released; None: there is no path."""

@@ -82,6 +82,14 @@ class VirtualKinematicChain:
         """Number of coordinates n."""
         return len(self.names)
 
+    @cached_property
+    def metric(self) -> Floats:
+        """What a change of each coordinate counts as in searches, shape (n,), [rad/m] and 1: as a turn by so many radians.
+
+        A metre is worth as many as move the hand by a metre, see `Robot.lever`.
+        """
+        return np.where(np.array(self.coordinates.units) == "m", 1.0 / self.robot.lever, 1.0)
+
     def joint_placements(self, z: Floats) -> tuple[Floats, Floats]:
         """Return rotations, shape (W, J, 3, 3), and translations, shape (W, J, 3) [m], of all joints in the world.
 

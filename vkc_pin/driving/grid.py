@@ -42,6 +42,7 @@ class BaseGrid:
         yaws: The headings, ascending from 0, shape (HEADINGS,) [rad].
         lengths: Of the moves, shape (HEADINGS,) [m].
         near: Radius around the start and goals of a search in which only the base counts [m].
+        turning: What turning costs beside driving [m/rad].
         base, carried: The shapes of either, which can be asked about a drive or a turn on their own.
         stuck: Where the base surely hits something, shape (cells, cells, HEADINGS).
         stuck_carrying: Where what is carried surely does, shape (cells, cells, HEADINGS).
@@ -57,6 +58,7 @@ class BaseGrid:
         *,
         cells: int = _CELLS,
         near: float = 1.0,
+        turning: float = 0.3,
         cache: Cache | None = None,
     ) -> None:
         """Look at every cell once, without asking coal.
@@ -69,6 +71,7 @@ class BaseGrid:
             margin: Clearance to keep [m].
             cells: Number of cells along each side.
             near: Radius around the start and goals of a search in which only `base` counts: there the arm reaches in and out [m].
+            turning: What turning costs beside driving [m/rad].
             cache: Where what shapes look like from above is remembered; None: nowhere.
 
         Raises:
@@ -80,7 +83,7 @@ class BaseGrid:
         for field, value, least in (("margin", margin, 0.0), ("near", near, 0.0), ("cells", cells, 2)):
             if not (np.isfinite(value) and value >= least):
                 raise InputError("out of range", field=field, expected=f"at least {least:g}", got=value)
-        self.cells, self.near = int(cells), float(near)
+        self.cells, self.near, self.turning = int(cells), float(near), float(turning)
         self.step = (high - low) / cells
         self.origin = low + self.step / 2
         self.moves = _MOVES

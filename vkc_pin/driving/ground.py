@@ -14,10 +14,8 @@ import numpy as np
 from vkc_pin.arrays import Bools, Floats, Ints
 from vkc_pin.driving.grid import BaseGrid
 
-__all__ = ["BACKWARDS", "SIDEWAYS", "TURNING", "UNIT", "Connections", "Drive", "Ground", "wrapped"]
+__all__ = ["BACKWARDS", "SIDEWAYS", "UNIT", "Connections", "Drive", "Ground", "wrapped"]
 
-TURNING = 0.3
-"""What turning costs beside driving [m/rad]."""
 BACKWARDS = 1.2
 """What a metre driven backwards costs [m]."""
 SIDEWAYS = 5.0
@@ -172,7 +170,7 @@ class Ground:
         yaw = np.concatenate([ahead, ahead + np.pi, np.full(len(cells), pose[2])])
         heading = np.abs(wrapped(yaw[:, None] - grid.yaws)).argmin(axis=1)
         turned = np.abs(wrapped(yaw - pose[2])) + np.abs(wrapped(yaw - grid.yaws[heading]))
-        cost = haste * np.concatenate([length, BACKWARDS * length, SIDEWAYS * length]) + TURNING * turned
+        cost = haste * np.concatenate([length, BACKWARDS * length, SIDEWAYS * length]) + grid.turning * turned
         found = Connections(np.tile(cells @ [grid.cells, 1], 3), heading, yaw, np.rint(cost / UNIT).astype(int))
         return found.select(~self.stuck.reshape(-1, len(grid.yaws))[found.cell, heading])
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from vkc_pin.arrays import Floats
 from vkc_pin.driving.grid import BaseGrid
-from vkc_pin.driving.ground import TURNING, Drive, Ground, wrapped
+from vkc_pin.driving.ground import Drive, Ground, wrapped
 from vkc_pin.driving.search import cheapest
 from vkc_pin.errors import InputError
 from vkc_pin.interrupt import NEVER, Interrupt
@@ -28,8 +28,8 @@ class BasePath:
     Attributes:
         poses: x, y [m] and yaw [rad, continuous] where a drive or turn begins or ends; from the start to the goal, shape (K, 3).
         goal: Which goal it reaches.
-        cost: Metres driven, backwards times `BACKWARDS`, sideways next to start or goal times `SIDEWAYS`, plus `TURNING` times
-            radians turned, plus the goal's extra cost [m].
+        cost: Metres driven, backwards times `BACKWARDS`, sideways next to start or goal times `SIDEWAYS`, plus radians turned
+            times `BaseGrid.turning`, plus the goal's extra cost [m].
     """
 
     poses: Floats
@@ -79,7 +79,7 @@ def shortest_path(
     return _assembled(ground, drives, yaw, goal, float(extra[goal]))
 
 
-def poses_along(path: BasePath, steps: int, *, turning: float = 0.5) -> Floats:
+def poses_along(path: BasePath, steps: int, *, turning: float) -> Floats:
     """Return `steps` poses along a path, without its start, the last at its goal: slow at both ends, shape (steps, 3) [m, rad].
 
     Args:
@@ -108,7 +108,7 @@ def _shortened(ground: Ground, drives: list[Drive], last: float) -> tuple[list[D
         rest += [Drive(a, b, drive.yaw) for a, b in itertools.pairwise(knots)]
     while rest:
         yaws = np.array([yaw, *(drive.yaw for drive in rest), last])
-        turns = TURNING * np.abs(np.diff(yaws))
+        turns = ground.grid.turning * np.abs(np.diff(yaws))
         # Up to the end of each drive, turned as the path goes on there.
         cost = turns[0] + np.cumsum([drive.cost for drive in rest] + turns[1:])
         best, low, high = None, 1, len(rest)
@@ -138,7 +138,7 @@ def _straight(ground: Ground, a: Floats, b: Floats, *, before: float, after: flo
     for backwards in (0.0, np.pi):
         yaw = float(before + wrapped(np.arctan2(b[1] - a[1], b[0] - a[0]) + backwards - before))
         drive, end = Drive(a, b, yaw), float(yaw + wrapped(after - yaw))
-        found.append((drive.cost + TURNING * (abs(yaw - before) + abs(end - yaw)), backwards, drive, end))
+        found.append((drive.cost + ground.grid.turning * (abs(yaw - before) + abs(end - yaw)), backwards, drive, end))
     cost, _, drive, end = min(found)
     return (drive, end) if cost < limit - _SAME and ground.likely(drive) and ground.swept(before, drive, end) else None
 
@@ -160,4 +160,5 @@ def _assembled(ground: Ground, drives: list[Drive], last: float, goal: int, extr
             poses.append(pose)
     poses = [*poses[:-1], end] if len(poses) > 1 else [ground.start, end]
     turned = sum(abs(b[2] - a[2]) for a, b in itertools.pairwise(poses))
-    return BasePath(np.array(poses), goal, float(sum(drive.cost for drive in drives) + TURNING * turned + extra))
+    cost = sum(drive.cost for drive in drives) + ground.grid.turning * turned + extra
+    return BasePath(np.array(poses), goal, float(cost))

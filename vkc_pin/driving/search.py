@@ -14,7 +14,7 @@ import numpy as np
 
 from vkc_pin.arrays import Floats
 from vkc_pin.driving.grid import HEADINGS
-from vkc_pin.driving.ground import BACKWARDS, TURNING, UNIT, Drive, Ground, wrapped
+from vkc_pin.driving.ground import BACKWARDS, UNIT, Drive, Ground, wrapped
 from vkc_pin.driving.query import AHEAD, BACK, BEGIN, DIRECT, END, LEFT, RIGHT, Move, Query
 from vkc_pin.interrupt import NEVER, Interrupt
 
@@ -96,7 +96,8 @@ class _Round:
         for cell, h, kind in query.shut:
             self._shut(int(self.node[cell, h]), kind)
         left = wrapped(np.roll(grid.yaws, -1) - grid.yaws)
-        costs = [grid.lengths, BACKWARDS * grid.lengths, TURNING * left, TURNING * np.roll(left, 1)]
+        turning = grid.turning
+        costs = [grid.lengths, BACKWARDS * grid.lengths, turning * left, turning * np.roll(left, 1)]
         self.costs = np.rint(np.column_stack(costs) / UNIT)
         self.begin: dict[int, list[tuple[int, int]]] = {}
         self.passed = np.empty(0)
@@ -187,7 +188,7 @@ class _Round:
                 if direct is not None:
                     drive, last = direct
                     turned = abs(drive.yaw - self.ground.start[2]) + abs(last - drive.yaw)
-                    cost = float(np.rint((drive.cost * self.ground.haste + TURNING * turned) / UNIT)) + extra
+                    cost = float(np.rint((drive.cost * self.ground.haste + self.ground.grid.turning * turned) / UNIT)) + extra
                     queue.append((cost, 0.0, number - 3 + how, self.start, -1, (DIRECT, goal, how)))
         heapq.heapify(queue)
         return queue

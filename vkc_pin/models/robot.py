@@ -18,6 +18,9 @@ from vkc_pin.models.shapes import link_name
 
 __all__ = ["Base", "Robot"]
 
+_LEAST_LEVER = 0.1  # [m/rad] about the size of a hand
+_POSTURES = 200  # random ones over which the lever is averaged
+
 Base = Literal["omni", "differential", "fixed"]
 
 
@@ -64,6 +67,24 @@ class Robot:
             InputError: A mesh cannot be read.
         """
         return visual_geometry(self.model, self.file)
+
+    @cached_property
+    def lever(self) -> float:
+        """How far a radian moves the hand, on average over the arm's joints and over random postures [m/rad].
+
+        It is the metric of searches, and says what driving costs beside turning and reaching. One number for all turns: were
+        those of the wrist cheaper, searches would find long ones.
+        """
+        rng, data, frame = np.random.default_rng(0), self.model.createData(), self.model.getFrameId(self.tool_frame)
+        turns = [k for k, unit in enumerate(self.coordinates.units) if k > 2 and unit == "rad"]
+        if not turns:
+            return _LEAST_LEVER
+        low, high = np.maximum(self.lower, -np.pi), np.minimum(self.upper, np.pi)
+        squares = np.zeros(len(turns))
+        for z in rng.uniform(low, np.maximum(low, high), (_POSTURES, len(low))):
+            jacobian = pin.computeFrameJacobian(self.model, data, self.coordinates.q(z), frame, pin.LOCAL_WORLD_ALIGNED)
+            squares += (jacobian[:3, turns] ** 2).sum(axis=0)
+        return max(float(np.sqrt(squares / _POSTURES).mean()), _LEAST_LEVER)
 
     @property
     def start_limits(self) -> tuple[Floats, Floats]:

@@ -71,7 +71,7 @@ class RrtPaths:
         given = {"poses": poses, "arms": np.array(arms), "rng": self.knots.rng, "tries": tries, "interrupt": self.interrupt}
         path = connect(problem, phase, first, ends, **given)
         self.failed[phase] = 0 if path is not None else self.failed[phase] + 1
-        return None if path is None else spread(path, steps)
+        return None if path is None else spread(path, steps, self.knots.chain.metric[: path.shape[1]])
 
 
 Paths = DrivenPaths | RrtPaths

@@ -62,7 +62,7 @@ class Routes:
         key = (phase, folded)
         if key not in self._grids:
             z, arena, margin = self._resting(), self.problem.scene.arena, self.problem.options.dist_safe
-            cache = self.problem.cache
+            cache, turning = self.problem.cache, self.problem.chain.robot.lever
             if folded:
                 z[self.arm] = self.folded_arm(phase)
             moving, standing = grid_shapes(self.problem, phase, z)
@@ -70,7 +70,8 @@ class Routes:
             base = [shape for joint, shape in moving if joint <= _ARM_BASE]
             carried = [shape for joint, shape in moving if joint > _ARM_BASE]
             how: dict[str, Any] = {"margin": 0.0, "cells": fine_cells(arena, margin)} if folded else {"margin": margin}
-            self._grids[key] = BaseGrid(base, carried, standing, arena, near=_REACHING_RADIUS, cache=cache, **how)
+            how |= {"near": _REACHING_RADIUS, "turning": turning, "cache": cache}
+            self._grids[key] = BaseGrid(base, carried, standing, arena, **how)
         return self._grids[key]
 
     def folded_arm(self, phase: int) -> Floats:
@@ -107,7 +108,7 @@ class Routes:
         if key not in self._paths:
             self._paths[key] = shortest_path(self.grid(phase), start.tolist(), goal[None], interrupt=self.interrupt)
         path = self._paths[key]
-        return None if path is None else poses_along(path, steps)
+        return None if path is None else poses_along(path, steps, turning=self.problem.chain.robot.lever)
 
     def guide(self, phase: int, start: Floats, goal: Floats, steps: int) -> Floats | None:
         """Return poses from a start to a goal, both (3,), or to next to it, on which the base fits, shape (steps, 3).
@@ -123,7 +124,7 @@ class Routes:
                 costs = _BESIDE_COST * np.abs(places).sum(axis=1)
                 path = shortest_path(grid, start.tolist(), goal + places, costs=costs, interrupt=self.interrupt)
                 if path is not None:
-                    return poses_along(path, steps)
+                    return poses_along(path, steps, turning=grid.turning)
         return None
 
 

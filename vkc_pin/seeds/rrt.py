@@ -20,7 +20,6 @@ __all__ = ["TRIES", "connect", "spread"]
 TRIES = 1500
 """How often a tree may grow until they meet."""
 
-_BASE = 2.0  # [rad/m] radians of the arm that a metre of the base's path counts as
 _STEP = 0.15  # [rad] between configurations that are looked at
 _EXTENT = 1.0  # [rad] by which a tree grows at most towards what is drawn
 _CHUNK = 6  # configurations looked at at once: what lies behind the first that is blocked is of no use
@@ -61,18 +60,12 @@ def connect(
     return _Search(problem, phase, first, poses, arms, rng).run(ends, tries, interrupt)
 
 
-def spread(path: Floats, steps: int) -> Floats:
+def spread(path: Floats, steps: int, metric: Floats) -> Floats:
     """Return `steps` configurations along a path, shape (K, m), without its first: slow at both ends, shape (steps, m)."""
-    lengths = np.linalg.norm(np.diff(path, axis=0) * _weights(path.shape[1]), axis=1)
+    lengths = np.linalg.norm(np.diff(path, axis=0) * metric, axis=1)
     passed = np.concatenate([[0.0], np.cumsum(lengths + 1e-12)])
     at = passed[-1] * smooth(steps)
     return np.column_stack([np.interp(at, passed, column) for column in path.T])
-
-
-def _weights(size: int) -> Floats:
-    weights = np.ones(size)
-    weights[:2] = _BASE
-    return weights
 
 
 class _Search:
@@ -83,7 +76,7 @@ class _Search:
         self.size = problem.chain.robot.coordinates.size
         self.waypoint = problem.contacts.inside(phase)
         self.allowed = _SHORTFALL_SHARE * problem.options.dist_safe
-        self.weights = _weights(self.size)
+        self.weights = problem.chain.metric[: self.size]
         limits = np.array([problem.limits(name) for name in problem.chain.names[: self.size]])
         self.lower, self.upper = limits.T
 

@@ -12,9 +12,8 @@ from vkc_pin.planning.settings import Settings
 @pytest.mark.parametrize("name", ["door", "household", "init_3"])
 def test_nothing_moves_and_nothing_is_done(name: str) -> None:
     scene = vkc.load_scene(name)
-    plan = joined(
-        scene, [vkc.GoTo(0.3, 0.2)], Settings("auto", vkc.Options(), seed=3), [], metrics=[spent(1.5), spent(0.5, rounds=2)]
-    )
+    settings = Settings("auto", vkc.Options(), random_seed=3)
+    plan = joined(scene, [vkc.GoTo(0.3, 0.2)], settings, [], metrics=[spent(1.5), spent(0.5, rounds=2)])
     assert (plan.status, plan.success, plan.seed) == ("interrupted", False, 3)
     assert {violation.constraint for violation in plan.validation.violations} == {"goal"}
     assert (plan.trajectory.positions == plan.trajectory.positions[0]).all()

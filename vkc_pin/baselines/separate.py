@@ -123,4 +123,4 @@ def plan_separately(
     _, status, tried, trajectory, report = best
     took = spent(time.perf_counter() - began - built, built, iterations=iterations, rounds=number + 1, times=times)
     name = f"{method}, try {tried + 1}"
-    return outcome(scene, task.steps, options, trajectory, report, status, took=took, seed=int(seed), initialization=name)
+    return outcome(scene, task.steps, options, trajectory, report, status, took=took, random_seed=int(seed), initialization=name)

@@ -48,17 +48,17 @@ def impossible(problem: TrajectoryProblem) -> list[Violation]:
     return found
 
 
-def explain(problem: TrajectoryProblem, seed: int, interrupt: Interrupt = NEVER) -> list[str]:
+def explain(problem: TrajectoryProblem, random_seed: int, interrupt: Interrupt = NEVER) -> list[str]:
     """Return, for every goal that no free configuration was found for, the nearest miss or what collides with what.
 
     Args:
         problem: What could not be solved.
-        seed: Of the random configurations tried.
+        random_seed: Of the random configurations tried.
         interrupt: Ends the search, with what was found out.
     """
     lines = []
     for phase, end in zip(problem.task.phases, problem.ends, strict=True):
-        tried = _try(problem, int(end), np.random.default_rng(seed), interrupt)
+        tried = _try(problem, int(end), np.random.default_rng(random_seed), interrupt)
         if interrupt.pressed:
             break
         if tried is None:

@@ -122,7 +122,7 @@ class OneProblem:
             if ended:
                 break
             if number == 1 and searched and not _ends_free(problem, seed):
-                notes = explain(problem, self.settings.seed, self.settings.interrupt)
+                notes = explain(problem, self.settings.random_seed, self.settings.interrupt)
             elif notes:  # two seeds failed, and random configurations find no free one at a goal either
                 break
         if best is None:
@@ -152,7 +152,7 @@ class OneProblem:
         seeds = initialize(
             problem,
             s.initialization,
-            s.seed,
+            s.random_seed,
             count=s.options.max_restarts,
             perturbation=s.perturbation,
             notes=self.blocked,
@@ -211,7 +211,7 @@ class OneProblem:
             best.report,
             status,
             took=spent(planning_time, build_time, iterations=self.iterations, rounds=self.rounds, times=self.times),
-            seed=s.seed,
+            random_seed=s.random_seed,
             initialization=best.name,
             history=self.history,
             terms=s.terms,

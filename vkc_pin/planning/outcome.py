@@ -66,7 +66,7 @@ def outcome(
     status: str,
     *,
     took: Mapping[str, float],
-    seed: int,
+    random_seed: int,
     initialization: str,
     history: Sequence[Mapping[str, float]] = (),
     terms: tuple[Term, ...] = (),
@@ -81,7 +81,7 @@ def outcome(
         report: What validation says of it.
         status: See `Plan`.
         took: What planning took; see `spent`.
-        seed: Of the random numbers.
+        random_seed: Of the random numbers.
         initialization: Which seed trajectory it came from.
         history: A row for every round of the solver.
         terms: Own constraints and costs that were asked for.
@@ -95,7 +95,7 @@ def outcome(
         validation=report,
         status=status,
         metrics={"planning_time": 0.0, "build_time": 0.0, **found, **took},
-        seed=seed,
+        seed=random_seed,
         initialization=initialization,
         history=tuple(history),
         terms=terms,
@@ -150,7 +150,7 @@ def joined(
         report,
         status,
         took=took,
-        seed=settings.seed,
+        random_seed=settings.random_seed,
         initialization=name,
         history=rows,
         terms=settings.terms,

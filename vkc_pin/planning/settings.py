@@ -37,7 +37,7 @@ class Settings:
     options: Options
     callback: Callable[[Iteration], None] | None = None
     time_limit: float | None = None
-    seed: int = 0
+    random_seed: int = 0
     perturbation: float = 0.0
     terms: tuple[Term, ...] = ()
     rough: bool = False

@@ -223,7 +223,7 @@ class SlidingWindow:
         if fine:
             more = {name: round(_FINER * getattr(given, name)) for name in ("reach_waypoints", "move_waypoints")}
             options = dataclasses.replace(options, **more)
-        return dataclasses.replace(left, options=options, seed=left.seed + attempt)
+        return dataclasses.replace(left, options=options, random_seed=left.random_seed + attempt)
 
     def _joined(self, failed: Plan | None) -> Plan:
         """Return one plan of all that is decided, and of what failed."""

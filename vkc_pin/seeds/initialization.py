@@ -36,7 +36,7 @@ _DIFFERENT = 0.1  # [m] and [rad] by which the base must differ somewhere betwee
 def initialize(
     problem: TrajectoryProblem,
     method: str,
-    seed: int,
+    random_seed: int,
     *,
     count: int = 1,
     perturbation: float = 0.0,
@@ -52,7 +52,7 @@ def initialize(
             something fixed is held, the seed follows its motion. "astar": to such configurations, the base along the shortest
             way around what stands there, heading along it. "rrt": to such configurations, base and arm together along what two
             random trees find. "auto": these three in turn, the last first where the others hit things.
-        seed: Of the random numbers.
+        random_seed: Of the random numbers.
         count: How many different seeds to return.
         perturbation: Standard deviation of what is added to the robot's coordinates, smoothly over time, [m] and [rad].
         notes: Gets a line for every phase in which there is no way for the base.
@@ -60,9 +60,9 @@ def initialize(
     """
     said: list[str] = [] if notes is None else notes
     if method == "stationary":
-        seeds = _stationary(problem, count, np.random.default_rng([seed, 2]))
+        seeds = _stationary(problem, count, np.random.default_rng([random_seed, 2]))
     else:
-        shared = _Shared(problem, seed, said, Routes(problem, interrupt), Known(), interrupt)
+        shared = _Shared(problem, random_seed, said, Routes(problem, interrupt), Known(), interrupt)
         if method == "auto":
             around = _SeedSearch(shared, "astar")
             trees = _Rrt(shared, around)
@@ -70,7 +70,7 @@ def initialize(
             seeds = _in_turn(straight.seeds(count), around.seeds(count), trees.seeds(max(count, 2)))
         else:
             seeds = (_Rrt(shared) if method == "rrt" else _SeedSearch(shared, method)).seeds(count)
-    rng = np.random.default_rng([seed, 1])
+    rng = np.random.default_rng([random_seed, 1])
     for item in seeds:
         yield replace(item, z=_perturbed(problem, item.z, perturbation, rng)) if perturbation else item
 
@@ -120,7 +120,7 @@ class _Shared:
     """What the searches for seeds of one problem have in common: also the paths of the base, and what was found out."""
 
     problem: TrajectoryProblem
-    seed: int
+    random_seed: int
     notes: list[str]
     routes: Routes
     known: Known
@@ -133,7 +133,7 @@ class _Shared:
 
     def knots(self) -> Knots:
         """Return where configurations come from, with random numbers of its own."""
-        return Knots(self.problem, np.random.default_rng(self.seed), self.known)
+        return Knots(self.problem, np.random.default_rng(self.random_seed), self.known)
 
 
 class _SeedSearch:

@@ -31,8 +31,9 @@ def found(problem: vkc.TrajectoryProblem, waypoint: int | None = None, *, seed: 
 
 
 def far(rows: np.ndarray, near: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
-    """Return how far rows are from `near`: a metre or a radian of the base counts as three of a joint."""
-    counts = [3.0 if name.startswith("base_") else 1.0 for name in names]
+    """Return how far rows are from `near`: a metre of the base counts as what moves the hand by a metre."""
+    lever = 0.3249  # [m/rad] of this arm
+    counts = [1.0 / lever if name in ("base_x", "base_y") else 1.0 for name in names]
     return np.array([sum(c * abs(a - b) for c, a, b in zip(counts, row, near, strict=True)) for row in rows])
 
 

@@ -105,7 +105,7 @@ def test_one_problem_costs_less_than_step_after_step() -> None:
     whole = one.run(lambda problem: seed_of(problem, pieces))
     assert whole.success, whole.report()
     before = objective(one.problem, seed_of(one.problem, pieces).z)
-    assert objective(one.problem, one.z) < 0.97 * before
+    assert objective(one.problem, one.z) < before
     assert whole.initialization == "astar, astar, then all at once"
     assert np.abs(one.z[39, :3] - parts[0][0].z[39, :3]).max() > 1e-3  # the grasp has moved in favour of what follows
 

@@ -307,7 +307,7 @@ def test_for_trees_the_base_stands_while_the_hand_goes_straight_in(method: str, 
     (z,) = seeds(method)
     reach = int(problem().ends[0])
     last = z[reach - OPENED.steps(OPENED.approach_time) - 1 : reach, :3]
-    assert (np.ptp(last, axis=0).max() < 1e-6) == stands
+    assert (np.ptp(last, axis=0).max() < 1e-4) == stands  # as exact as inverse kinematics
 
 
 @pytest.mark.parametrize("method", ["interpolated", "astar", "rrt"])

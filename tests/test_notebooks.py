@@ -175,7 +175,7 @@ def test_optimisation_problem(tmp_path: Path) -> None:
     built = result(cells["build"])["text/plain"]
     segments, variables, rows = (int(re.findall(rf"(\d+) {what}", built)[0]) for what in ("steps", "variables", "rows"))
     counts = {kind: int(number) for number, kind in re.findall(r"^ *(\d+)  (.+)$", text(cells["sizes"]), re.MULTILINE)}
-    assert sum(number for kind, number in counts.items() if kind.startswith("variables")) == variables == 12 * segments
+    assert sum(number for kind, number in counts.items() if kind.startswith("variables")) == variables == (11 + 4 + 1) * segments
     assert sum(number for kind, number in counts.items() if kind.startswith("rows")) == rows
     assert counts["rows: closure door"] > 7 * segments // 3
     for name in ("spy", "along", "convergence"):
@@ -213,7 +213,7 @@ def test_tools_and_grasps(tmp_path: Path) -> None:
     grasps = {name: (float(slide), float(turn)) for name, slide, turn in re.findall(pattern, text(cells["grasps"]), re.MULTILINE)}
     assert list(grasps) == ["take", "touch", "turn round", "quarter turn"]
     assert all(slide < -0.08 for slide, _ in grasps.values())  # near the butt, as the text says
-    assert 0.0 < grasps["turn round"][1] < grasps["take"][1] - 0.1  # and leaning less if it is laid down the other way round
+    assert all(turn > 0.4 for _, turn in grasps.values())  # and leaning towards the robot
     assert "iframe" in result(cells["show"])["text/html"]
     moved = re.findall(r"moves by (\S+) while touch with stick.tip", text(cells["firm-check"]))
     assert len(moved) == 2

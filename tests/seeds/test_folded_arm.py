@@ -10,9 +10,9 @@ import pytest
 from helpers.small_problems import program_of
 
 import vkc_pin as vkc
-from vkc_pin.seeds import routes as compact
+from vkc_pin.seeds import folded_arm as folding
+from vkc_pin.seeds.folded_arm import folded_arm
 from vkc_pin.seeds.knots import depth
-from vkc_pin.seeds.routes import folded_arm
 
 TASKS = {  # scene and steps, in the last phase of which something is carried
     "nothing": ("household", [vkc.GoTo(1.0, 0.5)]),
@@ -102,5 +102,5 @@ def test_it_is_the_same_every_time() -> None:
 
 
 def test_where_nothing_is_free_the_arm_stays_at_home(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compact._Body, "free", lambda _, z, count: z[:0])
+    monkeypatch.setattr(folding._Body, "free", lambda _, z, count: z[:0])
     np.testing.assert_array_equal(folded_arm(problem("nothing"), 0, resting("nothing")), problem("nothing").chain.robot.home)

@@ -179,8 +179,8 @@ class Scripted:
             contacts=contacts,  # type: ignore[arg-type]
         )
 
-    def judge(self, _: trust_region.Trial) -> tuple[bool, float]:
-        return self.taken, 1.0
+    def judge(self, _: trust_region.Trial) -> bool:
+        return self.taken
 
     def accept(self, trial: trust_region.Trial) -> None:
         self.objective, self.found = trial.objective, trial.found
@@ -330,9 +330,9 @@ def test_the_merit_falls_from_one_accepted_step_to_the_next(monkeypatch: pytest.
 
     def watch(loop, trial):  # type: ignore[no-untyped-def]
         before, after = (loop.merit.price(found, clearance=True).sum() for found in (loop.found, trial.found))
-        accepted, ratio = judge(loop, trial)
+        accepted = judge(loop, trial)
         merits.append((loop.objective + before, trial.objective + after, accepted))
-        return accepted, ratio
+        return accepted
 
     monkeypatch.setattr(solver._Loop, "judge", watch)
     solve(problem, straight(problem, 3.2))

@@ -6,7 +6,6 @@ import dataclasses
 from typing import Any
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -34,9 +33,8 @@ def trial(promise: Any = 0.0, *, step: Any = 0.1) -> Trial:
 @settings(max_examples=100, deadline=None)
 @given(st.floats(-1.0, 10.0), st.floats(-10.0, 10.0), st.floats(0.0, 100.0))
 def test_a_step_is_accepted_that_keeps_enough_of_its_promise(promised: float, actual: float, merit: float) -> None:
-    accepted, ratio = judge(promised, actual, merit)
+    accepted = judge(promised, actual, merit)
     if promised >= 1e-4 * max(1.0, merit):
-        assert ratio == pytest.approx(actual / promised)
         assert accepted == (actual > 0.05 * promised)
     else:  # nothing was to be had: it may not become worse
         assert accepted == (actual >= -1e-4 * max(1.0, merit))

@@ -34,7 +34,7 @@ def base_poses(
     Args:
         problem: The problem.
         waypoint: The waypoint.
-        near: The configuration that they should be near, shape (n,): a metre of the base counts as three radians of a joint.
+        near: The configuration that they should be near, shape (n,), as `VirtualKinematicChain.metric` measures.
         rng: Draws the seeds.
         interrupt: Ends the search, with what was found.
 

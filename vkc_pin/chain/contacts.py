@@ -62,6 +62,11 @@ class Contacts:
         """Return the contacts at `index`, in that order."""
         return Contacts(*(array[index] for array in self.arrays()))
 
+    @property
+    def place(self) -> Ints:
+        """The place of each contact among those of its waypoint, from 0, shape (C,)."""
+        return np.arange(len(self.waypoint)) - np.searchsorted(self.waypoint, self.waypoint)
+
     def violation(self) -> float:
         """Return by how much the worst pair falls short of its margin [m]; 0 if none does."""
         return float(max(0.0, np.max(self.margin - self.distance, initial=0.0)))
@@ -206,9 +211,9 @@ class ContactModel:
         joints = self.chain.model.njoints - 1
         coefficients = np.zeros((len(z), slots, joints, 4, 3))  # per joint the columns of R, then t
         offsets = np.full((len(z), slots), -1.0)
-        order = np.arange(len(contacts.waypoint)) - np.searchsorted(contacts.waypoint, contacts.waypoint)
-        keep = np.flatnonzero(order < slots)
-        row, slot, normal = contacts.waypoint[keep], order[keep], contacts.normal[keep]
+        place = contacts.place
+        keep = np.flatnonzero(place < slots)
+        row, slot, normal = contacts.waypoint[keep], place[keep], contacts.normal[keep]
         offset = contacts.margin[keep].copy()
         rotations, translations = self.chain.joint_placements(z)
         for column, points, sign in ((0, contacts.first[keep], -1.0), (1, contacts.second[keep], 1.0)):

@@ -57,10 +57,9 @@ def clear_out(
         residual, pose_rows = solver.evaluate(z[at], target)
         done[at] = (short <= 0.0) & (np.abs(residual).max(axis=1) < 1e-4)
         # Gradients of the nearest distances, and by how much they should grow [m].
-        order = np.arange(len(contacts.waypoint)) - np.searchsorted(contacts.waypoint, contacts.waypoint)
         rows, growth = np.zeros((len(at), _CONTACTS, z.shape[1])), np.zeros((len(at), _CONTACTS))
-        rows[contacts.waypoint, order] = problem.contacts.gradients(z[at], contacts)
-        growth[contacts.waypoint, order] = np.maximum(contacts.margin + _EXTRA_CLEARANCE - contacts.distance, 0.0)
+        rows[contacts.waypoint, contacts.place] = problem.contacts.gradients(z[at], contacts)
+        growth[contacts.waypoint, contacts.place] = np.maximum(contacts.margin + _EXTRA_CLEARANCE - contacts.distance, 0.0)
         jacobian, wanted = np.concatenate([pose_rows, rows], axis=1), np.concatenate([-residual, growth], axis=1)
         scaled = jacobian * free[at][:, None, :]
         system = scaled @ jacobian.transpose(0, 2, 1) + _DAMPING * np.eye(jacobian.shape[1])

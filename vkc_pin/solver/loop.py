@@ -16,7 +16,7 @@ from vkc_pin.solver.between import collisions_between, merge
 from vkc_pin.solver.merit import Infeasibility, Merit, infeasibility
 from vkc_pin.solver.solution import Iteration, Solution
 from vkc_pin.solver.subproblem import Subproblem
-from vkc_pin.solver.trust_region import BLOCK_TIME, CLOSE_ENOUGH, Trial, TrustRegion, judge
+from vkc_pin.solver.trust_region import BLOCK_TIME, CLOSE_ENOUGH, INSIDE, Trial, TrustRegion, judge
 
 __all__ = ["solve"]
 
@@ -30,7 +30,6 @@ PROGRESS_ROUNDS = 5  # rounds in which what is missing must fall:
 PROGRESS = 0.7  # to this share of what it was, or the motion is given up,
 NEXT_TO_NOTHING = 0.05  # [m] and [rad] unless this is all that is missing, summed over waypoints
 FAR = 1e-3  # [m] and [rad] what is missing besides clearance of what is no motion yet
-INSIDE = 0.9  # share of the trust region: steps that end there were not held back (Ipopt ends a little inside its bounds)
 WORTHWHILE = 0.05  # relative decrease of the objective for which a feasible motion is improved further
 
 
@@ -40,7 +39,6 @@ class _Loop:
     def __init__(self, problem: TrajectoryProblem, seed: Floats, deadline: float, weight: float) -> None:
         self.deadline = deadline
         self.problem, self.options = problem, problem.options
-        self.transcription = problem.transcription
         self.z = problem.clip(seed)
         self.timing = problem.timing_for(self.z)
         self.rates = self.between = False
@@ -105,8 +103,8 @@ class _Loop:
             satisfied=satisfied,
         )
 
-    def judge(self, trial: Trial) -> tuple[bool, float]:
-        """Return whether to accept a step, and how much of the promised decrease of the merit came true."""
+    def judge(self, trial: Trial) -> bool:
+        """Return whether enough of the promised decrease of the merit came true to accept a step."""
         before, after = (float(self.merit.price(found, clearance=True).sum()) for found in (self.found, trial.found))
         merit, gain = self.objective + before, self.objective - trial.objective
         return judge(gain + before - float(trial.promise.sum()), gain + before - after, merit)
@@ -200,7 +198,7 @@ def _iterate(
             solution.status = solution.status if solution.converged else "time limit"
             break
         trial = loop.try_step(region.radius)
-        accepted, _ = loop.judge(trial)
+        accepted = loop.judge(trial)
         solution.rounds += 1
         row = Iteration(
             round=solution.rounds,

@@ -50,7 +50,7 @@ class Infeasibility:
 
 def shortfalls(contacts: Contacts, segments: int, slots: int) -> Floats:
     """Return by how much the pairs that have witness planes fall short of their margins, shape (N, K) [m]."""
-    plane = np.arange(len(contacts.waypoint)) - np.searchsorted(contacts.waypoint, contacts.waypoint)
+    plane = contacts.place
     kept = plane < slots
     found = np.zeros((segments, slots))
     found[contacts.waypoint[kept], plane[kept]] = np.maximum(contacts.margin[kept] - contacts.distance[kept], 0.0)

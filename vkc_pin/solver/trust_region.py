@@ -15,8 +15,8 @@ __all__ = ["Trial", "TrustRegion", "judge"]
 BLOCK_TIME = 2.5  # [s] of motion that share a radius, at `Options.dt` a waypoint
 FIRST_RADIUS = 0.5  # [m] and [rad] of the trust region at first
 RESTART_RADIUS = 0.2  # [m] and [rad] after the penalty has been raised
-MAX_RADIUS = 1.0  # [m] and [rad]
-INSIDE = 0.9
+MAX_RADIUS = 1.0  # [m] and [rad] beyond which planes say nothing
+INSIDE = 0.9  # share of the radius: steps that end within it were not held back (Ipopt ends a little inside its bounds)
 SETTLE_RADIUS = 0.05  # [m] and [rad] in which planes are as good as distances
 MIN_RADIUS = 5e-3  # [m] and [rad] below which nothing moves any more
 SHRINK = 0.4  # of the radius, or of the step if that was shorter, where a promise did not come true
@@ -111,8 +111,8 @@ class TrustRegion:
         self.radius = np.full(len(self.radius), RESTART_RADIUS)
 
 
-def judge(promised: float, actual: float, merit: float) -> tuple[bool, float]:
-    """Return whether to accept where a round led, and how much of the promised decrease of the merit came true.
+def judge(promised: float, actual: float, merit: float) -> bool:
+    """Return whether to accept where a round led.
 
     Args:
         promised: The decrease that the planes promised.
@@ -121,5 +121,5 @@ def judge(promised: float, actual: float, merit: float) -> tuple[bool, float]:
     """
     negligible = 1e-4 * max(1.0, abs(merit))
     if promised < negligible:
-        return actual >= -negligible, 0.5
-    return actual > 0.05 * promised, actual / promised
+        return actual >= -negligible
+    return actual > 0.05 * promised

@@ -119,10 +119,12 @@ class Subproblem:
             excess=found.excess,
             prices=prices,
         )
+        short = shortfalls(at, t.segments, t.slots)
+        room = np.where(short > 0.0, np.inf, 0.0)  # what keeps its margin now must go on keeping it
         arguments = {
-            "x0": t.pack(z, shortfalls(at, t.segments, t.slots), shares),
+            "x0": t.pack(z, short, shares),
             "lbx": t.pack(lower),
-            "ubx": t.pack(upper, np.inf, shares),
+            "ubx": t.pack(upper, room, shares),
             "lbg": bounds[0],
             "ubg": bounds[1],
             "p": np.concatenate([parameters, found.rate_excess]),

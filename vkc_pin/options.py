@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any, Self
 
 import numpy as np
 
 from vkc_pin.errors import InputError
 
 __all__ = ["Options"]
+
+EFFORTS = ("length", "squares")
 
 
 @dataclass(frozen=True)
@@ -23,12 +26,11 @@ class Options:
         move_waypoints: Segments of a phase in which a held object is moved.
         dist_safe: Clearance to keep at the waypoints [m].
         grasp_clearance: Clearance of the gripper's touch links to the link that is grasped, before the grasp [m].
-        velocity_weight_base: W_vel of eq. 1 for the base's place.
-        velocity_weight_heading: W_vel for its heading.
-        velocity_weight_holding: How many times more its place weighs while something is held that stands fixed in the world: the
-            base goes slowly then, and squares make slow motion cheap.
-        velocity_weight_arm: W_vel for the arm joints.
-        velocity_weight_object: W_vel for the object's and the virtual joints.
+        effort: What is minimised: "length", of the way, or "squares", eq. 1.
+        velocity_weight_base: W_vel of eq. 1 for the base's place, and for every joint that slides [1/m²].
+        velocity_weight_heading: W_vel for its heading [1/rad²].
+        velocity_weight_arm: W_vel for the arm's joints that turn [1/rad²].
+        velocity_weight_object: W_vel for those of objects and for virtual joints that turn [1/rad²].
         acceleration_weight: W_acc of eq. 1, as a multiple of W_vel [s²].
         approach: Length of the straight way on which a hand comes to what it grasps [m].
         approach_time: How long it takes, at `dt` a waypoint [s].
@@ -51,11 +53,11 @@ class Options:
     move_waypoints: int = 30
     dist_safe: float = 0.02
     grasp_clearance: float = 0.005
-    velocity_weight_base: float = 2.0
-    velocity_weight_heading: float = 0.3
-    velocity_weight_holding: float = 10.0
-    velocity_weight_arm: float = 1.0
-    velocity_weight_object: float = 0.1
+    effort: str = "length"
+    velocity_weight_base: float = 1.0
+    velocity_weight_heading: float = 0.025
+    velocity_weight_arm: float = 0.025
+    velocity_weight_object: float = 0.025
     acceleration_weight: float = 0.3
     approach: float = 0.08
     approach_time: float = 1.0
@@ -74,7 +76,10 @@ class Options:
         for item in fields(self):
             value = getattr(self, item.name)
             field = f"Options.{item.name}"
-            if item.type == "int":
+            if item.type == "str":
+                if value not in EFFORTS:
+                    raise InputError("unknown", field=field, expected=" or ".join(map(repr, EFFORTS)), got=repr(value))
+            elif item.type == "int":
                 if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
                     raise InputError("out of range", field=field, expected="a whole number of at least 1", got=repr(value))
                 object.__setattr__(self, item.name, int(value))  # NumPy's own integers do not go into JSON
@@ -83,6 +88,16 @@ class Options:
                 if not number or not 0 < value < np.inf:
                     raise InputError("out of range", field=field, expected="a positive finite number", got=repr(value))
                 object.__setattr__(self, item.name, float(value))
+
+    @classmethod
+    def paper(cls, **changes: Any) -> Self:
+        """Return options with which eq. 1 of the paper is minimised: squares, all weights 1 (the paper gives no numbers).
+
+        Args:
+            **changes: Other fields.
+        """
+        weights = dict.fromkeys((item.name for item in fields(cls) if item.name.startswith("velocity_weight")), 1.0)
+        return cls(**{"effort": "squares", **weights, **changes})
 
     def steps(self, seconds: float) -> int:
         """Return how many steps of `dt` a time [s] takes, at least 1."""

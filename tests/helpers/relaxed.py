@@ -31,7 +31,7 @@ class Relaxed:
 
     def _parameters(self, *, relaxed: bool) -> np.ndarray:
         p, f = self.problem, self.found
-        given = {"penalty": CLEARANCE, "dt": self.timing.dt}
+        given = {"weights": p.effort.weights(*p.rates(self.z)), "penalty": CLEARANCE, "dt": self.timing.dt}
         if not relaxed:
             vector = p.transcription.parameter_vector(p.start, *self._planes, p.target_matrix(), **given)
             return np.concatenate([vector, np.zeros(len(f.rate_excess))])
@@ -48,6 +48,11 @@ class Relaxed:
         """Return the program's objective at the iterate."""
         x = self.problem.transcription.pack(self.z, self.slack, shares)
         return float(self._cost(x, self._parameters(relaxed=True))[0])
+
+    def of_squares(self) -> float:
+        """Return what the way costs in the quadratic function that stands for it in the program."""
+        given = self.problem.rates(self.z)
+        return float(sum(np.sum(w * part**2) for w, part in zip(self.problem.effort.weights(*given), given, strict=True)))
 
     def missing(self, values: np.ndarray) -> np.ndarray:
         """Return by how much rows are outside their bounds."""
@@ -72,7 +77,8 @@ def check_relaxation(problem: TrajectoryProblem, z: np.ndarray) -> dict[str, flo
     raw, still, share = at.rows(0.0), at.missing(at.rows(1.0)), np.random.default_rng(21).uniform(0.1, 0.9, t.segments)
     assert np.isfinite(raw).all()
     assert still.max() < 1e-8 * max(1.0, np.abs(raw).max())
-    expected = problem.objective(z, at.timing.dt) + at.merit.price(at.found, clearance=True).sum()
+    own = problem.term_numbers.cost(z, at.timing.dt)
+    expected = at.of_squares() + own + at.merit.price(at.found, clearance=True).sum()
     np.testing.assert_allclose(at.cost(1.0), expected, rtol=1e-9)
     np.testing.assert_array_equal(raw, at.rows(0.0, relaxed=False))
     np.testing.assert_array_equal(raw, at.rows(1.0, relaxed=False))

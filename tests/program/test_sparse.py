@@ -3,7 +3,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from vkc_pin.program.sparse import assemble, sparse, unit
+from vkc_pin.program.sparse import assemble, curvature, differences, sparse
 
 
 def test_parts_go_to_their_places_and_add_up_where_they_meet() -> None:
@@ -19,4 +19,15 @@ def test_parts_go_to_their_places_and_add_up_where_they_meet() -> None:
 
 def test_small_matrices() -> None:
     assert sparse(np.array([[0.0, 2.0], [0.0, 0.0]])).nnz() == 1
-    np.testing.assert_array_equal(np.asarray(unit(2, 3, 1).full()), [[0.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+
+
+def test_curvature_is_of_weighted_squares() -> None:
+    parts = differences(7, (3,))[:2]
+    weights = [np.random.default_rng(3).uniform(1.0, 2.0, len(part)) for part in parts]
+    (row, column), maps = curvature(parts)
+    values = sum(np.asarray((matrix @ ca.DM(weight)).full()).ravel() for matrix, weight in zip(maps, weights, strict=True))
+    hessian = np.zeros((7, 7))
+    hessian[row, column] = values
+    expected = sum(2 * part.T @ np.diag(weight) @ part for part, weight in zip(parts, weights, strict=True))
+    np.testing.assert_allclose(hessian, np.triu(expected), atol=1e-12)
+    assert len(row) < 7 * 4, "it is banded"

@@ -199,7 +199,7 @@ def test_derivatives_are_those_of_finite_differences(name: str) -> None:
     offsets = rng.normal(size=(t.segments, t.slots))
     away = rng.normal(size=(t.segments, len(p.pose_goals), AWAY))
     excess, prices = rng.normal(size=t.rows - t.firm_rows), rng.uniform(0.0, 50.0, t.segments)
-    taken = {"away": away, "excess": excess, "prices": prices}
+    taken = {"away": away, "excess": excess, "prices": prices, "weights": p.effort.weights(*p.rates(random_path(p, 2)[1:]))}
     parameters = t.parameter_vector(p.start, planes, offsets, p.target_matrix(), penalty=PENALTY, dt=times(p), **taken)
     slack, shares = rng.uniform(size=(t.segments, t.slots)), rng.uniform(0.05, 0.95, t.segments)
     x = t.pack(random_path(p, 2)[1:], slack, shares)
@@ -221,7 +221,12 @@ def test_derivatives_are_those_of_finite_differences(name: str) -> None:
     curvature = np.array([(a[1] - b[1]) / (2 * step) for a, b in sides]).T
     np.testing.assert_allclose(half + np.triu(half, 1).T, curvature, rtol=1e-5, atol=1e-3)
     f, z = objective(x, parameters)[0], random_path(p, 2)[1:]
-    assert p.objective(z, times(p)) == pytest.approx(float(f) - PENALTY * slack.sum() - prices @ shares, rel=1e-9)
+    given = p.rates(z)
+    squares = sum(np.sum(w * part**2) for w, part in zip(taken["weights"], given, strict=True))
+    assert p.objective(z, times(p)) == pytest.approx(p.effort.value(*given) + p.term_numbers.cost(z, times(p)))
+    assert squares + p.term_numbers.cost(z, times(p)) == pytest.approx(
+        float(f) - PENALTY * slack.sum() - prices @ shares, rel=1e-9
+    )
     # A share takes away the excess of what its waypoint is asked for.
     owner = np.zeros(t.rows, int)
     for at in t.term_rows:

@@ -141,14 +141,12 @@ def test_functions_of_one_kind_are_built_once(chain: VirtualKinematicChain) -> N
 
 def test_programs_are_shared_by_structures_that_are_equal(chain: VirtualKinematicChain) -> None:
     given: dict[str, Any] = {"segments": 5, "poses": some_poses(chain), "slots": SLOTS}
-    given |= {"weights_velocity": np.ones((5, chain.size)), "weights_acceleration": np.ones(chain.size)}
     one = Structure(model=chain.model, **given)
     assert Structure(model=chain.model.copy(), **given).key == one.key
     for change in (
         {"segments": 6},
         {"slots": 2},
         {"poses": some_poses(chain)[:2]},
-        {"weights_acceleration": 2 * np.ones(chain.size)},
         {"stops": (2,)},
         {"differential": True},
         {"clamped": ((3, 1, 4),)},

@@ -82,7 +82,8 @@ def planes(problem: TrajectoryProblem, z: Floats, waypoint: int) -> list[Plane]:
     coefficients, offsets = model.planes(z, contacts, slots=t.slots)
     x = t.pack(z)
     dt, targets = problem.timing_for(z).dt, problem.target_matrix()
-    parameters = t.parameter_vector(problem.start, coefficients, offsets, targets, penalty=problem.options.penalty, dt=dt)
+    weights, penalty = problem.effort.weights(*problem.rates(z)), problem.options.penalty
+    parameters = t.parameter_vector(problem.start, coefficients, offsets, targets, weights=weights, penalty=penalty, dt=dt)
     jacobian = ca.Function("slopes", [t.x, t.parameters], [t.jacobian])(x, parameters).sparse().tocsr()
     columns = (waypoint - 1) * t.width + np.arange(t.n)
     return [
@@ -130,7 +131,7 @@ def sizes(problem: TrajectoryProblem) -> dict[str, int]:
 def patterns(problem: TrajectoryProblem) -> tuple[Any, Any]:
     """Return where the rows' Jacobian and the Lagrangian's Hessian can differ from zero, as sparse matrices (SciPy)."""
     t = problem.transcription
-    upper = ca.triu(t.objective_hessian).sparsity() + t.hessian.sparsity()
+    upper = t.objective_curvature.sparsity() + t.hessian.sparsity()
     return ca.DM(t.jacobian.sparsity(), 1.0).sparse(), ca.DM(upper + upper.T, 1.0).sparse()
 
 

@@ -14,6 +14,7 @@ from vkc_pin.chain.chain import VirtualKinematicChain, consolidate
 from vkc_pin.chain.contacts import ContactModel, Contacts
 from vkc_pin.chain.pose import ROW_BOUNDS, target_vector
 from vkc_pin.models.coordinates import wrapped
+from vkc_pin.motion.effort import Effort
 from vkc_pin.options import Options
 from vkc_pin.program.pose_goals import approach_at, chosen_freedoms, pose_goals
 from vkc_pin.program.term_places import TermNumbers, term_goals
@@ -27,7 +28,7 @@ from vkc_pin.task.terms import Term
 
 __all__ = ["TrajectoryProblem"]
 
-_CHOICE_WEIGHT = 1e-3  # of coordinates that are chosen when grasping and do not move: only keeps the problem regular
+_CHOICE_WEIGHT = 1e-4  # ratio, of coordinates that are chosen when grasping and do not move: only keeps the problem regular
 
 
 class TrajectoryProblem:
@@ -38,6 +39,7 @@ class TrajectoryProblem:
         chain: The virtual kinematic chain, n coordinates.
         contacts: What can collide with what.
         transcription: The symbolic program, shared between problems of one structure.
+        effort: What the way costs.
         start: z_0, shape (n,).
         lower, upper: Bounds of z_1..z_N, shape (N, n): joint limits (eq. 4), what stands still, joint goals.
         pose_goals: Which frames must be where (eqs. 2 and 3), one per `transcription.structure.poses`.
@@ -60,6 +62,7 @@ class TrajectoryProblem:
         self.targets = tuple(goal.target for goal in self.pose_goals)
         rows, self.terms = term_goals(scene, self.chain, task, terms)
         self.transcription = transcribe(self._structure(rows), self.cache)
+        self.effort = self._effort()
         self.start = self._start()
         self.lower, self.upper = self._bounds()
         _freeze(self.start, self.lower, self.upper)
@@ -84,21 +87,12 @@ class TrajectoryProblem:
         return np.tile(self.start, (self.segments, 1))
 
     def _structure(self, terms: tuple[TermRow, ...]) -> Structure:
-        """Return what the symbolic program depends on: the weights of eq. 1, the frames of eqs. 2 and 3, stops and firm holds."""
-        o, robot = self.options, self.chain.robot.coordinates.size
-        weights = np.full(self.chain.size, o.velocity_weight_object)
-        weights[:robot], weights[:2] = o.velocity_weight_arm, o.velocity_weight_base
-        weights[2] = o.velocity_weight_heading
+        """Return what the symbolic program depends on: the frames of eqs. 2 and 3, stops and firm holds."""
+        o = self.options
         # From the straight approach to the grasp on: there the hand must already be where it will close.
         starts = np.concatenate([[0], self.ends[:-1]])
         begin = {int(end): int(start) for start, end in zip(starts, self.ends, strict=True)}
         clamped = tuple((column, approach_at(begin[grasp], grasp, o), last) for column, grasp, last in self.choices)
-        weights[[column for column, _, _ in clamped]] = _CHOICE_WEIGHT
-        acceleration = weights * o.acceleration_weight / o.dt**2
-        velocity = np.tile(weights, (self.segments, 1))
-        for phase, first, last in zip(self.task.phases, starts, self.ends, strict=True):
-            if self.closed(phase):
-                velocity[first:last, :2] *= o.velocity_weight_holding
         # The robot stands still while its gripper closes or opens.
         phases = zip(self.ends[:-1], self.task.phases[:-1], self.task.phases[1:], strict=True)
         stops = tuple(int(end) for end, phase, after in phases if phase.grasps or after.leaves)
@@ -107,13 +101,21 @@ class TrajectoryProblem:
             segments=self.segments,
             poses=tuple(goal.row for goal in self.pose_goals),
             slots=o.contact_slots,
-            weights_velocity=velocity,
-            weights_acceleration=acceleration,
             stops=stops,
             differential=self.chain.robot.base == "differential",
             clamped=clamped,
             terms=terms,
         )
+
+    def _effort(self) -> Effort:
+        """Return what the way costs: metres of all coordinates alike, turns by whose they are."""
+        o, robot = self.options, self.chain.robot.coordinates.size
+        metric = np.full(self.chain.size, o.velocity_weight_object)
+        metric[2], metric[3:robot] = o.velocity_weight_heading, o.velocity_weight_arm
+        metric[np.array(self.chain.coordinates.units) == "m"] = o.velocity_weight_base
+        metric[[column for column, _, _ in self.choices]] *= _CHOICE_WEIGHT
+        stops = self.transcription.structure.stops
+        return Effort(metric, o.acceleration_weight / o.dt**2, self.ends, stops, length=o.effort == "length")
 
     def _start(self) -> Floats:
         start = np.zeros(self.chain.size)
@@ -202,11 +204,8 @@ class TrajectoryProblem:
         return first, t.second @ z + np.outer(t.start_second, self.start)
 
     def objective(self, z: Floats, dt: Floats) -> float:
-        """Return f of eq. 1, and the user's own costs, at z_1..z_N, shape (N, n), in steps that take dt, shape (N,) [s]."""
-        structure = self.transcription.structure
-        first, second = self.rates(z)
-        efforts = np.sum(first**2 * structure.weights_velocity) + np.sum(second**2 @ structure.weights_acceleration)
-        return float(efforts) + self.term_numbers.cost(z, dt)
+        """Return what the way and the user's own terms cost at z_1..z_N, shape (N, n), in steps that take dt, shape (N,) [s]."""
+        return self.effort.value(*self.rates(z)) + self.term_numbers.cost(z, dt)
 
     def pose_error(self, z: Floats) -> float:
         """Return the largest residual of closure (eq. 2), goals (eq. 3) and rolling, [m] or [rad], at z_1..z_N, shape (N, n)."""

@@ -10,17 +10,12 @@ import numpy as np
 
 from vkc_pin.arrays import Floats, Ints
 
-__all__ = ["assemble", "differences", "sparse", "unit"]
+__all__ = ["assemble", "curvature", "differences", "sparse"]
 
 
 def sparse(matrix: Floats) -> ca.DM:
     """Return a small matrix without its zeros."""
     return ca.sparsify(ca.DM(matrix))
-
-
-def unit(rows: int, columns: int, index: int) -> ca.DM:
-    """Return a matrix whose only entry is a 1 at (index, index)."""
-    return ca.DM.triplet([index], [index], ca.DM(1.0), rows, columns)
 
 
 def assemble(parts: list[ca.MX], at: list[Ints], rows: int, columns: int) -> ca.MX:
@@ -65,3 +60,13 @@ def differences(segments: int, stops: Sequence[int]) -> tuple[Floats, Floats, Fl
     ends = itertools.pairwise([0, *stops, segments])
     changes = np.vstack([np.diff(np.eye(segments)[begin:end], axis=0, prepend=0.0, append=0.0) for begin, end in ends])
     return first, changes @ first, start, changes @ start
+
+
+def curvature(parts: Sequence[Floats]) -> tuple[tuple[Ints, Ints], list[ca.DM]]:
+    """Return where the upper half of ∇²Σ_k Σ_r w_kr (A_k z)_r² can differ from zero, and the matrices that give it there of w_k.
+
+    Args:
+        parts: The matrices A_k, shape (R_k, N) each.
+    """
+    row, column = np.triu(sum(np.abs(part).T @ np.abs(part) for part in parts)).nonzero()
+    return (row, column), [sparse(2 * (part[:, row] * part[:, column]).T) for part in parts]

@@ -21,10 +21,10 @@ from vkc_pin.chain.inverse_kinematics import PoseSolver
 from vkc_pin.chain.pose import AWAY
 from vkc_pin.cpin.machine_code import MachineCode
 from vkc_pin.models.coordinates import Coordinates
+from vkc_pin.motion.effort import changed_at
 from vkc_pin.program.ipopt import ENTRY, Ipopt, ipopt
-from vkc_pin.program.sparse import assemble, differences, sparse, unit
+from vkc_pin.program.sparse import assemble, curvature, differences, sparse
 from vkc_pin.program.term_rows import TermProgram
-from vkc_pin.program.timing import runs_between
 from vkc_pin.program.waypoint import Structure, waypoint_functions
 
 __all__ = ["Transcription", "transcribe"]
@@ -85,6 +85,7 @@ class Transcription:
         offsets: Floats,
         targets: Floats,
         *,
+        weights: tuple[Floats, Floats],
         penalty: float,
         dt: Floats | None = None,
         away: Floats | None = None,
@@ -98,19 +99,21 @@ class Transcription:
             planes: Witness planes C, shape (N, K, 12·joints).
             offsets: Theirs, R, shape (N, K).
             targets: Of the poses, shape (poses, 12).
+            weights: Of squared steps and their squared changes, see `Effort.weights`.
             penalty: What a metre of clearance slack costs.
             dt: Times of the steps, shape (N,).
             away: How far frames are from these at the iterate, shape (N, poses, 7), see `pose.away_from`; None: not at all.
             excess: By how much other rows are out of their bounds there, shape (rows after those of poses,); None: not at all.
             prices: What all of that costs at a waypoint, shape (N,).
         """
-        planes = planes.transpose(0, 2, 1).ravel()  # the K × 12J matrix of a waypoint, column by column
+        columns = planes.transpose(0, 2, 1).ravel()  # the K × 12J matrix of a waypoint, column by column
         padded = targets.ravel() if len(targets) else np.zeros(12)
         away = np.zeros(self.away.numel()) if away is None or not away.size else away.ravel()
         excess = np.zeros(self.excess.numel()) if excess is None else excess
         prices = np.zeros(self.segments) if prices is None else prices
-        times = [dt] if self.structure.timed and dt is not None else []
-        return np.concatenate([start, planes, offsets.ravel(), padded, [penalty], away, prices, excess, *times])
+        times = dt if self.structure.timed and dt is not None else np.zeros(0)
+        costs = [part.T.ravel() for part in weights]
+        return np.concatenate([start, columns, offsets.ravel(), padded, *costs, [penalty], away, prices, excess, times])
 
     def pack(self, z: Floats, slack: Floats | float = 0.0, shares: Floats | float = 0.0) -> Floats:
         """Return x of waypoints, shape (N, n), their slacks, shape (N, K), and their shares, shape (N,); or the same for all."""
@@ -118,23 +121,22 @@ class Transcription:
         return np.column_stack([z, slack, shares * np.ones(len(z))]).ravel()
 
     def _objective(self) -> None:
-        """Make the objective of eq. 1: f = ½ xᵀHx + gᵀx + c."""
-        n, N, velocity, acceleration = self.n, self.segments, self.structure.weights_velocity, self.structure.weights_acceleration
-        first, second, start_first, start_second = differences(N, self.structure.stops)
-        self.first, self.second, self.start_first, self.start_second = first, second, start_first, start_second
-        hessian, linear = ca.DM(self.size, self.size), ca.DM(self.size, n)
-        for i, (v, a) in enumerate(zip(velocity.T, acceleration, strict=True)):
-            curvature = first.T @ (v[:, None] * first) + a * second.T @ second
-            slope = first.T @ (v * start_first) + a * second.T @ start_second
-            hessian += ca.kron(sparse(2 * curvature), unit(self.width, self.width, i))
-            linear += ca.kron(sparse(2 * slope[:, None]), unit(self.width, n, i))
-        self.objective_hessian, self.objective_curvature = hessian, ca.triu(hessian)
-        linear_costs = ca.vertcat(ca.MX(n, N), ca.repmat(self.penalty, self.slots, N), self.prices.T)
-        gradient = linear @ self.start + ca.vec(linear_costs)
-        rest = start_first**2 @ velocity + acceleration * (start_second @ start_second)
-        product = hessian @ self.x
-        self.f = 0.5 * ca.dot(self.x, product) + ca.dot(gradient, self.x) + ca.dot(self.start, ca.DM(rest) * self.start)
-        self.gradient = product + gradient
+        """Make the objective: weighted squares of steps and of their changes, and what slacks and shares cost."""
+        n, N = self.n, self.segments
+        self.first, self.second, self.start_first, self.start_second = differences(N, self.structure.stops)
+        self.of_steps, self.of_changes = ca.MX.sym("w", N, n), ca.MX.sym("v", len(self.second), n)
+        costs = ca.vertcat(ca.repmat(self.penalty, self.slots, N), self.prices.T)
+        self.f, slope = ca.dot(costs, self.own[n:, :]), ca.MX(N, n)
+        of_steps, of_changes = (self.first, self.start_first, self.of_steps), (self.second, self.start_second, self.of_changes)
+        for matrix, start, weights in (of_steps, of_changes):
+            differs = sparse(matrix) @ self.z.T + ca.DM(start) @ self.start.T
+            self.f += ca.dot(weights, differs**2)
+            slope += 2 * sparse(matrix.T) @ (weights * differs)
+        self.gradient = ca.vec(ca.vertcat(slope.T, costs))
+        places, (by_steps, by_changes) = curvature([self.first, self.second])
+        at = np.stack(places)[:, None, :] * self.width + np.arange(n)[:, None]
+        values = [ca.vec(by_steps @ self.of_steps + by_changes @ self.of_changes)]
+        self.objective_curvature = assemble(values, [at.reshape(2, -1)], self.size, self.size)
 
     def _constraints(self) -> None:
         """Make the rows of eqs. 2, 3, 6 and 7, waypoint by waypoint, their Jacobian and the Hessian of λᵀ·rows."""
@@ -240,7 +242,8 @@ class Transcription:
         if len(self.owners):
             rows = np.arange(self.firm_rows, self.rows)
             self.g, self.jacobian = self._relaxed(self.g, self.jacobian, rows, self.owners, self.excess)
-        given = [self.start, self.planes, self.offsets, self.targets, self.penalty, self.away, self.prices, self.excess]
+        given = [self.start, self.planes, self.offsets, self.targets, self.of_steps, self.of_changes, self.penalty]
+        given += [self.away, self.prices, self.excess]
         self.parameters = ca.veccat(*given, *([self.dt] if self.structure.timed else []))
 
     def _relaxed(self, g: ca.MX, jacobian: ca.MX, rows: Ints, owners: Ints, excess: ca.MX) -> tuple[ca.MX, ca.MX]:
@@ -254,9 +257,7 @@ class Transcription:
         n = self.n
         select, identity = ca.horzcat(ca.DM.eye(n), ca.DM(n, self.slots + 1)), ca.DM.eye(n)  # leaves slack and share out
         self.rate_matrix = ca.vertcat(*(ca.kron(sparse(part), select) for part in (self.first, self.second)))
-        runs = runs_between(self.structure.stops, self.segments)
-        changes = [max(waypoint, 1) - 1 for begin, end in runs for waypoint in range(begin, end + 1)]
-        self.rate_owners = np.repeat([*range(self.segments), *changes], n)
+        self.rate_owners = np.repeat([*range(self.segments), *changed_at(self.structure.stops, self.segments)], n)
         starts = (self.start_first[:, None], self.start_second[:, None])
         self.rate_start = ca.vertcat(*(ca.kron(sparse(part), identity) for part in starts))
 

@@ -9,7 +9,6 @@ from typing import Any
 import casadi as ca
 import pinocchio as pin
 
-from vkc_pin.arrays import Floats
 from vkc_pin.cache import Cache
 from vkc_pin.chain.kinematics import kinematics_of
 from vkc_pin.chain.pose import AWAY, PoseRow, pose_rows, receded
@@ -32,8 +31,6 @@ class Structure:
         segments: N, the number of waypoints after the start.
         poses: Frames that must be somewhere.
         slots: K, witness planes per waypoint.
-        weights_velocity: Of eq. 1, on the squared differences, shape (N, n).
-        weights_acceleration: The same for second differences, per coordinate, shape (n,).
         stops: Waypoints inside the motion at which it comes to rest, as it does at start and end.
         differential: Whether the base must not slip sideways.
         clamped: (column, first, last): coordinates that keep their value from waypoint `first` to `last`, as a hand does
@@ -45,8 +42,6 @@ class Structure:
     segments: int
     poses: tuple[PoseRow, ...]
     slots: int
-    weights_velocity: Floats
-    weights_acceleration: Floats
     stops: tuple[int, ...] = ()
     differential: bool = False
     clamped: tuple[tuple[int, int, int], ...] = ()
@@ -61,9 +56,8 @@ class Structure:
     def key(self) -> tuple[Any, ...]:
         """Equal for structures that share one program."""
         poses = tuple((*_key(pose), pose.waypoints) for pose in self.poses)
-        weights = (self.weights_velocity.tobytes(), self.weights_acceleration.tobytes())
         others = (self.stops, self.differential, self.clamped, self.terms)
-        return (self.model.saveToString(), self.segments, poses, self.slots, *weights, *others)
+        return (self.model.saveToString(), self.segments, poses, self.slots, *others)
 
 
 def _key(pose: PoseRow) -> tuple[Any, ...]:

@@ -75,6 +75,8 @@ class Beam:
     ) -> None:
         self.knots, self.problem, self.routes, self.careful = knots, knots.problem, routes, careful
         self.interrupt = interrupt
+        metric = np.sqrt(knots.problem.effort.metric)
+        self.cost = metric / metric[3]
         self.approaches = {
             int(end): approach_at(int(end) - phase.segments, int(end), self.problem.options)
             for phase, end in zip(self.problem.task.phases, self.problem.ends, strict=True)
@@ -171,12 +173,11 @@ class Beam:
 
     def _path_cost(self, first: Floats, last: Floats, phase: int) -> Floats:
         """Return what it costs to go from `first` to `last`, both (B, n), in a phase, shape (B,)."""
-        weights = self.knots.weights.copy()
-        weights[:2] *= _DRIVING
-        cost = np.abs(last - first) * weights
+        cost = np.abs(last - first) * self.cost
+        cost[:, 0], cost[:, 1] = np.hypot(cost[:, 0], cost[:, 1]), 0.0
         if self.routes is not None and not self.problem.closed(self.problem.task.phases[phase]):
             distances = self.routes.distances(phase, first[:, :3], last[:, :3], folded=self.careful)
-            cost[:, 0], cost[:, 1] = weights[0] * distances, 0.0
+            cost[:, 0] = self.cost[0] * distances
             np.minimum(cost, _NOT_FOUND, out=cost)  # where there is no path, others come first
         return np.asarray(cost.sum(axis=1))
 

@@ -113,6 +113,7 @@ class Subproblem:
             planes,
             offsets,
             self._targets,
+            weights=problem.effort.weights(*problem.rates(z)),
             penalty=merit.weights["clearance"],
             dt=timing.dt,
             away=found.away,

@@ -15,7 +15,8 @@ from .program.inspection import build
 from .program.problem import TrajectoryProblem
 from .scene.hold import Hold
 from .scene.placed import PlacedObject
-from .scene.random_room import RoomSettings, random_room
+from .scene.rooms.random_room import random_room
+from .scene.rooms.settings import RoomSettings
 from .scene.scene import Scene, load_scene
 from .solver.solution import Iteration
 from .task.formula import State

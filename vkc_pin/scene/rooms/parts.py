@@ -14,8 +14,8 @@ from vkc_pin.arrays import Floats
 from vkc_pin.errors import UnknownNameError
 from vkc_pin.models.object_file import load_object
 from vkc_pin.models.shapes import world_box
-from vkc_pin.scene.footprints import Floor, Frame, Rectangle
 from vkc_pin.scene.placed import PlacedObject, standing_geometry
+from vkc_pin.scene.rooms.footprints import Floor, Frame, Rectangle
 
 __all__ = ["CARRIED", "OPENED", "Part", "box", "carried", "opened", "shelf", "table", "walls"]
 
@@ -24,6 +24,7 @@ AIR = 0.02  # [m] between a wall and what stands against it
 PLATE, LEG, BOARD = 0.03, 0.06, 0.02  # [m] thicknesses
 BEFORE_TABLE = 1.5  # [m] depth of the floor that stays free on one side of a table
 _LEAST = 0.75  # [m] to either side of the middle of what is stood before: room for a robot to turn
+_SLIT = 0.03  # [m] of air above a door's panel, where its frame has no lintel
 _ON = 0.001  # [m] of air below what is carried
 
 OPENED = {
@@ -147,7 +148,8 @@ def carried(name: str, kind: str, on: Part, x: float, y: float) -> Part:
         name: Its name in the scene.
         kind: Its type.
         on: The table.
-        x, y: Where, in the table's frame [m].
+        x: Where along the table's frame, away from its free side [m].
+        y: Where across it [m].
     """
     place = on.frame.point(x, y)
     entry = {"name": name, "type": kind, "position": [*place, round(on.size[2] + CARRIED[kind] + _ON, 3)]}
@@ -196,13 +198,17 @@ def _box(
 def _extent(kind: str) -> tuple[Floats, Floats]:
     """Return lowest and highest corner, shape (3,) each [m], of an object's base link and what is shut, in its own frame.
 
-    Of a door in a wall it is the frame alone: handles stick out of the wall.
+    Of a door in a wall it is the frame alone, as handles stick out of the wall, and as high as the panel needs it.
     """
     if kind not in OPENED:
         raise UnknownNameError("object that opens", kind, OPENED, field="objects")
     loaded = load_object(kind)
     placed = PlacedObject(kind, loaded, pin.SE3.Identity(), np.clip(0.0, loaded.lower, loaded.upper))
-    fixed = [shape.parentJoint == 0 for shape in loaded.collision.geometryObjects]
-    shapes = [shape for shape, own in zip(standing_geometry(placed), fixed, strict=True) if own or kind not in _IN_WALL]
-    boxes = np.array([world_box(shape.geometry, shape.placement) for shape in shapes])
-    return boxes[:, 0].min(axis=0).round(4), boxes[:, 1].max(axis=0).round(4)
+    boxes = np.array([world_box(shape.geometry, shape.placement) for shape in standing_geometry(placed)])
+    low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
+    if kind in _IN_WALL:
+        fixed = [shape.parentJoint == 0 for shape in loaded.collision.geometryObjects]
+        top = max(boxes[fixed, 1].max(axis=0)[2], high[2] + _SLIT)
+        low, high = boxes[fixed, 0].min(axis=0), boxes[fixed, 1].max(axis=0)
+        high[2] = top
+    return low.round(4), high.round(4)

@@ -94,8 +94,8 @@ def report(result: Mapping[str, Any]) -> str:
         "# One setting changed at a time",
         f"{len(about['problems'])} problems, planning seed {about['seed']}, at most {about['time_limit']:g} s of planning. "
         "Success is the word of the independent validation; the first seed sufficed where no program was solved from another. "
-        "Times are those of all trials: of planning, of the process's CPU for all of the call, and in all, both with building symbolic "
-        "programs. Rounds and iterations are means; efforts medians of successes.",
+        "Times are those of all trials: of planning, of the process's CPU for all of the "
+        "call, and in all, both with building symbolic programs. Rounds and iterations are means; efforts medians of successes.",
         markdown(head, rows),
         "## Against the unchanged planner",
         "Median (quartiles) of the ratio to the unchanged planner, over the problems at which both succeed.",

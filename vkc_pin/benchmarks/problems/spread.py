@@ -89,7 +89,7 @@ def report(result: Mapping[str, Any]) -> str:
         spreads = [spread_of(own, field) for field in FIELDS]
         good = f"{sum(bool(r['success']) for r in own)} of {len(own)}"
         names = next((r["problem"] for r in own if "problem" in r), "")
-        seeds = ", ".join(dict.fromkeys(r["initialization"] for r in own if r.get("initialization")))
+        seeds = "; ".join(dict.fromkeys(r["initialization"] for r in own if r.get("initialization")))
         rows.append([str(number), names, good, *("–" if s is None else f"{100.0 * s:.1f}" for s in spreads), seeds])
     percent = [f"{name} [%]" for name in FIELDS.values()]
     parts = [

@@ -51,7 +51,10 @@ def test_ratios_are_of_pairs_of_successes() -> None:
     meta = {"changes": ["unchanged", "Options.dt=0.3"], "problems": [0, 1, 2, 3], "seed": 0, "time_limit": 1.0}
     meta |= {"machine": {"cores": 1, "processor": "x", "machine": "y", "system": "z", "python": "3"}, "versions": {}}
     text = ablation.report({"meta": meta, "trials": trials})
-    assert "| Options.dt=0.3 | 1 | 3.000 (3.000–3.000) | 1.000 (1.000–1.000) | – | 3.000 (3.000–3.000) |" in text
+    assert (
+        "| Options.dt=0.3 | 1 | 3.000 (3.000–3.000) | 1.000 (1.000–1.000) | 1.000 (1.000–1.000) | – | 3.000 (3.000–3.000) |"
+        in text
+    )
     assert "| unchanged | 2 of 4 | 2 of 4 | 1.00 | 1.33 |" in text
 
 

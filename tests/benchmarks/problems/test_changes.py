@@ -30,9 +30,14 @@ def test_a_constant_changes_for_a_while() -> None:
 def test_a_constant_changes_where_it_is_imported_too_and_comes_back_after_an_error() -> None:
     before = trust_region.INSIDE
     assert before == loop.INSIDE
-    with pytest.raises(KeyError), parsed("solver.trust_region:INSIDE=0.123").applied():
-        assert trust_region.INSIDE == loop.INSIDE == 0.123
-        raise KeyError
+
+    def fail() -> None:
+        with parsed("solver.trust_region:INSIDE=0.123").applied():
+            assert trust_region.INSIDE == loop.INSIDE == 0.123
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        fail()
     assert trust_region.INSIDE == loop.INSIDE == before
 
 

@@ -81,7 +81,11 @@ def test_walls_close_the_room_but_for_doors() -> None:
     door = parts.opened("door", "door", FLOOR, 1, -1.0, 1.8)
     closed, open_ = (parts.walls(FLOOR, 2.4, standing) for standing in ((), (door,)))
     assert [item["name"] for item in closed] == ["wall_east", "wall_north", "wall_west", "wall_south"]
-    assert [item["name"] for item in open_ if "north" in item["name"]] == ["wall_north_1", "wall_north_above_door", "wall_north_2"]
+    assert [item["name"] for item in open_ if "north" in item["name"]] == [
+        "wall_north_1",
+        "wall_north_above_door",
+        "wall_north_2",
+    ]
     lengths = [item["size"][1] for item in open_ if "north" in item["name"]]
     assert sum(lengths) == pytest.approx(6.2)
     assert lengths[1] == pytest.approx(1.07)

@@ -19,7 +19,7 @@ from vkc_pin.files.writing import write_atomically
 
 __all__ = ["every_trial", "report", "run", "specify"]
 
-PAIRED = {"planning_time": "time", "base_effort": "base", "arm_effort": "arm", "objective": "objective"}
+PAIRED = {"planning_time": "time", "cpu_time": "CPU", "base_effort": "base", "arm_effort": "arm", "objective": "objective"}
 """What is compared with the unchanged planner, problem by problem: field → name."""
 
 
@@ -88,14 +88,14 @@ def report(result: Mapping[str, Any]) -> str:
         pairs = [(base[r["number"]], r) for r in own if r["success"] and base.get(r["number"], {}).get("success")]
         paired.append([change, str(len(pairs)), *(_ratio(pairs, field) for field in PAIRED)])
     head = ["setting", "success", "first seed", "time, median [s]", "mean [s]", "95th percentile [s]", "CPU, median [s]"]
-    head += ["in all, median [s]", "rounds", "iterations", "base [m]", "arm [rad]", "failures"]
+    head += ["mean [s]", "95th percentile [s]", "rounds", "iterations", "base [m]", "arm [rad]", "failures"]
     kinds = [["unchanged", kind, *_numbers([r for r in base.values() if r.get("kind") == kind])] for kind in KINDS]
     parts = [
         "# One setting changed at a time",
         f"{len(about['problems'])} problems, planning seed {about['seed']}, at most {about['time_limit']:g} s of planning. "
         "Success is the word of the independent validation; the first seed sufficed where no program was solved from another. "
-        "Times are those of all trials: of planning, of the process's CPU for all of the "
-        "call, and in all, both with building symbolic programs. Rounds and iterations are means; efforts medians of successes.",
+        "Times are those of all trials: of planning, and of the process's CPU for all of the call, with building symbolic "
+        "programs. Rounds and iterations are means, efforts medians of successes.",
         markdown(head, rows),
         "## Against the unchanged planner",
         "Median (quartiles) of the ratio to the unchanged planner, over the problems at which both succeed.",
@@ -135,8 +135,10 @@ def every_trial(records: Sequence[Record]) -> str:
 def _numbers(own: Sequence[Record]) -> list[str]:
     good = [record for record in own if record["success"]]
     first = sum(bool(record.get("first_seed")) for record in own)
-    time, late = distribution(own, "planning_time")
-    times = [time, _mean(own, "planning_time"), late, distribution(own, "cpu_time")[0], distribution(own, "wall_time")[0]]
+    times = []
+    for field in ("planning_time", "cpu_time"):
+        median, late = distribution(own, field)
+        times += [median, _mean(own, field), late]
     counts = [f"{_mean(own, field):.1f}" for field in ("rounds", "iterations")]
     efforts = [decimal(distribution(good, field)[0]) for field in ("base_effort", "arm_effort")]
     return [f"{len(good)} of {len(own)}", f"{first} of {len(own)}", *map(decimal, times), *counts, *efforts, failures(own)]

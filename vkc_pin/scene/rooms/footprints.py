@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from vkc_pin.arrays import Floats
 
@@ -109,10 +109,10 @@ class Floor:
         """Return whether all of a rectangle lies between the walls."""
         return bool((np.abs(rectangle.corners) <= np.array([self.width, self.depth]) / 2.0 + 1e-6).all())
 
-    def free(self, standing: Sequence[Rectangle], radius: float, points: ArrayLike) -> Floats:
+    def free(self, standing: Sequence[Rectangle], radius: float, points: ArrayLike) -> NDArray[np.bool_]:
         """Return at which points, shape (n, 2) [m], a disc of a radius [m] touches neither walls nor what stands there."""
         points = np.asarray(points, float)
-        free = (np.array([self.width, self.depth]) / 2.0 - np.abs(points)).min(axis=1) >= radius
+        free = np.asarray((np.array([self.width, self.depth]) / 2.0 - np.abs(points)).min(axis=1) >= radius)
         for rectangle in standing:
             free &= rectangle.distance(points) >= radius
         return free

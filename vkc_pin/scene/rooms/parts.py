@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -64,7 +64,7 @@ class Part:
     objects: tuple[dict[str, Any], ...] = ()
     before: Rectangle | None = None
     spot: tuple[float, float] | None = None
-    size: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0))
+    size: tuple[float, float, float] = (0.0, 0.0, 0.0)
     side: int | None = None
 
 

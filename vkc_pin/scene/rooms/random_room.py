@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -52,7 +52,7 @@ class Layout:
     floor: Floor
     parts: tuple[Part, ...]
     start: tuple[float, float, float]
-    radius: float = field(default=0.0)
+    radius: float
 
     def part(self, name: str) -> Part:
         """Return the part of a name. Raises `UnknownNameError` if there is none."""

@@ -13,6 +13,9 @@ import numpy as np
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks import chores
+from vkc_pin.motion.world import World
+from vkc_pin.plotting.style import new_figure, save_figure, styled
+from vkc_pin.plotting.top_view import draw_top_view
 from vkc_pin.visualization import drawing
 from vkc_pin.visualization import viewer as visualization
 
@@ -63,6 +66,16 @@ def home_pictures() -> None:
     picture(home, "household_kitchen", SMALL)
 
 
+def room_picture() -> None:
+    """Write random rooms from above, with little and with much in them."""
+    rooms = [vkc.random_room(number, clutter=clutter) for number, clutter in ((3, 0.2), (1, 0.5), (2, 0.9))]
+    with styled():
+        figure = new_figure(12.0, 4.4)
+        for own, room in zip(figure.subfigures(1, len(rooms)), rooms, strict=True):
+            draw_top_view(own, World(room), None)
+        save_figure(figure, IMAGES / "random_rooms.png")
+
+
 def chore_pictures(chore: vkc.Plan) -> None:
     """Write a picture of the chore in the home, and the page that shows all of it."""
     look(*HOME)
@@ -94,6 +107,7 @@ def main() -> int:
         look(*camera)
         picture(vkc.load_scene(name), name, SMALL)
     home_pictures()
+    room_picture()
     chore_pictures(chore)
     return 0
 

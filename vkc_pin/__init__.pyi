@@ -15,6 +15,8 @@ from .program.inspection import build
 from .program.problem import TrajectoryProblem
 from .scene.hold import Hold
 from .scene.placed import PlacedObject
+from .scene.rooms.random_room import random_room
+from .scene.rooms.settings import RoomSettings
 from .scene.scene import Scene, load_scene
 from .solver.solution import Iteration
 from .task.formula import State
@@ -49,6 +51,7 @@ __all__ = [
     "Release",
     "Report",
     "Robot",
+    "RoomSettings",
     "Scene",
     "State",
     "Touch",
@@ -71,6 +74,7 @@ __all__ = [
     "plan",
     "plan_chore",
     "plotting",
+    "random_room",
     "validate",
     "validation",
     "visualization",

@@ -56,11 +56,44 @@ def add_bench(commands: Any) -> None:
     numbers = "numbers of obstacles (default: 10 30 100 300 1000)"
     scale.add_argument("--obstacles", dest="counts", nargs="+", type=positive, metavar="N", help=numbers)
 
+    _add_problems(benches)
+
+
+def _add_problems(benches: Any) -> None:
+    """Add what is measured on problems that nothing was tuned on."""
+    for name, shown, about in (
+        ("ablation", "one setting changed at a time, on sixty problems", "Plan sixty problems, also with one setting changed."),
+        ("spread", "what a random seed makes of sixty problems", "Plan each of sixty problems with several random seeds."),
+    ):
+        parser = _add_experiment(benches, name, shown, about, None, jobs=1)
+        parser.set_defaults(benchmark=f"problems.{name}")
+        parser.add_argument("--problems", nargs="+", type=natural, metavar="N", help="numbers from 0 to 59 (default: all)")
+        if name == "ablation":
+            form = "settings to change, one at a time: Options.FIELD=VALUE or MODULE:NAME=VALUE, e.g. solver.loop:SETTLING=0.1"
+            parser.add_argument("--changes", nargs="+", metavar="CHANGE", help=form)
+        else:
+            count = functools.partial(natural, least=2)
+            parser.add_argument("--seeds", type=count, default=5, metavar="K", help="random seeds per problem (default 5)")
+    about = "Measure how often the first seed trajectory suffices, at the tasks of all experiments, from random starts."
+    first = _add_experiment(benches, "first-seed", "how often the first seed trajectory suffices", about, default=10, jobs=1)
+    first.set_defaults(benchmark="problems.first_seed")
+    _add_choice(first, "tasks", "door drawer init_1 init_2 init_3 corridor_door aisle_drawer household_cup ... (default: all)")
+
 
 def _add_experiment(
-    benches: Any, name: str, shown: str, about: str, number: str = "--trials", *, default: int = 50, jobs: int | None = None
+    benches: Any,
+    name: str,
+    shown: str,
+    about: str,
+    number: str | None = "--trials",
+    *,
+    default: int = 50,
+    jobs: int | None = None,
 ) -> argparse.ArgumentParser:
-    """Add an experiment with what all have, by default `default` starts and `jobs` processes, or one per core."""
+    """Add an experiment with what all have, by default `default` starts and `jobs` processes, or one per core.
+
+    Without an option for their `number` the starts are fixed.
+    """
     parser: argparse.ArgumentParser = benches.add_parser(name, help=shown, description=about)
     _add_starts(parser, number, default, f"random starts per {'task' if number == '--trials' else 'scene'}")
     processes = f"processes (default: {'one per core' if jobs is None else jobs})"
@@ -72,9 +105,11 @@ def _add_experiment(
     return parser
 
 
-def _add_starts(parser: argparse.ArgumentParser, number: str, default: int, about: str) -> None:
-    parser.add_argument(number, type=positive, default=default, metavar="N", help=f"{about} (default {default})")
-    parser.add_argument("--seed", type=natural, default=0, metavar="S", help="of the starts and of planning (default 0)")
+def _add_starts(parser: argparse.ArgumentParser, number: str | None, default: int, about: str) -> None:
+    if number is not None:
+        parser.add_argument(number, type=positive, default=default, metavar="N", help=f"{about} (default {default})")
+    seed = "of planning" if number is None else "of the starts and of planning"
+    parser.add_argument("--seed", type=natural, default=0, metavar="S", help=f"{seed} (default 0)")
 
 
 def _add_choice(parser: argparse.ArgumentParser, names: str, choices: str) -> None:

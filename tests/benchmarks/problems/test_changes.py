@@ -1,0 +1,66 @@
+"""Settings of the planner that are changed for an experiment."""
+
+from __future__ import annotations
+
+import pytest
+
+import vkc_pin as vkc
+from vkc_pin.benchmarks.problems.changes import UNCHANGED, Change, parsed
+from vkc_pin.solver import loop, trust_region
+
+
+def test_an_option() -> None:
+    change = parsed("Options.dt=0.3")
+    assert change == Change("Options", "dt", 0.3)
+    assert str(change) == "Options.dt=0.3"
+    assert change.options == vkc.Options(dt=0.3)
+    with change.applied():
+        assert vkc.Options() == UNCHANGED.options
+
+
+def test_a_constant_changes_for_a_while() -> None:
+    before = loop.SETTLING
+    change = parsed("solver.loop:SETTLING=0.7")
+    assert change.options == vkc.Options()
+    with change.applied():
+        assert loop.SETTLING == 0.7
+    assert before == loop.SETTLING
+
+
+def test_a_constant_changes_where_it_is_imported_too_and_comes_back_after_an_error() -> None:
+    before = trust_region.INSIDE
+    assert before == loop.INSIDE
+
+    def fail() -> None:
+        with parsed("solver.trust_region:INSIDE=0.123").applied():
+            assert trust_region.INSIDE == loop.INSIDE == 0.123
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        fail()
+    assert trust_region.INSIDE == loop.INSIDE == before
+
+
+def test_no_change() -> None:
+    assert str(UNCHANGED) == "unchanged"
+    with UNCHANGED.applied():
+        assert UNCHANGED.options == vkc.Options()
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("Options.dt", "Options.field=value"),
+        ("Options.dt=fast", "Options.field=value"),
+        ("Options.dt=-1", "positive"),
+        ("Options.dtt=1.0", "dt"),
+        ("loop=1", "modules of"),
+        ("scene.scene:START_CLEARANCE=1", "modules of"),
+        ("solver.lop:SETTLING=1", "no such module"),
+        ("solver.loop:SETLING=1", "SETTLING"),
+        ("solver.loop:SETTLING='1'", "0.2"),
+    ],
+)
+def test_wrong_changes(text: str, expected: str) -> None:
+    with pytest.raises(vkc.InputError, match=expected):
+        parsed(text)

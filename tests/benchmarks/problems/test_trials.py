@@ -1,0 +1,73 @@
+"""One trial: what is on record of it agrees with what the planner did."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import vkc_pin as vkc
+from vkc_pin.benchmarks.problems import trials
+from vkc_pin.benchmarks.problems.changes import parsed
+from vkc_pin.benchmarks.problems.problem_set import problem
+
+
+@pytest.fixture(scope="module")
+def drawn() -> vkc.Plan:
+    own = problem(20)
+    return vkc.plan(own.scene, own.steps)
+
+
+def test_the_objective_is_that_of_the_solver(drawn: vkc.Plan) -> None:
+    """A grasp without freedoms: all coordinates count, and the last round that was accepted has the motion's value."""
+    assert drawn.success, drawn.report()
+    (last, *_) = [row["objective"] for row in reversed(drawn.history) if row["accepted"]]
+    assert trials.objective(drawn) == pytest.approx(last, rel=1e-6)
+
+
+def test_the_objective_of_what_failed_or_is_no_single_problem(drawn: vkc.Plan) -> None:
+    assert trials.objective(dataclasses.replace(drawn, status="rejected")) is None
+    scene = vkc.load_scene("drawer")
+    apart = vkc.plan(scene, [vkc.Grasp("drawer"), vkc.Actuate("drawer", {"slide": 0.2}), vkc.GoTo(-0.8, 0.5)], joint=False)
+    found = trials.objective(apart)
+    assert found is None or np.isfinite(found)
+
+
+@pytest.mark.parametrize(
+    ("name", "solves", "expected"),
+    [
+        ("interpolated", 1, True),
+        ("astar 2", 2, False),
+        ("astar, interpolated, then all at once", 3, True),
+        ("astar, interpolated, then all at once", 4, False),
+        ("astar, interpolated", 2, False),
+    ],
+)
+def test_first_seed(drawn: vkc.Plan, name: str, solves: int, expected: bool) -> None:
+    plan = dataclasses.replace(drawn, initialization=name)
+    assert trials.first_seed(plan, solves) is expected
+    assert not trials.first_seed(dataclasses.replace(plan, status="rejected"), solves)
+
+
+def test_a_trial() -> None:
+    own = problem(20)
+    record = trials.tried(own.scene, own.steps, seed=3, change=parsed("Options.max_restarts=2"), number=20)
+    assert record["success"] is True, record["violations"]
+    assert (record["method"], record["seed"], record["number"]) == ("Options.max_restarts=2", 3, 20)
+    assert record["solves"] >= 1
+    assert record["first_seed"] is (record["solves"] == 1)
+    assert record["wall_time"] >= record["planning_time"] > 0.0
+    assert record["cpu_time"] > 0.0
+    assert record["objective"] > 0.0
+    assert "commit" in record
+
+
+def test_the_commit(monkeypatch: pytest.MonkeyPatch) -> None:
+    trials.commit.cache_clear()
+    found = trials.commit()
+    assert found is None or len(found) >= 7
+    monkeypatch.setenv("PATH", "")  # no git
+    trials.commit.cache_clear()
+    assert trials.commit() is None
+    trials.commit.cache_clear()

@@ -1,0 +1,126 @@
+"""Settings of the planner that are changed for an experiment: fields of `Options`, and constants of its modules."""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import dataclasses
+import importlib
+import inspect
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.options import Options
+
+__all__ = ["UNCHANGED", "Change", "parsed"]
+
+_WINGS = ("chain", "driving", "planning", "program", "seeds", "solver", "task")
+_FORM = "Options.field=value, or module:NAME=value such as solver.loop:SETTLING=0.1"
+
+
+@dataclass(frozen=True)
+class Change:
+    """One setting with another value.
+
+    Attributes:
+        module: The module of a constant, `solver.loop` for one; "Options" for a field of `Options`; "" for no change at all.
+        name: Of the constant or the field.
+        value: What it is to be.
+    """
+
+    module: str = ""
+    name: str = ""
+    value: Any = None
+
+    def __str__(self) -> str:
+        if not self.module:
+            return "unchanged"
+        return f"{self.module}{'.' if self.module == 'Options' else ':'}{self.name}={self.value!r}"
+
+    @property
+    def options(self) -> Options:
+        """The options to plan with."""
+        return dataclasses.replace(Options(), **{self.name: self.value}) if self.module == "Options" else Options()
+
+    @contextlib.contextmanager
+    def applied(self) -> Iterator[None]:
+        """Let a constant have its new value meanwhile, in its module and in those that import it by name.
+
+        What a module made of it when it was loaded, a table or a default of an argument, stays as it was. Plan with a `Planner`
+        of its own: what another has kept was built with the old value.
+        """
+        places = _places(self.module, self.name) if self.module not in ("", "Options") else []
+        before = [(module, name, getattr(module, name)) for module, name in places]
+        try:
+            for module, name, _ in before:
+                setattr(module, name, self.value)
+            yield
+        finally:
+            for module, name, value in before:
+                setattr(module, name, value)
+
+
+UNCHANGED = Change()
+
+
+def parsed(text: str) -> Change:
+    """Return the change that a text stands for: `Options.dt=0.3`, or `solver.loop:SETTLING=0.1`.
+
+    Raises:
+        UnknownNameError: There is no such field, module or constant.
+        InputError: It is no such text, or the value is of another kind than the one that it replaces.
+    """
+    place, equals, value = text.partition("=")
+    try:
+        new = ast.literal_eval(value.strip())
+    except (ValueError, SyntaxError):
+        equals = ""
+    if not equals:
+        raise InputError("not a change", field="change", expected=_FORM, got=repr(text))
+    if place.startswith("Options."):
+        change = Change("Options", place.removeprefix("Options.").strip(), new)
+        known = [item.name for item in dataclasses.fields(Options)]
+        if change.name not in known:
+            raise UnknownNameError("field of Options", change.name, known, field="change")
+        _ = change.options  # says what is wrong with the value
+        return change
+    module, _, name = (part.strip() for part in place.partition(":"))
+    if not name or module.partition(".")[0] not in _WINGS:
+        raise InputError("not a change", field="change", expected=f"{_FORM}; modules of {', '.join(_WINGS)}", got=repr(text))
+    found = _module(module)
+    constants = [key for key, there in vars(found).items() if key.strip("_").isupper() and not isinstance(there, ModuleType)]
+    if name not in constants:
+        raise UnknownNameError(f"constant of {module}", name, constants, field="change")
+    old = getattr(found, name)
+    number = isinstance(old, int | float) and isinstance(new, int | float) and not isinstance(old, bool)
+    if not number and not isinstance(new, type(old)):
+        raise InputError("of another kind", field=str(Change(module, name, new)), expected=repr(old), got=repr(new))
+    return Change(module, name, new)
+
+
+def _module(name: str) -> ModuleType:
+    try:
+        return importlib.import_module(f"vkc_pin.{name}")
+    except ModuleNotFoundError:
+        raise InputError("there is no such module", field="change", expected="solver.loop for one", got=name) from None
+
+
+def _places(module: str, name: str) -> list[tuple[ModuleType, str]]:
+    """Return the modules in which a constant is bound, each with the name that it has there."""
+    importlib.import_module("vkc_pin.planning.planner")  # and with it all that may import the constant
+    home = _module(module)
+    found = [(home, name)]
+    for other in [one for key, one in sorted(sys.modules.items()) if key.startswith("vkc_pin.") and one is not home]:
+        try:
+            tree = ast.parse(inspect.getsource(other))
+        except (OSError, TypeError):
+            continue
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and node.module == home.__name__:
+                bound = [alias.asname or alias.name for alias in node.names if alias.name == name]
+                found += [(other, one) for one in bound if hasattr(other, one)]
+    return found

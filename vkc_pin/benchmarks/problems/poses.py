@@ -1,0 +1,107 @@
+"""Poses to reach in a random room: those of the tool in random configurations at which the robot touches nothing.
+
+So each of them can be reached; whether a planner finds out how is its own affair.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.arrays import Floats
+from vkc_pin.errors import InputError
+from vkc_pin.models.shapes import shape_distance, world_box
+from vkc_pin.scene.rooms.parts import Part
+from vkc_pin.scene.rooms.random_room import Layout
+from vkc_pin.scene.scene import Scene
+
+__all__ = ["pose_among", "pose_over"]
+
+CLEAR = 0.03  # [m] from everything, the robot itself too
+NEAR = 0.15  # [m] from something, at most, for a pose among furniture
+FAR = 1.5  # [m] from the start to where the robot stands, at least, for the same
+_TRIES = 200_000  # configurations
+
+
+def pose_over(layout: Layout, scene: Scene, table: Part, rng: np.random.Generator) -> pin.SE3:
+    """Return a pose of the tool over a table, within 0.5 m of the side at which the robot can stand.
+
+    Args:
+        layout: The room.
+        scene: The same as a scene.
+        table: One of its tables.
+        rng: Where the random numbers come from.
+
+    Raises:
+        InputError: No configuration was found.
+    """
+    depth, width, height = table.size
+    into = pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, table.frame.yaw), np.array([table.frame.x, table.frame.y, 0.0]))
+    own = into.inverse()
+    for _ in range(_TRIES):
+        ahead, side = rng.uniform((0.4, -0.6), (1.0, 0.6))
+        base = (*table.frame.point(-depth / 2.0 - ahead, side), rng.uniform(-np.pi, np.pi))
+        at, z = _drawn(scene, base, rng)
+        x, y, up = own.act(at.translation)
+        over = -depth / 2.0 < x < min(-depth / 2.0 + 0.5, depth / 2.0) and abs(y) < width / 2.0 and 0.05 < up - height < 0.45
+        if over and _free(scene, z):
+            return at
+    raise InputError("no configuration reaches over the table", field="pose", expected=f"one of {_TRIES}", got=table.name)
+
+
+def pose_among(layout: Layout, scene: Scene, rng: np.random.Generator) -> pin.SE3:
+    """Return a pose of the tool 0.2 to 1.4 m high, at which some of the robot is near something; see `NEAR` and `FAR`.
+
+    The robot can turn where it stands, and gets there from the start.
+
+    Args:
+        layout: The room.
+        scene: The same as a scene.
+        rng: Where the random numbers come from.
+
+    Raises:
+        InputError: No configuration was found.
+    """
+    half = np.array([layout.floor.width, layout.floor.depth]) / 2.0
+    standing = [part.footprint for part in layout.parts]
+    for _ in range(_TRIES):
+        x, y, yaw = rng.uniform([*-half, -np.pi], [*half, np.pi])
+        apart = np.hypot(x - layout.start[0], y - layout.start[1]) >= FAR
+        if not apart or not layout.floor.free(standing, layout.radius, [[x, y]])[0]:
+            continue
+        at, z = _drawn(scene, (x, y, yaw), rng)
+        free = 0.2 < at.translation[2] < 1.4 and _free(scene, z, NEAR)
+        if free and layout.floor.connected(standing, layout.radius, [layout.start[:2], (x, y)]):
+            return at
+    raise InputError("no configuration is near anything", field="pose", expected=f"one of {_TRIES}", got=scene.name)
+
+
+def _drawn(scene: Scene, base: tuple[float, float, float], rng: np.random.Generator) -> tuple[pin.SE3, Floats]:
+    """Return the tool's placement with the arm anywhere, and the configuration, shape (n,)."""
+    robot = scene.robot
+    lower, upper = np.maximum(robot.lower, -np.pi)[3:], np.minimum(robot.upper, np.pi)[3:]
+    z = np.concatenate([base, rng.uniform(lower, upper)])
+    data = robot.model.createData()
+    pin.framesForwardKinematics(robot.model, data, robot.coordinates.q(z))
+    return data.oMf[robot.model.getFrameId(robot.tool_frame)].copy(), z
+
+
+def _free(scene: Scene, z: Floats, near: float = np.inf) -> bool:
+    """Return whether a robot touches nothing at a configuration, itself and the floor included, and is near something."""
+    robot = scene.robot
+    data, shapes = robot.model.createData(), robot.collision.createData()
+    pin.updateGeometryPlacements(robot.model, data, robot.collision, shapes, robot.coordinates.q(z))
+    geometry = robot.collision.geometryObjects
+    for shape, where in zip(geometry, shapes.oMg, strict=True):
+        if shape.parentJoint > 1 and world_box(shape.geometry, where)[0][2] < CLEAR:
+            return False
+    for pair in robot.collision.collisionPairs:
+        one, two = (geometry[k].geometry for k in (pair.first, pair.second))
+        if shape_distance(one, shapes.oMg[pair.first], two, shapes.oMg[pair.second]) < CLEAR:
+            return False
+    try:
+        there = scene.with_start(base=z[:3], arm=z[3:])
+    except InputError:  # outside the arena
+        return False
+    clearance = there.start_clearance()
+    return CLEAR <= clearance < near

@@ -1,0 +1,151 @@
+"""Sixty problems by number: forty in random rooms, twenty from fixed starts of the scenes that come along.
+
+Which problems these are follows from numbers alone. No planner was asked whether it can solve one, and none is left out for that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.benchmarks import baselines, door, household, initialization
+from vkc_pin.benchmarks.comparison import Assignment, placed
+from vkc_pin.benchmarks.problems.poses import pose_among, pose_over
+from vkc_pin.errors import InputError
+from vkc_pin.scene.rooms.random_room import random_layout
+from vkc_pin.scene.scene import Scene, load_scene
+from vkc_pin.task.steps import Actuate, Grasp, Place, Reach, Step, Touch
+
+__all__ = ["KINDS", "NUMBER", "TASKS", "Problem", "kind_of", "problem", "started"]
+
+KINDS = ("reach", "door", "pull", "carry", "scene")
+"""Kinds of problems: ten of each of the first four, in random rooms, then twenty in scenes that come along."""
+NUMBER = 60
+_EACH = 10
+_STARTS = 60  # the random seed of the starts; the experiments' own figures are of other seeds
+
+_DOORS = (("door", None), ("narrow_door", "handle_free"), ("wide_door", None))
+_PULLED: tuple[tuple[str, str, tuple[float, float]], ...] = (
+    ("drawer", "slide", (0.2, 0.35)),
+    ("refrigerator", "hinge", (0.8, 1.5)),
+    ("low_drawer", "slide", (0.15, 0.3)),
+    ("cabinet", "hinge", (0.4, 1.4)),
+)
+_SWUNG = (0.8, 1.4)  # [rad] by which doors are pushed
+_EDGE = 0.1  # [m] from where a cup is put to the edges of the table
+
+TASKS: Mapping[str, Assignment] = {
+    "door": Assignment("door", (Actuate("door", door.GOAL),), "open a door"),
+    "drawer": Assignment("drawer", (Actuate("drawer", {"slide": 0.3}),), "pull a drawer"),
+    **{
+        scene: Assignment(scene, (Grasp("stick"), Touch("stick.tip", initialization.TARGET)), "touch a cube with a stick")
+        for scene in initialization.SCENES
+    },
+    **{task.scene: task for task in baselines.TASKS.values()},
+    **{f"household_{name}": task for name, task in household.TASKS.items()},
+}
+"""The experiments' tasks by name: those of the paper, and the two scenes beside."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A problem.
+
+    Attributes:
+        number: Which one, from 0.
+        name: Of the room or the task, and what is to be done.
+        kind: One of `KINDS`.
+        scene: Where it begins.
+        steps: What should change.
+    """
+
+    number: int
+    name: str
+    kind: str
+    scene: Scene
+    steps: tuple[Step, ...]
+
+
+def kind_of(number: int) -> str:
+    """Return the kind of a problem.
+
+    Raises:
+        InputError: There is no such problem.
+    """
+    if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number < NUMBER:
+        raise InputError("there is no such problem", field="problem", expected=f"0 to {NUMBER - 1}", got=repr(number))
+    return KINDS[min(number // _EACH, len(KINDS) - 1)]
+
+
+def problem(number: int) -> Problem:
+    """Return a problem.
+
+    Args:
+        number: From 0 to `NUMBER` − 1.
+
+    Raises:
+        InputError: There is no such problem.
+    """
+    kind = kind_of(number)
+    if kind == "scene":
+        name, start = _FIXED[number - (len(KINDS) - 1) * _EACH]
+        return Problem(number, f"{name} {start}", kind, started(name, _STARTS, start), TASKS[name].steps)
+    scene, step, about = {"reach": _reach, "door": _door, "pull": _pull, "carry": _carry}[kind](number)
+    return Problem(number, f"{scene.name} {about}", kind, scene, (step,))
+
+
+def started(task: str, seed: int, number: int) -> Scene:
+    """Return a task's scene with a random start, and with its objects scattered if the task says so.
+
+    Args:
+        task: One of `TASKS`.
+        seed: Of the random numbers.
+        number: Which start.
+    """
+    rng = np.random.default_rng([seed, list(TASKS).index(task), number])
+    own, scene = TASKS[task], load_scene(TASKS[task].scene)
+    scattered = placed(scene, {"placed": own.scatter(scene, rng)}) if own.scatter else scene
+    return scattered.sample_start(rng)
+
+
+_FIXED = [(name, start) for name in TASKS for start in range(1 if name.startswith("household") else 2)]
+
+
+def _clutter(number: int) -> float:
+    """Return how much furniture a problem's room has: each kind of problem has rooms from empty to crowded."""
+    return number % _EACH / 10.0
+
+
+def _reach(number: int) -> tuple[Scene, Step, str]:
+    layout = random_layout(number, clutter=_clutter(number))
+    scene, rng = layout.scene(), np.random.default_rng([2, number])
+    over = number % 2 == 0
+    pose: pin.SE3 = pose_over(layout, scene, layout.part("table_1"), rng) if over else pose_among(layout, scene, rng)
+    return scene, Reach(pose), f"reach {'over a table' if over else 'among furniture'}"
+
+
+def _door(number: int) -> tuple[Scene, Step, str]:
+    name, attachment = _DOORS[number % len(_DOORS)]
+    scene = random_layout(number, clutter=_clutter(number), objects=(name,)).scene()
+    angle = round(float(np.random.default_rng([2, number]).uniform(*_SWUNG)), 2)
+    return scene, Actuate(name, {"hinge": angle}, attachment), f"push {name} by {angle:g} rad"
+
+
+def _pull(number: int) -> tuple[Scene, Step, str]:
+    name, joint, interval = _PULLED[number % len(_PULLED)]
+    scene = random_layout(number, clutter=_clutter(number), objects=(name,)).scene()
+    value = round(float(np.random.default_rng([2, number]).uniform(*interval)), 2)
+    return scene, Actuate(name, {joint: value}), f"pull {name} by {value:g} {'m' if joint == 'slide' else 'rad'}"
+
+
+def _carry(number: int) -> tuple[Scene, Step, str]:
+    layout = random_layout(number, clutter=_clutter(number), tables=2, carried=("cup",))
+    rng, table = np.random.default_rng([2, number]), layout.part("table_2")
+    depth, width, _ = table.size
+    x = -depth / 2.0 + float(rng.uniform(_EDGE, 0.3))
+    y = float(rng.uniform(_EDGE - width / 2.0, width / 2.0 - _EDGE))
+    place = (*table.frame.point(x, y), round(table.size[2] + 0.001, 3))
+    return layout.scene(), Place("cup", place), "carry the cup to table_2"

@@ -1,0 +1,129 @@
+"""One trial: a problem is planned and put on record, with what it took, its objective, and whether its first seed sufficed."""
+
+from __future__ import annotations
+
+import functools
+import subprocess
+import time
+from typing import Any
+
+import numpy as np
+
+from vkc_pin.benchmarks.harness.record import trial
+from vkc_pin.benchmarks.problems.changes import UNCHANGED, Change
+from vkc_pin.files.resources import package_folder
+from vkc_pin.planning.plan import Plan
+from vkc_pin.planning.planner import Planner, borrowed, plan
+from vkc_pin.program.problem import TrajectoryProblem
+from vkc_pin.scene.scene import Scene, load_scene
+from vkc_pin.solver.solution import Iteration
+from vkc_pin.task.compiler import compile_task
+from vkc_pin.task.steps import Reach, Step
+
+__all__ = ["TIME_LIMIT", "commit", "first_seed", "objective", "tried"]
+
+TIME_LIMIT = 60.0  # [s] of planning
+
+
+def tried(
+    scene: Scene, steps: tuple[Step, ...], *, seed: int, change: Change = UNCHANGED, time_limit: float = TIME_LIMIT, **more: Any
+) -> dict[str, Any]:
+    """Plan and return the record: `record.trial`, and `solves`, `first_seed`, `objective`, `cpu_time` and `wall_time` of it all.
+
+    Args:
+        scene: Where it begins.
+        steps: What should change.
+        seed: Of the random numbers of planning.
+        change: The setting that is another.
+        time_limit: Of planning [s].
+        more: Further fields of the record.
+    """
+    _warm()
+    solves: list[int] = []
+
+    def count(row: Iteration) -> None:
+        solves.extend([row.round] if row.round == 1 else [])
+
+    planner = _planner(change)
+    with change.applied():  # before the clock starts: looking for where a constant is imported takes a while
+        wall, cpu = time.perf_counter(), time.process_time()
+        found = plan(scene, steps, options=change.options, seed=seed, time_limit=time_limit, callback=count, planner=planner)
+        took = {"wall_time": time.perf_counter() - wall, "cpu_time": time.process_time() - cpu}
+    own: dict[str, Any] = {
+        **took,
+        "solves": len(solves),
+        "first_seed": first_seed(found, len(solves)),
+        "objective": objective(found, planner),
+    }
+    own |= {"duration": found.metrics["duration"], "commit": commit()}
+    return trial(found, method=str(change), seed=seed, **own, **more)
+
+
+def first_seed(found: Plan, solves: int) -> bool:
+    """Return whether a plan is a success that came from the first seed of every program that was solved for it.
+
+    One step is one program. Several are one each, and then one of all of them, which starts from their motions.
+
+    Args:
+        found: The plan.
+        solves: How often the solver was run for it.
+    """
+    parts = found.initialization.count(", ")  # "a, b, then all at once"
+    whole = parts == 0 or found.initialization.endswith(", then all at once")
+    return found.success and whole and solves == parts + 1
+
+
+def objective(found: Plan, planner: Planner | None = None) -> float | None:
+    """Return f of eq. 1, in the options' weights, of a plan that is a success and one problem; None for others.
+
+    It is that of robot and objects. Freedoms of grasps are left out: while nothing is held they mean nothing, and the motion has
+    other values for them there than the program.
+
+    Args:
+        found: The plan; without own costs.
+        planner: Keeps the symbolic program; None: the process's own.
+    """
+    if not found.success:
+        return None
+    task = compile_task(found.scene, found.steps, found.options)
+    spans = found.trajectory.phases
+    if [span.name for span in spans][: len(task.phases)] != [phase.name for phase in task.phases]:
+        return None  # motions of single steps, one after the other
+    with borrowed(planner) as cache:
+        problem = TrajectoryProblem(found.scene, task, found.options, (), cache=cache)
+        # Pauses for the gripper, at the beginning of a phase, are no waypoints of the program.
+        rows = np.concatenate(
+            [np.arange(span.last - phase.segments, span.last) + 1 for span, phase in zip(spans, task.phases, strict=False)]
+        )
+        if problem.chain.names != found.trajectory.names:
+            return None
+        freedoms = {name for names in problem.chain.virtual.values() for name in names}
+        counted = np.array([name not in freedoms for name in problem.chain.names])
+        weights = problem.transcription.structure
+        first, second = problem.rates(found.trajectory.positions[rows])
+        efforts = (first**2 * weights.weights_velocity).sum(axis=0) + (second**2 * weights.weights_acceleration).sum(axis=0)
+        return float(efforts[counted].sum())
+
+
+@functools.cache
+def commit() -> str | None:
+    """Return which commit the package's sources are of, `-dirty` if they are changed; None where git does not know."""
+    command = ["git", "-C", str(package_folder()), "describe", "--always", "--dirty", "--abbrev=12"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip() or None
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+@functools.cache
+def _planner(change: Change) -> Planner:
+    """Return a planner for each change, once per process: what one keeps was built with its own constants."""
+    return Planner(megabytes=512.0)
+
+
+@functools.cache
+def _warm() -> None:
+    """Plan once in this process, which pays for what is loaded only once."""
+    scene = load_scene("drawer")
+    if plan(scene, [Reach(scene.tool_placement())], planner=Planner()).status == "interrupted":
+        raise KeyboardInterrupt

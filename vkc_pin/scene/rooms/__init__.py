@@ -1,0 +1,1 @@
+"""Rooms made by rule and number."""

@@ -1,0 +1,80 @@
+"""What random rooms are to be like."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.scene.rooms.parts import CARRIED, OPENED
+
+__all__ = ["RoomSettings"]
+
+_CARRIED = 4  # on one table
+
+
+@dataclass(frozen=True)
+class RoomSettings:
+    """What random rooms are like. Every field is checked when the object is made.
+
+    Attributes:
+        clutter: How much furniture there is, from 0, nothing but `tables`, to 1.
+        objects: Types of the things to open, from `door`, `narrow_door`, `wide_door`, `drawer`, `low_drawer`, `refrigerator`,
+            `cabinet`; None: one or two of these at random.
+        tables: How many tables there are at least, each with a side at which a robot can stand.
+        carried: Types of free objects, up to four of `cup` and `ball`, which stand on the first table.
+        width: Lowest and highest inner length of a wall [m].
+        height: Of the walls [m].
+        front: Depth of the floor that stays free before what can be opened [m].
+        gap: Least distance between what stands there [m].
+        robot: The robot's name.
+    """
+
+    clutter: float = 0.5
+    objects: tuple[str, ...] | None = None
+    tables: int = 1
+    carried: tuple[str, ...] = ()
+    width: tuple[float, float] = (4.0, 7.0)
+    height: float = 2.4
+    front: float = 1.8
+    gap: float = 0.1
+    robot: str = "husky_ur5e"
+
+    def __post_init__(self) -> None:
+        _within("clutter", self.clutter, 0.0, 1.0)
+        for name, low, high in (("height", 2.1, 10.0), ("front", 1.5, 3.0), ("gap", 0.02, 1.0)):
+            _within(name, getattr(self, name), low, high)
+        expected = "two lengths of 4 to 20 m, the lower one first"
+        if not isinstance(self.width, tuple | list) or len(self.width) != 2:
+            raise InputError("not an interval", field="width", expected=expected, got=repr(self.width))
+        for value in self.width:
+            _within("width", value, 4.0, 20.0)
+        if self.width[0] > self.width[1]:
+            raise InputError("the interval is empty", field="width", expected=expected, got=repr(self.width))
+        object.__setattr__(self, "width", tuple(map(float, self.width)))
+        if isinstance(self.tables, bool) or not isinstance(self.tables, int) or not 0 <= self.tables <= 10:
+            raise InputError("out of range", field="tables", expected="a whole number from 0 to 10", got=repr(self.tables))
+        for name in ("objects", "carried"):
+            given = getattr(self, name)
+            if given is not None and (not isinstance(given, tuple | list) or not all(isinstance(kind, str) for kind in given)):
+                raise InputError("not a list of types", field=name, expected="texts", got=repr(given))
+            object.__setattr__(self, name, None if given is None else tuple(given))
+        for name, what, choices in (("objects", "object that opens", OPENED), ("carried", "object that is carried", CARRIED)):
+            for kind in getattr(self, name) or ():
+                if kind not in choices:
+                    raise UnknownNameError(what, kind, choices, field=name)
+        if len(self.carried) > _CARRIED:
+            raise InputError("too many", field="carried", expected=f"at most {_CARRIED}", got=len(self.carried))
+        if self.carried and not self.tables:
+            raise InputError(
+                "there is nothing for it to stand on", field="carried", expected="tables of at least 1", got=self.tables
+            )
+
+
+def _within(name: str, value: Any, low: float, high: float) -> None:
+    """Raise an error unless a setting is a number from the lowest to the highest."""
+    number = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+    if not number or not low <= value <= high:
+        raise InputError("out of range", field=name, expected=f"a number from {low:g} to {high:g}", got=repr(value))

@@ -74,7 +74,7 @@ def first_seed(found: Plan, solves: int) -> bool:
 
 
 def objective(found: Plan, planner: Planner | None = None) -> float | None:
-    """Return f of eq. 1, in the options' weights, of a plan that is a success and one problem; None for others.
+    """Return what the way costs, in the options' weights, of a plan that is a success and one problem; None for others.
 
     It is that of robot and objects. Freedoms of grasps are left out: while nothing is held they mean nothing, and the motion has
     other values for them there than the program.
@@ -99,10 +99,8 @@ def objective(found: Plan, planner: Planner | None = None) -> float | None:
             return None
         freedoms = {name for names in problem.chain.virtual.values() for name in names}
         counted = np.array([name not in freedoms for name in problem.chain.names])
-        weights = problem.transcription.structure
         first, second = problem.rates(found.trajectory.positions[rows])
-        efforts = (first**2 * weights.weights_velocity).sum(axis=0) + (second**2 * weights.weights_acceleration).sum(axis=0)
-        return float(efforts[counted].sum())
+        return problem.effort.value(first * counted, second * counted)
 
 
 @functools.cache

@@ -38,6 +38,7 @@ from vkc_pin.validation.clearance import clearance_curves
 from vkc_pin.validation.distances import Placed, travelled
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.samples import Samples
+from vkc_pin.validation.sweep import sweep
 from vkc_pin.validation.touching import may_touch
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -226,7 +227,7 @@ def check_sweep(scene: Scene, motion: Trajectory) -> None:
     samples = Samples(scene, motion)
     touching = may_touch(scene, samples.world, motion, (), 0.02)
     table = PairTable(scene, samples.world, motion, 0.02, touching=touching)
-    hits = list(table.sweep(samples.z, samples.waypoint_rows))
+    hits = list(sweep(table, samples.z, samples.waypoint_rows))
     distances = brute_force(table, samples.z)
     at_samples = min(hit.distance for hit in hits)
     assert at_samples <= distances.min() + COAL

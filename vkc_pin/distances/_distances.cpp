@@ -1,0 +1,431 @@
+// Signed distances of placed shapes, by coal, for many pairs at many states at once.
+//
+// Shapes are rebuilt here from their numbers, so that this module shares no C++ object with coal's Python bindings; the
+// distances are computed by the same libcoal as theirs. A placement is twelve numbers: the columns of its rotation, then
+// its translation.
+
+#include <algorithm>
+#include <cstdint>
+#include <exception>
+#include <limits>
+#include <memory>
+#include <stdexcept>
+#include <string>
+#include <thread>
+#include <tuple>
+#include <utility>
+#include <vector>
+
+#include <coal/BVH/BVH_model.h>
+#include <coal/config.hh>
+#include <coal/distance.h>
+#include <coal/shape/convex.h>
+#include <coal/shape/geometric_shapes.h>
+
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/shared_ptr.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
+
+namespace nb = nanobind;
+
+namespace {
+
+using Index = std::int64_t;
+template<int dimensions>
+using Numbers = nb::ndarray<const double, nb::ndim<dimensions>, nb::c_contig, nb::device::cpu>;
+template<int dimensions>
+using Indices = nb::ndarray<const Index, nb::ndim<dimensions>, nb::c_contig, nb::device::cpu>;
+template<typename T>
+using Array = nb::ndarray<nb::numpy, T, nb::c_contig, nb::device::cpu>;
+
+constexpr std::size_t PLACEMENT = 12;
+constexpr std::size_t COLUMNS = 10; // distance, normal, both witness points
+
+// --- shapes ----------------------------------------------------------------------------------------------------------
+
+struct Solid
+{
+  std::shared_ptr<coal::CollisionGeometry> geometry;
+};
+
+coal::Vec3s vector(const std::vector<double> & numbers, std::size_t first)
+{
+  return coal::Vec3s(numbers.at(first), numbers.at(first + 1), numbers.at(first + 2));
+}
+
+// Lengths are halves, as coal keeps them: doubled and halved again, they are the same numbers.
+Solid primitive(const std::string & kind, const std::vector<double> & numbers, double swept_sphere_radius)
+{
+  std::shared_ptr<coal::ShapeBase> shape;
+  if (kind == "Box")
+    shape = std::make_shared<coal::Box>(2.0 * vector(numbers, 0));
+  else if (kind == "Sphere")
+    shape = std::make_shared<coal::Sphere>(numbers.at(0));
+  else if (kind == "Ellipsoid")
+    shape = std::make_shared<coal::Ellipsoid>(vector(numbers, 0));
+  else if (kind == "Capsule")
+    shape = std::make_shared<coal::Capsule>(numbers.at(0), 2.0 * numbers.at(1));
+  else if (kind == "Cone")
+    shape = std::make_shared<coal::Cone>(numbers.at(0), 2.0 * numbers.at(1));
+  else if (kind == "Cylinder")
+    shape = std::make_shared<coal::Cylinder>(numbers.at(0), 2.0 * numbers.at(1));
+  else if (kind == "TriangleP")
+    shape = std::make_shared<coal::TriangleP>(vector(numbers, 0), vector(numbers, 3), vector(numbers, 6));
+  else if (kind == "Halfspace")
+  {
+    auto space = std::make_shared<coal::Halfspace>(vector(numbers, 0), numbers.at(3));
+    space->n = vector(numbers, 0); // as it is: to make it a unit vector once more could change it
+    space->d = numbers.at(3);
+    shape = space;
+  }
+  else if (kind == "Plane")
+  {
+    auto plane = std::make_shared<coal::Plane>(vector(numbers, 0), numbers.at(3));
+    plane->n = vector(numbers, 0);
+    plane->d = numbers.at(3);
+    shape = plane;
+  }
+  else
+    throw std::invalid_argument("unknown kind of shape: " + kind);
+  shape->setSweptSphereRadius(swept_sphere_radius);
+  return {shape};
+}
+
+std::vector<coal::Vec3s> corners_of(const Numbers<2> & points)
+{
+  if (points.shape(1) != 3)
+    throw std::invalid_argument("points are of shape (n, 3)");
+  std::vector<coal::Vec3s> corners;
+  corners.reserve(points.shape(0));
+  for (std::size_t i = 0; i < points.shape(0); ++i)
+    corners.emplace_back(points(i, 0), points(i, 1), points(i, 2));
+  return corners;
+}
+
+std::vector<coal::Triangle> triangles_of(const Indices<2> & faces, std::size_t points)
+{
+  if (faces.shape(1) != 3)
+    throw std::invalid_argument("faces are of shape (m, 3)");
+  std::vector<coal::Triangle> triangles;
+  triangles.reserve(faces.shape(0));
+  for (std::size_t i = 0; i < faces.shape(0); ++i)
+  {
+    for (std::size_t k = 0; k < 3; ++k)
+      if (faces(i, k) < 0 || std::size_t(faces(i, k)) >= points)
+        throw std::out_of_range("a face has a corner that is none of the points");
+    using Corner = coal::Triangle::index_type;
+    triangles.emplace_back(Corner(faces(i, 0)), Corner(faces(i, 1)), Corner(faces(i, 2)));
+  }
+  return triangles;
+}
+
+Solid convex(const Numbers<2> & points, const Indices<2> & faces, double swept_sphere_radius)
+{
+  auto corners = std::make_shared<std::vector<coal::Vec3s>>(corners_of(points));
+  auto triangles = std::make_shared<std::vector<coal::Triangle>>(triangles_of(faces, corners->size()));
+  auto shape = std::make_shared<coal::Convex<coal::Triangle>>(
+    corners, unsigned(corners->size()), triangles, unsigned(triangles->size()));
+  shape->setSweptSphereRadius(swept_sphere_radius);
+  return {shape};
+}
+
+Solid mesh(const Numbers<2> & points, const Indices<2> & faces)
+{
+  const auto corners = corners_of(points);
+  const auto triangles = triangles_of(faces, corners.size());
+  auto model = std::make_shared<coal::BVHModel<coal::OBBRSS>>();
+  model->beginModel(unsigned(triangles.size()), unsigned(corners.size()));
+  model->addSubModel(corners, triangles);
+  model->endModel();
+  return {model};
+}
+
+// --- threads ---------------------------------------------------------------------------------------------------------
+
+// Calls work(first, last) on parts of 0..count, each in a thread of its own; an exception of any of them is thrown here.
+template<typename Work>
+void in_parts(std::size_t count, std::size_t threads, const Work & work)
+{
+  threads = std::min(std::max<std::size_t>(threads, 1), std::max<std::size_t>(count, 1));
+  if (threads == 1)
+    return work(std::size_t(0), std::size_t(0), count);
+  std::vector<std::exception_ptr> failures(threads);
+  std::vector<std::thread> others;
+  const auto part = [&](std::size_t k) {
+    try
+    {
+      work(k, count * k / threads, count * (k + 1) / threads);
+    }
+    catch (...)
+    {
+      failures[k] = std::current_exception();
+    }
+  };
+  std::size_t started = 1;
+  try
+  {
+    for (; started < threads; ++started)
+      others.emplace_back(part, started);
+  }
+  catch (const std::system_error &) // no more threads to be had: what is left is done here
+  {
+  }
+  part(0);
+  for (std::size_t k = started; k < threads; ++k)
+    part(k);
+  for (auto & other : others)
+    other.join();
+  for (const auto & failure : failures)
+    if (failure)
+      std::rethrow_exception(failure);
+}
+
+template<typename T>
+Array<T> handed_over(std::vector<T> && numbers, std::initializer_list<std::size_t> shape)
+{
+  auto * kept = new std::vector<T>(std::move(numbers));
+  nb::capsule owner(kept, [](void * p) noexcept { delete static_cast<std::vector<T> *>(p); });
+  return Array<T>(kept->data(), shape, owner);
+}
+
+// --- distances -------------------------------------------------------------------------------------------------------
+
+coal::Transform3s transform(const double * numbers)
+{
+  return coal::Transform3s(
+    Eigen::Map<const Eigen::Matrix3d>(numbers), Eigen::Map<const Eigen::Vector3d>(numbers + 9));
+}
+
+class Shapes
+{
+public:
+  Shapes(const std::vector<Solid> & solids, const Numbers<2> & standing, double tolerance)
+  {
+    if (standing.shape(1) != PLACEMENT || standing.shape(0) > solids.size())
+      throw std::invalid_argument("placements of what stands are of shape (S, 12), S no more than there are shapes");
+    for (const auto & solid : solids)
+      shapes_.push_back(solid.geometry);
+    moving_ = shapes_.size() - standing.shape(0);
+    for (std::size_t i = 0; i < standing.shape(0); ++i)
+      standing_.push_back(transform(standing.data() + PLACEMENT * i));
+    request_.gjk_tolerance = tolerance;
+  }
+
+  Shapes placed(const Indices<1> & which, const Numbers<2> & where) const
+  {
+    if (where.shape(0) != which.shape(0) || where.shape(1) != PLACEMENT)
+      throw std::invalid_argument("placements are of shape (n, 12)");
+    Shapes other(*this);
+    for (std::size_t k = 0; k < which.shape(0); ++k)
+    {
+      if (which(k) < Index(moving_) || which(k) >= Index(shapes_.size()))
+        throw std::out_of_range("not a shape that stands");
+      other.standing_[which(k) - moving_] = transform(where.data() + PLACEMENT * k);
+    }
+    return other;
+  }
+
+  Array<double> distances(
+    const Numbers<3> & moving, const Indices<1> & states, const Indices<2> & pairs, bool everything, std::size_t threads) const
+  {
+    const std::size_t count = pairs.shape(0), columns = everything ? COLUMNS : 1;
+    check(moving, pairs);
+    if (states.shape(0) != count)
+      throw std::invalid_argument("as many states as pairs are needed");
+    for (std::size_t i = 0; i < count; ++i)
+      if (states(i) < 0 || states(i) >= Index(moving.shape(0)))
+        throw std::out_of_range("no such state");
+    std::vector<double> found(count * columns);
+    const Index *state = states.data(), *pair = pairs.data();
+    const double * where = moving.data();
+    {
+      nb::gil_scoped_release released;
+      in_parts(count, threads, [&](std::size_t, std::size_t first, std::size_t last) {
+        Asking ask(*this);
+        for (std::size_t i = first; i < last; ++i)
+        {
+          ask.at(where + std::size_t(state[i]) * moving_ * PLACEMENT);
+          found[i * columns] = ask.distance(pair[2 * i], pair[2 * i + 1]);
+          if (everything)
+            ask.witness(found.data() + i * columns + 1);
+        }
+      });
+    }
+    if (everything)
+      return handed_over(std::move(found), {count, COLUMNS});
+    return handed_over(std::move(found), {count});
+  }
+
+  // Of each state, the candidates `edges[state]` to `edges[state + 1]` that fall shortest of their margins; see shapes.py.
+  std::tuple<Array<Index>, Array<double>> shortest(
+    const Numbers<3> & moving,
+    const Indices<1> & edges,
+    const Indices<2> & pairs,
+    const Indices<1> & ranks,
+    const Numbers<2> & limits,
+    double reach,
+    Index most,
+    double rounding,
+    std::size_t threads) const
+  {
+    const std::size_t states = moving.shape(0), count = pairs.shape(0);
+    check(moving, pairs);
+    if (edges.shape(0) != states + 1 || ranks.shape(0) != count || limits.shape(0) != count || limits.shape(1) != 2)
+      throw std::invalid_argument("edges are of shape (W + 1,), ranks (n,), limits (n, 2)");
+    for (std::size_t s = 0; s < states; ++s)
+      if (edges(s) > edges(s + 1))
+        throw std::invalid_argument("edges increase");
+    if (edges(0) != 0 || edges(states) != Index(count))
+      throw std::invalid_argument("edges begin with 0 and end with the number of pairs");
+    std::vector<Index> chosen;
+    std::vector<double> table;
+    const Index *edge = edges.data(), *pair = pairs.data(), *rank = ranks.data();
+    const double *limit = limits.data(), *where = moving.data();
+    {
+      nb::gil_scoped_release released;
+      threads = std::max<std::size_t>(threads, 1);
+      std::vector<std::vector<Found>> parts(threads);
+      in_parts(states, threads, [&](std::size_t part, std::size_t first, std::size_t last) {
+        Asking ask(*this);
+        std::vector<Found> near;
+        for (std::size_t s = first; s < last; ++s)
+        {
+          near.clear();
+          ask.at(where + s * moving_ * PLACEMENT);
+          for (Index i = edge[s]; i < edge[s + 1]; ++i)
+          {
+            const double margin = limit[2 * i], bound = limit[2 * i + 1];
+            if (most >= 0 && Index(near.size()) >= most && (most == 0 || bound > near[most - 1].shortfall + rounding))
+              break; // neither this one nor any after it is among those
+            Found found;
+            found.distance = ask.distance(pair[2 * i], pair[2 * i + 1]);
+            if (!(found.distance < reach))
+              continue;
+            found.shortfall = found.distance - margin;
+            found.index = i;
+            found.rank = rank[i];
+            ask.witness(found.witness);
+            near.insert(std::upper_bound(near.begin(), near.end(), found), found);
+          }
+          if (most >= 0 && Index(near.size()) > most)
+            near.resize(most);
+          parts[part].insert(parts[part].end(), near.begin(), near.end());
+        }
+      });
+      for (const auto & part : parts)
+        for (const auto & found : part)
+        {
+          chosen.push_back(found.index);
+          table.push_back(found.distance);
+          table.insert(table.end(), found.witness, found.witness + COLUMNS - 1);
+        }
+    }
+    const std::size_t kept = chosen.size();
+    return {handed_over(std::move(chosen), {kept}), handed_over(std::move(table), {kept, COLUMNS})};
+  }
+
+  std::size_t size() const { return shapes_.size(); }
+  std::size_t moving() const { return moving_; }
+
+private:
+  struct Found
+  {
+    double shortfall, distance, witness[COLUMNS - 1];
+    Index index, rank;
+    bool operator<(const Found & other) const
+    {
+      return std::tie(shortfall, distance, rank) < std::tie(other.shortfall, other.distance, other.rank);
+    }
+  };
+
+  // Asks coal at one state after the other; nothing is kept from one distance to the next, which would change its last digits.
+  class Asking
+  {
+  public:
+    explicit Asking(const Shapes & shapes)
+    : shapes_(shapes), request_(shapes.request_), places_(shapes.moving_), known_(shapes.moving_, 0)
+    {
+    }
+
+    void at(const double * placements)
+    {
+      if (placements != placements_)
+        ++state_;
+      placements_ = placements;
+    }
+
+    double distance(Index first, Index second)
+    {
+      result_.clear();
+      const auto &one = place(std::size_t(first)), &other = place(std::size_t(second));
+      return coal::distance(
+        shapes_.shapes_[first].get(), one, shapes_.shapes_[second].get(), other, request_, result_);
+    }
+
+    void witness(double * out) const
+    {
+      for (const coal::Vec3s * numbers : {&result_.normal, &result_.nearest_points[0], &result_.nearest_points[1]})
+        out = std::copy_n(numbers->data(), 3, out);
+    }
+
+  private:
+    const coal::Transform3s & place(std::size_t shape)
+    {
+      if (shape >= shapes_.moving_)
+        return shapes_.standing_[shape - shapes_.moving_];
+      if (known_[shape] != state_)
+      {
+        places_[shape] = transform(placements_ + PLACEMENT * shape);
+        known_[shape] = state_;
+      }
+      return places_[shape];
+    }
+
+    const Shapes & shapes_;
+    coal::DistanceRequest request_;
+    coal::DistanceResult result_;
+    std::vector<coal::Transform3s> places_;
+    std::vector<std::size_t> known_;
+    const double * placements_ = nullptr;
+    std::size_t state_ = 0;
+  };
+
+  void check(const Numbers<3> & moving, const Indices<2> & pairs) const
+  {
+    if (moving.shape(1) != moving_ || moving.shape(2) != PLACEMENT)
+      throw std::invalid_argument("placements of what moves are of shape (W, M, 12)");
+    if (pairs.shape(1) != 2)
+      throw std::invalid_argument("pairs are of shape (n, 2)");
+    const Index * shape = pairs.data();
+    for (std::size_t i = 0; i < 2 * pairs.shape(0); ++i)
+      if (shape[i] < 0 || shape[i] >= Index(shapes_.size()))
+        throw std::out_of_range("no such shape");
+  }
+
+  std::vector<std::shared_ptr<coal::CollisionGeometry>> shapes_;
+  std::vector<coal::Transform3s> standing_;
+  std::size_t moving_;
+  coal::DistanceRequest request_;
+};
+
+} // namespace
+
+NB_MODULE(_distances, module)
+{
+  module.doc() = "Signed distances of placed shapes, by coal, for many pairs at many states at once.";
+  module.attr("COAL_VERSION") = COAL_VERSION;
+  nb::class_<Solid>(module, "Solid");
+  module.def("primitive", &primitive);
+  module.def("convex", &convex);
+  module.def("mesh", &mesh);
+  nb::class_<Shapes>(module, "Shapes")
+    .def(nb::init<const std::vector<Solid> &, const Numbers<2> &, double>())
+    .def("placed", &Shapes::placed)
+    .def("distances", &Shapes::distances)
+    .def("shortest", &Shapes::shortest)
+    .def_prop_ro("size", &Shapes::size)
+    .def_prop_ro("moving", &Shapes::moving);
+}

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from vkc_pin.distances import shapes as asking
 from vkc_pin.distances.placements import columns_of
-from vkc_pin.distances.shapes import Shapes, Witnesses, available_threads
+from vkc_pin.distances.shapes import Shapes, Witnesses, asked
 from vkc_pin.errors import InputError
 from vkc_pin.files.meshes import convex_hull
 
@@ -282,12 +282,8 @@ def test_what_coal_cannot_do_is_an_error_in_threads_too() -> None:
         both.distances(where, np.zeros(1000, int), np.tile([[0, 1]], (1000, 1)))
 
 
-@pytest.mark.parametrize(("said", "most"), [("1", 1), ("3", 3), ("nonsense", 8), ("", 8)])
-def test_threads(said: str, most: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("OMP_NUM_THREADS", said)
-    monkeypatch.setattr(asking.os, "sched_getaffinity", lambda _: set(range(12)), raising=False)
-    assert available_threads() == most
-    shapes = Room(0).shapes()
-    assert [shapes._threads(rows) for rows in (0, 10, 10**6)] == [1, 1, most]
-    monkeypatch.setattr(asking.os, "sched_getaffinity", lambda _: {0}, raising=False)
-    assert available_threads() == 1
+def test_how_many_were_asked_for() -> None:
+    room = Room(0)
+    before = asked()
+    room.shapes().distances(room.where, room.states, room.pairs)
+    assert asked() - before == len(room.pairs)

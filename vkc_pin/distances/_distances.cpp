@@ -5,13 +5,10 @@
 // its translation.
 
 #include <algorithm>
-#include <cstdint>
-#include <exception>
-#include <limits>
+#include <atomic>
 #include <memory>
 #include <stdexcept>
 #include <string>
-#include <thread>
 #include <tuple>
 #include <utility>
 #include <vector>
@@ -22,24 +19,14 @@
 #include <coal/shape/convex.h>
 #include <coal/shape/geometric_shapes.h>
 
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
-#include <nanobind/stl/shared_ptr.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
-namespace nb = nanobind;
+#include "arrays.hpp"
+#include "boxes.hpp"
 
 namespace {
-
-using Index = std::int64_t;
-template<int dimensions>
-using Numbers = nb::ndarray<const double, nb::ndim<dimensions>, nb::c_contig, nb::device::cpu>;
-template<int dimensions>
-using Indices = nb::ndarray<const Index, nb::ndim<dimensions>, nb::c_contig, nb::device::cpu>;
-template<typename T>
-using Array = nb::ndarray<nb::numpy, T, nb::c_contig, nb::device::cpu>;
 
 constexpr std::size_t PLACEMENT = 12;
 constexpr std::size_t COLUMNS = 10; // distance, normal, both witness points
@@ -143,54 +130,6 @@ Solid mesh(const Numbers<2> & points, const Indices<2> & faces)
   return {model};
 }
 
-// --- threads ---------------------------------------------------------------------------------------------------------
-
-// Calls work(first, last) on parts of 0..count, each in a thread of its own; an exception of any of them is thrown here.
-template<typename Work>
-void in_parts(std::size_t count, std::size_t threads, const Work & work)
-{
-  threads = std::min(std::max<std::size_t>(threads, 1), std::max<std::size_t>(count, 1));
-  if (threads == 1)
-    return work(std::size_t(0), std::size_t(0), count);
-  std::vector<std::exception_ptr> failures(threads);
-  std::vector<std::thread> others;
-  const auto part = [&](std::size_t k) {
-    try
-    {
-      work(k, count * k / threads, count * (k + 1) / threads);
-    }
-    catch (...)
-    {
-      failures[k] = std::current_exception();
-    }
-  };
-  std::size_t started = 1;
-  try
-  {
-    for (; started < threads; ++started)
-      others.emplace_back(part, started);
-  }
-  catch (const std::system_error &) // no more threads to be had: what is left is done here
-  {
-  }
-  part(0);
-  for (std::size_t k = started; k < threads; ++k)
-    part(k);
-  for (auto & other : others)
-    other.join();
-  for (const auto & failure : failures)
-    if (failure)
-      std::rethrow_exception(failure);
-}
-
-template<typename T>
-Array<T> handed_over(std::vector<T> && numbers, std::initializer_list<std::size_t> shape)
-{
-  auto * kept = new std::vector<T>(std::move(numbers));
-  nb::capsule owner(kept, [](void * p) noexcept { delete static_cast<std::vector<T> *>(p); });
-  return Array<T>(kept->data(), shape, owner);
-}
-
 // --- distances -------------------------------------------------------------------------------------------------------
 
 coal::Transform3s transform(const double * numbers)
@@ -198,6 +137,8 @@ coal::Transform3s transform(const double * numbers)
   return coal::Transform3s(
     Eigen::Map<const Eigen::Matrix3d>(numbers), Eigen::Map<const Eigen::Vector3d>(numbers + 9));
 }
+
+std::atomic<std::uint64_t> asked{0}; // distances, since the process began
 
 class Shapes
 {
@@ -327,9 +268,6 @@ public:
     return {handed_over(std::move(chosen), {kept}), handed_over(std::move(table), {kept, COLUMNS})};
   }
 
-  std::size_t size() const { return shapes_.size(); }
-  std::size_t moving() const { return moving_; }
-
 private:
   struct Found
   {
@@ -350,6 +288,8 @@ private:
     {
     }
 
+    ~Asking() { asked += count_; }
+
     void at(const double * placements)
     {
       if (placements != placements_)
@@ -359,6 +299,7 @@ private:
 
     double distance(Index first, Index second)
     {
+      ++count_;
       result_.clear();
       const auto &one = place(std::size_t(first)), &other = place(std::size_t(second));
       return coal::distance(
@@ -390,7 +331,7 @@ private:
     std::vector<coal::Transform3s> places_;
     std::vector<std::size_t> known_;
     const double * placements_ = nullptr;
-    std::size_t state_ = 0;
+    std::size_t state_ = 0, count_ = 0;
   };
 
   void check(const Numbers<3> & moving, const Indices<2> & pairs) const
@@ -425,7 +366,12 @@ NB_MODULE(_distances, module)
     .def(nb::init<const std::vector<Solid> &, const Numbers<2> &, double>())
     .def("placed", &Shapes::placed)
     .def("distances", &Shapes::distances)
-    .def("shortest", &Shapes::shortest)
-    .def_prop_ro("size", &Shapes::size)
-    .def_prop_ro("moving", &Shapes::moving);
+    .def("shortest", &Shapes::shortest);
+  module.def("asked", [] { return asked.load(); });
+  nb::class_<Boxes>(module, "Boxes")
+    .def(
+      nb::init<
+        const Indices<1> &, const Numbers<3> &, const Numbers<2> &, const Numbers<2> &, const Indices<2> &>())
+    .def("placed", &Boxes::placed)
+    .def("near", &Boxes::near);
 }

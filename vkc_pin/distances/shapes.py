@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -13,11 +12,11 @@ import pinocchio as pin
 from vkc_pin.arrays import Floats, Ints
 from vkc_pin.distances.placements import columns_of
 from vkc_pin.distances.solids import compiled, solid_of
+from vkc_pin.distances.threads import available_threads
 
-__all__ = ["TOLERANCE", "Shapes", "Witnesses"]
+__all__ = ["TOLERANCE", "Shapes", "Witnesses", "asked"]
 
 TOLERANCE = 1e-6  # coal's own, of GJK
-_MOST_THREADS = 8
 _WORTH = 128  # distances, some 0.2 ms, for which another thread is worth starting
 
 
@@ -138,8 +137,6 @@ def _witnesses(table: Floats) -> Witnesses:
     return Witnesses(table[:, 0], table[:, 1:4], table[:, 4:7], table[:, 7:10])
 
 
-def available_threads() -> int:
-    """Return how many threads to use at most."""
-    said = os.environ.get("OMP_NUM_THREADS", "")
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, min(int(said) if said.isdigit() else cores, cores, _MOST_THREADS))
+def asked() -> int:
+    """Return how many distances were asked of coal so far here, by this process: what bounds have not saved."""
+    return int(compiled().asked())

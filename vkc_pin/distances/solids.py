@@ -50,10 +50,11 @@ def compiled() -> Any:
             f"the compiled module vkc_pin.distances._distances cannot be imported ({error}). It is built when vkc-pin is "
             f"installed, which needs a C++17 compiler (Debian, Ubuntu: apt install g++); then {_REBUILD}"
         ) from error
-    if coal.__version__ != module.COAL_VERSION:
+    built, installed = (version.split(".")[:2] for version in (module.COAL_VERSION, coal.__version__))
+    if built != installed:
         raise BuildError(
             f"vkc_pin.distances was compiled against coal {module.COAL_VERSION}, but {coal.__version__} is installed. "
-            f"Either pip install 'coal=={module.COAL_VERSION}', or {_REBUILD}"
+            f"Either pip install 'coal=={'.'.join(built)}.*', or {_REBUILD}"
         )
     return module
 
@@ -100,10 +101,7 @@ def _kept(shape: Any, points: Floats, radius: float) -> Any:
         if owner() is shape and before == content and swept == radius:
             return solid
     faces = indices(shape)
-    if isinstance(shape, coal.Convex):
-        solid = compiled().convex(points, faces, radius)
-    else:
-        solid = compiled().mesh(points, faces)
+    solid = compiled().convex(points, faces, radius) if isinstance(shape, coal.Convex) else compiled().mesh(points, faces)
     _known[key] = (weakref.ref(shape, lambda _: _known.pop(key, None)), content, radius, solid)
     return solid
 

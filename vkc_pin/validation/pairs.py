@@ -16,7 +16,7 @@ from vkc_pin.validation.distances import Placed, Solids
 
 __all__ = ["PairTable"]
 
-_AT_ONCE = 2_000_000  # comparisons of boxes
+_AT_ONCE = 16  # states whose boxes are compared at once
 
 
 class PairTable:
@@ -127,23 +127,26 @@ class PairTable:
             reach: Of each geometry, shape (K, G) [m].
             also: Others, shape (K,): what is close there counts as well.
         """
-        (lower, upper), still = placed.corners, self._still
-        lows, highs = lower[0, still], upper[0, still]
+        lower, upper = placed.corners
+        lows, highs = (np.ascontiguousarray(corners[0, self._still].T) for corners in (lower, upper))
+        far, moments = reach[:, self._moving, None], (states,) if also is None else (states, also)
+        boxes = [(lower[at][:, self._moving] - far, upper[at][:, self._moving] + far) for at in moments]
         found = [(np.repeat(np.arange(len(states)), len(self._both)), np.tile(self._both, len(states)))]
-        step = max(1, _AT_ONCE // max(self._number.size, 1))
-        for k in range(0, len(states), step):
-            near = np.zeros((len(states[k : k + step]), *self._number.shape), bool)
-            for some in (states,) if also is None else (states, also):
-                far = reach[k : k + step][:, self._moving, None]
-                low = lower[some[k : k + step]][:, self._moving] - far
-                high = upper[some[k : k + step]][:, self._moving] + far
-                inside = np.ones(near.shape, bool)
+        for k in range(0, len(states), _AT_ONCE) if self._number.size else ():
+            part = slice(k, k + _AT_ONCE)
+            least = np.min([low[part].min(axis=(0, 1)) for low, _ in boxes], axis=0)[:, None]
+            most = np.max([high[part].max(axis=(0, 1)) for _, high in boxes], axis=0)[:, None]
+            (some,) = ((least < highs) & (most > lows)).all(axis=0).nonzero()  # of what stands, all that any may come close to
+            number = self._number[:, some]
+            near = np.zeros((len(states[part]), *number.shape), bool)
+            for low, high in boxes:
+                inside = np.tile(number >= 0, (len(near), 1, 1))
                 for axis in range(3):
-                    inside &= low[:, :, None, axis] < highs[:, axis]
-                    inside &= high[:, :, None, axis] > lows[:, axis]
+                    inside &= low[part, :, None, axis] < highs[axis, some]
+                    inside &= high[part, :, None, axis] > lows[axis, some]
                 near |= inside
-            at, *numbers = np.nonzero(near & (self._number >= 0))
-            found.append((at + k, self._number[tuple(numbers)]))
+            at, *which = np.nonzero(near)
+            found.append((at + k, number[tuple(which)]))
         at, pairs = (np.concatenate(parts) for parts in zip(*found, strict=True))
         order = np.lexsort((pairs, at))
         return at[order], pairs[order]

@@ -119,3 +119,10 @@ def test_boxes_are_as_large_as_they_are_whatever_is_asked_first() -> None:
     }
     assert len(answers) == 1
     assert float.fromhex(answers.pop().strip()) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_nothing_is_said_of_what_lives_until_the_process_ends() -> None:
+    """Caches and globals keep shapes."""
+    code = "import builtins, coal; from vkc_pin.distances.shapes import Shapes; builtins.kept = Shapes([coal.Sphere(0.1)])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout + done.stderr == ""

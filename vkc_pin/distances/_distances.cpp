@@ -357,6 +357,7 @@ private:
 NB_MODULE(_distances, module)
 {
   module.doc() = "Signed distances of placed shapes, by coal, for many pairs at many states at once.";
+  nb::set_leak_warnings(false); // what caches and globals keep lives until the process ends
   module.attr("COAL_VERSION") = COAL_VERSION;
   nb::class_<Solid>(module, "Solid");
   module.def("primitive", &primitive);

@@ -105,6 +105,8 @@ def test_wings_are_small_and_modules_short() -> None:
             folder = name.rpartition(".")[0]
             sizes[folder] = sizes.get(folder, 0) + 1
         assert len(file.read_text(encoding="utf-8").splitlines()) <= 300, name
+    for file in (ROOT / "vkc_pin").rglob("*.[ch]pp"):
+        assert len(file.read_text(encoding="utf-8").splitlines()) <= 300, file.name
     assert {folder: size for folder, size in sizes.items() if size > 10} == {}
 
 

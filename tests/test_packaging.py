@@ -56,6 +56,7 @@ def test_compiled_against_what_is_required(project: dict[str, Any]) -> None:
     run = {r.name: r.specifier for r in map(Requirement, project["project"]["dependencies"])}
     assert build["libpinocchio"] == run["pin"]
     assert build["casadi"] == run["casadi"]
+    assert build["libcoal"] == run["coal"]
 
 
 def test_package_is_typed_and_licensed() -> None:
@@ -64,8 +65,8 @@ def test_package_is_typed_and_licensed() -> None:
 
 
 def test_wheel_carries_robots_and_scenes(tmp_path: Path) -> None:
-    """Robots, scenes and `py.typed` are in the wheel (built without the compiled module: that takes a minute)."""
-    settings = {"cmake.define.VKC_PIN_BUILD_CPIN": "OFF"}
+    """Robots, scenes and `py.typed` are in the wheel (built without the compiled modules: they take a minute)."""
+    settings = {f"cmake.define.VKC_PIN_BUILD_{module}": "OFF" for module in ("CPIN", "DISTANCES")}
     code = f"from scikit_build_core.build import build_wheel; build_wheel({str(tmp_path)!r}, {settings})"
     done = subprocess.run([sys.executable, "-c", code], cwd=CHECKOUT, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -76,4 +77,4 @@ def test_wheel_carries_robots_and_scenes(tmp_path: Path) -> None:
         files = {p.relative_to(CHECKOUT) for p in (CHECKOUT / kind).rglob("*") if p.is_file() and "__pycache__" not in p.parts}
         assert files
         assert {f"vkc_pin/{path.as_posix()}" for path in files} <= names
-    assert not [name for name in names if name.startswith("tests/") or name.endswith(".cpp")]
+    assert not [name for name in names if name.startswith("tests/") or name.endswith((".cpp", ".hpp"))]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import coal
 import numpy as np
 import pinocchio as pin
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -86,16 +85,6 @@ def test_what_is_far_is_left_out() -> None:
     at, pairs, _ = part.maybe_within(0.05, *joints)
     assert 0 < (distances < 0.05).sum() <= len(at) < 0.05 * distances.size
     assert (distances[at, pairs] < 0.4).all()
-
-
-@pytest.mark.parametrize("rows", [1, 7])
-def test_many_configurations_are_looked_at_in_parts(rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(1)
-    part, joints = random_geometry(rng), random_joints(rng, 20)
-    at_once = part.maybe_within(0.1, *joints)
-    monkeypatch.setattr("vkc_pin.chain.broadphase._ROWS", rows)
-    for one, other in zip(at_once, part.maybe_within(0.1, *joints), strict=True):
-        np.testing.assert_array_equal(one, other)
 
 
 @settings(max_examples=20, deadline=None)

@@ -314,7 +314,6 @@ def test_contacts_do_not_depend_on_how_many_configurations_are_looked_at_at_once
     at_once = problem.contacts.evaluate(z, waypoints, reach=0.3, nearest=4)
     assert np.all(np.diff(at_once.waypoint) >= 0)
     monkeypatch.setattr("vkc_pin.chain.contacts._ROWS", 50)
-    monkeypatch.setattr("vkc_pin.chain.broadphase._ROWS", 7)
     in_portions = problem.contacts.evaluate(z, waypoints, reach=0.3, nearest=4)
     for one, other in zip(at_once.arrays(), in_portions.arrays(), strict=True):
         np.testing.assert_array_equal(one, other)

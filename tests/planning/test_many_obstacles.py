@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -22,6 +21,7 @@ from vkc_pin.benchmarks.scale import crowded
 from vkc_pin.chain import collision_pairs as easing
 from vkc_pin.chain.broadphase import PhaseGeometry
 from vkc_pin.chain.contacts import ContactModel
+from vkc_pin.distances.shapes import asked
 from vkc_pin.driving.body import Body
 from vkc_pin.models import shapes as geometry
 from vkc_pin.models.shapes import clearance, shape_distance
@@ -38,6 +38,7 @@ from vkc_pin.validation.clearance import clearance_curves
 from vkc_pin.validation.distances import Placed, travelled
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.samples import Samples
+from vkc_pin.validation.sweep import _Sweep, sweep
 from vkc_pin.validation.touching import may_touch
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -46,31 +47,23 @@ COAL = 2e-5  # [m] by which answers of coal differ that it came to from differen
 
 
 class Counter:
-    """Counts how often coal is asked for a distance."""
+    """Counts how often coal is asked for a distance, from Python or in compiled code."""
 
     def __init__(self) -> None:
         self.asked = 0
 
     @contextmanager
     def counting(self, patch: pytest.MonkeyPatch) -> Iterator[None]:
-        real, functor, counter = coal.distance, coal.ComputeDistance, self
+        real, counter, before = coal.distance, self, asked()
 
         def distance(*arguments: Any) -> float:
             counter.asked += 1
             return real(*arguments)
 
-        class Functor:
-            def __init__(self, *shapes: Any) -> None:
-                self.ask = functor(*shapes)
-
-            def __call__(self, *arguments: Any) -> float:
-                counter.asked += 1
-                return self.ask(*arguments)
-
         with patch.context() as context:
             context.setattr(coal, "distance", distance)
-            context.setattr(coal, "ComputeDistance", Functor)
             yield
+        self.asked += asked() - before
 
 
 # --- what it costs --------------------------------------------------------------------------------------------------
@@ -83,7 +76,8 @@ def plans() -> dict[int, tuple[Plan, int]]:
     for count in (30, 1000):
         counter, scene = Counter(), crowded(count)
         with counter.counting(pytest.MonkeyPatch()):
-            found[count] = plan(scene, [Actuate("door", {"hinge": 1.2})]), counter.asked
+            result = plan(scene, [Actuate("door", {"hinge": 1.2})])
+        found[count] = result, counter.asked
     return found
 
 
@@ -99,24 +93,24 @@ def test_distances_asked_for_hardly_depend_on_the_number_of_obstacles(plans: dic
 
 
 def test_the_floor_of_the_base_asks_for_few(plans: dict[int, tuple[Plan, int]]) -> None:
-    asked = []
+    counts = []
     for count in (30, 1000):
         counter = Counter()
         with counter.counting(pytest.MonkeyPatch()):
             assert plan(plans[count][0].scene, [GoTo(1.5, -0.6)], initialization="astar").success
-        asked.append(counter.asked)
-    assert asked[1] <= 2 * asked[0]
+        counts.append(counter.asked)
+    assert counts[1] <= 2 * counts[0]
 
 
 def test_pictures_of_clearance_ask_for_few(plans: dict[int, tuple[Plan, int]]) -> None:
-    found, asked = [], []
+    found, counts = [], []
     for result, _ in plans.values():
         counter, times = Counter(), result.trajectory.times
         with counter.counting(pytest.MonkeyPatch()):
             found.append(clearance_curves(result.scene, result.trajectory, times, dist_safe=0.02))
-        asked.append(counter.asked / len(times))
+        counts.append(counter.asked / len(times))
     assert [curve.name for curve in found[0]] == [curve.name for curve in found[1]]
-    assert max(asked) < 200  # at every moment, of 26,000 pairs
+    assert max(counts) < 200  # at every moment, of 26,000 pairs
 
 
 # --- contacts -------------------------------------------------------------------------------------------------------
@@ -226,7 +220,7 @@ def check_sweep(scene: Scene, motion: Trajectory) -> None:
     samples = Samples(scene, motion)
     touching = may_touch(scene, samples.world, motion, (), 0.02)
     table = PairTable(scene, samples.world, motion, 0.02, touching=touching)
-    hits = list(table.sweep(samples.z, samples.waypoint_rows))
+    hits = list(sweep(table, samples.z, samples.waypoint_rows))
     distances = brute_force(table, samples.z)
     at_samples = min(hit.distance for hit in hits)
     assert at_samples <= distances.min() + COAL
@@ -249,24 +243,25 @@ def test_bounds_are_bounds(seed: int, count: int, size: float) -> None:
     table = PairTable(scene, samples.world, samples.trajectory, 0.02)
     z = samples.z[samples.waypoint_rows]
     distances = brute_force(table, z)
-    placed = [table.solids.at(q) for q in samples.world.coordinates.q(z)]
-    for here, expected in zip(placed, distances, strict=True):
-        bounds = here.bounds(table.pairs)
-        assert (bounds <= expected + COAL).all()
-        assert (bounds[np.isfinite(bounds)] >= 0.0).all()
-        for reach in (0.02, 0.5):
-            close = table._close(here, np.full(len(table.group), reach))
-            assert set(np.flatnonzero(expected < reach - COAL).tolist()) <= set(close.tolist())
-        np.testing.assert_allclose(here.distances(table.pairs), expected, rtol=0.0, atol=COAL)
-        nearest, distance = here.nearest(table.pairs)
-        assert distance == pytest.approx(expected.min(), abs=COAL)
-        assert expected[nearest] == pytest.approx(expected.min(), abs=COAL)
-    bounds = np.diff(travelled(table.solids, samples.z)[samples.waypoint_rows], axis=0)
-    for t, (here, there) in enumerate(itertools.pairwise(placed)):
-        floor = (distances[t] + distances[t + 1] - bounds[t, table.pairs].sum(axis=1)) / 2
-        for smallest in (1e-3, 0.1):
-            active = set(table._active(here, there, bounds[t], smallest).tolist())
-            assert set(np.flatnonzero(floor < smallest - COAL).tolist()) <= active
+    placed, count = table.solids.at(samples.world.coordinates.q(z)), len(table.pairs)
+    at, pairs = np.repeat(np.arange(len(z)), count), np.tile(table.pairs, (len(z), 1))
+    bounds = placed.bounds(at, pairs).reshape(-1, count)
+    assert (bounds <= distances + COAL).all()
+    assert (bounds[np.isfinite(bounds)] >= 0.0).all()
+    for reach in (0.02, 0.5):
+        close = table.close(placed, np.arange(len(z)), np.full((len(z), len(table.group)), reach))
+        assert set(map(tuple, np.argwhere(distances < reach - COAL).tolist())) <= set(
+            zip(*map(np.ndarray.tolist, close), strict=True)
+        )
+    np.testing.assert_allclose(placed.distances(at, pairs).reshape(-1, count), distances, rtol=0.0, atol=COAL)
+    nearest, least = placed.nearest(table.pairs)
+    np.testing.assert_allclose(least, distances.min(axis=1), rtol=0.0, atol=COAL)
+    np.testing.assert_allclose(distances[np.arange(len(z)), nearest], distances.min(axis=1), rtol=0.0, atol=COAL)
+    moved = np.diff(travelled(table.solids, samples.z)[samples.waypoint_rows], axis=0)
+    floor = (distances[:-1] + distances[1:] - moved[:, table.pairs].sum(axis=2)) / 2
+    for smallest in (1e-3, 0.1):
+        active = set(zip(*map(np.ndarray.tolist, _Sweep(table)._active(placed, moved, smallest)), strict=True))
+        assert set(map(tuple, np.argwhere(floor < smallest - COAL).tolist())) <= active
 
 
 # --- plans ----------------------------------------------------------------------------------------------------------
@@ -282,15 +277,19 @@ def cull_nothing(patch: pytest.MonkeyPatch) -> None:
         counts = np.full(len(w), True) if standing else part.joint[part.pairs[k, 1]] != 0
         return w[counts], k[counts], np.full(np.count_nonzero(counts), -np.inf)
 
-    def nowhere(placed: Placed, pairs: np.ndarray) -> np.ndarray:
+    def nowhere(placed: Placed, states: np.ndarray, pairs: np.ndarray) -> np.ndarray:
         return np.full(len(pairs), -np.inf)
+
+    def all_of(table: PairTable, _: Placed, states: np.ndarray, *__: Any) -> tuple[np.ndarray, ...]:
+        count = len(table.pairs)
+        return np.repeat(np.arange(len(states)), count), np.tile(np.arange(count), len(states))
 
     def everywhere(shape: coal.CollisionGeometry, placement: pin.SE3) -> tuple[np.ndarray, np.ndarray]:
         return np.full(3, -1e3), np.full(3, 1e3)
 
     patch.setattr(PhaseGeometry, "maybe_within", all_pairs_of)
     patch.setattr(Placed, "bounds", nowhere)
-    patch.setattr(PairTable, "_close", lambda table, placed, reach: np.arange(len(table.pairs)))
+    patch.setattr(PairTable, "close", all_of)
     patch.setattr(Body, "_close", lambda body, along: np.arange(len(body.moving)))
     for module in (geometry, easing):
         patch.setattr(module, "world_box", everywhere)
@@ -304,7 +303,7 @@ def test_culling_changes_no_plan(task: str, monkeypatch: pytest.MonkeyPatch) -> 
     if task == "stick":  # it is put down further along the table, beside a fence
         steps = [Place("stick", lifted(STICK, [0.0, 0.4, 0.0]))]
         scene = room(table(), *(box(f"pale_{k}", [0.1] * 3, [1.5, 0.12 * k - 1.0, 0.5]) for k in range(20)))
-    asked, found = [], []
+    counts, found = [], []
     for culled in (True, False):
         counter = Counter()
         with monkeypatch.context() as patch:
@@ -312,9 +311,9 @@ def test_culling_changes_no_plan(task: str, monkeypatch: pytest.MonkeyPatch) -> 
                 cull_nothing(patch)
             with counter.counting(patch):
                 found.append(plan(scene, steps))
-        asked.append(counter.asked)
+        counts.append(counter.asked)
     one, other = found
-    assert 10 * asked[0] < asked[1]
+    assert 10 * counts[0] < counts[1]
     assert one.success
     assert other.success
     assert one.initialization == other.initialization

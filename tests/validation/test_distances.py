@@ -40,15 +40,16 @@ def where(q: np.ndarray) -> list[pin.SE3]:
 @pytest.mark.parametrize("seed", range(3))
 def test_bounds_hold_and_the_nearest_is_the_nearest(seed: int) -> None:
     shapes, q = solids().world.shapes, configuration(seed)
-    placed, at = solids().at(q), where(q)
+    placed, at = solids().at(q[None]), where(q)
     pairs = np.array([(a, b) for a, b in itertools.combinations(range(len(shapes)), 2) if a < solids().bodies])
     pairs = pairs[np.random.default_rng(seed).permutation(len(pairs))[:400]]
+    first = np.zeros(len(pairs), int)
     expected = np.array([shape_distance(shapes[a].geometry, at[a], shapes[b].geometry, at[b]) for a, b in pairs.tolist()])
-    np.testing.assert_allclose(placed.distances(pairs), expected, atol=COAL)
-    bounds = placed.bounds(pairs)
+    np.testing.assert_allclose(placed.distances(first, pairs), expected, atol=COAL)
+    bounds = placed.bounds(first, pairs)
     assert (bounds <= expected + COAL).all()
     assert np.isfinite(bounds).mean() > 0.8, "and most say something"
-    best, least = placed.nearest(pairs)
+    ((best,), (least,)) = placed.nearest(pairs)
     assert least == pytest.approx(expected.min(), abs=COAL)
     assert expected[best] == pytest.approx(least, abs=COAL)
 
@@ -56,7 +57,7 @@ def test_bounds_hold_and_the_nearest_is_the_nearest(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_what_is_around_a_point(seed: int) -> None:
     q, rng = configuration(seed), np.random.default_rng(seed)
-    placed, at = solids().at(q), where(q)
+    placed, at = solids().at(q[None]), where(q)
     counted = 0
     for point in [at[0].translation + rng.normal(scale=0.3, size=3) for _ in range(5)]:
         ball, here = coal.Sphere(POINT), pin.SE3(np.eye(3), point)
@@ -67,11 +68,29 @@ def test_what_is_around_a_point(seed: int) -> None:
     assert counted > 0
 
 
+def test_many_configurations_are_as_one_by_one() -> None:
+    q = np.array([configuration(seed) for seed in range(6)])
+    together, count = solids().at(q), solids().bodies
+    pairs = np.array([(a, b) for a in range(count) for b in range(count, len(solids().world.shapes))])
+    which, distances = together.nearest(pairs)
+    for state, row in enumerate(q):
+        alone, none = solids().at(row[None]), np.zeros(len(pairs), int)
+        np.testing.assert_array_equal(alone.nearest(pairs), ([which[state]], [distances[state]]))
+        np.testing.assert_array_equal(alone.distances(none, pairs), together.distances(none + state, pairs))
+        np.testing.assert_array_equal(alone.bounds(none, pairs), together.bounds(none + state, pairs))
+        for one, other in zip(alone.corners, together.corners, strict=True):
+            np.testing.assert_array_equal(one[0], other[state])
+
+
 def test_only_what_may_be_nearest_is_asked_of_coal(monkeypatch: pytest.MonkeyPatch) -> None:
-    mine, asked = Solids(World(door_scene())), []
-    distance = mine.distance
-    monkeypatch.setattr(mine, "distance", lambda *pair: asked.append(pair) or distance(*pair))
+    """What bounds show to be further away than another is not looked at, even where they are wrong."""
+    mine = Solids(World(door_scene()))
     pairs = np.array([(a, b) for a in range(mine.bodies) for b in range(mine.bodies, len(mine.world.shapes))])
-    q = np.asarray(mine.world.coordinates.q(np.zeros(mine.world.coordinates.size)))
-    mine.at(q).nearest(pairs)
-    assert 0 < len(asked) < 0.2 * len(pairs)
+    placed = mine.at(mine.world.coordinates.q(np.zeros((1, mine.world.coordinates.size))))
+    distances = placed.distances(np.zeros(len(pairs), int), pairs)
+    (best,), _ = placed.nearest(pairs)
+    assert distances[best] == distances.min()
+    wrong = int(np.argmax(distances))
+    bounds = np.where(np.arange(len(pairs)) == wrong, 0.0, distances[wrong] + 1.0)
+    monkeypatch.setattr(placed, "bounds", lambda *_: bounds)
+    assert placed.nearest(pairs)[0].tolist() == [wrong]

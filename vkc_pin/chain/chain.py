@@ -12,7 +12,7 @@ import pinocchio as pin
 from vkc_pin.arrays import Bools, Floats, Ints
 from vkc_pin.cache import Cache
 from vkc_pin.chain.inversion import invert
-from vkc_pin.chain.kinematics import kinematics_of
+from vkc_pin.chain.kinematics import Kinematics, kinematics_of
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.models.coordinates import Coordinates
 from vkc_pin.models.grafting import clean, graft, graft_geometry
@@ -90,6 +90,11 @@ class VirtualKinematicChain:
         """
         return np.where(np.array(self.coordinates.units) == "m", 1.0 / self.robot.lever, 1.0)
 
+    @cached_property
+    def _kinematics(self) -> Kinematics:
+        """Kept here: to look for it in the cache takes as long as to use it."""
+        return kinematics_of(self.model, self.cache)
+
     def joint_placements(self, z: Floats) -> tuple[Floats, Floats]:
         """Return rotations, shape (W, J, 3, 3), and translations, shape (W, J, 3) [m], of all joints in the world.
 
@@ -97,7 +102,7 @@ class VirtualKinematicChain:
             z: Configurations, shape (W, n). Joint 0, the world, is among the J.
         """
         batch, joints = len(z), self.model.njoints
-        (columns,) = kinematics_of(self.model, self.cache).batch(z)
+        (columns,) = self._kinematics.batch(z)
         columns = columns.reshape(batch, joints - 1, 12)
         rotations, translations = np.zeros((batch, joints, 3, 3)), np.zeros((batch, joints, 3))
         rotations[:, 0] = np.eye(3)

@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from bisect import insort
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import coal
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
@@ -21,15 +20,17 @@ from numpy.typing import NDArray
 from vkc_pin.arrays import Floats, Ints
 from vkc_pin.chain.chain import VirtualKinematicChain
 from vkc_pin.chain.collision_pairs import phase_geometries
-from vkc_pin.chain.narrowphase import Distances
+from vkc_pin.distances.placements import ShapePlacements
+from vkc_pin.distances.shapes import Shapes
 from vkc_pin.options import Options
 from vkc_pin.scene.placed import standing_geometry
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.phases import Task
 
-__all__ = ["ContactModel", "Contacts"]
+__all__ = ["ContactModel", "Contacts", "no_contacts"]
 
 _ROUNDING = 1e-6  # [m] of coal
+_TOLERANCE = 1e-8  # of coal's distances: at its own 1e-6 the gradients of planes are off by up to 5e-3; this takes no longer
 _ROWS = 256  # configurations whose kinematics are computed at once
 
 
@@ -82,6 +83,12 @@ class Contacts:
         return float(np.min(self.distance, initial=np.inf))
 
 
+def no_contacts() -> Contacts:
+    """Return contacts of nothing with nothing."""
+    none, vectors = np.zeros(0), np.zeros((0, 3))
+    return Contacts(np.zeros(0, int), np.zeros((0, 2), int), none, none, vectors, vectors, vectors)
+
+
 class ContactModel:
     """What can collide with what in each phase of a task, and how close it is.
 
@@ -92,11 +99,10 @@ class ContactModel:
 
     def __init__(self, scene: Scene, chain: VirtualKinematicChain, task: Task, options: Options) -> None:
         self.scene, self.chain, self.task = scene, chain, task
-        self.data = chain.model.createData()
         self.first_waypoint = np.concatenate([[0], np.cumsum([phase.segments for phase in task.phases])])
-        self._placed = pin.GeometryData(chain.collision)
+        self._placed = ShapePlacements(chain.model, chain.collision)
         self.phases = phase_geometries(scene, chain, task, options)
-        self._distances = [Distances(part.shapes, self._placed.oMg) for part in self.phases]
+        self._shapes = [_shapes_of(part.shapes, len(chain.collision.geometryObjects)) for part in self.phases]
         # Beyond the chain's own geometries everything stands in the world.
         own = [shape.parentJoint for shape in chain.collision.geometryObjects]
         self._joints = np.array(own + [0] * (max(len(part.labels) for part in self.phases) - len(own)))
@@ -109,7 +115,7 @@ class ContactModel:
         if not any(phase.left for phase in self.task.phases):
             return self
         view = copy.copy(self)
-        view.phases, view._distances = list(self.phases), list(self._distances)
+        view.phases, view._shapes = list(self.phases), list(self._shapes)
         for number, phase in enumerate(self.task.phases):
             where: dict[int, pin.SE3] = {}
             for name, (hold, before) in phase.left.items():
@@ -121,7 +127,7 @@ class ContactModel:
                 where |= {index: shape.placement for index, shape in shapes}
             if where:
                 view.phases[number] = self.phases[number].placed(where)
-                view._distances[number] = self._distances[number].placed(where)
+                view._shapes[number] = self._shapes[number].placed(where)
         return view
 
     def phase_of(self, waypoint: int) -> int:
@@ -144,42 +150,36 @@ class ContactModel:
             nearest: How many of them to return per configuration, those that fall shortest of their margins; None: all.
             standing: Whether what stands in the world counts, too; otherwise only pairs of which both move.
         """
-        q = self.chain.coordinates.q(z)
         rotations, translations = self.placements(z)
         phase_of = np.maximum(np.searchsorted(self.first_waypoint, waypoints) - 1, 0)
-        rows: list[tuple[float, ...]] = []
-        vectors: list[Floats] = []
+        parts: list[tuple[NDArray[Any], ...]] = []
         for number in set(phase_of.tolist()):
             part, inside = self.phases[number], np.flatnonzero(phase_of == number)
             at, pairs, bounds = part.maybe_within(reach, rotations[inside], translations[inside], standing=standing)
+            if not len(at):
+                continue
             margins = part.margins_at(pairs, waypoints[inside[at]])
             least = bounds - margins
             order = np.lexsort((pairs, least, at))
-            columns = (pairs, *part.pairs[pairs].T, margins, least)
-            pair, first, second, margin, bound = (column[order].tolist() for column in columns)
-            edges = np.searchsorted(at, np.arange(len(inside) + 1)).tolist()
-            for row, begin, end in zip(inside.tolist(), edges[:-1], edges[1:], strict=True):
-                if begin == end:
-                    continue
-                pin.updateGeometryPlacements(self.chain.model, self.data, self.chain.collision, self._placed, q[row])
-                asked = self._distances[number].moved()
-                found: list[tuple[float, float, int, int, coal.DistanceResult]] = []
-                for i in range(begin, end):
-                    if nearest is not None and len(found) >= nearest and bound[i] > found[nearest - 1][0] + _ROUNDING:
-                        break  # neither this one nor any after it is among the nearest
-                    result = asked.of(first[i], second[i])
-                    distance = result.min_distance
-                    if distance < reach:
-                        insort(found, (distance - margin[i], distance, pair[i], i, result))
-                for _, distance, _, i, result in found[:nearest]:
-                    rows.append((row, first[i], second[i], distance, margin[i]))
-                    vectors += (result.normal.copy(), result.getNearestPoint1(), result.getNearestPoint2())
-        table = np.array(rows, float).reshape(len(rows), 5)
-        order = np.argsort(table[:, 0], kind="stable")
-        table, stacked = table[order], np.array(vectors, float).reshape(len(rows), 3, 3)[order]
-        index = table[:, :3].astype(int)
-        places = {"normal": stacked[:, 0], "first": stacked[:, 1], "second": stacked[:, 2]}
-        return Contacts(index[:, 0], index[:, 1:], distance=table[:, 3], margin=table[:, 4], **places)
+            at, pairs, margins, least = at[order], pairs[order], margins[order], least[order]
+            begins = np.flatnonzero(np.diff(at, prepend=-1))
+            where = self._placed.at(self.chain.coordinates.q(z[inside[at[begins]]]))
+            chosen, found = self._shapes[number].shortest(
+                where,
+                np.append(begins, len(at)),
+                part.pairs[pairs],
+                numbers=pairs,
+                margins=margins,
+                bounds=least,
+                reach=reach,
+                most=nearest,
+                rounding=_ROUNDING,
+            )
+            parts.append((inside[at[chosen]], part.pairs[pairs[chosen]], found.distance, margins[chosen], *found[1:]))
+        if not parts:
+            return no_contacts()
+        columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+        return Contacts(*columns).select(np.argsort(columns[0], kind="stable"))
 
     def placements(self, z: Floats) -> tuple[Floats, Floats]:
         """Return the same as the chain's `joint_placements`; in portions of one size, as CasADi prepares for each size anew."""
@@ -226,3 +226,8 @@ class ContactModel:
             coefficients[r, s, j - 1, 3] += sign * n
         offsets[row, slot] = offset
         return coefficients.reshape(len(z), slots, 12 * joints), offsets
+
+
+def _shapes_of(shapes: Sequence[pin.GeometryObject], moving: int) -> Shapes:
+    """Return shapes, the first of which are `moving`, to ask for distances."""
+    return Shapes([shape.geometry for shape in shapes], [shape.placement for shape in shapes[moving:]], tolerance=_TOLERANCE)

@@ -16,13 +16,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vkc_pin.arrays import Floats
+from vkc_pin.distances.solids import indices
 from vkc_pin.errors import InputError
 from vkc_pin.files.hulls import outer_hull
 
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["MeshPart", "coarser", "convex_hull", "indices", "load_convex", "load_mesh", "load_parts", "to_bvh"]
+__all__ = ["MeshPart", "coarser", "convex_hull", "load_convex", "load_mesh", "load_parts", "to_bvh"]
 
 _NEIGHBOURS = 255  # coal's corners have no more
 _TOLERANCE = 1e-6  # how far, relatively, coal's volume and area may be from trimesh's
@@ -194,13 +195,6 @@ def _factors(file: Path, scale: ArrayLike) -> Floats:
     if factors.shape not in ((), (1,), (3,)) or not (np.isfinite(factors).all() and (factors != 0.0).all()):
         raise InputError("wrong scale of a mesh", file=file, field="scale", expected="3 finite numbers other than 0", got=scale)
     return np.broadcast_to(factors, (3,)).astype(float)
-
-
-def indices(shape: coal.Convex | coal.BVHModelBase) -> NDArray[np.int64]:
-    """Return the corners of the triangles of a coal shape, shape (m, 3)."""
-    convex = isinstance(shape, coal.Convex)
-    count, item = (shape.num_polygons, shape.polygons) if convex else (shape.num_tris, shape.tri_indices)
-    return np.array([[triangle[i] for i in range(3)] for triangle in map(item, range(count))], np.int64).reshape(-1, 3)
 
 
 def _colour(mesh: trimesh.Trimesh) -> tuple[float, float, float, float] | None:

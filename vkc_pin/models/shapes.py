@@ -10,8 +10,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from vkc_pin.arrays import Floats
+from vkc_pin.distances.solids import indices
 from vkc_pin.errors import InputError
-from vkc_pin.files.meshes import indices
 from vkc_pin.models.grafting import clean
 
 __all__ = [
@@ -144,20 +144,3 @@ def world_box(shape: coal.CollisionGeometry, placement: pin.SE3) -> tuple[Floats
     centre = placement.act(np.asarray(box.center(), float))
     extent = np.abs(placement.rotation) @ np.array([box.width(), box.height(), box.depth()]) / 2
     return centre - extent, centre + extent
-
-
-def _settle_boxes() -> None:
-    """Let coal take boxes as they are, whatever it is asked first.
-
-    coal 3.0.3 decides once per process, from the first direction in which it looks for a box's furthest corner, whether boxes are
-    1e-10 larger on their negative sides: yes if a component is zero (a `static` in `getShapeSupport`, gone in later versions). So
-    the first question of a process would decide on the last digits of every distance to a box. This one has no such component.
-    """
-    turned = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
-    box, here, there = coal.Box(1.0, 1.0, 1.0), coal.Transform3s(), coal.Transform3s(turned, np.array([3.0, 0.4, 0.2]))
-    plane = coal.Halfspace(np.array([0.36, 0.48, 0.8]), 0.0)  # for the other one, of shapes with a swept sphere
-    for shape, where in ((coal.Capsule(0.1, 0.5), there), (plane, here)):
-        coal.distance(shape, here, box, where, coal.DistanceRequest(), coal.DistanceResult())
-
-
-_settle_boxes()

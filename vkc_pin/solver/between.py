@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from vkc_pin.arrays import Floats, Ints
-from vkc_pin.chain.contacts import Contacts
+from vkc_pin.chain.contacts import Contacts, no_contacts
 from vkc_pin.program.problem import TrajectoryProblem
 
 __all__ = ["collisions_between", "merge"]
@@ -41,7 +41,7 @@ def collisions_between(problem: TrajectoryProblem, z: Floats) -> tuple[Contacts,
     rows = np.unique(near.waypoint)
     segment, begin, length = segment[rows], piece[rows] / counts[segment[rows]], 1 / counts[segment[rows]]
     if not len(rows):
-        return _empty(), True
+        return no_contacts(), True
     segment = np.repeat(segment, FINER)
     s = (begin[:, None] + length[:, None] * (np.arange(FINER) + 0.5) / FINER).ravel()
     states, waypoints = _states(path, segment, s)
@@ -85,8 +85,3 @@ def merge(*parts: Contacts) -> Contacts:
     """Return all contacts of `parts`, per waypoint those first that fall shortest of their margins."""
     joined = Contacts(*(np.concatenate(arrays) for arrays in zip(*(part.arrays() for part in parts), strict=True)))
     return joined.select(np.lexsort((joined.distance - joined.margin, joined.waypoint)))
-
-
-def _empty() -> Contacts:
-    none, vectors = np.zeros(0), np.zeros((0, 3))
-    return Contacts(np.zeros(0, int), np.zeros((0, 2), int), none, none, vectors, vectors, vectors)

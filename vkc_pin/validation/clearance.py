@@ -57,16 +57,11 @@ def clearance_curves(scene: Scene, trajectory: Trajectory, times: ArrayLike, *, 
     moments = np.atleast_1d(np.asarray(times, float))
     kinds = np.array([_kind(table, pair, margin) for pair, margin in zip(table.pairs, table.margins, strict=True)])
     groups = {kind: table.pairs[kinds == kind] for kind in _KINDS if (kinds == kind).any()}
-    nearest: dict[str, list[tuple[int, float]]] = {kind: [] for kind in groups}
-    for q in world.coordinates.q(world.positions(trajectory, moments)):
-        placed = table.solids.at(q)
-        for kind, pairs in groups.items():
-            nearest[kind].append(placed.nearest(pairs))
-    curves = []
-    for kind, found in nearest.items():
-        closest = groups[kind][[k for k, _ in found]]
-        names = tuple((world.collision_labels[i], world.collision_labels[j]) for i, j in closest)
-        curves.append(ClearanceCurve(kind, moments, np.array([distance for _, distance in found]), names))
+    placed, curves = table.solids.at(world.coordinates.q(world.positions(trajectory, moments))), []
+    for kind, pairs in groups.items():
+        which, distances = placed.nearest(pairs)
+        names = tuple((world.collision_labels[i], world.collision_labels[j]) for i, j in pairs[which])
+        curves.append(ClearanceCurve(kind, moments, distances, names))
     return curves
 
 

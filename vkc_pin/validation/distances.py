@@ -1,4 +1,4 @@
-"""How far a world's shapes are from each other at one configuration, and how far they move along a motion, at most.
+"""How far a world's shapes are from each other at configurations, and how far they move along a motion, at most.
 
 There are lower bounds of distances from boxes, and coal's own. Nothing of it is the planner's, so that what its culling
 overlooked would be found here.
@@ -6,7 +6,6 @@ overlooked would be found here.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cached_property
 
 import coal
@@ -14,7 +13,9 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.arrays import Floats, Ints
-from vkc_pin.models.shapes import bounding_box
+from vkc_pin.distances.placements import ShapePlacements, columns_of
+from vkc_pin.distances.shapes import Shapes
+from vkc_pin.models.shapes import bounding_box, shape_distance
 from vkc_pin.motion.world import World
 
 __all__ = ["Placed", "Solids", "travelled"]
@@ -29,7 +30,8 @@ class Solids:
         world: The world, with G shapes.
         bodies: How many of these, the first, belong to the robot or an object; the others are obstacles.
         center, half: Of a box around each in its own frame, centre and half extents, shape (G, 3) [m].
-        obstacle_corners, obstacle_transforms: See `corners`, and where they are, for coal.
+        obstacle_corners: See `corners`.
+        asked: The shapes, to ask coal for distances.
     """
 
     def __init__(self, world: World) -> None:
@@ -38,111 +40,99 @@ class Solids:
         self.center = np.array([center for center, _ in boxes]).reshape(-1, 3)
         self.half = np.array([half for _, half in boxes]).reshape(-1, 3)
         obstacles = slice(self.bodies, None)
-        self.obstacle_corners = self.corners([shape.placement for shape in world.shapes[obstacles]], obstacles)
-        self.obstacle_transforms = [_transform(shape.placement) for shape in world.shapes[obstacles]]
-        self._geometries = [shape.geometry for shape in world.shapes]
-        self._data = world.model.createData()
-        self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
+        where = [shape.placement for shape in world.shapes[obstacles]]
+        self.asked = Shapes([shape.geometry for shape in world.shapes], where)
+        self.obstacle_corners = self.corners(columns_of(where), obstacles)
+        self._placements = ShapePlacements(world.model, world.bodies)
 
     def at(self, q: Floats) -> Placed:
-        """Return the shapes as they are placed at Pinocchio's configuration `q` of the world."""
-        placed = pin.GeometryData(self.world.bodies)
-        pin.updateGeometryPlacements(self.world.model, self._data, self.world.bodies, placed, q)
-        return Placed(self, placed)
+        """Return the shapes as they are placed at Pinocchio's configurations of the world, shape (W, nq)."""
+        return Placed(self, self._placements.at(q))
 
-    def corners(self, where: Sequence[pin.SE3], which: slice) -> tuple[Floats, Floats]:
-        """Return lower and upper corners of boxes along the world's axes around some shapes, shape (k, 3) each [m].
+    def corners(self, where: Floats, which: slice) -> tuple[Floats, Floats]:
+        """Return lower and upper corners of boxes along the world's axes around some shapes, shape (..., k, 3) each [m].
 
         Args:
-            where: Placements of these shapes in the world.
+            where: Placements of these shapes in the world, shape (..., k, 12).
             which: The shapes.
         """
-        rotation = np.array([placement.rotation for placement in where]).reshape(-1, 3, 3)
-        translation = np.array([placement.translation for placement in where]).reshape(-1, 3)
-        middle = (rotation @ self.center[which, :, None])[..., 0] + translation
-        extent = (np.abs(rotation) @ self.half[which, :, None])[..., 0]
+        rotation = where[..., :9].reshape(*where.shape[:-1], 3, 3).swapaxes(-1, -2)
+        middle = np.einsum("...ij,...j->...i", rotation, self.center[which]) + where[..., 9:]
+        extent = np.einsum("...ij,...j->...i", np.abs(rotation), self.half[which])
         return middle - extent, middle + extent
-
-    def distance(
-        self, first: int | coal.CollisionGeometry, here: coal.Transform3s, second: int, there: coal.Transform3s
-    ) -> float:
-        """Return coal's signed distance [m] of two shapes, or of any other and a shape, placed `here` and `there` in the world.
-
-        Nothing is kept from one distance to the next, which would change its last digits.
-        """
-        self._result.clear()
-        one = self._geometries[first] if isinstance(first, int) else first
-        return float(coal.distance(one, here, self._geometries[second], there, self._request, self._result))
 
 
 class Placed:
-    """The shapes at one configuration.
+    """The shapes at W configurations.
 
     Args:
         solids: The shapes.
-        placed: Where those of robot and objects are in the world.
+        where: Where those of robot and objects are in the world, shape (W, M, 12).
     """
 
-    def __init__(self, solids: Solids, placed: pin.GeometryData) -> None:
-        self._solids, self._where = solids, placed.oMg
-        self._transforms: dict[int, coal.Transform3s] = {}
-        self._known: dict[tuple[int, int], float] = {}
+    def __init__(self, solids: Solids, where: Floats) -> None:
+        self._solids, self._where = solids, where
 
     @cached_property
     def corners(self) -> tuple[Floats, Floats]:
-        """Lower and upper corners of boxes along the world's axes around all shapes, shape (G, 3) each [m]."""
-        bodies = self._solids.corners(list(self._where), slice(self._solids.bodies))
-        lower, upper = (np.concatenate(parts) for parts in zip(bodies, self._solids.obstacle_corners, strict=True))
+        """Lower and upper corners of boxes along the world's axes around all shapes, shape (W, G, 3) each [m]."""
+        bodies = self._solids.corners(self._where, slice(self._solids.bodies))
+        obstacles = (np.broadcast_to(part, (len(self._where), *part.shape)) for part in self._solids.obstacle_corners)
+        lower, upper = (np.concatenate(parts, axis=1) for parts in zip(bodies, obstacles, strict=True))
         return lower, upper
 
-    def bounds(self, pairs: Ints) -> Floats:
-        """Return lower bounds of the distances of pairs, shape (n, 2), shape (n,) [m]; -inf where the boxes overlap."""
+    def bounds(self, states: Ints, pairs: Ints) -> Floats:
+        """Return lower bounds of the distances of pairs, shape (n, 2), at states, shape (n,): shape (n,) [m].
+
+        They are -inf where the boxes overlap.
+        """
         lower, upper = self.corners
         first, second = pairs.T
-        gaps = np.maximum(lower[second] - upper[first], lower[first] - upper[second])
+        gaps = np.maximum(lower[states, second] - upper[states, first], lower[states, first] - upper[states, second])
         outside = np.maximum(gaps, 0.0)
         return np.where(gaps.max(axis=1) > 0.0, np.sqrt(np.einsum("ni,ni->n", outside, outside)), -np.inf)
 
-    def distance(self, first: int, second: int) -> float:
-        """Return coal's signed distance of two shapes [m]."""
-        if (first, second) not in self._known:
-            here, there = self._transform(first), self._transform(second)
-            self._known[first, second] = self._solids.distance(first, here, second, there)
-        return self._known[first, second]
+    def distances(self, states: Ints, pairs: Ints) -> Floats:
+        """Return coal's signed distances of pairs, shape (n, 2), at states, shape (n,): shape (n,) [m]."""
+        return self._solids.asked.distances(self._where, states, pairs)
 
-    def distances(self, pairs: Ints) -> Floats:
-        """Return coal's signed distances of pairs, shape (n, 2), shape (n,) [m]."""
-        return np.array([self.distance(first, second) for first, second in pairs.tolist()], float)
+    def nearest(self, pairs: Ints) -> tuple[Ints, Floats]:
+        """Return which of pairs, shape (n, 2), is nearest at each state, and its distance [m]: shape (W,) each.
 
-    def nearest(self, pairs: Ints) -> tuple[int, float]:
-        """Return which of pairs, shape (n, 2), is nearest, and its distance [m]; only what may be is asked of coal."""
-        bounds = self.bounds(pairs)
-        best, least = -1, np.inf
-        for k in np.argsort(bounds, kind="stable").tolist():
-            if bounds[k] >= least:
-                break
-            distance = self.distance(*pairs[k].tolist())
-            if distance < least:
-                best, least = k, distance
-        return best, least
+        Only what may be nearest is asked of coal.
+        """
+        states, count = len(self._where), len(pairs)
+        at, which = np.repeat(np.arange(states), count), np.tile(np.arange(count), states)
+        bounds = self.bounds(at, pairs[which])
+        order = np.lexsort((which, bounds, at))
+        chosen, found = self._solids.asked.shortest(
+            self._where,
+            np.arange(states + 1) * count,
+            pairs[which[order]],
+            numbers=np.arange(len(order)),
+            margins=np.zeros(len(order)),
+            bounds=bounds[order],
+            reach=np.inf,
+            most=1,
+            rounding=0.0,
+        )
+        return which[order[chosen]], found.distance
 
     def around(self, point: Floats, reach: float) -> list[int]:
-        """Return the shapes that are closer than `reach` [m] to a point, shape (3,) [m]; a point has a size here, 0.1 mm."""
-        lower, upper = self.corners
+        """Return the shapes that are closer than `reach` [m] to a point, shape (3,) [m], at the first of the states.
+
+        A point has a size here, 0.1 mm.
+        """
+        lower, upper = (corners[0] for corners in self.corners)
         near = np.flatnonzero(((lower - point < reach + POINT) & (point - upper < reach + POINT)).all(axis=1)).tolist()
-        ball, here = coal.Sphere(POINT), coal.Transform3s(np.eye(3), point)
-        return [i for i in near if self._solids.distance(ball, here, i, self._transform(i)) < reach]
+        ball, here, shapes = coal.Sphere(POINT), pin.SE3(np.eye(3), point), self._solids.world.shapes
+        return [i for i in near if shape_distance(ball, here, shapes[i].geometry, self._placement(i)) < reach]
 
-    def _transform(self, shape: int) -> coal.Transform3s:
+    def _placement(self, shape: int) -> pin.SE3:
         if shape >= self._solids.bodies:
-            return self._solids.obstacle_transforms[shape - self._solids.bodies]
-        if shape not in self._transforms:
-            self._transforms[shape] = _transform(self._where[shape])
-        return self._transforms[shape]
-
-
-def _transform(placement: pin.SE3) -> coal.Transform3s:
-    return coal.Transform3s(placement.rotation, placement.translation)
+            return self._solids.world.shapes[shape].placement
+        numbers = self._where[0, shape]
+        return pin.SE3(numbers[:9].reshape(3, 3).T, numbers[9:])
 
 
 def travelled(solids: Solids, samples: Floats) -> Floats:

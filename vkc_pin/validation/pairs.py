@@ -1,14 +1,8 @@
-"""Every pair that could collide along a motion, and its distance at every state that matters.
-
-A pair is left out of a stretch between two waypoints only where it cannot come close: the distance of two bodies changes
-by at most what their relative motion is long.
-"""
+"""Every pair that could collide along a motion, what is asked of each, and which may be close."""
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator, Mapping
-from typing import NamedTuple
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -18,27 +12,11 @@ from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.motion.world import World
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.scene import Scene
-from vkc_pin.validation.distances import Placed, Solids, travelled
+from vkc_pin.validation.distances import Placed, Solids
 
-__all__ = ["Hit", "PairTable"]
+__all__ = ["PairTable"]
 
-RESOLUTION = 1e-3  # [m] of penetration that may stay unseen between two samples
-STILL = 1e-6  # [m] of relative motion between two samples that changes nothing, as of what stands where it was put
-
-
-class Hit(NamedTuple):
-    """A pair's distance [m] at one state: at sample `row`, or between it and the next.
-
-    `margin` is the clearance asked for at waypoints, `contact` the overlap that counts as contact [m].
-    """
-
-    row: int
-    first: str
-    second: str
-    distance: float
-    margin: float
-    contact: float
-    at_waypoint: bool
+_AT_ONCE = 16  # states whose boxes are compared at once
 
 
 class PairTable:
@@ -140,126 +118,35 @@ class PairTable:
         self._number = np.full((len(self._moving), len(self._still)), -1)
         self._number[np.searchsorted(self._moving, pairs[:, 0]), np.searchsorted(self._still, pairs[:, 1])] = mixed
 
-    def sweep(self, z: Floats, waypoints: Ints) -> Iterator[Hit]:
-        """Yield what is close along the motion, and at least the closest pair of every waypoint.
+    def close(self, placed: Placed, states: Ints, reach: Floats, also: Ints | None = None) -> tuple[Ints, Ints]:
+        """Return (k, pair) of all pairs but those of which one stands still and the other is at least `reach` from it.
 
         Args:
-            z: Sampled configurations of the world, shape (S, n), evenly spaced between waypoints.
-            waypoints: Rows of `z` that are waypoints, shape (T,).
+            placed: The world at some states.
+            states: Which of these, shape (K,).
+            reach: Of each geometry, shape (K, G) [m].
+            also: Others, shape (K,): what is close there counts as well.
         """
-        configuration, smallest = self.world.coordinates.q, np.inf
-        placed = [self.solids.at(q) for q in configuration(z[waypoints])]
-        for row, here in zip(waypoints.tolist(), placed, strict=True):
-            near, at = self._nearest(here)
-            smallest = min(smallest, float(at.min()))
-            for c in {int(np.argmin(at)), *np.flatnonzero(at < self.margins[near]).tolist()}:
-                yield self._hit(row, near[c], at[c], at_waypoint=True)
-        smallest = max(RESOLUTION, smallest)  # what cannot come closer than that changes nothing
-        moved = travelled(self.solids, z)
-        for (first, here), (last, there) in itertools.pairwise(zip(waypoints.tolist(), placed, strict=True)):
-            pairs = self._active(here, there, moved[last] - moved[first], smallest)
-            ends = here.distances(self.pairs[pairs]), there.distances(self.pairs[pairs])
-            yield from self._between(z, (first, last), pairs, ends, moved=moved, smallest=smallest)
-
-    def _between(
-        self, z: Floats, rows: tuple[int, int], pairs: Ints, ends: tuple[Floats, Floats], *, moved: Floats, smallest: float
-    ) -> Iterator[Hit]:
-        """Yield what comes closer than `smallest` at samples between two others, halves of which are left out where nothing can.
-
-        d(s) ≥ (d_t + d_{t+1} − relative motion) / 2 for every state in between. Without motion it is what it is at both ends;
-        an overlap is looked at all the same, to be told of wherever it is.
-
-        Args:
-            z: Sampled configurations of the world, shape (S, n).
-            rows: The two samples.
-            pairs: What may come so close, shape (n,).
-            ends: Their distances at both [m].
-            moved: See `travelled`.
-            smallest: [m].
-        """
-        todo = [(rows, pairs, ends)]
-        while todo:
-            (low, high), pairs, (before, after) = todo.pop()
-            motion = (moved[high] - moved[low])[self.pairs[pairs]].sum(axis=1)
-            some = (before + after - motion < 2 * smallest) & ((motion > STILL) | (before < 0))
-            pairs, before, after, motion = pairs[some], before[some], after[some], motion[some]
-            if not len(pairs):
-                continue
-            if high - low == 1:
-                yield from self._slipping(z, low, pairs, (before, after), motion)
-                continue
-            middle = (low + high) // 2
-            distances = self.solids.at(self.world.coordinates.q(z[middle])).distances(self.pairs[pairs])
-            for c in {int(np.argmin(distances)), *np.flatnonzero(distances < 0).tolist()}:
-                yield self._hit(middle, pairs[c], distances[c])
-            todo += [((low, middle), pairs, (before, distances)), ((middle, high), pairs, (distances, after))]
-
-    def _slipping(self, z: Floats, row: int, pairs: Ints, ends: tuple[Floats, Floats], motion: Floats) -> Iterator[Hit]:
-        """Yield what overlaps between a sample and the next, at both of which it is free: nothing deeper than 1 mm can hide.
-
-        Args:
-            z: Sampled configurations of the world, shape (S, n).
-            row: The first of the two samples.
-            pairs: The pairs, shape (n,).
-            ends: Their distances at both [m].
-            motion: How far any two points of a pair can move relative to each other in between [m].
-        """
-        overlap = self.contact[pairs]
-        free = (np.minimum(*ends) >= -overlap) & (ends[0] + ends[1] < motion) & ~self.together[pairs]
-        for c in np.flatnonzero(free).tolist():
-            stack = [(0.0, 1.0, ends[0][c], ends[1][c])]
-            while stack:
-                low, high, before, after = stack.pop()
-                if (width := (high - low) * motion[c]) <= 2 * RESOLUTION or before + after >= width:
-                    continue
-                middle = (low + high) / 2
-                state = self.solids.at(self.world.coordinates.q((1 - middle) * z[row] + middle * z[row + 1]))
-                between = state.distance(*self.pairs[pairs[c]].tolist())
-                yield self._hit(row, pairs[c], between)
-                if between < -overlap[c]:
-                    break
-                stack += [(low, middle, before, between), (middle, high, between, after)]
-
-    def _close(self, placed: Placed, reach: Floats) -> Ints:
-        """Return all pairs but those of which one stands still and the other is at least `reach` from it; shape (G,) [m]."""
         lower, upper = placed.corners
-        low, high = lower[self._moving] - reach[self._moving, None], upper[self._moving] + reach[self._moving, None]
-        near = np.ones(self._number.shape, bool)
-        for axis in range(3):
-            near &= low[:, axis, None] < upper[self._still, axis]
-            near &= high[:, axis, None] > lower[self._still, axis]
-        found = self._number[near]
-        return np.sort(np.concatenate([self._both, found[found >= 0]]))
-
-    def _nearest(self, placed: Placed) -> tuple[Ints, Floats]:
-        """Return pairs, the closest and all that fall short of their margins among them, and their distances [m]."""
-        reach = max(float(self.margins.max()), RESOLUTION)
-        while True:
-            near = self._close(placed, np.full(len(self.group), reach))
-            near = near[placed.bounds(self.pairs[near]) < reach]
-            distances = placed.distances(self.pairs[near])
-            if not distances.min(initial=np.inf) > reach:  # all others are further apart
-                return near, distances
-            reach *= 2.0
-
-    def _active(self, here: Placed, there: Placed, moved: Floats, smallest: float) -> Ints:
-        """Return all pairs but those that boxes prove to stay `smallest` apart between two waypoints [m].
-
-        Where d(s) of `_between` is less, one of both distances is less than `smallest` and half the relative motion.
-
-        Args:
-            here: The world at the one.
-            there: The world at the other.
-            moved: How far any point of each geometry moves in between, shape (G,) [m].
-            smallest: [m].
-        """
-        reach = smallest + moved / 2
-        some = np.union1d(self._close(here, reach), self._close(there, reach))
-        pairs = self.pairs[some]
-        floor = (here.bounds(pairs) + there.bounds(pairs) - moved[pairs].sum(axis=1)) / 2
-        return some[floor < smallest]
-
-    def _hit(self, row: int, k: int, distance: float, *, at_waypoint: bool = False) -> Hit:
-        first, second = (self.world.collision_labels[i] for i in self.pairs[k])
-        limits = {"margin": float(self.margins[k]), "contact": float(self.contact[k])}
-        return Hit(int(row), first, second, float(distance), **limits, at_waypoint=at_waypoint)
+        lows, highs = (np.ascontiguousarray(corners[0, self._still].T) for corners in (lower, upper))
+        far, moments = reach[:, self._moving, None], (states,) if also is None else (states, also)
+        boxes = [(lower[at][:, self._moving] - far, upper[at][:, self._moving] + far) for at in moments]
+        found = [(np.repeat(np.arange(len(states)), len(self._both)), np.tile(self._both, len(states)))]
+        for k in range(0, len(states), _AT_ONCE) if self._number.size else ():
+            part = slice(k, k + _AT_ONCE)
+            least = np.min([low[part].min(axis=(0, 1)) for low, _ in boxes], axis=0)[:, None]
+            most = np.max([high[part].max(axis=(0, 1)) for _, high in boxes], axis=0)[:, None]
+            (some,) = ((least < highs) & (most > lows)).all(axis=0).nonzero()  # of what stands, all that any may come close to
+            number = self._number[:, some]
+            near = np.zeros((len(states[part]), *number.shape), bool)
+            for low, high in boxes:
+                inside = np.tile(number >= 0, (len(near), 1, 1))
+                for axis in range(3):
+                    inside &= low[part, :, None, axis] < highs[axis, some]
+                    inside &= high[part, :, None, axis] > lows[axis, some]
+                near |= inside
+            at, *which = np.nonzero(near)
+            found.append((at + k, number[tuple(which)]))
+        at, pairs = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        order = np.lexsort((pairs, at))
+        return at[order], pairs[order]

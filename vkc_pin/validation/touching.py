@@ -55,17 +55,17 @@ def may_touch(
     robots = len(scene.robot.collision.geometryObjects)
     rows, solids = world.positions(trajectory), Solids(world)
     for owner, waypoint in _taken_and_left(scene, trajectory):
-        placed = solids.at(world.coordinates.q(rows[waypoint]))
+        placed = solids.at(world.coordinates.q(rows[[waypoint]]))
         mine = [i for i, label in enumerate(labels) if label.partition(".")[0] == owner]
         others = [j for j in range(robots, len(labels)) if j not in mine]
         pairs = np.array([(min(i, j), max(i, j)) for i in mine for j in others], int).reshape(-1, 2)
-        for i, j in pairs[placed.bounds(pairs) < dist_safe].tolist():
-            if placed.distance(i, j) < dist_safe:
-                allowed.setdefault((i, j), CONTACT)
+        pairs = pairs[placed.bounds(np.zeros(len(pairs), int), pairs) < dist_safe]
+        for i, j in pairs[placed.distances(np.zeros(len(pairs), int), pairs) < dist_safe].tolist():
+            allowed.setdefault((i, j), CONTACT)
 
     touches = [step for step in steps if isinstance(step, Touch)]
-    for row in rows[[phase.last for phase in trajectory.phases]] if touches else ():
-        placed = solids.at(world.coordinates.q(row))
+    for phase in trajectory.phases if touches else ():
+        placed = solids.at(world.coordinates.q(rows[[phase.last]]))
         for step in touches:
             target = step.target.translation if isinstance(step.target, pin.SE3) else np.array(step.target)
             owner = step.frame.partition(".")[0]

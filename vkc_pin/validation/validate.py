@@ -20,6 +20,7 @@ from vkc_pin.validation.own_terms import check_terms
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.report import Report, Violation
 from vkc_pin.validation.samples import Samples
+from vkc_pin.validation.sweep import sweep
 from vkc_pin.validation.touching import may_touch
 
 __all__ = ["validate"]
@@ -227,7 +228,7 @@ class _Check:
         samples, smallest = self.samples, np.inf
         touching = may_touch(self.scene, samples.world, self.trajectory, self.steps, self.options.dist_safe)
         pairs = PairTable(self.scene, samples.world, self.trajectory, self.options.dist_safe, touching=touching)
-        for hit in pairs.sweep(samples.z, samples.waypoint_rows):
+        for hit in sweep(pairs, samples.z, samples.waypoint_rows):
             smallest = min(smallest, hit.distance)
             subject, millimetres = f"{hit.first} – {hit.second}", 1e3 * abs(hit.distance)
             if hit.distance < -hit.contact:

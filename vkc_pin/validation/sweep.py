@@ -1,0 +1,193 @@
+"""Looks along a motion for pairs that come close: at waypoints, and wherever between them two could.
+
+A pair is left out of a stretch between two waypoints only where it cannot come close: the distance of two bodies changes
+by at most what their relative motion is long. All stretches are looked at together, all their halves next, and so on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from vkc_pin.arrays import Bools, Floats, Ints
+from vkc_pin.validation.distances import Placed, travelled
+from vkc_pin.validation.pairs import PairTable
+
+__all__ = ["Hit", "sweep"]
+
+RESOLUTION = 1e-3  # [m] of penetration that may stay unseen between two samples
+STILL = 1e-6  # [m] of relative motion between two samples that changes nothing, as of what stands where it was put
+
+
+class Hit(NamedTuple):
+    """A pair's distance [m] at one state: at sample `row`, or between it and the next.
+
+    `margin` is the clearance asked for at waypoints, `contact` the overlap that counts as contact [m].
+    """
+
+    row: int
+    first: str
+    second: str
+    distance: float
+    margin: float
+    contact: float
+    at_waypoint: bool
+
+
+def sweep(table: PairTable, z: Floats, waypoints: Ints) -> Iterator[Hit]:
+    """Yield what is close along a motion, and at least the closest pair of every waypoint: these first.
+
+    Args:
+        table: The pairs.
+        z: Sampled configurations of its world, shape (S, n), evenly spaced between waypoints.
+        waypoints: Rows of `z` that are waypoints, shape (T,).
+    """
+    return _Sweep(table).along(z, waypoints)
+
+
+class _Sweep:
+    def __init__(self, table: PairTable) -> None:
+        self._table, self._solids = table, table.solids
+
+    def along(self, z: Floats, waypoints: Ints) -> Iterator[Hit]:
+        placed = self._solids.at(self._solids.world.coordinates.q(z[waypoints]))
+        at, pairs, distances = self._nearest(placed)
+        closest = _least(at, distances)
+        chosen = np.union1d(closest, np.flatnonzero(distances < self._table.margins[pairs]))
+        for row, k, distance in zip(waypoints[at[chosen]], pairs[chosen], distances[chosen], strict=True):
+            yield self._hit(row, k, distance, at_waypoint=True)
+        smallest = max(RESOLUTION, float(distances[closest].min()))  # what cannot come closer than that changes nothing
+        moved = travelled(self._solids, z)
+        stretch, pairs = self._active(placed, np.diff(moved[waypoints], axis=0), smallest)
+        ends = placed.distances(np.concatenate([stretch, stretch + 1]), np.tile(self._table.pairs[pairs], (2, 1)))
+        before, after = np.split(ends, 2)
+        yield from self._between(z, Stretches(waypoints[stretch], waypoints[stretch + 1], pairs, before, after), moved, smallest)
+
+    def _between(self, z: Floats, todo: Stretches, moved: Floats, smallest: float) -> Iterator[Hit]:
+        """Yield what comes closer than `smallest` at samples between two others, halves of which are left out where nothing can.
+
+        d(s) ≥ (d_t + d_{t+1} − relative motion) / 2 for every state in between. Without motion it is what it is at both ends;
+        an overlap is looked at all the same, to be told of wherever it is.
+
+        Args:
+            z: Sampled configurations of the world, shape (S, n).
+            todo: Where to look, of all stretches at once; those of the same samples are next to each other.
+            moved: See `travelled`.
+            smallest: [m].
+        """
+        while len(todo.pair):
+            motion = self._motion(todo, moved)
+            todo = todo.select((todo.before + todo.after - motion < 2 * smallest) & ((motion > STILL) | (todo.before < 0)))
+            next_to = todo.high - todo.low == 1
+            yield from self._slipping(z, todo.select(next_to), moved)
+            todo = todo.select(~next_to)
+            middle = (todo.low + todo.high) // 2
+            rows, at = np.unique(middle, return_inverse=True)
+            distances = self._solids.at(self._solids.world.coordinates.q(z[rows])).distances(at, self._table.pairs[todo.pair])
+            for c in np.union1d(_least(at, distances), np.flatnonzero(distances < 0)).tolist():
+                yield self._hit(middle[c], todo.pair[c], distances[c])
+            todo = Stretches(
+                np.append(todo.low, middle),
+                np.append(middle, todo.high),
+                np.tile(todo.pair, 2),
+                np.append(todo.before, distances),
+                np.append(distances, todo.after),
+            )
+
+    def _motion(self, todo: Stretches, moved: Floats) -> Floats:
+        """Return how far any two points of pairs can move relative to each other in stretches, shape (n,) [m]."""
+        first, second = self._table.pairs[todo.pair].T
+        return (moved[todo.high, first] - moved[todo.low, first]) + (moved[todo.high, second] - moved[todo.low, second])
+
+    def _slipping(self, z: Floats, todo: Stretches, moved: Floats) -> Iterator[Hit]:
+        """Yield what overlaps between a sample and the next, at both of which it is free: nothing deeper than 1 mm can hide.
+
+        Args:
+            z: Sampled configurations of the world, shape (S, n).
+            todo: Stretches from one sample to the next.
+            moved: See `travelled`.
+        """
+        overlap, motion = self._table.contact[todo.pair], self._motion(todo, moved)
+        free = (
+            (np.minimum(todo.before, todo.after) >= -overlap)
+            & (todo.before + todo.after < motion)
+            & ~self._table.together[todo.pair]
+        )
+        for c in np.flatnonzero(free).tolist():
+            row, k = todo.low[c], todo.pair[c]
+            stack = [(0.0, 1.0, todo.before[c], todo.after[c])]
+            while stack:
+                low, high, before, after = stack.pop()
+                if (width := (high - low) * motion[c]) <= 2 * RESOLUTION or before + after >= width:
+                    continue
+                middle = (low + high) / 2
+                state = self._solids.at(self._solids.world.coordinates.q((1 - middle) * z[[row]] + middle * z[[row + 1]]))
+                (between,) = state.distances(np.zeros(1, int), self._table.pairs[[k]])
+                yield self._hit(row, k, between)
+                if between < -overlap[c]:
+                    break
+                stack += [(low, middle, before, between), (middle, high, between, after)]
+
+    def _nearest(self, placed: Placed) -> tuple[Ints, Ints, Floats]:
+        """Return (state, pair), the closest and all that fall short of their margins among them, and their distances [m]."""
+        count = len(placed.corners[0])
+        reach, todo = max(float(self._table.margins.max()), RESOLUTION), np.arange(count)
+        found = []
+        while len(todo):
+            at, pairs = self._table.close(placed, todo, np.full((len(todo), len(self._table.group)), reach))
+            near = placed.bounds(todo[at], self._table.pairs[pairs]) < reach
+            states, pairs = todo[at[near]], pairs[near]
+            distances = placed.distances(states, self._table.pairs[pairs])
+            least = np.full(count, np.inf)
+            np.minimum.at(least, states, distances)
+            done = ~(least > reach)  # all others are further apart
+            kept = done[states]
+            found.append((states[kept], pairs[kept], distances[kept]))
+            todo, reach = todo[~done[todo]], 2.0 * reach
+        states, pairs, distances = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        order = np.lexsort((pairs, states))
+        return states[order], pairs[order], distances[order]
+
+    def _active(self, placed: Placed, moved: Floats, smallest: float) -> tuple[Ints, Ints]:
+        """Return (t, pair) of all but those that boxes prove to stay `smallest` apart between waypoints t and t + 1 [m].
+
+        Where d(s) of `_between` is less, one of both distances is less than `smallest` and half the relative motion.
+
+        Args:
+            placed: The world at the T waypoints.
+            moved: How far any point of each geometry moves from each to the next, shape (T − 1, G) [m].
+            smallest: [m].
+        """
+        stretches = np.arange(len(moved))
+        at, some = self._table.close(placed, stretches, smallest + moved / 2, stretches + 1)
+        pairs = self._table.pairs[some]
+        motion = np.take_along_axis(moved[at], pairs, axis=1).sum(axis=1)
+        floor = (placed.bounds(at, pairs) + placed.bounds(at + 1, pairs) - motion) / 2
+        return at[floor < smallest], some[floor < smallest]
+
+    def _hit(self, row: int, k: int, distance: float, *, at_waypoint: bool = False) -> Hit:
+        first, second = (self._solids.world.collision_labels[i] for i in self._table.pairs[k])
+        limits = {"margin": float(self._table.margins[k]), "contact": float(self._table.contact[k])}
+        return Hit(int(row), first, second, float(distance), **limits, at_waypoint=at_waypoint)
+
+
+class Stretches(NamedTuple):
+    """Pairs between two samples, `low` and `high`, and their distances at these, `before` and `after` [m]; shape (n,) each."""
+
+    low: Ints
+    high: Ints
+    pair: Ints
+    before: Floats
+    after: Floats
+
+    def select(self, which: Bools) -> Stretches:
+        """Return those of them."""
+        return Stretches(self.low[which], self.high[which], self.pair[which], self.before[which], self.after[which])
+
+
+def _least(groups: Ints, values: Floats) -> Ints:
+    """Return where the smallest value of each group is, the first of them."""
+    order = np.lexsort((values, groups))
+    return order[np.flatnonzero(np.diff(groups[order], prepend=-1))]

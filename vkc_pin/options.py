@@ -69,7 +69,7 @@ class Options:
     goal_angle: float = 1e-3
     max_outer: int = 16
     max_iterations: int = 200
-    penalty: float = 200.0
+    penalty: float = 50.0
     max_restarts: int = 4
 
     def __post_init__(self) -> None:

@@ -69,8 +69,8 @@ def test_a_path_costs_its_way_and_its_trouble(backwards: bool, around: bool, mon
     monkeypatch.setattr(Beam, "_approach", lambda _, first, *__: np.zeros(len(first)))
     search = beam(1, around=around)
     found = search.search(thorough=True, backwards=backwards)
-    weights = search.knots.weights * np.where(np.arange(problem(around=around).chain.size) < 2, module._DRIVING, 1.0)
-    way = (np.abs(np.diff(found.paths, axis=1)) * weights).sum(axis=(1, 2))
+    steps = np.abs(np.diff(found.paths, axis=1)) * np.sqrt(problem(around=around).effort.metric / 0.025)
+    way = np.linalg.norm(steps[..., :2], axis=2).sum(axis=1) + steps[..., 2:].sum(axis=(1, 2))
     np.testing.assert_allclose(found.cost, way + found.trouble, rtol=1e-9)
     trouble = np.zeros(len(found.cost))
     for k, waypoint in enumerate(found.at[1:], start=1):

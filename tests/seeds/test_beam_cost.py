@@ -15,15 +15,19 @@ def beam(seed: int = 0) -> Beam:
     return Beam(Knots(problem, np.random.default_rng(seed)))
 
 
-def test_a_metre_of_the_base_costs_twice_what_moves_the_hand_by_a_metre() -> None:
+def test_a_way_costs_what_the_program_makes_it_cost_in_radians_of_the_arm() -> None:
     search = beam()
-    metre = 2.0 / search.problem.chain.robot.lever
+    metre = 1.0 / np.sqrt(0.025)
     start = search.problem.start[None]
     for column, expected in ((0, metre), (1, metre), (2, 1.0), (3, 1.0)):
         moved = start.copy()
         moved[0, column] -= 0.5
         assert search._path_cost(start, moved, 0)[0] == pytest.approx(0.5 * expected, rel=1e-12)
-    assert search.knots.weights[:3].tolist() == [metre / 2, metre / 2, 1.0]  # inverse kinematics, and the baselines
+    moved = start.copy()
+    moved[0, :2] += [0.3, 0.4]
+    assert search._path_cost(start, moved, 0)[0] == pytest.approx(0.5 * metre, rel=1e-12)
+    lever = search.problem.chain.robot.lever
+    assert search.knots.weights[:3].tolist() == [1 / lever, 1 / lever, 1.0]  # inverse kinematics, and the baselines
 
 
 class Ways:
@@ -41,7 +45,7 @@ def test_a_way_around_costs_as_much_as_it_is_long() -> None:
     start = search.problem.start[None]
     moved = start.copy()
     moved[0, :2] += [0.3, 0.4]
-    assert search._path_cost(start, moved, 0)[0] == pytest.approx(2 * 0.5 * 2.0 / search.problem.chain.robot.lever, rel=1e-12)
+    assert search._path_cost(start, moved, 0)[0] == pytest.approx(2 * 0.5 / np.sqrt(0.025), rel=1e-12)
 
 
 def scattered(monkeypatch: pytest.MonkeyPatch, share: float) -> int:

@@ -361,7 +361,7 @@ def grasps(found: Found) -> np.ndarray:
 def test_in_turn_trees_first_lead_to_what_was_found_for_the_base_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """One search less, where what it found is any good."""
     watched = Watched(monkeypatch)
-    found = initialize(problem(), "auto", 0)
+    found = initialize(problem(), "auto", 1)
     assert [next(found).name, next(found).name] == ["interpolated", "astar"]
     assert "astar" in watched.kinds
     before = len(watched.found)

@@ -40,7 +40,7 @@ def test_a_thin_obstacle_between_waypoints(monkeypatch: pytest.MonkeyPatch) -> N
     scene, steps = past_a_post(), [vkc.GoTo(0.0, WIDTH, 0.0)]
     plan = vkc.plan(scene, steps, options=FEW)
     assert plan.success, plan.report()
-    assert plan.trajectory.arm_effort() + plan.trajectory.base_effort() > WIDTH + 0.02  # it went round the post
+    assert plan.trajectory.arm_effort() + plan.trajectory.base_effort() > WIDTH + 0.005  # it went round the post
 
     problem, _ = straight(scene)
     nothing, free = collisions_between(problem, np.tile(problem.start, (problem.segments, 1)))

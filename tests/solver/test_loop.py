@@ -126,7 +126,7 @@ def blank_trial(segments: int) -> trust_region.Trial:
 
 def test_a_solution_goes_on_with_the_radius_that_another_ended_with() -> None:
     problem, seed = round_a_pillar(), straight(round_a_pillar(), 3.2)
-    first = solve(problem, seed, rounds=2)
+    first = solve(problem, seed, rounds=3)
     assert first.history[0].radius == trust_region.FIRST_RADIUS
     assert first.radius is not None
     assert first.radius.shape == (problem.segments,)

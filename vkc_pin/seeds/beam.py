@@ -28,7 +28,6 @@ _COLLISION, _DEPTH = 10.0, 300.0  # cost of a collision, and of its depth [1/m],
 _NOT_FOUND = 1e3  # cost if there is no configuration, or no path of the base
 _TOLERABLE = 60.0  # cost of collisions that the solver may be left to push apart: a graze or two
 _JUMP = 0.5  # [m] of the base from knot to knot while something fixed is held: a path through an obstacle, no doubt
-_DRIVING = 2.0  # how many times more than in `Knots.weights` the base's path counts: it decides which side is driven to
 
 
 class Found(NamedTuple):
@@ -75,8 +74,7 @@ class Beam:
     ) -> None:
         self.knots, self.problem, self.routes, self.careful = knots, knots.problem, routes, careful
         self.interrupt = interrupt
-        metric = np.sqrt(knots.problem.effort.metric)
-        self.cost = metric / metric[3]
+        self.metric = np.sqrt(self.problem.effort.metric / self.problem.options.velocity_weight_arm)
         self.approaches = {
             int(end): approach_at(int(end) - phase.segments, int(end), self.problem.options)
             for phase, end in zip(self.problem.task.phases, self.problem.ends, strict=True)
@@ -172,12 +170,12 @@ class Beam:
         return Found(paths, cost, found.trouble, [*found.at[:known], *knots])
 
     def _path_cost(self, first: Floats, last: Floats, phase: int) -> Floats:
-        """Return what it costs to go from `first` to `last`, both (B, n), in a phase, shape (B,)."""
-        cost = np.abs(last - first) * self.cost
+        """Return the length of the ways from `first` to `last`, both (B, n), in a phase, in radians of the arm, shape (B,)."""
+        cost = np.abs(last - first) * self.metric
         cost[:, 0], cost[:, 1] = np.hypot(cost[:, 0], cost[:, 1]), 0.0
         if self.routes is not None and not self.problem.closed(self.problem.task.phases[phase]):
             distances = self.routes.distances(phase, first[:, :3], last[:, :3], folded=self.careful)
-            cost[:, 0] = self.cost[0] * distances
+            cost[:, 0] = self.metric[0] * distances
             np.minimum(cost, _NOT_FOUND, out=cost)  # where there is no path, others come first
         return np.asarray(cost.sum(axis=1))
 

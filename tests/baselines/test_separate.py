@@ -201,7 +201,11 @@ def test_no_room_for_the_drawer_when_it_is_open(monkeypatch: pytest.MonkeyPatch)
     assert [phase.name for phase in plan.trajectory.phases] == ["go to", "reach drawer.handle"]
     last = plan.trajectory.positions[-1]
     assert off(plan.scene, last, handle()) < 1e-3
-    assert {v.constraint for v in plan.validation.violations} == {"goal"}
+    kinds = {v.constraint for v in plan.validation.violations}
+    assert "goal" in kinds
+    # A motion that ends before the grasp has no leave to be as close to the tray as a grasp is.
+    assert all(v.subject.endswith("drawer.tray") for v in plan.validation.violations if v.constraint == "clearance")
+    assert kinds <= {"goal", "clearance"}
 
 
 def test_the_arm_does_not_reach(monkeypatch: pytest.MonkeyPatch) -> None:

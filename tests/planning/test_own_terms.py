@@ -103,13 +103,13 @@ def test_slowly_near_somebody() -> None:
 
 
 def test_a_cost_changes_the_posture() -> None:
-    plan = checked(vkc.plan(room(), OVER, options=SHORT, terms=[ELBOW]))
+    """On average over random seeds: which way an elbow bends is a seed's, and a cost moves it only from there."""
 
-    def off(plan: vkc.Plan) -> float:
-        return float(((plan.trajectory.column("elbow_joint") - 1.5) ** 2).mean())
+    def off(terms: list[vkc.Cost]) -> float:
+        plans = [checked(vkc.plan(room(), OVER, options=SHORT, terms=terms, seed=seed)) for seed in range(4)]
+        return float(np.mean([((plan.trajectory.column("elbow_joint") - 1.5) ** 2).mean() for plan in plans]))
 
-    assert off(plan) < 0.8 * off(plain())
-    assert plan.history[-1]["objective"] > plain().history[-1]["objective"]
+    assert off([ELBOW]) < 0.6 * off([])
 
 
 def test_a_cost_that_is_not_convex() -> None:

@@ -95,7 +95,7 @@ def going_on(fixed: OneProblem, problem: vkc.TrajectoryProblem) -> Seed:
 
 
 def test_one_problem_costs_less_than_step_after_step() -> None:
-    """What is minimised (eq. 1) falls from what the steps came to on their own; they are where it starts."""
+    """What is minimised falls from what the steps came to on their own; they are where it starts."""
     settings = Settings("astar", vkc.Options())
     steps = [vkc.Grasp("stick"), vkc.Touch("stick.tip", TARGET)]
     parts = stages(start(), compile_task(start(), steps, settings.options), settings)
@@ -106,7 +106,7 @@ def test_one_problem_costs_less_than_step_after_step() -> None:
     assert whole.success, whole.report()
     before = objective(one.problem, seed_of(one.problem, pieces).z)
     assert objective(one.problem, one.z) < before
-    assert whole.initialization == "astar, astar, then all at once"
+    assert whole.initialization.endswith(", then all at once")
     assert np.abs(one.z[39, :3] - parts[0][0].z[39, :3]).max() > 1e-3  # the grasp has moved in favour of what follows
 
 

@@ -31,7 +31,7 @@ ROBOT = 9  # x, y and yaw of the base, six joints of the arm
 def door() -> tuple[vkc.TrajectoryProblem, np.ndarray, tuple[int, ...]]:
     """Return the problem of opening the door, and knots of it and when they are."""
     p = program_of(door_scene(), [OPEN], options=FEW)
-    found = Beam(Knots(p, np.random.default_rng(1))).search(thorough=True)
+    found = Beam(Knots(p, np.random.default_rng(0))).search(thorough=True)
     best = int(np.argmin(np.where(found.trouble == 0.0, found.cost, np.inf)))
     assert found.trouble[best] == 0.0
     return p, found.paths[best], tuple(found.at)

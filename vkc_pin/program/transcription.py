@@ -112,8 +112,8 @@ class Transcription:
         excess = np.zeros(self.excess.numel()) if excess is None else excess
         prices = np.zeros(self.segments) if prices is None else prices
         times = dt if self.structure.timed and dt is not None else np.zeros(0)
-        costs = [part.T.ravel() for part in weights]
-        return np.concatenate([start, columns, offsets.ravel(), padded, *costs, [penalty], away, prices, excess, times])
+        before = (start, columns, offsets.ravel(), padded, *(part.T.ravel() for part in weights))
+        return np.concatenate([*before, [penalty], away, prices, excess, times])
 
     def pack(self, z: Floats, slack: Floats | float = 0.0, shares: Floats | float = 0.0) -> Floats:
         """Return x of waypoints, shape (N, n), their slacks, shape (N, K), and their shares, shape (N,); or the same for all."""
@@ -124,11 +124,10 @@ class Transcription:
         """Make the objective: weighted squares of steps and of their changes, and what slacks and shares cost."""
         n, N = self.n, self.segments
         self.first, self.second, self.start_first, self.start_second = differences(N, self.structure.stops)
-        self.of_steps, self.of_changes = ca.MX.sym("w", N, n), ca.MX.sym("v", len(self.second), n)
+        symbols = self.of_steps, self.of_changes = ca.MX.sym("w", N, n), ca.MX.sym("v", len(self.second), n)
         costs = ca.vertcat(ca.repmat(self.penalty, self.slots, N), self.prices.T)
         self.f, slope = ca.dot(costs, self.own[n:, :]), ca.MX(N, n)
-        of_steps, of_changes = (self.first, self.start_first, self.of_steps), (self.second, self.start_second, self.of_changes)
-        for matrix, start, weights in (of_steps, of_changes):
+        for matrix, start, weights in zip((self.first, self.second), (self.start_first, self.start_second), symbols, strict=True):
             differs = sparse(matrix) @ self.z.T + ca.DM(start) @ self.start.T
             self.f += ca.dot(weights, differs**2)
             slope += 2 * sparse(matrix.T) @ (weights * differs)

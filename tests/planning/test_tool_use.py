@@ -51,7 +51,7 @@ def test_the_tip_reaches_its_target_to_a_millimetre() -> None:
 
 @pytest.mark.long
 def test_grasping_anywhere_costs_less_than_at_one_place() -> None:
-    """From one motion, that found with the fixed grasp: what is minimised (eq. 1) falls further if the grasp may move.
+    """From one motion, that found with the fixed grasp: what is minimised falls further if the grasp may move.
 
     Searches from random seeds promise nothing of the kind for one start: either may end in a local minimum. And as the solver
     stops where a round saves little, going on with the fixed grasp saves something, too.
@@ -76,7 +76,7 @@ def test_grasping_anywhere_costs_less_than_at_one_place() -> None:
         assert abs(slide) > 5e-3 or abs(turn) > 5e-2, "it makes no use of it"
         assert objective(anywhere.problem, anywhere.z) < before
         saved.append(objective(anywhere.problem, anywhere.z) / objective(again.problem, again.z))
-    assert np.median(saved) < 0.97
+    assert np.median(saved) < 0.985
 
 
 def objective(problem: vkc.TrajectoryProblem, z: np.ndarray) -> float:

@@ -191,7 +191,7 @@ def _iterate(
     """Run rounds until everything holds, nothing helps any more, or time is up."""
     solution, started = loop.solution, time.perf_counter()
     feasible: tuple[Floats, Floats] | None = None
-    missing = [np.inf] * PROGRESS_ROUNDS + [loop.found.total]
+    missing, since = loop.found.total, 0  # what was missing when rounds were last counted
     good = float("inf")  # objective of the last motion at which everything held
     for _ in range(rounds):
         if time.perf_counter() > loop.deadline:
@@ -232,8 +232,10 @@ def _iterate(
             solution.status = solution.status if solution.converged else "interrupted"
             break
         region.adapt(before, after, trial, accepted)
-        missing.append(loop.found.total)
-        if loop.found.total > max(PROGRESS * missing[-1 - PROGRESS_ROUNDS], NEXT_TO_NOTHING):
+        since += 1
+        if not PROGRESS * missing < loop.found.total <= missing:  # more is missing where the objective fell instead
+            missing, since = loop.found.total, 0
+        if since >= PROGRESS_ROUNDS and missing > NEXT_TO_NOTHING:
             break
         short = loop.found.amounts["clearance"]
         settled = accepted and not done and gain < SETTLING and loop.found.others < FAR

@@ -271,8 +271,9 @@ def test_baselines(tmp_path: Path) -> None:
     assert "every constraint holds" in text(cells["vkc"])
     assert text(cells["b1"]).startswith("aisle_drawer: ")
     assert "iframe" in result(cells["show"])["text/html"]
-    efforts = dict(re.findall(r"(VKC|B1) +base ([\d.]+) m, arm [\d.]+ rad", text(cells["efforts"])))
-    assert float(efforts["VKC"]) < float(efforts["B1"])
+    found = re.findall(r"(VKC|B1) +base ([\d.]+) m, arm ([\d.]+) rad", text(cells["efforts"]))
+    ways = {name: float(base) + 0.158 * float(arm) for name, base, arm in found}  # in the metric of what is minimised
+    assert ways["VKC"] < 0.95 * ways["B1"]
     assert min(size(cells["joints"])) > 300
 
     lines = re.findall(r"^(\d) (\w+) ([a-z ]+) base ([\d.]+) m", text(cells["run"]), re.MULTILINE)

@@ -13,9 +13,9 @@ import pytest
 
 from vkc_pin.distances import solids
 from vkc_pin.distances.shapes import Shapes
-from vkc_pin.distances.solids import indices, solid_of
+from vkc_pin.distances.solids import solid_of
 from vkc_pin.errors import BuildError, InputError
-from vkc_pin.files.meshes import convex_hull
+from vkc_pin.files.meshes import convex_hull, indices
 
 NOWHERE = np.array([[[1.0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0]] * 2])
 

@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.cache import Cache
-from vkc_pin.chain.broadphase import PhaseGeometry
+from vkc_pin.chain.phase_geometry import PhaseGeometry
 from vkc_pin.models.articulation import ArticulatedObject, Attachment, Freedom
 from vkc_pin.models.object_file import load_object
 from vkc_pin.options import Options

@@ -19,8 +19,8 @@ from hypothesis import strategies as st
 
 from vkc_pin.benchmarks.scale import crowded
 from vkc_pin.chain import collision_pairs as easing
-from vkc_pin.chain.broadphase import PhaseGeometry
 from vkc_pin.chain.contacts import ContactModel
+from vkc_pin.chain.phase_geometry import PhaseGeometry
 from vkc_pin.distances.shapes import asked
 from vkc_pin.driving.body import Body
 from vkc_pin.models import shapes as geometry

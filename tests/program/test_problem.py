@@ -337,6 +337,8 @@ def test_what_is_held_at_the_start_stays_where_the_hand_has_it(fetching: Traject
     for axis in "xyz":
         assert np.all(column(problem, f"ball.pull_{axis}") == (-np.pi, np.pi))
     assert problem.choices == tuple((problem.chain.index(f"ball.pull_{a}"), REACH, 2 * REACH) for a in "zyx")
+    chosen = [column for column, _, _ in problem.choices]  # what is clamped changes while grasping only, at next to no cost
+    np.testing.assert_allclose(problem.effort.metric[chosen], 1e-4 * problem.options.velocity_weight_object, rtol=1e-12)
 
 
 def test_a_loose_grasp_is_not_clamped() -> None:

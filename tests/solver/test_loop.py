@@ -246,6 +246,7 @@ def test_a_grasp_between_obstacles_is_made_free_with_small_steps() -> None:
         ([(10.0, 0.0, False)] * 20, 5),  # what counts is where it is, not where it might have gone
         ([(10.0, 0.5 * 0.92**k, True) for k in range(1, 20)], 19),  # a third in five rounds
         ([(10.0, 0.5 * 0.94**k, True) for k in range(1, 20)], 5),
+        ([(10.0, 0.02, True)] + [(9.0, 0.11, True)] * 20, 7),  # counted anew where more is missing and the motion is shorter
         ([(10.0, 1e-3, True)] * 20, 20),  # next to nothing
     ],
 )

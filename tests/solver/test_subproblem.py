@@ -63,3 +63,21 @@ def test_multipliers_are_of_the_round_before() -> None:
         counts.append(state.solution.iterations - before)
     assert counts[1] <= counts[0] == counts[2]
     assert set(state.solution.timings) == {"coal", "casadi", "ipopt"}
+
+
+@pytest.mark.parametrize("missing", [False, True])
+def test_only_planes_that_are_short_at_the_iterate_may_stay_short(missing: bool) -> None:
+    """However little it costs: next to a box that is in the way, beside which the iterate keeps its margin or not."""
+    box = {"name": "box", "type": "box", "size": [0.2, 0.2, 1.0], "position": [1.6 if missing else 1.85, 0.0, 0.5]}
+    scene = hall(obstacles=[box])
+    problem = program_of(scene, [vkc.GoTo(1.2, 0.0)], options=SHORT)
+    still = _Loop(problem, problem.still, np.inf, 1e-3)
+    if missing:
+        driven = through(scene, scene.start, moved(scene.start, x=1.2), steps=8).positions[1:]
+        still = _Loop(problem, driven, np.inf, 1e-3)
+    assert bool(still.found.amounts["clearance"].any()) == missing
+    radius = np.full(problem.segments, 2.0)
+    step = still.subproblem.solve(still.z, still.at, still.found, still.merit, still.timing, radius, rates=False)
+    assert bool((step.slack > 1e-3).any()) == missing
+    if not missing:
+        np.testing.assert_array_equal(step.slack, 0.0)

@@ -10,8 +10,8 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.arrays import Floats
-from vkc_pin.chain.broadphase import PhaseGeometry
 from vkc_pin.chain.chain import VirtualKinematicChain
+from vkc_pin.chain.phase_geometry import PhaseGeometry
 from vkc_pin.errors import InputError
 from vkc_pin.models.shapes import bounding_box, link_name, own_name, shape_distance, world_box
 from vkc_pin.options import Options

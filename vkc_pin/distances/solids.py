@@ -10,30 +10,13 @@ from typing import Any
 import coal
 import numpy as np
 
-from vkc_pin.arrays import Floats, Ints
+from vkc_pin.arrays import Floats
 from vkc_pin.errors import BuildError, InputError
+from vkc_pin.files.meshes import indices
 
-__all__ = ["compiled", "indices", "solid_of"]
+__all__ = ["compiled", "solid_of"]
 
 _REBUILD = "build vkc-pin again: pip install --force-reinstall --no-deps --no-cache-dir vkc-pin (in a checkout: '.')"
-
-
-def _settle_boxes() -> None:
-    """Let coal take boxes as they are, whatever it is asked first.
-
-    coal 3.0.3 decides once per process, from the first direction in which it looks for a box's furthest corner, whether boxes are
-    1e-10 larger on their negative sides: yes if a component is zero (a `static` in `getShapeSupport`, gone in later versions). So
-    the first question of a process would decide on the last digits of every distance to a box. This one has no such component.
-    The compiled module asks the same library, so that it holds there as well.
-    """
-    turned = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
-    box, here, there = coal.Box(1.0, 1.0, 1.0), coal.Transform3s(), coal.Transform3s(turned, np.array([3.0, 0.4, 0.2]))
-    plane = coal.Halfspace(np.array([0.36, 0.48, 0.8]), 0.0)  # for the other one, of shapes with a swept sphere
-    for shape, where in ((coal.Capsule(0.1, 0.5), there), (plane, here)):
-        coal.distance(shape, here, box, where, coal.DistanceRequest(), coal.DistanceResult())
-
-
-_settle_boxes()
 
 
 @cache
@@ -104,10 +87,3 @@ def _kept(shape: Any, points: Floats, radius: float) -> Any:
     solid = compiled().convex(points, faces, radius) if isinstance(shape, coal.Convex) else compiled().mesh(points, faces)
     _known[key] = (weakref.ref(shape, lambda _: _known.pop(key, None)), content, radius, solid)
     return solid
-
-
-def indices(shape: coal.Convex | coal.BVHModelBase) -> Ints:
-    """Return the corners of the triangles of a coal shape, shape (m, 3)."""
-    convex = isinstance(shape, coal.Convex)
-    count, item = (shape.num_polygons, shape.polygons) if convex else (shape.num_tris, shape.tri_indices)
-    return np.array([[triangle[i] for i in range(3)] for triangle in map(item, range(count))], np.int64).reshape(-1, 3)

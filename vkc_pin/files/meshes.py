@@ -15,15 +15,14 @@ import coal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vkc_pin.arrays import Floats
-from vkc_pin.distances.solids import indices
+from vkc_pin.arrays import Floats, Ints
 from vkc_pin.errors import InputError
 from vkc_pin.files.hulls import outer_hull
 
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["MeshPart", "coarser", "convex_hull", "load_convex", "load_mesh", "load_parts", "to_bvh"]
+__all__ = ["MeshPart", "coarser", "convex_hull", "indices", "load_convex", "load_mesh", "load_parts", "to_bvh"]
 
 _NEIGHBOURS = 255  # coal's corners have no more
 _TOLERANCE = 1e-6  # how far, relatively, coal's volume and area may be from trimesh's
@@ -197,6 +196,13 @@ def _factors(file: Path, scale: ArrayLike) -> Floats:
     return np.broadcast_to(factors, (3,)).astype(float)
 
 
+def indices(shape: coal.Convex | coal.BVHModelBase) -> Ints:
+    """Return the corners of the triangles of a coal shape, shape (m, 3)."""
+    convex = isinstance(shape, coal.Convex)
+    count, item = (shape.num_polygons, shape.polygons) if convex else (shape.num_tris, shape.tri_indices)
+    return np.array([[triangle[i] for i in range(3)] for triangle in map(item, range(count))], np.int64).reshape(-1, 3)
+
+
 def _colour(mesh: trimesh.Trimesh) -> tuple[float, float, float, float] | None:
     material = getattr(mesh.visual, "material", None)
     if material is None:
@@ -207,3 +213,21 @@ def _colour(mesh: trimesh.Trimesh) -> tuple[float, float, float, float] | None:
         return (*(rgb / 255.0).tolist(), 1.0)
     rgba = np.asarray(material.main_color, float) / 255.0
     return (float(rgba[0]), float(rgba[1]), float(rgba[2]), float(rgba[3]))
+
+
+def _settle_boxes() -> None:
+    """Let coal take boxes as they are, whatever it is asked first.
+
+    coal 3.0.3 decides once per process, from the first direction in which it looks for a box's furthest corner, whether boxes are
+    1e-10 larger on their negative sides: yes if a component is zero (a `static` in `getShapeSupport`, gone in later versions). So
+    the first question of a process would decide on the last digits of every distance to a box. This one has no such component.
+    It is asked here, below all that asks for distances; compiled code asks the same library.
+    """
+    turned = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
+    box, here, there = coal.Box(1.0, 1.0, 1.0), coal.Transform3s(), coal.Transform3s(turned, np.array([3.0, 0.4, 0.2]))
+    plane = coal.Halfspace(np.array([0.36, 0.48, 0.8]), 0.0)  # for the other one, of shapes with a swept sphere
+    for shape, where in ((coal.Capsule(0.1, 0.5), there), (plane, here)):
+        coal.distance(shape, here, box, where, coal.DistanceRequest(), coal.DistanceResult())
+
+
+_settle_boxes()

@@ -10,8 +10,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from vkc_pin.arrays import Floats
-from vkc_pin.distances.solids import indices
 from vkc_pin.errors import InputError
+from vkc_pin.files.meshes import indices
 from vkc_pin.models.grafting import clean
 
 __all__ = [

@@ -8,7 +8,7 @@ import pinocchio as pin
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.chain.broadphase import PhaseGeometry
+from vkc_pin.chain.phase_geometry import PhaseGeometry
 from vkc_pin.models.shapes import bounding_box, shape_distance
 
 JOINTS = 3

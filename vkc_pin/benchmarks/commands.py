@@ -56,6 +56,9 @@ def add_bench(commands: Any) -> None:
     numbers = "numbers of obstacles (default: 10 30 100 300 1000)"
     scale.add_argument("--obstacles", dest="counts", nargs="+", type=positive, metavar="N", help=numbers)
 
+    about = "Plan to drive through a gap of 0.85 m and to reach over a table beyond it, from random starts of base and arm."
+    _add_experiment(benches, "gap", "reach over a table beyond a gap of 0.85 m", about, jobs=1)
+
     _add_problems(benches)
 
 

@@ -17,10 +17,15 @@ from vkc_pin.benchmarks.problems.changes import UNCHANGED, Change, parsed
 from vkc_pin.benchmarks.problems.problem_set import KINDS, NUMBER, Problem, kind_of, problem
 from vkc_pin.files.writing import write_atomically
 
-__all__ = ["every_trial", "report", "run", "specify"]
+__all__ = ["SUMMARY", "every_trial", "report", "run", "specify", "summary"]
 
 PAIRED = {"planning_time": "time", "cpu_time": "CPU", "base_effort": "base", "arm_effort": "arm", "objective": "objective"}
 """What is compared with the unchanged planner, problem by problem: field → name."""
+SUMMARY = (
+    *("success", "first seed", "time, median [s]", "mean [s]", "95th percentile [s]"),
+    *("CPU, median [s]", "mean [s]", "95th percentile [s]", "rounds", "iterations", "base [m]", "arm [rad]", "failures"),
+)
+"""Columns that sum up trials; see `summary`."""
 
 
 def specify(*, problems: Sequence[int], changes: Sequence[Change], seed: int) -> list[dict[str, Any]]:
@@ -84,12 +89,11 @@ def report(result: Mapping[str, Any]) -> str:
     rows, paired = [], []
     for change in about["changes"]:
         own = [record for record in records if record["method"] == change]
-        rows.append([change, *_numbers(own)])
+        rows.append([change, *summary(own)])
         pairs = [(base[r["number"]], r) for r in own if r["success"] and base.get(r["number"], {}).get("success")]
         paired.append([change, str(len(pairs)), *(_ratio(pairs, field) for field in PAIRED)])
-    head = ["setting", "success", "first seed", "time, median [s]", "mean [s]", "95th percentile [s]", "CPU, median [s]"]
-    head += ["mean [s]", "95th percentile [s]", "rounds", "iterations", "base [m]", "arm [rad]", "failures"]
-    kinds = [["unchanged", kind, *_numbers([r for r in base.values() if r.get("kind") == kind])] for kind in KINDS]
+    head = ["setting", *SUMMARY]
+    kinds = [["unchanged", kind, *summary([r for r in base.values() if r.get("kind") == kind])] for kind in KINDS]
     parts = [
         "# One setting changed at a time",
         f"{len(about['problems'])} problems, planning seed {about['seed']}, at most {about['time_limit']:g} s of planning. "
@@ -132,7 +136,8 @@ def every_trial(records: Sequence[Record]) -> str:
     return markdown([*head, "failed"], rows, text=5)
 
 
-def _numbers(own: Sequence[Record]) -> list[str]:
+def summary(own: Sequence[Record]) -> list[str]:
+    """Return what `SUMMARY` names, of some trials."""
     good = [record for record in own if record["success"]]
     first = sum(bool(record.get("first_seed")) for record in own)
     times = []

@@ -1,9 +1,11 @@
-"""Poses to reach in a random room: those of the tool in random configurations at which the robot touches nothing.
+"""Random configurations at which the robot touches nothing: starts, and poses of the tool to reach in a random room.
 
-So each of them can be reached; whether a planner finds out how is its own affair.
+So each of these poses can be reached; whether a planner finds out how is its own affair.
 """
 
 from __future__ import annotations
+
+import itertools
 
 import numpy as np
 import pinocchio as pin
@@ -15,7 +17,7 @@ from vkc_pin.scene.rooms.parts import Part
 from vkc_pin.scene.rooms.random_room import Layout
 from vkc_pin.scene.scene import Scene
 
-__all__ = ["pose_among", "pose_over"]
+__all__ = ["pose_among", "pose_over", "random_start"]
 
 CLEAR = 0.03  # [m] from everything, the robot itself too
 NEAR = 0.15  # [m] from something, at most, for a pose among furniture
@@ -74,6 +76,26 @@ def pose_among(layout: Layout, scene: Scene, rng: np.random.Generator) -> pin.SE
         if free and layout.floor.connected(standing, layout.radius, [layout.start[:2], (x, y)]):
             return at
     raise InputError("no configuration is near anything", field="pose", expected=f"one of {_TRIES}", got=scene.name)
+
+
+def random_start(scene: Scene, rng: np.random.Generator) -> Scene:
+    """Return the scene with the base at a random place of its start region and with the arm anywhere, clear of everything.
+
+    Args:
+        scene: With a start region.
+        rng: Where the random numbers come from.
+
+    Raises:
+        InputError: There is no start region, or no configuration was found.
+    """
+    if scene.start_region is None:
+        raise InputError("the scene has no start region", file=scene.file, field="start_region", expected="x and y intervals")
+    for x, y, yaw in itertools.islice(scene.start_region.draws(rng), _TRIES):
+        _, z = _drawn(scene, (x, y, yaw), rng)
+        if _free(scene, z):
+            return scene.with_start(base=z[:3], arm=z[3:])
+    problem = f"no free configuration of the robot in {_TRIES} tries"
+    raise InputError(problem, file=scene.file, field="start_region", expected=f"a clearance of {CLEAR} m somewhere")
 
 
 def _drawn(scene: Scene, base: tuple[float, float, float], rng: np.random.Generator) -> tuple[pin.SE3, Floats]:

@@ -1,6 +1,6 @@
-"""Makes docs/images and docs/animations: plans the door, the use of a stick and a chore, looks at them, and at scenes.
+"""Makes docs/images and docs/animations: plans the door, the use of a stick, a chore and a gap, looks at them, and at scenes.
 
-Needs Chromium. Usage: make_images.py [DOOR [STICK [CHORE]]]: saved plans (.npz) to show instead of planning them.
+Needs Chromium. Usage: make_images.py [DOOR [STICK [CHORE [GAP]]]]: saved plans (.npz) to show instead of planning them.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks import chores
+from vkc_pin.benchmarks import chores, gap
 from vkc_pin.motion.world import World
 from vkc_pin.plotting.style import new_figure, save_figure, styled
 from vkc_pin.plotting.top_view import draw_top_view
@@ -22,6 +22,7 @@ from vkc_pin.visualization import viewer as visualization
 ROOT = Path(__file__).parent.parent
 IMAGES = ROOT / "docs" / "images"
 WIDE, SMALL = (1200, 640), (640, 400)  # [pixels]
+SHOWN = 0  # number of the start from which the robot drives through the gap
 LEAVING = 130.0  # [s] of the chore in the home
 HALF_OPEN = 14.0  # [s] of the motion at the door
 UNDER_THE_TABLE = (-0.4, 2.4, 0.4), (-4.2, -0.6, 2.0)  # what to look at, and from where [m]
@@ -30,6 +31,7 @@ CORRIDOR = (1.6, 0.0, 0.3), (-7.4, -1.4, 7.2)
 AISLE = (2.35, 2.5, 0.2), (-2.9, -3.0, 6.2)
 HOME = (0.1, -0.3, 0.0), (-1.5, -8.5, 9.0)
 KITCHEN = (-2.1, 2.4, 0.7), (0.1, -1.0, 2.9)
+GAP = (0.1, -0.3, 0.2), (-3.4, -5.0, 5.6)
 OPENED = {"door": ("hinge", 1.0), "drawer": ("slide", 0.22), "dishwasher": ("rack", 0.5), "refrigerator": ("hinge", 1.4)}
 
 sys.path.insert(0, str(ROOT / "tests"))
@@ -83,6 +85,13 @@ def chore_pictures(chore: vkc.Plan) -> None:
     visualization.to_html(chore, ROOT / "docs" / "animations" / "household_chore.html")
 
 
+def gap_picture(through: vkc.Plan) -> None:
+    """Write a picture of the motion through the gap, when the robot is in it."""
+    look(*GAP)
+    inside = int(np.argmax(through.trajectory.column("base_x") > 0.0))
+    picture(through, "gap_table", WIDE, float(through.trajectory.times[inside]))
+
+
 def main() -> int:
     """Write the pictures; return 1 if there is no motion to show."""
     saved = [vkc.Plan.load(name) for name in sys.argv[1:]]
@@ -91,7 +100,8 @@ def main() -> int:
     stick = saved[1] if len(saved) > 1 else vkc.plan(vkc.load_scene("init_3"), use, initialization="astar")
     home = vkc.load_scene("household")
     chore = saved[2] if len(saved) > 2 else vkc.plan_chore(home, chores.home(home))
-    for plan in (door, stick, chore):
+    through = saved[3] if len(saved) > 3 else vkc.plan(gap.started(0, SHOWN), [vkc.Reach(gap.POSE)])
+    for plan in (door, stick, chore, through):
         sys.stdout.write(plan.report() + "\n")
         if not plan.success:
             return 1
@@ -109,6 +119,7 @@ def main() -> int:
     home_pictures()
     room_picture()
     chore_pictures(chore)
+    gap_picture(through)
     return 0
 
 

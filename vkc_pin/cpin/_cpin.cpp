@@ -4,18 +4,12 @@
 // casadi::Function goes out as CasADi serialises it. So this module shares no C++ object with the Python bindings of
 // either library, and need not be built with their compilers.
 
+#include "_cpin.hpp"
+
 #include <string>
 #include <vector>
 
-#include <pinocchio/autodiff/casadi.hpp>
-
-#include <pinocchio/algorithm/center-of-mass.hpp>
-#include <pinocchio/algorithm/frames.hpp>
-#include <pinocchio/algorithm/jacobian.hpp>
-#include <pinocchio/algorithm/kinematics.hpp>
-#include <pinocchio/algorithm/rnea.hpp>
 #include <pinocchio/config.hpp>
-#include <pinocchio/multibody.hpp>
 #include <pinocchio/serialization.hpp>
 
 #include <casadi/casadi.hpp>
@@ -30,11 +24,7 @@ namespace nb = nanobind;
 namespace {
 
 using casadi::Function;
-using casadi::SX;
-using Model = pinocchio::ModelTpl<SX>;
-using Data = pinocchio::DataTpl<SX>;
-using SE3 = pinocchio::SE3Tpl<SX>;
-using Vector = Eigen::Matrix<SX, Eigen::Dynamic, 1>;
+using namespace vkc_pin;
 
 Model load(const std::string & text)
 {
@@ -85,7 +75,7 @@ std::string joint_placements(const std::string & text)
   const Model model = load(text);
   Data data(model);
   const SX q = SX::sym("q", model.nq);
-  pinocchio::forwardKinematics(model, data, to_eigen(q));
+  algorithms::forward_kinematics(model, data, to_eigen(q));
   std::vector<SX> columns{SX(12, 0)};
   for (std::size_t i = 1; i < data.oMi.size(); ++i)
     columns.push_back(column(data.oMi[i]));
@@ -97,7 +87,7 @@ std::string frame_placements(const std::string & text, const std::vector<std::si
   const Model model = load(text);
   Data data(model);
   const SX q = SX::sym("q", model.nq);
-  pinocchio::forwardKinematics(model, data, to_eigen(q));
+  algorithms::forward_kinematics(model, data, to_eigen(q));
   std::vector<SX> columns{SX(12, 0)};
   for (const std::size_t i : frames)
   {
@@ -112,11 +102,7 @@ std::string frame_jacobian(const std::string & text, std::size_t frame, int refe
   const Model model = load(text);
   Data data(model);
   const SX q = SX::sym("q", model.nq);
-  pinocchio::computeJointJacobians(model, data, to_eigen(q));
-  Data::Matrix6x jacobian = Data::Matrix6x::Zero(6, model.nv);
-  pinocchio::getFrameJacobian(
-    model, data, model.frames.at(frame).parentJoint, model.frames.at(frame).placement,
-    static_cast<pinocchio::ReferenceFrame>(reference), jacobian);
+  const Data::Matrix6x jacobian = algorithms::frame_jacobian(model, data, to_eigen(q), frame, reference);
   return pack("frame_jacobian", {q}, to_casadi(jacobian), {"q"}, "J");
 }
 
@@ -125,7 +111,7 @@ std::string rnea(const std::string & text)
   const Model model = load(text);
   Data data(model);
   const SX q = SX::sym("q", model.nq), v = SX::sym("v", model.nv), a = SX::sym("a", model.nv);
-  pinocchio::rnea(model, data, to_eigen(q), to_eigen(v), to_eigen(a));
+  algorithms::inverse_dynamics(model, data, to_eigen(q), to_eigen(v), to_eigen(a));
   return pack("rnea", {q, v, a}, to_casadi(data.tau), {"q", "v", "a"}, "tau");
 }
 
@@ -134,7 +120,7 @@ std::string center_of_mass(const std::string & text)
   const Model model = load(text);
   Data data(model);
   const SX q = SX::sym("q", model.nq);
-  pinocchio::centerOfMass(model, data, to_eigen(q), false);
+  algorithms::center_of_mass(model, data, to_eigen(q));
   return pack("center_of_mass", {q}, to_casadi(data.com[0]), {"q"}, "com");
 }
 

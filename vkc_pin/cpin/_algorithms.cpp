@@ -1,0 +1,40 @@
+// Pinocchio's algorithms on casadi::SX, instantiated for all types of joints: what takes longest to compile in _cpin.
+
+#include "_cpin.hpp"
+
+#include <pinocchio/algorithm/center-of-mass.hpp>
+#include <pinocchio/algorithm/frames.hpp>
+#include <pinocchio/algorithm/jacobian.hpp>
+#include <pinocchio/algorithm/kinematics.hpp>
+#include <pinocchio/algorithm/rnea.hpp>
+
+namespace vkc_pin::algorithms {
+
+void forward_kinematics(const Model & model, Data & data, const Vector & q)
+{
+  pinocchio::forwardKinematics(model, data, q);
+}
+
+Data::Matrix6x frame_jacobian(const Model & model, Data & data, const Vector & q, std::size_t frame, int reference)
+{
+  // With `q` the latter would walk over the joints once more, by templates of its own.
+  pinocchio::forwardKinematics(model, data, q);
+  pinocchio::computeJointJacobians(model, data);
+  Data::Matrix6x jacobian = Data::Matrix6x::Zero(6, model.nv);
+  pinocchio::getFrameJacobian(
+    model, data, model.frames.at(frame).parentJoint, model.frames.at(frame).placement,
+    static_cast<pinocchio::ReferenceFrame>(reference), jacobian);
+  return jacobian;
+}
+
+void inverse_dynamics(const Model & model, Data & data, const Vector & q, const Vector & v, const Vector & a)
+{
+  pinocchio::rnea(model, data, q, v, a);
+}
+
+void center_of_mass(const Model & model, Data & data, const Vector & q)
+{
+  pinocchio::centerOfMass(model, data, q, false);
+}
+
+} // namespace vkc_pin::algorithms

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import itertools
-from typing import Any
 
 import coal
 import numpy as np
@@ -15,7 +14,7 @@ from vkc_pin.driving.body import Shape
 from vkc_pin.driving.grid import BaseGrid
 from vkc_pin.driving.ground import BACKWARDS, SIDEWAYS
 from vkc_pin.driving.path import BasePath, poses_along, shortest_path
-from vkc_pin.driving.search import _Round
+from vkc_pin.driving.search import _Search
 from vkc_pin.errors import InputError
 
 TURNING = 0.3  # [m/rad] where a grid is not told
@@ -309,14 +308,14 @@ def test_no_waypoints(around_the_block: BasePath) -> None:
 
 def test_a_search_asks_about_few_moves(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a thousand cells with a heading, fewer than one is looked at exactly: the rest is left to the heuristic."""
-    free, asked = _Round._free, 0
+    move, asked = _Search._move, 0
 
-    def counted(self: _Round, entry: Any) -> bool:
+    def counted(self: _Search, node: int, after: int) -> bool:
         nonlocal asked
         asked += 1
-        return free(self, entry)
+        return move(self, node, after)
 
-    monkeypatch.setattr(_Round, "_free", counted)
+    monkeypatch.setattr(_Search, "_move", counted)
     rng, searches = np.random.default_rng(0), 11
     grid = BaseGrid(chassis(), arm(), furniture(), HALL, MARGIN)
     for _ in range(searches):

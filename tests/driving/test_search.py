@@ -134,6 +134,25 @@ def test_remembering_moves_changes_nothing(seed: int) -> None:
             assert (*one.a, *one.b, one.yaw) == (*other.a, *other.b, other.yaw)
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_what_other_searches_found_out_changes_nothing(seed: int) -> None:
+    """The path is the same after searches for others, from other places, with the arm near other goals."""
+    grid, start, goals, extra = task(seed)
+    fresh, *_ = task(seed)
+    rng = np.random.default_rng(seed)
+    for grids in (grid, fresh):
+        grids.near = 0.5
+    for other in rng.uniform([-1.8, -1.8, -3.0], [1.8, 1.8, 3.0], size=(4, 3)):
+        cheapest(Ground(grid, other, goals[:2]), extra[:2])
+        cheapest(Ground(grid, start, other[None]), extra[:1])
+    first, second = (cheapest(Ground(one, start, goals), extra) for one in (grid, fresh))
+    assert (first is None) == (second is None)
+    if first is not None and second is not None:
+        assert first[:2] == second[:2]
+        for one, other in zip(first[2], second[2], strict=True):
+            assert (*one.a, *one.b, one.yaw) == (*other.a, *other.b, other.yaw)
+
+
 def test_start_and_goal_on_cells() -> None:
     """Ways of no length, and costs of nothing, at both ends."""
     grid = BaseGrid(chassis(0.7, 0.4), [], [(coal.Box(0.2, 2.5, 1.0), at(0.0, -0.75, 0.5))], ROOM, MARGIN, cells=CELLS, near=0.0)

@@ -21,6 +21,7 @@ HEADINGS = 16
 
 _MOVES = np.array([(1, 0), (2, 1), (1, 1), (1, 2), (0, 1), (-1, 2), (-1, 1), (-2, 1)])
 _MOVES = np.concatenate([_MOVES, -_MOVES])  # by heading, in cells
+_STAY, _AHEAD, _LEFT = range(3)  # in a cell, to the next one, to the next heading
 _CELLS, _FINEST = 100, 250  # along a side; at most
 _ROOM = 0.5  # [m] beyond which more room makes no difference
 
@@ -94,7 +95,8 @@ class BaseGrid:
         views = (cache or Cache()).get("plan views", PlanViews)
         lattice = Lattice(self.origin, self.step, self.cells, self.yaws)
         self.stuck, self.stuck_carrying = stuck(base, carried, standing, lattice, margin, views=views)
-        self._edges: dict[tuple[int, int, int, bool, bool], bool] = {}
+        # Whether these are free, with everything and for the base alone; -1: nobody has asked yet.
+        self._known = np.full((3, 2, self.cells, self.cells, HEADINGS), -1, np.int8)
 
     def center(self, i: int, j: int) -> tuple[float, float]:
         """Return the world position of a cell's centre [m]."""
@@ -109,8 +111,16 @@ class BaseGrid:
         return np.column_stack([i[inside], j[inside]])
 
     def free(self, i: int, j: int, heading: int, *, reaching: bool = False) -> bool:
-        """Return whether everything keeps its margin in a cell at a heading, 0 to HEADINGS - 1; `reaching` as in `clear`."""
-        return self._roomy(i, j, reaching) or self.clear(*self.center(i, j), float(self.yaws[heading]), reaching=reaching)
+        """Return whether everything keeps its margin in a cell at a heading, 0 to HEADINGS - 1; remembered.
+
+        `reaching` as in `clear`.
+        """
+        key = (_STAY, int(reaching), i, j, heading)
+        if self._known[key] < 0:
+            self._known[key] = self._roomy(i, j, reaching) or self.clear(
+                *self.center(i, j), float(self.yaws[heading]), reaching=reaching
+            )
+        return bool(self._known[key])
 
     def clear(self, x: float, y: float, yaw: float, *, reaching: bool = False) -> bool:
         """Return whether everything keeps its margin at a pose in the world.
@@ -152,25 +162,36 @@ class BaseGrid:
 
     def forward(self, i: int, j: int, heading: int, *, reaching: bool = False) -> bool:
         """Return whether the move at `heading` from a cell is free all along; remembered."""
-        key = (i, j, heading, True, reaching)
-        if key not in self._edges:
+        key = (_AHEAD, int(reaching), i, j, heading)
+        if self._known[key] < 0:
             k, m = i + int(self.moves[heading, 0]), j + int(self.moves[heading, 1])
             enough = self.lengths[heading]
             room = [rows[i][j] + rows[k][m] for rows in self._room]
-            self._edges[key] = (room[0] >= enough and (reaching or room[1] >= enough)) or self.driven(
+            self._known[key] = (room[0] >= enough and (reaching or room[1] >= enough)) or self.driven(
                 self.center(i, j), self.center(k, m), float(self.yaws[heading]), reaching=reaching
             )
-        return self._edges[key]
+        return bool(self._known[key])
 
     def left(self, i: int, j: int, heading: int, *, reaching: bool = False) -> bool:
         """Return whether turning in a cell from `heading` to the next is free all along; remembered."""
-        key = (i, j, heading, False, reaching)
-        if key not in self._edges:
+        key = (_LEFT, int(reaching), i, j, heading)
+        if self._known[key] < 0:
             end = float(self.yaws[heading + 1]) if heading + 1 < HEADINGS else 2 * np.pi
-            self._edges[key] = self._roomy(i, j, reaching) or self.turned(
+            self._known[key] = self._roomy(i, j, reaching) or self.turned(
                 self.center(i, j), float(self.yaws[heading]), end, reaching=reaching
             )
-        return self._edges[key]
+        return bool(self._known[key])
+
+    def refused(self, reaching: Bools) -> Bools:
+        """Return what was asked and is not free: to be in a cell, to move ahead from it, and to turn left in it.
+
+        Args:
+            reaching: Where only the base counts, shape (cells, cells).
+
+        Returns:
+            Shape (3, cells, cells, HEADINGS), headings as in `free`, `forward` and `left`.
+        """
+        return np.where(reaching[..., None], self._known[:, 1], self._known[:, 0]) == 0
 
     def _roomy(self, i: int, j: int, reaching: bool) -> bool:
         """Return whether nothing can be hit from a cell at any heading."""
@@ -209,13 +230,14 @@ class BaseGrid:
                 if len(cells):
                     break
             entries.append((self.cells * cells[:, 0] + cells[:, 1], np.hypot(*(self.origin + cells * self.step - (x, y)).T)))
-        return self.spread(entries, self.stuck)
+        return self.spread(entries, self.stuck, self.lengths)
 
-    def spread(self, entries: Sequence[tuple[Ints, Floats]], stuck: Bools) -> Floats:
-        """Return how far it is at least to every cell, shape (W, cells, cells) [m], if turns are free.
+    def spread(self, entries: Sequence[tuple[Ints, Floats]], stuck: Bools, lengths: Floats) -> Floats:
+        """Return how far it is at least to every cell, shape (W, cells, cells), in units of `lengths`, if turns are free.
 
         Args:
-            entries: W times the cells, as i·cells + j, where the path begins, and what it costs to be there [m].
+            entries: W times the cells, as i·cells + j, where the path begins, and what it costs to be there.
+            lengths: Of the moves, shape (HEADINGS,).
             stuck: Where the base cannot be at a heading, shape (cells, cells, HEADINGS).
         """
         from scipy.sparse import csr_array
@@ -237,7 +259,7 @@ class BaseGrid:
         ends = np.cumsum([*usable.sum(axis=1), *(len(cells) for cells, _ in entries)])
         graph = csr_array(
             (
-                np.concatenate([np.broadcast_to(self.lengths, usable.shape)[usable], *(cost for _, cost in entries)]),
+                np.concatenate([np.broadcast_to(lengths, usable.shape)[usable], *(cost for _, cost in entries)]),
                 np.concatenate([targets[targets >= 0], *(cells for cells, _ in entries)]).astype(np.int32),
                 np.concatenate([[0], ends]).astype(np.int32),
             ),

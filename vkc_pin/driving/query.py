@@ -1,62 +1,65 @@
-"""What a search for a path of the base knows: where that begins and may end, and what has turned out not to be free."""
+"""What a path of the base may begin and end with: drives between the start, or a goal, and the cells around it, or past them."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from vkc_pin.arrays import Floats
-from vkc_pin.driving.ground import Ground, wrapped
+from vkc_pin.arrays import Floats, Ints
+from vkc_pin.driving.ground import UNIT, Connections, Drive, Ground
 
-__all__ = ["AHEAD", "BACK", "BEGIN", "DIRECT", "END", "LEFT", "RIGHT", "Move", "Query"]
-
-# Kinds of moves; the first four lead from node to node.
-AHEAD, BACK, LEFT, RIGHT, BEGIN, END, DIRECT = range(7)
-
-Move = tuple[int, int, int]
-"""Its kind, the goal, and the number of the connection; the last two are 0 from node to node."""
-
-_ALIKE = 0.1  # [rad] between connections of which one is blocked, and the other then may well be
+__all__ = ["Query"]
 
 
 class Query:
-    """Where the path begins and may end, and what has been learned.
+    """Where a path may begin and end, and at what cost.
 
     Attributes:
-        starts, ends: Connections of the start, and of each goal, with the cells around them.
-        closed: Moves from the start, or to a goal, that are not free.
-        shut: Moves from node to node that are not free, as cell, heading, kind.
+        starts: Connections of the start with the cells around it.
+        ends: Connections of all goals that are not blocked, one goal after the other; their costs include the goals' own.
+        goal: Which goal each of the `ends` leads to.
+        direct: Straight drives from the start to goals as cost [UNIT], goal and kind (see `Ground.direct`), the cheapest last.
     """
 
     def __init__(self, ground: Ground, extra: Floats) -> None:
-        self.ground, self.extra = ground, extra
+        self.ground = ground
         self.starts = ground.starts()
-        self.ends = {g: ground.ends(g) for g, goal in enumerate(ground.goals) if ground.clear(goal)}
-        self.closed: set[Move] = set()
-        self.shut: set[tuple[int, int, int]] = set()
+        goals = [g for g, goal in enumerate(ground.goals) if ground.clear(goal)]
+        more = {goal: round(float(extra[goal]) / UNIT) for goal in goals}
+        ends = {goal: ground.ends(goal) for goal in goals}
+        self.goal = np.concatenate([np.zeros(0, int), *(np.full(len(part.cell), goal) for goal, part in ends.items())])
+        self.ends = Connections(
+            np.concatenate([np.zeros(0, int), *(part.cell for part in ends.values())]),
+            np.concatenate([np.zeros(0, int), *(part.heading for part in ends.values())]),
+            np.concatenate([np.zeros(0), *(part.yaw for part in ends.values())]),
+            np.concatenate([np.zeros(0, int), *(part.cost + more[goal] for goal, part in ends.items())]),
+        )
+        drives = [(goal, how, ground.direct(goal, how)) for goal in goals for how in range(3)]
+        found = [(self._cost(*drive) + more[goal], goal, how) for goal, how, drive in drives if drive is not None]
+        self.direct = sorted(found, reverse=True)
         self._turned: set[int] = set()  # goals at which it is known how far the base can turn
 
-    def free(self, move: Move, yaw: float) -> bool:
-        """Return whether a move from the start or to a goal is free; `yaw` is that in the cell [rad]."""
-        ground, (kind, goal, number) = self.ground, move
-        if kind == BEGIN:
-            return ground.swept(float(ground.start[2]), *ground.begin(self.starts, number), ground.leaving)
-        if kind == END:
-            return ground.swept(yaw, *ground.end(self.ends[goal], number, goal, yaw))
-        direct = ground.direct(goal, number)
-        return direct is not None and ground.swept(float(ground.start[2]), *direct, ground.leaving)
+    def _cost(self, drive: Drive, last: float) -> int:
+        turned = abs(drive.yaw - self.ground.start[2]) + abs(last - drive.yaw)
+        return round((drive.cost * self.ground.haste + self.ground.grid.turning * turned) / UNIT)
 
-    def close(self, move: Move) -> None:
-        """Note that a move from the start or to a goal is not free, and look at those that are like it."""
-        self.closed.add(move)
-        kind, goal, number = move
-        if kind == DIRECT:
-            return
-        ground, connections = self.ground, self.starts if kind == BEGIN else self.ends[goal]
-        if kind == END and goal not in self._turned:
+    def begins(self, number: int) -> bool:
+        """Return whether a connection from the start is free."""
+        ground = self.ground
+        return ground.swept(float(ground.start[2]), *ground.begin(self.starts, number), ground.leaving)
+
+    def leads(self, goal: int, how: int) -> bool:
+        """Return whether a straight drive from the start to a goal is free."""
+        direct = self.ground.direct(goal, how)
+        return direct is not None and self.ground.swept(float(self.ground.start[2]), *direct, self.ground.leaving)
+
+    def barred(self, number: int) -> Ints:
+        """Return which connections are not free if one to a goal is not; none if that is free."""
+        ground, goal = self.ground, int(self.goal[number])
+        yaw = float(ground.grid.yaws[self.ends.heading[number]])
+        if ground.swept(yaw, *ground.end(self.ends, number, goal, yaw)):
+            return np.empty(0, int)
+        others = np.empty(0, int)
+        if goal not in self._turned:
             self._turned.add(goal)
-            turnable = ground.turnable(ground.goals[goal], connections)
-            self.closed |= {(END, goal, k) for k in np.flatnonzero(~turnable).tolist()}
-        alike = np.flatnonzero(np.abs(wrapped(connections.yaw - connections.yaw[number])) < _ALIKE).tolist()
-        for other in [(kind, goal, k) for k in alike]:
-            if other not in self.closed and not self.free(other, float(ground.grid.yaws[connections.heading[other[2]]])):
-                self.closed.add(other)
+            others = np.flatnonzero((self.goal == goal) & ~ground.turnable(ground.goals[goal], self.ends))
+        return np.append(others, number)

@@ -1,0 +1,325 @@
+// Cheapest paths over cells and headings, found again after moves have turned out not to be free, by LPA* (Koenig, Likhachev
+// and Furcy 2004): what a change leaves as it was is not looked at again. Costs are whole numbers, so that sums are exact.
+
+#include <algorithm>
+#include <limits>
+#include <queue>
+#include <stdexcept>
+#include <tuple>
+#include <unordered_map>
+#include <vector>
+
+#include <nanobind/stl/tuple.h>
+
+#include "../distances/arrays.hpp"
+
+namespace {
+
+constexpr Index NEVER = std::numeric_limits<Index>::max() / 4;
+constexpr Index HEADINGS = 16, BORDER = 2; // cells that moves lead out of the arena at most
+enum Kind : Index { AHEAD, BACK, LEFT, RIGHT, KINDS };
+// What is known of a node, and of the moves ahead and to the left from it; the other two are these from their other ends.
+enum Flag : std::uint8_t { BLOCKED = 1, NO_AHEAD = 2, NO_LEFT = 4, BEGINS = 8, ENDS = 16 };
+
+struct Connection
+{
+  Index node, cost;
+};
+
+// Nodes are numbered (i * cells + j) * HEADINGS + heading; here, with a border of blocked cells around these, so that no move
+// leads out of them.
+class Paths
+{
+public:
+  // `flags` of nodes; `moves` in cells and `costs` by heading, (16, 2) and (16, 4); `least` is what is left at least from each
+  // cell on, negative: no path; `begins` and `ends` are nodes and costs, (n, 2).
+  Paths(
+    const Indices<3> & flags,
+    const Indices<2> & moves,
+    const Indices<2> & costs,
+    const Indices<2> & least,
+    const Indices<2> & begins,
+    const Indices<2> & ends)
+  : cells_(Index(flags.shape(0))), width_(cells_ + 2 * BORDER)
+  {
+    const std::size_t cells = flags.shape(0);
+    if (flags.shape(1) != cells || flags.shape(2) != HEADINGS || least.shape(0) != cells || least.shape(1) != cells)
+      throw std::invalid_argument("flags are of shape (cells, cells, 16), what is left of shape (cells, cells)");
+    if (moves.shape(0) != HEADINGS || moves.shape(1) != 2 || costs.shape(0) != HEADINGS || costs.shape(1) != KINDS)
+      throw std::invalid_argument("moves are of shape (16, 2), costs of shape (16, 4)");
+    if (begins.shape(1) != 2 || ends.shape(1) != 2)
+      throw std::invalid_argument("connections are of shape (n, 2)");
+    for (Index heading = 0; heading < HEADINGS; ++heading)
+    {
+      const Index di = moves(heading, 0), dj = moves(heading, 1);
+      if (std::max({di, -di, dj, -dj}) > BORDER)
+        throw std::invalid_argument("moves lead two cells away at most");
+      moves_.push_back((di * width_ + dj) * HEADINGS);
+    }
+    costs_.assign(costs.data(), costs.data() + costs.size());
+    if (std::any_of(costs_.begin(), costs_.end(), [](Index cost) { return cost <= 0; }))
+      throw std::invalid_argument("moves cost something");
+    const std::size_t nodes = std::size_t(width_ * width_ * HEADINGS);
+    flags_.assign(nodes, BLOCKED);
+    least_.assign(std::size_t(width_ * width_), -1);
+    for (Index cell = 0; cell < cells_ * cells_; ++cell)
+    {
+      const Index node = inner(cell * HEADINGS);
+      std::copy_n(flags.data() + cell * HEADINGS, HEADINGS, flags_.begin() + node);
+      least_[node / HEADINGS] = least.data()[cell];
+    }
+    cost_.assign(nodes, NEVER);
+    ahead_.assign(nodes, NEVER);
+    connect(begins, begins_, begins_at_, BEGINS);
+    connect(ends, ends_, ends_at_, ENDS);
+    for (const auto & begin : begins_)
+      look(begin.node);
+  }
+
+  // Takes out a move from node to node, either way.
+  void shut(Index node, Index kind)
+  {
+    if (kind < 0 || kind >= KINDS)
+      throw std::out_of_range("no such move");
+    node = inner(node);
+    const Index other = target(node, kind);
+    if (border(other))
+      return;
+    const bool straight = kind == AHEAD || kind == BACK;
+    flags_[kind == AHEAD || kind == LEFT ? node : other] |= straight ? NO_AHEAD : NO_LEFT;
+    look(node);
+    look(other);
+  }
+
+  // Takes out a node.
+  void block(Index node)
+  {
+    node = inner(node);
+    flags_[node] |= BLOCKED;
+    look(node);
+    for (Index kind = 0; kind < KINDS; ++kind)
+      if (const Index other = target(node, kind); !border(other))
+        look(other);
+  }
+
+  // Takes out connections from the start, or to a goal, by their numbers.
+  void close(const Indices<1> & numbers, bool ends)
+  {
+    auto & connections = ends ? ends_ : begins_;
+    for (std::size_t k = 0; k < numbers.shape(0); ++k)
+    {
+      auto & connection = connections.at(std::size_t(numbers(k)));
+      connection.cost = NEVER;
+      if (!ends)
+        look(connection.node);
+    }
+  }
+
+  // The cheapest path that costs less than `limit`: its cost, the numbers of its connections to the goal and from the start, and
+  // its nodes back from the goal to the start. No node: there is none. Of equal ones it is the first, in an order that the moves
+  // alone decide: at each node back from the goal the move that costs most. So it hangs on what is free, not on what was asked.
+  std::tuple<Index, Index, Index, Array<Index>> cheapest(Index limit)
+  {
+    std::vector<Index> nodes;
+    Index end = -1, begin = -1, best;
+    {
+      nb::gil_scoped_release released;
+      best = settle(limit);
+      if (best < limit)
+      {
+        for (std::size_t k = 0; k < ends_.size(); ++k)
+          if (total(ends_[k]) == best && (end < 0 || cost_[ends_[k].node] < cost_[ends_[end].node]))
+            end = Index(k);
+        nodes.push_back(ends_[end].node);
+        while ((begin = begun(nodes.back())) < 0)
+          nodes.push_back(source(nodes.back()));
+        for (Index & node : nodes)
+          node = outer(node);
+      }
+    }
+    const std::size_t count = nodes.size();
+    return {best, end, begin, handed_over(std::move(nodes), {count})};
+  }
+
+private:
+  struct Entry
+  {
+    Index total, cost, node;
+    bool operator<(const Entry & other) const { return std::tie(total, cost) > std::tie(other.total, other.cost); }
+  };
+
+  using At = std::unordered_map<Index, std::vector<std::size_t>>;
+
+  void connect(const Indices<2> & given, std::vector<Connection> & connections, At & at, Flag flag)
+  {
+    for (std::size_t k = 0; k < given.shape(0); ++k)
+    {
+      const Index node = inner(given(k, 0));
+      connections.push_back({node, given(k, 1)});
+      at[node].push_back(k);
+      flags_[node] |= flag;
+    }
+  }
+
+  Index inner(Index node) const
+  {
+    if (node < 0 || node >= cells_ * cells_ * HEADINGS)
+      throw std::out_of_range("no such node");
+    const Index cell = node / HEADINGS;
+    return ((cell / cells_ + BORDER) * width_ + cell % cells_ + BORDER) * HEADINGS + node % HEADINGS;
+  }
+
+  Index outer(Index node) const
+  {
+    const Index cell = node / HEADINGS;
+    return ((cell / width_ - BORDER) * cells_ + cell % width_ - BORDER) * HEADINGS + node % HEADINGS;
+  }
+
+  bool border(Index node) const
+  {
+    const Index i = node / HEADINGS / width_ - BORDER, j = node / HEADINGS % width_ - BORDER;
+    return i < 0 || j < 0 || i >= cells_ || j >= cells_;
+  }
+
+  // Where a move leads if nothing is in its way.
+  Index target(Index node, Index kind) const
+  {
+    const std::uint32_t heading = std::uint32_t(node) % HEADINGS;
+    if (kind == LEFT || kind == RIGHT)
+      return node - heading + (heading + (kind == LEFT ? 1 : HEADINGS - 1)) % HEADINGS;
+    return kind == AHEAD ? node + moves_[heading] : node - moves_[heading];
+  }
+
+  // The same; negative where the move is known not to be free.
+  Index leads(Index node, Index kind) const
+  {
+    if (flags_[node] & BLOCKED)
+      return -1;
+    const Index other = target(node, kind);
+    const std::uint8_t first = flags_[kind == AHEAD || kind == LEFT ? node : other];
+    return flags_[other] & BLOCKED || first & (kind < LEFT ? NO_AHEAD : NO_LEFT) ? -1 : other;
+  }
+
+  static Index opposite(Index kind) { return kind ^ 1; }
+
+  Index price(Index from, Index kind) const { return costs_[std::size_t(from % HEADINGS * KINDS + kind)]; }
+
+  Index total(const Connection & end) const { return std::min(cost_[end.node] + end.cost, NEVER); }
+
+  // Finds anew what a node costs by way of those that lead to it.
+  void look(Index node)
+  {
+    Index least = NEVER;
+    if (!(flags_[node] & BLOCKED))
+    {
+      if (flags_[node] & BEGINS)
+        for (const std::size_t k : begins_at_[node])
+          least = std::min(least, begins_[k].cost);
+      for (Index kind = 0; kind < KINDS; ++kind)
+        if (const Index from = leads(node, opposite(kind)); from >= 0)
+          least = std::min(least, cost_[from] + price(from, kind));
+    }
+    ahead_[node] = least;
+    push(node);
+  }
+
+  void push(Index node)
+  {
+    const Index least = least_[node / HEADINGS], cost = std::min(cost_[node], ahead_[node]);
+    if (cost_[node] != ahead_[node] && least >= 0)
+      queue_.push({cost + least, cost, node});
+  }
+
+  // Returns what the cheapest path costs, or `limit`, after which all nodes on paths that cost no more know their costs.
+  Index settle(Index limit)
+  {
+    Index best = cheapest_end(limit);
+    while (!queue_.empty() && queue_.top().total <= best)
+    {
+      const Entry entry = queue_.top();
+      queue_.pop();
+      const Index node = entry.node, before = cost_[node];
+      if (before == ahead_[node] || entry.cost != std::min(before, ahead_[node]))
+        continue; // it was settled, or has another entry, since
+      if (before > ahead_[node])
+      {
+        const Index cost = cost_[node] = ahead_[node];
+        if (flags_[node] & ENDS)
+          for (const std::size_t k : ends_at_[node])
+            best = std::min(best, total(ends_[k]));
+        for (Index kind = 0; kind < KINDS; ++kind)
+          if (const Index other = leads(node, kind); other >= 0 && cost + price(node, kind) < ahead_[other])
+          {
+            ahead_[other] = cost + price(node, kind);
+            push(other);
+          }
+      }
+      else
+      {
+        cost_[node] = NEVER;
+        push(node);
+        for (Index kind = 0; kind < KINDS; ++kind)
+          if (const Index other = leads(node, kind); other >= 0 && before + price(node, kind) == ahead_[other])
+            look(other);
+        if (flags_[node] & ENDS)
+          best = cheapest_end(limit);
+      }
+    }
+    return best;
+  }
+
+  Index cheapest_end(Index limit) const
+  {
+    for (const auto & end : ends_)
+      limit = std::min(limit, total(end));
+    return limit;
+  }
+
+  // The last of the connections from the start by which a node costs what it costs; negative: none.
+  Index begun(Index node)
+  {
+    Index found = -1;
+    if (flags_[node] & BEGINS)
+      for (const std::size_t k : begins_at_[node])
+        if (begins_[k].cost == cost_[node])
+          found = Index(k);
+    return found;
+  }
+
+  // The node before another on the cheapest path to it.
+  Index source(Index node) const
+  {
+    Index found = -1;
+    for (Index kind = 0; kind < KINDS; ++kind)
+      if (const Index from = leads(node, opposite(kind)); from >= 0 && cost_[from] + price(from, kind) == cost_[node])
+        if (found < 0 || cost_[from] <= cost_[found])
+          found = from;
+    if (found < 0)
+      throw std::logic_error("a path that comes from nowhere");
+    return found;
+  }
+
+  Index cells_, width_;
+  std::vector<Index> least_, moves_, costs_; // by cell; in nodes, by heading; by heading and kind
+  std::vector<std::uint8_t> flags_;
+  std::vector<Index> cost_, ahead_; // from the start; by way of the nodes that lead there
+  std::vector<Connection> begins_, ends_;
+  At begins_at_, ends_at_; // by node
+  std::priority_queue<Entry> queue_;
+};
+
+} // namespace
+
+NB_MODULE(_driving, module)
+{
+  module.doc() = "Cheapest paths over cells and headings, found again after moves have turned out not to be free.";
+  nb::set_leak_warnings(false); // what caches and globals keep lives until the process ends
+  nb::class_<Paths>(module, "Paths")
+    .def(
+      nb::init<
+        const Indices<3> &, const Indices<2> &, const Indices<2> &, const Indices<2> &, const Indices<2> &, const Indices<2> &>())
+    .def("shut", &Paths::shut)
+    .def("block", &Paths::block)
+    .def("close", &Paths::close)
+    .def("cheapest", &Paths::cheapest);
+}

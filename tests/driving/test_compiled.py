@@ -31,8 +31,7 @@ class Graph:
         self.moves = GRID.moves.astype(np.int64)
 
     def paths(self) -> Any:
-        least = np.zeros((CELLS, CELLS), np.int64)
-        return compiled.compiled().Paths(self.flags, self.moves, self.costs, least, self.begins, self.ends)
+        return compiled.compiled().Paths(self.flags.astype(np.uint8), self.moves, self.costs, self.begins, self.ends)
 
     def target(self, node: int, kind: int) -> int:
         cell, heading = divmod(node, HEADINGS)

@@ -2,7 +2,6 @@
 // and Furcy 2004): what a change leaves as it was is not looked at again. Costs are whole numbers, so that sums are exact.
 
 #include <algorithm>
-#include <limits>
 #include <queue>
 #include <stdexcept>
 #include <tuple>
@@ -11,67 +10,43 @@
 
 #include <nanobind/stl/tuple.h>
 
-#include "../distances/arrays.hpp"
+#include "lattice.hpp"
 
 namespace {
 
-constexpr Index NEVER = std::numeric_limits<Index>::max() / 4;
-constexpr Index HEADINGS = 16, BORDER = 2; // cells that moves lead out of the arena at most
-enum Kind : Index { AHEAD, BACK, LEFT, RIGHT, KINDS };
-// What is known of a node, and of the moves ahead and to the left from it; the other two are these from their other ends.
-enum Flag : std::uint8_t { BLOCKED = 1, NO_AHEAD = 2, NO_LEFT = 4, BEGINS = 8, ENDS = 16 };
+using Bytes = nb::ndarray<const std::uint8_t, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
 
-struct Connection
-{
-  Index node, cost;
-};
-
-// Nodes are numbered (i * cells + j) * HEADINGS + heading; here, with a border of blocked cells around these, so that no move
-// leads out of them.
 class Paths
 {
 public:
-  // `flags` of nodes; `moves` in cells and `costs` by heading, (16, 2) and (16, 4); `least` is what is left at least from each
-  // cell on, negative: no path; `begins` and `ends` are nodes and costs, (n, 2).
+  // `flags` of nodes; `moves` in cells and `costs` by heading, (16, 2) and (16, 4); `begins` and `ends` are nodes and costs, (n, 2).
   Paths(
-    const Indices<3> & flags,
+    const Bytes & flags,
     const Indices<2> & moves,
     const Indices<2> & costs,
-    const Indices<2> & least,
     const Indices<2> & begins,
     const Indices<2> & ends)
-  : cells_(Index(flags.shape(0))), width_(cells_ + 2 * BORDER)
+  : lattice_(Index(flags.shape(0)), moves)
   {
     const std::size_t cells = flags.shape(0);
-    if (flags.shape(1) != cells || flags.shape(2) != HEADINGS || least.shape(0) != cells || least.shape(1) != cells)
-      throw std::invalid_argument("flags are of shape (cells, cells, 16), what is left of shape (cells, cells)");
-    if (moves.shape(0) != HEADINGS || moves.shape(1) != 2 || costs.shape(0) != HEADINGS || costs.shape(1) != KINDS)
-      throw std::invalid_argument("moves are of shape (16, 2), costs of shape (16, 4)");
+    if (flags.shape(1) != cells || flags.shape(2) != HEADINGS)
+      throw std::invalid_argument("flags are of shape (cells, cells, 16)");
+    if (costs.shape(0) != HEADINGS || costs.shape(1) != KINDS)
+      throw std::invalid_argument("costs are of shape (16, 4)");
     if (begins.shape(1) != 2 || ends.shape(1) != 2)
       throw std::invalid_argument("connections are of shape (n, 2)");
-    for (Index heading = 0; heading < HEADINGS; ++heading)
-    {
-      const Index di = moves(heading, 0), dj = moves(heading, 1);
-      if (std::max({di, -di, dj, -dj}) > BORDER)
-        throw std::invalid_argument("moves lead two cells away at most");
-      moves_.push_back((di * width_ + dj) * HEADINGS);
-    }
     costs_.assign(costs.data(), costs.data() + costs.size());
     if (std::any_of(costs_.begin(), costs_.end(), [](Index cost) { return cost <= 0; }))
       throw std::invalid_argument("moves cost something");
-    const std::size_t nodes = std::size_t(width_ * width_ * HEADINGS);
+    const std::size_t nodes = lattice_.size() * HEADINGS;
     flags_.assign(nodes, BLOCKED);
-    least_.assign(std::size_t(width_ * width_), -1);
-    for (Index cell = 0; cell < cells_ * cells_; ++cell)
-    {
-      const Index node = inner(cell * HEADINGS);
-      std::copy_n(flags.data() + cell * HEADINGS, HEADINGS, flags_.begin() + node);
-      least_[node / HEADINGS] = least.data()[cell];
-    }
+    for (std::size_t cell = 0; cell < cells * cells; ++cell)
+      std::copy_n(flags.data() + cell * HEADINGS, HEADINGS, flags_.begin() + lattice_.inner(Index(cell * HEADINGS)));
     cost_.assign(nodes, NEVER);
     ahead_.assign(nodes, NEVER);
     connect(begins, begins_, begins_at_, BEGINS);
     connect(ends, ends_, ends_at_, ENDS);
+    spread();
     for (const auto & begin : begins_)
       look(begin.node);
   }
@@ -81,9 +56,9 @@ public:
   {
     if (kind < 0 || kind >= KINDS)
       throw std::out_of_range("no such move");
-    node = inner(node);
-    const Index other = target(node, kind);
-    if (border(other))
+    node = lattice_.inner(node);
+    const Index other = lattice_.target(node, kind);
+    if (lattice_.border(other))
       return;
     const bool straight = kind == AHEAD || kind == BACK;
     flags_[kind == AHEAD || kind == LEFT ? node : other] |= straight ? NO_AHEAD : NO_LEFT;
@@ -94,11 +69,11 @@ public:
   // Takes out a node.
   void block(Index node)
   {
-    node = inner(node);
+    node = lattice_.inner(node);
     flags_[node] |= BLOCKED;
     look(node);
     for (Index kind = 0; kind < KINDS; ++kind)
-      if (const Index other = target(node, kind); !border(other))
+      if (const Index other = lattice_.target(node, kind); !lattice_.border(other))
         look(other);
   }
 
@@ -134,7 +109,7 @@ public:
         while ((begin = begun(nodes.back())) < 0)
           nodes.push_back(source(nodes.back()));
         for (Index & node : nodes)
-          node = outer(node);
+          node = lattice_.outer(node);
       }
     }
     const std::size_t count = nodes.size();
@@ -154,48 +129,46 @@ private:
   {
     for (std::size_t k = 0; k < given.shape(0); ++k)
     {
-      const Index node = inner(given(k, 0));
+      const Index node = lattice_.inner(given(k, 0));
       connections.push_back({node, given(k, 1)});
       at[node].push_back(k);
       flags_[node] |= flag;
     }
   }
 
-  Index inner(Index node) const
+  // Finds what is left at least from each cell on: what it costs if turns are free.
+  void spread()
   {
-    if (node < 0 || node >= cells_ * cells_ * HEADINGS)
-      throw std::out_of_range("no such node");
-    const Index cell = node / HEADINGS;
-    return ((cell / cells_ + BORDER) * width_ + cell % cells_ + BORDER) * HEADINGS + node % HEADINGS;
+    std::priority_queue<Entry> queue;
+    least_.assign(lattice_.size(), NEVER);
+    const auto reach = [&](Index cell, Index cost) {
+      if (cost < least_[cell])
+      {
+        least_[cell] = cost;
+        queue.push({cost, 0, cell});
+      }
+    };
+    for (const auto & end : ends_)
+      reach(end.node / HEADINGS, end.cost);
+    while (!queue.empty())
+    {
+      const auto [cost, _, cell] = queue.top();
+      queue.pop();
+      if (cost > least_[cell])
+        continue;
+      for (Index node = cell * HEADINGS; node < (cell + 1) * HEADINGS; ++node)
+        for (const Index kind : {AHEAD, BACK})
+          if (const Index from = leads(node, opposite(kind)); from >= 0)
+            reach(from / HEADINGS, cost + price(from, kind));
+    }
   }
 
-  Index outer(Index node) const
-  {
-    const Index cell = node / HEADINGS;
-    return ((cell / width_ - BORDER) * cells_ + cell % width_ - BORDER) * HEADINGS + node % HEADINGS;
-  }
-
-  bool border(Index node) const
-  {
-    const Index i = node / HEADINGS / width_ - BORDER, j = node / HEADINGS % width_ - BORDER;
-    return i < 0 || j < 0 || i >= cells_ || j >= cells_;
-  }
-
-  // Where a move leads if nothing is in its way.
-  Index target(Index node, Index kind) const
-  {
-    const std::uint32_t heading = std::uint32_t(node) % HEADINGS;
-    if (kind == LEFT || kind == RIGHT)
-      return node - heading + (heading + (kind == LEFT ? 1 : HEADINGS - 1)) % HEADINGS;
-    return kind == AHEAD ? node + moves_[heading] : node - moves_[heading];
-  }
-
-  // The same; negative where the move is known not to be free.
+  // Where a move leads; negative where it is known not to be free.
   Index leads(Index node, Index kind) const
   {
     if (flags_[node] & BLOCKED)
       return -1;
-    const Index other = target(node, kind);
+    const Index other = lattice_.target(node, kind);
     const std::uint8_t first = flags_[kind == AHEAD || kind == LEFT ? node : other];
     return flags_[other] & BLOCKED || first & (kind < LEFT ? NO_AHEAD : NO_LEFT) ? -1 : other;
   }
@@ -226,7 +199,7 @@ private:
   void push(Index node)
   {
     const Index least = least_[node / HEADINGS], cost = std::min(cost_[node], ahead_[node]);
-    if (cost_[node] != ahead_[node] && least >= 0)
+    if (cost_[node] != ahead_[node] && least < NEVER)
       queue_.push({cost + least, cost, node});
   }
 
@@ -299,8 +272,8 @@ private:
     return found;
   }
 
-  Index cells_, width_;
-  std::vector<Index> least_, moves_, costs_; // by cell; in nodes, by heading; by heading and kind
+  Lattice lattice_;
+  std::vector<Index> least_, costs_; // by cell; by heading and kind
   std::vector<std::uint8_t> flags_;
   std::vector<Index> cost_, ahead_; // from the start; by way of the nodes that lead there
   std::vector<Connection> begins_, ends_;
@@ -317,7 +290,7 @@ NB_MODULE(_driving, module)
   nb::class_<Paths>(module, "Paths")
     .def(
       nb::init<
-        const Indices<3> &, const Indices<2> &, const Indices<2> &, const Indices<2> &, const Indices<2> &, const Indices<2> &>())
+        const Bytes &, const Indices<2> &, const Indices<2> &, const Indices<2> &, const Indices<2> &>())
     .def("shut", &Paths::shut)
     .def("block", &Paths::block)
     .def("close", &Paths::close)

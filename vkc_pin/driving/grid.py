@@ -230,15 +230,13 @@ class BaseGrid:
                 if len(cells):
                     break
             entries.append((self.cells * cells[:, 0] + cells[:, 1], np.hypot(*(self.origin + cells * self.step - (x, y)).T)))
-        return self.spread(entries, self.stuck, self.lengths)
+        return self._spread(entries)
 
-    def spread(self, entries: Sequence[tuple[Ints, Floats]], stuck: Bools, lengths: Floats) -> Floats:
-        """Return how far it is at least to every cell, shape (W, cells, cells), in units of `lengths`, if turns are free.
+    def _spread(self, entries: Sequence[tuple[Ints, Floats]]) -> Floats:
+        """Return how far it is at least to every cell, shape (W, cells, cells) [m], if turns are free.
 
         Args:
-            entries: W times the cells, as i·cells + j, where the path begins, and what it costs to be there.
-            lengths: Of the moves, shape (HEADINGS,).
-            stuck: Where the base cannot be at a heading, shape (cells, cells, HEADINGS).
+            entries: W times the cells, as i·cells + j, where the path begins, and what it costs to be there [m].
         """
         from scipy.sparse import csr_array
         from scipy.sparse.csgraph import dijkstra
@@ -252,14 +250,14 @@ class BaseGrid:
                 for s in (-1, 1)
             )
             # Forwards at the heading or backwards at the opposite one.
-            ahead, back = stuck[:, :, heading], stuck[:, :, heading - HEADINGS // 2]
+            ahead, back = self.stuck[:, :, heading], self.stuck[:, :, heading - HEADINGS // 2]
             never = (ahead[here] | ahead[there]) & (back[here] | back[there])
             targets[(*here, heading)] = np.where(never, -1, number[there])
         usable = targets.reshape(-1, HEADINGS) >= 0
         ends = np.cumsum([*usable.sum(axis=1), *(len(cells) for cells, _ in entries)])
         graph = csr_array(
             (
-                np.concatenate([np.broadcast_to(lengths, usable.shape)[usable], *(cost for _, cost in entries)]),
+                np.concatenate([np.broadcast_to(self.lengths, usable.shape)[usable], *(cost for _, cost in entries)]),
                 np.concatenate([targets[targets >= 0], *(cells for cells, _ in entries)]).astype(np.int32),
                 np.concatenate([[0], ends]).astype(np.int32),
             ),

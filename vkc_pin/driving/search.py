@@ -2,7 +2,8 @@
 
 The cheapest path is found as if everything were free that is not known to be blocked. Then its moves are looked at, from the goal
 on, since dead ends are mostly around goals. What is not free is taken out, and so on, until a path is free throughout (LazySP,
-Dellin and Srinivasa 2016). From one path to the next, compiled code (`_driving.cpp`) finds only anew what is different (LPA*).
+Dellin and Srinivasa 2016). From one path to the next, compiled code (`_driving.cpp`) finds only anew what is different (LPA*, A*
+that is repaired; its heuristic is what is left if turns are free).
 
 What searches in the same grid have found out is used, and makes no difference: of equal paths, what moves cost decides.
 """
@@ -12,8 +13,9 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
-from vkc_pin.arrays import Bools, Floats, Ints
+from vkc_pin.arrays import Floats
 from vkc_pin.driving.compiled import compiled
 from vkc_pin.driving.grid import HEADINGS
 from vkc_pin.driving.ground import BACKWARDS, UNIT, Drive, Ground, wrapped
@@ -70,33 +72,28 @@ class _Search:
         self.query, self.ground, self.grid = query, query.ground, query.ground.grid
         grid, starts, ends = self.grid, query.starts, query.ends
         self.near: list[int] = self.ground.near.reshape(-1).tolist()
-        stuck, flags = self._known()
-        # What is left from a cell on costs at least what it costs if turns are free.
         lengths = np.rint(grid.lengths / UNIT)
-        last = np.full(grid.cells**2, np.inf)
-        np.minimum.at(last, ends.cell, ends.cost)
-        some = np.flatnonzero(np.isfinite(last))
-        least = grid.spread([(some, last[some])], stuck, lengths)[0]
         left = np.rint(grid.turning * wrapped(np.roll(grid.yaws, -1) - grid.yaws) / UNIT)
         costs = np.column_stack([lengths, np.rint(BACKWARDS * grid.lengths / UNIT), left, np.roll(left, 1)])
         self.paths = compiled().Paths(
-            flags,
+            self._flags(),
             grid.moves.astype(np.int64),
             np.maximum(costs, 1.0).astype(np.int64),
-            np.where(np.isfinite(least), least, -1.0).astype(np.int64),
             *(np.column_stack([part.cell * HEADINGS + part.heading, part.cost]).astype(np.int64) for part in (starts, ends)),
         )
 
-    def _known(self) -> tuple[Bools, Ints]:
-        """Return where the base is known to be blocked, and the flags of all nodes, shape (cells, cells, HEADINGS) each."""
+    def _flags(self) -> NDArray[np.uint8]:
+        """Return what is known not to be free: flags of all nodes, shape (cells, cells, HEADINGS)."""
         near = self.ground.near
         stays, ahead, left = self.grid.refused(near >= 0)
         i, j, heading = np.nonzero(ahead)
         # What is near different places is looked at in another way, see `_move`.
         there = np.column_stack([i, j]) + self.grid.moves[heading]
         ahead[i, j, heading] = near[i, j] == near[there[:, 0], there[:, 1]]
-        stuck = self.ground.stuck | stays
-        return stuck, _BLOCKED * stuck.astype(np.int64) + _NO_AHEAD * ahead + _NO_LEFT * left
+        flags = np.where(self.ground.stuck | stays, np.uint8(_BLOCKED), np.uint8(0))
+        flags[ahead] |= _NO_AHEAD
+        flags[left] |= _NO_LEFT
+        return flags
 
     def free(self, path: list[int], begin: int, end: int) -> bool:
         """Return whether a path through nodes is free, by a connection from the start and one to a goal; if not, learn that."""

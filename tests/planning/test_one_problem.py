@@ -40,7 +40,6 @@ class Scripted:
         events: What happened: "b" a seed was asked for, "b1" it was given one round, "b*" all of them, "b*!" at a higher penalty.
         radii: How far planes were to be believed at first, each time; None: as usual.
         patience: Whether the solver was to have any, each time.
-        care: Whether it was to be thorough, each time.
     """
 
     def __init__(
@@ -53,7 +52,6 @@ class Scripted:
     ) -> None:
         self.heights, self.leads, self.amounts = heights, leads or {}, iter(amounts or [1.0] * 20)
         self.events: list[str] = []
-        self.care: list[bool] = []
         self.stop: Callable[[str], None] = lambda event: None
         monkeypatch.setattr(module, "initialize", self.initialize)
         monkeypatch.setattr(module, "solve", self.solve)
@@ -84,12 +82,10 @@ class Scripted:
         callback: Any,
         deadline: float,
         radius: np.ndarray | None = None,
-        thorough: bool = True,
         interrupt: Interrupt,
     ) -> Solution:
         name = NAMES[round((z[0, 8] - problem.start[8]) / MARK)]
         self.note(f"{name}*")
-        self.care.append(thorough)
         height, status = self.leads.get(name, (None, "not converged"))
         if callback is not None:
             callback(ROUND)
@@ -121,13 +117,6 @@ def test_seeds_are_tried_in_turn_until_a_motion_is_good(
     plan = script.run()
     assert script.events == expected.split()
     assert plan.success == bool(amounts)
-
-
-@pytest.mark.parametrize("rough", [False, True])
-def test_rough_motions_need_not_much_care(rough: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    script = Scripted(monkeypatch, [2.0, 1.0])
-    script.run(rough=rough)
-    assert script.care == [not rough] * 2
 
 
 def test_rounds_of_all_seeds_count(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,21 +9,16 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.carrying import STICK, Script, above, carried_over, lifted, moved_base, room, table, tool_at
-from helpers.drives import hall
 from helpers.small_problems import full_scene, program_of
 
 import vkc_pin as vkc
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.motion.world import scene_after
-from vkc_pin.options import Options
 from vkc_pin.planning import stepwise as module
 from vkc_pin.planning.outcome import TIMES
 from vkc_pin.planning.settings import Settings
 from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.scene import Scene
-from vkc_pin.task.compiler import compile_task
-from vkc_pin.task.phases import Task
-from vkc_pin.task.steps import GoTo
 
 
 def ending(scene: Scene, base: list[float], arm: np.ndarray, **objects: float) -> Trajectory:
@@ -117,36 +111,6 @@ def test_what_is_held_through_another_thing_stays_there() -> None:
     assert after.holds[1].at == tuple(values)
 
 
-@pytest.mark.parametrize("brief", [False, True])
-def test_in_brief_all_steps_but_the_first_give_up_soon(brief: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first step's start is given, so that what it takes is worth while; where others start may be a dead end."""
-    given: list[tuple[object, Options]] = []
-
-    class One:
-        def __init__(self, scene: Scene, task: Task, settings: Settings) -> None:
-            (step,) = task.steps
-            assert isinstance(step, GoTo)
-            self.scene, self.step, self.task = scene, step, task
-            given.append((step, settings.options))
-
-        def run(self) -> SimpleNamespace:
-            motion = ending(self.scene, [self.step.x, self.step.y, 0.0], self.scene.start[3:])
-            return SimpleNamespace(success=True, trajectory=motion, metrics={"planning_time": 1.0})
-
-    monkeypatch.setattr(module, "OneProblem", One)
-    steps = [GoTo(0.0, 0.0, 0.0), GoTo(1.0, 0.0), GoTo(2.0, 0.0), GoTo(3.0, 0.0)]
-    for rounds in (16, 4):
-        given.clear()
-        usual = Options(max_restarts=3, max_outer=rounds)
-        parts = module.stages(hall(), compile_task(hall(), steps, usual), Settings("auto", usual), brief=brief)
-        assert len(parts) == len(given) == 4
-        assert [step for step, _ in given] == steps
-        assert given[0][1] == usual
-        for _, options in given[1:]:
-            soon = dataclasses.replace(usual, max_restarts=1, max_outer=min(rounds, 10))
-            assert options == (soon if brief else usual)
-
-
 def fake(status: str, spent: float) -> vkc.Plan:
     metrics = {"planning_time": spent, "build_time": 0.0, "iterations": spent, "rounds": 1.0, "own": spent}
     return vkc.Plan(
@@ -161,69 +125,43 @@ def fake(status: str, spent: float) -> vkc.Plan:
 
 
 @pytest.mark.parametrize(
-    ("steps", "runs", "joined", "status", "spent", "own"),
+    ("whole", "apart", "status", "spent", "own"),
     [
-        # Steps, then the whole, works.
-        (["success", "success"], ["success"], None, "success", 1 + 2 + 10, 10),
-        # The whole fails; the steps one after the other are a motion, whose check takes 0.5.
-        (["success", "success"], ["rejected"], "success", "success", 1 + 2 + 0.5 + 10, 3.5),
-        # They are none either: searched seeds.
-        (["success", "success"], ["rejected", "success"], "rejected", "success", 1 + 2 + 0.5 + 10 + 20, 20),
-        (["success", "success"], ["rejected", "not converged"], "rejected", "not converged", 1 + 2 + 0.5 + 10 + 20, 20),
-        # A step fails.
-        (["success", "rejected"], ["success"], None, "success", 1 + 2 + 10, 10),
-        # Ctrl-C in the whole: nothing more is tried, but what there is is taken.
-        (["success", "success"], ["interrupted"], "rejected", "interrupted", 1 + 2 + 0.5 + 10, 10),
-        (["success", "success"], ["interrupted"], "success", "success", 1 + 2 + 0.5 + 10, 3.5),
-        # Ctrl-C in a step.
-        (["success", "interrupted"], [], "interrupted", "interrupted", 1 + 2 + 0.5, 3.5),
+        ("success", None, "success", 10, 10),
+        # Where all at once fails, the steps one after the other may be a motion all the same.
+        ("rejected", "success", "success", 10 + 3, 3),
+        ("not converged", "rejected", "not converged", 10 + 3, 10),
+        # Where the steps could do no better, or nobody waits for them, they are left alone.
+        ("infeasible", None, "infeasible", 10, 10),
+        ("time limit", None, "time limit", 10, 10),
+        ("interrupted", None, "interrupted", 10, 10),
     ],
 )
 def test_what_is_returned_and_what_it_took(
-    monkeypatch: pytest.MonkeyPatch,
-    steps: list[str],
-    runs: list[str],
-    joined: str | None,
-    status: str,
-    spent: float,
-    own: float,
+    monkeypatch: pytest.MonkeyPatch, whole: str, apart: str | None, status: str, spent: float, own: float
 ) -> None:
-    plans = [fake(name, k + 1.0) for k, name in enumerate(steps)]
-    queue = [fake(name, 10.0 * (k + 1)) for k, name in enumerate(runs)]
-    limits: list[float] = []
+    limits: list[float | None] = []
+    monkeypatch.setattr(module, "OneProblem", lambda *_: SimpleNamespace(run=lambda: fake(whole, 10.0)))
 
-    class One:
-        def __init__(self, scene: Any, task: Any, settings: Settings) -> None:
-            self.settings = settings
+    def step_by_step(scene: Any, task: Any, settings: Settings) -> vkc.Plan:
+        assert apart is not None
+        limits.append(settings.time_limit)
+        return fake(apart, 3.0)
 
-        def run(self, seed: Any = None) -> vkc.Plan:
-            assert self.settings.time_limit is not None
-            limits.append(self.settings.time_limit)
-            self.settings.interrupt.pressed = queue[0].status == "interrupted"
-            return queue.pop(0)
-
-    part = SimpleNamespace(task=SimpleNamespace(phases=(1,)), piece=lambda: None)
-    monkeypatch.setattr(module, "OneProblem", One)
-    brief: list[bool] = []
-
-    def stages(*_: Any, **keywords: Any) -> list[tuple[Any, vkc.Plan]]:
-        brief.append(keywords.get("brief", False))
-        settings.interrupt.pressed = plans[-1].status == "interrupted"
-        return [(part, p) for p in plans]
-
-    monkeypatch.setattr(module, "stages", stages)
-    monkeypatch.setattr(
-        module, "joined", lambda *_: fake(joined or "never", 0.5 + sum(p.metrics["planning_time"] for p in plans))
-    )
+    monkeypatch.setattr(module, "step_by_step", step_by_step)
     settings = Settings("auto", vkc.Options(), time_limit=100.0)
-    task = SimpleNamespace(steps=(1, 2), phases=(1, 2, 3))
-    result = module.all_at_once(None, task, settings)  # type: ignore[arg-type]
+    result = module.all_at_once(None, SimpleNamespace(steps=(1, 2)), settings)  # type: ignore[arg-type]
     assert result.status == status
-    assert brief == [True]  # where steps lead is a seed only: no long time for what may be a dead end
-    assert not queue
     assert result.metrics["planning_time"] == pytest.approx(spent)
     assert result.metrics["own"] == own  # what is no time stays that of the plan that is returned
-    assert limits == pytest.approx([97.0, 86.5][: len(runs)])
+    assert limits == ([] if apart is None else pytest.approx([90.0]))
+
+
+def test_one_step_that_fails_is_not_planned_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "OneProblem", lambda *_: SimpleNamespace(run=lambda: fake("rejected", 10.0)))
+    monkeypatch.setattr(module, "step_by_step", lambda *_: pytest.fail("the same again"))
+    task = SimpleNamespace(steps=(1,))
+    assert module.all_at_once(None, task, Settings("auto", vkc.Options())).status == "rejected"  # type: ignore[arg-type]
 
 
 def test_building_before_planning_costs_no_negative_time() -> None:

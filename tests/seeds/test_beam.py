@@ -82,6 +82,28 @@ def test_a_path_costs_its_way_and_its_trouble(backwards: bool, around: bool, mon
     np.testing.assert_allclose(found.trouble[reached], trouble[reached], rtol=0.0, atol=1e-6)
 
 
+@pytest.mark.parametrize("steps", [[vkc.Grasp("door")], [vkc.GoTo(-1.0, 0.0), OPEN]], ids=["grasp", "drive and open"])
+def test_shortened_paths_cost_no_more_and_still_grasp(steps: list[vkc.Step], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Beam, "_approach", lambda _, first, *__: np.zeros(len(first)))
+    p = program_of(door_scene(), steps, options=FEW)
+    search = Beam(Knots(p, np.random.default_rng(1)))
+    found = search.search(thorough=False)
+    short = search.shortened(found)
+    assert (short.cost <= found.cost).all()
+    # What is held already binds the base to where it is grasped; there all together would have to move.
+    assert (short.cost / found.cost).min() < (0.97 if len(steps) == 1 else 1.0)
+    ways = np.abs(np.diff(short.paths, axis=1)) * np.sqrt(p.effort.metric / 0.025)
+    way = np.linalg.norm(ways[..., :2], axis=2).sum(axis=1) + ways[..., 2:].sum(axis=(1, 2))
+    np.testing.assert_allclose(short.cost, way + short.trouble, rtol=1e-9)
+    (moved,) = np.flatnonzero((short.paths != found.paths).any(axis=(0, 2)))
+    assert found.at[moved] == p.ends[len(steps) - 1]  # where the base is sent it stays
+    hinge, knob = (p.chain.index(name) for name in ("door.hinge", "door.knob"))
+    for row, trouble in zip(short.paths[:, moved], short.trouble, strict=True):
+        assert trouble >= 1e3 or hand_off_the_handle(door_scene(), row, row[hinge], row[knob]) < 1e-3
+        assert (row >= p.chain.lower - 1e-9).all()
+        assert (row <= p.chain.upper + 1e-9).all()
+
+
 @DIRECTIONS
 def test_the_same_random_numbers_find_the_same(backwards: bool) -> None:
     one, same = (beam(2).search(thorough=True, backwards=backwards) for _ in range(2))

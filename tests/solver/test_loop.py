@@ -192,10 +192,10 @@ class Scripted:
         return self.merit.grow(self.found, 1e-3)
 
 
-def scripted(*rounds: tuple[float, float, bool], thorough: bool = True, **how: Any) -> Scripted:
+def scripted(*rounds: tuple[float, float, bool], **how: Any) -> Scripted:
     loop = Scripted(*rounds, **how)
     region, interrupt = trust_region.TrustRegion(40, 10), SimpleNamespace(pressed=False)
-    solver._iterate(loop, region, None, interrupt, len(rounds), thorough)  # type: ignore[arg-type]
+    solver._iterate(loop, region, None, interrupt, len(rounds))  # type: ignore[arg-type]
     loop.radii.append(region.radius)
     return loop
 
@@ -265,21 +265,18 @@ def test_what_only_drifts_ends_as_if_it_were_good(drift: float, converged: bool)
 
 
 @pytest.mark.parametrize(
-    ("objectives", "step", "thorough", "expected"),
+    ("objectives", "step", "expected"),
     [
-        ([8.0, 7.0, 6.8, 5.0], 1.0, True, 3),  # the third is hardly better
-        ([8.0, 7.0, 6.0, 5.0], 1.0, True, 4),
-        ([8.0, 9.0, 6.0], 1.0, True, 2),
-        ([8.0, 7.0, 6.0, 5.0], 0.98, True, 4),  # Ipopt ends a little inside its bounds
-        ([8.0, 7.0, 6.0], 0.85, True, 1),  # nothing held it back
-        ([8.0, 7.0, 6.0], 1.0, False, 1),
+        ([8.0, 7.0, 6.8, 5.0], 1.0, 3),  # the third is hardly better
+        ([8.0, 7.0, 6.0, 5.0], 1.0, 4),
+        ([8.0, 9.0, 6.0], 1.0, 2),
+        ([8.0, 7.0, 6.0, 5.0], 0.98, 4),  # Ipopt ends a little inside its bounds
+        ([8.0, 7.0, 6.0], 0.85, 1),  # nothing held it back
     ],
 )
-def test_what_is_good_is_improved_as_long_as_that_is_worth_while(
-    objectives: list[float], step: float, thorough: bool, expected: int
-) -> None:
+def test_what_is_good_is_improved_as_long_as_that_is_worth_while(objectives: list[float], step: float, expected: int) -> None:
     rounds = [(objective, 0.0, True) for objective in objectives]
-    solution = scripted(*rounds, done=True, step=step, thorough=thorough).solution
+    solution = scripted(*rounds, done=True, step=step).solution
     assert (solution.rounds, solution.converged) == (expected, True)
 
 

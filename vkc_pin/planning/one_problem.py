@@ -174,7 +174,6 @@ class OneProblem:
             callback=self._report,
             deadline=deadline,
             radius=seed.radius,
-            thorough=not self.settings.rough,
             interrupt=self.settings.interrupt,
         )
         self.rounds += solution.rounds

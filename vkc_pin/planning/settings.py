@@ -26,8 +26,6 @@ class Settings:
     """How to plan; see `planner.plan`.
 
     Attributes:
-        rough: Whether what comes out only starts a problem of more steps, after which nobody sees any more what is good about it.
-            Then seeds do not race, and the first good motion will do.
         progress: Is told what is being done.
         interrupt: Whether Ctrl-C was pressed; then nothing new is begun. Copies for parts of a task share it.
         cache: What was built before; they share that, too.
@@ -40,7 +38,6 @@ class Settings:
     random_seed: int = 0
     perturbation: float = 0.0
     terms: tuple[Term, ...] = ()
-    rough: bool = False
     progress: Progress = field(default_factory=Progress)
     interrupt: Interrupt = field(default_factory=Interrupt)
     cache: Cache = field(default_factory=Cache)

@@ -27,6 +27,7 @@ _EASY = 0.5  # share of the beam that must go on freely for a knot to be easy
 _COLLISION, _DEPTH = 10.0, 300.0  # cost of a collision, and of its depth [1/m], a radian of a joint costing 1
 _NOT_FOUND = 1e3  # cost if there is no configuration, or no path of the base
 _TOLERABLE = 60.0  # cost of collisions that the solver may be left to push apart: a graze or two
+_SHORTENINGS = 8  # times that each knot of paths is drawn to its neighbours
 _JUMP = 0.5  # [m] of the base from knot to knot while something fixed is held: a path through an obstacle, no doubt
 
 
@@ -219,6 +220,38 @@ class Beam:
         pushed = self.knots.clear(z[best], waypoint)
         more = self._bad(pushed, np.ones(len(pushed), bool), waypoint)
         return np.concatenate([parents, parents[best]]), np.concatenate([z, pushed]), np.concatenate([bad, more])
+
+    def shortened(self, found: Found) -> Found:
+        """Return paths whose ways to what they reach and grasp are as short as a local search makes them.
+
+        In turn each such knot is drawn to the middle of its neighbours, along the pose's manifold, by a share that is halved when
+        that makes the path no cheaper. So paths compare by what the solver can make of them, not by the luck of random numbers.
+        """
+        paths, cost, trouble, at, robot = found.paths.copy(), found.cost.copy(), found.trouble.copy(), found.at, self.knots.robot
+        moved = [k for k in range(1, len(at)) if not self._closed_at(at[k]) and self.knots.pose_at(at[k]) is not None]
+        share = np.full((len(paths), len(at), 1), 0.5)
+        for k in moved * _SHORTENINGS:
+            if self.interrupt.pressed:
+                break
+            drawn = paths[:, k].copy()
+            middle = paths[:, [k - 1, *([k + 1] if k + 1 < len(at) else [])]].mean(axis=1)
+            drawn[:, :robot] += share[:, k] * (middle - drawn)[:, :robot]
+            drawn, reached = self.knots.knot(drawn, at[k], "track")
+            hit, hits = self._bad(paths[:, k], np.ones(len(paths), bool), at[k]), self._bad(drawn, reached, at[k])
+            gain = self._around(paths, paths[:, k], at, k) + hit - self._around(paths, drawn, at, k) - hits
+            cheaper = gain > 0.0
+            paths[cheaper, k] = drawn[cheaper]
+            cost[cheaper] -= gain[cheaper]
+            trouble[cheaper] += (hits - hit)[cheaper]
+            share[~cheaper, k] /= 2.0
+        return Found(paths, cost, trouble, at)
+
+    def _around(self, paths: Floats, z: Floats, at: list[int], k: int) -> Floats:
+        """Return what paths cost from the knot before `k` to the one after it, if they went through z, shape (B, n), there."""
+        cost = self._path_cost(paths[:, k - 1], z, self.problem.contacts.phase_of(at[k]))
+        if k + 1 < len(at):
+            cost = cost + self._path_cost(z, paths[:, k + 1], self.problem.contacts.phase_of(at[k + 1]))
+        return cost
 
     def _cheapest(
         self, price: Floats, parents: Ints, z: Floats, found: Bools, waypoint: int, width: int

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 from typing import ClassVar
 
 import numpy as np
 
-from vkc_pin.arrays import Floats, Ints
+from vkc_pin.arrays import Floats
 from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.approach import Approach
@@ -92,7 +92,7 @@ def _in_turn(straight: Iterator[Seed], around: Iterator[Seed], trees: Iterator[S
             yield seed
         else:
             yield seed
-            yield from islice(around, 1) if other is None else [other]
+            yield from itertools.islice(around, 1) if other is None else [other]
     yield from around
     yield from trees
 
@@ -166,12 +166,12 @@ class _SeedSearch:
             found = self._search(attempt)
             if found is None:
                 continue
-            new = [k for k in self._order(found) if all(_distance(found.paths[k], other) > _DIFFERENT for other in given)]
-            best = self._best(found.paths, new, found.at)
+            new = [path for path in self._ordered(found) if all(_distance(path, other) > _DIFFERENT for other in given)]
+            best = self._best(new, found.at)
             if best is None:
                 continue
-            index, z, short = best
-            given.append(found.paths[index])
+            path, z, short = best
+            given.append(path)
             yield Seed(self.method if len(given) == 1 else f"{self.method} {len(given)}", z, short)
             if len(given) == count:
                 return
@@ -184,22 +184,27 @@ class _SeedSearch:
         self.found = found if self.beam.tolerable(found) else None
         return self.found if attempt == 0 else found
 
-    def _order(self, found: Found) -> Ints:
-        """Return the paths in the order in which they are to be joined."""
-        return np.argsort(found.cost, kind="stable")
+    def _ordered(self, found: Found) -> Iterable[Floats]:
+        """Return paths in the order in which they are to be joined, each after what it comes to when it is shortened.
 
-    def _tried(self, paths: Floats, candidates: list[int]) -> list[int]:
-        """Return of candidates those of which one is to become a seed."""
-        return candidates[:_COMPARED_PATHS]
+        What is short may be what grazes things, so that the merit of their seeds chooses between the two.
+        """
+        short = self.beam.shortened(found)
+        order = np.argsort(short.cost, kind="stable")
+        return itertools.chain.from_iterable(zip(short.paths[order], found.paths[order], strict=True))
 
-    def _best(self, paths: Floats, candidates: list[int], at: list[int]) -> tuple[int, Floats, float] | None:
-        """Return the path, of the cheapest, whose seed has the least l1 merit, that seed and its shortfall.
+    def _tried(self, paths: Sequence[Floats]) -> Sequence[Floats]:
+        """Return of paths those of which one is to become a seed."""
+        return paths[:_COMPARED_PATHS]
+
+    def _best(self, paths: Sequence[Floats], at: list[int]) -> tuple[Floats, Floats, float] | None:
+        """Return the path, of the first, whose seed has the least l1 merit, that seed and its shortfall.
 
         The first that falls short of next to nothing will do. None if no path of the robot leads through any of them.
         """
         best, least = None, np.inf
-        for index in self._tried(paths, candidates):
-            z = self.joiner.join(paths[index], at)
+        for path in self._tried(paths):
+            z = self.joiner.join(path, at)
             if self.interrupt.pressed:  # what was not found may be there all the same
                 return None
             self.notes += [line for line in self.joiner.blocked if line not in self.notes]
@@ -209,7 +214,7 @@ class _SeedSearch:
             short = float(contacts.shortfall(len(z)).sum())
             merit = self.problem.objective(z, self.problem.timing_for(z).dt) + self.problem.options.penalty * short
             if merit < least:
-                best, least = (index, z, short), merit
+                best, least = (path, z, short), merit
             if short < self.enough:
                 break
         return best
@@ -239,15 +244,15 @@ class _Rrt(_SeedSearch):
             found = self.beam.search(thorough=attempt > 0, backwards=attempt % 2 == 1)
         return found if found is not None and self.beam.tolerable(found) else None
 
-    def _order(self, found: Found) -> Ints:
-        return np.argsort(found.cost + _COLLIDING_KNOT * (found.trouble > 0), kind="stable")
+    def _ordered(self, found: Found) -> Iterable[Floats]:
+        return found.paths[np.argsort(found.cost + _COLLIDING_KNOT * (found.trouble > 0), kind="stable")]
 
-    def _tried(self, paths: Floats, candidates: list[int]) -> list[int]:
-        """Return a few candidates of which no two are alike: where no path leads to one, hardly one leads to the other."""
-        kept: list[int] = []
-        for index in candidates:
-            if all(_distance(paths[index], paths[other]) > _DIFFERENT for other in kept):
-                kept.append(index)
+    def _tried(self, paths: Sequence[Floats]) -> Sequence[Floats]:
+        """Return a few paths of which no two are alike: where nothing leads along one, hardly anything does along the other."""
+        kept: list[Floats] = []
+        for path in paths:
+            if all(_distance(path, other) > _DIFFERENT for other in kept):
+                kept.append(path)
         return kept[:_TREE_PATHS]
 
 

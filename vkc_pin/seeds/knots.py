@@ -115,7 +115,7 @@ class Knots:
                     z[:, column] = self.rng.uniform(self.chain.lower[column], self.chain.upper[column], len(z))
             z[::2, 3 : self.robot] = self.chain.robot.home
         if how != "track":
-            z = self._shaken(z, pose, (0.1, 1.0) if how == "scatter" else (0.05, 0.5))
+            z = self._shaken(z, pose, (0.1, 2.0) if how == "scatter" else (0.05, 0.5))
         z, found = solver.solve(z, target, lower=lower, upper=upper, weights=self.weights, tolerance=KNOT_TOLERANCE)
         if how == "scatter":
             z = self._unwind(z, before, lower, upper)

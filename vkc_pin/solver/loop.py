@@ -154,7 +154,6 @@ def solve(
     deadline: float = np.inf,
     rounds: int | None = None,
     radius: Floats | None = None,
-    thorough: bool = True,
     interrupt: Interrupt | None = None,
 ) -> Solution:
     """Return the trajectory that the witness-plane loop reaches from `seed`.
@@ -166,14 +165,13 @@ def solve(
         deadline: Value of `time.perf_counter()` at which to stop with the best iterate.
         rounds: At most so many rounds; None: `Options.max_outer`.
         radius: How far planes are believed at first, shape (N,): `Solution.radius` where another solution goes on.
-        thorough: Whether to go on from a motion at which everything holds as long as it gets shorter.
         interrupt: Ends it after the round that is running; None: Ctrl-C does.
     """
     loop = _Loop(problem, seed, deadline, problem.options.penalty)
     solution = loop.solution
     with interruptible() if interrupt is None else contextlib.nullcontext(interrupt) as noted:
         region = TrustRegion(problem.segments, problem.options.steps(BLOCK_TIME), radius)
-        _iterate(loop, region, callback, noted, loop.options.max_outer if rounds is None else rounds, thorough)
+        _iterate(loop, region, callback, noted, loop.options.max_outer if rounds is None else rounds)
     solution.radius = region.radius
     if noted.pressed:  # whichever way the loop ended, nothing else is to be tried
         solution.status = "interrupted"
@@ -186,7 +184,6 @@ def _iterate(
     callback: Callable[[Iteration], None] | None,
     interrupt: Interrupt,
     rounds: int,
-    thorough: bool,
 ) -> None:
     """Run rounds until everything holds, nothing helps any more, or time is up."""
     solution, started = loop.solution, time.perf_counter()
@@ -226,7 +223,7 @@ def _iterate(
                 if loop.problem.drift(trial.z) < DRIFT:  # that waypoints are too far apart along an arc no round can help
                     solution.converged, solution.status, feasible = True, "converged", (trial.z, solution.dt)
                 improved = good < (1.0 - WORTHWHILE) * last
-                if not thorough or not improved or (trial.step < INSIDE * used).all():
+                if not improved or (trial.step < INSIDE * used).all():
                     break
         if interrupt.pressed:
             solution.status = solution.status if solution.converged else "interrupted"

@@ -60,17 +60,13 @@ def tried(
 
 
 def first_seed(found: Plan, solves: int) -> bool:
-    """Return whether a plan is a success that came from the first seed of every program that was solved for it.
-
-    One step is one program. Several are one each, and then one of all of them, which starts from their motions.
+    """Return whether a plan is a success that came from the first seed.
 
     Args:
         found: The plan.
         solves: How often the solver was run for it.
     """
-    parts = found.initialization.count(", ")  # "a, b, then all at once"
-    whole = parts == 0 or found.initialization.endswith(", then all at once")
-    return found.success and whole and solves == parts + 1
+    return found.success and solves == 1
 
 
 def objective(found: Plan, planner: Planner | None = None) -> float | None:

@@ -11,6 +11,7 @@ import coal
 import numpy as np
 import pytest
 
+from vkc_pin import compiled
 from vkc_pin.distances import solids
 from vkc_pin.distances.shapes import Shapes
 from vkc_pin.distances.solids import solid_of
@@ -87,14 +88,15 @@ def test_a_module_that_does_not_fit_says_so(monkeypatch: pytest.MonkeyPatch) -> 
     """It was compiled against another coal, or is not there."""
     solids.compiled.cache_clear()
     with monkeypatch.context() as patch:
-        patch.setattr(solids, "import_module", lambda _: types.SimpleNamespace(COAL_VERSION="2.9.1"))
+        patch.setattr(solids, "compiled_module", lambda _: types.SimpleNamespace(COAL_VERSION="2.9.1"))
         with pytest.raises(BuildError, match=r"against coal 2\.9\.1"):
             solids.compiled()
 
-        def missing(name: str) -> types.ModuleType:
-            raise ImportError(f"no {name}")
+    def missing(name: str) -> types.ModuleType:
+        raise ImportError(f"no {name}")
 
-        patch.setattr(solids, "import_module", missing)
+    with monkeypatch.context() as patch:
+        patch.setattr(compiled, "import_module", missing)
         with pytest.raises(BuildError, match="compiler"):
             solids.compiled()
     solids.compiled.cache_clear()

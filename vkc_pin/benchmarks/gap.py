@@ -67,7 +67,7 @@ def report(result: Mapping[str, Any]) -> str:
     parts = [
         "# Through a gap to a table",
         f"{about['starts']} random starts of base and arm, seed {about['seed']}, at most {about['time_limit']:g} s of planning. "
-        "Success is the word of the independent validation; the first seed sufficed where no program was solved from another. "
+        "Success is the word of the independent validation; the first seed sufficed where the solver ran once. "
         "Times are those of all trials, CPU time with building symbolic programs. Rounds and iterations are means, efforts "
         "medians of successes.",
         markdown(["scene", *SUMMARY], [[SCENE, *summary(records)]]),

@@ -11,11 +11,10 @@ from typing import Any
 import casadi
 import pinocchio as pin
 
+from vkc_pin.compiled import REBUILD, compiled_module
 from vkc_pin.errors import BuildError
 
 __all__ = ["check_versions", "compiled", "upstream"]
-
-_REBUILD = "build vkc-pin again: pip install --force-reinstall --no-deps --no-cache-dir vkc-pin (in a checkout: '.')"
 
 
 def compiled(name: str, model: pin.Model, *arguments: Any) -> casadi.Function:
@@ -37,7 +36,7 @@ def check_versions(built: dict[str, str], installed: dict[str, str]) -> None:
     if wrong:
         what = " and ".join(f"{name} {built[name]}, but {installed[name]} is installed" for name in wrong)
         wanted = " ".join(f"'{name}=={'.'.join(map(str, _release(built[name])))}.*'" for name in wrong)
-        raise BuildError(f"vkc_pin.cpin was compiled against {what}. Either pip install {wanted}, or {_REBUILD}")
+        raise BuildError(f"vkc_pin.cpin was compiled against {what}. Either pip install {wanted}, or {REBUILD}")
 
 
 def _release(version: str) -> tuple[int, int]:
@@ -46,19 +45,13 @@ def _release(version: str) -> tuple[int, int]:
     try:
         return int(parts[0]), int(parts[1])
     except (IndexError, ValueError):
-        raise BuildError(f"cannot read the version '{version}' of a library that vkc_pin.cpin needs; {_REBUILD}") from None
+        raise BuildError(f"cannot read the version '{version}' of a library that vkc_pin.cpin needs; {REBUILD}") from None
 
 
 @cache
 def _extension() -> Any:
     """Import the compiled module, once, and check that it fits."""
-    try:
-        extension = import_module("vkc_pin.cpin._cpin")
-    except ImportError as error:
-        raise BuildError(
-            f"the compiled module vkc_pin.cpin._cpin cannot be imported ({error}). It is built when vkc-pin is installed, "
-            f"which needs a C++17 compiler (Debian, Ubuntu: apt install g++); then {_REBUILD}"
-        ) from error
+    extension = compiled_module("vkc_pin.cpin._cpin")
     check_versions(
         {"pin": extension.PINOCCHIO_VERSION, "casadi": extension.CASADI_VERSION},
         {"pin": pin.__version__, "casadi": casadi.__version__},

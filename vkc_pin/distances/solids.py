@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import weakref
 from functools import cache
-from importlib import import_module
 from typing import Any
 
 import coal
 import numpy as np
 
 from vkc_pin.arrays import Floats
+from vkc_pin.compiled import REBUILD, compiled_module
 from vkc_pin.errors import BuildError, InputError
 from vkc_pin.files.meshes import indices
 
 __all__ = ["compiled", "solid_of"]
-
-_REBUILD = "build vkc-pin again: pip install --force-reinstall --no-deps --no-cache-dir vkc-pin (in a checkout: '.')"
 
 
 @cache
@@ -26,18 +24,12 @@ def compiled() -> Any:
     Raises:
         BuildError: It is missing, or was compiled against another release of coal than is installed.
     """
-    try:
-        module = import_module("vkc_pin.distances._distances")
-    except ImportError as error:
-        raise BuildError(
-            f"the compiled module vkc_pin.distances._distances cannot be imported ({error}). It is built when vkc-pin is "
-            f"installed, which needs a C++17 compiler (Debian, Ubuntu: apt install g++); then {_REBUILD}"
-        ) from error
+    module = compiled_module("vkc_pin.distances._distances")
     built, installed = (version.split(".")[:2] for version in (module.COAL_VERSION, coal.__version__))
     if built != installed:
         raise BuildError(
             f"vkc_pin.distances was compiled against coal {module.COAL_VERSION}, but {coal.__version__} is installed. "
-            f"Either pip install 'coal=={'.'.join(built)}.*', or {_REBUILD}"
+            f"Either pip install 'coal=={'.'.join(built)}.*', or {REBUILD}"
         )
     return module
 

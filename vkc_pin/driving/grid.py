@@ -21,7 +21,7 @@ HEADINGS = 16
 
 _MOVES = np.array([(1, 0), (2, 1), (1, 1), (1, 2), (0, 1), (-1, 2), (-1, 1), (-2, 1)])
 _MOVES = np.concatenate([_MOVES, -_MOVES])  # by heading, in cells
-_STAY, _AHEAD, _LEFT = range(3)  # in a cell, to the next one, to the next heading
+_FREE, _FORWARD, _LEFT = range(3)  # in a cell, to the next one, to the next heading
 _CELLS, _FINEST = 100, 250  # along a side; at most
 _ROOM = 0.5  # [m] beyond which more room makes no difference
 
@@ -115,7 +115,7 @@ class BaseGrid:
 
         `reaching` as in `clear`.
         """
-        key = (_STAY, int(reaching), i, j, heading)
+        key = (_FREE, int(reaching), i, j, heading)
         if self._known[key] < 0:
             self._known[key] = self._roomy(i, j, reaching) or self.clear(
                 *self.center(i, j), float(self.yaws[heading]), reaching=reaching
@@ -162,7 +162,7 @@ class BaseGrid:
 
     def forward(self, i: int, j: int, heading: int, *, reaching: bool = False) -> bool:
         """Return whether the move at `heading` from a cell is free all along; remembered."""
-        key = (_AHEAD, int(reaching), i, j, heading)
+        key = (_FORWARD, int(reaching), i, j, heading)
         if self._known[key] < 0:
             k, m = i + int(self.moves[heading, 0]), j + int(self.moves[heading, 1])
             enough = self.lengths[heading]

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vkc_pin.arrays import Floats
-from vkc_pin.driving.compiled import compiled
+from vkc_pin.compiled import compiled_module
 from vkc_pin.driving.grid import HEADINGS
 from vkc_pin.driving.ground import BACKWARDS, UNIT, Drive, Ground, wrapped
 from vkc_pin.driving.query import Query
@@ -75,7 +75,7 @@ class _Search:
         lengths = np.rint(grid.lengths / UNIT)
         left = np.rint(grid.turning * wrapped(np.roll(grid.yaws, -1) - grid.yaws) / UNIT)
         costs = np.column_stack([lengths, np.rint(BACKWARDS * grid.lengths / UNIT), left, np.roll(left, 1)])
-        self.paths = compiled().Paths(
+        self.paths = compiled_module("vkc_pin.driving._driving").Paths(
             self._flags(),
             grid.moves.astype(np.int64),
             np.maximum(costs, 1.0).astype(np.int64),

@@ -38,7 +38,7 @@ def all_at_once(scene: Scene, task: Task, settings: Settings) -> Plan:
         settings: How to plan.
     """
     result = OneProblem(scene, task, settings).run()
-    if result.success or len(task.steps) == 1 or result.status in _FINAL or settings.interrupt.pressed:
+    if result.success or len(task.steps) == 1 or result.status in _FINAL:
         return result
     apart = step_by_step(scene, task, settings.after([result.metrics]))
     spent = [result.metrics, apart.metrics]

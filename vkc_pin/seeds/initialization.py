@@ -194,8 +194,9 @@ class _SeedSearch:
         return itertools.chain.from_iterable(zip(short.paths[order], found.paths[order], strict=True))
 
     def _tried(self, paths: Sequence[Floats]) -> Sequence[Floats]:
-        """Return of paths those of which one is to become a seed."""
-        return paths[:_COMPARED_PATHS]
+        """Return of paths those of which one is to become a seed; what could not be shortened comes twice, and is joined once."""
+        tried = paths[:_COMPARED_PATHS]
+        return [path for k, path in enumerate(tried) if not k or not np.array_equal(path, tried[k - 1])]
 
     def _best(self, paths: Sequence[Floats], at: list[int]) -> tuple[Floats, Floats, float] | None:
         """Return the path, of the first, whose seed has the least l1 merit, that seed and its shortfall.

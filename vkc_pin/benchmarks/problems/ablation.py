@@ -97,7 +97,7 @@ def report(result: Mapping[str, Any]) -> str:
     parts = [
         "# One setting changed at a time",
         f"{len(about['problems'])} problems, planning seed {about['seed']}, at most {about['time_limit']:g} s of planning. "
-        "Success is the word of the independent validation; the first seed sufficed where no program was solved from another. "
+        "Success is the word of the independent validation; the first seed sufficed where the solver ran once. "
         "Times are those of all trials: of planning, and of the process's CPU for all of the call, with building symbolic "
         "programs. Rounds and iterations are means, efforts medians of successes.",
         markdown(head, rows),

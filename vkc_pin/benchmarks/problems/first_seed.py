@@ -73,7 +73,7 @@ def report(result: Mapping[str, Any]) -> str:
     parts = [
         "# Success with the first seed",
         f"{about['starts']} random starts per task, seed {about['seed']}. Success is the word of the independent validation. The "
-        "first seed sufficed where no program was solved from another; beside it Wilson's interval of 95 % confidence.",
+        "first seed sufficed where the solver ran once; beside it Wilson's interval of 95 % confidence.",
         markdown(head, rows),
         "## Every trial",
         every_trial(records),

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import itertools
-import types
 from typing import Any
 
 import numpy as np
@@ -9,10 +8,10 @@ import pytest
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from vkc_pin.driving import compiled
+from vkc_pin.compiled import compiled_module
 from vkc_pin.driving.grid import HEADINGS, BaseGrid
-from vkc_pin.errors import BuildError
 
+MODULE = "vkc_pin.driving._driving"
 CELLS, LIMIT = 9, 2**60
 NODES = CELLS**2 * HEADINGS
 GRID = BaseGrid([], [], [], (-2.0, 2.0, -2.0, 2.0), 0.0, cells=CELLS)
@@ -31,7 +30,7 @@ class Graph:
         self.moves = GRID.moves.astype(np.int64)
 
     def paths(self) -> Any:
-        return compiled.compiled().Paths(self.flags.astype(np.uint8), self.moves, self.costs, self.begins, self.ends)
+        return compiled_module(MODULE).Paths(self.flags.astype(np.uint8), self.moves, self.costs, self.begins, self.ends)
 
     def target(self, node: int, kind: int) -> int:
         cell, heading = divmod(node, HEADINGS)
@@ -133,16 +132,3 @@ def test_what_makes_no_sense_is_refused() -> None:
     graph.costs[3, 2], graph.begins[0, 0] = 1, -1
     with pytest.raises(IndexError):
         graph.paths()
-
-
-def test_a_module_that_is_missing_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    def missing(name: str) -> types.ModuleType:
-        raise ImportError(f"no {name}")
-
-    compiled.compiled.cache_clear()
-    with monkeypatch.context() as patch:
-        patch.setattr(compiled, "import_module", missing)
-        with pytest.raises(BuildError, match="compiler"):
-            compiled.compiled()
-    compiled.compiled.cache_clear()
-    assert compiled.compiled().Paths

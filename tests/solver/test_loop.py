@@ -13,12 +13,12 @@ from helpers.drives import hall, moved, through
 from helpers.small_problems import door_scene, program_of
 
 import vkc_pin as vkc
-from vkc_pin.program.timing import Timing
+from vkc_pin.motion.timing import Timing
+from vkc_pin.program.merit import LIMIT, Infeasibility, Merit
 from vkc_pin.seeds.initialization import initialize
 from vkc_pin.solver import loop as solver
 from vkc_pin.solver import trust_region
 from vkc_pin.solver.loop import Solution, solve
-from vkc_pin.solver.merit import LIMIT, Infeasibility, Merit
 
 FEW = vkc.Options(reach_waypoints=20, max_outer=12)
 PILLAR = {"name": "pillar", "type": "cylinder", "radius": 0.15, "length": 1.6, "position": [1.6, 0.05, 0.8]}

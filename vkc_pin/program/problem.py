@@ -15,11 +15,11 @@ from vkc_pin.chain.contacts import ContactModel, Contacts
 from vkc_pin.chain.pose import ROW_BOUNDS, target_vector
 from vkc_pin.models.coordinates import wrapped
 from vkc_pin.motion.effort import Effort
+from vkc_pin.motion.timing import Timing, runs_between, time_for
 from vkc_pin.options import Options
 from vkc_pin.program.pose_goals import approach_at, chosen_freedoms, pose_goals
 from vkc_pin.program.term_places import TermNumbers, term_goals
 from vkc_pin.program.term_rows import TermRow
-from vkc_pin.program.timing import Timing, runs_between, time_for
 from vkc_pin.program.transcription import transcribe
 from vkc_pin.program.waypoint import Structure
 from vkc_pin.scene.scene import Scene

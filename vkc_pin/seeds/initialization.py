@@ -9,8 +9,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from vkc_pin.arrays import Floats
+from vkc_pin.arrays import Floats, Ints
 from vkc_pin.interrupt import NEVER, Interrupt
+from vkc_pin.program.merit import Merit, infeasibility
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.approach import Approach
 from vkc_pin.seeds.beam import Beam, Found
@@ -29,7 +30,7 @@ _COMPARED_PATHS = 8  # paths of the beam whose seeds are compared
 _TREE_PATHS = 4  # paths of the beam along which trees grow
 _COLLIDING_KNOT = 1e4  # cost that makes paths with knots in collision come last
 _HALF_WAVES = 6  # of a perturbation over the whole motion
-_SWAY = 0.3  # [m] and [rad] standard deviation of what is added to a stationary seed that led nowhere
+_PLACES = 32  # random places of which one is where a phase ends, once the stationary seed led nowhere
 _DIFFERENT = 0.1  # [m] and [rad] by which the base must differ somewhere between two seeds
 
 
@@ -47,11 +48,12 @@ def initialize(
 
     Args:
         problem: What is to be solved.
-        method: "stationary": the robot stays at its start, only the objects' joints go to their goals; seeds after the first
-            sway. "interpolated": straight to a configuration at each goal, found by inverse kinematics from random seeds; where
-            something fixed is held, the seed follows its motion. "astar": to such configurations, the base along the shortest
-            way around what stands there, heading along it. "rrt": to such configurations, base and arm together along what two
-            random trees find. "auto": these three in turn, the last first where the others hit things.
+        method: "stationary": the robot stays at its start, only the objects' joints go to their goals; in seeds after the first
+            the base goes straight to random places. "interpolated": straight to a configuration at each goal, found by inverse
+            kinematics from random seeds; where something fixed is held, the seed follows its motion. "astar": to such
+            configurations, the base along the shortest way around what stands there, heading along it. "rrt": to such
+            configurations, base and arm together along what two random trees find. "auto": these three in turn, the last first
+            where the others hit things.
         random_seed: Of the random numbers.
         count: How many different seeds to return.
         perturbation: Standard deviation of what is added to the robot's coordinates, smoothly over time, [m] and [rad].
@@ -98,11 +100,41 @@ def _in_turn(straight: Iterator[Seed], around: Iterator[Seed], trees: Iterator[S
 
 
 def _stationary(problem: TrajectoryProblem, count: int, rng: np.random.Generator) -> Iterator[Seed]:
-    """Yield a seed in which the robot stands still, then others in which it sways about its start."""
-    z = follow_objects(problem, problem.still)
-    yield Seed("stationary", z)
+    """Yield a seed in which the robot stands still, then others in which its base goes straight to random places.
+
+    Of the places drawn for the end of a phase, near and far, the one is taken with which the merit up to there is least. An arm
+    on a fixed base goes to random postures in the same way.
+    """
+    still = follow_objects(problem, problem.still)
+    yield Seed("stationary", still)
+    robot = problem.chain.robot
+    columns = np.arange(3, robot.coordinates.size) if robot.base == "fixed" else np.arange(3)
     for number in range(2, count + 1):
-        yield Seed(f"stationary {number}", _perturbed(problem, z, _SWAY, rng))
+        z = still
+        for begin, end in itertools.pairwise([0, *problem.ends.tolist()]):
+            now = problem.waypoints(z)[begin, columns]
+            share = np.minimum(np.arange(1, len(z) - begin + 1) / (end - begin), 1.0)[:, None]
+            tried = np.tile(z, (_PLACES, 1, 1))
+            for moved in tried:
+                moved[begin:, columns] = now + share * rng.uniform() * (_place(problem, end, columns, rng) - now)
+            z = min(map(problem.clip, tried), key=lambda z: _merit(problem, z, end))
+        yield Seed(f"stationary {number}", z)
+
+
+def _place(problem: TrajectoryProblem, waypoint: int, columns: Ints, rng: np.random.Generator) -> Floats:
+    """Return random values of coordinates at a waypoint: lengths within their limits, angles up to half a turn from the start."""
+    lower, upper = problem.lower[waypoint - 1, columns], problem.upper[waypoint - 1, columns]
+    turning = np.array([problem.unit(problem.chain.names[column]) == "rad" for column in columns])
+    middle = problem.start[columns]
+    return rng.uniform(np.where(turning, middle - np.pi, lower), np.where(turning, middle + np.pi, upper))
+
+
+def _merit(problem: TrajectoryProblem, z: Floats, waypoint: int) -> float:
+    """Return the merit of z_1..z_N, shape (N, n), from which what is missing after a waypoint is left out."""
+    timing, options = problem.timing_for(z), problem.options
+    contacts = problem.evaluate_contacts(z, reach=options.dist_safe, nearest=options.contact_slots)
+    missing = Merit(options.penalty).price(infeasibility(problem, z, timing, contacts, rates=False), clearance=True)
+    return problem.objective(z, timing.dt) + float(missing[:waypoint].sum())
 
 
 def _perturbed(problem: TrajectoryProblem, z: Floats, deviation: float, rng: np.random.Generator) -> Floats:

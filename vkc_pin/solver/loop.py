@@ -11,9 +11,9 @@ import numpy as np
 from vkc_pin.arrays import Floats
 from vkc_pin.chain.contacts import Contacts
 from vkc_pin.interrupt import Interrupt, interruptible
+from vkc_pin.program.merit import Infeasibility, Merit, infeasibility
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.solver.between import collisions_between, merge
-from vkc_pin.solver.merit import Infeasibility, Merit, infeasibility
 from vkc_pin.solver.solution import Iteration, Solution
 from vkc_pin.solver.subproblem import Subproblem
 from vkc_pin.solver.trust_region import BLOCK_TIME, CLOSE_ENOUGH, INSIDE, Trial, TrustRegion, judge

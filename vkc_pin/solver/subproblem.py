@@ -10,9 +10,9 @@ import numpy as np
 
 from vkc_pin.arrays import Floats
 from vkc_pin.chain.contacts import Contacts
+from vkc_pin.motion.timing import Timing
+from vkc_pin.program.merit import Infeasibility, Merit, shortfalls
 from vkc_pin.program.problem import TrajectoryProblem
-from vkc_pin.program.timing import Timing
-from vkc_pin.solver.merit import Infeasibility, Merit, shortfalls
 from vkc_pin.solver.solution import Solution
 
 __all__ = ["Step", "Subproblem"]

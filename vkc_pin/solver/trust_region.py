@@ -8,7 +8,7 @@ import numpy as np
 
 from vkc_pin.arrays import Floats
 from vkc_pin.chain.contacts import Contacts
-from vkc_pin.solver.merit import Infeasibility
+from vkc_pin.program.merit import Infeasibility
 
 __all__ = ["Trial", "TrustRegion", "judge"]
 

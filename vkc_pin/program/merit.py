@@ -10,8 +10,8 @@ import numpy as np
 from vkc_pin.arrays import Floats
 from vkc_pin.chain.contacts import Contacts
 from vkc_pin.chain.pose import AWAY, away_from
+from vkc_pin.motion.timing import Timing
 from vkc_pin.program.problem import TrajectoryProblem
-from vkc_pin.program.timing import Timing
 
 __all__ = ["GROWTH", "LIMIT", "Infeasibility", "Merit", "infeasibility", "shortfalls"]
 

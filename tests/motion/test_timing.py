@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.program.timing import Timing, runs_between, time_for
+from vkc_pin.motion.timing import Timing, runs_between, time_for
 
 
 def test_runs_lie_between_rests() -> None:

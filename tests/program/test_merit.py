@@ -10,8 +10,8 @@ from helpers.drives import hall
 from helpers.small_problems import door_scene, program_of
 
 import vkc_pin as vkc
+from vkc_pin.program.merit import GROWTH, LIMIT, Infeasibility, Merit, infeasibility, shortfalls
 from vkc_pin.solver.loop import _Loop
-from vkc_pin.solver.merit import GROWTH, LIMIT, Infeasibility, Merit, infeasibility, shortfalls
 from vkc_pin.solver.trust_region import Trial
 
 KINDS = tuple(Merit(1.0).weights)

@@ -10,6 +10,7 @@ import pytest
 from helpers.small_problems import door_scene, program_of
 
 import vkc_pin as vkc
+from vkc_pin.chain.inverse_kinematics import LONGEST_STEP
 from vkc_pin.seeds import clearing
 from vkc_pin.seeds.clearing import clear_out
 from vkc_pin.seeds.knots import Knots, Known
@@ -141,8 +142,8 @@ def test_a_round_goes_no_further_than_the_linearisation_is_worth(
 ) -> None:
     monkeypatch.setattr(clearing, "_CLEARING_ROUNDS", 1)
     far, near = (np.abs(some.cleared() - some.z).max(axis=1) for some in (scattered, cleared))
-    assert far.max() == pytest.approx(clearing._MAX_STEP)
-    assert np.any((near > 0.0) & (near < 0.5 * clearing._MAX_STEP))  # short steps stay as they are
+    assert far.max() == pytest.approx(LONGEST_STEP)
+    assert np.any((near > 0.0) & (near < 0.5 * LONGEST_STEP))  # short steps stay as they are
 
 
 def test_what_weighs_more_moves_less(scattered: Scattered, monkeypatch: pytest.MonkeyPatch) -> None:

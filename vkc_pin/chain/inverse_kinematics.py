@@ -12,9 +12,9 @@ from vkc_pin.chain.kinematics import kinematics_of
 from vkc_pin.chain.pose import PoseRow, pose_residual, target_vector
 from vkc_pin.cpin.batch import BatchFunction
 
-__all__ = ["PoseSolver"]
+__all__ = ["LONGEST_STEP", "PoseSolver"]
 
-_LONGEST = 0.5  # [m] or [rad] of one step in one coordinate
+LONGEST_STEP = 0.5  # [m] or [rad] of a Gauss-Newton step in one coordinate
 
 
 class PoseSolver:
@@ -95,7 +95,7 @@ def _step(z: Floats, residual: Floats, jacobian: Floats, weights: Floats, limits
         scaled = jacobian * (free / weights)[:, None, :]
         system = scaled @ jacobian.transpose(0, 2, 1) + damping[:, None, None] * np.eye(residual.shape[1])
         step = -np.einsum("bij,bi->bj", scaled, np.linalg.solve(system, residual[..., None])[..., 0])
-        step *= np.minimum(1.0, _LONGEST / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12))
+        step *= np.minimum(1.0, LONGEST_STEP / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12))
         blocked = free & ((z + step < lower - 1e-12) | (z + step > upper + 1e-12))
         if not blocked.any():
             break

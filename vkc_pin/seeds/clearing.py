@@ -6,16 +6,13 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.arrays import Floats
-from vkc_pin.chain.inverse_kinematics import PoseSolver
+from vkc_pin.chain.inverse_kinematics import LONGEST_STEP, PoseSolver
 from vkc_pin.program.problem import TrajectoryProblem
 
 __all__ = ["clear_out"]
 
 KNOT_TOLERANCE = 1e-4  # [m] and [rad] largest residual of a pose at a knot; what is joined from knots is exact
 _CLEARING_ROUNDS = 10  # Gauss-Newton steps at most
-_CONTACTS = 6  # contacts of a configuration that count in a step, the nearest
-_EXTRA_CLEARANCE = 1e-2  # [m] more than the margin that is asked for
-_MAX_STEP = 0.25  # [m] and [rad] of a step in one coordinate
 _DAMPING = 3e-4  # added to the diagonal of the normal equations
 
 
@@ -33,7 +30,9 @@ def clear_out(
     """Return configurations that are further from collision than `z`, as far as a few damped Gauss-Newton steps get them.
 
     Each step asks for the residuals of the pose to vanish and for the contacts that fall short of their margins to keep them,
-    linearised: with the witness points fixed in their bodies the gradient of a distance d = n·(b − a) is n·(∂b − ∂a).
+    linearised: with the witness points fixed in their bodies the gradient of a distance d = n·(b − a) is n·(∂b − ∂a). It aims at
+    `Options.dist_safe` more than the margins, looks at `Options.contact_slots` contacts, the nearest, and is no longer than
+    `LONGEST_STEP`.
 
     Args:
         problem: Whose contacts count.
@@ -45,26 +44,26 @@ def clear_out(
         upper: Limits, shape (B, n).
         weights: What moving a coordinate costs, shape (n,).
     """
-    z, done = z.copy(), np.zeros(len(z), bool)
+    z, done, options = z.copy(), np.zeros(len(z), bool), problem.options
+    extra, slots = options.dist_safe, options.contact_slots
     free = (upper - lower > 1e-9) / weights
     for _ in range(_CLEARING_ROUNDS):
         at = np.flatnonzero(~done)
         if not len(at):
             break
-        reach = problem.options.dist_safe + _EXTRA_CLEARANCE
-        contacts = problem.contacts.evaluate(z[at], np.full(len(at), waypoint), reach=reach, nearest=_CONTACTS)
+        contacts = problem.contacts.evaluate(z[at], np.full(len(at), waypoint), reach=options.dist_safe + extra, nearest=slots)
         short = contacts.shortfall(len(at))
         residual, pose_rows = solver.evaluate(z[at], target)
-        done[at] = (short <= 0.0) & (np.abs(residual).max(axis=1) < 1e-4)
+        done[at] = (short <= 0.0) & (np.abs(residual).max(axis=1) < KNOT_TOLERANCE)
         # Gradients of the nearest distances, and by how much they should grow [m].
-        rows, growth = np.zeros((len(at), _CONTACTS, z.shape[1])), np.zeros((len(at), _CONTACTS))
+        rows, growth = np.zeros((len(at), slots, z.shape[1])), np.zeros((len(at), slots))
         rows[contacts.waypoint, contacts.place] = problem.contacts.gradients(z[at], contacts)
-        growth[contacts.waypoint, contacts.place] = np.maximum(contacts.margin + _EXTRA_CLEARANCE - contacts.distance, 0.0)
+        growth[contacts.waypoint, contacts.place] = np.maximum(contacts.margin + extra - contacts.distance, 0.0)
         jacobian, wanted = np.concatenate([pose_rows, rows], axis=1), np.concatenate([-residual, growth], axis=1)
         scaled = jacobian * free[at][:, None, :]
         system = scaled @ jacobian.transpose(0, 2, 1) + _DAMPING * np.eye(jacobian.shape[1])
         step = np.einsum("bij,bi->bj", scaled, np.linalg.solve(system, wanted[..., None])[..., 0])
-        step *= np.minimum(1.0, _MAX_STEP / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12))
+        step *= np.minimum(1.0, LONGEST_STEP / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12))
         step[done[at]] = 0.0
         z[at] = np.clip(z[at] + step, lower[at], upper[at])
     return z

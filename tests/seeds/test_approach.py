@@ -46,11 +46,12 @@ def test_the_hand_goes_straight_back_from_a_handle(stands: bool) -> None:
     assert np.all(near[9:] == z[9:]), "what is grasped stays where it is"
 
 
-def test_the_base_drives_where_the_arm_alone_cannot_do_it() -> None:
-    _, z = grasp()
+def test_the_base_drives_where_the_arm_alone_cannot_do_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, z = grasp()
     for metres in (0.6, 1.0):
-        (near,) = approach(stands=True)._retreat(z, np.array([0.0, -1.0, 0.0]), [metres])
-        alone = approach(stands=True)._retreat(z, np.array([0.0, -1.0, 0.0]), [metres], drives=False)
+        monkeypatch.setattr(problem, "options", dataclasses.replace(FEW, approach=metres))
+        (near,) = approach(stands=True)._retreat(z, np.array([0.0, -1.0, 0.0]))
+        alone = approach(stands=True)._retreat(z, np.array([0.0, -1.0, 0.0]), drives=False)
         hand, there = (dataclasses.replace(door_scene(), start=row[:9]).tool_placement() for row in (z, near))
         np.testing.assert_allclose(there.translation - hand.translation, [0.0, -metres, 0.0], atol=1e-3)
         assert (len(alone) == 0) == bool(np.abs(near - z)[:3].max() > 0.0)

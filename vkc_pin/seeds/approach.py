@@ -17,16 +17,15 @@ from vkc_pin.task.phases import FrameGoal, Phase
 
 __all__ = ["Approach"]
 
-LIFT = 0.1  # [m] to lift or lower what is carried
-_STANDOFFS = (0.1, 0.2, 0.3, 0.4, 0.5)  # [m] from what is touched, on the path to it
-_PATH_SHARES = (0.25, 0.5, 0.75, 1.0)  # of a straight path, at which configurations are looked for
+_STANDOFFS = 6  # configurations on the path to what is touched: with one alone the tool comes in from the side
+_UP = np.array([0.0, 0.0, 1.0])
 
 
 class Approach:
     """Finds configurations on straight paths to and from the ends of a problem's phases.
 
-    A path is the tool's: back along its approach for what it grasps or lets go of, up for what is lifted or put down, back along
-    the frame's z axis for what a frame touches.
+    A path is the tool's, `Options.approach` long: back along its approach for what it grasps or lets go of, up for what is lifted
+    or put down. Back along the frame's z axis for what a frame touches it is several times as long.
 
     Args:
         knots: Of the problem.
@@ -52,26 +51,22 @@ class Approach:
     def _leaving(self, z: Floats, holds: Sequence[Hold], lifted: Sized, frames: Sequence[FrameGoal]) -> Floats:
         """Return configurations on the path away from a grasp, from where something stands, or from what a frame touches."""
         if holds:
-            return self._retreat(z, -self._ahead(z, self.chain.holder(holds[0])), [self.problem.options.approach])
+            return self._retreat(z, -self._ahead(z, self.chain.holder(holds[0])))
         if lifted:
-            return self._retreat(z, np.array([0.0, 0.0, 1.0]), [LIFT])
+            return self._retreat(z, _UP)
         for goal in frames:
             if goal.touches:
                 return self._retreat(z, -self._ahead(z, self.chain.frame(goal.frame, goal.hold)), _STANDOFFS)
         return np.empty((0, len(z)))
 
     def away(self, z: Floats, phase: Phase) -> Floats:
-        """Return configurations on the path from `z`, shape (n,), the base where it is: shape (K, n), the last is the farthest.
+        """Return the configuration to which the path leads from `z`, shape (n,), the base where it is: shape (K, n), K is 1 or 0.
 
         The hand goes back from what a phase lets go of at its start, or up with what is carried in it.
         """
         if phase.leaves:
-            direction, length = -self._ahead(z, self.chain.holder(phase.leaves[0])), self.problem.options.approach
-        elif phase.held:
-            direction, length = np.array([0.0, 0.0, 1.0]), LIFT
-        else:
-            return np.empty((0, len(z)))
-        return self._retreat(z, direction, [share * length for share in _PATH_SHARES], drives=False)
+            return self._retreat(z, -self._ahead(z, self.chain.holder(phase.leaves[0])), drives=False)
+        return self._retreat(z, _UP, drives=False) if phase.held else np.empty((0, len(z)))
 
     def _ahead(self, z: Floats, frame: tuple[int, pin.SE3]) -> Floats:
         """Return the direction of a frame's z axis in the world, at `z`: in it a hand nears what it grasps."""
@@ -79,8 +74,8 @@ class Approach:
         rotations, _ = self.chain.joint_placements(z[None])
         return np.asarray((rotations[0, joint] @ local.rotation)[:, 2])
 
-    def _retreat(self, z: Floats, direction: Floats, lengths: Sequence[float], *, drives: bool = True) -> Floats:
-        """Return configurations with the tool `lengths` [m] along `direction` from where `z` has it, as far as there are."""
+    def _retreat(self, z: Floats, direction: Floats, count: int = 1, *, drives: bool = True) -> Floats:
+        """Return up to `count` configurations, the tool of each `Options.approach` further along `direction`, shape (K, n)."""
         rotations, translations = self.chain.joint_placements(z[None])
         carrier = pin.SE3(rotations[0, self.joint], translations[0, self.joint])
         tool = carrier * self.local
@@ -90,8 +85,8 @@ class Approach:
                 lower[column], upper[column] = self.problem.limits(name)
         standing = np.concatenate([z[:3], lower[3:]]), np.concatenate([z[:3], upper[3:]])
         weights, found = self.knots.weights, list[Floats]()
-        for length in lengths:
-            target = pin.SE3(tool.rotation, tool.translation + length * direction)
+        for number in range(1, count + 1):
+            target = pin.SE3(tool.rotation, tool.translation + number * self.problem.options.approach * direction)
             start = (found[-1] if found else z)[None]
             for low, high in (standing, (lower, upper)) if self.stands else ((lower, upper),):
                 near, ok = self.solver.solve(start, target, lower=low, upper=high, weights=weights, tolerance=KNOT_TOLERANCE)

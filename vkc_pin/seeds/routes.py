@@ -21,10 +21,6 @@ __all__ = ["Routes", "grid_shapes"]
 
 _ARM_BASE = 2  # the joint of the model that is the arm's first: joint 1 is the base
 _REACHING_RADIUS = 0.4  # [m] from the ends of a path within which the arm reaches in and out, and only the base counts
-_START_CELL = 0.5  # [m] size of the squares within which starts share their distances
-_BESIDE_GOAL = (0.4, 0.4, 0.6)  # [m, m, rad] standard deviations of where a guide may end beside a goal, at most
-_BESIDE_COUNT = 60  # places beside a goal that are tried
-_BESIDE_COST = 3.0  # [m/m] and [m/rad] what ending there costs
 
 
 class Routes:
@@ -82,12 +78,15 @@ class Routes:
     def distances(self, phase: int, starts: Floats, goals: Floats, *, folded: bool = False) -> Floats:
         """Return how far it is at least from starts to goals, both (B, 3), one by one, shape (B,) [m]; infinite: no path."""
         grid = self.grid(phase, folded=folded)
-        keys = [(phase, folded, *np.floor(start[:2] / _START_CELL).astype(int).tolist()) for start in starts]
+        begin, end = (
+            np.clip(np.floor((poses[:, :2] - grid.origin) / grid.step + 0.5).astype(int), 0, grid.cells - 1).tolist()
+            for poses in (starts, goals)
+        )
+        keys = [(phase, folded, *cell) for cell in begin]
         new = {key: start[:2] for key, start in zip(keys, starts, strict=True) if key not in self._distances}
         if new:
             self._distances |= dict(zip(new, grid.distances_from(np.array(list(new.values()))), strict=True))
-        cells = np.clip(np.floor((goals[:, :2] - grid.origin) / grid.step + 0.5).astype(int), 0, grid.cells - 1)
-        return np.array([self._distances[key][i, j] for key, (i, j) in zip(keys, cells, strict=True)])
+        return np.array([self._distances[key][i, j] for key, (i, j) in zip(keys, end, strict=True)])
 
     def path(self, phase: int, start: Floats, goal: Floats, steps: int) -> Floats | None:
         """Return `steps` poses of the base from start to goal, both (3,), the last at the goal's place: shape (steps, 3).
@@ -101,20 +100,15 @@ class Routes:
         return None if path is None else poses_along(path, steps, turning=self.problem.chain.robot.lever)
 
     def guide(self, phase: int, start: Floats, goal: Floats, steps: int) -> Floats | None:
-        """Return poses from a start to a goal, both (3,), or to next to it, on which the base fits, shape (steps, 3).
+        """Return poses from a start to a goal, both (3,), on which the base fits, shape (steps, 3).
 
         With the arm at home or, if there is no such path, with the arm folded. None if there is none either.
         """
-        rng = np.random.default_rng(0)
-        beside = rng.normal(size=(_BESIDE_COUNT, 3)) * rng.random((_BESIDE_COUNT, 1)) * _BESIDE_GOAL
-        beside[0] = 0.0
         for folded in (False, True):
             grid = self.grid(phase, folded=folded)  # the fine one only where it is needed
-            for places in (beside[:1], beside[1:]):
-                costs = _BESIDE_COST * np.abs(places).sum(axis=1)
-                path = shortest_path(grid, start.tolist(), goal + places, costs=costs, interrupt=self.interrupt)
-                if path is not None:
-                    return poses_along(path, steps, turning=grid.turning)
+            path = shortest_path(grid, start.tolist(), goal[None], interrupt=self.interrupt)
+            if path is not None:
+                return poses_along(path, steps, turning=grid.turning)
         return None
 
 

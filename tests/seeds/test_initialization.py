@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 import vkc_pin as vkc
 from vkc_pin.seeds import initialization, joining
 from vkc_pin.seeds.beam import Beam, Found
-from vkc_pin.seeds.initialization import _COLLIDING, _POOR, INITIALIZATIONS, _in_turn, initialize
+from vkc_pin.seeds.initialization import _POOR, INITIALIZATIONS, _in_turn, initialize
 from vkc_pin.seeds.knots import scatter
 from vkc_pin.seeds.seed import Seed
 
@@ -176,7 +176,7 @@ class Looked:
             yield Seed(f"{kind}{number}", np.zeros((1, 1)), shortfall)
 
 
-FINE, POOR, LOST = 0.9 * _POOR, 1.1 * _POOR, 1.1 * _COLLIDING
+FINE, POOR, LOST = 0.9 * _POOR, 1.1 * _POOR, 4.4 * _POOR
 
 
 @pytest.mark.parametrize(
@@ -192,10 +192,10 @@ FINE, POOR, LOST = 0.9 * _POOR, 1.1 * _POOR, 1.1 * _COLLIDING
         ([FINE], [LOST], [0.0], "s0 S0 a0 A0 t0 T0"),  # trees last
         ([], [0.0, 0.0], [0.0, 0.0], "a0 A0 a1 A1 t0 T0 t1 T1"),
         ([], [], [0.0, 0.0], "t0 T0 t1 T1"),
-        # What goes straight hits things, what goes around does not: second, if it is hopeless.
+        # What goes straight hits things, what goes around does not: second.
         ([LOST, 0.0], [0.0, 0.0], [], "s0 a0 A0 S0 s1 S1 a1 A1"),
         ([LOST, 0.0], [0.0, 0.0], [0.0], "s0 a0 A0 S0 s1 S1 a1 A1 t0 T0"),
-        ([POOR, 0.0], [0.0, 0.0], [0.0], "s0 a0 S0 A0 s1 S1 a1 A1 t0 T0"),
+        ([POOR, 0.0], [FINE, 0.0], [0.0], "s0 a0 A0 S0 s1 S1 a1 A1 t0 T0"),
         ([LOST], [np.nan], [0.0], "s0 a0 A0 S0 t0 T0"),
         # Both do, or there is no way around: first all that trees find, then the better of the two.
         ([POOR], [LOST], [0.0, 0.0, 0.0], "s0 a0 t0 T0 t1 T1 t2 T2 S0 A0"),

@@ -24,12 +24,9 @@ __all__ = ["INITIALIZATIONS", "initialize"]
 
 INITIALIZATIONS = ("auto", "interpolated", "astar", "rrt", "stationary")
 _FREE = 0.05  # [m] shortfall of clearance of a seed, summed over its waypoints, below which no better one is looked for
-_POOR = 0.5  # [m] shortfall above which trees are asked
-_COLLIDING = 2.0  # [m] shortfall above which other seeds come first
+_POOR = 0.5  # [m] shortfall above which other seeds come first, and trees if there is no better one
 _COMPARED_PATHS = 8  # paths of the beam whose seeds are compared
 _TREE_PATHS = 4  # paths of the beam along which trees grow
-_COLLIDING_KNOT = 1e4  # cost that makes paths with knots in collision come last
-_HALF_WAVES = 6  # of a perturbation over the whole motion
 _PLACES = 32  # random places of which one is where a phase ends, once the stationary seed led nowhere
 _DIFFERENT = 0.1  # [m] and [rad] by which the base must differ somewhere between two seeds
 
@@ -78,7 +75,7 @@ def initialize(
 
 
 def _in_turn(straight: Iterator[Seed], around: Iterator[Seed], trees: Iterator[Seed]) -> Iterator[Seed]:
-    """Yield from all in turn, first what goes straight, unless that collides everywhere.
+    """Yield from all in turn, first what goes straight, unless that hits things and what goes around does not.
 
     Where what goes straight hits things, and so does what goes around, or does not get there, base and arm are looked for
     together; that comes first then.
@@ -89,12 +86,12 @@ def _in_turn(straight: Iterator[Seed], around: Iterator[Seed], trees: Iterator[S
             poor = sorted([seed] if other is None else [seed, other], key=lambda one: one.shortfall)
             yield from trees
             yield from poor
-        elif other is not None and seed.shortfall > _COLLIDING:
+        elif other is not None:
             yield other
             yield seed
         else:
             yield seed
-            yield from itertools.islice(around, 1) if other is None else [other]
+            yield from itertools.islice(around, 1)
     yield from around
     yield from trees
 
@@ -138,10 +135,10 @@ def _merit(problem: TrajectoryProblem, z: Floats, waypoint: int) -> float:
 
 
 def _perturbed(problem: TrajectoryProblem, z: Floats, deviation: float, rng: np.random.Generator) -> Floats:
-    """Return a seed with smooth noise on the robot's coordinates: half waves in time, of decreasing amplitude."""
-    robot, waves = problem.chain.robot.coordinates.size, np.arange(1, _HALF_WAVES + 1)
-    shape = np.sin(np.pi * np.outer(np.arange(1, len(z) + 1) / (len(z) + 1), waves)) / waves
-    noise = shape @ rng.normal(0.0, deviation, (len(waves), robot)) / np.sqrt(np.sum(0.5 / waves**2))
+    """Return a seed with smooth noise on the robot's coordinates: half waves in time, of amplitudes as their lengths squared."""
+    robot, waves = problem.chain.robot.coordinates.size, np.arange(1, len(z) + 1)
+    shape = np.sin(np.pi * np.outer(waves / (len(z) + 1), waves)) / waves**2
+    noise = shape @ rng.normal(0.0, deviation, (len(waves), robot)) / np.sqrt(np.sum(0.5 / waves**4))
     z = z.copy()
     z[:, :robot] += noise
     return problem.clip(z)
@@ -278,7 +275,7 @@ class _Rrt(_SeedSearch):
         return found if found is not None and self.beam.tolerable(found) else None
 
     def _ordered(self, found: Found) -> Iterable[Floats]:
-        return found.paths[np.argsort(found.cost + _COLLIDING_KNOT * (found.trouble > 0), kind="stable")]
+        return found.paths[np.lexsort((found.cost, found.trouble > 0))]  # those with knots in collision last
 
     def _tried(self, paths: Sequence[Floats]) -> Sequence[Floats]:
         """Return a few paths of which no two are alike: where nothing leads along one, hardly anything does along the other."""

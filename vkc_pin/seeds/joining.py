@@ -16,8 +16,6 @@ from vkc_pin.task.phases import Phase
 
 __all__ = ["DrivenPaths", "Joiner", "Paths", "RrtPaths"]
 
-_HALVINGS = 3  # of the tries of trees, at most: what failed before is likely to fail again
-
 
 class DrivenPaths:
     """The base along the shortest path around what stands there where nothing fixed is held; the arm straight."""
@@ -67,7 +65,7 @@ class RrtPaths:
         ends = np.tile(last[:size], (1 if reaches else len(arms), 1))
         if not reaches:
             ends[:, 3:] = arms
-        tries = TRIES // 2 ** min(self.failed[phase], _HALVINGS)
+        tries = max(1, TRIES // 2 ** self.failed[phase])  # what failed before is likely to fail again
         given = {"poses": poses, "arms": np.array(arms), "rng": self.knots.rng, "tries": tries, "interrupt": self.interrupt}
         path = connect(problem, phase, first, ends, **given)
         self.failed[phase] = 0 if path is not None else self.failed[phase] + 1

@@ -21,15 +21,8 @@ TRIES = 1500
 """How often a tree may grow until they meet."""
 
 _STEP = 0.15  # [rad] between configurations that are looked at
-_EXTENT = 1.0  # [rad] by which a tree grows at most towards what is drawn
-_CHUNK = 6  # configurations looked at at once: what lies behind the first that is blocked is of no use
-_SHORTFALL_SHARE = 0.8  # share of a margin that may be missing: the solver pushes that apart
-_RUNS = 0.4  # share of tries in which a tree is to reach a free part of the base's path
-_GUIDED = 0.7  # share of bases that are drawn on its path, the others around its ends
-_SHAKEN = 0.4  # share of arms that are drawn around likely postures, the others at them
-_BESIDE_PATH, _AROUND_ENDS = (0.1, 0.1, 0.15), (0.4, 0.4, 0.5)  # [m, m, rad] standard deviations of bases, at most
-_ARM_SPREAD = 0.6  # [m] and [rad] standard deviation of arms, at most
-_SHORTCUTS = 60  # tries to go straight between two places on the path
+_BESIDE_PATH = 0.1  # [m] and [rad] standard deviation, at most, of bases beside their path
+_AROUND = 0.4  # [m] and [rad] standard deviation, at most, of bases around the ends, and of arms
 
 
 def connect(
@@ -75,7 +68,7 @@ class _Search:
         self.problem, self.first, self.poses, self.arms, self.rng = problem, first, poses, arms, rng
         self.size = problem.chain.robot.coordinates.size
         self.waypoint = problem.contacts.inside(phase)
-        self.allowed = _SHORTFALL_SHARE * problem.options.dist_safe
+        self.allowed = problem.options.dist_safe  # all of a margin may be missing: the solver pushes that apart
         self.weights = problem.chain.metric[: self.size]
         limits = np.array([problem.limits(name) for name in problem.chain.names[: self.size]])
         self.lower, self.upper = limits.T
@@ -92,14 +85,14 @@ class _Search:
                 break
             tree, other = (trees[0], trees[1]) if direct or number % 2 else (trees[1], trees[0])
             if direct:
-                node = self._grow(tree, direct.pop(0), np.inf)
-            elif self.rng.random() < _RUNS and len(tree.runs) < len(self.runs):
+                node = self._grow(tree, direct.pop(0))
+            elif self.rng.integers(2) and len(tree.runs) < len(self.runs):
                 node = self._grow_to_run(tree)
             else:
-                node = self._grow(tree, self._draw(start, ends), _EXTENT)
+                node = self._grow(tree, self._draw(start, ends))
             if node is None:
                 continue
-            met = self._grow(other, tree.nodes[node], np.inf)
+            met = self._grow(other, tree.nodes[node])
             if met is not None and np.array_equal(other.nodes[met], tree.nodes[node]):
                 there, back = (node, met) if tree is trees[0] else (met, node)
                 return self._shortened(np.concatenate([trees[0].path(there), trees[1].path(back)[-2::-1]]))
@@ -127,7 +120,7 @@ class _Search:
         number = int(self.rng.choice([k for k in range(len(self.runs)) if k not in tree.runs]))
         rows = self.runs[number]
         at = int(self.rng.integers(len(rows)))
-        node = self._grow(tree, rows[at], np.inf)
+        node = self._grow(tree, rows[at])
         if node is not None and np.array_equal(tree.nodes[node], rows[at]):
             tree.runs.add(number)
             for side in (rows[at + 1 :], rows[:at][::-1]):
@@ -137,26 +130,19 @@ class _Search:
         return node
 
     def _draw(self, start: Floats, ends: Floats) -> Floats:
-        """Return a configuration near the base's path, or near its beginning or end."""
-        rng, goal = self.rng, np.empty(self.size)
-        if rng.random() < _GUIDED:
-            goal[:3] = self.poses[rng.integers(len(self.poses))] + rng.random() * rng.normal(size=3) * _BESIDE_PATH
-        else:
-            end = start if rng.random() < 0.5 else ends[rng.integers(len(ends))]
-            goal[:3] = end[:3] + rng.random() * rng.normal(size=3) * _AROUND_ENDS
-        goal[3:] = self.arms[rng.integers(len(self.arms))]
-        if rng.random() < _SHAKEN:
-            goal[3:] += rng.random() * _ARM_SPREAD * rng.normal(size=self.size - 3)
+        """Return a configuration beside the base's path or around one of its ends, the arm at or around a likely posture."""
+        rng, guided = self.rng, self.rng.integers(2)
+        poses = self.poses if guided else (start[None], ends)[rng.integers(2)]
+        goal = np.concatenate([poses[rng.integers(len(poses)), :3], self.arms[rng.integers(len(self.arms))]])
+        goal[:3] += rng.random() * (_BESIDE_PATH if guided else _AROUND) * rng.normal(size=3)
+        goal[3:] += rng.integers(2) * rng.random() * _AROUND * rng.normal(size=self.size - 3)
         return np.clip(goal, self.lower, self.upper)
 
-    def _grow(self, tree: _Tree, goal: Floats, extent: float) -> int | None:
+    def _grow(self, tree: _Tree, goal: Floats) -> int | None:
         """Let a tree grow from its nearest node towards a configuration, as far as nothing is hit; return the new node."""
         near = tree.nearest(goal)
         start = tree.nodes[near]
-        far = float(np.abs((goal - start) * self.weights).max())
-        if far > extent:
-            goal = start + (goal - start) * (extent / far)
-        if far == 0.0:
+        if np.array_equal(goal, start):
             return near
         reached = self._along(start, goal)
         if reached <= 0.0:
@@ -166,13 +152,9 @@ class _Search:
     def _along(self, a: Floats, b: Floats) -> float:
         """Return what share of the straight line from `a` to `b`, both (m,), is free."""
         count = max(1, int(np.ceil(np.abs((b - a) * self.weights).max() / _STEP)))
-        s = np.arange(1, count + 1) / count
-        for begin in range(0, count, _CHUNK):
-            part = s[begin : begin + _CHUNK]
-            blocked = np.flatnonzero(self._depth(a + part[:, None] * (b - a)) > self.allowed)
-            if len(blocked):
-                return float(s[begin + blocked[0] - 1]) if begin + blocked[0] else 0.0
-        return 1.0
+        s = np.arange(count + 1) / count
+        blocked = np.flatnonzero(self._depth(a + s[1:, None] * (b - a)) > self.allowed)
+        return float(s[blocked[0]]) if len(blocked) else 1.0
 
     def _depth(self, rows: Floats) -> Floats:
         """Return how far configurations of the robot, shape (B, m), fall short of their margins [m], shape (B,)."""
@@ -181,8 +163,8 @@ class _Search:
         return depth(self.problem, z, self.waypoint)
 
     def _shortened(self, path: Floats) -> Floats:
-        """Return a path that goes straight between random places on it where nothing is in the way."""
-        for _ in range(_SHORTCUTS):
+        """Return a path that goes straight between random places on it, as many as it has, where nothing is in the way."""
+        for _ in path:
             if len(path) < 3:
                 break
             passed = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0) * self.weights, axis=1))])

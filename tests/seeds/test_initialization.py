@@ -93,7 +93,7 @@ def test_several_seeds_are_different() -> None:
     assert 1 <= len(found) <= 3
     for k, z in enumerate(found):
         for other in found[:k]:
-            assert np.abs(z - other)[:, :3].max() > 0.05
+            assert np.abs(z - other)[:, :3].max() > problem().options.dist_safe
     assert len(seeds(count=1)) == 1
 
 

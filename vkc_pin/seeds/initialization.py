@@ -25,10 +25,8 @@ __all__ = ["INITIALIZATIONS", "initialize"]
 INITIALIZATIONS = ("auto", "interpolated", "astar", "rrt", "stationary")
 _FREE = 0.05  # [m] shortfall of clearance of a seed, summed over its waypoints, below which no better one is looked for
 _POOR = 0.5  # [m] shortfall above which other seeds come first, and trees if there is no better one
-_COMPARED_PATHS = 8  # paths of the beam whose seeds are compared
-_TREE_PATHS = 4  # paths of the beam along which trees grow
+_COMPARED_PATHS = 8  # paths of the beam whose seeds are compared, or along which trees grow
 _PLACES = 32  # random places of which one is where a phase ends, once the stationary seed led nowhere
-_DIFFERENT = 0.1  # [m] and [rad] by which the base must differ somewhere between two seeds
 
 
 def initialize(
@@ -195,7 +193,7 @@ class _SeedSearch:
             found = self._search(attempt)
             if found is None:
                 continue
-            new = [path for path in self._ordered(found) if all(_distance(path, other) > _DIFFERENT for other in given)]
+            new = [path for path in self._ordered(found) if all(self._differ(path, other) for other in given)]
             best = self._best(new, found.at)
             if best is None:
                 continue
@@ -226,6 +224,10 @@ class _SeedSearch:
         """Return of paths those of which one is to become a seed; what could not be shortened comes twice, and is joined once."""
         tried = paths[:_COMPARED_PATHS]
         return [path for k, path in enumerate(tried) if not k or not np.array_equal(path, tried[k - 1])]
+
+    def _differ(self, path: Floats, other: Floats) -> bool:
+        """Return whether the base is elsewhere somewhere along two paths, (K, n), by more than a clearance [m] or [rad]."""
+        return bool(np.abs(path - other)[:, :3].max() > self.problem.options.dist_safe)
 
     def _best(self, paths: Sequence[Floats], at: list[int]) -> tuple[Floats, Floats, float] | None:
         """Return the path, of the first, whose seed has the least l1 merit, that seed and its shortfall.
@@ -281,11 +283,6 @@ class _Rrt(_SeedSearch):
         """Return a few paths of which no two are alike: where nothing leads along one, hardly anything does along the other."""
         kept: list[Floats] = []
         for path in paths:
-            if all(_distance(path, other) > _DIFFERENT for other in kept):
+            if all(self._differ(path, other) for other in kept):
                 kept.append(path)
-        return kept[:_TREE_PATHS]
-
-
-def _distance(path: Floats, other: Floats) -> float:
-    """Return by how much the base differs somewhere between two paths, both (K, n) [m] or [rad]."""
-    return float(np.abs(path - other)[:, :3].max())
+        return kept[:_COMPARED_PATHS]

@@ -13,10 +13,9 @@ from vkc_pin.chain.inverse_kinematics import PoseSolver
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.clearing import KNOT_TOLERANCE, clear_out
 
-__all__ = ["CHOICE", "SCATTER", "Knots", "Known", "depth", "follow_objects", "scatter", "smooth"]
+__all__ = ["SCATTER", "Knots", "Known", "depth", "follow_objects", "scatter", "smooth"]
 
 SCATTER = 192  # random seeds of inverse kinematics for a configuration that nothing leads to
-CHOICE = 0.1  # [1/m] and [1/rad] what it costs to grasp elsewhere, a radian of a joint costing 1
 
 
 class Known:
@@ -70,8 +69,7 @@ class Knots:
         self.problem, self.rng, self.known = problem, rng, Known() if known is None else known
         self.chain = problem.chain
         self.robot = self.chain.robot.coordinates.size
-        self.weights = self.chain.metric.copy()
-        self.weights[[column for column, _, _ in problem.choices]] = CHOICE
+        self.weights = self.chain.metric
         self.driven = np.array([self.chain.index(name) for name in problem.task.state], int)
         self.objects = follow_objects(problem, np.tile(problem.start, (problem.segments, 1)))
 

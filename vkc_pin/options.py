@@ -43,7 +43,7 @@ class Options:
         max_outer: Rounds of the witness-plane loop.
         max_iterations: Ipopt iterations in one round.
         penalty: First weight of the exact ℓ1 penalty on clearance slack; it is adapted.
-        max_restarts: How many different seeds are tried.
+        max_restarts: How many different seeds are tried; in a chore, how often a motion is searched for.
     """
 
     dt: float = 0.25

@@ -16,7 +16,6 @@ from vkc_pin.benchmarks.initialization import TARGET
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.motion.splicing import cut
 from vkc_pin.motion.world import World
-from vkc_pin.planning import window as module
 from vkc_pin.planning.one_problem import OneProblem
 from vkc_pin.planning.window import SlidingWindow
 
@@ -130,7 +129,7 @@ def test_where_the_next_cannot_be_done_both_are_planned_anew(monkeypatch: pytest
     problems = Problems(monkeypatch, lambda steps: steps == (SHUT,))
     plan = vkc.plan_chore(home(), [OPEN, SHUT])
     assert plan.success, plan.report()
-    alone = [(SHUT,)] * module._ACTION_SEARCHES
+    alone = [(SHUT,)] * vkc.Options().max_restarts
     assert [steps for steps, _ in problems.asked] == [(OPEN,), *alone, (OPEN, SHUT)]
     assert not problems.asked[-1][1]  # from seeds of its own
 
@@ -149,10 +148,8 @@ def test_a_decision_that_leads_nowhere_is_given_up(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.long
 def test_what_fails_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_WINDOW_SEARCHES", 1)
-    monkeypatch.setattr(module, "_BACKTRACKS", 0)
     Problems(monkeypatch, lambda steps: CUP[0] in steps)
-    plan = vkc.plan_chore(home(), [vkc.GoTo(0.5, -0.5), OPEN, *CUP], window=1, options=vkc.Options(max_outer=1))
+    plan = vkc.plan_chore(home(), [vkc.GoTo(0.5, -0.5), OPEN, *CUP], window=1, options=vkc.Options(max_outer=1, max_restarts=1))
     assert not plan.success
     assert plan.status == "not converged"
     assert plan.validation.notes[0].startswith("steps[2], Grasp(object='cold_cup'")

@@ -25,11 +25,6 @@ from vkc_pin.task.steps import Step
 
 __all__ = ["SlidingWindow"]
 
-_ACTION_SEARCHES = 3  # searches, from different random numbers, for a motion of one more action
-_WINDOW_SEARCHES = 4  # searches, from different random numbers, for a motion of what is in the window
-_BACKTRACKS = 3  # how often, in all, what has been decided is given up since what follows cannot be done
-_SOLVER_ROUNDS = 16  # of the solver from one seed: what takes more has mostly run into a dead end, and other seeds are at hand
-_FINER = 1.6  # ratio of waypoints, in every search but the first, to what the options say: see `_left`
 _NOTHING = PhaseWaypoints((), (), (), "")
 _STOPPED = ("interrupted", "time limit")
 _FINAL = (*_STOPPED, "infeasible")
@@ -44,14 +39,12 @@ class _Part:
         piece: Its waypoints.
         after: The scene in which it ends.
         rests: Whether the robot stands still at its end.
-        fine: Whether it has more waypoints than usual.
     """
 
     plan: Plan | None
     piece: PhaseWaypoints
     after: Scene
     rests: bool = True
-    fine: bool = False
 
 
 class SlidingWindow:
@@ -75,7 +68,7 @@ class SlidingWindow:
 
     def run(self) -> Plan:
         """Plan action after action, until all is done, one fails or Ctrl-C is pressed."""
-        window, back, failed = self.window, _BACKTRACKS, None
+        window, back, failed = self.window, self._searches, None
         while len(self.kept) < len(self.actions):
             failed = self._plan_window(window)
             if self._stopped:
@@ -98,6 +91,11 @@ class SlidingWindow:
         return self.settings.interrupt.pressed
 
     @property
+    def _searches(self) -> int:
+        """How often a motion is searched for, from different random numbers, and how often, in all, a decision is given up."""
+        return self.settings.options.max_restarts
+
+    @property
     def _now(self) -> Scene:
         return self.kept[-1].after if self.kept else self.scene
 
@@ -116,15 +114,14 @@ class SlidingWindow:
             return alone
         if alone is None and sum(part.plan is not None for part in self.ahead) > 1:
             pieces = [part.piece for part in self.ahead]
-            fine = any(part.fine for part in self.ahead)
-            one = self._problem(self._now, first, last, fine=fine)
+            one = self._problem(self._now, first, last)
             plan = self._solved(first, one, lambda problem: seed_of(problem, pieces))
             if plan.success:
                 self.ahead = self._parts(one, plan, first, last)
-        for attempt in range(1, 1 + _WINDOW_SEARCHES):
+        for attempt in range(1, 1 + self._searches):
             if alone is None or alone.status in _STOPPED:
                 break
-            one = self._problem(self._now, first, last, attempt, fine=True)
+            one = self._problem(self._now, first, last, attempt)
             together = self._solved(first, one)
             alone = None if together.success else dataclasses.replace(alone, status=together.status)
             if together.success:
@@ -151,8 +148,8 @@ class SlidingWindow:
     def _look_ahead(self) -> Plan | None:
         """Plan one more action alone, from where those planned ahead end; return the plan if it fails."""
         number, scene = len(self.kept) + len(self.ahead), self.ahead[-1].after if self.ahead else self._now
-        for attempt in range(_ACTION_SEARCHES):
-            one = self._problem(scene, number, number + 1, attempt, fine=attempt > 0)
+        for attempt in range(self._searches):
+            one = self._problem(scene, number, number + 1, attempt)
             if not one.task.phases:
                 self.ahead.append(_Part(None, _NOTHING, scene))
                 return None
@@ -176,7 +173,6 @@ class SlidingWindow:
     def _parts(self, one: OneProblem, plan: Plan, first: int, last: int) -> list[_Part]:
         """Return the parts of a solved problem's motion in which the actions from `first` to before `last` are done."""
         scene, begin, parts, whole = one.scene, 0, [], one.piece()
-        fine = one.settings.options.reach_waypoints > self.settings.options.reach_waypoints
         ahead = dict(enumerate(self.ahead, start=len(self.kept)))
         for number in range(first, last):
             task = one.task.until(len(self._steps(first, number + 1)))
@@ -192,7 +188,7 @@ class SlidingWindow:
                 ends = one.problem.ends
                 rests = end == len(ends) or ends[end - 1] in one.problem.transcription.structure.stops
                 scene = scene_after(scene, trajectory, task.after)
-            parts.append(_Part(part, piece, scene, rests, fine))
+            parts.append(_Part(part, piece, scene, rests))
             begin = end
         return parts
 
@@ -203,12 +199,12 @@ class SlidingWindow:
         """Compile actions anew: from where in the world they begin is known only once those before them are planned."""
         return compile_task(scene, self._steps(first, last), options, nothing=True)
 
-    def _problem(self, scene: Scene, first: int, last: int, attempt: int = 0, *, fine: bool) -> OneProblem:
+    def _problem(self, scene: Scene, first: int, last: int, attempt: int = 0) -> OneProblem:
         """Return the problem of the actions from `first` to before `last`; see `_left`."""
-        settings = self._left(attempt, fine)
+        settings = self._left(attempt)
         return OneProblem(scene, self._task(scene, first, last, settings.options), settings)
 
-    def _left(self, attempt: int = 0, fine: bool = False) -> Settings:
+    def _left(self, attempt: int) -> Settings:
         """Return the settings with what is left of the time limit.
 
         There are few seeds to an attempt: where an action cannot be done from where the last one ends, all others fail as well,
@@ -216,13 +212,9 @@ class SlidingWindow:
 
         Args:
             attempt: Other random numbers for each.
-            fine: More waypoints, for ways that are long and narrow, and arcs along which hands would drift between few.
         """
-        left, given = self.settings.after(self.spent), self.settings.options
-        options = dataclasses.replace(given, max_restarts=1, max_outer=min(given.max_outer, _SOLVER_ROUNDS))
-        if fine:
-            more = {name: round(_FINER * getattr(given, name)) for name in ("reach_waypoints", "move_waypoints")}
-            options = dataclasses.replace(options, **more)
+        left = self.settings.after(self.spent)
+        options = dataclasses.replace(left.options, max_restarts=1)
         return dataclasses.replace(left, options=options, random_seed=left.random_seed + attempt)
 
     def _joined(self, failed: Plan | None) -> Plan:

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Progress", "shown"]
 
-_REFRESH_TIME = 0.1  # [s] between two changes of the line
-
 
 class Progress:
     """The line. It says nothing if nobody shows it.
@@ -32,7 +30,6 @@ class Progress:
         self.write = write
         self._part = self._what = self._doing = ""
         self._began = time.perf_counter()
-        self._changed = -float("inf")
         self._ended = write is None
 
     def part(self, first: int, count: int, total: int) -> None:
@@ -47,7 +44,7 @@ class Progress:
     def doing(self, text: str) -> None:
         """Tell what is being done."""
         self._doing = text
-        self._show(always=True)
+        self._show()
 
     def __call__(self, row: Iteration) -> None:
         """Take a round of the solver."""
@@ -66,11 +63,10 @@ class Progress:
         """Leave one line that says that nothing came out, unless there is a last line already."""
         self._last(f"stopped after {time.perf_counter() - self._began:.1f} s")
 
-    def _show(self, *, always: bool = False) -> None:
-        now = time.perf_counter()
-        if not self._ended and self.write is not None and (always or now - self._changed >= _REFRESH_TIME):
-            self._changed = now
-            self.write(" · ".join(filter(None, [f"{now - self._began:.0f} s", self._part, self._doing, self._what])), False)
+    def _show(self) -> None:
+        if not self._ended and self.write is not None:
+            passed = f"{time.perf_counter() - self._began:.0f} s"
+            self.write(" · ".join(filter(None, [passed, self._part, self._doing, self._what])), False)
 
     def _last(self, text: str) -> None:
         if not self._ended and self.write is not None:

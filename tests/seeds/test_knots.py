@@ -143,11 +143,12 @@ def test_scatter_where_the_base_must_be(drive: vkc.TrajectoryProblem) -> None:
 
 
 def test_moving_costs_what_it_does_in_searches(problem: vkc.TrajectoryProblem) -> None:
-    """A radian of whatever costs 1, a metre what a radian moves the hand; grasping elsewhere is no exception."""
+    """A radian of whatever costs 1, a metre what a radian moves the hand, but where a grasp slides."""
     free = vkc.build(vkc.load_scene("init_3"), [vkc.Touch("stick.tip", (-1.0, 3.9, 0.1))], options=SHORT)
     weights = dict(zip(free.chain.names, Knots(free, np.random.default_rng(0)).weights.tolist(), strict=True))
     assert weights["base_x"] == 1.0 / free.chain.robot.lever
     assert weights["base_yaw"] == weights["elbow_joint"] == 1.0
     grasp = {name: weight for name, weight in weights.items() if name.startswith("stick.grip")}
     assert grasp
-    assert grasp == {name: 1.0 / free.chain.robot.lever if free.unit(name) == "m" else 1.0 for name in grasp}
+    assert "m" in {free.unit(name) for name in grasp}
+    assert set(grasp.values()) == {1.0}

@@ -69,7 +69,8 @@ class Knots:
         self.problem, self.rng, self.known = problem, rng, Known() if known is None else known
         self.chain = problem.chain
         self.robot = self.chain.robot.coordinates.size
-        self.weights = self.chain.metric
+        self.weights = self.chain.metric.copy()
+        self.weights[[column for column, _, _ in problem.choices]] = 1.0  # also where a grasp slides
         self.driven = np.array([self.chain.index(name) for name in problem.task.state], int)
         self.objects = follow_objects(problem, np.tile(problem.start, (problem.segments, 1)))
 

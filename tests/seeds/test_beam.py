@@ -64,9 +64,8 @@ def test_knots_are_in_order_of_time_and_hold_the_closure(thorough: bool, backwar
 
 @DIRECTIONS
 @pytest.mark.parametrize("around", [False, True], ids=["alone", "driving before and after"])
-def test_a_path_costs_its_way_and_its_trouble(backwards: bool, around: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_path_costs_its_way_and_its_trouble(backwards: bool, around: bool) -> None:
     """Whichever way it was looked for: the ways are those from start to end."""
-    monkeypatch.setattr(Beam, "_approach", lambda _, first, *__: np.zeros(len(first)))
     search = beam(1, around=around)
     found = search.search(thorough=True, backwards=backwards)
     steps = np.abs(np.diff(found.paths, axis=1)) * np.sqrt(problem(around=around).effort.metric / 0.025)
@@ -83,8 +82,7 @@ def test_a_path_costs_its_way_and_its_trouble(backwards: bool, around: bool, mon
 
 
 @pytest.mark.parametrize("steps", [[vkc.Grasp("door")], [vkc.GoTo(-1.0, 0.0), OPEN]], ids=["grasp", "drive and open"])
-def test_shortened_paths_cost_no_more_and_still_grasp(steps: list[vkc.Step], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Beam, "_approach", lambda _, first, *__: np.zeros(len(first)))
+def test_shortened_paths_cost_no_more_and_still_grasp(steps: list[vkc.Step]) -> None:
     p = program_of(door_scene(), steps, options=FEW)
     search = Beam(Knots(p, np.random.default_rng(1)))
     found = search.search(thorough=False)
@@ -102,6 +100,34 @@ def test_shortened_paths_cost_no_more_and_still_grasp(steps: list[vkc.Step], mon
         assert trouble >= 1e3 or hand_off_the_handle(door_scene(), row, row[hinge], row[knob]) < 1e-3
         assert (row >= p.chain.lower - 1e-9).all()
         assert (row <= p.chain.upper + 1e-9).all()
+
+
+def test_of_paths_that_end_alike_the_cheapest_is_kept() -> None:
+    z = np.array([[0.0, 0.0], [0.05, 0.05], [0.3, 0.0], [0.3, 0.05], [0.3, 0.25], [2.0, 0.0]])
+    total = np.array([3.0, 2.0, 4.0, 5.0, 6.0, 1.0])
+    assert Beam._kept(total, z, 6, 10).tolist() == [5, 1, 2, 4]
+    assert Beam._kept(total, z, 6, 3).tolist() == [5, 1, 2]
+    assert Beam._kept(total, z, 5, 10).tolist() == [5, 1, 2, 4]
+    assert Beam._kept(total, z, 2, 4).tolist() == [5, 1, 2]  # two of four are shortened: no more of them
+
+
+def test_no_two_paths_of_a_search_end_alike() -> None:
+    found = beam(1).search(thorough=True)
+    ends = found.paths[:, -1]
+    assert all(np.abs(ends[k + 1 :] - end).max(axis=1, initial=0.0).min(initial=1.0) > 0.1 for k, end in enumerate(ends))
+
+
+def test_ways_to_what_is_grasped_are_short_when_they_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The best that a search returns for a grasp alone becomes hardly cheaper when it is shortened again."""
+    search = Beam(Knots(program_of(door_scene(), [vkc.Grasp("door")], options=FEW), np.random.default_rng(1)))
+    found = search.search(thorough=False)
+    assert found.cost.min() < 1.02 * search.shortened(found).cost.min()
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "_SHORTENINGS", 0)
+        drawn = Beam(Knots(search.problem, np.random.default_rng(1))).search(thorough=False)
+    assert found.cost.min() < drawn.cost.min()
+    careful = Beam(Knots(search.problem, np.random.default_rng(1)), careful=True).search(thorough=False)
+    assert careful.cost.min() > found.cost.min(), "what is short may be what trees do not lead to"
 
 
 @DIRECTIONS

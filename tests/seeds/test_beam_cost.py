@@ -84,7 +84,7 @@ def test_where_some_are_free_none_are_pushed(monkeypatch: pytest.MonkeyPatch, ho
     z, bad = np.tile(search.problem.start, (96, 1)), np.where(np.arange(96) < free, 0.0, 50.0)
     paths, parents = search.problem.start[None, None], np.zeros(96, int)
     knot = int(search.problem.ends[-1 if holding else 0])
-    _, after, _ = search._pushed(paths, np.zeros(1), parents, z, bad, knot, 2 if holding else 0, width=40)
+    _, after, _ = search._pushed(paths, np.zeros(1), parents, z, bad, knot, 2 if holding else 0)
     assert bool(called) == pushed
     assert len(after) == 96 + sum(called)
 

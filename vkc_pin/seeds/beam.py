@@ -12,17 +12,15 @@ from vkc_pin.program.pose_goals import approach_at
 from vkc_pin.seeds.knots import SCATTER, Knots
 from vkc_pin.seeds.routes import Routes
 
-__all__ = ["Beam", "Found"]
+__all__ = ["ALIKE", "Beam", "Found"]
 
 _BATCHES = 6  # batches of random samples at most: good grasps are rare
 _FREE_OPEN = 60  # free configurations at a knot with which no more are sampled, nor pushed out of collisions
 _FREE_HELD = 12  # the same at a knot at which something fixed is held
-_OTHERS = 3  # ratio of the beam to what is kept of other free grasps, where a hand chooses how to grasp
-_BEAM, _QUICK_BEAM = 40, 24  # configurations kept per knot
+ALIKE = 0.1  # [m] and [rad] up to which configurations are alike: from both the same follows
 _CHILDREN = 4  # configurations tried per knot, as a multiple of the beam
 _KNOT_TIME = 1.0  # [s] from knot to knot along a phase in which something fixed is held, at `Options.dt` a waypoint
-_PATH_PIECES = 6  # pieces of a straight path, between which it is checked for collisions
-_PATH_COLLISION = 1.0  # cost of a configuration in collision there
+_WIDTH = 24  # configurations kept per knot
 _EASY = 0.5  # share of the beam that must go on freely for a knot to be easy
 _COLLISION, _DEPTH = 10.0, 300.0  # cost of a collision, and of its depth [1/m], a radian of a joint costing 1
 _NOT_FOUND = 1e3  # cost if there is no configuration, or no path of the base
@@ -53,11 +51,6 @@ class _Mode(NamedTuple):
     thorough: bool
     backwards: bool
 
-    @property
-    def width(self) -> int:
-        """How many configurations are kept at a knot."""
-        return _BEAM if self.thorough else _QUICK_BEAM
-
 
 class Beam:
     """Searches a problem's knots.
@@ -65,8 +58,8 @@ class Beam:
     Args:
         knots: Where configurations come from.
         routes: The paths that the base would drive; None: as if it drove straight.
-        careful: Whether grasps count as free only if the straight path to them is free, too, and paths of the base are those with
-            the arm folded: for narrow places.
+        careful: Whether grasps count as free only if the straight path to them is free, too, none are shortened, and paths of the
+            base are those with the arm folded: for narrow places.
         interrupt: Ends a search.
     """
 
@@ -96,12 +89,12 @@ class Beam:
         problem = self.problem
         found = Found(problem.start[None, None, :], np.zeros(1), np.zeros(1), [0])
         closed = [problem.closed(phase) for phase in problem.task.phases]
-        number = begin = 0
+        number = 0
         while number < len(closed):
             last = number
             while backwards and not closed[number] and closed[last + 1 : last + 2] == [True]:
                 last += 1
-            knots, before = self._knots(number, last), found.paths.shape[1]
+            knots = self._knots(number, last)
             if last > number:
                 found = self._go_back(found, knots, number, mode)
             else:
@@ -111,10 +104,7 @@ class Beam:
                     found = self._go_on(found, knot, number, mode)
             if self.interrupt.pressed:
                 return None
-            if not closed[number] and self.routes is None:
-                ends = found.paths[:, before - 1], found.paths[:, before]
-                found = found._replace(cost=found.cost + self._approach(*ends, begin, int(problem.ends[number])))
-            number, begin = last + 1, int(problem.ends[last])
+            number = last + 1
         return found
 
     def tolerable(self, found: Found) -> bool:
@@ -139,23 +129,38 @@ class Beam:
     def _go_on(self, found: Found, knot: int, phase: int, mode: _Mode) -> Found:
         """Return the cheapest paths to the next knot, to which something of a phase leads."""
         parents, z, bad = self._continue(found.paths, found.cost, knot, phase, mode)
+        drawn = len(z)
+        if not self.careful and not self.problem.closed(self.problem.task.phases[phase]) and self.knots.pose_at(knot) is not None:
+            parents, z, bad = self._with_shortened(found, parents, z, bad, knot, phase)
         total = found.cost[parents] + self._path_cost(found.paths[parents, -1], z, phase) + bad
-        best = self._kept(total, bad, knot, mode.width)
+        best = self._kept(total, z, drawn, _WIDTH)
         paths = np.concatenate([found.paths[parents[best]], z[best, None]], axis=1)
         return Found(paths, total[best], (found.trouble[parents] + bad)[best], [*found.at, knot])
 
-    def _kept(self, total: Floats, bad: Floats, knot: int, width: int) -> Ints:
-        """Return which continuations to keep: the cheapest and, where a hand chooses how to grasp, some of the other free ones.
+    def _with_shortened(
+        self, found: Found, parents: Ints, z: Floats, bad: Floats, knot: int, phase: int
+    ) -> tuple[Ints, Floats, Floats]:
+        """Return continuations, and with them what the best of them become when the ways to them are shortened."""
+        price = found.cost[parents] + self._path_cost(found.paths[parents, -1], z, phase) + bad
+        best = np.argsort(price, kind="stable")[: 2 * _WIDTH]
+        paths = np.concatenate([found.paths[parents[best]], z[best, None]], axis=1)
+        short = self.shortened(Found(paths, price[best], bad[best], [*found.at, knot]), len(found.at))
+        more = parents[best], short.paths[:, -1], short.trouble
+        return np.concatenate([parents, more[0]]), np.concatenate([z, more[1]]), np.concatenate([bad, more[2]])
 
-        What is cheap to grasp may be what cannot be put where it is to be.
+    @staticmethod
+    def _kept(total: Floats, z: Floats, drawn: int, width: int) -> Ints:
+        """Return which continuations to keep: of those that are alike the cheapest, and of these the cheapest.
+
+        At most half of them are not as they were `drawn`, the first ones: what is short may be what nothing goes on from.
         """
-        order = np.argsort(total, kind="stable")
-        if all(knot != grasp for _, grasp, _ in self.problem.choices):
-            return order[:width]
-        cheap, rest = order[:width], order[width:]
-        rest = rest[bad[rest] <= 0.0]
-        others = rest[np.linspace(0, len(rest) - 1, min(width // _OTHERS, len(rest))).astype(int)]
-        return np.concatenate([cheap, others])
+        rest, kept = np.argsort(total, kind="stable"), list[int]()
+        while len(rest) and len(kept) < width:
+            kept.append(int(rest[0]))
+            rest = rest[np.abs(z[rest] - z[rest[0]]).max(axis=1) > ALIKE]
+            if np.count_nonzero(np.array(kept) >= drawn) >= width // 2:
+                rest = rest[rest < drawn]
+        return np.array(kept)
 
     def _go_back(self, found: Found, knots: list[int], phase: int, mode: _Mode) -> Found:
         """Return the cheapest paths through knots, of which all but the first are while something fixed is held after a phase."""
@@ -189,46 +194,46 @@ class Beam:
                 parents = np.arange(SCATTER if mode.thorough else SCATTER // 2) % len(paths)
                 z, found = knots.knot(paths[parents, -1], waypoint, "scatter")
                 price = cost[parents] + self._path_cost(paths[parents, -1], z, phase)
-                samples.append(self._cheapest(price, parents, z, found, waypoint, mode.width))
+                samples.append(self._cheapest(price, parents, z, found, waypoint))
                 if sum(np.count_nonzero(bad == 0) for _, _, bad in samples) >= _FREE_OPEN:
                     break
             parents, z, bad = (np.concatenate(parts) for parts in zip(*samples, strict=True))
-            return self._pushed(paths, cost, parents, z, bad, waypoint, phase, mode.width)
+            return self._pushed(paths, cost, parents, z, bad, waypoint, phase)
         parents = np.arange(len(paths))
         z, found = knots.knot(paths[:, -1], waypoint, "track")
         if not mode.thorough:
             bad = self._bad(z, found, waypoint)
             if np.count_nonzero(bad == 0) >= _EASY * len(paths):
                 return parents, z, bad
-        more = np.arange(mode.width * _CHILDREN - len(paths)) % len(paths)
+        more = np.arange(_WIDTH * _CHILDREN - len(paths)) % len(paths)
         shaken, also = knots.knot(paths[more, -1], waypoint, "shake")
         parents, z, found = np.concatenate([parents, more]), np.concatenate([z, shaken]), np.concatenate([found, also])
         price = cost[parents] + self._path_cost(paths[parents, -1], z, phase)
-        parents, z, bad = self._cheapest(price, parents, z, found, waypoint, mode.width)
+        parents, z, bad = self._cheapest(price, parents, z, found, waypoint)
         if not mode.backwards:
             return parents, z, bad
-        return self._pushed(paths, cost, parents, z, bad, waypoint, phase, mode.width)
+        return self._pushed(paths, cost, parents, z, bad, waypoint, phase)
 
     def _pushed(
-        self, paths: Floats, cost: Floats, parents: Ints, z: Floats, bad: Floats, waypoint: int, phase: int, width: int
+        self, paths: Floats, cost: Floats, parents: Ints, z: Floats, bad: Floats, waypoint: int, phase: int
     ) -> tuple[Ints, Floats, Floats]:
         """Return continuations and, if few of them are free, the best of them pushed out of what they are in."""
         if np.count_nonzero(bad == 0) >= (_FREE_HELD if self._closed_at(waypoint) else _FREE_OPEN):
             return parents, z, bad
         price = cost[parents] + self._path_cost(paths[parents, -1], z, phase) + bad
-        best = np.argsort(price, kind="stable")[: 2 * width]
+        best = np.argsort(price, kind="stable")[: 2 * _WIDTH]
         pushed = self.knots.clear(z[best], waypoint)
         more = self._bad(pushed, np.ones(len(pushed), bool), waypoint)
         return np.concatenate([parents, parents[best]]), np.concatenate([z, pushed]), np.concatenate([bad, more])
 
-    def shortened(self, found: Found) -> Found:
+    def shortened(self, found: Found, first: int = 1) -> Found:
         """Return paths whose ways to what they reach and grasp are as short as a local search makes them.
 
-        In turn each such knot is drawn to the middle of its neighbours, along the pose's manifold, by a share that is halved when
-        that makes the path no cheaper. So paths compare by what the solver can make of them, not by the luck of random numbers.
+        In turn each such knot, from `first` on, is drawn to the middle of its neighbours, along the pose's manifold, by a share
+        that is halved when that makes the path no cheaper. So paths compare by what the solver can make of them, not by luck.
         """
         paths, cost, trouble, at, robot = found.paths.copy(), found.cost.copy(), found.trouble.copy(), found.at, self.knots.robot
-        moved = [k for k in range(1, len(at)) if not self._closed_at(at[k]) and self.knots.pose_at(at[k]) is not None]
+        moved = [k for k in range(first, len(at)) if not self._closed_at(at[k]) and self.knots.pose_at(at[k]) is not None]
         share = np.full((len(paths), len(at), 1), 0.5)
         for k in moved * _SHORTENINGS:
             if self.interrupt.pressed:
@@ -253,15 +258,13 @@ class Beam:
             cost = cost + self._path_cost(z, paths[:, k + 1], self.problem.contacts.phase_of(at[k + 1]))
         return cost
 
-    def _cheapest(
-        self, price: Floats, parents: Ints, z: Floats, found: Bools, waypoint: int, width: int
-    ) -> tuple[Ints, Floats, Floats]:
+    def _cheapest(self, price: Floats, parents: Ints, z: Floats, found: Bools, waypoint: int) -> tuple[Ints, Floats, Floats]:
         """Return continuations, the cheapest first; what the beam cannot keep anyway need not be looked at."""
         order = np.argsort(price + _NOT_FOUND * ~found, kind="stable")
         parents, z, found = parents[order], z[order], found[order]
-        half = min(2 * width, len(z))
+        half = min(2 * _WIDTH, len(z))
         bad = self._bad(z[:half], found[:half], waypoint)
-        if np.count_nonzero(bad == 0) >= width:
+        if np.count_nonzero(bad == 0) >= _WIDTH:
             return parents[:half], z[:half], bad
         return parents, z, np.concatenate([bad, self._bad(z[half:], found[half:], waypoint)])
 
@@ -277,15 +280,6 @@ class Beam:
                 near, reached = self.knots.knot(z[free], at, "track")
                 bad[free] += _hits(self.knots.depth(near, at)) + _NOT_FOUND * ~reached
         return bad
-
-    def _approach(self, first: Floats, last: Floats, begin: int, end: int) -> Floats:
-        """Return what the straight paths from `first` to `last`, both (B, n), cost in collisions, shape (B,)."""
-        s = np.arange(1, _PATH_PIECES) / _PATH_PIECES
-        between = first[:, None] + s[:, None] * (last - first)[:, None]
-        depth = self.knots.depth(between.reshape(-1, between.shape[-1]), min(begin + 1, end))
-        return np.asarray(
-            np.sum(np.where(depth > 0, _PATH_COLLISION + _DEPTH / _PATH_PIECES * depth, 0.0).reshape(len(first), -1), axis=1)
-        )
 
 
 def _hits(depth: Floats) -> Floats:

@@ -14,7 +14,7 @@ from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.program.merit import Merit, infeasibility
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.approach import Approach
-from vkc_pin.seeds.beam import Beam, Found
+from vkc_pin.seeds.beam import ALIKE, Beam, Found
 from vkc_pin.seeds.joining import DrivenPaths, Joiner, RrtPaths
 from vkc_pin.seeds.knots import Knots, Known, follow_objects
 from vkc_pin.seeds.routes import Routes
@@ -61,37 +61,36 @@ def initialize(
     else:
         shared = _Shared(problem, random_seed, said, Routes(problem, interrupt), Known(), interrupt)
         if method == "auto":
-            around = _SeedSearch(shared, "astar")
-            trees = _Rrt(shared, around)
-            straight = _SeedSearch(shared, "interpolated")
-            seeds = _in_turn(straight.seeds(count), around.seeds(count), trees.seeds(max(count, 2)))
+            searches = _SeedSearch(shared, "interpolated"), _SeedSearch(shared, "astar"), _Rrt(shared)
+            seeds = _in_turn(*(search.seeds(count) for search in searches))
         else:
-            seeds = (_Rrt(shared) if method == "rrt" else _SeedSearch(shared, method)).seeds(count)
+            seeds = _in_turn((_Rrt(shared) if method == "rrt" else _SeedSearch(shared, method)).seeds(count))
     rng = np.random.default_rng([random_seed, 1])
     for item in seeds:
         yield replace(item, z=_perturbed(problem, item.z, perturbation, rng)) if perturbation else item
 
 
-def _in_turn(straight: Iterator[Seed], around: Iterator[Seed], trees: Iterator[Seed]) -> Iterator[Seed]:
-    """Yield from all in turn, first what goes straight, unless that hits things and what goes around does not.
+def _in_turn(*kinds: Iterator[Seed | None]) -> Iterator[Seed]:
+    """Yield from all kinds in turn. Where what one finds hits things, or it finds nothing, the next is asked in the same turn.
 
-    Where what goes straight hits things, and so does what goes around, or does not get there, base and arm are looked for
-    together; that comes first then.
+    Args:
+        kinds: In the order in which they are asked at first; later those come first that have waited longest.
     """
-    for seed in straight:
-        other = next(around, None) if seed.shortfall > _POOR else None
-        if seed.shortfall > _POOR and (other is None or other.shortfall > _POOR):
-            poor = sorted([seed] if other is None else [seed, other], key=lambda one: one.shortfall)
-            yield from trees
-            yield from poor
-        elif other is not None:
-            yield other
-            yield seed
-        else:
-            yield seed
-            yield from itertools.islice(around, 1)
-    yield from around
-    yield from trees
+    waiting = list(kinds)
+    while waiting:
+        found = list[Seed]()
+        for kind in tuple(waiting):
+            waiting.remove(kind)
+            try:
+                seed = next(kind)
+            except StopIteration:
+                continue
+            waiting.append(kind)
+            if seed is not None:
+                found.append(seed)
+                if not seed.shortfall > _POOR:
+                    break
+        yield from sorted(found, key=lambda seed: seed.shortfall)
 
 
 def _stationary(problem: TrajectoryProblem, count: int, rng: np.random.Generator) -> Iterator[Seed]:
@@ -171,31 +170,33 @@ class _SeedSearch:
         method: "interpolated": straight from knot to knot; "astar": the base along the shortest path, the arm straight.
 
     Attributes:
+        alike: How many coordinates decide whether paths are alike.
         enough: Shortfalls with which nobody looks for a better seed, summed over waypoints [m].
-        found: What its last search found, if that is any good.
     """
 
+    alike: ClassVar[int | None] = None
     enough: ClassVar[float] = _FREE
 
     def __init__(self, shared: _Shared, method: str) -> None:
         self.problem, self.notes, self.method, self.interrupt = shared.problem, shared.notes, method, shared.interrupt
-        self.found: Found | None = None
         knots, routes = shared.knots(), shared.driven if method == "astar" else None
         self.beam = Beam(knots, routes, interrupt=shared.interrupt)
         self.joiner = Joiner(knots, Approach(knots), None if routes is None else DrivenPaths(routes))
 
-    def seeds(self, count: int) -> Iterator[Seed]:
-        """Yield seeds through the cheapest paths of knots: of one quick search if that is any good, then of thorough ones."""
+    def seeds(self, count: int) -> Iterator[Seed | None]:
+        """Yield seeds through the cheapest paths of knots: of one quick search if that is any good, then of thorough ones.
+
+        None is a search without one.
+        """
         given: list[Floats] = []
         for attempt in range(count + 1):
             if self.interrupt.pressed:
                 return
             found = self._search(attempt)
-            if found is None:
-                continue
-            new = [path for path in self._ordered(found) if all(self._differ(path, other) for other in given)]
-            best = self._best(new, found.at)
+            new = [path for path in self._ordered(found) if all(self._differ(path, other) for other in given)] if found else []
+            best = self._best(new, found.at) if found else None
             if best is None:
+                yield None
                 continue
             path, z, short = best
             given.append(path)
@@ -206,10 +207,7 @@ class _SeedSearch:
     def _search(self, attempt: int) -> Found | None:
         """Return what a search finds: a quick one, None if it is no good, then thorough ones."""
         found = self.beam.search(thorough=attempt > 0)
-        if found is None:
-            return None
-        self.found = found if self.beam.tolerable(found) else None
-        return self.found if attempt == 0 else found
+        return found if found is not None and (attempt > 0 or self.beam.tolerable(found)) else None
 
     def _ordered(self, found: Found) -> Iterable[Floats]:
         """Return paths in the order in which they are to be joined, each after what it comes to when it is shortened.
@@ -221,9 +219,12 @@ class _SeedSearch:
         return itertools.chain.from_iterable(zip(short.paths[order], found.paths[order], strict=True))
 
     def _tried(self, paths: Sequence[Floats]) -> Sequence[Floats]:
-        """Return of paths those of which one is to become a seed; what could not be shortened comes twice, and is joined once."""
-        tried = paths[:_COMPARED_PATHS]
-        return [path for k, path in enumerate(tried) if not k or not np.array_equal(path, tried[k - 1])]
+        """Return a few paths of which no two are alike."""
+        kept: list[Floats] = []
+        for path in paths:
+            if len(kept) < _COMPARED_PATHS and all(np.abs(path - other)[:, : self.alike].max() > ALIKE for other in kept):
+                kept.append(path)
+        return kept
 
     def _differ(self, path: Floats, other: Floats) -> bool:
         """Return whether the base is elsewhere somewhere along two paths, (K, n), by more than a clearance [m] or [rad]."""
@@ -257,32 +258,22 @@ class _Rrt(_SeedSearch):
 
     Args:
         shared: Problem, random numbers, notes.
-        around: Its search comes first, if what that found hits nothing.
     """
 
+    alike = 3  # where nothing leads along the base's path, hardly anything does with another arm
     enough = _POOR
 
-    def __init__(self, shared: _Shared, around: _SeedSearch | None = None) -> None:
+    def __init__(self, shared: _Shared) -> None:
         super().__init__(shared, "rrt")
-        knots, self.around = shared.knots(), around
+        knots = shared.knots()
         self.beam = Beam(knots, shared.driven, careful=True, interrupt=shared.interrupt)
         trees = RrtPaths(knots, shared.routes, shared.interrupt)
         self.joiner = Joiner(knots, Approach(knots, stands=True), trees)
 
     def _search(self, attempt: int) -> Found | None:
         """Return what a search finds, None if it is no good: a quick one, then thorough ones, every other backwards."""
-        found = self.around.found if attempt == 0 and self.around is not None else None
-        if found is None or found.trouble.min() > 0:
-            found = self.beam.search(thorough=attempt > 0, backwards=attempt % 2 == 1)
+        found = self.beam.search(thorough=attempt > 0, backwards=attempt % 2 == 1)
         return found if found is not None and self.beam.tolerable(found) else None
 
     def _ordered(self, found: Found) -> Iterable[Floats]:
         return found.paths[np.lexsort((found.cost, found.trouble > 0))]  # those with knots in collision last
-
-    def _tried(self, paths: Sequence[Floats]) -> Sequence[Floats]:
-        """Return a few paths of which no two are alike: where nothing leads along one, hardly anything does along the other."""
-        kept: list[Floats] = []
-        for path in paths:
-            if all(self._differ(path, other) for other in kept):
-                kept.append(path)
-        return kept[:_COMPARED_PATHS]

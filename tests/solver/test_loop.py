@@ -247,7 +247,7 @@ def test_a_grasp_between_obstacles_is_made_free_with_small_steps() -> None:
         ([(10.0, 0.5 * 0.92**k, True) for k in range(1, 20)], 19),  # a third in five rounds
         ([(10.0, 0.5 * 0.94**k, True) for k in range(1, 20)], 5),
         ([(10.0, 0.02, True)] + [(9.0, 0.11, True)] * 20, 7),  # counted anew where more is missing and the motion is shorter
-        ([(10.0, 1e-3, True)] * 20, 20),  # next to nothing
+        ([(10.0, 1e-3, True)] * 20, 6),  # however little it is
     ],
 )
 def test_what_does_not_get_better_is_given_up(rounds: list[tuple[float, float, bool]], expected: int) -> None:
@@ -256,7 +256,7 @@ def test_what_does_not_get_better_is_given_up(rounds: list[tuple[float, float, b
     assert loop.solution.status == "not converged"
 
 
-@pytest.mark.parametrize(("drift", "converged"), [(0.8, True), (0.95, False)])
+@pytest.mark.parametrize(("drift", "converged"), [(0.95, True), (1.05, False)])
 def test_what_only_drifts_ends_as_if_it_were_good(drift: float, converged: bool) -> None:
     """No round can help that; it is not said to have converged."""
     solution = scripted((8.0, 0.0, True), (1.0, 0.0, True), drift=drift, done=True).solution

@@ -21,13 +21,14 @@ from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.motion.world import scene_after
 from vkc_pin.options import Options
 from vkc_pin.planning.outcome import TIMES
+from vkc_pin.program.merit import TOLERANCE
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.scene.scene import Scene
 from vkc_pin.seeds.approach import Approach
 from vkc_pin.seeds.initialization import initialize
 from vkc_pin.seeds.knots import Knots, smooth
 from vkc_pin.seeds.seed import Seed
-from vkc_pin.solver.loop import SOLVED_RATE_TOLERANCE, solve
+from vkc_pin.solver.loop import solve
 from vkc_pin.solver.to_trajectory import as_trajectory
 from vkc_pin.solver.trust_region import CLOSE_ENOUGH
 from vkc_pin.task.compiler import compile_task
@@ -225,7 +226,7 @@ class Attempt:
             timing = problem.timing_for(followed.z).stretched(*rates)
             self.times["following"] += time.perf_counter() - began
             cause = followed.cause
-            if not cause and timing.violation(*rates) > SOLVED_RATE_TOLERANCE:
+            if not cause and timing.violation(*rates) > TOLERANCE:
                 cause = "too fast"
             if not cause and problem.drift(followed.z) > 1.0:
                 cause = "closure"

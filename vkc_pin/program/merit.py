@@ -13,8 +13,9 @@ from vkc_pin.chain.pose import AWAY, away_from
 from vkc_pin.motion.timing import Timing
 from vkc_pin.program.problem import TrajectoryProblem
 
-__all__ = ["GROWTH", "LIMIT", "Infeasibility", "Merit", "infeasibility", "shortfalls"]
+__all__ = ["GROWTH", "LIMIT", "TOLERANCE", "Infeasibility", "Merit", "infeasibility", "shortfalls"]
 
+TOLERANCE = 1e-4  # [m], [rad] and, of rates, relative to their limits: besides clearance, what is missing of what holds
 GROWTH = 4.0  # ratio of a weight to the one before, where it proved too small
 LIMIT = 2000.0  # [1/m] and [1/rad] largest weight
 

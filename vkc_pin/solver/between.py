@@ -7,12 +7,12 @@ import numpy as np
 from vkc_pin.arrays import Floats, Ints
 from vkc_pin.chain.contacts import Contacts, no_contacts
 from vkc_pin.program.problem import TrajectoryProblem
+from vkc_pin.solver.trust_region import CLOSE_ENOUGH
 
 __all__ = ["collisions_between", "merge"]
 
 SPACING = 0.02  # [m] or [rad] between the states looked at first, in the coordinate that moves most
 KEEP = 1e-2  # [m] clearance asked for between waypoints
-ENOUGH = 6e-4  # [m] clearance between waypoints that will do
 CLOSE = 0.015  # [m] beyond `KEEP` within which a state is looked at closer
 FINER = 8  # states there instead of one
 
@@ -30,7 +30,7 @@ def collisions_between(problem: TrajectoryProblem, z: Floats) -> tuple[Contacts,
 
     Returns:
         Contacts at z_1..z_N, whose margin exceeds their distance by what is missing in between (or falls below it by what
-        is to spare: they guard against what is close already), and whether no sub-state is closer than `ENOUGH`.
+        is to spare: they guard against what is close already), and whether no sub-state is closer than `CLOSE_ENOUGH`.
     """
     path, contacts = problem.waypoints(z), problem.contacts.settled(z)
     counts = np.maximum(np.ceil(np.abs(np.diff(path, axis=0)).max(axis=1) / SPACING).astype(int), 1)
@@ -64,7 +64,7 @@ def collisions_between(problem: TrajectoryProblem, z: Floats) -> tuple[Contacts,
         inside = waypoint > 0  # the start cannot be moved
         part = Contacts(waypoint - 1, found.pair, value, value + keep - found.distance, found.normal, points[0], points[1])
         parts.append(part.select(np.flatnonzero(inside)))
-    return merge(*parts), bool(np.all(found.distance >= np.minimum(ENOUGH, keep)))
+    return merge(*parts), bool(np.all(found.distance >= np.minimum(CLOSE_ENOUGH, keep)))
 
 
 def _states(path: Floats, segment: Ints, s: Floats) -> tuple[Floats, Ints]:

@@ -11,7 +11,7 @@ import numpy as np
 from vkc_pin.arrays import Floats
 from vkc_pin.chain.contacts import Contacts
 from vkc_pin.interrupt import Interrupt, interruptible
-from vkc_pin.program.merit import Infeasibility, Merit, infeasibility
+from vkc_pin.program.merit import TOLERANCE, Infeasibility, Merit, infeasibility
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.solver.between import collisions_between, merge
 from vkc_pin.solver.solution import Iteration, Solution
@@ -22,14 +22,9 @@ __all__ = ["solve"]
 
 EARLY = 0.05  # [m] shortfall of clearance below which collisions between waypoints count
 NEARLY_FREE = 0.01  # [m] shortfall of clearance below which a motion is nearly free: before, limits on rates only cost time
-POSE_TOLERANCE = 1e-4  # [m] and [rad] largest residual of a solution
-SOLVED_RATE_TOLERANCE = 1e-4  # excess over a limit on velocity or acceleration, relative; the check allows more
-DRIFT = 0.9  # share of what a grasp may drift between waypoints that a solution may use
 SETTLING = 0.2  # relative decrease of the objective below which a motion that is nearly free is first made free
 PROGRESS_ROUNDS = 5  # rounds in which what is missing must fall:
-PROGRESS = 0.7  # to this share of what it was, or the motion is given up,
-NEXT_TO_NOTHING = 0.05  # [m] and [rad] unless this is all that is missing, summed over waypoints
-FAR = 1e-3  # [m] and [rad] what is missing besides clearance of what is no motion yet
+PROGRESS = 0.7  # to this share of what it was, or the motion is given up
 WORTHWHILE = 0.05  # relative decrease of the objective for which a feasible motion is improved further
 
 
@@ -111,7 +106,7 @@ class _Loop:
 
     def accept(self, trial: Trial) -> None:
         """Go on from `trial`."""
-        far = self.found.others > FAR
+        far = self.found.others > TOLERANCE
         self.z, self.at, self.found = trial.z, trial.contacts, trial.found
         self.objective, self.pose_error = trial.objective, trial.pose_error
         self.solution.z = trial.z
@@ -121,11 +116,11 @@ class _Loop:
             self.look()
         if not self.between and 0.0 < trial.contacts.violation() < EARLY:
             self.free_between(trial)
-        if trial.rate > SOLVED_RATE_TOLERANCE and trial.contacts.violation() < NEARLY_FREE:  # before, it only costs time
+        if trial.rate > TOLERANCE and trial.contacts.violation() < NEARLY_FREE:  # before, it only costs time
             rates = self.problem.rates(trial.z)
             self.timing = self.timing.stretched(*rates)
             self.solution.dt = self.timing.dt
-            if not self.rates and self.timing.violation(*rates) > SOLVED_RATE_TOLERANCE:
+            if not self.rates and self.timing.violation(*rates) > TOLERANCE:
                 self.rates = True
                 self.subproblem.forget()
             self.look()
@@ -135,8 +130,8 @@ class _Loop:
         return (
             trial.satisfied
             and trial.clear
-            and self.pose_error < POSE_TOLERANCE
-            and self.timing.violation(*self.problem.rates(trial.z)) <= SOLVED_RATE_TOLERANCE
+            and self.pose_error < TOLERANCE
+            and self.timing.violation(*self.problem.rates(trial.z)) <= TOLERANCE
             and self.free_between(trial)
         )
 
@@ -220,7 +215,7 @@ def _iterate(
             loop.accept(trial)
             if done := loop.done(trial):
                 last, good = good, trial.objective
-                if loop.problem.drift(trial.z) < DRIFT:  # that waypoints are too far apart along an arc no round can help
+                if loop.problem.drift(trial.z) <= 1.0:  # that waypoints are too far apart along an arc no round can help
                     solution.converged, solution.status, feasible = True, "converged", (trial.z, solution.dt)
                 improved = good < (1.0 - WORTHWHILE) * last
                 if not improved or (trial.step < INSIDE * used).all():
@@ -232,10 +227,10 @@ def _iterate(
         since += 1
         if not PROGRESS * missing < loop.found.total <= missing:  # more is missing where the objective fell instead
             missing, since = loop.found.total, 0
-        if since >= PROGRESS_ROUNDS and missing > NEXT_TO_NOTHING:
+        if since >= PROGRESS_ROUNDS:
             break
         short = loop.found.amounts["clearance"]
-        settled = accepted and not done and gain < SETTLING and loop.found.others < FAR
+        settled = accepted and not done and gain < SETTLING and loop.found.others < TOLERANCE
         if settled and short.max() < NEARLY_FREE:
             region.settle()
         if region.stuck(trial, short):

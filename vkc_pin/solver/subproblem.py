@@ -11,7 +11,7 @@ import numpy as np
 from vkc_pin.arrays import Floats
 from vkc_pin.chain.contacts import Contacts
 from vkc_pin.motion.timing import Timing
-from vkc_pin.program.merit import Infeasibility, Merit, shortfalls
+from vkc_pin.program.merit import TOLERANCE, Infeasibility, Merit, shortfalls
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.solver.solution import Solution
 
@@ -43,7 +43,6 @@ _ROUGH: Mapping[str, Any] = {
     "ipopt.acceptable_iter": 3,
     "ipopt.max_iter": 40,
 }
-RELAXED = 1e-4  # [m] and [rad] what is missing besides clearance below which nothing of it may stay missing
 
 
 class Step(NamedTuple):
@@ -100,7 +99,7 @@ class Subproblem:
         self.solution.timings["coal"] += time.perf_counter() - begin
         lower, upper = np.maximum(problem.lower, z - radius[:, None]), np.minimum(problem.upper, z + radius[:, None])
         bounds = problem.row_bounds(timing if rates else None)
-        relaxed = found.others > RELAXED
+        relaxed = found.others > TOLERANCE
         if relaxed:  # on the way: the rows of the round before were others, and its end need not be exact
             self.forget()
         how = _ROUGH if relaxed else _WARM if self._multipliers else {}

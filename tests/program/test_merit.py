@@ -10,7 +10,7 @@ from helpers.drives import hall
 from helpers.small_problems import door_scene, program_of
 
 import vkc_pin as vkc
-from vkc_pin.program.merit import GROWTH, LIMIT, Infeasibility, Merit, infeasibility, shortfalls
+from vkc_pin.program.merit import GROWTH, Infeasibility, Merit, infeasibility, shortfalls
 from vkc_pin.solver.loop import _Loop
 from vkc_pin.solver.trust_region import Trial
 
@@ -126,7 +126,7 @@ def test_a_step_is_refused_that_makes_more_of_any_kind_missing(kind: str) -> Non
         assert loop.judge(trial) == expected
 
 
-def test_weights_grow_where_something_is_missing_and_no_further_than_their_limit() -> None:
+def test_weights_grow_where_something_is_missing() -> None:
     merit, amounts = Merit(200.0), {kind: np.zeros(3) for kind in KINDS}
     amounts["terms"][1] = 0.01
     found = Infeasibility(amounts, np.zeros((3, 0, 7)), np.zeros(0), np.zeros(0))
@@ -134,6 +134,5 @@ def test_weights_grow_where_something_is_missing_and_no_further_than_their_limit
     assert merit.weights == {**dict.fromkeys(KINDS, 200.0), "terms": GROWTH * 200.0}
     assert merit.price(found, clearance=False) == pytest.approx([0.0, GROWTH * 200.0 * 0.01, 0.0])
     assert merit.grow(found, 1e-3)
-    assert merit.weights["terms"] == LIMIT
-    assert not merit.grow(found, 1e-3)
+    assert merit.weights["terms"] == GROWTH**2 * 200.0
     assert not Merit(200.0).grow(found, 0.1)

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from vkc_pin.solver.trust_region import (
     CLOSE_ENOUGH,
     FIRST_RADIUS,
-    MAX_RADIUS,
     MIN_RADIUS,
     SETTLE_RADIUS,
     Trial,
@@ -72,13 +71,6 @@ def test_what_half_keeps_its_promise_keeps_the_radius() -> None:
     np.testing.assert_array_equal(region.radius, FIRST_RADIUS)
 
 
-def test_radii_have_an_upper_end() -> None:
-    region = TrustRegion(SEGMENTS, BLOCK)
-    for _ in range(9):
-        region.adapt(np.ones(SEGMENTS), np.zeros(SEGMENTS), trial(step=region.radius), True)
-    np.testing.assert_array_equal(region.radius, MAX_RADIUS)
-
-
 @settings(max_examples=50, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_radii_stay_positive_and_one_to_a_block(seed: int) -> None:
@@ -104,7 +96,7 @@ def test_stuck_is_where_something_is_in_the_way_and_does_not_move() -> None:
     region.settle()
     np.testing.assert_array_equal(region.radius, SETTLE_RADIUS)
     region.restart()
-    assert (region.radius > SETTLE_RADIUS).all()
+    np.testing.assert_array_equal(region.radius, FIRST_RADIUS)
 
 
 def test_the_radii_of_another_solution_are_taken_over_and_left_alone() -> None:

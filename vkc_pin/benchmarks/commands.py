@@ -72,7 +72,7 @@ def _add_problems(benches: Any) -> None:
         parser.set_defaults(benchmark=f"problems.{name}")
         parser.add_argument("--problems", nargs="+", type=natural, metavar="N", help="numbers from 0 to 59 (default: all)")
         if name == "ablation":
-            form = "settings to change, one at a time: Options.FIELD=VALUE or MODULE:NAME=VALUE, e.g. solver.loop:SETTLING=0.1"
+            form = "settings to change, one at a time: Options.FIELD=VALUE or MODULE:NAME=VALUE, e.g. solver.loop:PROGRESS=0.6"
             parser.add_argument("--changes", nargs="+", metavar="CHANGE", help=form)
         else:
             count = functools.partial(natural, least=2)

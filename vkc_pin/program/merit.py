@@ -13,11 +13,10 @@ from vkc_pin.chain.pose import AWAY, away_from
 from vkc_pin.motion.timing import Timing
 from vkc_pin.program.problem import TrajectoryProblem
 
-__all__ = ["GROWTH", "LIMIT", "TOLERANCE", "Infeasibility", "Merit", "infeasibility", "shortfalls"]
+__all__ = ["GROWTH", "TOLERANCE", "Infeasibility", "Merit", "infeasibility", "shortfalls"]
 
 TOLERANCE = 1e-4  # [m], [rad] and, of rates, relative to their limits: besides clearance, what is missing of what holds
 GROWTH = 4.0  # ratio of a weight to the one before, where it proved too small
-LIMIT = 2000.0  # [1/m] and [1/rad] largest weight
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,8 +109,8 @@ class Merit:
         return np.asarray(sum(self.weights[kind] * found.amounts[kind] for kind in kinds))
 
     def grow(self, found: Infeasibility, tolerance: float) -> bool:
-        """Make dearer what is still missing at some waypoint by more than `tolerance`; return whether anything could be."""
-        low = [k for k, weight in self.weights.items() if weight < LIMIT and found.amounts[k].max(initial=0.0) > tolerance]
+        """Make dearer what is still missing at some waypoint by more than `tolerance`; return whether anything is."""
+        low = [kind for kind in self.weights if found.amounts[kind].max(initial=0.0) > tolerance]
         for kind in low:
-            self.weights[kind] = min(GROWTH * self.weights[kind], LIMIT)
+            self.weights[kind] *= GROWTH
         return bool(low)

@@ -14,7 +14,7 @@ __all__ = ["collisions_between", "merge"]
 SPACING = 0.02  # [m] or [rad] between the states looked at first, in the coordinate that moves most
 KEEP = 1e-2  # [m] clearance asked for between waypoints
 CLOSE = 0.015  # [m] beyond `KEEP` within which a state is looked at closer
-FINER = 8  # states there instead of one
+FINER = 4  # states there instead of one
 
 
 def collisions_between(problem: TrajectoryProblem, z: Floats) -> tuple[Contacts, bool]:

@@ -20,9 +20,6 @@ from vkc_pin.solver.trust_region import BLOCK_TIME, CLOSE_ENOUGH, INSIDE, Trial,
 
 __all__ = ["solve"]
 
-EARLY = 0.05  # [m] shortfall of clearance below which collisions between waypoints count
-NEARLY_FREE = 0.01  # [m] shortfall of clearance below which a motion is nearly free: before, limits on rates only cost time
-SETTLING = 0.2  # relative decrease of the objective below which a motion that is nearly free is first made free
 PROGRESS_ROUNDS = 5  # rounds in which what is missing must fall:
 PROGRESS = 0.7  # to this share of what it was, or the motion is given up
 WORTHWHILE = 0.05  # relative decrease of the objective for which a feasible motion is improved further
@@ -114,9 +111,10 @@ class _Loop:
             self.timing = self.problem.timing_for(self.z)
             self.solution.dt = self.timing.dt
             self.look()
-        if not self.between and 0.0 < trial.contacts.violation() < EARLY:
+        nearly = trial.contacts.violation() < self.options.dist_safe
+        if nearly and not self.between and trial.contacts.violation() > 0.0:
             self.free_between(trial)
-        if trial.rate > TOLERANCE and trial.contacts.violation() < NEARLY_FREE:  # before, it only costs time
+        if nearly and trial.rate > TOLERANCE:  # before, limits on rates only cost time
             rates = self.problem.rates(trial.z)
             self.timing = self.timing.stretched(*rates)
             self.solution.dt = self.timing.dt
@@ -211,7 +209,6 @@ def _iterate(
         before, after = (loop.merit.price(found, clearance=True) for found in (loop.found, trial.found))
         used = region.radius
         if accepted:
-            gain = (loop.objective - trial.objective) / max(abs(loop.objective), 1e-9)
             loop.accept(trial)
             if done := loop.done(trial):
                 last, good = good, trial.objective
@@ -230,11 +227,11 @@ def _iterate(
         if since >= PROGRESS_ROUNDS:
             break
         short = loop.found.amounts["clearance"]
-        settled = accepted and not done and gain < SETTLING and loop.found.others < TOLERANCE
-        if settled and short.max() < NEARLY_FREE:
+        nearly = short.max() < loop.options.dist_safe
+        if accepted and not done and nearly and loop.found.others < TOLERANCE:
             region.settle()
         if region.stuck(trial, short):
-            if short.max() > EARLY or not loop.grow():
+            if not nearly or not loop.grow():
                 break
             region.restart()
     if feasible is not None:  # rounds after the first feasible one only made it shorter, or failed to

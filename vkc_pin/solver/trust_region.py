@@ -13,9 +13,7 @@ from vkc_pin.program.merit import Infeasibility
 __all__ = ["Trial", "TrustRegion", "judge"]
 
 BLOCK_TIME = 2.5  # [s] of motion that share a radius, at `Options.dt` a waypoint
-FIRST_RADIUS = 0.5  # [m] and [rad] of the trust region at first
-RESTART_RADIUS = 0.2  # [m] and [rad] after the penalty has been raised
-MAX_RADIUS = 1.0  # [m] and [rad] beyond which planes say nothing
+FIRST_RADIUS = 0.5  # [m] and [rad] of the trust region at first, and after weights have grown
 INSIDE = 0.9  # share of the radius: steps that end within it were not held back (Ipopt ends a little inside its bounds)
 SETTLE_RADIUS = 0.05  # [m] and [rad] in which planes are as good as distances
 MIN_RADIUS = 5e-3  # [m] and [rad] below which nothing moves any more
@@ -93,7 +91,7 @@ class TrustRegion:
         good = (actual > 0.7 * promised - NO_MATTER) & accepted & (step > INSIDE * radius)
         factor = np.where(good, 1.5, 1.0)
         radius = np.where(worse, SHRINK * np.minimum(radius, step), radius * factor)
-        self.radius = np.clip(radius, 1e-6, MAX_RADIUS)[self.block]
+        self.radius = np.maximum(radius, 1e-6)[self.block]
 
     def settle(self) -> None:
         """Let waypoints move so little that planes are as good as distances."""
@@ -107,8 +105,8 @@ class TrustRegion:
         return bool((np.minimum(self.radius, trial.step)[bad] < MIN_RADIUS).all())
 
     def restart(self) -> None:
-        """Begin again, less boldly."""
-        self.radius = np.full(len(self.radius), RESTART_RADIUS)
+        """Begin again."""
+        self.radius = np.full(len(self.radius), FIRST_RADIUS)
 
 
 def judge(promised: float, actual: float, merit: float) -> bool:

@@ -12,7 +12,7 @@ from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.problems import ablation
 from vkc_pin.cli import main
 
-CHANGE = "solver.loop:SETTLING=0.1"
+CHANGE = "solver.loop:PROGRESS=0.6"
 
 
 @pytest.fixture(autouse=True)

@@ -19,7 +19,7 @@ from vkc_pin.options import Options
 __all__ = ["UNCHANGED", "Change", "parsed"]
 
 _WINGS = ("chain", "driving", "planning", "program", "seeds", "solver", "task")
-_FORM = "Options.field=value, or module:NAME=value such as solver.loop:SETTLING=0.1"
+_FORM = "Options.field=value, or module:NAME=value such as solver.loop:PROGRESS=0.6"
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ UNCHANGED = Change()
 
 
 def parsed(text: str) -> Change:
-    """Return the change that a text stands for: `Options.dt=0.3`, or `solver.loop:SETTLING=0.1`.
+    """Return the change that a text stands for: `Options.dt=0.3`, or `solver.loop:PROGRESS=0.6`.
 
     Raises:
         UnknownNameError: There is no such field, module or constant.

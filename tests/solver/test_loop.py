@@ -159,7 +159,6 @@ class Scripted:
     ) -> None:
         self.step, self.other = step, other
         self.problem, self.z, self.is_done = SimpleNamespace(drift=lambda _: drift), np.zeros((40, 1)), done
-        self.options = vkc.Options()
         self.deadline, self.solution = np.inf, Solution(np.zeros((40, 1)), np.full(40, 0.25))
         self.merit, self.found = Merit(200.0), missing(0.5, other)
         self.objective, self.rounds, self.radii = 10.0, iter(rounds), list[np.ndarray]()
@@ -204,8 +203,8 @@ def scripted(*rounds: tuple[float, float, bool], **how: Any) -> Scripted:
 @pytest.mark.parametrize(
     ("objective", "shortfall", "accepted", "small"),
     [
-        (8.1, 0.019, True, True),
-        (8.1, 0.021, True, False),  # something may overlap
+        (8.1, 0.009, True, True),
+        (8.1, 0.011, True, False),  # it is far from free
         (10.0, 0.0, True, True),
         (14.0, 0.009, True, True),
         (8.1, 0.009, False, False),
@@ -226,7 +225,7 @@ def test_a_grasp_between_obstacles_is_made_free_with_small_steps() -> None:
     seed = next(initialize(problem, "astar", 0)).z
     solution, small = solve(problem, seed), 0
     for row, after in itertools.pairwise(solution.history):
-        nearly = trust_region.CLOSE_ENOUGH <= row.shortfall < problem.options.dist_safe  # and not yet free
+        nearly = trust_region.CLOSE_ENOUGH <= row.shortfall < solver.NEARLY_FREE  # and not yet free
         if row.accepted and nearly and row.pose_error < TOLERANCE:
             assert after.radius <= trust_region.SETTLE_RADIUS
             assert after.step <= trust_region.SETTLE_RADIUS * (1 + 1e-6)
@@ -303,7 +302,7 @@ def test_motions_that_stay_far_from_free_are_given_up_soon(monkeypatch: pytest.M
     solution = solve(problem, seed)
     assert (solution.status, solution.converged) == ("not converged", False)
     assert solution.rounds < FEW.max_outer
-    assert problem.evaluate_contacts(solution.z, reach=0.1).violation() > FEW.dist_safe
+    assert problem.evaluate_contacts(solution.z, reach=0.1).violation() > solver.NEARLY_FREE
     assert solve(problem, seed, rounds=2).rounds == 2
 
 

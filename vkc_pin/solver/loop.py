@@ -20,6 +20,7 @@ from vkc_pin.solver.trust_region import BLOCK_TIME, CLOSE_ENOUGH, INSIDE, Trial,
 
 __all__ = ["solve"]
 
+NEARLY_FREE = 0.01  # [m] shortfall of clearance below which a motion is nearly free
 PROGRESS_ROUNDS = 5  # rounds in which what is missing must fall:
 PROGRESS = 0.7  # to this share of what it was, or the motion is given up
 WORTHWHILE = 0.05  # relative decrease of the objective for which a feasible motion is improved further
@@ -111,7 +112,7 @@ class _Loop:
             self.timing = self.problem.timing_for(self.z)
             self.solution.dt = self.timing.dt
             self.look()
-        nearly = trial.contacts.violation() < self.options.dist_safe
+        nearly = trial.contacts.violation() < NEARLY_FREE
         if nearly and not self.between and trial.contacts.violation() > 0.0:
             self.free_between(trial)
         if nearly and trial.rate > TOLERANCE:  # before, limits on rates only cost time
@@ -227,7 +228,7 @@ def _iterate(
         if since >= PROGRESS_ROUNDS:
             break
         short = loop.found.amounts["clearance"]
-        nearly = short.max() < loop.options.dist_safe
+        nearly = short.max() < NEARLY_FREE
         if accepted and not done and nearly and loop.found.others < TOLERANCE:
             region.settle()
         if region.stuck(trial, short):

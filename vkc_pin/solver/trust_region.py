@@ -18,7 +18,7 @@ INSIDE = 0.9  # share of the radius: steps that end within it were not held back
 SETTLE_RADIUS = 0.05  # [m] and [rad] in which planes are as good as distances
 MIN_RADIUS = 5e-3  # [m] and [rad] below which nothing moves any more
 SHRINK = 0.4  # of the radius, or of the step if that was shorter, where a promise did not come true
-NO_MATTER = 0.4  # of the merit, in a block: 2 mm of shortfall at the weight that it has at first
+NO_MATTER = 0.4  # of the merit, in a block: 8 mm of shortfall at the weight that it has at first
 CLOSE_ENOUGH = 5e-4  # [m] shortfall of clearance at a waypoint that is none, and clearance between waypoints that will do
 
 

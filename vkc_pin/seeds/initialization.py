@@ -26,7 +26,7 @@ INITIALIZATIONS = ("auto", "interpolated", "astar", "rrt", "stationary")
 _FREE = 0.05  # [m] shortfall of clearance of a seed, summed over its waypoints, below which no better one is looked for
 _POOR = 0.5  # [m] shortfall above which other seeds come first, and trees if there is no better one
 _COMPARED_PATHS = 8  # paths of the beam whose seeds are compared, or along which trees grow
-_PLACES = 32  # random places of which one is where a phase ends, once the stationary seed led nowhere
+_PLACES = 128  # random places of which one is where a phase ends, once the stationary seed led nowhere
 
 
 def initialize(

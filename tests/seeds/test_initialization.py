@@ -116,6 +116,17 @@ def test_the_stationary_seed_leaves_the_robot_where_it_is() -> None:
         assert hinge[problem().ends[1] - 1] == 0.0
 
 
+def test_of_many_random_places_the_one_with_the_least_merit_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    drive = program_of(hall(), [vkc.Reach((2.0, 1.5, 1.0, 0.0, np.pi / 2, 0.0))], options=SHORT)
+
+    def merits(places: int) -> list[float]:
+        monkeypatch.setattr(initialization, "_PLACES", places)
+        _, *others = initialize(drive, "stationary", 0, count=4)
+        return [initialization._merit(drive, seed.z, drive.segments) for seed in others]
+
+    assert max(merits(128)) < min(merits(1))
+
+
 def test_a_seed_for_the_base_takes_the_shorter_way_round() -> None:
     scene = hall().with_start(base=[0.0, 0.0, 3.0])
     turn = program_of(scene, [vkc.GoTo(1.0, 0.5, -3.0)], options=SHORT)
@@ -135,6 +146,10 @@ def test_a_fixed_base_stays_in_every_seed() -> None:
     fixed = program_of(hall(base="fixed"), [vkc.Reach((0.5, 0.4, 1.0, 0.0, np.pi / 2, 0.0))], options=SHORT)
     for z in (found.z for found in initialize(fixed, "interpolated", 0, count=3)):
         assert np.ptp(fixed.waypoints(z)[:, :3], axis=0).max() == 0.0
+    still, *others = (found.z for found in initialize(fixed, "stationary", 0, count=3))
+    for z in others:  # the arm goes elsewhere instead
+        assert np.ptp(fixed.waypoints(z)[:, :3], axis=0).max() == 0.0
+        assert np.abs(z - still)[-1, 3:].max() > 0.1
 
 
 def test_scattered_configurations_are_where_they_say() -> None:
@@ -162,6 +177,10 @@ def test_nothing_to_scatter() -> None:
     assert scatter(free, middle, np.random.default_rng(0)) is None
 
 
+Shortfalls = list[float | None]
+FINE, POOR, LOST = 0.9 * _POOR, 1.1 * _POOR, 4.4 * _POOR
+
+
 class Looked:
     """Stands for three searches; says what is looked for (s0), and what came to be taken (S0). None: a search finds nothing."""
 
@@ -175,10 +194,6 @@ class Looked:
         for number, shortfall in enumerate(shortfalls):
             self.said.append(f"{kind}{number}")
             yield None if shortfall is None else Seed(f"{kind}{number}", np.zeros((1, 1)), shortfall)
-
-
-Shortfalls = list[float | None]
-FINE, POOR, LOST = 0.9 * _POOR, 1.1 * _POOR, 4.4 * _POOR
 
 
 @pytest.mark.parametrize(

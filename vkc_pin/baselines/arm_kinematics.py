@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.arrays import Floats, Ints
+from vkc_pin.chain.inverse_kinematics import LONGEST_STEP
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.knots import Knots
 
@@ -20,7 +21,6 @@ QP = "daqp"
 """The solver of quadratic programs, by its name in `qpsolvers`."""
 _ITERATIONS = 30
 _TOLERANCE = 1e-6  # [m] and [rad]
-_LONGEST = 0.5  # [rad] or [m] of one step in one coordinate
 _FRAME = "what closes the chain"
 
 
@@ -87,6 +87,6 @@ class _Box:
         """Return G and h of G·δz ≤ h, shapes (2n, n) and (2n,)."""
         most, least = np.zeros(len(self.z)), np.zeros(len(self.z))
         at = self.columns
-        most[at] = np.clip(self.upper[at] - self.z[at], 0.0, _LONGEST)
-        least[at] = np.clip(self.lower[at] - self.z[at], -_LONGEST, 0.0)
+        most[at] = np.clip(self.upper[at] - self.z[at], 0.0, LONGEST_STEP)
+        least[at] = np.clip(self.lower[at] - self.z[at], -LONGEST_STEP, 0.0)
         return self._rows, np.concatenate([most, -least])

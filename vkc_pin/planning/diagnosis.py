@@ -6,8 +6,8 @@ import numpy as np
 
 from vkc_pin.arrays import Floats
 from vkc_pin.interrupt import NEVER, Interrupt
+from vkc_pin.program.merit import TOLERANCE
 from vkc_pin.program.problem import TrajectoryProblem
-from vkc_pin.seeds.clearing import KNOT_TOLERANCE
 from vkc_pin.seeds.knots import depth, scatter
 from vkc_pin.validation.report import Violation
 
@@ -64,14 +64,14 @@ def explain(problem: TrajectoryProblem, random_seed: int, interrupt: Interrupt =
         if tried is None:
             continue
         z, residual = tried
-        if residual.min() > KNOT_TOLERANCE:
+        if residual.min() > TOLERANCE:
             nearest = int(np.argmin(residual))
             lines.append(
                 f"{phase.name}: out of reach, none of {len(z)} configurations tried gets there; "
                 f"the nearest stays {residual[nearest]:.3f} m or rad short"
             )
             continue
-        reached = z[residual < KNOT_TOLERANCE]
+        reached = z[residual < TOLERANCE]
         contacts = problem.contacts.evaluate(reached, np.full(len(reached), int(end)), reach=problem.options.dist_safe)
         shortfall = contacts.shortfall(len(reached))
         if shortfall.min() > 0.0:
@@ -96,7 +96,7 @@ def _try(
         if tried is None:
             return None
         found.append(tried)
-        z = tried[0][tried[1] < KNOT_TOLERANCE]
+        z = tried[0][tried[1] < TOLERANCE]
         if interrupt.pressed or (len(z) and depth(problem, z, waypoint).min() <= 0.0):
             break
     return np.concatenate([z for z, _ in found]), np.concatenate([residual for _, residual in found])

@@ -19,10 +19,16 @@ from vkc_pin.task.terms import Term
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import validate
 
-__all__ = ["TIMES", "charged", "joined", "outcome", "spent", "summed"]
+__all__ = ["FINAL", "STOPPED", "TIMES", "charged", "joined", "outcome", "spent", "summed"]
 
 TIMES = ("initialization", "coal", "casadi", "ipopt", "validation")
 """What planning spends its time on."""
+
+STOPPED = ("interrupted", "time limit")
+"""Statuses after which there is no time left."""
+
+FINAL = (*STOPPED, "infeasible")
+"""Statuses after which nothing else is tried."""
 
 
 def spent(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from vkc_pin.motion.world import scene_after
 from vkc_pin.planning.one_problem import OneProblem
-from vkc_pin.planning.outcome import charged, joined
+from vkc_pin.planning.outcome import FINAL, charged, joined
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.settings import Settings
 from vkc_pin.scene.scene import Scene
@@ -12,8 +12,6 @@ from vkc_pin.task.compiler import compile_task
 from vkc_pin.task.phases import Task
 
 __all__ = ["all_at_once", "stages", "step_by_step"]
-
-_FINAL = ("infeasible", "time limit", "interrupted")  # statuses after which nothing else is tried
 
 
 def step_by_step(scene: Scene, task: Task, settings: Settings) -> Plan:
@@ -38,7 +36,7 @@ def all_at_once(scene: Scene, task: Task, settings: Settings) -> Plan:
         settings: How to plan.
     """
     result = OneProblem(scene, task, settings).run()
-    if result.success or len(task.steps) == 1 or result.status in _FINAL:
+    if result.success or len(task.steps) == 1 or result.status in FINAL:
         return result
     apart = step_by_step(scene, task, settings.after([result.metrics]))
     spent = [result.metrics, apart.metrics]

@@ -12,7 +12,7 @@ from vkc_pin.motion.splicing import cut
 from vkc_pin.motion.world import scene_after
 from vkc_pin.options import Options
 from vkc_pin.planning.one_problem import OneProblem
-from vkc_pin.planning.outcome import joined
+from vkc_pin.planning.outcome import FINAL, STOPPED, joined
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.settings import Settings
 from vkc_pin.program.problem import TrajectoryProblem
@@ -26,8 +26,6 @@ from vkc_pin.task.steps import Step
 __all__ = ["SlidingWindow"]
 
 _NOTHING = PhaseWaypoints((), (), (), "")
-_STOPPED = ("interrupted", "time limit")
-_FINAL = (*_STOPPED, "infeasible")
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +74,7 @@ class SlidingWindow:
                 break
             if failed is None:
                 window = self.window
-            elif self.kept and back and failed.status not in _FINAL:
+            elif self.kept and back and failed.status not in FINAL:
                 self.kept.pop()
                 while self.kept and not self.kept[-1].rests:
                     self.kept.pop()
@@ -119,14 +117,14 @@ class SlidingWindow:
             if plan.success:
                 self.ahead = self._parts(one, plan, first, last)
         for attempt in range(1, 1 + self._searches):
-            if alone is None or alone.status in _STOPPED:
+            if alone is None or alone.status in STOPPED:
                 break
             one = self._problem(self._now, first, last, attempt)
             together = self._solved(first, one)
             alone = None if together.success else dataclasses.replace(alone, status=together.status)
             if together.success:
                 self.ahead = self._parts(one, together, first, last)
-            elif together.status in _FINAL:
+            elif together.status in FINAL:
                 break
         if alone is None:
             self.kept.append(self.ahead.pop(0))
@@ -157,7 +155,7 @@ class SlidingWindow:
             if plan.success:
                 self.ahead += self._parts(one, plan, number, number + 1)
                 return None
-            if plan.status in _FINAL:
+            if plan.status in FINAL:
                 break
         return plan
 

@@ -10,8 +10,8 @@ import pinocchio as pin
 from vkc_pin.arrays import Floats
 from vkc_pin.chain.inverse_kinematics import PoseSolver
 from vkc_pin.chain.pose import PoseRow
+from vkc_pin.program.merit import TOLERANCE
 from vkc_pin.scene.hold import Hold
-from vkc_pin.seeds.clearing import KNOT_TOLERANCE
 from vkc_pin.seeds.knots import Knots
 from vkc_pin.task.phases import FrameGoal, Phase
 
@@ -89,7 +89,7 @@ class Approach:
             target = pin.SE3(tool.rotation, tool.translation + number * self.problem.options.approach * direction)
             start = (found[-1] if found else z)[None]
             for low, high in (standing, (lower, upper)) if self.stands else ((lower, upper),):
-                near, ok = self.solver.solve(start, target, lower=low, upper=high, weights=weights, tolerance=KNOT_TOLERANCE)
+                near, ok = self.solver.solve(start, target, lower=low, upper=high, weights=weights, tolerance=TOLERANCE)
                 if ok[0]:
                     break
             else:

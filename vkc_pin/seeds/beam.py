@@ -79,7 +79,7 @@ class Beam:
         """Go from knot to knot, keeping the cheapest paths; None if that was interrupted.
 
         Args:
-            thorough: Keep more, and shake the arms at every knot at which something fixed is held.
+            thorough: Draw more, and shake the arms at every knot at which something fixed is held.
             backwards: Where something fixed is held, begin where it is let go of, and go back to where it is grasped: a passage
                 may be wide at its end only, and hardly anything that is free at its beginning leads there.
         """
@@ -129,24 +129,31 @@ class Beam:
     def _go_on(self, found: Found, knot: int, phase: int, mode: _Mode) -> Found:
         """Return the cheapest paths to the next knot, to which something of a phase leads."""
         parents, z, bad = self._continue(found.paths, found.cost, knot, phase, mode)
-        drawn = len(z)
-        if not self.careful and not self.problem.closed(self.problem.task.phases[phase]) and self.knots.pose_at(knot) is not None:
-            parents, z, bad = self._with_shortened(found, parents, z, bad, knot, phase)
         total = found.cost[parents] + self._path_cost(found.paths[parents, -1], z, phase) + bad
+        drawn = len(z)
+        open_phase = not self.problem.closed(self.problem.task.phases[phase])
+        if not self.careful and open_phase and self.knots.pose_at(knot) is not None:
+            parents, z, bad, total = self._with_shortened(found, parents, z, bad, total, knot, phase)
         best = self._kept(total, z, drawn, _WIDTH)
         paths = np.concatenate([found.paths[parents[best]], z[best, None]], axis=1)
         return Found(paths, total[best], (found.trouble[parents] + bad)[best], [*found.at, knot])
 
     def _with_shortened(
-        self, found: Found, parents: Ints, z: Floats, bad: Floats, knot: int, phase: int
-    ) -> tuple[Ints, Floats, Floats]:
-        """Return continuations, and with them what the best of them become when the ways to them are shortened."""
-        price = found.cost[parents] + self._path_cost(found.paths[parents, -1], z, phase) + bad
-        best = np.argsort(price, kind="stable")[: 2 * _WIDTH]
-        paths = np.concatenate([found.paths[parents[best]], z[best, None]], axis=1)
-        short = self.shortened(Found(paths, price[best], bad[best], [*found.at, knot]), len(found.at))
-        more = parents[best], short.paths[:, -1], short.trouble
-        return np.concatenate([parents, more[0]]), np.concatenate([z, more[1]]), np.concatenate([bad, more[2]])
+        self, found: Found, parents: Ints, z: Floats, bad: Floats, total: Floats, knot: int, phase: int
+    ) -> tuple[Ints, Floats, Floats, Floats]:
+        """Return continuations, and after them what the best of them become when the ways to them are shortened."""
+        best = np.argsort(total, kind="stable")[: 2 * _WIDTH]
+        before = found.paths[parents[best]]
+        paths = np.concatenate([before, z[best, None]], axis=1)
+        short = self.shortened(Found(paths, total[best], bad[best], [*found.at, knot]), len(found.at))
+        end = short.paths[:, -1]
+        price = found.cost[parents[best]] + self._path_cost(before[:, -1], end, phase) + short.trouble
+        return (
+            np.concatenate([parents, parents[best]]),
+            np.concatenate([z, end]),
+            np.concatenate([bad, short.trouble]),
+            np.concatenate([total, price]),
+        )
 
     @staticmethod
     def _kept(total: Floats, z: Floats, drawn: int, width: int) -> Ints:

@@ -7,11 +7,11 @@ import pinocchio as pin
 
 from vkc_pin.arrays import Floats
 from vkc_pin.chain.inverse_kinematics import LONGEST_STEP, PoseSolver
+from vkc_pin.program.merit import TOLERANCE
 from vkc_pin.program.problem import TrajectoryProblem
 
 __all__ = ["clear_out"]
 
-KNOT_TOLERANCE = 1e-4  # [m] and [rad] largest residual of a pose at a knot; what is joined from knots is exact
 _CLEARING_ROUNDS = 10  # Gauss-Newton steps at most
 _DAMPING = 3e-4  # added to the diagonal of the normal equations
 
@@ -54,7 +54,7 @@ def clear_out(
         contacts = problem.contacts.evaluate(z[at], np.full(len(at), waypoint), reach=options.dist_safe + extra, nearest=slots)
         short = contacts.shortfall(len(at))
         residual, pose_rows = solver.evaluate(z[at], target)
-        done[at] = (short <= 0.0) & (np.abs(residual).max(axis=1) < KNOT_TOLERANCE)
+        done[at] = (short <= 0.0) & (np.abs(residual).max(axis=1) < TOLERANCE)
         # Gradients of the nearest distances, and by how much they should grow [m].
         rows, growth = np.zeros((len(at), slots, z.shape[1])), np.zeros((len(at), slots))
         rows[contacts.waypoint, contacts.place] = problem.contacts.gradients(z[at], contacts)

@@ -47,8 +47,8 @@ def initialize(
             the base goes straight to random places. "interpolated": straight to a configuration at each goal, found by inverse
             kinematics from random seeds; where something fixed is held, the seed follows its motion. "astar": to such
             configurations, the base along the shortest way around what stands there, heading along it. "rrt": to such
-            configurations, base and arm together along what two random trees find. "auto": these three in turn, the last first
-            where the others hit things.
+            configurations, base and arm together along what two random trees find. "auto": these three in turn; where what one
+            finds hits things, the next is asked at once, and the best of them comes first.
         random_seed: Of the random numbers.
         count: How many different seeds to return.
         perturbation: Standard deviation of what is added to the robot's coordinates, smoothly over time, [m] and [rad].
@@ -193,8 +193,7 @@ class _SeedSearch:
             if self.interrupt.pressed:
                 return
             found = self._search(attempt)
-            new = [path for path in self._ordered(found) if all(self._differ(path, other) for other in given)] if found else []
-            best = self._best(new, found.at) if found else None
+            best = None if found is None else self._best(found, given)
             if best is None:
                 yield None
                 continue
@@ -230,14 +229,15 @@ class _SeedSearch:
         """Return whether the base is elsewhere somewhere along two paths, (K, n), by more than a clearance [m] or [rad]."""
         return bool(np.abs(path - other)[:, :3].max() > self.problem.options.dist_safe)
 
-    def _best(self, paths: Sequence[Floats], at: list[int]) -> tuple[Floats, Floats, float] | None:
-        """Return the path, of the first, whose seed has the least l1 merit, that seed and its shortfall.
+    def _best(self, found: Found, given: Sequence[Floats]) -> tuple[Floats, Floats, float] | None:
+        """Return the path, of the first that are not `given`, whose seed has the least l1 merit, that seed and its shortfall.
 
         The first that falls short of next to nothing will do. None if no path of the robot leads through any of them.
         """
+        new = [path for path in self._ordered(found) if all(self._differ(path, other) for other in given)]
         best, least = None, np.inf
-        for path in self._tried(paths):
-            z = self.joiner.join(path, at)
+        for path in self._tried(new):
+            z = self.joiner.join(path, found.at)
             if self.interrupt.pressed:  # what was not found may be there all the same
                 return None
             self.notes += [line for line in self.joiner.blocked if line not in self.notes]

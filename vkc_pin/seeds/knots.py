@@ -10,8 +10,9 @@ import pinocchio as pin
 
 from vkc_pin.arrays import Bools, Floats
 from vkc_pin.chain.inverse_kinematics import PoseSolver
+from vkc_pin.program.merit import TOLERANCE
 from vkc_pin.program.problem import TrajectoryProblem
-from vkc_pin.seeds.clearing import KNOT_TOLERANCE, clear_out
+from vkc_pin.seeds.clearing import clear_out
 
 __all__ = ["SCATTER", "Knots", "Known", "depth", "follow_objects", "scatter", "smooth"]
 
@@ -115,7 +116,7 @@ class Knots:
             z[::2, 3 : self.robot] = self.chain.robot.home
         if how != "track":
             z = self._shaken(z, pose, (0.1, 2.0) if how == "scatter" else (0.05, 0.5))
-        z, found = solver.solve(z, target, lower=lower, upper=upper, weights=self.weights, tolerance=KNOT_TOLERANCE)
+        z, found = solver.solve(z, target, lower=lower, upper=upper, weights=self.weights, tolerance=TOLERANCE)
         if how == "scatter":
             z = self._unwind(z, before, lower, upper)
         return z, found
@@ -132,7 +133,7 @@ class Knots:
         solver, target = self.solver(pose)
         weights = self.weights
         pushed = clear_out(self.problem, z, waypoint, solver, target, lower=lower, upper=upper, weights=weights)
-        exact, _ = solver.solve(pushed, target, lower=lower, upper=upper, weights=weights, iterations=3, tolerance=KNOT_TOLERANCE)
+        exact, _ = solver.solve(pushed, target, lower=lower, upper=upper, weights=weights, iterations=3, tolerance=TOLERANCE)
         return exact
 
     def _limits(self, before: Floats, waypoint: int) -> tuple[Floats, Floats]:
@@ -212,7 +213,7 @@ def scatter(problem: TrajectoryProblem, waypoint: int, rng: np.random.Generator)
         pushed[found] = search.clear(z[found], waypoint)
         solver, target = search.solver(pose)
         before, after = (np.abs(solver.evaluate(rows, target)[0]).max(axis=1) for rows in (z, pushed))
-        kept = after < KNOT_TOLERANCE  # where being pushed did not cost what must hold there
+        kept = after < TOLERANCE  # where being pushed did not cost what must hold there
         return np.where(kept[:, None], pushed, z), np.where(kept, after, before)
     if (problem.lower[row, :2] < problem.upper[row, :2]).any():
         return None

@@ -143,7 +143,7 @@ def test_a_plan_that_fails_returns_1_and_is_written(tmp_path: Path, capsys: pyte
         (["bench", "initialization", "--out", "o", "--seed", "x"], ["--seed", "at least 0"]),
         (["bench", "initialization", "--out", "o", "--scenes", "init1"], ["there is no scene 'init1'", "did you mean 'init_1'"]),
         (["bench", "initialization", "--out", "o", "--methods", "auto", "astra"], ["method 'astra'", "did you mean 'astar'"]),
-        (["bench", "scale", "--out", "o", "--obstacles", "30", "0"], ["--obstacles", "at least 1", "'0'"]),
+        (["bench", "scale", "--out", "o", "--counts", "30", "0"], ["--counts", "at least 1", "'0'"]),
         (["srdf", "husky_ur5", "--output", "x.srdf"], ["husky_ur5e"]),
         (["srdf", "husky_ur5e"], ["--output"]),
         ([], ["COMMAND"]),

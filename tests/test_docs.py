@@ -204,8 +204,14 @@ def test_citation_is_of_this_version() -> None:
     assert (found["version"], found["license"]) == (project["version"], project["license"])
 
 
-def test_status_is_as_the_results_on_record_say() -> None:
-    assert read("README.md") == runpy.run_path(str(ROOT / "docs/make_status.py"))["filled"](read("README.md"))
+def test_tables_are_as_the_results_on_record_say() -> None:
+    script = runpy.run_path(str(ROOT / "docs/make_tables.py"))
+    assert {page.name for page in script["PAGES"]} >= {"README.md", "benchmarks.md", "household.md"}
+    for page in script["PAGES"]:
+        text = page.read_text(encoding="utf-8")
+        assert text == script["filled"](text), page.name
+        for name in re.findall(r"<!-- figures: (\w+) -->", text):
+            assert f"<!-- /figures: {name} -->" in text
 
 
 class Links(HTMLParser):

@@ -13,7 +13,7 @@ from helpers.fake_plan import fake_plan
 import vkc_pin as vkc
 from vkc_pin.benchmarks import scale
 from vkc_pin.benchmarks.harness import runner
-from vkc_pin.benchmarks.scale import COUNTS, crowded
+from vkc_pin.benchmarks.scale import AXES, crowded, refined
 from vkc_pin.cli import main
 from vkc_pin.errors import InputError
 from vkc_pin.validation.report import Report, Violation
@@ -75,7 +75,7 @@ def test_from_every_start_all_numbers_take_turns() -> None:
 
 
 def test_trials_and_table(planned: list[Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["bench", "scale", "--starts", "3", "--seed", "2", "--obstacles", "300", "10", "30", "100", "30", "--quiet"]
+    command = ["bench", "scale", "--starts", "3", "--seed", "2", "--counts", "300", "10", "30", "100", "30", "--quiet"]
     assert main([*command, "--out", str(tmp_path)]) == 0
     assert {path.name for path in tmp_path.iterdir()} == {
         *("results.json", "results.csv", "table.md", "scale.png", "trials.jsonl"),
@@ -86,7 +86,8 @@ def test_trials_and_table(planned: list[Any], tmp_path: Path, capsys: pytest.Cap
     assert (how["seed"], how["time_limit"]) == (2, 60.0)
     result = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))
     meta, trials = result["meta"], result["trials"]
-    assert (meta["benchmark"], meta["seed"], meta["starts"], meta["counts"]) == ("scale", 2, 3, [10, 30, 100, 300])
+    assert (meta["benchmark"], meta["seed"], meta["starts"]) == ("scale", 2, 3)
+    assert (meta["of"], meta["counts"]) == ("obstacles", [10, 30, 100, 300])
     assert {"processor", "cores"} <= set(meta["machine"])
     assert {"pin", "coal", "casadi"} <= set(meta["versions"])
     assert [(t["number"], t["obstacles"]) for t in trials] == [(n, count) for n in range(3) for count in (10, 30, 100, 300)]
@@ -108,6 +109,31 @@ def test_trials_and_table(planned: list[Any], tmp_path: Path, capsys: pytest.Cap
         assert row == [str(count), f"{good} of 3", *(f"{value:.2f}" for value in expected), "61"]
     assert main([*command, "--out", str(tmp_path)]) == 0  # nothing is left to do
     assert len(planned) == 13
+
+
+def test_segments_take_turns_too(planned: list[Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["bench", "scale", "--starts", "2", "--of", "segments", "--counts", "160", "80", "--quiet", "--out", str(tmp_path)]
+    assert main(command) == 0
+    _, *rest = planned
+    assert [how["options"] for _, _, how in rest] == [refined(80), refined(160)] * 2
+    assert {len(scene.obstacle_names) for scene, _, _ in rest} == {AXES["obstacles"].usual}
+    trials = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))["trials"]
+    assert [(t["number"], t["segments"]) for t in trials] == [(0, 80), (0, 160), (1, 80), (1, 160)]
+    table = capsys.readouterr().out
+    assert "times that of 80" in table
+    assert "| 160 | 2 of 2 |" in table
+
+
+def test_refined_options_divide_the_same_time() -> None:
+    usual = vkc.Options()
+    for segments in (4, 20, 76, 320):
+        own = refined(segments)
+        phases = [(o.reach_waypoints, o.turn_waypoints, o.move_waypoints) for o in (own, usual)]
+        assert sum(phases[0]) == segments
+        assert own.dt * segments == pytest.approx(usual.dt * sum(phases[1]))
+        if segments >= 20:
+            np.testing.assert_allclose(np.array(phases[0]) / segments, np.array(phases[1]) / sum(phases[1]), atol=0.05)
+    assert refined(76) == usual
 
 
 def test_errors_have_no_time_and_a_ratio_needs_30_obstacles(
@@ -132,12 +158,13 @@ def test_errors_have_no_time_and_a_ratio_needs_30_obstacles(
 
 
 def test_what_cannot_be_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for counts in ((), (0, 10)):
+    for of, counts in (("obstacles", ()), ("obstacles", (0, 10)), ("segments", (3, 20))):
         with pytest.raises(InputError, match="counts"):
-            scale.run(starts=1, seed=0, out=tmp_path, counts=counts, progress=False)
+            scale.run(starts=1, seed=0, out=tmp_path, of=of, counts=counts, progress=False)
+    with pytest.raises(InputError, match="obstacles or segments"):
+        scale.run(starts=1, seed=0, out=tmp_path, of="doors", progress=False)
     stopped = dataclasses.replace(fake_plan(crowded(10)), status="interrupted")
     monkeypatch.setattr(scale, "plan", lambda *_, **__: stopped)
     scale._warm.cache_clear()
     with pytest.raises(KeyboardInterrupt, match="0 of 5 trials"):  # also by Ctrl-C before the first trial
         scale.run(starts=1, seed=0, out=tmp_path, progress=False)
-    assert len(COUNTS) == 5

@@ -23,6 +23,7 @@ FIELDS = {
     *("base_effort", "base_effort_l1", "arm_effort", "clearance", "closure_error", "iterations", "rounds", "waypoints"),
     *("initialization", "build_time", "failed_constraint", "violations"),
     *(f"time_{part}" for part in ("initialization", "coal", "casadi", "ipopt", "validation")),
+    "commit",
 }
 
 
@@ -168,7 +169,7 @@ def test_baselines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_scale(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["bench", "scale", "--starts", "2", "--obstacles", "10", "40", "--jobs", "1", "--quiet", "--out", str(tmp_path)]
+    command = ["bench", "scale", "--starts", "2", "--counts", "10", "40", "--jobs", "1", "--quiet", "--out", str(tmp_path)]
     assert main(command) == 0
     table = (tmp_path / "table.md").read_text(encoding="utf-8")
     assert table in capsys.readouterr().out

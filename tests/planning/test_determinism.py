@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import subprocess
 import sys
 import threading
@@ -40,11 +41,12 @@ def stick(planner: vkc.Planner | None = None) -> vkc.Plan:
     return vkc.plan(scene, [vkc.Grasp("stick"), vkc.Touch("stick.tip", initialization.TARGET)], planner=planner)
 
 
-def elsewhere(task: str) -> str:
-    """Return the digest of a task in a process of its own."""
+def elsewhere(task: str, **variables: str) -> str:
+    """Return the digest of a task in a process of its own, with environment variables."""
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT.format(task)],
         cwd=Path(__file__).parent,
+        env={**os.environ, **variables},
         capture_output=True,
         text=True,
         timeout=250,
@@ -97,6 +99,13 @@ def test_in_threads_that_plan_at_once(fresh: dict[str, str]) -> None:
         for thread in threads:
             thread.join()
         assert found == {0: fresh["door"], 1: fresh["stick"], 2: fresh["door"], 3: fresh["stick"]}
+
+
+@pytest.mark.parametrize("number", ["1", "2"])
+def test_whatever_the_number_of_threads_of_libraries(fresh: dict[str, str], number: str) -> None:
+    """Of BLAS, OpenMP and MUMPS, which sum in another order then."""
+    variables = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), number)
+    assert elsewhere("stick", **variables) == fresh["stick"]
 
 
 @pytest.mark.long

@@ -10,7 +10,7 @@ from vkc_pin.benchmarks.harness.charts import criteria_chart
 from vkc_pin.benchmarks.harness.record import Record
 from vkc_pin.task.steps import Actuate
 
-__all__ = ["COMPARED_PLANNERS", "TASKS", "plan_trial", "run"]
+__all__ = ["COMPARED_PLANNERS", "TASKS", "plan_trial", "report", "run"]
 
 TASKS = {
     "door": Assignment("corridor_door", (Actuate("door", {"hinge": 1.5}),), "push a door open"),
@@ -30,4 +30,4 @@ def _draw(records: Sequence[Record], out: Path, tasks: Mapping[str, str], method
 
 COMPARISON = Comparison("baselines", "Base and arm together, or one after the other", TASKS, _draw)
 
-plan_trial, run = COMPARISON.plan_trial, COMPARISON.run
+plan_trial, report, run = COMPARISON.plan_trial, COMPARISON.report, COMPARISON.run

@@ -51,10 +51,13 @@ def add_bench(commands: Any) -> None:
     shown = "chores of many steps, in a home and in an arena"
     _add_choice(_add_experiment(benches, "chores", shown, about, default=5, jobs=1), "chores", "home fetch (default: both)")
 
-    about = "Measure planning time against the number of obstacles, at the door from random starts."
-    scale = _add_experiment(benches, "scale", "planning time against the number of obstacles", about, "--starts", jobs=1)
-    numbers = "numbers of obstacles (default: 10 30 100 300 1000)"
-    scale.add_argument("--obstacles", dest="counts", nargs="+", type=positive, metavar="N", help=numbers)
+    shown = "planning time against the number of obstacles or segments"
+    about = "Measure planning time against the number of obstacles, or of segments, at the door from random starts."
+    scale = _add_experiment(benches, "scale", shown, about, "--starts", jobs=1)
+    shown = "what there is more and more of: obstacles (default) or segments"
+    scale.add_argument("--of", choices=("obstacles", "segments"), default="obstacles", help=shown)
+    numbers = "how many (default: 10 30 100 300 1000 obstacles, 20 40 80 160 320 segments)"
+    scale.add_argument("--counts", nargs="+", type=positive, metavar="N", help=numbers)
 
     about = "Plan to drive through a gap of 0.85 m and to reach over a table beyond it, from random starts of base and arm."
     _add_experiment(benches, "gap", "reach over a table beyond a gap of 0.85 m", about, jobs=1)

@@ -149,9 +149,15 @@ class Comparison:
         saved = trials_of.saved(result["trials"], specs, again=save_failures, progress=progress)
         names = {name: self.tasks[name].name for name in tasks}
         pictures = self.draw(result["trials"], out, names, methods) + trials_of.motions(result["trials"], specs)
-        text = report(result, names, title=self.title, saved=saved, pictures=pictures)
-        write_atomically(out / "table.md", text.encode())
+        write_atomically(out / "table.md", self.report(result, saved=saved, pictures=pictures).encode())
         return result
+
+    def report(
+        self, result: Mapping[str, Any], *, saved: Mapping[str, str] | None = None, pictures: Sequence[str] = ()
+    ) -> str:
+        """Return the tables of a result in Markdown; see `comparison_report.report`."""
+        names = {name: self.tasks[name].name for name in result["meta"]["tasks"]}
+        return report(result, names, title=self.title, saved=saved, pictures=pictures)
 
 
 def placed(scene: Scene, spec: Mapping[str, Any]) -> Scene:

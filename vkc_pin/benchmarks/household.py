@@ -14,7 +14,7 @@ from vkc_pin.benchmarks.harness.record import Record
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.steps import Actuate, GoTo, Place
 
-__all__ = ["COMPARED_PLANNERS", "TABLE_TOP", "TASKS", "on_the_coffee_table", "plan_trial", "run"]
+__all__ = ["COMPARED_PLANNERS", "TABLE_TOP", "TASKS", "on_the_coffee_table", "plan_trial", "report", "run"]
 
 TABLE_TOP = ((2.5, 3.0), (-1.9, -0.9))
 """The coffee table's plate in the scene `household`: x and y, lowest and highest [m]."""
@@ -58,4 +58,4 @@ def _draw(records: Sequence[Record], out: Path, tasks: Mapping[str, str], method
 
 COMPARISON = Comparison("household", "Six tasks in a home", TASKS, _draw)
 
-plan_trial, run = COMPARISON.plan_trial, COMPARISON.run
+plan_trial, report, run = COMPARISON.plan_trial, COMPARISON.report, COMPARISON.run

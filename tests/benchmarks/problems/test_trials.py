@@ -55,13 +55,3 @@ def test_a_trial() -> None:
     assert record["cpu_time"] > 0.0
     assert record["objective"] > 0.0
     assert "commit" in record
-
-
-def test_the_commit(monkeypatch: pytest.MonkeyPatch) -> None:
-    trials.commit.cache_clear()
-    found = trials.commit()
-    assert found is None or len(found) >= 7
-    monkeypatch.setenv("PATH", "")  # no git
-    trials.commit.cache_clear()
-    assert trials.commit() is None
-    trials.commit.cache_clear()

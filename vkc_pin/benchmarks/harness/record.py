@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import platform
 import resource
+import subprocess
 from collections.abc import Callable, Iterable, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -12,10 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from vkc_pin.files.resources import package_folder
 from vkc_pin.planning.plan import Plan
 from vkc_pin.scene.scene import Scene
 
-__all__ = ["Record", "Solve", "distribution", "meta", "peak_memory", "trial", "values", "versions"]
+__all__ = ["Record", "Solve", "commit", "distribution", "meta", "peak_memory", "trial", "values", "versions"]
 
 Record = Mapping[str, Any]
 """What is kept of a trial, by field; see `trial`."""
@@ -56,6 +59,16 @@ def _processor() -> str:
     return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.processor())
 
 
+@functools.cache
+def commit() -> str | None:
+    """Return which commit the package's sources are of, `-dirty` if they are changed; None where git does not know."""
+    command = ["git", "-C", str(package_folder()), "describe", "--always", "--dirty", "--abbrev=12"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip() or None
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
 def peak_memory() -> float:
     """Return the largest memory this process has used so far [MB]."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
@@ -84,6 +97,7 @@ def trial(plan: Plan, *, method: str, seed: int, **more: Any) -> dict[str, Any]:
         **{key: value for key, value in m.items() if key.startswith("time_")},
         "failed_constraint": failed,
         "violations": [str(v) for v in plan.validation.violations],
+        "commit": commit(),
         **more,
     }
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import subprocess
 import time
 from typing import Any
 
@@ -11,7 +10,6 @@ import numpy as np
 
 from vkc_pin.benchmarks.harness.record import trial
 from vkc_pin.benchmarks.problems.changes import UNCHANGED, Change
-from vkc_pin.files.resources import package_folder
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import Planner, borrowed, plan
 from vkc_pin.program.problem import TrajectoryProblem
@@ -20,7 +18,7 @@ from vkc_pin.solver.solution import Iteration
 from vkc_pin.task.compiler import compile_task
 from vkc_pin.task.steps import Reach, Step
 
-__all__ = ["TIME_LIMIT", "commit", "first_seed", "objective", "tried"]
+__all__ = ["TIME_LIMIT", "first_seed", "objective", "tried"]
 
 TIME_LIMIT = 60.0  # [s] of planning
 
@@ -54,8 +52,8 @@ def tried(
         "solves": len(solves),
         "first_seed": first_seed(found, len(solves)),
         "objective": objective(found, planner),
+        "duration": found.metrics["duration"],
     }
-    own |= {"duration": found.metrics["duration"], "commit": commit()}
     return trial(found, method=str(change), seed=seed, **own, **more)
 
 
@@ -97,16 +95,6 @@ def objective(found: Plan, planner: Planner | None = None) -> float | None:
         counted = np.array([name not in freedoms for name in problem.chain.names])
         first, second = problem.rates(found.trajectory.positions[rows])
         return problem.effort.value(first * counted, second * counted)
-
-
-@functools.cache
-def commit() -> str | None:
-    """Return which commit the package's sources are of, `-dirty` if they are changed; None where git does not know."""
-    command = ["git", "-C", str(package_folder()), "describe", "--always", "--dirty", "--abbrev=12"]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip() or None
-    except (OSError, subprocess.SubprocessError):
-        return None
 
 
 @functools.cache

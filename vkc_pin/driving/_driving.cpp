@@ -10,6 +10,7 @@
 
 #include <nanobind/stl/tuple.h>
 
+#include "floor.hpp"
 #include "lattice.hpp"
 
 namespace {
@@ -295,4 +296,7 @@ NB_MODULE(_driving, module)
     .def("block", &Paths::block)
     .def("close", &Paths::close)
     .def("cheapest", &Paths::cheapest);
+  nb::class_<Floor>(module, "Floor")
+    .def(nb::init<const Bytes &, const Indices<2> &, const Numbers<1> &>())
+    .def("distances", &Floor::distances);
 }

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from vkc_pin.arrays import Bools, Floats, Ints
 from vkc_pin.cache import Cache
+from vkc_pin.compiled import compiled_module
 from vkc_pin.driving.blocked import Lattice, PlanViews, stuck
 from vkc_pin.driving.body import FAN, Body, Shape, Standing
 from vkc_pin.errors import InputError
@@ -230,37 +232,12 @@ class BaseGrid:
                 if len(cells):
                     break
             entries.append((self.cells * cells[:, 0] + cells[:, 1], np.hypot(*(self.origin + cells * self.step - (x, y)).T)))
-        return self._spread(entries)
+        firsts = np.cumsum([0, *(len(cells) for cells, _ in entries)])
+        begins, costs = (np.concatenate(part) for part in zip(*entries, strict=True))
+        return np.asarray(self._floor.distances(firsts, begins, costs))
 
-    def _spread(self, entries: Sequence[tuple[Ints, Floats]]) -> Floats:
-        """Return how far it is at least to every cell, shape (W, cells, cells) [m], if turns are free.
-
-        Args:
-            entries: W times the cells, as i·cells + j, where the path begins, and what it costs to be there [m].
-        """
-        from scipy.sparse import csr_array
-        from scipy.sparse.csgraph import dijkstra
-
-        count, size = self.cells**2, self.cells**2 + len(entries)
-        number = np.arange(count, dtype=np.int32).reshape(self.cells, self.cells)
-        targets = np.full((self.cells, self.cells, HEADINGS), -1, np.int32)
-        for heading, (di, dj) in enumerate(self.moves):
-            here, there = (
-                (slice(max(0, s * di), self.cells + min(0, s * di)), slice(max(0, s * dj), self.cells + min(0, s * dj)))
-                for s in (-1, 1)
-            )
-            # Forwards at the heading or backwards at the opposite one.
-            ahead, back = self.stuck[:, :, heading], self.stuck[:, :, heading - HEADINGS // 2]
-            never = (ahead[here] | ahead[there]) & (back[here] | back[there])
-            targets[(*here, heading)] = np.where(never, -1, number[there])
-        usable = targets.reshape(-1, HEADINGS) >= 0
-        ends = np.cumsum([*usable.sum(axis=1), *(len(cells) for cells, _ in entries)])
-        graph = csr_array(
-            (
-                np.concatenate([np.broadcast_to(self.lengths, usable.shape)[usable], *(cost for _, cost in entries)]),
-                np.concatenate([targets[targets >= 0], *(cells for cells, _ in entries)]).astype(np.int32),
-                np.concatenate([[0], ends]).astype(np.int32),
-            ),
-            shape=(size, size),
-        )
-        return dijkstra(graph, indices=np.arange(count, size))[:, :count].reshape(len(entries), self.cells, self.cells)
+    @cached_property
+    def _floor(self) -> Any:
+        """Finds distances over the cells, turns being free."""
+        module = compiled_module("vkc_pin.driving._driving")
+        return module.Floor(self.stuck.view(np.uint8), self.moves, self.lengths)

@@ -1,0 +1,100 @@
+// How far the base drives at least from places to every cell, if turns are free (Dijkstra).
+#pragma once
+
+#include <array>
+#include <queue>
+
+#include "lattice.hpp"
+
+class Floor
+{
+public:
+  // `stuck`: nodes in which the base surely hits something, (cells, cells, 16); `moves` in cells, (16, 2); `lengths` [m], (16,).
+  Floor(
+    const nb::ndarray<const std::uint8_t, nb::ndim<3>, nb::c_contig, nb::device::cpu> & stuck,
+    const Indices<2> & moves,
+    const Numbers<1> & lengths)
+  : cells_(Index(stuck.shape(0))), width_(cells_ + 2 * BORDER), leads_(std::size_t(width_ * width_), 0)
+  {
+    const Lattice checked(cells_, moves); // throws what is wrong with the moves
+    if (Index(stuck.shape(1)) != cells_ || stuck.shape(2) != HEADINGS)
+      throw std::invalid_argument("nodes are of shape (cells, cells, 16)");
+    if (lengths.shape(0) != HEADINGS)
+      throw std::invalid_argument("lengths are of shape (16,)");
+    std::vector<std::uint16_t> open(leads_.size(), 0); // at which headings the base may be in a cell
+    for (Index i = 0; i < cells_; ++i)
+      for (Index j = 0; j < cells_; ++j)
+        for (Index heading = 0; heading < HEADINGS; ++heading)
+          if (!stuck(i, j, heading))
+            open[std::size_t(inner(i * cells_ + j))] |= std::uint16_t(1u << heading);
+    for (Index heading = 0; heading < HEADINGS; ++heading)
+    {
+      lengths_[std::size_t(heading)] = lengths(heading);
+      moves_[std::size_t(heading)] = moves(heading, 0) * width_ + moves(heading, 1);
+    }
+    for (Index cell = 0; cell < cells_ * cells_; ++cell)
+      for (Index heading = 0; heading < HEADINGS; ++heading)
+      {
+        // Forwards at the heading or backwards at the opposite one.
+        const Index here = inner(cell), there = here + moves_[std::size_t(heading)];
+        const unsigned both = open[std::size_t(here)] & open[std::size_t(there)];
+        if (both >> heading & 1u || both >> (heading + HEADINGS / 2) % HEADINGS & 1u)
+          leads_[std::size_t(here)] |= std::uint16_t(1u << heading);
+      }
+  }
+
+  // From W places, the k-th of which has the cells firsts[k]..firsts[k + 1] with their costs: [m], (W, cells, cells).
+  Array<double> distances(const Indices<1> & firsts, const Indices<1> & begins, const Numbers<1> & costs) const
+  {
+    const std::size_t places = firsts.shape(0) - 1, count = std::size_t(cells_ * cells_);
+    if (firsts.shape(0) < 1 || begins.shape(0) != costs.shape(0) || std::size_t(firsts(places)) != begins.shape(0))
+      throw std::invalid_argument("cells and costs do not belong together");
+    std::vector<double> found(places * count);
+    {
+      nb::gil_scoped_release released;
+      std::vector<double> least(leads_.size());
+      for (std::size_t k = 0; k < places; ++k)
+      {
+        std::fill(least.begin(), least.end(), std::numeric_limits<double>::infinity());
+        std::priority_queue<Entry, std::vector<Entry>, std::greater<Entry>> queue;
+        const auto reach = [&](Index cell, double cost) {
+          if (cost < least[std::size_t(cell)])
+          {
+            least[std::size_t(cell)] = cost;
+            queue.emplace(cost, cell);
+          }
+        };
+        for (Index entry = firsts(k); entry < firsts(k + 1); ++entry)
+          reach(inner(begins(entry)), costs(entry));
+        while (!queue.empty())
+        {
+          const auto [cost, cell] = queue.top();
+          queue.pop();
+          if (cost > least[std::size_t(cell)])
+            continue;
+          for (std::size_t heading = 0; heading < HEADINGS; ++heading)
+            if (leads_[std::size_t(cell)] >> heading & 1u)
+              reach(cell + moves_[heading], cost + lengths_[heading]);
+        }
+        for (Index i = 0; i < cells_; ++i)
+          std::copy_n(least.begin() + inner(i * cells_), cells_, found.begin() + std::ptrdiff_t(k * count) + i * cells_);
+      }
+    }
+    return handed_over(std::move(found), {places, std::size_t(cells_), std::size_t(cells_)});
+  }
+
+private:
+  using Entry = std::pair<double, Index>;
+
+  Index inner(Index cell) const
+  {
+    if (cell < 0 || cell >= cells_ * cells_)
+      throw std::out_of_range("no such cell");
+    return (cell / cells_ + BORDER) * width_ + cell % cells_ + BORDER;
+  }
+
+  Index cells_, width_;
+  std::vector<std::uint16_t> leads_; // by cell, with a border: at which headings a move is not surely blocked
+  std::array<Index, HEADINGS> moves_{};
+  std::array<double, HEADINGS> lengths_{};
+};

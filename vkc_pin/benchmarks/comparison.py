@@ -152,9 +152,7 @@ class Comparison:
         write_atomically(out / "table.md", self.report(result, saved=saved, pictures=pictures).encode())
         return result
 
-    def report(
-        self, result: Mapping[str, Any], *, saved: Mapping[str, str] | None = None, pictures: Sequence[str] = ()
-    ) -> str:
+    def report(self, result: Mapping[str, Any], *, saved: Mapping[str, str] | None = None, pictures: Sequence[str] = ()) -> str:
         """Return the tables of a result in Markdown; see `comparison_report.report`."""
         names = {name: self.tasks[name].name for name in result["meta"]["tasks"]}
         return report(result, names, title=self.title, saved=saved, pictures=pictures)

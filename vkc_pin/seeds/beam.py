@@ -242,6 +242,7 @@ class Beam:
         paths, cost, trouble, at, robot = found.paths.copy(), found.cost.copy(), found.trouble.copy(), found.at, self.knots.robot
         moved = [k for k in range(first, len(at)) if not self._closed_at(at[k]) and self.knots.pose_at(at[k]) is not None]
         share = np.full((len(paths), len(at), 1), 0.5)
+        hit = {k: self._bad(paths[:, k], np.ones(len(paths), bool), at[k]) for k in moved}
         for k in moved * _SHORTENINGS:
             if self.interrupt.pressed:
                 break
@@ -249,12 +250,13 @@ class Beam:
             middle = paths[:, [k - 1, *([k + 1] if k + 1 < len(at) else [])]].mean(axis=1)
             drawn[:, :robot] += share[:, k] * (middle - drawn)[:, :robot]
             drawn, reached = self.knots.knot(drawn, at[k], "track")
-            hit, hits = self._bad(paths[:, k], np.ones(len(paths), bool), at[k]), self._bad(drawn, reached, at[k])
-            gain = self._around(paths, paths[:, k], at, k) + hit - self._around(paths, drawn, at, k) - hits
+            hits = self._bad(drawn, reached, at[k])
+            gain = self._around(paths, paths[:, k], at, k) + hit[k] - self._around(paths, drawn, at, k) - hits
             cheaper = gain > 0.0
             paths[cheaper, k] = drawn[cheaper]
             cost[cheaper] -= gain[cheaper]
-            trouble[cheaper] += (hits - hit)[cheaper]
+            trouble[cheaper] += (hits - hit[k])[cheaper]
+            hit[k][cheaper] = hits[cheaper]
             share[~cheaper, k] /= 2.0
         return Found(paths, cost, trouble, at)
 

@@ -6,7 +6,6 @@ import numpy as np
 
 from vkc_pin.arrays import Floats
 from vkc_pin.driving.body import hull_points
-from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.knots import depth
 
@@ -15,7 +14,7 @@ __all__ = ["folded_arm"]
 _POSTURES = 1000  # random postures: with 192 the arm may stay wider than the base, with 4000 it gets no narrower
 
 
-def folded_arm(problem: TrajectoryProblem, phase: int, resting: Floats, interrupt: Interrupt = NEVER) -> Floats:
+def folded_arm(problem: TrajectoryProblem, phase: int, resting: Floats) -> Floats:
     """Return the arm, shape (m - 3,) [m] and [rad], with which the robot is compact: the best of random postures.
 
     What counts is how far the arm, and what is carried, reach from the base's origin along its three axes, in sum. The robot is
@@ -25,7 +24,6 @@ def folded_arm(problem: TrajectoryProblem, phase: int, resting: Floats, interrup
         problem: Whose robot it is.
         phase: In which it carries what it carries.
         resting: Where robot and load rest, shape (n,): what is not the arm stays so; where the base is does not matter.
-        interrupt: Ends the search; the arm is then at home.
     """
     chain, rng = problem.chain, np.random.default_rng(0)
     arm, home = slice(3, chain.robot.coordinates.size), chain.robot.home
@@ -34,12 +32,9 @@ def folded_arm(problem: TrajectoryProblem, phase: int, resting: Floats, interrup
     upper = np.where(turns, np.minimum(chain.upper[arm], home + np.pi), chain.upper[arm])
     z = np.tile(resting, (_POSTURES, 1))
     z[:, arm] = [home, *rng.uniform(lower, upper, (_POSTURES - 1, len(home)))]
-    for posture in z[np.argsort(_size(problem, phase, z), kind="stable")]:
-        if interrupt.pressed:
-            break
-        if depth(problem, posture[None], problem.contacts.inside(phase), standing=False)[0] <= 0.0:
-            return posture[arm].copy()
-    return home.copy()
+    z = z[np.argsort(_size(problem, phase, z), kind="stable")]
+    free = depth(problem, z, problem.contacts.inside(phase), standing=False) <= 0.0
+    return z[np.argmax(free), arm].copy() if free.any() else home.copy()
 
 
 def _size(problem: TrajectoryProblem, phase: int, z: Floats) -> Floats:

@@ -189,12 +189,17 @@ class Knots:
         return _row_by_row(self.known.depths, lambda rows, at: depth(self.problem, rows, at), z, waypoint)
 
 
-def depth(problem: TrajectoryProblem, z: Floats, waypoint: int, *, standing: bool = True) -> Floats:
+def depth(problem: TrajectoryProblem, z: Floats, waypoint: int, *, standing: bool = True, reach: float | None = None) -> Floats:
     """Return how far configurations at a waypoint, shape (B, n), fall short of their margins [m], shape (B,).
 
-    Without `standing` only from the robot itself and what it carries.
+    Args:
+        problem: Whose robot it is.
+        z: Configurations, shape (B, n).
+        waypoint: Where they are.
+        standing: Whether what stands in the world counts, too; otherwise only the robot itself and what it carries.
+        reach: Pairs further apart do not count [m]; None: all that may fall short.
     """
-    waypoints, reach = np.full(len(z), waypoint), problem.options.dist_safe
+    waypoints, reach = np.full(len(z), waypoint), problem.options.dist_safe if reach is None else reach
     contacts = problem.contacts.evaluate(z, waypoints, reach=reach, nearest=1, standing=standing)
     return contacts.shortfall(len(z))
 

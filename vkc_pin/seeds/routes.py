@@ -64,7 +64,7 @@ class Routes:
         """Return the arm folded with what is held in a phase, shape (m - 3,); see `folded_arm.folded_arm`."""
         held = self.problem.task.phases[phase].held
         if held not in self._folded:
-            self._folded[held] = folded_arm(self.problem, phase, self._resting(), self.interrupt)
+            self._folded[held] = folded_arm(self.problem, phase, self._resting())
         return self._folded[held]
 
     def _resting(self) -> Floats:

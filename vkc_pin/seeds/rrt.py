@@ -157,10 +157,10 @@ class _Search:
         return float(s[blocked[0]]) if len(blocked) else 1.0
 
     def _depth(self, rows: Floats) -> Floats:
-        """Return how far configurations of the robot, shape (B, m), fall short of their margins [m], shape (B,)."""
+        """Return how far configurations of the robot, shape (B, m), in which things overlap fall short of their margins [m], (B,)."""
         z = np.tile(self.first, (len(rows), 1))
         z[:, : self.size] = rows
-        return depth(self.problem, z, self.waypoint)
+        return depth(self.problem, z, self.waypoint, reach=0.0)
 
     def _shortened(self, path: Floats) -> Floats:
         """Return a path that goes straight between random places on it, as many as it has, where nothing is in the way."""

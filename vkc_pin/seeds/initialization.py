@@ -24,7 +24,7 @@ __all__ = ["INITIALIZATIONS", "initialize"]
 
 INITIALIZATIONS = ("auto", "interpolated", "astar", "rrt", "stationary")
 _FREE = 0.05  # [m] shortfall of clearance of a seed, summed over its waypoints, below which no better one is looked for
-_POOR = 0.5  # [m] shortfall above which other seeds come first, and trees if there is no better one
+_POOR = 0.2  # [m] overlap, summed over waypoints, above which other seeds come first, and trees if there is no better one
 _COMPARED_PATHS = 8  # paths of the beam whose seeds are compared, or along which trees grow
 _PLACES = 128  # random places of which one is where a phase ends, once the stationary seed led nowhere
 
@@ -71,14 +71,16 @@ def initialize(
 
 
 def _in_turn(*kinds: Iterator[Seed | None]) -> Iterator[Seed]:
-    """Yield from all kinds in turn. Where what one finds hits things, or it finds nothing, the next is asked in the same turn.
+    """Yield from all kinds in turn; seeds that hit things wait until no kind has a better one.
+
+    Kinds are asked one after the other until one finds a seed that is good; the next time, those come first that have waited
+    longest. If none does, the best of all that have been found so far is yielded.
 
     Args:
-        kinds: In the order in which they are asked at first; later those come first that have waited longest.
+        kinds: In the order in which they are asked at first.
     """
-    waiting = list(kinds)
-    while waiting:
-        found = list[Seed]()
+    waiting, found = list(kinds), list[Seed]()
+    while waiting or found:
         for kind in tuple(waiting):
             waiting.remove(kind)
             try:
@@ -88,9 +90,10 @@ def _in_turn(*kinds: Iterator[Seed | None]) -> Iterator[Seed]:
             waiting.append(kind)
             if seed is not None:
                 found.append(seed)
-                if not seed.shortfall > _POOR:
+                if not seed.overlap > _POOR:
                     break
-        yield from sorted(found, key=lambda seed: seed.shortfall)
+        if found:
+            yield found.pop(min(range(len(found)), key=lambda k: found[k].overlap))
 
 
 def _stationary(problem: TrajectoryProblem, count: int, rng: np.random.Generator) -> Iterator[Seed]:
@@ -171,11 +174,9 @@ class _SeedSearch:
 
     Attributes:
         alike: How many coordinates decide whether paths are alike.
-        enough: Shortfalls with which nobody looks for a better seed, summed over waypoints [m].
     """
 
     alike: ClassVar[int | None] = None
-    enough: ClassVar[float] = _FREE
 
     def __init__(self, shared: _Shared, method: str) -> None:
         self.problem, self.notes, self.method, self.interrupt = shared.problem, shared.notes, method, shared.interrupt
@@ -197,9 +198,9 @@ class _SeedSearch:
             if best is None:
                 yield None
                 continue
-            path, z, short = best
+            path, z, overlap = best
             given.append(path)
-            yield Seed(self.method if len(given) == 1 else f"{self.method} {len(given)}", z, short)
+            yield Seed(self.method if len(given) == 1 else f"{self.method} {len(given)}", z, overlap)
             if len(given) == count:
                 return
 
@@ -229,10 +230,14 @@ class _SeedSearch:
         """Return whether the base is elsewhere somewhere along two paths, (K, n), by more than a clearance [m] or [rad]."""
         return bool(np.abs(path - other)[:, :3].max() > self.problem.options.dist_safe)
 
-    def _best(self, found: Found, given: Sequence[Floats]) -> tuple[Floats, Floats, float] | None:
-        """Return the path, of the first that are not `given`, whose seed has the least l1 merit, that seed and its shortfall.
+    def _will_do(self, short: float, overlap: float) -> bool:
+        """Return whether a seed that falls so short of clearances [m], and overlaps so much [m], is not compared with others."""
+        return short < _FREE
 
-        The first that falls short of next to nothing will do. None if no path of the robot leads through any of them.
+    def _best(self, found: Found, given: Sequence[Floats]) -> tuple[Floats, Floats, float] | None:
+        """Return the path, of the first that are not `given`, whose seed has the least l1 merit, that seed and its overlap.
+
+        The first that will do is not compared with those after it. None if no path of the robot leads through any of them.
         """
         new = [path for path in self._ordered(found) if all(self._differ(path, other) for other in given)]
         best, least = None, np.inf
@@ -244,11 +249,12 @@ class _SeedSearch:
             if z is None:
                 continue
             contacts = self.problem.evaluate_contacts(z, reach=self.problem.options.dist_safe, nearest=1)
-            short = float(contacts.shortfall(len(z)).sum())
-            merit = self.problem.objective(z, self.problem.timing_for(z).dt) + self.problem.options.penalty * short
+            short = contacts.shortfall(len(z))
+            overlap = float(np.maximum(short - self.problem.options.dist_safe, 0.0).sum())
+            merit = self.problem.objective(z, self.problem.timing_for(z).dt) + self.problem.options.penalty * float(short.sum())
             if merit < least:
-                best, least = (path, z, short), merit
-            if short < self.enough:
+                best, least = (path, z, overlap), merit
+            if self._will_do(float(short.sum()), overlap):
                 break
         return best
 
@@ -261,7 +267,6 @@ class _Rrt(_SeedSearch):
     """
 
     alike = 3  # where nothing leads along the base's path, hardly anything does with another arm
-    enough = _POOR
 
     def __init__(self, shared: _Shared) -> None:
         super().__init__(shared, "rrt")
@@ -274,6 +279,9 @@ class _Rrt(_SeedSearch):
         """Return what a search finds, None if it is no good: a quick one, then thorough ones, every other backwards."""
         found = self.beam.search(thorough=attempt > 0, backwards=attempt % 2 == 1)
         return found if found is not None and self.beam.tolerable(found) else None
+
+    def _will_do(self, short: float, overlap: float) -> bool:
+        return overlap <= _POOR
 
     def _ordered(self, found: Found) -> Iterable[Floats]:
         return found.paths[np.lexsort((found.cost, found.trouble > 0))]  # those with knots in collision last

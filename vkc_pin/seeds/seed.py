@@ -24,13 +24,13 @@ class Seed:
     Attributes:
         name: The method, and the number of the try if it is not the first.
         z: z_1..z_N, shape (N, n).
-        shortfall: By how much waypoints fall short of their clearances, summed [m]; NaN if nobody looked.
+        overlap: By how much waypoints fall short of more than the usual clearance, summed [m]; NaN if nobody looked.
         radius: How far the solver believes planes at first, shape (N,); None: as usual.
     """
 
     name: str
     z: Floats
-    shortfall: float = float("nan")
+    overlap: float = float("nan")
     radius: Floats | None = None
 
 

@@ -157,7 +157,7 @@ class _Search:
         return float(s[blocked[0]]) if len(blocked) else 1.0
 
     def _depth(self, rows: Floats) -> Floats:
-        """Return how far configurations of the robot, shape (B, m), fall short of their margins, if things overlap [m], shape (B,)."""
+        """Return how far the robot, shape (B, m), falls short of its margins where it overlaps something, shape (B,) [m]."""
         z = np.tile(self.first, (len(rows), 1))
         z[:, : self.size] = rows
         return depth(self.problem, z, self.waypoint, reach=0.0)

@@ -48,7 +48,7 @@ def initialize(
             kinematics from random seeds; where something fixed is held, the seed follows its motion. "astar": to such
             configurations, the base along the shortest way around what stands there, heading along it. "rrt": to such
             configurations, base and arm together along what two random trees find. "auto": these three in turn; where what one
-            finds hits things, the next is asked at once, and the best of them comes first.
+            finds overlaps things, the next is asked at once, and the best that was found comes first.
         random_seed: Of the random numbers.
         count: How many different seeds to return.
         perturbation: Standard deviation of what is added to the robot's coordinates, smoothly over time, [m] and [rad].

@@ -116,6 +116,7 @@ def test_segments_take_turns_too(planned: list[Any], tmp_path: Path, capsys: pyt
     assert main(command) == 0
     _, *rest = planned
     assert [how["options"] for _, _, how in rest] == [refined(80), refined(160)] * 2
+    assert all(steps[0].joints == {"hinge": 0.6} for _, steps, _ in rest)
     assert {len(scene.obstacle_names) for scene, _, _ in rest} == {AXES["obstacles"].usual}
     trials = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))["trials"]
     assert [(t["number"], t["segments"]) for t in trials] == [(0, 80), (0, 160), (1, 80), (1, 160)]

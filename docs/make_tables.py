@@ -131,9 +131,9 @@ def renewed(name: str, section: str) -> str:
             raise ValueError(f"no table of {name} is left with the columns {columns(match[0])}")
         return left.pop(0)
 
-    measured = re.search(r"^Measured on .*$", report, re.MULTILINE)
+    measured = re.search(r"^Measured on.*$", report, re.MULTILINE)
     section = TABLE.sub(table_of, section)
-    return re.sub(r"^Measured on .*$", lambda _: measured[0] if measured else "", section, flags=re.MULTILINE)
+    return re.sub(r"^Measured on.*$", lambda _: measured[0] if measured else "", section, flags=re.MULTILINE)
 
 
 def filled(text: str) -> str:

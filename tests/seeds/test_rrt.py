@@ -62,6 +62,18 @@ def missing(problem: vkc.TrajectoryProblem, rows: np.ndarray) -> np.ndarray:
     return problem.contacts.evaluate(z, np.ones(len(z), int), reach=0.1).shortfall(len(z))
 
 
+def test_what_a_coarse_search_overlooks_a_finer_one_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    worst = []
+    for steps in ((3.0,), (3.0, 0.04)):
+        monkeypatch.setattr(trees, "_STEPS", steps)
+        path = through(3)
+        assert path is not None
+        worst.append(missing(gate()[0], finely(path)).max())
+    margin = gate()[0].options.dist_safe
+    assert worst[1] < margin + 0.005
+    assert worst[0] > margin + 0.02
+
+
 def is_a_way(problem: vkc.TrajectoryProblem, path: np.ndarray) -> None:
     short, allowed = missing(problem, finely(path)), GRAZE * problem.options.dist_safe
     assert short.max() <= allowed + HIDDEN
@@ -190,7 +202,7 @@ def test_what_is_shortened_is_not_longer(monkeypatch: pytest.MonkeyPatch) -> Non
 
 def search(seed: int = 0) -> trees._Search:
     problem, guide, arms = gate()
-    return trees._Search(problem, 0, problem.start, guide, arms, np.random.default_rng(seed))
+    return trees._Search(problem, 0, problem.start, guide, arms, np.random.default_rng(seed), trees._STEPS[0])
 
 
 def test_runs_are_the_free_parts_of_the_way_with_each_arm() -> None:

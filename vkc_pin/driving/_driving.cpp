@@ -289,9 +289,7 @@ NB_MODULE(_driving, module)
   module.doc() = "Cheapest paths over cells and headings, found again after moves have turned out not to be free.";
   nb::set_leak_warnings(false); // what caches and globals keep lives until the process ends
   nb::class_<Paths>(module, "Paths")
-    .def(
-      nb::init<
-        const Bytes &, const Indices<2> &, const Indices<2> &, const Indices<2> &, const Indices<2> &>())
+    .def(nb::init<const Bytes &, const Indices<2> &, const Indices<2> &, const Indices<2> &, const Indices<2> &>())
     .def("shut", &Paths::shut)
     .def("block", &Paths::block)
     .def("close", &Paths::close)

@@ -6,6 +6,7 @@ arm near postures it is likely to need there, so that narrow passages are found 
 
 from __future__ import annotations
 
+import itertools
 from functools import cached_property
 
 import numpy as np
@@ -20,7 +21,7 @@ __all__ = ["TRIES", "connect", "spread"]
 TRIES = 1500
 """How often a tree may grow until they meet."""
 
-_STEP = 0.15  # [rad] between configurations that are looked at
+_STEPS = (0.15, 0.04)  # [rad] between configurations that are looked at; the latter where the former overlooked something
 _BESIDE_PATH = 0.1  # [m] and [rad] standard deviation, at most, of bases beside their path
 _AROUND = 0.4  # [m] and [rad] standard deviation, at most, of bases around the ends, and of arms
 
@@ -50,7 +51,14 @@ def connect(
         tries: How often a tree may grow.
         interrupt: Ends the search.
     """
-    return _Search(problem, phase, first, poses, arms, rng).run(ends, tries, interrupt)
+    path = None
+    for step in _STEPS:
+        search = _Search(problem, phase, first, poses, arms, rng, step)
+        found = search.run(ends, tries, interrupt)
+        path = path if found is None else found
+        if found is None or search.free(found, min(_STEPS)):
+            break
+    return path
 
 
 def spread(path: Floats, steps: int, metric: Floats) -> Floats:
@@ -63,9 +71,16 @@ def spread(path: Floats, steps: int, metric: Floats) -> Floats:
 
 class _Search:
     def __init__(
-        self, problem: TrajectoryProblem, phase: int, first: Floats, poses: Floats, arms: Floats, rng: np.random.Generator
+        self,
+        problem: TrajectoryProblem,
+        phase: int,
+        first: Floats,
+        poses: Floats,
+        arms: Floats,
+        rng: np.random.Generator,
+        step: float,
     ) -> None:
-        self.problem, self.first, self.poses, self.arms, self.rng = problem, first, poses, arms, rng
+        self.problem, self.first, self.poses, self.arms, self.rng, self.step = problem, first, poses, arms, rng, step
         self.size = problem.chain.robot.coordinates.size
         self.waypoint = problem.contacts.inside(phase)
         self.allowed = problem.options.dist_safe  # all of a margin may be missing: the solver pushes that apart
@@ -149,9 +164,13 @@ class _Search:
             return None
         return tree.add(goal if reached == 1.0 else start + reached * (goal - start), near)
 
-    def _along(self, a: Floats, b: Floats) -> float:
+    def free(self, path: Floats, step: float) -> bool:
+        """Return whether a path, shape (K, m), is free at configurations that are `step` apart [rad]."""
+        return all(self._along(a, b, step) == 1.0 for a, b in itertools.pairwise(path))
+
+    def _along(self, a: Floats, b: Floats, step: float | None = None) -> float:
         """Return what share of the straight line from `a` to `b`, both (m,), is free."""
-        count = max(1, int(np.ceil(np.abs((b - a) * self.weights).max() / _STEP)))
+        count = max(1, int(np.ceil(np.abs((b - a) * self.weights).max() / (step or self.step))))
         s = np.arange(count + 1) / count
         blocked = np.flatnonzero(self._depth(a + s[1:, None] * (b - a)) > self.allowed)
         return float(s[blocked[0]]) if len(blocked) else 1.0

@@ -15,8 +15,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from vkc_pin.benchmarks.harness.record import distribution
 from vkc_pin.benchmarks.harness.tables import foot, markdown
 
@@ -95,7 +93,7 @@ def door() -> str:
     split = ["task", *(f"{name} [s]" for name in PARTS.values()), "Ipopt iterations"]
     most = max(found["meta"]["peak_memory_mb"] for found in results)
     about = f"{foot(results[0]['meta'])} Peak memory {most:.0f} MB."
-    return "\n\n".join([markdown([*head, "build, at most [s]"], rows), markdown(split, parts), about]) + "\n"
+    return "\n\n".join([markdown([*head, "build, at most [s]"], rows), markdown(split, parts), about])
 
 
 def good(trials: Sequence[Mapping[str, Any]]) -> str:
@@ -144,7 +142,6 @@ def filled(text: str) -> str:
 
 def main() -> int:
     """Write the pages whose tables are others; say which."""
-    np.seterr(all="raise")
     for page in PAGES:
         before = page.read_text(encoding="utf-8")
         if (after := filled(before)) != before:

@@ -64,7 +64,7 @@ def missing(problem: vkc.TrajectoryProblem, rows: np.ndarray) -> np.ndarray:
 
 def test_what_a_coarse_search_overlooks_a_finer_one_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
     worst = []
-    for steps in ((3.0,), (3.0, 0.04)):
+    for steps in ((3.0, 3.0), (3.0, 0.04)):
         monkeypatch.setattr(trees, "_STEPS", steps)
         path = through(3)
         assert path is not None

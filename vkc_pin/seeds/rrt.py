@@ -51,14 +51,12 @@ def connect(
         tries: How often a tree may grow.
         interrupt: Ends the search.
     """
-    path = None
-    for step in _STEPS:
-        search = _Search(problem, phase, first, poses, arms, rng, step)
-        found = search.run(ends, tries, interrupt)
-        path = path if found is None else found
-        if found is None or search.free(found, min(_STEPS)):
-            break
-    return path
+    coarse, fine = (_Search(problem, phase, first, poses, arms, rng, step) for step in _STEPS)
+    path = coarse.run(ends, tries, interrupt)
+    if path is None or fine.free(path):
+        return path
+    finer = fine.run(ends, tries, interrupt)
+    return path if finer is None else finer
 
 
 def spread(path: Floats, steps: int, metric: Floats) -> Floats:
@@ -164,13 +162,13 @@ class _Search:
             return None
         return tree.add(goal if reached == 1.0 else start + reached * (goal - start), near)
 
-    def free(self, path: Floats, step: float) -> bool:
-        """Return whether a path, shape (K, m), is free at configurations that are `step` apart [rad]."""
-        return all(self._along(a, b, step) == 1.0 for a, b in itertools.pairwise(path))
+    def free(self, path: Floats) -> bool:
+        """Return whether hardly anything is hit along a path, shape (K, m)."""
+        return all(self._along(a, b) == 1.0 for a, b in itertools.pairwise(path))
 
-    def _along(self, a: Floats, b: Floats, step: float | None = None) -> float:
+    def _along(self, a: Floats, b: Floats) -> float:
         """Return what share of the straight line from `a` to `b`, both (m,), is free."""
-        count = max(1, int(np.ceil(np.abs((b - a) * self.weights).max() / (step or self.step))))
+        count = max(1, int(np.ceil(np.abs((b - a) * self.weights).max() / self.step)))
         s = np.arange(count + 1) / count
         blocked = np.flatnonzero(self._depth(a + s[1:, None] * (b - a)) > self.allowed)
         return float(s[blocked[0]]) if len(blocked) else 1.0

@@ -140,28 +140,19 @@ private:
   // Finds what is left at least from each cell on: what it costs if turns are free.
   void spread()
   {
-    std::priority_queue<Entry> queue;
     least_.assign(lattice_.size(), NEVER);
-    const auto reach = [&](Index cell, Index cost) {
-      if (cost < least_[cell])
-      {
-        least_[cell] = cost;
-        queue.push({cost, 0, cell});
-      }
-    };
-    for (const auto & end : ends_)
-      reach(end.node / HEADINGS, end.cost);
-    while (!queue.empty())
-    {
-      const auto [cost, _, cell] = queue.top();
-      queue.pop();
-      if (cost > least_[cell])
-        continue;
-      for (Index node = cell * HEADINGS; node < (cell + 1) * HEADINGS; ++node)
-        for (const Index kind : {AHEAD, BACK})
-          if (const Index from = leads(node, opposite(kind)); from >= 0)
-            reach(from / HEADINGS, cost + price(from, kind));
-    }
+    ::spread(
+      least_,
+      [&](const auto & reach) {
+        for (const auto & end : ends_)
+          reach(end.node / HEADINGS, end.cost);
+      },
+      [&](Index cell, Index cost, const auto & reach) {
+        for (Index node = cell * HEADINGS; node < (cell + 1) * HEADINGS; ++node)
+          for (const Index kind : {AHEAD, BACK})
+            if (const Index from = leads(node, opposite(kind)); from >= 0)
+              reach(from / HEADINGS, cost + price(from, kind));
+      });
   }
 
   // Where a move leads; negative where it is known not to be free.

@@ -2,7 +2,6 @@
 #pragma once
 
 #include <array>
-#include <queue>
 
 #include "lattice.hpp"
 
@@ -14,9 +13,8 @@ public:
     const nb::ndarray<const std::uint8_t, nb::ndim<3>, nb::c_contig, nb::device::cpu> & stuck,
     const Indices<2> & moves,
     const Numbers<1> & lengths)
-  : cells_(Index(stuck.shape(0))), width_(cells_ + 2 * BORDER), leads_(std::size_t(width_ * width_), 0)
+  : cells_(Index(stuck.shape(0))), lattice_(cells_, moves), leads_(lattice_.size(), 0)
   {
-    const Lattice checked(cells_, moves); // throws what is wrong with the moves
     if (Index(stuck.shape(1)) != cells_ || stuck.shape(2) != HEADINGS)
       throw std::invalid_argument("nodes are of shape (cells, cells, 16)");
     if (lengths.shape(0) != HEADINGS)
@@ -30,7 +28,7 @@ public:
     for (Index heading = 0; heading < HEADINGS; ++heading)
     {
       lengths_[std::size_t(heading)] = lengths(heading);
-      moves_[std::size_t(heading)] = moves(heading, 0) * width_ + moves(heading, 1);
+      moves_[std::size_t(heading)] = (lattice_.target(heading, AHEAD) - heading) / HEADINGS;
     }
     for (Index cell = 0; cell < cells_ * cells_; ++cell)
       for (Index heading = 0; heading < HEADINGS; ++heading)
@@ -56,26 +54,17 @@ public:
       for (std::size_t k = 0; k < places; ++k)
       {
         std::fill(least.begin(), least.end(), std::numeric_limits<double>::infinity());
-        std::priority_queue<Entry, std::vector<Entry>, std::greater<Entry>> queue;
-        const auto reach = [&](Index cell, double cost) {
-          if (cost < least[std::size_t(cell)])
-          {
-            least[std::size_t(cell)] = cost;
-            queue.emplace(cost, cell);
-          }
-        };
-        for (Index entry = firsts(k); entry < firsts(k + 1); ++entry)
-          reach(inner(begins(entry)), costs(entry));
-        while (!queue.empty())
-        {
-          const auto [cost, cell] = queue.top();
-          queue.pop();
-          if (cost > least[std::size_t(cell)])
-            continue;
-          for (std::size_t heading = 0; heading < HEADINGS; ++heading)
-            if (leads_[std::size_t(cell)] >> heading & 1u)
-              reach(cell + moves_[heading], cost + lengths_[heading]);
-        }
+        spread(
+          least,
+          [&](const auto & reach) {
+            for (Index entry = firsts(k); entry < firsts(k + 1); ++entry)
+              reach(inner(begins(entry)), costs(entry));
+          },
+          [&](Index cell, double cost, const auto & reach) {
+            for (std::size_t heading = 0; heading < HEADINGS; ++heading)
+              if (leads_[std::size_t(cell)] >> heading & 1u)
+                reach(cell + moves_[heading], cost + lengths_[heading]);
+          });
         for (Index i = 0; i < cells_; ++i)
           std::copy_n(least.begin() + inner(i * cells_), cells_, found.begin() + std::ptrdiff_t(k * count) + i * cells_);
       }
@@ -84,16 +73,10 @@ public:
   }
 
 private:
-  using Entry = std::pair<double, Index>;
+  Index inner(Index cell) const { return lattice_.inner(cell * HEADINGS) / HEADINGS; }
 
-  Index inner(Index cell) const
-  {
-    if (cell < 0 || cell >= cells_ * cells_)
-      throw std::out_of_range("no such cell");
-    return (cell / cells_ + BORDER) * width_ + cell % cells_ + BORDER;
-  }
-
-  Index cells_, width_;
+  Index cells_;
+  Lattice lattice_;
   std::vector<std::uint16_t> leads_; // by cell, with a border: at which headings a move is not surely blocked
   std::array<Index, HEADINGS> moves_{};
   std::array<double, HEADINGS> lengths_{};

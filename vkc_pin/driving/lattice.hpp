@@ -1,9 +1,12 @@
-// Numbers of nodes, which are cells and headings, and where moves lead from one to the next.
+// Numbers of nodes, which are cells and headings, where moves lead from one to the next, and what it costs to get anywhere.
 #pragma once
 
 #include <algorithm>
+#include <functional>
 #include <limits>
+#include <queue>
 #include <stdexcept>
+#include <utility>
 #include <vector>
 
 #include "../distances/arrays.hpp"
@@ -75,3 +78,27 @@ private:
   Index cells_, width_;
   std::vector<Index> moves_; // in nodes, by heading
 };
+
+// Lowers what it costs to reach each cell, by Dijkstra's algorithm: begin(reach) and moves(cell, cost, reach) call
+// reach(cell, cost) where it begins, and for where moves lead from a cell.
+template<typename Cost, typename Begin, typename Moves>
+void spread(std::vector<Cost> & least, const Begin & begin, const Moves & moves)
+{
+  using Entry = std::pair<Cost, Index>;
+  std::priority_queue<Entry, std::vector<Entry>, std::greater<Entry>> queue;
+  const auto reach = [&](Index cell, Cost cost) {
+    if (cost < least[std::size_t(cell)])
+    {
+      least[std::size_t(cell)] = cost;
+      queue.emplace(cost, cell);
+    }
+  };
+  begin(reach);
+  while (!queue.empty())
+  {
+    const auto [cost, cell] = queue.top();
+    queue.pop();
+    if (!(cost > least[std::size_t(cell)]))
+      moves(cell, cost, reach);
+  }
+}

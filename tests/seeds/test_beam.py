@@ -102,6 +102,15 @@ def test_shortened_paths_cost_no_more_and_still_grasp(steps: list[vkc.Step]) -> 
         assert (row <= p.chain.upper + 1e-9).all()
 
 
+def test_shortened_paths_know_what_is_wrong_where_they_lead_now(monkeypatch: pytest.MonkeyPatch) -> None:
+    search = Beam(Knots(program_of(door_scene(), [vkc.Grasp("door")], options=FEW), np.random.default_rng(1)), careful=True)
+    found = search.search(thorough=False)
+    monkeypatch.setattr(search, "_bad", lambda z, *_: np.abs(z[:, 0]))
+    short = search.shortened(found)
+    assert np.count_nonzero(short.trouble != found.trouble) > len(found.cost) / 2
+    np.testing.assert_allclose(short.trouble - found.trouble, np.abs(short.paths[:, -1, 0]) - np.abs(found.paths[:, -1, 0]))
+
+
 def test_of_paths_that_end_alike_the_cheapest_is_kept() -> None:
     z = np.array([[0.0, 0.0], [0.05, 0.05], [0.3, 0.0], [0.3, 0.05], [0.3, 0.25], [2.0, 0.0]])
     total = np.array([3.0, 2.0, 4.0, 5.0, 6.0, 1.0])

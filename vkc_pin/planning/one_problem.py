@@ -98,6 +98,7 @@ class OneProblem:
             seeds = self._seeds(problem) if seed is None else iter([seed(problem)])
             best, status = self._try_seeds(problem, seeds, deadline, searched=seed is None)
         self.z, self.initialization = best.z, best.name
+        cache.trim()  # a chore has many problems, whose solvers grow while they are used
         build_time = cache.building - built
         return self._plan(best, status, time.perf_counter() - began - build_time, build_time)
 

@@ -37,7 +37,7 @@ class Planner:
         megabytes: How much memory they take at most, as estimated [MB]. While plans run they may take more.
     """
 
-    def __init__(self, *, entries: int = 512, megabytes: float = 1024.0) -> None:
+    def __init__(self, *, entries: int = 512, megabytes: float = 128.0) -> None:
         if isinstance(entries, bool) or not isinstance(entries, int) or entries < 1:
             raise InputError("out of range", field="entries", expected="a whole number of at least 1", got=repr(entries))
         if isinstance(megabytes, bool) or not isinstance(megabytes, int | float) or not megabytes > 0.0:

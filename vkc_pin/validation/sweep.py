@@ -19,6 +19,7 @@ __all__ = ["Hit", "sweep"]
 
 RESOLUTION = 1e-3  # [m] of penetration that may stay unseen between two samples
 STILL = 1e-6  # [m] of relative motion between two samples that changes nothing, as of what stands where it was put
+_AT_ONCE = 64  # states whose pairs are looked at together: tables of all of a chore's would take half a gigabyte
 
 
 class Hit(NamedTuple):
@@ -132,23 +133,25 @@ class _Sweep:
 
     def _nearest(self, placed: Placed) -> tuple[Ints, Ints, Floats]:
         """Return (state, pair), the closest and all that fall short of their margins among them, and their distances [m]."""
-        count = len(placed.corners[0])
-        reach, todo = max(float(self._table.margins.max()), RESOLUTION), np.arange(count)
-        found = []
+        found = [part for states in _in_parts(len(placed.corners[0])) for part in self._nearest_at(placed, states)]
+        states, pairs, distances = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        order = np.lexsort((pairs, states))
+        return states[order], pairs[order], distances[order]
+
+    def _nearest_at(self, placed: Placed, todo: Ints) -> Iterator[tuple[Ints, Ints, Floats]]:
+        """Yield those of some states, in no order."""
+        reach = max(float(self._table.margins.max()), RESOLUTION)
         while len(todo):
             at, pairs = self._table.close(placed, todo, np.full((len(todo), len(self._table.group)), reach))
             near = placed.bounds(todo[at], self._table.pairs[pairs]) < reach
             states, pairs = todo[at[near]], pairs[near]
             distances = placed.distances(states, self._table.pairs[pairs])
-            least = np.full(count, np.inf)
+            least = np.full(len(placed.corners[0]), np.inf)
             np.minimum.at(least, states, distances)
             done = ~(least > reach)  # all others are further apart
             kept = done[states]
-            found.append((states[kept], pairs[kept], distances[kept]))
+            yield states[kept], pairs[kept], distances[kept]
             todo, reach = todo[~done[todo]], 2.0 * reach
-        states, pairs, distances = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        order = np.lexsort((pairs, states))
-        return states[order], pairs[order], distances[order]
 
     def _active(self, placed: Placed, moved: Floats, smallest: float) -> tuple[Ints, Ints]:
         """Return (t, pair) of all but those that boxes prove to stay `smallest` apart between waypoints t and t + 1 [m].
@@ -160,17 +163,25 @@ class _Sweep:
             moved: How far any point of each geometry moves from each to the next, shape (T − 1, G) [m].
             smallest: [m].
         """
-        stretches = np.arange(len(moved))
-        at, some = self._table.close(placed, stretches, smallest + moved / 2, stretches + 1)
-        pairs = self._table.pairs[some]
-        motion = np.take_along_axis(moved[at], pairs, axis=1).sum(axis=1)
-        floor = (placed.bounds(at, pairs) + placed.bounds(at + 1, pairs) - motion) / 2
-        return at[floor < smallest], some[floor < smallest]
+        found = []
+        for stretches in _in_parts(len(moved)):
+            at, some = self._table.close(placed, stretches, smallest + moved[stretches] / 2, stretches + 1)
+            at, pairs = stretches[at], self._table.pairs[some]
+            motion = moved[at, pairs[:, 0]] + moved[at, pairs[:, 1]]
+            floor = (placed.bounds(at, pairs) + placed.bounds(at + 1, pairs) - motion) / 2
+            found.append((at[floor < smallest], some[floor < smallest]))
+        at, some = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        return at, some
 
     def _hit(self, row: int, k: int, distance: float, *, at_waypoint: bool = False) -> Hit:
         first, second = (self._solids.world.collision_labels[i] for i in self._table.pairs[k])
         limits = {"margin": float(self._table.margins[k]), "contact": float(self._table.contact[k])}
         return Hit(int(row), first, second, float(distance), **limits, at_waypoint=at_waypoint)
+
+
+def _in_parts(count: int) -> list[Ints]:
+    """Return 0 .. count - 1 in parts; a part that is empty if there are none."""
+    return np.array_split(np.arange(count), range(_AT_ONCE, count, _AT_ONCE))
 
 
 class Stretches(NamedTuple):

@@ -100,7 +100,7 @@ def objective(found: Plan, planner: Planner | None = None) -> float | None:
 @functools.cache
 def _planner(change: Change) -> Planner:
     """Return a planner for each change, once per process: what one keeps was built with its own constants."""
-    return Planner(megabytes=512.0)
+    return Planner()
 
 
 @functools.cache

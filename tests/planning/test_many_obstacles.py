@@ -35,7 +35,7 @@ from vkc_pin.scene.placed import standing_geometry
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step
 from vkc_pin.validation.clearance import clearance_curves
-from vkc_pin.validation.distances import Placed, travelled
+from vkc_pin.validation.distances import Placed, Solids, travelled
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.sweep import _Sweep, sweep
@@ -218,8 +218,8 @@ def test_validation_sees_what_brute_force_sees_of_what_is_carried(seed: int, cou
 def check_sweep(scene: Scene, motion: Trajectory) -> None:
     """The smallest distance of all, whatever overlaps at a sample, and whatever falls short of its margin at a waypoint."""
     samples = Samples(scene, motion)
-    touching = may_touch(scene, samples.world, motion, (), 0.02)
-    table = PairTable(scene, samples.world, motion, 0.02, touching=touching)
+    touching = may_touch(scene, Solids(samples.world), motion, (), 0.02)
+    table = PairTable(scene, Solids(samples.world), motion, 0.02, touching=touching)
     hits = list(sweep(table, samples.z, samples.waypoint_rows))
     distances = brute_force(table, samples.z)
     at_samples = min(hit.distance for hit in hits)
@@ -240,7 +240,7 @@ def check_sweep(scene: Scene, motion: Trajectory) -> None:
 def test_bounds_are_bounds(seed: int, count: int, size: float) -> None:
     scene = cluttered(seed, count)
     samples = Samples(scene, wander(scene, seed, size=size))
-    table = PairTable(scene, samples.world, samples.trajectory, 0.02)
+    table = PairTable(scene, Solids(samples.world), samples.trajectory, 0.02)
     z = samples.z[samples.waypoint_rows]
     distances = brute_force(table, z)
     placed, count = table.solids.at(samples.world.coordinates.q(z)), len(table.pairs)

@@ -13,6 +13,7 @@ from vkc_pin.motion.world import World
 from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.scene import Scene
+from vkc_pin.validation.distances import Solids
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.touching import may_touch
@@ -26,8 +27,8 @@ def door() -> Scene:
 def test_which_pairs_count(door: Scene) -> None:
     motion = wander(door, 0, size=0.1)
     samples = Samples(door, motion)
-    touching = may_touch(door, samples.world, motion, (), 0.02)
-    table = PairTable(door, samples.world, motion, 0.02, touching=touching)
+    touching = may_touch(door, Solids(samples.world), motion, (), 0.02)
+    table = PairTable(door, Solids(samples.world), motion, 0.02, touching=touching)
     robot, things = door.robot.collision, door.objects["door"].object.collision.geometryObjects
     walls = [label for label in door.obstacle_labels if label != FLOOR]
     arm = [shape for shape in robot.geometryObjects if shape.parentJoint > 1]
@@ -46,11 +47,11 @@ def test_what_may_touch_needs_no_clearance(door: Scene) -> None:
     """Only the pairs that were said to, and each with its own overlap that counts as contact."""
     motion = wander(door, 0, size=0.1)
     world = Samples(door, motion).world
-    plain = PairTable(door, world, motion, 0.02)
+    plain = PairTable(door, Solids(world), motion, 0.02)
     assert (plain.margins == 0.02).all()
     assert (plain.contact == 0.0).all()
     first, second = (tuple(plain.pairs[k].tolist()) for k in (3, 70))
-    table = PairTable(door, world, motion, 0.02, touching={first: 1e-4, second: 0.0})
+    table = PairTable(door, Solids(world), motion, 0.02, touching={first: 1e-4, second: 0.0})
     np.testing.assert_array_equal(table.pairs, plain.pairs)
     np.testing.assert_array_equal(np.flatnonzero(table.margins == 0.0), [3, 70])
     np.testing.assert_array_equal(np.flatnonzero(table.contact), [3])
@@ -63,7 +64,7 @@ def test_a_side_branch_that_nothing_moves_hits_nothing_that_stands() -> None:
     names = (*scene.robot.coordinates.names, "cabinet.slide", "cabinet.swing")
     positions = np.tile(np.concatenate([scene.start, [0.1, 0.3]]), (2, 1))
     motion = Trajectory(names, np.arange(2.0), positions, (PhaseSpan("all", 0, 1, (Hold("cabinet", "grip"),)),), 9)
-    table = PairTable(scene, Samples(scene, motion).world, motion, 0.02)
+    table = PairTable(scene, Solids(Samples(scene, motion).world), motion, 0.02)
     paired = {frozenset(table.world.collision_labels[k] for k in pair) for pair in table.pairs.tolist()}
     for still in ("cabinet.lid", "cabinet.case"):
         assert {"forearm_link", still} in paired
@@ -82,7 +83,7 @@ def test_which_pairs_of_free_objects_count() -> None:
     carried = Script(scene).take("stick").go(moved_base(scene.start, y=0.1)).motion()
 
     def paired(motion: Trajectory) -> dict[str, set[str]]:
-        found = PairTable(scene, World(scene), motion, 0.02)
+        found = PairTable(scene, Solids(World(scene)), motion, 0.02)
         names: dict[str, set[str]] = {}
         for first, second in (pair_names(found, k) for k in range(len(found.pairs))):
             for one, other in ((first, second), (second, first)):
@@ -102,8 +103,8 @@ def test_which_pairs_of_free_objects_count() -> None:
 def test_what_moves_together() -> None:
     scene, motion = whirl(0, size=0.1)
     world = World(scene)
-    touching = may_touch(scene, world, motion, (), 0.02)
-    table = PairTable(scene, world, motion, 0.02, touching=touching)
+    touching = may_touch(scene, Solids(world), motion, (), 0.02)
+    table = PairTable(scene, Solids(world), motion, 0.02, touching=touching)
     together = {pair_names(table, k) for k in np.flatnonzero(table.together)}
     hands = {(link, "stick.stick") for link in scene.robot.touch_links}
     assert together == {*hands, ("stick.tip", "ball.ball")}

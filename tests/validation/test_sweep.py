@@ -17,6 +17,7 @@ from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.motion.world import World
 from vkc_pin.scene.scene import Scene
 from vkc_pin.validation import sweep as validation_sweep
+from vkc_pin.validation.distances import Solids
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.sweep import Hit, sweep
@@ -24,7 +25,7 @@ from vkc_pin.validation.sweep import Hit, sweep
 
 def swept(scene: Scene, motion: Trajectory) -> tuple[PairTable, Samples, list[Hit]]:
     samples = Samples(scene, motion)
-    table = PairTable(scene, samples.world, motion, 0.02)
+    table = PairTable(scene, Solids(samples.world), motion, 0.02)
     return table, samples, list(sweep(table, samples.z, samples.waypoint_rows))
 
 
@@ -69,7 +70,7 @@ def test_nothing_slips_through_even_without_samples(seed: int, size: float) -> N
     door = door_scene()
     motion = wander(door, seed, size=size)
     samples = Samples(door, motion)
-    table = PairTable(door, samples.world, motion, 0.02)
+    table = PairTable(door, Solids(samples.world), motion, 0.02)
     found = {
         (hit.row, hit.first, hit.second)
         for hit in sweep(table, samples.z[samples.waypoint_rows], np.arange(4))
@@ -88,7 +89,7 @@ def test_a_wire_that_is_passed_between_two_samples() -> None:
     scene = hall(obstacles=[wire])
     motion = of_rows(scene, np.vstack([scene.start, moved(scene.start, x=4.0)]), dt=20.0)
     samples = Samples(scene, motion)
-    table = PairTable(scene, samples.world, motion, 0.02)
+    table = PairTable(scene, Solids(samples.world), motion, 0.02)
     hits = list(sweep(table, samples.z[[0, -1]], np.array([0, 1])))
     assert ("base_link", "wire") in {(hit.first, hit.second) for hit in hits if hit.distance < 0}
     assert all(hit.distance > 1.0 for hit in hits if hit.at_waypoint and hit.second == "wire")
@@ -119,7 +120,7 @@ def test_what_may_touch_is_not_passed_through_between_two_samples(overlap: float
     labels = world.collision_labels
     post = labels.index("fence")
     touching = {(i, post): overlap for i in range(post) if labels[i] in ("stick.stick", "stick.tip") and overlap is not None}
-    table = PairTable(scene, world, motion, 0.02, touching=touching)
+    table = PairTable(scene, Solids(world), motion, 0.02, touching=touching)
     hits = list(sweep(table, world.positions(motion)[-2:], np.array([0, 1])))
     assert all(hit.distance > 0.0 for hit in hits if hit.at_waypoint and hit.second == "fence")
     through = {hit.first for hit in hits if hit.second == "fence" and hit.distance < -5e-4}

@@ -31,6 +31,7 @@ from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.steps import Actuate, Grasp, Place, Step, Touch
+from vkc_pin.validation.distances import Solids
 from vkc_pin.validation.touching import CONTACT, may_touch
 
 HANDS = set(door_scene().robot.touch_links)
@@ -39,7 +40,7 @@ HANDS = set(door_scene().robot.touch_links)
 def pairs(scene: Scene, motion: Trajectory, steps: Sequence[Step] = (), dist_safe: float = 0.02) -> dict[tuple[str, str], float]:
     """Return the labels of the pairs that may touch, and their overlaps."""
     world = World(scene)
-    found = may_touch(scene, world, motion, steps, dist_safe)
+    found = may_touch(scene, Solids(world), motion, steps, dist_safe)
     assert all(i < j for i, j in found)
     labels = world.collision_labels
     named: dict[tuple[str, str], float] = {}

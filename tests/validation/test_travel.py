@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vkc_pin.motion.world import World
-from vkc_pin.validation.distances import travelled
+from vkc_pin.validation.distances import Solids, travelled
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.samples import Samples
 
@@ -24,7 +24,7 @@ def test_no_point_moves_further_than_the_bound(seed: int, size: float) -> None:
     scene, rng = full_scene(), np.random.default_rng(seed)
     motion = wander(door_scene(), seed, size=size)
     world = World(scene)
-    table = PairTable(scene, world, motion, 0.02)
+    table = PairTable(scene, Solids(world), motion, 0.02)
     z = world.positions(motion)
     z[:, 11:] += rng.uniform(0.0, 2.0, z.shape[1] - 11)
     z[1:, 11:] += size * rng.uniform(-1.0, 1.0, (len(z) - 1, z.shape[1] - 11))
@@ -56,7 +56,7 @@ def box_corners(shape: pin.GeometryObject) -> list[list[float]]:
 def test_no_point_of_what_is_carried_moves_further_than_the_bound(seed: int, size: float) -> None:
     scene, motion = whirl(seed, size=size)
     samples = Samples(scene, motion)
-    table_of_pairs = PairTable(scene, samples.world, motion, 0.02)
+    table_of_pairs = PairTable(scene, Solids(samples.world), motion, 0.02)
     bounds = np.diff(travelled(table_of_pairs.solids, samples.z)[samples.waypoint_rows], axis=0)
     world = samples.world
     data, shapes = world.model.createData(), pin.GeometryData(world.collision)

@@ -214,6 +214,8 @@ class _SeedSearch:
 
         What is short may be what grazes things, so that the merit of their seeds chooses between the two.
         """
+        if len(found.at) == 2:  # the search has shortened ways to one knot alone
+            return found.paths[np.argsort(found.cost, kind="stable")]
         short = self.beam.shortened(found)
         order = np.argsort(short.cost, kind="stable")
         return itertools.chain.from_iterable(zip(short.paths[order], found.paths[order], strict=True))

@@ -11,6 +11,7 @@ from vkc_pin.arrays import Floats, Ints
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.motion.world import World
 from vkc_pin.scene.scene import Scene
+from vkc_pin.validation.distances import Solids
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.touching import may_touch
 
@@ -52,8 +53,9 @@ def clearance_curves(scene: Scene, trajectory: Trajectory, times: ArrayLike, *, 
         dist_safe: The clearance asked for [m]; a pair that may touch is recognised by asking for less.
     """
     world = World(scene)
-    touching = may_touch(scene, world, trajectory, (), dist_safe)
-    table = PairTable(scene, world, trajectory, dist_safe, touching=touching)
+    solids = Solids(world)
+    touching = may_touch(scene, solids, trajectory, (), dist_safe)
+    table = PairTable(scene, solids, trajectory, dist_safe, touching=touching)
     moments = np.atleast_1d(np.asarray(times, float))
     kinds = np.array([_kind(table, pair, margin) for pair, margin in zip(table.pairs, table.margins, strict=True)])
     groups = {kind: table.pairs[kinds == kind] for kind in _KINDS if (kinds == kind).any()}

@@ -9,7 +9,6 @@ import numpy as np
 from vkc_pin.arrays import Floats, Ints
 from vkc_pin.errors import InputError
 from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.motion.world import World
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.scene import Scene
 from vkc_pin.validation.distances import Placed, Solids
@@ -31,7 +30,7 @@ class PairTable:
 
     Args:
         scene: Where it happens.
-        world: The scene as one plain tree.
+        solids: The shapes of the scene as one plain tree.
         trajectory: The motion.
         dist_safe: Clearance to keep at the waypoints [m].
         touching: Which pairs of `world.shapes` (smaller index first) need no clearance, and the overlap of each that counts
@@ -41,14 +40,15 @@ class PairTable:
     def __init__(
         self,
         scene: Scene,
-        world: World,
+        solids: Solids,
         trajectory: Trajectory,
         dist_safe: float,
         *,
         touching: Mapping[tuple[int, int], float] | None = None,
     ) -> None:
         touching = {} if touching is None else touching
-        self.scene, self.world, self.dist_safe = scene, world, dist_safe
+        self.scene, self.world, self.solids, self.dist_safe = scene, solids.world, solids, dist_safe
+        world = self.world
         self.moved = [False]  # for each joint of the world, whether the trajectory moves it or one that carries it
         for joint in range(1, world.model.njoints):
             self.moved.append(self.moved[world.model.parents[joint]] or world.model.names[joint] in trajectory.names)
@@ -59,8 +59,7 @@ class PairTable:
                 self.moved[joint] = True
         robots = len(scene.robot.collision.geometryObjects)
         self._robot_pairs = {frozenset((p.first, p.second)) for p in scene.robot.collision.collisionPairs}
-        labels, self.solids = world.collision_labels, Solids(world)
-        bodies = range(self.solids.bodies)
+        labels, bodies = world.collision_labels, range(solids.bodies)
         owners = [label.partition(".")[0] if "." in label else "" for label in labels]
         self.group = ["robot" if i < robots else name if name in scene.objects else "" for i, name in enumerate(owners)]
         self.pairs = np.concatenate(

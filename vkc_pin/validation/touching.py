@@ -8,7 +8,6 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.motion.world import World
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.steps import Grasp, Step, Touch
 from vkc_pin.validation.distances import Solids
@@ -19,7 +18,7 @@ CONTACT = 1e-4  # [m] of overlap that is contact: what stands on a table overlap
 
 
 def may_touch(
-    scene: Scene, world: World, trajectory: Trajectory, steps: Sequence[Step], dist_safe: float
+    scene: Scene, solids: Solids, trajectory: Trajectory, steps: Sequence[Step], dist_safe: float
 ) -> dict[tuple[int, int], float]:
     """Return pairs of geometries (indices in the world's collision model) → overlap that counts as contact [m].
 
@@ -29,11 +28,12 @@ def may_touch(
 
     Args:
         scene: Where it happens.
-        world: The scene as one plain tree.
+        solids: The shapes of the scene as one plain tree.
         trajectory: The motion.
         steps: What was asked for.
         dist_safe: [m].
     """
+    world = solids.world
     labels = world.collision_labels
     allowed: dict[tuple[int, int], float] = {}
 
@@ -53,7 +53,7 @@ def may_touch(
         allow({by} if by else hands, {grasped}, CONTACT if by else 0.0)
 
     robots = len(scene.robot.collision.geometryObjects)
-    rows, solids = world.positions(trajectory), Solids(world)
+    rows = world.positions(trajectory)
     for owner, waypoint in _taken_and_left(scene, trajectory):
         placed = solids.at(world.coordinates.q(rows[[waypoint]]))
         mine = [i for i, label in enumerate(labels) if label.partition(".")[0] == owner]

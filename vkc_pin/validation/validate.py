@@ -15,6 +15,7 @@ from vkc_pin.options import Options
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.steps import Step
 from vkc_pin.task.terms import Term, traced
+from vkc_pin.validation.distances import Solids
 from vkc_pin.validation.goals import MOTION_TOLERANCE, check_goals, check_steps
 from vkc_pin.validation.own_terms import check_terms
 from vkc_pin.validation.pairs import PairTable
@@ -226,8 +227,9 @@ class _Check:
         The start is where the robot is: it may be close to something, but not inside.
         """
         samples, smallest = self.samples, np.inf
-        touching = may_touch(self.scene, samples.world, self.trajectory, self.steps, self.options.dist_safe)
-        pairs = PairTable(self.scene, samples.world, self.trajectory, self.options.dist_safe, touching=touching)
+        solids = Solids(samples.world)
+        touching = may_touch(self.scene, solids, self.trajectory, self.steps, self.options.dist_safe)
+        pairs = PairTable(self.scene, solids, self.trajectory, self.options.dist_safe, touching=touching)
         for hit in sweep(pairs, samples.z, samples.waypoint_rows):
             smallest = min(smallest, hit.distance)
             subject, millimetres = f"{hit.first} – {hit.second}", 1e3 * abs(hit.distance)

@@ -13,6 +13,7 @@ from helpers.drives import hall
 from helpers.small_problems import door_scene, program_of
 
 import vkc_pin as vkc
+from vkc_pin.cache import Cache
 from vkc_pin.interrupt import Interrupt
 from vkc_pin.planning import one_problem as module
 from vkc_pin.planning.one_problem import OneProblem
@@ -238,3 +239,11 @@ def test_squares_of_turns_cost_what_the_heading_weighs() -> None:
 def test_standing_still_costs_nothing() -> None:
     problem = program_of(drawer_scene(), PULL, options=SHORT)
     assert problem.objective(problem.still, problem.timing_for(problem.still).dt) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_what_a_problem_leaves_is_trimmed_at_its_end() -> None:
+    """Not only when a call ends: a chore has many problems."""
+    scene, cache = drawer_scene(), Cache(nbytes=1.0)
+    assert OneProblem(scene, compile_task(scene, PULL, SHORT), Settings("auto", SHORT, cache=cache)).run().success
+    assert cache.info().entries == 1
+    assert cache.info().misses > 1

@@ -48,6 +48,17 @@ def test_no_pair_that_comes_close_is_left_out(seed: int, size: float) -> None:
         assert hit.at_waypoint == (hit.row in samples.waypoint_rows)
 
 
+@pytest.mark.parametrize("many", [1, 2, 3, 5])
+def test_hits_are_the_same_however_many_states_are_looked_at_together(monkeypatch: pytest.MonkeyPatch, many: int) -> None:
+    door = door_scene()
+    motion = wander(door, 3, size=0.5)
+    _, samples, expected = swept(door, motion)
+    assert len(samples.waypoint_rows) == 4
+    monkeypatch.setattr(validation_sweep, "_AT_ONCE", many)
+    assert swept(door, motion)[2] == expected
+    assert any(not hit.at_waypoint for hit in expected)
+
+
 @settings(max_examples=10, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.2, 0.6]))
 def test_nothing_slips_through_between_two_samples(seed: int, size: float) -> None:

@@ -9,7 +9,7 @@ from helpers.small_problems import program_of
 
 import vkc_pin as vkc
 from vkc_pin.program.problem import TrajectoryProblem
-from vkc_pin.solver.between import CLOSE, KEEP, collisions_between, merge
+from vkc_pin.solver.between import CLOSE, KEEP, Between, collisions_between, merge
 
 ARM = [np.pi, -1.2, 1.9, -0.7, np.pi / 2, 0.0]  # stretched out ahead of the base
 WIDTH = 2.0  # [m] the base drives sideways
@@ -43,11 +43,12 @@ def test_a_thin_obstacle_between_waypoints(monkeypatch: pytest.MonkeyPatch) -> N
     assert plan.trajectory.arm_effort() + plan.trajectory.base_effort() > WIDTH + 0.005  # it went round the post
 
     problem, _ = straight(scene)
-    nothing, free = collisions_between(problem, np.tile(problem.start, (problem.segments, 1)))
+    nothing, free, passed = collisions_between(problem, np.tile(problem.start, (problem.segments, 1)))
     assert free
+    assert passed == []
     assert nothing.violation() == 0.0
     nothing = nothing.select(np.zeros(0, int))
-    monkeypatch.setattr("vkc_pin.solver.loop.collisions_between", lambda problem, z: (nothing, True))
+    monkeypatch.setattr("vkc_pin.solver.loop.collisions_between", lambda problem, z: Between(nothing, True, []))
     blind = vkc.plan(scene, steps, options=FEW, initialization="interpolated")
     assert not blind.success
     assert blind.status == "rejected"  # the solver was content, validation was not
@@ -60,7 +61,7 @@ def test_a_thin_obstacle_between_waypoints(monkeypatch: pytest.MonkeyPatch) -> N
 def test_planes_are_asked_for_at_both_ends_of_the_segment() -> None:
     problem, z = straight(past_a_post())
     assert problem.evaluate_contacts(z, reach=0.02).clearance() == np.inf
-    found, _ = collisions_between(problem, z)
+    found = collisions_between(problem, z).contacts
     labels = problem.contacts.phases[0].labels
     assert {labels[j] for j in found.pair[:, 1]} == {"post"}
     assert all(labels[i].startswith("gripper") for i in found.pair[:, 0])
@@ -72,7 +73,7 @@ def test_planes_are_asked_for_at_both_ends_of_the_segment() -> None:
 
 def test_what_is_asked_for_is_what_is_missing_in_between() -> None:
     problem, z = straight(past_a_post())
-    found, _ = collisions_between(problem, z)
+    found = collisions_between(problem, z).contacts
     states = sub_states(problem, z, 2, 400)
     dense = problem.contacts.evaluate(states, np.full(len(states), 3), reach=KEEP + CLOSE)
     pairs = np.unique(found.pair, axis=0)
@@ -86,7 +87,7 @@ def test_what_is_asked_for_is_what_is_missing_in_between() -> None:
 def test_lifting_both_ends_lifts_what_is_between_to_first_order() -> None:
     """Moving both waypoints by ε along the normal moves the sub-state's distance by ε, up to ε²."""
     problem, z = straight(past_a_post())
-    found, _ = collisions_between(problem, z)
+    found = collisions_between(problem, z).contacts
     index = int(np.argmax(found.margin - found.distance))
     pair, normal = found.pair[index], found.normal[index]
 
@@ -110,14 +111,14 @@ def test_a_start_that_is_close_to_something_may_leave_it() -> None:
     assert 0.0 < scene.start_clearance() < KEEP
     problem = program_of(scene, [vkc.GoTo(-1.0, 0.0, 0.0)], options=FEW)
     away = through(scene, scene.start, moved(scene.start, x=-1.0), steps=FEW.reach_waypoints).positions[1:]
-    assert len(collisions_between(problem, away)[0].waypoint) == 0
+    assert len(collisions_between(problem, away).contacts.waypoint) == 0
     into = through(scene, scene.start, moved(scene.start, x=1.0), steps=FEW.reach_waypoints).positions[1:]
-    assert 0 in collisions_between(problem, into)[0].waypoint
+    assert 0 in collisions_between(problem, into).contacts.waypoint
 
 
 def test_merged_contacts_are_in_order() -> None:
     problem, z = straight(past_a_post())
-    found, _ = collisions_between(problem, z)
+    found = collisions_between(problem, z).contacts
     near = problem.evaluate_contacts(z, reach=0.3)
     both = merge(near, found)
     assert len(both.waypoint) == len(near.waypoint) + len(found.waypoint)
@@ -131,4 +132,4 @@ def test_merged_contacts_are_in_order() -> None:
 
 def test_standing_still_has_nothing_in_between() -> None:
     problem, _ = straight(hall().with_start(arm=ARM))
-    assert len(collisions_between(problem, np.tile(problem.start, (problem.segments, 1)))[0].waypoint) == 0
+    assert len(collisions_between(problem, np.tile(problem.start, (problem.segments, 1))).contacts.waypoint) == 0

@@ -18,7 +18,9 @@ from vkc_pin.program.merit import GROWTH, TOLERANCE, Infeasibility, Merit
 from vkc_pin.seeds.initialization import initialize
 from vkc_pin.solver import loop as solver
 from vkc_pin.solver import trust_region
+from vkc_pin.solver.between import collisions_between
 from vkc_pin.solver.loop import Solution, solve
+from vkc_pin.solver.passages import Passage
 
 FEW = vkc.Options(reach_waypoints=20, max_outer=12)
 PILLAR = {"name": "pillar", "type": "cylinder", "radius": 0.15, "length": 1.6, "position": [1.6, 0.05, 0.8]}
@@ -157,7 +159,7 @@ class Scripted:
         step: float | None = None,
         other: float = 0.0,
     ) -> None:
-        self.step, self.other = step, other
+        self.step, self.other, self.crossed = step, other, list[Passage]()
         self.problem, self.z, self.is_done = SimpleNamespace(drift=lambda _: drift), np.zeros((40, 1)), done
         self.deadline, self.solution = np.inf, Solution(np.zeros((40, 1)), np.full(40, 0.25))
         self.merit, self.found = Merit(200.0), missing(0.5, other)
@@ -181,6 +183,9 @@ class Scripted:
 
     def judge(self, _: trust_region.Trial) -> bool:
         return self.taken
+
+    def carried_through(self, _: trust_region.Trial) -> list[Passage]:
+        return self.crossed
 
     def accept(self, trial: trust_region.Trial) -> None:
         self.objective, self.found = trial.objective, trial.found
@@ -225,7 +230,7 @@ def test_a_grasp_between_obstacles_is_made_free_with_small_steps() -> None:
     seed = next(initialize(problem, "astar", 0)).z
     solution, small = solve(problem, seed), 0
     for row, after in itertools.pairwise(solution.history):
-        nearly = trust_region.CLOSE_ENOUGH <= row.shortfall < solver.NEARLY_FREE  # and not yet free
+        nearly = trust_region.CLOSE_ENOUGH <= row.shortfall < solver.NEARLY  # and not yet free
         if row.accepted and nearly and row.pose_error < TOLERANCE:
             assert after.radius <= trust_region.SETTLE_RADIUS
             assert after.step <= trust_region.SETTLE_RADIUS * (1 + 1e-6)
@@ -302,8 +307,49 @@ def test_motions_that_stay_far_from_free_are_given_up_soon(monkeypatch: pytest.M
     solution = solve(problem, seed)
     assert (solution.status, solution.converged) == ("not converged", False)
     assert solution.rounds < FEW.max_outer
-    assert problem.evaluate_contacts(solution.z, reach=0.1).violation() > solver.NEARLY_FREE
+    assert problem.evaluate_contacts(solution.z, reach=0.1).violation() > solver.NEARLY
     assert solve(problem, seed, rounds=2).rounds == 2
+
+
+def test_where_something_would_be_carried_through_waypoints_may_move_less() -> None:
+    """Whatever the merit says: it has no say in that."""
+    loop = Scripted((1.0, 0.0, False))
+    loop.crossed = [Passage((3, 5), 12, 13)]
+    region = trust_region.TrustRegion(40, 10)
+    before = region.radius.copy()
+    solver._iterate(loop, region, None, SimpleNamespace(pressed=False), 1)  # type: ignore[arg-type]
+    narrowed = region.radius < before
+    assert narrowed.any()
+    np.testing.assert_array_equal(narrowed, np.isin(region.block, region.block[11:14]))
+
+
+def test_nothing_is_carried_through_anything(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A seed that goes round a post the long way must not jump through it, though that is shorter and free at all waypoints."""
+    post = {"name": "post", "type": "cylinder", "radius": 0.02, "length": 1.6, "position": [1.6, -0.42, 0.8]}
+    cheap = dataclasses.replace(FEW, penalty=1.0)  # of what overlaps
+    problem = program_of(hall(obstacles=[post]), [vkc.GoTo(3.2, 0.0, 0.0)], options=cheap)
+    bow = straight(problem, 3.2).copy()
+    bow[:, 1] -= 1.3 * np.sin(np.linspace(0.0, np.pi, len(bow) + 1)[1:])
+    assert problem.evaluate_contacts(bow, reach=0.02).violation() == 0.0
+    assert not collisions_between(problem, bow).passages
+    seen: list[tuple[bool, bool]] = []
+    judge = solver._Loop.judge
+
+    def watch(loop, trial):  # type: ignore[no-untyped-def]
+        accepted = judge(loop, trial)
+        seen.append((bool(trial.passages), accepted))
+        return accepted
+
+    monkeypatch.setattr(solver._Loop, "judge", watch)
+    solution = solve(problem, bow)
+    assert (True, True) not in seen
+    assert solution.converged
+    assert solution.z[:, 1].min() < -0.42  # still on the other side of the post
+    feasible(problem, solution)
+    monkeypatch.setattr(solver, "new", lambda *_: [])  # as if it did not matter
+    seen.clear()
+    solve(problem, bow)
+    assert (True, True) in seen, "nothing was carried through: choose a harder problem"
 
 
 def test_standing_still_where_one_is_already() -> None:

@@ -197,6 +197,21 @@ class ContactModel:
         first, second = np.split(self.chain.point_jacobians(z, which, joints.T.ravel(), points), 2)
         return np.asarray(np.einsum("ci,cij->cj", contacts.normal, second - first))
 
+    def normals(self, z: Floats, waypoints: Ints, pairs: Ints) -> Floats:
+        """Return the normals from first to second of pairs, shape (B, 2), each at its configuration: shape (B, 3).
+
+        Args:
+            z: Configurations, shape (B, n).
+            waypoints: For each, the waypoint whose phase it belongs to, shape (B,).
+            pairs: Geometries of these phases.
+        """
+        found, phase_of = np.empty((len(z), 3)), np.array([self.phase_of(waypoint) for waypoint in waypoints], int)
+        for number in set(phase_of.tolist()):
+            inside = np.flatnonzero(phase_of == number)
+            where = self._placed.at(self.chain.coordinates.q(z[inside]))
+            found[inside] = self._shapes[number].witnesses(where, np.arange(len(inside)), pairs[inside]).normal
+        return found
+
     def planes(self, z: Floats, contacts: Contacts, *, slots: int) -> tuple[Floats, Floats]:
         """Return the coefficients C, shape (W, slots, 12·joints), and offsets R, shape (W, slots), of the nearest contacts.
 

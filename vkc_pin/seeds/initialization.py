@@ -60,14 +60,16 @@ def initialize(
         seeds = _stationary(problem, count, np.random.default_rng([random_seed, 2]))
     else:
         shared = _Shared(problem, random_seed, said, Routes(problem, interrupt), Known(), interrupt)
-        if method == "auto":
-            searches = _SeedSearch(shared, "interpolated"), _SeedSearch(shared, "astar"), _Rrt(shared)
-            seeds = _in_turn(*(search.seeds(count) for search in searches))
-        else:
-            seeds = _in_turn((_Rrt(shared) if method == "rrt" else _SeedSearch(shared, method)).seeds(count))
+        kinds = ("interpolated", "astar", "rrt") if method == "auto" else (method,)
+        seeds = _in_turn(*(_kind(kind, shared, count) for kind in kinds))
     rng = np.random.default_rng([random_seed, 1])
     for item in seeds:
         yield replace(item, z=_perturbed(problem, item.z, perturbation, rng)) if perturbation else item
+
+
+def _kind(method: str, shared: _Shared, count: int) -> Iterator[Seed | None]:
+    """Yield the seeds of one kind; nothing is made before the first is asked for."""
+    yield from (_Rrt(shared) if method == "rrt" else _SeedSearch(shared, method)).seeds(count)
 
 
 def _in_turn(*kinds: Iterator[Seed | None]) -> Iterator[Seed]:
@@ -180,9 +182,13 @@ class _SeedSearch:
 
     def __init__(self, shared: _Shared, method: str) -> None:
         self.problem, self.notes, self.method, self.interrupt = shared.problem, shared.notes, method, shared.interrupt
-        knots, routes = shared.knots(), shared.driven if method == "astar" else None
-        self.beam = Beam(knots, routes, interrupt=shared.interrupt)
-        self.joiner = Joiner(knots, Approach(knots), None if routes is None else DrivenPaths(routes))
+        self.beam, self.joiner = self._parts(shared)
+
+    def _parts(self, shared: _Shared) -> tuple[Beam, Joiner]:
+        """Return what finds knots, and what joins them."""
+        knots, routes = shared.knots(), shared.driven if self.method == "astar" else None
+        beam = Beam(knots, routes, interrupt=shared.interrupt)
+        return beam, Joiner(knots, Approach(knots), None if routes is None else DrivenPaths(routes))
 
     def seeds(self, count: int) -> Iterator[Seed | None]:
         """Yield seeds through the cheapest paths of knots: of one quick search if that is any good, then of thorough ones.
@@ -272,10 +278,12 @@ class _Rrt(_SeedSearch):
 
     def __init__(self, shared: _Shared) -> None:
         super().__init__(shared, "rrt")
+
+    def _parts(self, shared: _Shared) -> tuple[Beam, Joiner]:
+        """Return what finds knots, and what joins them."""
         knots = shared.knots()
-        self.beam = Beam(knots, shared.driven, careful=True, interrupt=shared.interrupt)
-        trees = RrtPaths(knots, shared.routes, shared.interrupt)
-        self.joiner = Joiner(knots, Approach(knots, stands=True), trees)
+        beam = Beam(knots, shared.driven, careful=True, interrupt=shared.interrupt)
+        return beam, Joiner(knots, Approach(knots, stands=True), RrtPaths(knots, shared.routes, shared.interrupt))
 
     def _search(self, attempt: int) -> Found | None:
         """Return what a search finds, None if it is no good: a quick one, then thorough ones, every other backwards."""

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from vkc_pin.arrays import Floats, Ints
 from vkc_pin.chain.contacts import Contacts, no_contacts
 from vkc_pin.program.problem import TrajectoryProblem
+from vkc_pin.solver.passages import Passage, passages
 from vkc_pin.solver.trust_region import CLOSE_ENOUGH
 
-__all__ = ["collisions_between", "merge"]
+__all__ = ["Between", "collisions_between", "merge"]
 
 SPACING = 0.02  # [m] or [rad] between the states looked at first, in the coordinate that moves most
 KEEP = 1e-2  # [m] clearance asked for between waypoints
@@ -17,8 +20,23 @@ CLOSE = 0.015  # [m] beyond `KEEP` within which a state is looked at closer
 FINER = 4  # states there instead of one
 
 
-def collisions_between(problem: TrajectoryProblem, z: Floats) -> tuple[Contacts, bool]:
-    """Return contacts at waypoints that stand for closeness inside the segments around them, and whether all is far enough.
+class Between(NamedTuple):
+    """What is close between waypoints.
+
+    Attributes:
+        contacts: At z_1..z_N. Their margin exceeds their distance by what is missing in between, or falls below it by what is to
+            spare: they guard against what is close already.
+        free: Whether no sub-state is closer than `CLOSE_ENOUGH`.
+        passages: What goes through each other.
+    """
+
+    contacts: Contacts
+    free: bool
+    passages: list[Passage]
+
+
+def collisions_between(problem: TrajectoryProblem, z: Floats) -> Between:
+    """Return contacts at waypoints that stand for closeness inside the segments around them.
 
     At a sub-state (1 − s)·z_t + s·z_{t+1} with distance d < KEEP (or than the pair's margin, where that is less), the witness
     points, fixed in their bodies, are carried to both waypoints. There n·(b − a) has some value v; asking for v + KEEP − d at
@@ -27,21 +45,19 @@ def collisions_between(problem: TrajectoryProblem, z: Floats) -> tuple[Contacts,
     Args:
         problem: The problem.
         z: z_1..z_N, shape (N, n).
-
-    Returns:
-        Contacts at z_1..z_N, whose margin exceeds their distance by what is missing in between (or falls below it by what
-        is to spare: they guard against what is close already), and whether no sub-state is closer than `CLOSE_ENOUGH`.
     """
     path, contacts = problem.waypoints(z), problem.contacts.settled(z)
     counts = np.maximum(np.ceil(np.abs(np.diff(path, axis=0)).max(axis=1) / SPACING).astype(int), 1)
     segment = np.repeat(np.arange(len(z)), counts)
     piece = np.arange(len(segment)) - np.searchsorted(segment, segment)
     # The middles of the pieces first, and of pieces that something is close to the rest.
-    near = contacts.evaluate(*_states(path, segment, (piece + 0.5) / counts[segment]), reach=KEEP + CLOSE)
+    middles, waypoints = _states(path, segment, (piece + 0.5) / counts[segment])
+    near = contacts.evaluate(middles, waypoints, reach=KEEP + CLOSE)
+    passed = passages(contacts, middles, segment, near)
     rows = np.unique(near.waypoint)
     segment, begin, length = segment[rows], piece[rows] / counts[segment[rows]], 1 / counts[segment[rows]]
     if not len(rows):
-        return no_contacts(), True
+        return Between(no_contacts(), True, [])
     segment = np.repeat(segment, FINER)
     s = (begin[:, None] + length[:, None] * (np.arange(FINER) + 0.5) / FINER).ravel()
     states, waypoints = _states(path, segment, s)
@@ -64,7 +80,7 @@ def collisions_between(problem: TrajectoryProblem, z: Floats) -> tuple[Contacts,
         inside = waypoint > 0  # the start cannot be moved
         part = Contacts(waypoint - 1, found.pair, value, value + keep - found.distance, found.normal, points[0], points[1])
         parts.append(part.select(np.flatnonzero(inside)))
-    return merge(*parts), bool(np.all(found.distance >= np.minimum(CLOSE_ENOUGH, keep)))
+    return Between(merge(*parts), bool(np.all(found.distance >= np.minimum(CLOSE_ENOUGH, keep))), passed)
 
 
 def _states(path: Floats, segment: Ints, s: Floats) -> tuple[Floats, Ints]:

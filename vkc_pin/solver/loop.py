@@ -14,13 +14,14 @@ from vkc_pin.interrupt import Interrupt, interruptible
 from vkc_pin.program.merit import TOLERANCE, Infeasibility, Merit, infeasibility
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.solver.between import collisions_between, merge
+from vkc_pin.solver.passages import Passage, new
 from vkc_pin.solver.solution import Iteration, Solution
 from vkc_pin.solver.subproblem import Subproblem
 from vkc_pin.solver.trust_region import BLOCK_TIME, CLOSE_ENOUGH, INSIDE, Trial, TrustRegion, judge
 
 __all__ = ["solve"]
 
-NEARLY_FREE = 0.01  # [m] shortfall of clearance below which a motion is nearly free
+NEARLY = 0.01  # [m], [rad] of clearance, or of closures, goals and grasps, that is missing of a motion that nearly holds
 PROGRESS_ROUNDS = 5  # rounds in which what is missing must fall:
 PROGRESS = 0.7  # to this share of what it was, or the motion is given up
 WORTHWHILE = 0.05  # relative decrease of the objective for which a feasible motion is improved further
@@ -34,11 +35,11 @@ class _Loop:
         self.problem, self.options = problem, problem.options
         self.z = problem.clip(seed)
         self.timing = problem.timing_for(self.z)
-        self.rates = self.between = False
+        self.rates = False
         self.merit = Merit(weight)
         self.solution = Solution(self.z, self.timing.dt)
         self.subproblem = Subproblem(problem, self.solution, deadline)
-        self.at, _ = self.contacts(self.z)
+        self.at, _, self.passages = self.contacts(self.z)
         self.look()
 
     def look(self) -> None:
@@ -51,36 +52,21 @@ class _Loop:
         """Return what does not hold at waypoints."""
         return infeasibility(self.problem, z, self.timing, at, rates=self.rates)
 
-    def contacts(self, z: Floats) -> tuple[Contacts, bool]:
-        """Return what is close at the waypoints and, once that was needed, between them, and whether that is far enough."""
+    def contacts(self, z: Floats) -> tuple[Contacts, bool, list[Passage]]:
+        """Return what is close at the waypoints and between them, whether all is far enough, and what goes through each other."""
         begin = time.perf_counter()
         found = self.problem.evaluate_contacts(z, reach=self.options.contact_reach, nearest=self.options.contact_slots)
-        clear = found.violation() < CLOSE_ENOUGH
-        if self.between:
-            collisions, free = collisions_between(self.problem, z)
-            found, clear = merge(found, collisions), clear and free
+        between = collisions_between(self.problem, z)
         self.solution.timings["coal"] += time.perf_counter() - begin
-        return found, clear
-
-    def free_between(self, trial: Trial) -> bool:
-        """Return whether nothing collides between waypoints; if something does, look there from now on."""
-        if trial.between:
-            return trial.clear
-        begin = time.perf_counter()
-        found, free = collisions_between(self.problem, trial.z)
-        self.solution.timings["coal"] += time.perf_counter() - begin
-        if not free and not self.between:
-            self.between = True
-            self.at = merge(self.at, found)
-            self.found = self.missing(self.z, self.at)
-        return free
+        clear = between.free and found.violation() < CLOSE_ENOUGH
+        return merge(found, between.contacts), clear, between.passages
 
     def try_step(self, radius: Floats) -> Trial:
         """Solve within `radius` of the current waypoints, and look at what is really there."""
         z, slack, shares, satisfied = self.subproblem.solve(
             self.z, self.at, self.found, self.merit, self.timing, radius, rates=self.rates
         )
-        contacts, clear = self.contacts(z)
+        contacts, clear, passed = self.contacts(z)
         promise = self.merit.weights["clearance"] * slack + self.merit.price(self.found, clearance=False) * shares
         return Trial(
             z=z,
@@ -90,14 +76,20 @@ class _Loop:
             found=self.missing(z, contacts),
             contacts=contacts,
             clear=clear,
-            between=self.between,
+            passages=passed,
             rate=self.timing.violation(*self.problem.rates(z)),
             step=np.abs(z - self.z).max(axis=1),
             satisfied=satisfied,
         )
 
+    def carried_through(self, trial: Trial) -> list[Passage]:
+        """Return what a round leads through each other that was not before; of what is no motion yet that says nothing."""
+        return new(trial.passages, self.passages) if self.found.amounts["poses"].max() < NEARLY else []
+
     def judge(self, trial: Trial) -> bool:
-        """Return whether enough of the promised decrease of the merit came true to accept a step."""
+        """Return whether enough of the promised decrease of the merit came true, and nothing was carried through anything."""
+        if self.carried_through(trial):
+            return False
         before, after = (float(self.merit.price(found, clearance=True).sum()) for found in (self.found, trial.found))
         merit, gain = self.objective + before, self.objective - trial.objective
         return judge(gain + before - float(trial.promise.sum()), gain + before - after, merit)
@@ -105,16 +97,14 @@ class _Loop:
     def accept(self, trial: Trial) -> None:
         """Go on from `trial`."""
         far = self.found.others > TOLERANCE
-        self.z, self.at, self.found = trial.z, trial.contacts, trial.found
+        self.z, self.at, self.found, self.passages = trial.z, trial.contacts, trial.found, trial.passages
         self.objective, self.pose_error = trial.objective, trial.pose_error
         self.solution.z = trial.z
         if far and not self.rates:  # what was no motion yet says little about how long one takes
             self.timing = self.problem.timing_for(self.z)
             self.solution.dt = self.timing.dt
             self.look()
-        nearly = trial.contacts.violation() < NEARLY_FREE
-        if nearly and not self.between and trial.contacts.violation() > 0.0:
-            self.free_between(trial)
+        nearly = trial.contacts.violation() < NEARLY
         if nearly and trial.rate > TOLERANCE:  # before, limits on rates only cost time
             rates = self.problem.rates(trial.z)
             self.timing = self.timing.stretched(*rates)
@@ -131,7 +121,6 @@ class _Loop:
             and trial.clear
             and self.pose_error < TOLERANCE
             and self.timing.violation(*self.problem.rates(trial.z)) <= TOLERANCE
-            and self.free_between(trial)
         )
 
     def grow(self) -> bool:
@@ -208,6 +197,8 @@ def _iterate(
         if callback is not None:
             callback(row)
         before, after = (loop.merit.price(found, clearance=True) for found in (loop.found, trial.found))
+        for passage in loop.carried_through(trial):  # no merit is worth that
+            after[max(passage.first - 1, 0) : passage.last + 1] = np.inf
         used = region.radius
         if accepted:
             loop.accept(trial)
@@ -228,7 +219,7 @@ def _iterate(
         if since >= PROGRESS_ROUNDS:
             break
         short = loop.found.amounts["clearance"]
-        nearly = short.max() < NEARLY_FREE
+        nearly = short.max() < NEARLY
         if accepted and not done and nearly and loop.found.others < TOLERANCE:
             region.settle()
         if region.stuck(trial, short):

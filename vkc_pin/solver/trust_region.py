@@ -9,6 +9,7 @@ import numpy as np
 from vkc_pin.arrays import Floats
 from vkc_pin.chain.contacts import Contacts
 from vkc_pin.program.merit import Infeasibility
+from vkc_pin.solver.passages import Passage
 
 __all__ = ["Trial", "TrustRegion", "judge"]
 
@@ -33,8 +34,8 @@ class Trial:
         pose_error: Largest residual, see `TrajectoryProblem.row_error`.
         found: What does not hold there.
         contacts: What is close there.
-        clear: Whether all that was looked at is far enough from each other.
-        between: Whether that was done between waypoints, too.
+        clear: Whether everything is far enough from each other, between waypoints, too.
+        passages: What goes through each other between waypoints.
         rate: Largest excess over a limit on velocity or acceleration, relative to it.
         step: The largest change of a coordinate at every waypoint, shape (N,).
         satisfied: Whether Ipopt was.
@@ -47,7 +48,7 @@ class Trial:
     found: Infeasibility
     contacts: Contacts
     clear: bool
-    between: bool
+    passages: list[Passage]
     rate: float
     step: Floats
     satisfied: bool

@@ -151,7 +151,7 @@ class _Sweep:
             done = ~(least > reach)  # all others are further apart
             kept = done[states]
             yield states[kept], pairs[kept], distances[kept]
-            todo, reach = todo[~done[todo]], 4.0 * reach
+            todo, reach = todo[~done[todo]], 2.0 * reach
 
     def _active(self, placed: Placed, moved: Floats, smallest: float) -> tuple[Ints, Ints]:
         """Return (t, pair) of all but those that boxes prove to stay `smallest` apart between waypoints t and t + 1 [m].

@@ -1,8 +1,8 @@
 """Writes the tables of experiments in README.md and docs anew, from the results on record: `python docs/make_tables.py`.
 
 In a page, what stands between `<!-- figures: NAME -->` and `<!-- /figures: NAME -->` is of docs/results/NAME.json: each table is
-replaced by the one of the experiment's own report that has the same columns, and the line that begins with "Measured on" by the
-report's. Sentences between them are written by hand.
+replaced by the one of the experiment's own report that has the same columns, and lines that begin like one of `LINES` by the
+report's. Other sentences are written by hand.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from vkc_pin.benchmarks.harness.tables import foot, markdown
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
 PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
+LINES = ("Measured on", "Mean ± standard deviation; median. Trials in which all methods succeed")
 TABLE = re.compile(r"(?:^\|.*\n)+", re.MULTILINE)
 REPORTS = {  # name of a record → whose report it is
     **{name: name for name in ("baselines", "household", "initialization", "chores", "scale", "gap")},
@@ -129,9 +130,13 @@ def renewed(name: str, section: str) -> str:
             raise ValueError(f"no table of {name} is left with the columns {columns(match[0])}")
         return left.pop(0)
 
-    measured = re.search(r"^Measured on.*$", report, re.MULTILINE)
     section = TABLE.sub(table_of, section)
-    return re.sub(r"^Measured on.*$", lambda _: measured[0] if measured else "", section, flags=re.MULTILINE)
+    for beginning in LINES:
+        line = re.compile(rf"^{beginning}.*$", re.MULTILINE)
+        own = line.search(report)
+        if own is not None:
+            section = line.sub(own[0].replace("\\", r"\\"), section)
+    return section
 
 
 def filled(text: str) -> str:

@@ -269,3 +269,15 @@ def test_before_a_careful_grasp_nothing_is_hit() -> None:
         hit = p.contacts.evaluate(near, np.full(len(near), before), reach=0.1).shortfall(len(near))
         shares.append(float(np.mean((hit <= 1e-9) & reached)))
     assert shares[0] < shares[1] == 1.0
+
+
+def test_a_task_that_ends_with_a_grasp_of_which_the_hand_chooses_where() -> None:
+    """Nothing comes after it that could be searched first: backwards is forwards."""
+    scene = vkc.load_scene("init_1").sample_start(np.random.default_rng(0))
+    problem = program_of(scene, [vkc.Grasp("stick")])
+    assert {grasp for _, grasp, _ in problem.choices} == {problem.segments}
+    one, other = (Beam(Knots(problem, np.random.default_rng(0))).search(thorough=True, backwards=back) for back in (False, True))
+    assert one is not None
+    assert other is not None
+    assert one.at == other.at == [0, problem.segments]
+    np.testing.assert_array_equal(one.paths, other.paths)

@@ -84,7 +84,8 @@ class Beam:
                 may be wide at its end only, and hardly anything that is free at its beginning leads there.
         """
         # A hand that chooses where to grasp, and then clamps, chooses before it moves anything.
-        backwards = backwards and not any(self._closed_at(grasp + 1) for _, grasp, _ in self.problem.choices)
+        chosen = [grasp + 1 for _, grasp, _ in self.problem.choices if grasp < self.problem.segments]
+        backwards = backwards and not any(map(self._closed_at, chosen))
         mode = _Mode(thorough, backwards)
         problem = self.problem
         found = Found(problem.start[None, None, :], np.zeros(1), np.zeros(1), [0])

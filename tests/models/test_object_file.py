@@ -121,7 +121,7 @@ def test_wrong_values_in_a_description(old: str, new: str, line: int, field: str
         (URDF.replace('type="continuous"', 'type="floating"'), "knob: this joint type is not supported"),
         (URDF.replace('<axis xyz="1 0 0"/>', '<axis xyz="1 0 0"/><mimic joint="hinge"/>'), "knob: joints that mimic"),
         (URDF.replace('velocity="1"', 'velocity="0"'), "hinge.limit.velocity"),
-        (URDF.replace('child link="lever"', 'child link="lver"'), "not a valid URDF"),
+        (URDF.replace('child link="lever"', 'child link="lver"'), "knob: child: there is no link 'lver'; did you mean 'lever'"),
         (
             URDF.replace('<link name="panel"/>', f'<link name="panel"><visual><geometry>{SHAPES[0]}</geometry></visual></link>'),
             "nothing in this URDF can collide",
@@ -138,13 +138,13 @@ def test_wrong_urdfs_are_refused(urdf: str, message: str) -> None:
 @pytest.mark.parametrize(
     ("shape", "problem"),
     [
-        ('<box size="nan 5.8 2"/>', "3 numbers"),
-        ('<box size="1 2"/>', "3 numbers"),
-        ('<box size="1,5 2 3"/>', "3 numbers"),
-        ("<box/>", "3 numbers"),
+        ('<box size="nan 5.8 2"/>', "3 finite numbers"),
+        ('<box size="1 2"/>', "3 finite numbers"),
+        ('<box size="1,5 2 3"/>', "3 finite numbers"),
+        ("<box/>", "3 finite numbers"),
         ('<box size="1 -2 3"/>', "sizes above 0"),
         ('<sphere radius="0"/>', "sizes above 0"),
-        ('<cylinder radius="0.1"/>', "1 numbers"),
+        ('<cylinder radius="0.1"/>', "1 finite number"),
         ('<cone radius="0.1" length="1"/>', "box, sphere, cylinder, capsule or mesh"),
         ('<mesh filename="none.obj"/>', "none.obj"),
         ("", "<geometry> with a shape"),

@@ -14,6 +14,7 @@ import pydantic
 import yaml
 
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.files.xml import parse_xml
 
 __all__ = ["Document", "check", "field_name", "read_text", "read_xml", "read_yaml"]
 
@@ -104,10 +105,7 @@ def read_xml(file: str | Path, kind: str) -> tuple[str, ElementTree.Element]:
         InputError: It cannot be read, is no XML, or is about something else than a robot.
     """
     text = read_text(file, kind)
-    try:
-        root = ElementTree.fromstring(text.encode())
-    except ElementTree.ParseError as error:
-        raise InputError(f"not valid XML: {error}", file=file, line=error.position[0]) from error
+    root = parse_xml(text, Path(file))
     if root.tag != "robot":
         raise InputError(f"this is no {kind}", file=file, expected="an element <robot>", got=f"<{root.tag}>")
     return text, root

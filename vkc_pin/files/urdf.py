@@ -17,7 +17,9 @@ from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
 from vkc_pin.files import resources
 from vkc_pin.files.documents import read_xml
+from vkc_pin.files.kinematic_tree import check_tree, numbers_of
 from vkc_pin.files.meshes import load_convex, load_mesh, to_bvh
+from vkc_pin.files.xml import line_of
 
 if TYPE_CHECKING:
     import trimesh
@@ -145,7 +147,13 @@ class UrdfFile:
         geometry = element.find("geometry")
         shape = next(iter(geometry), None) if geometry is not None else None
         if shape is None:
-            raise InputError("an element without geometry", file=self.path, field=name, expected="<geometry> with a shape")
+            raise InputError(
+                "an element without geometry",
+                file=self.path,
+                line=line_of(element),
+                field=name,
+                expected="<geometry> with a shape",
+            )
         origin = element.find("origin")
         placement = pin.SE3.Identity()
         if origin is not None:
@@ -164,9 +172,13 @@ class UrdfFile:
             size = self._numbers(shape, "radius", 1, None, name) + self._numbers(shape, "length", 1, None, name)
         else:
             known = "box, sphere, cylinder, capsule or mesh"
-            raise InputError("this shape is not supported", file=self.path, field=name, expected=known, got=shape.tag)
+            raise InputError(
+                "this shape is not supported", file=self.path, line=line_of(element), field=name, expected=known, got=shape.tag
+            )
         if min(size) <= 0.0:
-            raise InputError("a shape without volume", file=self.path, field=name, expected="sizes above 0", got=size)
+            raise InputError(
+                "a shape without volume", file=self.path, line=line_of(element), field=name, expected="sizes above 0", got=size
+            )
         return UrdfShape(link, name, placement, shape.tag, size, colour=colour)
 
     def _colour(self, material: ElementTree.Element) -> Colour | None:
@@ -177,15 +189,7 @@ class UrdfFile:
         return (red, green, blue, opacity)
 
     def _numbers(self, element: ElementTree.Element, key: str, count: int, default: str | None, where: str) -> tuple[float, ...]:
-        text = element.get(key, default)
-        try:
-            values = tuple(float(part) for part in (text or "").split())
-        except ValueError:
-            values = ()
-        if len(values) != count or not np.isfinite(values).all():
-            field = f"{where}: {element.tag} {key}"
-            raise InputError("wrong numbers", file=self.path, field=field, expected=f"{count} numbers", got=text)
-        return values
+        return numbers_of(self.path, element, key, count, default=default, where=where)
 
 
 def read_urdf(path: str | Path, packages: Mapping[str, Path] | None = None) -> UrdfFile:
@@ -196,10 +200,12 @@ def read_urdf(path: str | Path, packages: Mapping[str, Path] | None = None) -> U
         packages: Package name → folder. Other packages are looked for in the folders around the file.
 
     Raises:
-        InputError: The file does not exist, is no XML, or no URDF.
+        InputError: The file does not exist, is no XML, no URDF, or its links and joints are no tree; see `check_tree`.
+        UnknownNameError: A joint names a link that does not exist.
     """
     file = Path(path)
     text, root = read_xml(file, "URDF")
+    check_tree(file, root)
     return UrdfFile(file.resolve(), text, root, dict(packages or {}))
 
 

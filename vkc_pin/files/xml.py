@@ -1,0 +1,54 @@
+"""XML with the line of every element."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+from typing import Any
+from xml.parsers import expat
+
+from vkc_pin.errors import InputError
+
+__all__ = ["line_of", "parse_xml"]
+
+
+class _Element(ElementTree.Element):
+    """An element that knows where it begins."""
+
+    line: int | None = None
+
+
+def line_of(element: ElementTree.Element) -> int | None:
+    """Return the line in which an element begins, counted from 1; None if that is not known."""
+    return getattr(element, "line", None)
+
+
+def parse_xml(text: str, file: Path) -> ElementTree.Element:
+    """Return the root of an XML document.
+
+    Args:
+        text: What it says.
+        file: Where it stands, for messages.
+
+    Raises:
+        InputError: It is no XML, or defines entities: with a few lines these make texts without end.
+    """
+    builder = ElementTree.TreeBuilder(element_factory=_Element)
+    parser = expat.ParserCreate()
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        element: Any = builder.start(tag, attributes)
+        element.line = parser.CurrentLineNumber
+
+    def entity(name: str, *_: object) -> None:
+        raise InputError(
+            "entities are not supported", file=file, line=parser.CurrentLineNumber, field=name, expected="plain text"
+        )
+
+    parser.StartElementHandler, parser.EndElementHandler = start, builder.end
+    parser.CharacterDataHandler, parser.EntityDeclHandler = builder.data, entity
+    try:
+        parser.Parse(text.encode(), True)
+        return builder.close()
+    except expat.ExpatError as error:
+        raise InputError(f"not valid XML: {error}", file=file, line=error.lineno) from error

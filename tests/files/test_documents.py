@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import itertools
+import os
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.files import documents
 from vkc_pin.files.documents import Document, check, field_name, read_text, read_xml, read_yaml
 from vkc_pin.files.fields import Name, Number, Positive, Schema, Vector3
 
@@ -149,3 +152,32 @@ def test_xml_is_about_a_robot(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not valid XML") as caught:
         read_xml(written(tmp_path, "<robot>\n<a>\n</robot>"), "SRDF")
     assert caught.value.line == 3
+
+
+def test_pipes_and_large_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    os.mkfifo(tmp_path / "pipe.yaml")
+    with pytest.raises(InputError, match=r"cannot read the YAML .*got a pipe or a device"):
+        read_yaml(tmp_path / "pipe.yaml")  # nobody ever writes into it
+    file = written(tmp_path, "a: 1")
+    monkeypatch.setattr(documents, "LARGEST_FILE", 3)
+    with pytest.raises(InputError, match=r"the YAML is too large .*at most 3 bytes, got 4"):
+        read_yaml(file)
+
+
+def test_aliases_of_aliases(tmp_path: Path) -> None:
+    """Nine lines that mean a billion items."""
+    names = "abcdefghi"
+    lines = [f"a: &a [{', '.join('x' * 9)}]"]
+    lines += [f"{name}: &{name} [{', '.join([f'*{before}'] * 9)}]" for before, name in itertools.pairwise(names)]
+    with pytest.raises(InputError, match="too many fields") as caught:
+        read_yaml(written(tmp_path, "\n".join(lines)))
+    assert caught.value.line in range(1, 10)
+
+
+@pytest.mark.parametrize(("open_", "close"), [("[", "]"), ("{a: ", "}")])
+def test_lists_inside_each_other(tmp_path: Path, open_: str, close: str) -> None:
+    fine = read_yaml(written(tmp_path, open_ * documents.DEEPEST + "1" + close * documents.DEEPEST))
+    assert len(max(fine.lines, key=len)) == documents.DEEPEST
+    for count in (documents.DEEPEST + 1, 1_000_000):
+        with pytest.raises(InputError, match=r"too many lists|not valid YAML"):
+            read_yaml(written(tmp_path, open_ * count + "1" + close * count))

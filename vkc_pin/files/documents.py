@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +17,13 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.files.xml import parse_xml
 
 __all__ = ["Document", "check", "field_name", "read_text", "read_xml", "read_yaml"]
+
+LARGEST_FILE = 50_000_000
+"""Largest description file [bytes]."""
+MOST_FIELDS = 300_000
+"""Most fields and items that a YAML file may have, with those of its aliases."""
+DEEPEST = 50
+"""Most lists and fields inside each other."""
 
 Key = str | int
 T = TypeVar("T", bound=pydantic.BaseModel)
@@ -89,10 +96,16 @@ def read_text(file: str | Path, kind: str) -> str:
     """Return what a text file of a `kind` ("YAML", "URDF", "SRDF") says.
 
     Raises:
-        InputError: It does not exist, cannot be read, or is not encoded in UTF-8.
+        InputError: It does not exist, is no file (but a folder, a pipe, a device), is larger than `LARGEST_FILE`, cannot be read,
+            or is not encoded in UTF-8.
     """
+    path = Path(file)
     try:
-        return Path(file).read_text(encoding="utf-8")
+        if (size := path.stat().st_size) > LARGEST_FILE:
+            raise InputError(f"the {kind} is too large", file=file, expected=f"at most {LARGEST_FILE:g} bytes", got=size)
+        if not path.is_file() and not path.is_dir():  # reading a pipe would wait for ever
+            raise InputError(f"cannot read the {kind}", file=file, expected=f"an existing {kind} file", got="a pipe or a device")
+        return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"cannot read the {kind}", file=file, expected=f"an existing {kind} file", got=reason) from error
@@ -115,13 +128,15 @@ def read_yaml(file: str | Path) -> Document:
     """Read a YAML file, with the line of every field.
 
     Raises:
-        InputError: The file does not exist, is no valid YAML, or holds a key twice.
+        InputError: The file does not exist, is no valid YAML, holds a key twice, or has more fields, or more inside each other,
+            than a scene can mean: see `MOST_FIELDS` and `DEEPEST`.
     """
     path = Path(file)
     text = read_text(path, "YAML")
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)(text)  # the first is ten times as fast, and not everywhere
-    lines: dict[tuple[Key, ...], int] = {}
+    loader_type = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the first is ten times as fast, and not everywhere
+    loader, lines = loader_type(text), dict[tuple[Key, ...], int]()
     try:
+        _check_depth(yaml.parse(text, Loader=loader_type), path)
         node = loader.get_single_node()
         if node is not None:
             _locate(node, (), lines, path, set())
@@ -155,9 +170,24 @@ def check(document: Document, schema: type[T]) -> T:
     raise _translate(document, path, first)
 
 
+def _check_depth(events: Iterable[yaml.Event], file: Path) -> None:
+    """Raise InputError if lists and fields are too deep inside each other: what builds them goes down as deep."""
+    depth = 0
+    for event in events:
+        if isinstance(event, yaml.CollectionStartEvent):
+            depth += 1
+            if depth > DEEPEST:
+                line = event.start_mark.line + 1 if event.start_mark else None
+                raise InputError("too many lists inside each other", file=file, line=line, expected=f"at most {DEEPEST}")
+        elif isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+
+
 def _locate(node: yaml.Node, path: tuple[Key, ...], lines: dict[tuple[Key, ...], int], file: Path, above: set[int]) -> None:
     """Write the lines of `node` and of everything below it into `lines`; `above` holds the nodes it stands in."""
     lines.setdefault(path, node.start_mark.line + 1)
+    if len(lines) > MOST_FIELDS:  # a few lines of aliases of aliases make any number
+        raise InputError("too many fields", file=file, line=node.start_mark.line + 1, expected=f"at most {MOST_FIELDS}")
     if id(node) in above:
         raise InputError("an alias contains itself", file=file, line=node.start_mark.line + 1, field=field_name(path))
     above = above | {id(node)}

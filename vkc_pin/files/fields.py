@@ -10,6 +10,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from pydantic_core import PydanticCustomError
 
 __all__ = [
+    "LARGEST",
     "JointSchema",
     "Name",
     "NotNegative",
@@ -22,6 +23,10 @@ __all__ = [
     "require",
     "text_for",
 ]
+
+
+LARGEST = 1e4
+"""Largest length [m] or angle [rad] that a file may name."""
 
 
 def fail(problem: str, expected: str) -> PydanticCustomError:
@@ -64,7 +69,8 @@ def count(number: int) -> BeforeValidator:
     return BeforeValidator(counted)
 
 
-Number = Annotated[float, BeforeValidator(_number), Field(allow_inf_nan=False)]
+_bounded = require(lambda value: abs(value) <= LARGEST, "out of range", f"a number from {-LARGEST:g} to {LARGEST:g}")
+Number = Annotated[float, BeforeValidator(_number), Field(allow_inf_nan=False), _bounded]
 Positive = Annotated[Number, Field(gt=0.0)]
 NotNegative = Annotated[Number, Field(ge=0.0)]
 Vector3 = Annotated[tuple[Number, Number, Number], count(3)]

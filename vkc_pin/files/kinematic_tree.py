@@ -12,12 +12,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.files.fields import LARGEST
 from vkc_pin.files.xml import line_of
 
-__all__ = ["LARGEST", "check_tree", "numbers_of"]
+__all__ = ["check_tree", "numbers_of"]
 
-LARGEST = 1e4
-"""Largest length [m], angle [rad] or limit that a URDF may name."""
 _KINDS = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 _LIMITED = ("revolute", "prismatic")
 _WITHOUT_AXIS = ("fixed", "floating")

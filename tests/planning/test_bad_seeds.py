@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.drawers import SHORT, drawer_scene
+from helpers.drawers import drawer_scene
 from helpers.drives import hall
 from helpers.small_problems import door_scene
 
@@ -25,9 +25,10 @@ def test_a_handle_is_reached_by_a_robot_that_stands_still(seed: int) -> None:
     assert plan.initialization.startswith("stationary")
 
 
-@pytest.mark.long
-def test_a_drawer_is_pulled_by_a_robot_that_stands_still() -> None:
-    plan = vkc.plan(drawer_scene(), [vkc.Actuate("drawer", {"slide": 0.3})], initialization="stationary", options=SHORT)
+@pytest.mark.parametrize("seed", range(3))
+def test_a_drawer_is_pulled_by_a_robot_that_stands_still(seed: int) -> None:
+    """In as many waypoints as usual: where few have to do, ways between them are long and lead through things."""
+    plan = vkc.plan(drawer_scene(), [vkc.Actuate("drawer", {"slide": 0.3})], initialization="stationary", seed=seed)
     assert plan.success, plan.report()
 
 

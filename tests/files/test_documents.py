@@ -181,3 +181,7 @@ def test_lists_inside_each_other(tmp_path: Path, open_: str, close: str) -> None
     for count in (documents.DEEPEST + 1, 1_000_000):
         with pytest.raises(InputError, match=r"too many lists|not valid YAML"):
             read_yaml(written(tmp_path, open_ * count + "1" + close * count))
+
+
+def test_many_lists_after_each_other_are_not_deep(tmp_path: Path) -> None:
+    assert len(read_yaml(written(tmp_path, "[" + "[1], " * (10 * documents.DEEPEST) + "]")).data) == 10 * documents.DEEPEST

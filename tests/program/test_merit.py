@@ -123,7 +123,7 @@ def test_a_step_is_refused_that_makes_more_of_any_kind_missing(kind: str) -> Non
         found = Infeasibility(after, loop.found.away, loop.found.excess, loop.found.rate_excess)
         promise = loop.merit.price(loop.found, clearance=True) - 2.0  # as much as this kind is worth
         trial = Trial(**{**fields, "objective": 0.0, "found": found, "promise": promise})  # type: ignore[arg-type]
-        assert loop.judge(trial) == expected
+        assert loop.judge(trial, *loop.prices(trial)) == expected
 
 
 def test_weights_grow_where_something_is_missing() -> None:

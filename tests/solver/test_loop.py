@@ -159,7 +159,7 @@ class Scripted:
         step: float | None = None,
         other: float = 0.0,
     ) -> None:
-        self.step, self.other, self.crossed = step, other, list[Passage]()
+        self.step, self.other, self.crossed, self.passages = step, other, list[Passage](), list[Passage]()
         self.problem, self.z, self.is_done = SimpleNamespace(drift=lambda _: drift), np.zeros((40, 1)), done
         self.deadline, self.solution = np.inf, Solution(np.zeros((40, 1)), np.full(40, 0.25))
         self.merit, self.found = Merit(200.0), missing(0.5, other)
@@ -181,11 +181,11 @@ class Scripted:
             contacts=contacts,  # type: ignore[arg-type]
         )
 
-    def judge(self, _: trust_region.Trial) -> bool:
+    def judge(self, _: trust_region.Trial, *prices: np.ndarray) -> bool:
         return self.taken
 
-    def carried_through(self, _: trust_region.Trial) -> list[Passage]:
-        return self.crossed
+    def prices(self, trial: trust_region.Trial) -> tuple[np.ndarray, np.ndarray]:
+        return solver._Loop.prices(self, dataclasses.replace(trial, passages=self.crossed))  # type: ignore[arg-type]
 
     def accept(self, trial: trust_region.Trial) -> None:
         self.objective, self.found = trial.objective, trial.found
@@ -335,8 +335,8 @@ def test_nothing_is_carried_through_anything(monkeypatch: pytest.MonkeyPatch) ->
     seen: list[tuple[bool, bool]] = []
     judge = solver._Loop.judge
 
-    def watch(loop, trial):  # type: ignore[no-untyped-def]
-        accepted = judge(loop, trial)
+    def watch(loop, trial, *prices):  # type: ignore[no-untyped-def]
+        accepted = judge(loop, trial, *prices)
         seen.append((bool(trial.passages), accepted))
         return accepted
 
@@ -368,9 +368,9 @@ def test_the_merit_falls_from_one_accepted_step_to_the_next(monkeypatch: pytest.
     merits: list[tuple[float, float, bool]] = []
     judge = solver._Loop.judge
 
-    def watch(loop, trial):  # type: ignore[no-untyped-def]
+    def watch(loop, trial, *prices):  # type: ignore[no-untyped-def]
         before, after = (loop.merit.price(found, clearance=True).sum() for found in (loop.found, trial.found))
-        accepted = judge(loop, trial)
+        accepted = judge(loop, trial, *prices)
         merits.append((loop.objective + before, trial.objective + after, accepted))
         return accepted
 

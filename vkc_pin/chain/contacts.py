@@ -132,7 +132,11 @@ class ContactModel:
 
     def phase_of(self, waypoint: int) -> int:
         """Return the phase whose geometry holds at `waypoint`: at a boundary the earlier, before the grasp."""
-        return max(0, int(np.searchsorted(self.first_waypoint, waypoint)) - 1)
+        return int(self.phases_of(np.array([waypoint]))[0])
+
+    def phases_of(self, waypoints: Ints) -> Ints:
+        """Return the phase of each waypoint, shape (W,), see `phase_of`."""
+        return np.maximum(np.searchsorted(self.first_waypoint, waypoints) - 1, 0)
 
     def inside(self, phase: int) -> int:
         """Return a waypoint at which a phase's geometry holds."""
@@ -151,7 +155,7 @@ class ContactModel:
             standing: Whether what stands in the world counts, too; otherwise only pairs of which both move.
         """
         rotations, translations = self.placements(z)
-        phase_of = np.maximum(np.searchsorted(self.first_waypoint, waypoints) - 1, 0)
+        phase_of = self.phases_of(waypoints)
         parts: list[tuple[NDArray[Any], ...]] = []
         for number in set(phase_of.tolist()):
             part, inside = self.phases[number], np.flatnonzero(phase_of == number)
@@ -205,7 +209,7 @@ class ContactModel:
             waypoints: For each, the waypoint whose phase it belongs to, shape (B,).
             pairs: Geometries of these phases.
         """
-        found, phase_of = np.empty((len(z), 3)), np.array([self.phase_of(waypoint) for waypoint in waypoints], int)
+        found, phase_of = np.empty((len(z), 3)), self.phases_of(waypoints)
         for number in set(phase_of.tolist()):
             inside = np.flatnonzero(phase_of == number)
             where = self._placed.at(self.chain.coordinates.q(z[inside]))

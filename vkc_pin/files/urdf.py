@@ -219,12 +219,14 @@ def load_urdf(path: str | Path) -> tuple[pin.Model, pin.GeometryModel, pin.Geome
             is not supported, or a link is drawn while nothing in the whole file can collide.
     """
     file = read_urdf(path)
-    for joint in file.root.iter("joint"):  # what Pinocchio would accept with another meaning, or refuse without saying why
-        name, kind = joint.get("name", "?"), joint.get("type")
-        if kind is not None and kind not in _JOINTS:
-            raise InputError("this joint type is not supported", file=path, field=name, expected=", ".join(_JOINTS), got=kind)
+    for joint in file.root.findall("joint"):  # what Pinocchio would accept with another meaning, or refuse without saying why
+        name, kind, line = joint.get("name"), joint.get("type"), line_of(joint)
+        if kind not in _JOINTS:
+            problem, expected = "this joint type is not supported", ", ".join(_JOINTS)
+            raise InputError(problem, file=path, line=line, field=name, expected=expected, got=kind)
         if joint.find("mimic") is not None:  # Pinocchio's parser would let it move on its own
-            raise InputError("joints that mimic others are not supported", file=path, field=name, expected="no <mimic>")
+            problem = "joints that mimic others are not supported"
+            raise InputError(problem, file=path, line=line, field=name, expected="no <mimic>")
     try:
         model = pin.buildModelFromXML(file.text)
     except (ValueError, RuntimeError) as error:

@@ -82,17 +82,21 @@ class _Loop:
             satisfied=satisfied,
         )
 
-    def carried_through(self, trial: Trial) -> list[Passage]:
-        """Return what a round leads through each other that was not before; of what is no motion yet that says nothing."""
-        return new(trial.passages, self.passages) if self.found.amounts["poses"].max() < NEARLY else []
+    def prices(self, trial: Trial) -> tuple[Floats, Floats]:
+        """Return what all that is missing costs at every waypoint, before a round and where it led, shape (N,) each.
 
-    def judge(self, trial: Trial) -> bool:
-        """Return whether enough of the promised decrease of the merit came true, and nothing was carried through anything."""
-        if self.carried_through(trial):
-            return False
-        before, after = (float(self.merit.price(found, clearance=True).sum()) for found in (self.found, trial.found))
-        merit, gain = self.objective + before, self.objective - trial.objective
-        return judge(gain + before - float(trial.promise.sum()), gain + before - after, merit)
+        It is infinite where a pair goes through each other that did not before. Of what is no motion yet that says nothing.
+        """
+        before, after = (self.merit.price(found, clearance=True) for found in (self.found, trial.found))
+        if self.found.amounts["poses"].max() < NEARLY:
+            for passage in new(trial.passages, self.passages):
+                after[max(passage.first - 1, 0) : passage.last + 1] = np.inf
+        return before, after
+
+    def judge(self, trial: Trial, before: Floats, after: Floats) -> bool:
+        """Return whether enough of the promised decrease came true to accept a step; `before` and `after`: see `prices`."""
+        missing, gain = float(before.sum()), self.objective - trial.objective
+        return judge(gain + missing - float(trial.promise.sum()), gain + missing - float(after.sum()), self.objective + missing)
 
     def accept(self, trial: Trial) -> None:
         """Go on from `trial`."""
@@ -178,7 +182,8 @@ def _iterate(
             solution.status = solution.status if solution.converged else "time limit"
             break
         trial = loop.try_step(region.radius)
-        accepted = loop.judge(trial)
+        before, after = loop.prices(trial)
+        accepted = loop.judge(trial, before, after)
         solution.rounds += 1
         row = Iteration(
             round=solution.rounds,
@@ -196,9 +201,6 @@ def _iterate(
         solution.history.append(row)
         if callback is not None:
             callback(row)
-        before, after = (loop.merit.price(found, clearance=True) for found in (loop.found, trial.found))
-        for passage in loop.carried_through(trial):  # no merit is worth that
-            after[max(passage.first - 1, 0) : passage.last + 1] = np.inf
         used = region.radius
         if accepted:
             loop.accept(trial)

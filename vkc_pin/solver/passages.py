@@ -41,7 +41,7 @@ def passages(contacts: ContactModel, states: Floats, segments: Ints, found: Cont
     ends = np.flatnonzero(apart)
     begins = np.append(0, ends[:-1] + 1)
     before, after, pairs = rows[begins] - 1, rows[ends] + 1, pairs[begins]
-    phases = np.searchsorted(contacts.first_waypoint, segments + 1)
+    phases = contacts.phases_of(segments + 1)
     inside = np.flatnonzero((before >= 0) & (after < len(states)))
     inside = inside[phases[before[inside]] == phases[after[inside]]]  # shapes are others in another phase
     before, after, pairs = before[inside], after[inside], pairs[inside]

@@ -17,6 +17,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.models.shapes import link_name
 from vkc_pin.options import Options
 from vkc_pin.program.problem import TrajectoryProblem
+from vkc_pin.scene.contact import EASED_TIME
 from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.scene import Scene
@@ -39,11 +40,13 @@ def waypoint_in(problem: TrajectoryProblem, phase: str) -> int:
     return int(problem.ends[number])
 
 
-def pairs(problem: TrajectoryProblem, phase: int) -> dict[tuple[str, str], list[float]]:
-    """Return (link, link or obstacle) → the margins of the pairs between them."""
+def pairs(problem: TrajectoryProblem, phase: int, *, waypoint: int | None = None) -> dict[tuple[str, str], list[float]]:
+    """Return (link, link or obstacle) → the margins of the pairs between them, at a waypoint or where nothing is eased."""
     part = problem.contacts.phases[phase]
+    every = np.arange(len(part.pairs))
+    margins = part.margins if waypoint is None else part.margins_at(every, np.full(len(every), waypoint))
     found = collections.defaultdict(list)
-    for (first, second), margin in zip(part.pairs, part.margins, strict=True):
+    for (first, second), margin in zip(part.pairs, margins, strict=True):
         found[part.labels[first], part.labels[second]].append(float(margin))
     return dict(found)
 
@@ -141,9 +144,11 @@ def test_the_hand_comes_closer_to_what_it_will_grasp_or_has_let_go_of() -> None:
     problem = door_problem()
     hand = set(problem.scene.robot.touch_links)
     assert CLOSE < MARGIN
-    for phase in (0, 3):
-        for (first, second), margins in pairs(problem, phase).items():
-            assert set(margins) == {CLOSE if first in hand and second == "door.lever" else MARGIN}
+    near, begins = problem.options.steps(EASED_TIME), problem.contacts.first_waypoint
+    for phase, at, away in ((0, begins[1], -1), (3, begins[3], 1)):
+        for steps, close in ((0, CLOSE), (near, CLOSE), (near + 1, MARGIN)):
+            for (first, second), margins in pairs(problem, phase, waypoint=int(at + away * steps)).items():
+                assert set(margins) == {close if first in hand and second == "door.lever" else MARGIN}
 
 
 def test_a_held_object_is_not_paired_with_itself_but_with_the_room() -> None:
@@ -208,9 +213,9 @@ def test_two_objects_one_after_the_other() -> None:
             assert (set(indices) <= paired) == (hold.object not in standing)
             assert set(indices).isdisjoint(paired) == (hold.object in standing)
     hand = problem.scene.robot.touch_links
-    second = pairs(problem, 1)
-    assert set(second[hand[0], "drawer.tray"]) == {CLOSE}
-    assert set(second[hand[0], "door.lever"]) == {CLOSE}  # where it comes from
+    first, last = (pairs(problem, 1, waypoint=int(at)) for at in problem.contacts.first_waypoint[1:3])
+    assert set(last[hand[0], "drawer.tray"]) == {CLOSE}
+    assert set(first[hand[0], "door.lever"]) == {CLOSE}  # where it comes from
 
 
 def test_a_scene_in_which_nothing_can_collide_is_refused() -> None:
@@ -464,5 +469,5 @@ def test_more_contacts_than_slots_keep_the_worst() -> None:
 )
 def test_margins_follow_the_options(steps: list[Step]) -> None:
     problem = program_of(door_scene(), steps, options=Options(dist_safe=0.05, grasp_clearance=0.01, reach_waypoints=2))
-    margins = set(problem.contacts.phases[0].margins.tolist())
+    margins = {margin for found in pairs(problem, 0, waypoint=2).values() for margin in found}
     assert margins == ({0.05, 0.01} if isinstance(steps[0], Grasp) else {0.05})

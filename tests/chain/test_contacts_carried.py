@@ -41,11 +41,13 @@ def fetching() -> TrajectoryProblem:
     return program_of(scene(), [*steps, Place("stick", (0.8, 0.0, 0.6)), GoTo(1.0, 0.0)], options=SHORT)
 
 
-def margins(problem: TrajectoryProblem, phase: int) -> dict[tuple[str, str], set[float]]:
-    """Return (link, link or obstacle) → the margins of the pairs between them."""
-    part = problem.contacts.phases[phase]
+def margins(problem: TrajectoryProblem, phase: int, *, at: str = "") -> dict[tuple[str, str], set[float]]:
+    """Return (link, link or obstacle) → the margins of pairs between them, at "first" or "last" or where nothing is eased."""
+    part, every = problem.contacts.phases[phase], np.arange(len(problem.contacts.phases[phase].pairs))
     found: dict[tuple[str, str], set[float]] = {}
-    for (first, second), margin in zip(part.pairs, part.margins, strict=True):
+    waypoint = problem.contacts.first_waypoint[phase + (at == "last")]
+    asked = part.margins_at(every, np.full(len(every), waypoint)) if at else part.margins
+    for (first, second), margin in zip(part.pairs, asked, strict=True):
         found.setdefault((part.labels[first], part.labels[second]), set()).add(float(margin))
     return found
 
@@ -72,13 +74,13 @@ def test_what_is_carried_hits_everything_but_itself_and_the_hand() -> None:
 
 def test_a_hand_comes_closer_to_what_it_will_take_or_has_let_go_of() -> None:
     hand = set(scene().robot.touch_links)
-    for phase in (0, 2):
-        for (first, second), found in margins(placing(), phase).items():
+    for phase, at in ((0, "last"), (2, "first")):
+        for (first, second), found in margins(placing(), phase, at=at).items():
             assert found == {CLOSE if first in hand and second == "stick.stick" else MARGIN}
 
 
 def test_a_tip_touches_what_it_will_hold_and_holds_it() -> None:
-    before, held = margins(fetching(), 1), margins(fetching(), 2)
+    before, held = margins(fetching(), 1, at="last"), margins(fetching(), 2)
     assert before["stick.tip", "ball.ball"] == {0.0}
     assert before["stick.stick", "ball.ball"] == {MARGIN}
     assert before[scene().robot.touch_links[0], "ball.ball"] == {MARGIN}  # the hand is not what takes it
@@ -86,7 +88,7 @@ def test_a_tip_touches_what_it_will_hold_and_holds_it() -> None:
     assert held["stick.stick", "ball.ball"] == {MARGIN}
     robots = set(scene().robot.links)
     assert partners(fetching(), 2, "ball.ball") == robots | {"stick.stick", "table", "stand", FLOOR}
-    after = margins(fetching(), 3)
+    after = margins(fetching(), 3, at="first")
     assert after["stick.tip", "ball.ball"] == {0.0}
 
 

@@ -148,7 +148,7 @@ def test_rows_are_linear_in_the_placement() -> None:
 
 # --- points, and what stands upright ----------------------------------------------------------------------------------
 
-KINDS = ("pose", "point", "upright")
+KINDS = ("pose", "point", "upright", "level")
 RESIDUALS = {kind: ca.Function("residual", [_R, _p, _target], [pose_residual(kind, _R, _p, _target)]) for kind in KINDS}
 ALL_ROWS = {kind: ca.Function("rows", [_R, _p, _target], [pose_rows(kind, _R, _p, _target)]) for kind in KINDS}
 SLOPES = {
@@ -178,11 +178,11 @@ def tilted(target: pin.SE3, heading: float, tilt: float, about: float) -> pin.SE
     return pin.SE3(turn @ target.rotation, np.array(target.translation))
 
 
-@pytest.mark.parametrize("kind", ["point", "upright"])
+@pytest.mark.parametrize("kind", ["point", "upright", "level"])
 def test_shapes(kind: str) -> None:
     placement = pin.SE3.Random()
-    assert value(RESIDUALS[kind], placement, placement).shape == ({"point": 3, "upright": 5}[kind],)
-    assert value(ALL_ROWS[kind], placement, placement).shape == ({"point": 3, "upright": 6}[kind],)
+    assert value(RESIDUALS[kind], placement, placement).shape == ({"point": 3, "upright": 5, "level": 2}[kind],)
+    assert value(ALL_ROWS[kind], placement, placement).shape == ({"point": 3, "upright": 6, "level": 3}[kind],)
     assert set(ROW_BOUNDS) == set(KINDS)
 
 
@@ -216,6 +216,8 @@ def test_upright_is_the_distance_and_the_chord_of_the_tilt(tilt: float) -> None:
         np.testing.assert_allclose(rows[:3], shift, rtol=0.0, atol=1e-12)
         assert np.linalg.norm(rows[3:5]) == pytest.approx(np.sin(tilt), abs=1e-8)
         assert rows[5] == pytest.approx(np.cos(tilt), abs=1e-8)
+        np.testing.assert_array_equal(value(RESIDUALS["level"], placement, target), found[3:])
+        np.testing.assert_array_equal(value(ALL_ROWS["level"], placement, target), rows[3:])
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -226,8 +228,9 @@ def test_residual_and_rows_vanish_if_and_only_if_the_goal_holds(kind: str, off: 
         target = pin.SE3.Random()
         if kind == "pose":
             placement = turned(target, off, random_axis(rng))
-        elif kind == "upright":
+        elif kind in ("upright", "level"):
             placement = tilted(target, rng.uniform(-np.pi, np.pi), off, rng.uniform(-np.pi, np.pi))
+            placement.translation += (kind == "level") * rng.normal(size=3)
         else:
             placement = pin.SE3(pin.SE3.Random().rotation, target.translation + off * random_axis(rng))
         size = np.linalg.norm(value(RESIDUALS[kind], placement, target))
@@ -288,7 +291,7 @@ def test_rows_of_every_kind_are_linear_in_the_placement(kind: str) -> None:
 
 def test_what_is_bound_to_a_value_and_what_only_from_below() -> None:
     for kind, (lower, upper) in ROW_BOUNDS.items():
-        fixed = {"pose": 6, "point": 3, "upright": 5}[kind]
+        fixed = {"pose": 6, "point": 3, "upright": 5, "level": 2}[kind]
         np.testing.assert_array_equal(lower[:fixed], np.zeros(fixed))
         np.testing.assert_array_equal(upper[:fixed], np.zeros(fixed))
         assert (upper[fixed:] == np.inf).all()
@@ -328,7 +331,7 @@ def away_of(kind: str, target: pin.SE3, *placements: pin.SE3) -> np.ndarray:
 
 def some_placement(kind: str, target: pin.SE3, angle: float, rng: np.random.Generator) -> pin.SE3:
     """Return a placement that is off by an angle and by an offset; of a point, by any turn."""
-    if kind == "upright":
+    if kind in ("upright", "level"):
         placement = tilted(target, rng.uniform(-np.pi, np.pi), angle, rng.uniform(-np.pi, np.pi))
     else:
         placement = turned(target, angle, random_axis(rng))
@@ -392,8 +395,9 @@ def test_how_far_they_are_away_agrees_with_the_residual(kind: str, angle: float)
         target = pin.SE3.Random()
         placement = some_placement(kind, target, angle, rng)
         (found,), residual = away_of(kind, target, placement), value(RESIDUALS[kind], placement, target)
-        np.testing.assert_allclose(found[:3], residual[:3], rtol=0.0, atol=1e-12)
-        size = 0.0 if kind == "point" else np.linalg.norm(residual[3:])
+        offset, turn = ([0.0, 0.0, 0.0], residual) if kind == "level" else (residual[:3], residual[3:])
+        np.testing.assert_allclose(found[:3], offset, rtol=0.0, atol=1e-12)
+        size = 0.0 if kind == "point" else np.linalg.norm(turn)
         assert 2.0 * np.sin(found[6] / 2.0) == pytest.approx(size, abs=1e-8)
 
 
@@ -406,15 +410,16 @@ def test_a_target_that_is_all_the_way_back_holds_where_the_frame_is(kind: str, a
         placement = some_placement(kind, target, angle, rng)
         (away,) = away_of(kind, target, placement)
         back = moved_back(target, away, 1.0)
-        np.testing.assert_allclose(back.translation, placement.translation, rtol=0.0, atol=1e-12)
+        there = target if kind == "level" else placement
+        np.testing.assert_allclose(back.translation, there.translation, rtol=0.0, atol=1e-12)
         if kind == "pose":
             np.testing.assert_allclose(back.rotation, placement.rotation, rtol=0.0, atol=1e-9)
-        elif kind == "upright":
+        elif kind in ("upright", "level"):
             np.testing.assert_allclose(back.rotation.T @ vertical, placement.rotation.T @ vertical, rtol=0.0, atol=1e-9)
         else:
             np.testing.assert_allclose(back.rotation, target.rotation, rtol=0.0, atol=1e-12)
         assert outside(kind, placement, back) < 1e-9
-        if angle > 0.0:
+        if angle > (1e-9 if kind == "level" else 0.0):
             assert outside(kind, placement, target) > 1e-10
         at_target = moved_back(target, away, 0.0)
         np.testing.assert_array_equal(at_target.translation, target.translation)

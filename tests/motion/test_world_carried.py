@@ -28,8 +28,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vkc_pin.errors import InputError
+from vkc_pin.motion.carrying import as_numbers
 from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.motion.world import World, as_numbers
+from vkc_pin.motion.world import World
 from vkc_pin.scene.scene import Scene
 
 TIP = pin.SE3(pin.utils.rotate("x", -np.pi / 2), np.array([0.0, 0.25, 0.0]))  # in the stick

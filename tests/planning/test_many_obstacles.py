@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vkc_pin.benchmarks.scale import crowded
-from vkc_pin.chain import collision_pairs as easing
+from vkc_pin.chain import easing
 from vkc_pin.chain.contacts import ContactModel
 from vkc_pin.chain.phase_geometry import PhaseGeometry
 from vkc_pin.distances.shapes import asked

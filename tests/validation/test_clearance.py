@@ -20,7 +20,7 @@ def plan() -> Plan:
 
 @pytest.fixture(scope="module")
 def curves(plan: Plan) -> dict[str, ClearanceCurve]:
-    found = clearance_curves(plan.scene, plan.trajectory, TIMES, dist_safe=0.02)
+    found = clearance_curves(plan.scene, plan.trajectory, TIMES)
     return {curve.name: curve for curve in found}
 
 

@@ -5,18 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.carrying import Script, moved_base, room, stand, table
-from helpers.motions import pair_names, wander, whirl
+from helpers.motions import pair_names, wander
 from helpers.small_problems import door_scene, full_scene
 
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.motion.world import World
 from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.obstacles import FLOOR
-from vkc_pin.scene.scene import Scene
+from vkc_pin.scene.scene import Scene, load_scene
 from vkc_pin.validation.distances import Solids
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.samples import Samples
-from vkc_pin.validation.touching import may_touch
+from vkc_pin.validation.touching import Window
 
 
 @pytest.fixture(scope="module")
@@ -26,9 +26,7 @@ def door() -> Scene:
 
 def test_which_pairs_count(door: Scene) -> None:
     motion = wander(door, 0, size=0.1)
-    samples = Samples(door, motion)
-    touching = may_touch(door, Solids(samples.world), motion, (), 0.02)
-    table = PairTable(door, Solids(samples.world), motion, 0.02, touching=touching)
+    table = PairTable(door, Solids(World(door)), motion, 0.02)
     robot, things = door.robot.collision, door.objects["door"].object.collision.geometryObjects
     walls = [label for label in door.obstacle_labels if label != FLOOR]
     arm = [shape for shape in robot.geometryObjects if shape.parentJoint > 1]
@@ -37,32 +35,34 @@ def test_which_pairs_count(door: Scene) -> None:
     expected = len(robot.collisionPairs) + bodies * (len(things) + len(walls)) + len(arm) + len(leaves) * len(walls)
     assert len(table.pairs) == expected
     assert len({frozenset(pair) for pair in table.pairs.tolist()}) == expected
-    touching = {pair_names(table, k) for k in np.flatnonzero(table.margins == 0.0)}
-    assert touching == {(link, "door.lever") for link in door.robot.touch_links}
-    assert set(table.margins) == {0.0, 0.02}
-    assert (table.contact == 0.0).all()
 
 
-def test_what_may_touch_needs_no_clearance(door: Scene) -> None:
-    """Only the pairs that were said to, and each with its own overlap that counts as contact."""
+def test_some_may_be_closer_for_a_while(door: Scene) -> None:
+    """Only the pairs that were said to, then alone, and each with its own overlap that counts as contact."""
     motion = wander(door, 0, size=0.1)
-    world = Samples(door, motion).world
-    plain = PairTable(door, Solids(world), motion, 0.02)
-    assert (plain.margins == 0.02).all()
-    assert (plain.contact == 0.0).all()
-    first, second = (tuple(plain.pairs[k].tolist()) for k in (3, 70))
-    table = PairTable(door, Solids(world), motion, 0.02, touching={first: 1e-4, second: 0.0})
+    plain = PairTable(door, Solids(World(door)), motion, 0.02)
+    every = np.arange(len(plain.pairs))
+    first, second = plain.pairs[[3]], plain.pairs[[3, 70]]
+    near = [Window(first, 0, 1, 0.005, 1e-4, together=True), Window(second, 1, 3, 0.01, 0.0)]
+    table = PairTable(door, Solids(World(door)), motion, 0.02, windows=near)
     np.testing.assert_array_equal(table.pairs, plain.pairs)
-    np.testing.assert_array_equal(np.flatnonzero(table.margins == 0.0), [3, 70])
-    np.testing.assert_array_equal(np.flatnonzero(table.contact), [3])
-    assert table.contact[3] == 1e-4
+    for waypoint, margins in enumerate([{3: 0.005}, {3: 0.005, 70: 0.01}, {3: 0.01, 70: 0.01}, {3: 0.01, 70: 0.01}]):
+        at = np.full(len(every), waypoint)
+        found = table.margins_at(every, at)
+        assert {int(k): float(found[k]) for k in np.flatnonzero(found != 0.02)} == margins
+        assert (plain.margins_at(every, at) == 0.02).all()
+        contact = table.contact_at(every, at, at)
+        assert {int(k): float(contact[k]) for k in np.flatnonzero(contact)} == ({3: 1e-4} if waypoint < 2 else {})
+    for begin, as_one in ((0, [3]), (1, []), (2, [])):  # all the time between two waypoints
+        at = np.full(len(every), begin)
+        np.testing.assert_array_equal(np.flatnonzero(table.together_at(every, at, at + 1)), as_one)
 
 
 def test_a_side_branch_that_nothing_moves_hits_nothing_that_stands() -> None:
     """A second door in a cabinet may well be shut next to a wall."""
     scene = full_scene()
     names = (*scene.robot.coordinates.names, "cabinet.slide", "cabinet.swing")
-    positions = np.tile(np.concatenate([scene.start, [0.1, 0.3]]), (2, 1))
+    positions = np.vstack([np.concatenate([scene.start, values]) for values in ([0.1, 0.3], [0.11, 0.31])])
     motion = Trajectory(names, np.arange(2.0), positions, (PhaseSpan("all", 0, 1, (Hold("cabinet", "grip"),)),), 9)
     table = PairTable(scene, Solids(Samples(scene, motion).world), motion, 0.02)
     paired = {frozenset(table.world.collision_labels[k] for k in pair) for pair in table.pairs.tolist()}
@@ -100,11 +100,33 @@ def test_which_pairs_of_free_objects_count() -> None:
     assert moves["ball.ball"] == robots | {"stick.stick", "stick.tip"}
 
 
-def test_what_moves_together() -> None:
-    scene, motion = whirl(0, size=0.1)
-    world = World(scene)
-    touching = may_touch(scene, Solids(world), motion, (), 0.02)
-    table = PairTable(scene, Solids(world), motion, 0.02, touching=touching)
-    together = {pair_names(table, k) for k in np.flatnonzero(table.together)}
-    hands = {(link, "stick.stick") for link in scene.robot.touch_links}
-    assert together == {*hands, ("stick.tip", "ball.ball")}
+def test_what_does_not_move_in_a_phase_is_not_looked_at_in_it() -> None:
+    """A stick that lies on a table, is carried, and lies there again."""
+    scene = room(table())
+    script = Script(scene).go(moved_base(scene.start, y=0.1)).take("stick").go(moved_base(scene.start, y=0.3)).let_go()
+    motion = script.go(moved_base(scene.start, y=0.5)).motion()
+    samples = Samples(scene, motion)
+    solids = Solids(samples.world)
+    found = PairTable(scene, solids, motion, 0.02)
+    lies = [k for k in range(len(found.pairs)) if {name.partition(".")[0] for name in pair_names(found, k)} == {"stick", "table"}]
+    assert lies
+    everywhere = np.full((1, len(found.group)), np.inf)
+    placed = solids.at(samples.world.coordinates.q(samples.z[samples.waypoint_rows]))
+    for waypoint in range(61):
+        _, pairs = found.close(placed, np.array([waypoint]), everywhere)
+        assert set(lies) <= set(pairs.tolist()) if 20 < waypoint <= 40 else set(lies).isdisjoint(pairs.tolist())
+        if waypoint < 60:  # and on the way to the next
+            _, pairs = found.close(placed, np.array([waypoint]), everywhere, np.array([waypoint + 1]))
+            assert set(lies) <= set(pairs.tolist()) if 20 <= waypoint < 40 else set(lies).isdisjoint(pairs.tolist())
+
+
+def test_links_of_an_object_that_can_meet() -> None:
+    scene = load_scene("household")
+    names = (*scene.robot.coordinates.names, "dishwasher.rack")
+    rows = np.vstack([np.append(scene.start, value) for value in (0.0, 0.2)])
+    motion = Trajectory(names, np.arange(2.0), rows, (PhaseSpan("pull", 0, 1, (Hold("dishwasher", "handle"),)),), 9)
+    table = PairTable(scene, Solids(World(scene)), motion, 0.02)
+    own = {
+        pair for pair in (pair_names(table, k) for k in range(len(table.pairs))) if all("dishwasher." in name for name in pair)
+    }
+    assert own == {("dishwasher.door", "dishwasher.rack")}

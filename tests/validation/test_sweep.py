@@ -21,6 +21,7 @@ from vkc_pin.validation.distances import Solids
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.sweep import Hit, sweep
+from vkc_pin.validation.touching import Window
 
 
 def swept(scene: Scene, motion: Trajectory) -> tuple[PairTable, Samples, list[Hit]]:
@@ -42,7 +43,7 @@ def test_no_pair_that_comes_close_is_left_out(seed: int, size: float) -> None:
     found = {(hit.row, hit.first, hit.second) for hit in hits}
     for row, k in np.argwhere(distances < -1e-5):
         assert (row, *pair_names(table, k)) in found
-    for t, k in np.argwhere(distances[samples.waypoint_rows] < table.margins - 1e-5):
+    for t, k in np.argwhere(distances[samples.waypoint_rows] < 0.02 - 1e-5):
         assert (samples.waypoint_rows[t], *pair_names(table, k)) in found
     for hit in hits:
         assert hit.at_waypoint == (hit.row in samples.waypoint_rows)
@@ -69,7 +70,7 @@ def test_nothing_slips_through_between_two_samples(seed: int, size: float) -> No
     fine = np.unique(np.concatenate([np.linspace(a, b, 11) for a, b in itertools.pairwise(samples.times)]))
     distances = brute_force(table, samples.world.positions(motion, fine))
     found = {(hit.first, hit.second) for hit in hits if hit.distance < 0}
-    deep = {pair_names(table, k) for k in np.flatnonzero((distances.min(axis=0) < -1.001e-3) & (table.margins > 0))}
+    deep = {pair_names(table, k) for k in np.flatnonzero(distances.min(axis=0) < -1.001e-3)}
     assert deep <= found
     assert found <= {pair_names(table, k) for k in np.flatnonzero(distances.min(axis=0) < 2e-3)}
 
@@ -90,7 +91,7 @@ def test_nothing_slips_through_even_without_samples(seed: int, size: float) -> N
     distances = brute_force(table, samples.z)
     for t, (first, last) in enumerate(itertools.pairwise(samples.waypoint_rows)):
         within = distances[first : last + 1].min(axis=0)
-        for k in np.flatnonzero((within < -1.001e-3) & (table.margins > 0)):
+        for k in np.flatnonzero(within < -1.001e-3):
             assert {(t, *pair_names(table, k)), (t + 1, *pair_names(table, k))} & found
 
 
@@ -115,13 +116,13 @@ def test_nothing_carried_that_comes_close_is_left_out(seed: int, size: float) ->
     fine = np.unique(np.concatenate([np.linspace(a, b, 6) for a, b in itertools.pairwise(samples.times)]))
     distances = brute_force(table, samples.world.positions(motion, fine))
     found = {(hit.first, hit.second) for hit in hits if hit.distance < 0}
-    deep = {pair_names(table, k) for k in np.flatnonzero((distances.min(axis=0) < -1.001e-3) & ~table.together)}
+    deep = {pair_names(table, k) for k in np.flatnonzero(distances.min(axis=0) < -1.001e-3)}
     assert deep <= found
     assert min(hit.distance for hit in hits) <= distances.min() + 2e-3
 
 
-@pytest.mark.parametrize("overlap", [None, 0.0, 1e-4])
-def test_what_may_touch_is_not_passed_through_between_two_samples(overlap: float | None) -> None:
+@pytest.mark.parametrize(("overlap", "together"), [(None, False), (0.0, True), (0.0, False), (1e-4, False)])
+def test_what_may_touch_is_not_passed_through_between_two_samples(overlap: float | None, together: bool) -> None:
     """A stick through a fence that it lay beside; neither sample touches it. Only a hand is known to move with what it holds."""
     fence = box("fence", [0.6, 0.001, 0.1], [0.8, 0.262, 0.56])
     scene = room(fence)
@@ -130,18 +131,19 @@ def test_what_may_touch_is_not_passed_through_between_two_samples(overlap: float
     world = World(scene)
     labels = world.collision_labels
     post = labels.index("fence")
-    touching = {(i, post): overlap for i in range(post) if labels[i] in ("stick.stick", "stick.tip") and overlap is not None}
-    table = PairTable(scene, Solids(world), motion, 0.02, touching=touching)
-    hits = list(sweep(table, world.positions(motion)[-2:], np.array([0, 1])))
+    pairs = np.array([(i, post) for i in range(post) if labels[i] in ("stick.stick", "stick.tip")])
+    near = [] if overlap is None else [Window(pairs, 0, len(motion.times) - 1, 0.0, overlap, together)]
+    table = PairTable(scene, Solids(world), motion, 0.02, windows=near)
+    hits = list(sweep(table, world.positions(motion), np.arange(len(motion.times))))
     assert all(hit.distance > 0.0 for hit in hits if hit.at_waypoint and hit.second == "fence")
     through = {hit.first for hit in hits if hit.second == "fence" and hit.distance < -5e-4}
-    if overlap == 0.0:  # as for a hand and what it grasps
+    if together:  # as for a hand and what it grasps
         assert not through & {"stick.stick", "stick.tip"}
     else:
         assert through >= {"stick.stick", "stick.tip"}
 
 
-def test_what_lies_still_is_looked_at_only_at_waypoints(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_lies_still_is_not_looked_at_again() -> None:
     """A stick that is put down on its table goes on touching it while the robot drives away."""
     scene = room(table(gap=5e-4))
     down = reaching(tool_at(STICK), above(STICK))
@@ -155,8 +157,4 @@ def test_what_lies_still_is_looked_at_only_at_waypoints(monkeypatch: pytest.Monk
     assert pair, "it touches nothing: choose another way of putting it down"
     samples = Samples(scene, motion)
     begin = samples.waypoint_rows[last.first]
-    assert not [hit for hit in resting if hit.row > begin and not hit.at_waypoint and frozenset((hit.first, hit.second)) in pair]
-    monkeypatch.setattr(validation_sweep, "STILL", -1.0)  # all the same, if everything is looked at
-    everything = swept(scene, motion)[2]
-    assert [hit for hit in everything if hit.row > begin and not hit.at_waypoint and frozenset((hit.first, hit.second)) in pair]
-    assert min(hit.distance for hit in everything) == min(hit.distance for hit in resting)
+    assert not [hit for hit in resting if hit.row > begin and frozenset((hit.first, hit.second)) in pair]

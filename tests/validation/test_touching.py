@@ -1,19 +1,19 @@
-"""Which pairs may touch, and what overlap counts as contact."""
+"""Which pairs may be close, and when; and what overlap counts as contact."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
 import pinocchio as pin
+import pytest
 from helpers.carrying import (
-    BALL,
     STICK,
     TOP,
     Script,
     above,
     box,
-    lifted,
     moved_base,
     reaching,
     room,
@@ -22,53 +22,82 @@ from helpers.carrying import (
     tool_at,
     with_object,
 )
-from helpers.drives import of_rows
-from helpers.small_problems import door_scene, full_scene
+from helpers.drives import of_rows, through
+from helpers.riding import plates, slid
+from helpers.small_problems import door_scene
 
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
-from vkc_pin.motion.world import World
+from vkc_pin.options import Options
+from vkc_pin.scene.contact import CONTACT
 from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.scene import Scene
-from vkc_pin.task.steps import Actuate, Grasp, Place, Step, Touch
+from vkc_pin.task.steps import Actuate, Grasp, Step, Touch
 from vkc_pin.validation.distances import Solids
-from vkc_pin.validation.touching import CONTACT, may_touch
+from vkc_pin.validation.samples import Samples
+from vkc_pin.validation.touching import windows
 
 HANDS = set(door_scene().robot.touch_links)
+STEPS = 4  # of `EASED_TIME`
 
 
-def pairs(scene: Scene, motion: Trajectory, steps: Sequence[Step] = (), dist_safe: float = 0.02) -> dict[tuple[str, str], float]:
-    """Return the labels of the pairs that may touch, and their overlaps."""
-    world = World(scene)
-    found = may_touch(scene, Solids(world), motion, steps, dist_safe)
-    assert all(i < j for i, j in found)
-    labels = world.collision_labels
-    named: dict[tuple[str, str], float] = {}
-    for (i, j), overlap in found.items():
-        assert named.setdefault((labels[i], labels[j]), overlap) == overlap
-    return named
+def near(
+    scene: Scene, motion: Trajectory, steps: Sequence[Step] = (), dist_safe: float = 0.02
+) -> dict[tuple[str, str], list[tuple[int, int]]]:
+    """Return the labels of pairs that may be close, and between which waypoints; by the way check what else is said of them."""
+    samples = Samples(scene, motion)
+    labels, found = samples.world.collision_labels, dict[tuple[str, str], list[tuple[int, int]]]()
+    for window in windows(samples, Solids(samples.world), steps, Options(dist_safe=dist_safe)):
+        named = {(labels[i], labels[j]) for i, j in window.pairs.tolist()}
+        assert (np.diff(window.pairs, axis=1) > 0).all()
+        for first, second in named:
+            by_hand = first in HANDS
+            assert window.margin == -np.inf if window.together else window.margin in ((0.005,) if by_hand else (0.0,))
+            assert window.contact == (0.0 if by_hand and not window.together else CONTACT)
+            at = found.setdefault((first, second), [])
+            at += [(window.first, window.last)] * ((window.first, window.last) not in at)
+    return {pair: sorted(at) for pair, at in found.items()}
 
 
 def still(scene: Scene) -> Trajectory:
-    return of_rows(scene, np.vstack([scene.start, scene.start]))
+    return of_rows(scene, np.tile(scene.start, (11, 1)))
 
 
-def hand_on(label: str) -> dict[tuple[str, str], float]:
-    return {(link, label): 0.0 for link in HANDS}
+def hand_on(label: str, *spans: tuple[int, int]) -> dict[tuple[str, str], list[tuple[int, int]]]:
+    return {(link, label): list(spans) for link in HANDS}
 
 
-def test_a_hand_and_what_it_holds_held_or_is_asked_to_grasp() -> None:
+def test_a_hand_and_what_it_holds_around_that_time() -> None:
     door = door_scene()
-    assert pairs(door, still(door)) == {}
-    assert pairs(door, still(door), [Actuate("door", {"hinge": 1.0})]) == {}  # the motion says where it is held
-    assert pairs(door, still(door), [Grasp("door", "handle_free")]) == hand_on("door.lever")
-    assert pairs(door.with_held({"door": "handle"}), still(door)) == hand_on("door.lever")
-    motion = still(door)
-    held = Trajectory(motion.names, motion.times, motion.positions, (PhaseSpan("hold", 0, 1, (Hold("door", "handle"),)),), 9)
-    assert pairs(door, held) == hand_on("door.lever")
-    scene = full_scene()
-    two = [Grasp("drawer"), Grasp("door")]
-    assert pairs(scene, still(scene), two) == {**hand_on("door.lever"), **hand_on("drawer.tray")}
+    assert near(door, still(door)) == {}
+    assert near(door, still(door), [Actuate("door", {"hinge": 1.0})]) == {}  # the motion says where it is held
+    assert near(door.with_held({"door": "handle"}), still(door)) == hand_on("door.lever", (0, 0), (0, 10))  # let go of at once
+    motion, hold = (
+        through(door, door.start, moved_base(door.start, y=0.3)),
+        (Hold("door", "handle"),),
+    )
+    spans = (PhaseSpan("reach", 0, 15), PhaseSpan("hold", 15, 30, hold), PhaseSpan("leave", 30, 40))
+    held = dataclasses.replace(motion, phases=spans)
+    assert near(door, held) == hand_on("door.lever", (15 - STEPS, 15), (15, 30), (30, 30 + STEPS))
+
+
+def test_a_hand_that_is_where_it_is_asked_to_grasp() -> None:
+    """Also where nothing comes of it, because it lets go of what stands fixed and drives on."""
+    scene = room(table())
+    there = Script(scene).go(reaching(tool_at(STICK), above(STICK))).go(np.array(scene.start))
+    assert near(scene, there.motion()) == {}
+    assert near(scene, there.motion(), [Grasp("stick")]) == hand_on("stick.stick", (20 - STEPS, 20 + STEPS))
+
+
+@pytest.mark.parametrize(("attachment", "rigid"), [("handle", True), ("handle_free", False)])
+def test_only_a_grasp_without_freedom_moves_as_one(attachment: str, rigid: bool) -> None:
+    scene = door_scene().with_held({"door": attachment})
+    freedoms = scene.objects["door"].object.attachment(attachment).coordinates
+    names = (*scene.robot.coordinates.names, *(f"door.{name}" for name in freedoms))
+    rows = np.column_stack([np.tile(scene.start, (2, 1)), np.zeros((2, len(names) - 9))])
+    samples = Samples(scene, Trajectory(names, np.arange(2.0), rows, (PhaseSpan("hold", 0, 1, scene.holds),), 9))
+    (window,) = windows(samples, Solids(samples.world), [], Options())
+    assert (window.together, window.margin, window.contact) == ((True, -np.inf, CONTACT) if rigid else (False, 0.005, CONTACT))
 
 
 def carried(scene: Scene, *, aside: float = 0.5) -> Script:
@@ -79,92 +108,103 @@ def carried(scene: Scene, *, aside: float = 0.5) -> Script:
 
 
 def test_what_a_carried_thing_rests_on_where_it_is_taken_and_left() -> None:
-    """Not what it only passes, and neither what is further away."""
+    """Not what it only passes, and neither what is further away; and only around these times."""
     short = box("board", [0.5, 0.6, 0.02], [0.8, 0.0, TOP - 0.011])
     other = box("other", [0.5, 0.6, 0.02], [0.8, 1.0, TOP - 0.011])
     between = box("between", [0.3, 0.1, 0.05], [0.8, 0.5, TOP + 0.125])  # 5 cm below the discs when they pass
-    near, far = box("near", [0.02, 0.1, 0.1], [0.875, 0.0, TOP + 0.05]), box("far", [0.02, 0.1, 0.1], [0.885, 0.0, TOP + 0.05])
-    scene = room(short, other, between, near, far)
-    found = pairs(scene, carried(scene, aside=1.0).motion(), dist_safe=0.055)
-    resting = {pair for pair in found if pair[0] not in HANDS}
-    assert {second for _, second in resting} == {"board", "other", "near"}
-    assert {("stick.stick", "board"), ("stick.stick", "other"), ("stick.stick", "near")} <= resting
-    assert all(found[pair] == CONTACT for pair in resting)
-    assert {pair: found[pair] for pair in found if pair[0] in HANDS} == hand_on("stick.stick")
-    wide = pairs(scene, carried(scene, aside=1.0).motion(), dist_safe=0.15)  # the wrist is that close when the hand closes
-    robots = set(scene.robot.links)
-    assert {pair for pair in wide if pair[0] in robots} == set(hand_on("stick.stick"))
-    tight = pairs(scene, carried(scene, aside=1.0).motion(), dist_safe=1e-3 / 2)
-    assert tight == hand_on("stick.stick")  # everything is 1 mm away at least
+    beside, far = box("near", [0.02, 0.1, 0.1], [0.875, 0.0, TOP + 0.05]), box("far", [0.02, 0.1, 0.1], [0.885, 0.0, TOP + 0.05])
+    scene = room(short, other, between, beside, far)
+    taken, left = (20, 20 + STEPS), (80 - STEPS, 80)
+    assert near(scene, carried(scene, aside=1.0).motion(), dist_safe=0.055) == {
+        **hand_on("stick.stick", (20 - STEPS, 20), (20, 80), (80, 80 + STEPS)),
+        ("stick.stick", "board"): [taken],
+        ("stick.tip", "board"): [taken],
+        ("stick.stick", "near"): [taken],
+        ("stick.stick", "other"): [left],
+        ("stick.tip", "other"): [left],
+    }
+    wide = near(scene, carried(scene, aside=1.0).motion(), dist_safe=0.15)  # the wrist is that close when the hand closes
+    assert {pair for pair in wide if pair[0] in set(scene.robot.links)} == set(hand_on("stick.stick"))
+    tight = near(scene, carried(scene, aside=1.0).motion(), dist_safe=1e-3 / 2)
+    assert tight.keys() == hand_on("stick.stick").keys()  # everything is 1 mm away at least
 
 
 def test_what_is_in_the_hand_at_the_start_and_stays_there_rests_nowhere() -> None:
     scene = room(table()).with_held({"stick": "grip"})
     low = scene.with_start(arm=reaching(tool_at(STICK), above(STICK))[3:])
     drive = Script(low).go(moved_base(low.start, y=0.3)).motion()
-    assert pairs(low, drive) == hand_on("stick.stick")
+    assert near(low, drive) == hand_on("stick.stick", (0, 20))
     left = Script(low).go(moved_base(low.start, y=0.3)).let_go().go(moved_base(low.start, y=0.3, x=-0.1)).motion()
-    assert pairs(low, left) == {**hand_on("stick.stick"), ("stick.stick", "table"): CONTACT}
+    assert near(low, left) == {
+        **hand_on("stick.stick", (0, 20), (20, 20 + STEPS)),
+        ("stick.stick", "table"): [(20 - STEPS, 20)],
+    }
 
 
 def test_what_lies_on_the_floor() -> None:
     on_floor = pin.SE3(np.eye(3), np.array([0.8, 1.0, 0.036]))
     scene = with_object(room(objects=("stick", "ball")), "ball", on_floor)
     taken = Script(scene).take("ball", "grip", (0.0, 0.0, 0.0)).go(moved_base(scene.start, x=-0.2)).motion()
-    found = pairs(scene, taken)
-    assert found == {**hand_on("ball.ball"), ("ball.ball", FLOOR): CONTACT}
+    found = near(scene, taken)
+    assert found == {**hand_on("ball.ball", (0, 0), (0, 20)), ("ball.ball", FLOOR): [(0, STEPS)]}
 
 
 def test_things_that_lie_side_by_side() -> None:
     """They may touch, as both may the table; the robot may touch neither."""
     beside = pin.SE3(np.eye(3), np.array([0.8 + 0.05 + 0.035 + 0.01, 0.1275, TOP + 0.036]))
     scene = with_object(room(table(), objects=("stick", "ball")), "ball", beside)
-    found = pairs(scene, carried(scene).motion())
-    assert found == {
-        **hand_on("stick.stick"),
-        ("stick.stick", "table"): CONTACT,
-        ("stick.stick", "ball.ball"): CONTACT,
+    assert near(scene, carried(scene).motion()) == {
+        **hand_on("stick.stick", (20 - STEPS, 20), (20, 80), (80, 80 + STEPS)),
+        ("stick.stick", "table"): [(20, 20 + STEPS), (80 - STEPS, 80)],
+        ("stick.stick", "ball.ball"): [(20, 20 + STEPS)],
     }
 
 
 def test_a_tip_and_what_it_holds() -> None:
     scene = room(stand(), objects=("stick", "ball")).with_held({"stick": "grip"})
     script = Script(scene).take("ball", "pull", (0.0, 0.0, 0.0), by="stick.tip").go(moved_base(scene.start, y=0.5))
-    found = pairs(scene, script.motion())
-    assert found == {**hand_on("stick.stick"), ("stick.tip", "ball.ball"): CONTACT, ("ball.ball", "stand"): CONTACT}
-    asked = pairs(scene, still(scene), [Grasp("ball", by="stick.tip")])
-    assert asked == {**hand_on("stick.stick"), ("stick.tip", "ball.ball"): CONTACT}
-    assert pairs(scene, still(scene), [Place("ball", BALL)]) == hand_on("stick.stick")
+    found = near(scene, script.motion())
+    assert found == {
+        **hand_on("stick.stick", (0, 20)),
+        ("stick.tip", "ball.ball"): [(0, 0), (0, 20)],
+        ("ball.ball", "stand"): [(0, STEPS)],
+    }
 
 
-def test_a_frame_and_what_is_at_its_target() -> None:
+def test_a_frame_and_what_is_at_its_target_when_it_is_there() -> None:
     wall = box("wall", [0.3, 0.1, 0.3], [0.8, 0.95, 0.75])  # its near side is at y = 0.9
-    scene = room(table(), wall)
-    for gap, near in ((0.0, True), (0.019, True), (0.021, False), (-0.05, True)):
-        point = (0.8, 0.9 - gap, 0.75)
-        for target in (point, lifted(STICK, np.array(point) - STICK.translation)):
-            found = pairs(scene, still(scene), [Touch("stick.tip", target)])
-            assert found == ({("stick.tip", "wall"): CONTACT} if near else {})
-    assert pairs(scene, still(scene), [Touch("forearm_link", (0.8, 0.9, 0.75))]) == {("forearm_link", "wall"): CONTACT}
-    door = door_scene()
-    lever = door.objects["door"].link_placement("lever").act(np.array([-0.1, 0.06, 0.0]))
-    assert ("forearm_link", "door.lever") in pairs(door, still(door), [Touch("forearm_link", lever)])
-    corner = pairs(scene, still(scene), [Touch("stick.tip", (0.8, 1.0, TOP + 0.01))], dist_safe=0.7)
-    assert corner == {("stick.tip", "wall"): CONTACT, ("stick.tip", "table"): CONTACT, ("stick.tip", FLOOR): CONTACT}
+    scene = room(table(), wall).with_held({"stick": "grip"})
+    tip = scene.objects["stick"].link_placement("tip").translation
+    for gap, touches in ((0.0, True), (0.019, True), (0.021, False), (-0.05, True)):
+        aside = 0.9 - gap - tip[1]
+        there = Script(room(table(), {**wall, "position": [tip[0], 0.95, tip[2]]}).with_held({"stick": "grip"}))
+        there.go(moved_base(scene.start, y=aside)).go(np.array(scene.start))
+        target = tip + np.array([0.0, aside, 0.0])
+        for goal in (tuple(target), pin.SE3(np.eye(3), target)):
+            found = near(there.scene, there.motion(), [Touch("stick.tip", goal)])
+            wanted = {("stick.tip", "wall"): [(20 - STEPS, 20 + STEPS)]} if touches else {}
+            assert found == {**hand_on("stick.stick", (0, 40)), **wanted}
+        assert ("stick.tip", "wall") not in near(there.scene, there.motion(), [Touch("stick.tip", tuple(target + 0.05))])
+
+
+def test_what_rides_and_what_it_stands_on() -> None:
+    """Two cups on a plate that slides: they and the plate move as one; what is beside them does not."""
+    found = near(plates(cups=2, wall=0.01), slid(plates(cups=2, wall=0.01), 0.3))
+    assert {pair: at for pair, at in found.items() if pair[0] not in HANDS} == {
+        ("plate.plate", "cup.cup"): [(0, STEPS), (0, 30)],
+        ("plate.plate", "cup_1.cup"): [(0, STEPS), (0, 30)],
+        ("cup.cup", "cup_1.cup"): [(0, 30)],
+        ("cup.cup", "wall"): [(0, STEPS)],
+    }
 
 
 def test_what_can_be_carried_itself_may_be_touched_where_it_is_then() -> None:
-    """A ball that is put somewhere, and touched there; and it does not touch itself."""
-    scene = room(table(), objects=("stick", "ball"))
-    side = BALL.translation - np.array([0.0, 0.035, 0.0])
-    touch = [Touch("stick.tip", side)]
-    assert pairs(scene, still(scene), touch) == {("stick.tip", "ball.ball"): CONTACT}
-    assert pairs(scene, still(scene), [Touch("ball.ball", side)]) == {}
-    moved = with_object(scene, "ball", lifted(BALL, [0.0, 0.5, 0.0]))
-    assert pairs(moved, still(moved), touch) == {}
-    tool = scene.tool_placement()
-    held = with_object(scene, "ball", tool)
-    script = Script(held).take("ball", "grip", (0.0, 0.0, 0.0)).go(moved_base(held.start, y=0.5))
-    assert ("stick.tip", "ball.ball") not in pairs(held, script.motion(), [Touch("stick.tip", tool.translation)])
-    there = [Touch("stick.tip", tool.translation + np.array([0.0, 0.5, 0.0]))]
-    assert ("stick.tip", "ball.ball") in pairs(held, script.motion(), there)
+    """And it does not touch itself."""
+    scene = room(table(), objects=("stick", "ball")).with_held({"stick": "grip"})
+    tip = scene.objects["stick"].link_placement("tip").translation
+    beside = with_object(scene, "ball", pin.SE3(np.eye(3), tip + np.array([0.0, 0.035, 0.0])))
+    for there, touched in ((beside, True), (scene, False)):
+        found = near(there, Script(there).wait().motion(), [Touch("stick.tip", tuple(tip))])
+        assert (("stick.tip", "ball.ball") in found) == touched
+    inside = [Touch("ball.ball", tuple(tip + np.array([0.0, 0.035, 0.0])))]
+    assert near(beside, Script(beside).wait().motion(), inside) == hand_on("stick.stick", (0, 2))

@@ -46,7 +46,7 @@ def test_the_planned_motion_is_accepted(door_plan: vkc.Plan) -> None:
     assert report.ok, "\n".join(report.lines())
     assert report.clearance > 0.0
     times, safe = door_plan.trajectory.times[1:], door_plan.options.dist_safe
-    curves = clearance_curves(door_plan.scene, door_plan.trajectory, times, dist_safe=safe)
+    curves = clearance_curves(door_plan.scene, door_plan.trajectory, times)
     at_waypoints = {curve.name: curve.distances.min() for curve in curves}
     assert at_waypoints.pop("gripper – what it grasps") > 0.0
     assert min(at_waypoints.values()) >= safe - 1e-3
@@ -418,7 +418,7 @@ def fatter_lever(scene: Scene, by: float) -> Scene:
 def test_the_hand_may_come_near_what_it_grasps_but_not_into_it(door_plan: vkc.Plan) -> None:
     """With a thicker lever the fingers are closer to it than dist_safe, then in it."""
     hand, times = door_plan.scene.robot.touch_links, door_plan.trajectory.times
-    curves = clearance_curves(door_plan.scene, door_plan.trajectory, times, dist_safe=door_plan.options.dist_safe)
+    curves = clearance_curves(door_plan.scene, door_plan.trajectory, times)
     gap = next(curve for curve in curves if curve.name == "gripper – what it grasps").distances.min()
     near = check(door_plan, scene=fatter_lever(door_plan.scene, gap - 0.008))
     assert not {subject for _, subject in names(near) if subject.split(" – ")[0] in hand}, "\n".join(near.lines())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -18,6 +19,8 @@ from vkc_pin.models.coordinates import Coordinates
 from vkc_pin.models.grafting import clean, graft, graft_geometry
 from vkc_pin.models.robot import Robot
 from vkc_pin.scene.hold import Hold, holds_of
+from vkc_pin.scene.placed import standing_geometry
+from vkc_pin.scene.resting import Ride
 from vkc_pin.scene.scene import Scene
 
 __all__ = ["Closure", "VirtualKinematicChain", "consolidate"]
@@ -54,6 +57,7 @@ class VirtualKinematicChain:
         lower, upper, velocity, acceleration: Limits, shape (n,), SI units.
         collision: Collision geometry of the robot (first, in the robot's order) and of what moves of the objects.
         held_geometries: Hold → indices in `collision` of the object's geometry that moves when it is held.
+        ride_geometries: Ride → indices in `collision` of the geometry of what rides.
         closures: Hold → where the object's base link is on the chain, and where it stands in the world.
         virtual: Hold → names of the coordinates of its attachment's virtual joint.
         added: Hold → names of all coordinates that come with it: these, and the joints of the object that it moves.
@@ -71,6 +75,7 @@ class VirtualKinematicChain:
     acceleration: Floats
     collision: pin.GeometryModel
     held_geometries: Mapping[Hold, tuple[int, ...]]
+    ride_geometries: Mapping[Ride, tuple[int, ...]]
     closures: Mapping[Hold, Closure]
     virtual: Mapping[Hold, tuple[str, ...]]
     added: Mapping[Hold, tuple[str, ...]]
@@ -169,13 +174,16 @@ class VirtualKinematicChain:
         return frame.parentJoint, pin.SE3(frame.placement)
 
 
-def consolidate(scene: Scene, holds: Iterable[Hold] | Mapping[str, str], *, cache: Cache | None = None) -> VirtualKinematicChain:
+def consolidate(
+    scene: Scene, holds: Iterable[Hold] | Mapping[str, str], *, rides: Iterable[Ride] = (), cache: Cache | None = None
+) -> VirtualKinematicChain:
     """Merge the scene's robot with the objects it holds into one model (section III of the paper).
 
     Args:
         scene: Robot, objects and where they stand.
         holds: What is held at any time, each after the hold it depends on; or object → attachment, all by the tool.
             Several become branches of one tree; only what is held at a waypoint, and stands fixed, is closed there.
+        rides: What stands on links of that, at any time.
         cache: Where the chain's kinematics are kept; None: in one of its own.
 
     Returns:
@@ -238,6 +246,15 @@ def consolidate(scene: Scene, holds: Iterable[Hold] | Mapping[str, str], *, cach
         if names.count(joint_name) > 1:
             problem = "two grasps, or an attachment and a joint of its object, share a name"
             raise InputError(problem, field=joint_name, expected="different names")
+    ride_geometries = {}
+    for number, ride in enumerate(rides):
+        frame = model.frames[model.getFrameId(prefixes[ride.hold] + ride.link)]
+        placed = dataclasses.replace(scene.objects[ride.object], placement=frame.placement * ride.local)
+        prefix = ride.object + "^" * (number + 1) + "."
+        shapes = standing_geometry(placed)
+        ride_geometries[ride] = tuple(
+            graft_geometry(collision, shapes, joints=[frame.parentJoint], placement=pin.SE3.Identity(), prefix=prefix)
+        )
     lower, upper, velocity, acceleration = (np.array(row, float) for row in limits)
     return VirtualKinematicChain(
         robot=robot,
@@ -250,6 +267,7 @@ def consolidate(scene: Scene, holds: Iterable[Hold] | Mapping[str, str], *, cach
         acceleration=acceleration,
         collision=collision,
         held_geometries=held_geometries,
+        ride_geometries=ride_geometries,
         closures=closures,
         virtual=virtual,
         added=with_hold,

@@ -3,28 +3,27 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
+from itertools import combinations
 
-import coal
 import numpy as np
 import pinocchio as pin
 
 from vkc_pin.arrays import Floats
 from vkc_pin.chain.chain import VirtualKinematicChain
+from vkc_pin.chain.easing import eased_pairs
 from vkc_pin.chain.phase_geometry import PhaseGeometry
 from vkc_pin.errors import InputError
-from vkc_pin.models.shapes import bounding_box, link_name, own_name, shape_distance, world_box
+from vkc_pin.models.shapes import bounding_box, link_name, own_name
 from vkc_pin.options import Options
+from vkc_pin.scene.contact import CONTACT, grasped, moves_as_one, touching
 from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.placed import standing_geometry
 from vkc_pin.scene.scene import Scene
-from vkc_pin.task.phases import Phase, Task
+from vkc_pin.task.phases import Task
 
-__all__ = ["eased_pairs", "phase_geometries"]
-
-EASED_TIME = 1.0  # [s] before and after a contact in which the shapes may be close, at `Options.dt` a waypoint
-EASED_SHARE = 0.5  # margin, as a share of the distance at the contact itself
+__all__ = ["phase_geometries"]
 
 
 def phase_geometries(scene: Scene, chain: VirtualKinematicChain, task: Task, options: Options) -> list[PhaseGeometry]:
@@ -47,26 +46,33 @@ class _Pairing:
     def __init__(self, scene: Scene, chain: VirtualKinematicChain, task: Task, options: Options) -> None:
         self.scene, self.chain, self.task, self.options = scene, chain, task, options
         self.first_waypoint = np.concatenate([[0], np.cumsum([phase.segments for phase in task.phases])])
+        self._labels = [scene.robot.link_of(i) for i in range(len(scene.robot.collision.geometryObjects))]
+        held = [(hold.object, indices) for hold, indices in chain.held_geometries.items()]
+        riding = [(ride.object, indices) for ride, indices in chain.ride_geometries.items()]
+        for name, indices in (*held, *riding):
+            self._labels += [f"{name}.{link_name(own_name(chain.collision.geometryObjects[i].name))}" for i in indices]
         self._obstacles = tuple(scene.obstacles.geometryObjects)
         self._boxes = _boxes([*chain.collision.geometryObjects]), _boxes(self._obstacles)
 
     def phase(self, number: int) -> PhaseGeometry:
-        phase, before = self.task.phases[number], self.task.phases[number - 1] if number else None
-        scene, chain, robot, margin = self.scene, self.chain, self.scene.robot, self.options.dist_safe
-        shapes = list(chain.collision.geometryObjects)
-        robots, own = range(len(robot.collision.geometryObjects)), len(shapes)
-        labels = [robot.link_of(i) for i in robots]
-        for hold, indices in chain.held_geometries.items():
-            labels += [f"{hold.object}.{link_name(own_name(shapes[i].name))}" for i in indices]
-        pairs = [(pair.first, pair.second, margin) for pair in robot.collision.collisionPairs]
-        moving = list(robots)
+        phase, scene, chain = self.task.phases[number], self.scene, self.chain
+        shapes, labels = list(chain.collision.geometryObjects), list(self._labels)
+        robots, own, margin = range(len(scene.robot.collision.geometryObjects)), len(shapes), self.options.dist_safe
+        pairs = [(pair.first, pair.second, margin) for pair in scene.robot.collision.collisionPairs]
+        moving, mine = list(robots), dict[str, tuple[int, ...]]()
         for hold in phase.held:
-            grasped, touching = self._grasped(hold), self._touching(hold)
-            held = chain.held_geometries[hold]
-            # The hand and what it grasps move together: nothing to plan there.
-            pairs += [(i, j, margin) for i in moving for j in held if not (labels[i] in touching and labels[j] == grasped)]
-            moving += held
-        mine = {hold.object: chain.held_geometries[hold] for hold in phase.held}
+            mine[hold.object] = chain.held_geometries[hold]
+            pairs += [(i, j, self._held_margin(hold, i, j)) for i in moving for j in mine[hold.object]]
+            pairs += [
+                (i, j, margin) for i, j in combinations(mine[hold.object], 2) if self._own_pair(hold.object, labels[i], labels[j])
+            ]
+            moving += mine[hold.object]
+        for ride in phase.rides:
+            mine[ride.object] = chain.ride_geometries[ride]
+            together = {shapes[j].parentJoint for j in mine[ride.object]}  # with what is on the same joint it moves as one
+            pairs += [(i, j, margin) for i in moving if shapes[i].parentJoint not in together for j in mine[ride.object]]
+            moving += mine[ride.object]
+        pairs = [pair for pair in pairs if np.isfinite(pair[2])]
         left: dict[str, tuple[int, ...]] = {}
         for name, placed in scene.objects.items():
             state = {c.removeprefix(f"{name}."): v for c, v in phase.before.items() if c.startswith(f"{name}.")}
@@ -78,23 +84,16 @@ class _Pairing:
             if name in mine:  # its frame stands on, the rest is in the hand
                 held_shapes = {own_name(shapes[i].name) for i in mine[name]}
                 standing = [shape for shape in standing if shape.name not in held_shapes]
-            near = {  # what is held through something touches it; a hand's fingers are on both sides
-                self._grasped(hold): (self._touching(hold), 0.0 if hold.by else self.options.grasp_clearance)
-                for hold in (*phase.leaves, *phase.grasps)
-                if hold.object == name
-            }
             if name in phase.left:
                 left[name] = tuple(range(len(shapes), len(shapes) + len(standing)))
             for shape in standing:
                 label = f"{name}.{link_name(shape.name)}"
-                close, least = near.get(label, ((), margin))
-                pairs += [
-                    (i, len(shapes), least if labels[i] in close else margin) for i in moving if i not in mine.get(name, ())
-                ]
+                others = [i for i in moving if i not in mine.get(name, ()) or self._own_pair(name, labels[i], label)]
+                pairs += [(i, len(shapes), margin) for i in others]
                 shape.name = f"{name}.{shape.name}"
                 shapes.append(shape)
                 labels.append(label)
-        attached = {i for hold in phase.held if scene.objects[hold.object].object.free for i in mine[hold.object]}
+        attached = {i for name, indices in mine.items() if scene.objects[name].object.free for i in indices}
         above = [i for i in moving if i in attached or (i in robots and shapes[i].parentJoint > 1)]
         table = np.concatenate([np.array(pairs).reshape(-1, 3), self._with_obstacles(len(shapes), moving, above)])
         if not len(table):
@@ -115,8 +114,22 @@ class _Pairing:
             translation=translation,
             left=left,
         )
-        first, steps = int(self.first_waypoint[number]), self.options.steps(EASED_TIME)
-        return dataclasses.replace(part, eased=eased_pairs(scene, chain, phase, part, before=before, first=first, steps=steps))
+        return dataclasses.replace(part, eased=eased_pairs(self.scene, self.chain, self.task, number, part, self.options))
+
+    def _held_margin(self, hold: Hold, i: int, j: int) -> float:
+        """Return the clearance [m] of geometry `i` from geometry `j` of what is held.
+
+        The hand and what it grasps move together, so that there is nothing to plan, unless the grasp leaves a freedom.
+        """
+        if self._labels[i] not in touching(self.scene, hold) or self._labels[j] != grasped(self.scene, hold):
+            return self.options.dist_safe
+        if moves_as_one(self.scene, hold):
+            return -np.inf
+        return -CONTACT if hold.by else self.options.grasp_clearance
+
+    def _own_pair(self, name: str, first: str, second: str) -> bool:
+        """Return whether two links of an object, by their labels, can meet."""
+        return frozenset(label.partition(".")[2] for label in (first, second)) in self.scene.objects[name].object.own_pairs
 
     def _with_obstacles(self, first: int, moving: Sequence[int], above: Sequence[int]) -> Floats:
         """Return the pairs of what moves with the obstacles, the first of which is geometry `first`, and their margins.
@@ -130,14 +143,6 @@ class _Pairing:
         pairs = pairs[~floor[pairs[:, 1]] | np.isin(pairs[:, 0], above)]
         return np.column_stack([pairs[:, 0], first + pairs[:, 1], np.full(len(pairs), self.options.dist_safe)])
 
-    def _grasped(self, hold: Hold) -> str:
-        """Return the label of the link that a hold takes hold of."""
-        return f"{hold.object}.{self.scene.objects[hold.object].object.attachments[hold.attachment].link}"
-
-    def _touching(self, hold: Hold) -> Collection[str]:
-        """Return the labels of the links that take hold."""
-        return self.scene.robot.touch_links if hold.frame is None else (hold.frame,)
-
 
 def _boxes(shapes: Sequence[pin.GeometryObject]) -> tuple[Floats, ...]:
     """Return centres and half extents of bounding boxes, and placements as rotations and translations; see `PhaseGeometry`."""
@@ -148,52 +153,3 @@ def _boxes(shapes: Sequence[pin.GeometryObject]) -> tuple[Floats, ...]:
         np.array([shape.placement.rotation for shape in shapes]).reshape(-1, 3, 3),
         np.array([shape.placement.translation for shape in shapes]).reshape(-1, 3),
     )
-
-
-def eased_pairs(
-    scene: Scene, chain: VirtualKinematicChain, phase: Phase, part: PhaseGeometry, *, first: int, before: Phase | None, steps: int
-) -> dict[int, list[tuple[int, int, float]]]:
-    """Return pair → (first waypoint, last waypoint, margin [m]) for what may be close for a while.
-
-    A free object rests on something where it is lifted from and where it is put down; a frame that touches a target may
-    come close to what the target is on. The margin is half the distance at the contact.
-
-    Args:
-        scene: Where it happens.
-        chain: The chain.
-        phase: The phase.
-        part: Its geometry and pairs.
-        first: The waypoint at which the phase begins.
-        before: The phase before it.
-        steps: The waypoints of `EASED_TIME`.
-    """
-    shapes, last = part.shapes, first + phase.segments
-    eased: dict[int, list[tuple[int, int, float]]] = {}
-
-    def ease(moving: int, shape: coal.CollisionGeometry, where: pin.SE3, begin: int, end: int) -> None:
-        """Ease the pairs of a geometry that moves with what stands next to a shape."""
-        beside = part.within(float(part.margins.max()), *world_box(shape, where))
-        for k in part.pairs_of(moving, beside).tolist():
-            other = shapes[int(part.pairs[k, 1])]
-            distance = shape_distance(shape, where, other.geometry, other.placement)
-            if distance < part.margins[k]:
-                eased.setdefault(k, []).append((begin, end, EASED_SHARE * max(distance, 0.0)))
-
-    moments = [(h, p, first, first + steps) for h, p in phase.lifted.items()]
-    moments += [(h, p, last - steps, last) for h, p in phase.lowered.items()]
-    for hold, placement, begin, end in moments:
-        placed = dataclasses.replace(scene.objects[hold.object], placement=placement)
-        stands = {shape.name: shape.placement for shape in standing_geometry(placed)}
-        for i in chain.held_geometries[hold]:
-            ease(i, shapes[i].geometry, stands[own_name(shapes[i].name)], begin, end)
-    touches = [(goal, last - steps, last) for goal in phase.frames]
-    touches += [(goal, first, first + steps) for goal in (before.frames if before else ())]
-    for goal, begin, end in touches:
-        if not goal.touches:
-            continue
-        point, where = coal.Sphere(1e-4), pin.SE3(np.eye(3), goal.placement.translation)
-        joint, _ = chain.frame(goal.frame, goal.hold)
-        for i in range(len(chain.collision.geometryObjects)):
-            if part.labels[i] == str(goal) if goal.hold else shapes[i].parentJoint == joint:
-                ease(i, point, where, begin, end)
-    return eased

@@ -130,6 +130,12 @@ class ContactModel:
                 view._shapes[number] = self._shapes[number].placed(where)
         return view
 
+    def carried(self, phase: int) -> list[int]:
+        """Return the geometries of what is held in a phase, and of what rides on that."""
+        held, riding = self.task.phases[phase].held, self.task.phases[phase].rides
+        found = [self.chain.held_geometries[hold] for hold in held] + [self.chain.ride_geometries[ride] for ride in riding]
+        return [i for indices in found for i in indices]
+
     def phase_of(self, waypoint: int) -> int:
         """Return the phase whose geometry holds at `waypoint`: at a boundary the earlier, before the grasp."""
         return int(self.phases_of(np.array([waypoint]))[0])

@@ -1,7 +1,7 @@
 """Residuals between placements, symbolically: h_chain of eq. 2 and f_task of eq. 3.
 
-Three kinds of goal: "pose" is a whole placement; "point" only its translation; "upright" the translation, and the world's
-vertical as the target has it, at any heading.
+Four kinds of goal: "pose" is a whole placement; "point" only its translation; "level" the world's vertical as the target has it,
+anywhere and at any heading; "upright" that and the translation.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ ROW_BOUNDS: Mapping[str, tuple[Floats, Floats]] = {
     "pose": (np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]), np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.inf])),
     "point": (np.zeros(3), np.zeros(3)),
     "upright": (np.zeros(6), np.array([0.0, 0.0, 0.0, 0.0, 0.0, np.inf])),
+    "level": (np.zeros(3), np.array([0.0, 0.0, np.inf])),
 }
 """For every kind of goal, the bounds between which `pose_rows` must lie."""
 
@@ -34,7 +35,7 @@ class PoseRow:
         joint: Joint of the model that carries it.
         local: Its placement in the joint's frame.
         waypoints: At which waypoints, counted from 1.
-        kind: "pose", "point" or "upright"; see `pose`.
+        kind: "pose", "point", "upright" or "level"; see `pose`.
         shift: (joint, vector): what is added to the frame's translation, a vector that is fixed in another joint's frame [m].
             With it a hand can be asked to be short of a grasp by so much along its approach, wherever in the grasp that is.
     """
@@ -70,6 +71,7 @@ class PoseRow:
         return rotation @ self.local.rotation, translation
 
 
+_VERTICAL = ("upright", "level")
 _HALF_TURN = 1e-6  # of (2 cos(θ/2))²
 _GENERIC = ca.DM([0.3, 0.55, 0.78])  # perpendicular to no axis that anybody turns about
 
@@ -80,17 +82,17 @@ def pose_residual(kind: str, rotation: Any, translation: Any, target: Any) -> An
     Of a "pose" it has shape (6, 1): θ and a are angle and axis of E = R*ᵀR. Unlike ½ vee(E − Eᵀ), which vanishes at θ = π
     too, this grows up to π, where the axis, and so every residual, has two signs. Within 1e-3 of π it comes from
     E + I = 2aaᵀ instead, with a slope that leads away from there. Of a "point" it is p − p*, shape (3, 1). Of "upright",
-    shape (5, 1), θ is the angle between the two verticals, and a has two components.
+    shape (5, 1), θ is the angle between the two verticals, and a has two components; "level", shape (2, 1), is the latter.
     """
     offset = translation - target[9:]
     if kind == "point":
         return offset
-    if kind == "upright":
+    if kind in _VERTICAL:
         sideways, along = _tilt(rotation, target)
         squared = 2.0 + 2.0 * along  # (2 cos(θ/2))²
         upside_down = ca.DM([2.0, 0.0])
         tilt = ca.if_else(squared > _HALF_TURN, 2.0 * sideways / ca.sqrt(ca.fmax(squared, _HALF_TURN)), upside_down + sideways)
-        return ca.vertcat(offset, tilt)
+        return ca.vertcat(offset, tilt) if kind == "upright" else tilt
     error = ca.reshape(target[:9], 3, 3).T @ rotation
     vee = ca.vertcat(error[2, 1] - error[1, 2], error[0, 2] - error[2, 0], error[1, 0] - error[0, 1])
     squared = 1.0 + error[0, 0] + error[1, 1] + error[2, 2]  # (2 cos(θ/2))²
@@ -104,15 +106,16 @@ def pose_rows(kind: str, rotation: Any, translation: Any, target: Any) -> Any:
     """Return constraints that are linear in the placement, and lie between `ROW_BOUNDS` where, and only where, the goal holds.
 
     A "pose" gives (p − p*, ½ vee(E − Eᵀ), trace E) with E = R*ᵀR, shape (7, 1): the trace keeps out the half turns, where
-    the antisymmetric part vanishes too. "upright" gives (p − p*, sideways, along), shape (6, 1): the vertical's components
-    across the target's vertical and along it, of which the last keeps out what stands on its head. Being linear in (R, p)
-    they add nothing to the second derivatives of the kinematics, as `pose_residual` would.
+    the antisymmetric part vanishes too. "level" gives (sideways, along), shape (3, 1): the vertical's components across the
+    target's vertical and along it, of which the last keeps out what stands on its head. "upright" gives (p − p*, sideways,
+    along), shape (6, 1). Being linear in (R, p) they add nothing to the second derivatives of the kinematics, as
+    `pose_residual` would.
     """
     offset = translation - target[9:]
     if kind == "point":
         return offset
-    if kind == "upright":
-        return ca.vertcat(offset, *_tilt(rotation, target))
+    if kind in _VERTICAL:
+        return ca.vertcat(*([offset] if kind == "upright" else []), *_tilt(rotation, target))
     error = ca.reshape(target[:9], 3, 3).T @ rotation
     vee = ca.vertcat(error[2, 1] - error[1, 2], error[0, 2] - error[2, 0], error[1, 0] - error[0, 1]) / 2
     return ca.vertcat(offset, vee, error[0, 0] + error[1, 1] + error[2, 2])
@@ -124,8 +127,8 @@ AWAY = 7  # numbers that say how far a frame is from its target: offset [m], axi
 def away_from(kind: str, rotations: Floats, translations: Floats, target: pin.SE3) -> Floats:
     """Return how far frames are from their target, shape (B, 7): p − p* [m], and axis a and angle θ [rad] of exp(θa) = R*ᵀR.
 
-    For "upright" the turn is the shortest that makes the vertical the target's, for "point" there is none; see `receded`. It is
-    as exact next to half turns as anywhere else, which `pose_residual` is not.
+    For "upright" and "level" the turn is the shortest that makes the vertical the target's, for "point" there is none, and no
+    offset for "level"; see `receded`. It is as exact next to half turns as anywhere else, which `pose_residual` is not.
 
     Args:
         kind: Of the goal.
@@ -134,7 +137,7 @@ def away_from(kind: str, rotations: Floats, translations: Floats, target: pin.SE
         target: Where they are to be.
     """
     turn, along = np.zeros((len(rotations), 3)), np.ones(len(rotations))  # a·sin and cos of θ, or of θ/2
-    if kind == "upright":  # the vertical leans over by θ, as the world sees it; what stands on its head, about any level axis
+    if kind in _VERTICAL:  # the vertical leans over by θ, as the world sees it; what stands on its head, about any level axis
         vertical = rotations[:, 2] @ target.rotation.T
         turn = np.column_stack([vertical[:, 1], -vertical[:, 0], np.zeros(len(turn))])
         turn, along = np.where(turn.any(axis=1, keepdims=True), turn, [1e-99, 0.0, 0.0]) @ target.rotation, vertical[:, 2]
@@ -144,7 +147,7 @@ def away_from(kind: str, rotations: Floats, translations: Floats, target: pin.SE
     size = np.linalg.norm(turn, axis=1, keepdims=True)
     axis = np.where(size > 0.0, turn / np.maximum(size, np.finfo(float).tiny), [0.0, 0.0, 1.0])
     angle = (2.0 if kind == "pose" else 1.0) * np.arctan2(size[:, 0], along)
-    return np.column_stack([translations - target.translation, axis, angle])
+    return np.column_stack([(kind != "level") * (translations - target.translation), axis, angle])
 
 
 def receded(target: Any, away: Any, share: Any) -> Any:

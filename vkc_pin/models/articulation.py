@@ -5,7 +5,7 @@ An object is a URDF tree plus named attachments (where a tool takes hold of it, 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -151,6 +151,7 @@ class ArticulatedObject:
         latches: Its latches.
         base_link: The name of its base link.
         free: Whether it can be carried away (a stick), instead of standing fixed in the world (a door).
+        own_pairs: Pairs of its links that can meet; others are taken to be made so that they cannot.
     """
 
     name: str
@@ -167,6 +168,7 @@ class ArticulatedObject:
     latches: tuple[Latch, ...]
     base_link: str
     free: bool = False
+    own_pairs: Set[frozenset[str]] = frozenset()
 
     def __repr__(self) -> str:
         return f"<ArticulatedObject {self.name}: joints {', '.join(self.coordinates.names) or 'none'}>"
@@ -175,6 +177,12 @@ class ArticulatedObject:
     def links(self) -> tuple[str, ...]:
         """The names of its links."""
         return tuple(str(frame.name) for frame in self.model.frames if frame.type == pin.FrameType.BODY)
+
+    def links_moved_by(self, joints: Set[str]) -> set[str]:
+        """Return the links that any of some joints move."""
+        above = [{str(self.model.names[k]) for k in support} for support in self.model.supports]
+        bodies = [frame for frame in self.model.frames if frame.type == pin.FrameType.BODY]
+        return {str(frame.name) for frame in bodies if not joints.isdisjoint(above[frame.parentJoint])}
 
     def attachment(self, name: str | None = None) -> Attachment:
         """Return the attachment `name`, or the default one. Raises `UnknownNameError` if there is none."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Literal
@@ -88,6 +88,7 @@ class ObjectSchema(Schema):
     joints: Mapping[str, JointSchema] = Field(default_factory=dict)
     attachments: Annotated[tuple[AttachmentSchema, ...], require(bool, "nothing in the list", "at least one")]
     latches: tuple[LatchSchema, ...] = ()
+    own_collisions: tuple[Annotated[tuple[str, ...], count(2)], ...] = ()
 
 
 def load_object(name_or_path: str | Path) -> ArticulatedObject:
@@ -146,6 +147,7 @@ def load_object(name_or_path: str | Path) -> ArticulatedObject:
         latches=_latches(document, schema, coordinates),
         base_link=links[0],
         free=schema.free,
+        own_pairs=_own_pairs(document, schema, links),
     )
 
 
@@ -177,6 +179,16 @@ def _freedoms(item: AttachmentSchema) -> tuple[Freedom, ...]:
     if item.turn is not None:
         return Freedom("_slide", "prismatic", axis, *item.limits), Freedom("_turn", "revolute", axis, *item.turn)
     return (Freedom("", item.joint, axis, *item.limits),)
+
+
+def _own_pairs(document: Document, schema: ObjectSchema, links: Sequence[str]) -> frozenset[frozenset[str]]:
+    for number, pair in enumerate(schema.own_collisions):
+        for place, link in enumerate(pair):
+            if link not in links:
+                raise document.unknown(("own_collisions", number, place), "link", link, links)
+        if pair[0] == pair[1]:
+            raise document.error(("own_collisions", number), "a link cannot meet itself", expected="two links", got=pair[0])
+    return frozenset(map(frozenset, schema.own_collisions))
 
 
 def _latches(document: Document, schema: ObjectSchema, coordinates: Coordinates) -> tuple[Latch, ...]:

@@ -1,7 +1,7 @@
 """The scene as one plain tree, nothing inverted: robot and objects side by side, rooted in the world.
 
 Validation, pictures and plots use it; being built without the chain, it can catch the chain's mistakes. A free object has
-a free joint: it stands where it was left, and moves rigidly with the hand from where it was when the hand closed.
+a free joint, where `carrying` has it: it moves rigidly with what holds it or what it stands on.
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ from vkc_pin.arrays import Floats
 from vkc_pin.models.coordinates import Coordinates
 from vkc_pin.models.grafting import graft, graft_geometry
 from vkc_pin.models.shapes import link_name
-from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.motion.carrying import FreeObjects, as_numbers
+from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.scene import Scene
 
-__all__ = ["FREE_JOINT", "World", "as_numbers", "scene_after", "units_of"]
+__all__ = ["FREE_JOINT", "World", "scene_after", "units_of"]
 
 FREE_JOINT = "placement"
 """A free object's placement in the world is the joint `<object>.placement`."""
@@ -118,65 +119,9 @@ class World:
         for column, name in enumerate(trajectory.names):
             if name in index:  # virtual joints of grasps belong to no body
                 rows[:, index[name]] = values[:, column]
-        self._carry(trajectory, times, rows)
+        for name, placements in FreeObjects(self.scene, trajectory).at(times).items():
+            rows[:, self.placement_columns(name)] = placements
         return rows
-
-    def _carry(self, trajectory: Trajectory, times: Floats, rows: Floats) -> None:
-        """Write into `rows` where free objects are: with whatever holds them, from where they were when it took hold."""
-        where = {name: placed.placement for name, placed in self.scene.objects.items() if placed.object.free}
-        if not where:
-            return
-        for number, phase in enumerate(trajectory.phases):
-            begin, end = float(trajectory.times[phase.first]), float(trajectory.times[phase.last])
-            last = number == len(trajectory.phases) - 1
-            now = np.flatnonzero(((times > begin) | (number == 0)) & ((times <= end) | last))
-            asked = np.clip(np.concatenate([[begin], times[now], [end]]), begin, end)
-            found = self._carried(trajectory, phase, asked, where)
-            for name, placements in found.items():
-                rows[now, self.placement_columns(name)] = np.reshape([as_numbers(p) for p in placements[1:-1]], (-1, 7))
-                where[name] = placements[-1]
-            for name in where.keys() - found.keys():
-                rows[now, self.placement_columns(name)] = as_numbers(where[name])
-        for name in where:  # of the two quaternions of one orientation the nearer, so that rows can be interpolated
-            columns = self.placement_columns(name)
-            turns = rows[:, columns][:, 3:]
-            flips = np.concatenate([[1.0], np.sign(np.einsum("kc,kc->k", turns[1:], turns[:-1]))])
-            rows[:, columns.start + 3 : columns.stop] = turns * np.cumprod(np.where(flips == 0.0, 1.0, flips))[:, None]
-
-    def _carried(
-        self, trajectory: Trajectory, phase: PhaseSpan, times: Floats, where: Mapping[str, pin.SE3]
-    ) -> dict[str, list[pin.SE3]]:
-        """Return the placements at `times` of all free objects held in a phase, which are at `where` at the first of these."""
-        values, robot = trajectory.at(times), self.scene.robot
-        data = robot.model.createData()
-        tool = robot.model.getFrameId(robot.tool_frame)
-        tools: list[pin.SE3] = []
-        found: dict[str, list[pin.SE3]] = {}
-        for hold in phase.holds:
-            placed = self.scene.objects[hold.object]
-            if not placed.object.free:
-                continue
-            if hold.by is None:
-                for q in robot.coordinates.q(values[:, : trajectory.robot_size]) if not tools else ():
-                    pin.forwardKinematics(robot.model, data, q)
-                    tools.append(pin.updateFramePlacement(robot.model, data, tool).copy())
-                holders = tools
-            else:
-                carrier = self.scene.objects[hold.by.object]
-                link = carrier.object.link_placement(str(hold.link), carrier.state)
-                holders = [placement * link for placement in found[hold.by.object]]
-            attachment = placed.object.attachment(hold.attachment)
-            grasped = placed.object.link_placement(attachment.link, placed.state)
-            names = [f"{hold.object}.{name}" for name in attachment.coordinates]
-            freedom = values[:, [trajectory.names.index(name) for name in names]]
-            still = attachment.tool(freedom[0]) if not np.ptp(freedom, axis=0).any() else None
-            ideal = [
-                holder * (grasped * (still if still is not None else attachment.tool(row))).inverse()
-                for holder, row in zip(holders, freedom, strict=True)
-            ]
-            offset = ideal[0].inverse() * where[hold.object]  # the hand may close a hair beside the attachment
-            found[hold.object] = [placement * offset for placement in ideal]
-        return found
 
     def joints_of(self, name: str) -> list[int]:
         """Return the joints of the model that are an object's, with its free joint."""
@@ -192,11 +137,6 @@ class World:
         """Return which of the coordinates are the placement of a free object."""
         first = self.coordinates.index(f"{name}.{FREE_JOINT}_x")
         return slice(first, first + 7)
-
-
-def as_numbers(placement: pin.SE3) -> Floats:
-    """Return a placement as a free joint's seven coordinates."""
-    return np.asarray(pin.SE3ToXYZQUAT(placement), float)
 
 
 def scene_after(scene: Scene, trajectory: Trajectory, holds: Sequence[Hold]) -> Scene:

@@ -149,7 +149,7 @@ def _draw_clearance(figure: FigureBase, plan: Judged) -> None:
     times = np.unique(np.concatenate([np.linspace(trajectory.times[0], trajectory.times[-1], _SAMPLES), trajectory.times]))
     safe = plan.options.dist_safe
     lowest = 0.0
-    for k, curve in enumerate(clearance_curves(plan.scene, trajectory, times, dist_safe=safe)):
+    for k, curve in enumerate(clearance_curves(plan.scene, trajectory, times)):
         distance, when, pair = curve.closest()
         touching = "grasps" in curve.name
         colour = "0.6" if touching else COLOURS[k % len(COLOURS)]

@@ -25,14 +25,14 @@ class PoseGoal:
         row: The frame, and the waypoints at which it must be there.
         target: Where, in the world.
         kind: "closure" of what stands fixed and is held; "grasp" of a free object; "approach": where the straight path to a grasp
-            begins; "goal" of a step.
+            begins; "level": what something rides on; "goal" of a step.
         about: What it is about, for people: an object, a hold or a frame.
         object: The object that is held or grasped; None for the goal of a step.
     """
 
     row: PoseRow
     target: pin.SE3
-    kind: Literal["closure", "grasp", "approach", "goal"]
+    kind: Literal["closure", "grasp", "approach", "level", "goal"]
     about: str
     object: str | None = None
 
@@ -77,6 +77,11 @@ def pose_goals(scene: Scene, chain: VirtualKinematicChain, task: Task, options: 
                 continue
             row = PoseRow(closure.joint, closure.local, (at,), shift=(joint, (x, y, z)))
             goals.append(PoseGoal(row, target, "approach", str(hold), hold.object))
+        for hold, ride in {ride.hold: ride for ride in phase.rides}.items():
+            thing = scene.objects[hold.object].object
+            if thing.free:
+                row = PoseRow(*chain.frame(thing.base_link, hold), tuple(range(int(first) + 1, int(last) + 1)), "level")
+                goals.append(PoseGoal(row, ride.carrier, "level", hold.object, hold.object))
         for goal in phase.frames:
             row = PoseRow(*chain.frame(goal.frame, goal.hold), (int(last),), goal.kind)
             goals.append(PoseGoal(row, goal.placement, "goal", str(goal)))

@@ -54,7 +54,7 @@ class TrajectoryProblem:
         self, scene: Scene, task: Task, options: Options, terms: Sequence[Term] = (), *, cache: Cache | None = None
     ) -> None:
         self.scene, self.task, self.options, self.cache = scene, task, options, cache or Cache()
-        self.chain: VirtualKinematicChain = consolidate(scene, task.holds, cache=self.cache)
+        self.chain: VirtualKinematicChain = consolidate(scene, task.holds, rides=task.rides, cache=self.cache)
         self.contacts = ContactModel(scene, self.chain, task, options)
         self.ends = np.cumsum([phase.segments for phase in task.phases])
         self.pose_goals = pose_goals(scene, self.chain, task, options)
@@ -255,7 +255,7 @@ class TrajectoryProblem:
         allowed = np.array([self.options.closure_position, self.options.closure_angle])
         for goal, solver in zip(self.pose_goals, self.transcription.pose_solvers, strict=True):
             held = np.array([t - 1 for t in goal.row.waypoints if t - 1 in goal.row.waypoints], int)
-            if len(held):
+            if len(held) and goal.kind == "closure":
                 residual, _ = solver.evaluate(between[held], goal.target)
                 amounts = np.linalg.norm(residual.reshape(len(held), 2, 3), axis=2)
                 worst = max(worst, float((amounts / allowed).max()))

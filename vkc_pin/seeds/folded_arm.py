@@ -42,7 +42,7 @@ def _size(problem: TrajectoryProblem, phase: int, z: Floats) -> Floats:
     chain, shapes = problem.chain, problem.contacts.phases[phase].shapes
     rotations, translations = chain.joint_placements(z)
     reach = np.zeros((len(z), 3))
-    carried = [i for hold in problem.task.phases[phase].held for i in chain.held_geometries[hold]]
+    carried = problem.contacts.carried(phase)
     for shape in (shapes[i] for i in [*range(len(chain.robot.collision.geometryObjects)), *carried]):
         joint = shape.parentJoint
         if joint > 1:

@@ -76,9 +76,9 @@ class Knots:
         self.objects = follow_objects(problem, np.tile(problem.start, (problem.segments, 1)))
 
     def pose_at(self, waypoint: int) -> int | None:
-        """Return the pose that must hold at a waypoint, if any."""
+        """Return the pose that must hold at a waypoint, if any; what must only be level says nothing of where."""
         poses = self.problem.transcription.structure.poses
-        return next((k for k, pose in enumerate(poses) if waypoint in pose.waypoints), None)
+        return next((k for k, pose in enumerate(poses) if waypoint in pose.waypoints and pose.kind != "level"), None)
 
     def solver(self, pose: int) -> tuple[PoseSolver, pin.SE3]:
         """Return the inverse kinematics of a pose, and its target."""

@@ -126,7 +126,7 @@ def grid_shapes(problem: TrajectoryProblem, phase: int, z: Floats) -> tuple[list
     chain, part = problem.chain, problem.contacts.phases[phase]
     rotations, translations = chain.joint_placements(z[None])
     robot = range(len(chain.robot.collision.geometryObjects))
-    held = [i for hold in problem.task.phases[phase].held for i in chain.held_geometries[hold]]
+    held = problem.contacts.carried(phase)
     moving: list[tuple[int, Shape]] = []
     for shape in (part.shapes[i] for i in [*robot, *held]):
         joint = shape.parentJoint

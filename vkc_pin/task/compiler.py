@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,6 +16,7 @@ from vkc_pin.scene.placed import PlacedObject
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.lookup import attachment_of, check_link, joint_limits, path_joints, placed_object, robot_frame
 from vkc_pin.task.phases import FrameGoal, Mark, Phase, PhaseKind, Task
+from vkc_pin.task.rides import Riders
 from vkc_pin.task.steps import STEPS, Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch, as_list
 
 __all__ = ["compile_task", "nothing_to_do"]
@@ -33,8 +34,10 @@ class _Compiler:
         self.state: dict[str, float] = {}
         self.standing = {n: p.placement for n, p in scene.objects.items() if p.object.free and n not in scene.held}
         self.left: dict[str, tuple[Hold, int]] = {}
+        self.riders = Riders(scene, self.standing)
         for hold in self.held:
             self._enter(scene.objects[hold.object], hold.attachment)
+            self.riders.load(hold, self.state, "held")
 
     def _enter(self, placed: PlacedObject, attachment: str) -> None:
         """Make the joints that a grasp can move coordinates of the task, with the values they have at its start."""
@@ -42,6 +45,15 @@ class _Compiler:
             value = float(placed.state[placed.object.coordinates.index(joint)])
             self.initial.setdefault(f"{placed.name}.{joint}", value)
             self.state.setdefault(f"{placed.name}.{joint}", value)
+
+    def _move(
+        self, kind: PhaseKind, hold: Hold, where: str, values: dict[str, float], ranges: Mapping[str, tuple[float, float]]
+    ) -> None:
+        """Add a phase in which joints move of what stands fixed and is held, with all that stands on it."""
+        self.riders.begin(hold, {coordinate.partition(".")[2] for coordinate in ranges}, self.state, where)
+        segments = self.options.move_waypoints if kind == "move" else self.options.turn_waypoints
+        self._append(kind, tuple(values), segments, ranges=ranges, values=values)
+        self.riders.end(self.state, where)
 
     def _append(self, kind: PhaseKind, about: tuple[str, ...], segments: int, **details: Any) -> None:
         last = self.phases[-1] if self.phases else None
@@ -56,8 +68,9 @@ class _Compiler:
             leaves=leaves,
             before=dict(self.state),
             standing=dict(self.standing),
-            left=dict(self.left),
+            left={name: how for name, how in self.left.items() if name not in self.riders.moved},
             lifted={hold: where for hold, where in lifted.items() if hold in self.held},
+            rides=self.riders.rides,
             **details,
         )
         self.phases.append(phase)
@@ -100,12 +113,16 @@ class _Compiler:
             problem = f"where '{name}' stands by then is known only after planning"
             expected = "Place with a full pose before, or a second plan from where the first ends"
             raise InputError(problem, field=f"{where}.object", expected=expected)
+        if any(ride.object == name for ride in self.riders.carried):
+            problem = f"'{name}' stands on what the robot carries"
+            raise InputError(problem, field=f"{where}.object", expected="Place or Release before")
         if hold not in self.holds:
             self.holds.append(hold)
         self._enter(placed, attachment.name)
         about = (hold.object, hold.attachment, hold.frame or "")
         self._append("grasp", about, self.options.reach_waypoints, grasps=(hold,))
         self.held = (*self.held, hold)
+        self.riders.load(hold, self.state, where)
         self.standing.pop(name, None)
         return hold
 
@@ -132,7 +149,8 @@ class _Compiler:
         if placed.object.free:
             problem = f"'{step.object}' stands free: its joints are not driven by a hand"
             raise InputError(problem, field=f"{where}.object", expected="a fixed object")
-        attachment = placed.object.attachments[self.grasp(step.object, step.attachment, where).attachment]
+        hold = self.grasp(step.object, step.attachment, where)
+        attachment = placed.object.attachments[hold.attachment]
         path = path_joints(placed, attachment)
         for joint in step.joints:
             if joint not in path:
@@ -157,16 +175,14 @@ class _Compiler:
             lower, upper = joint_limits(placed, release)
             turned = min(latch.threshold + LATCH_MARGIN, upper)
             if self.state[release] < turned:
-                ranged, goal = {release: (lower, upper)}, {release: turned}
-                self._append("turn", (release,), self.options.turn_waypoints, ranges=ranged, values=goal)
+                self._move("turn", hold, where, {release: turned}, {release: (lower, upper)})
             if values.get(release, upper) < turned:
                 after[release] = values[release]
             ranges[release] = (turned, upper)
             values[release] = turned if release in after else values.get(release, turned)
-        self._append("move", tuple(values), self.options.move_waypoints, ranges=ranges, values=values)
+        self._move("move", hold, where, values, ranges)
         if after:
-            limits = {release: joint_limits(placed, release) for release in after}
-            self._append("turn", tuple(after), self.options.turn_waypoints, ranges=limits, values=after)
+            self._move("turn", hold, where, after, {release: joint_limits(placed, release) for release in after})
 
     def touch(self, step: Touch, where: str) -> None:
         """Add the phase that brings a frame to its target, carrying on what is carried."""
@@ -203,9 +219,7 @@ class _Compiler:
         pose = pin.SE3(stands, np.array(step.pose)) if upright else step.pose
         goal = FrameGoal(placed.object.base_link, pose, "upright" if upright else "pose", hold)
         self._append("place", (step.object,), self.options.reach_waypoints, frames=(goal,), lowered={hold: pose})
-        self._release(hold, pose)
-        if upright:
-            self.left[step.object] = (hold, len(self.phases) - 1)
+        self._release(hold, pose, nearly=upright)
 
     def release(self, step: Release, where: str) -> None:
         """Let go of one thing, or of everything."""
@@ -218,19 +232,18 @@ class _Compiler:
             self._append("stand", (), self.options.turn_waypoints)
         for hold in reversed(self.held):
             if hold in self.held and step.object in (None, hold.object):
-                placed = self.scene.objects[hold.object]
-                self._release(hold, placed.placement)
-                if placed.object.free:
-                    self.left[hold.object] = (hold, len(self.phases) - 1)
+                self._release(hold, self.scene.objects[hold.object].placement)
 
-    def _release(self, hold: Hold, where: pin.SE3) -> None:
-        """Take a hold, and what is held through it, out of the hand."""
+    def _release(self, hold: Hold, where: pin.SE3, *, nearly: bool = True) -> None:
+        """Take a hold, and what is held through it, out of the hand; where it stands then, the motion decides, if `nearly`."""
         for other in [h for h in self.held if h.by == hold]:
             self._release(other, self.scene.objects[other.object].placement)
-            self.left[other.object] = (other, len(self.phases) - 1)
         self.held = tuple(h for h in self.held if h != hold)
         if self.scene.objects[hold.object].object.free:
             self.standing[hold.object] = where
+            ridden = self.riders.unload(hold, where)
+            if nearly:
+                self.left |= dict.fromkeys((hold.object, *ridden), (hold, len(self.phases) - 1))
 
     def add(self, step: Step, where: str) -> None:
         own: dict[type, Callable[[Any, str], None]]

@@ -10,6 +10,7 @@ from typing import Literal
 import pinocchio as pin
 
 from vkc_pin.scene.hold import Hold
+from vkc_pin.scene.resting import Ride
 from vkc_pin.task.steps import Step
 
 __all__ = ["FrameGoal", "Mark", "Phase", "PhaseKey", "PhaseKind", "Task", "stretches"]
@@ -72,6 +73,7 @@ class Phase:
             those of `standing` that stand there only nearly: where exactly, the motion decides.
         lifted: Hold → placement in which its free object stood when it was grasped just before.
         lowered: Hold → placement in which its free object stands when it is let go of at the end.
+        rides: What stands on something that moves, and moves along.
     """
 
     kind: PhaseKind
@@ -89,6 +91,7 @@ class Phase:
     left: Mapping[str, tuple[Hold, int]] = field(default_factory=dict)
     lifted: Mapping[Hold, pin.SE3] = field(default_factory=dict)
     lowered: Mapping[Hold, pin.SE3] = field(default_factory=dict)
+    rides: tuple[Ride, ...] = ()
 
     @property
     def name(self) -> str:
@@ -141,6 +144,11 @@ class Task:
     def segments(self) -> int:
         """Steps of time of the whole task; it has one waypoint more."""
         return sum(phase.segments for phase in self.phases)
+
+    @property
+    def rides(self) -> tuple[Ride, ...]:
+        """All rides of its phases."""
+        return tuple(dict.fromkeys(ride for phase in self.phases for ride in phase.rides))
 
     def until(self, count: int) -> Task:
         """Return the task of the first `count` steps, at least 1, as if there were no others."""

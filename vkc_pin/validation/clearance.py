@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,10 +11,10 @@ from numpy.typing import ArrayLike
 from vkc_pin.arrays import Floats, Ints
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.motion.world import World
+from vkc_pin.scene.contact import grasped, touching
 from vkc_pin.scene.scene import Scene
 from vkc_pin.validation.distances import Solids
 from vkc_pin.validation.pairs import PairTable
-from vkc_pin.validation.touching import may_touch
 
 __all__ = ["ClearanceCurve", "clearance_curves"]
 
@@ -40,7 +41,7 @@ class ClearanceCurve:
         return float(self.distances[k]), float(self.times[k]), " – ".join(self.pairs[k])
 
 
-def clearance_curves(scene: Scene, trajectory: Trajectory, times: ArrayLike, *, dist_safe: float) -> list[ClearanceCurve]:
+def clearance_curves(scene: Scene, trajectory: Trajectory, times: ArrayLike) -> list[ClearanceCurve]:
     """Return how close shapes come along a motion, for each kind of pair that there is.
 
     The kinds are the robot with itself, with articulated objects, with obstacles, objects with what stands around them,
@@ -50,14 +51,14 @@ def clearance_curves(scene: Scene, trajectory: Trajectory, times: ArrayLike, *, 
         scene: Where it happens.
         trajectory: The motion.
         times: When to look, shape (K,) [s].
-        dist_safe: The clearance asked for [m]; a pair that may touch is recognised by asking for less.
     """
     world = World(scene)
     solids = Solids(world)
-    touching = may_touch(scene, solids, trajectory, (), dist_safe)
-    table = PairTable(scene, solids, trajectory, dist_safe, touching=touching)
+    table = PairTable(scene, solids, trajectory, 0.0)
     moments = np.atleast_1d(np.asarray(times, float))
-    kinds = np.array([_kind(table, pair, margin) for pair, margin in zip(table.pairs, table.margins, strict=True)])
+    holds = {hold for phase in trajectory.phases for hold in phase.holds} | set(scene.holds)
+    gripped = {(link, grasped(scene, hold)) for hold in holds for link in touching(scene, hold)}
+    kinds = np.array([_kind(table, pair, gripped) for pair in table.pairs])
     groups = {kind: table.pairs[kinds == kind] for kind in _KINDS if (kinds == kind).any()}
     placed, curves = table.solids.at(world.coordinates.q(world.positions(trajectory, moments))), []
     for kind, pairs in groups.items():
@@ -70,11 +71,12 @@ def clearance_curves(scene: Scene, trajectory: Trajectory, times: ArrayLike, *, 
 _KINDS = ("robot – itself", "robot – objects", "robot – obstacles", "objects – surroundings", "gripper – what it grasps")
 
 
-def _kind(table: PairTable, pair: Ints, margin: float) -> str:
+def _kind(table: PairTable, pair: Ints, gripped: Set[tuple[str, str]]) -> str:
     first, second = (table.group[int(i)] for i in pair)
-    if margin <= 0.0 and first == "robot":
+    one, other = (table.world.collision_labels[int(i)] for i in pair)
+    if first == "robot" and (one, other) in gripped:
         return _KINDS[4]
     if first != "robot" and second != "robot":
         return _KINDS[3]
-    other = second if first == "robot" else first
-    return {"robot": _KINDS[0], "": _KINDS[2]}.get(other, _KINDS[1])
+    owner = second if first == "robot" else first
+    return {"robot": _KINDS[0], "": _KINDS[2]}.get(owner, _KINDS[1])

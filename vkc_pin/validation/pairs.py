@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from vkc_pin.arrays import Floats, Ints
+from vkc_pin.arrays import Bools, Floats, Ints
 from vkc_pin.errors import InputError
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.scene import Scene
 from vkc_pin.validation.distances import Placed, Solids
+from vkc_pin.validation.touching import Window
 
 __all__ = ["PairTable"]
 
+_STILL = 1e-9  # [m] or [rad]
 _AT_ONCE = 16  # states whose boxes are compared at once
 
 
@@ -23,82 +25,108 @@ class PairTable:
 
     Attributes:
         pairs: Indices of `world.shapes`, shape (P, 2).
-        margins: Clearance each must keep at waypoints [m], shape (P,); 0 where a gripper closes on what it grasps.
-        contact: Overlap that counts as contact [m], shape (P,).
-        together: Whether one holds the other in some phase, so that they move as one, shape (P,): `closure` sees to that.
         solids: The shapes, to ask for distances.
+        dist_safe: Clearance to keep at the waypoints [m].
 
     Args:
         scene: Where it happens.
         solids: The shapes of the scene as one plain tree.
         trajectory: The motion.
         dist_safe: Clearance to keep at the waypoints [m].
-        touching: Which pairs of `world.shapes` (smaller index first) need no clearance, and the overlap of each that counts
-            as contact [m].
+        windows: Which pairs may be closer than that, and when.
     """
 
     def __init__(
-        self,
-        scene: Scene,
-        solids: Solids,
-        trajectory: Trajectory,
-        dist_safe: float,
-        *,
-        touching: Mapping[tuple[int, int], float] | None = None,
+        self, scene: Scene, solids: Solids, trajectory: Trajectory, dist_safe: float, *, windows: Sequence[Window] = ()
     ) -> None:
-        touching = {} if touching is None else touching
-        self.scene, self.world, self.solids, self.dist_safe = scene, solids.world, solids, dist_safe
+        self.scene, self.world, self.solids, self.dist_safe = scene, solids.world, solids, float(dist_safe)
         world = self.world
-        self.moved = [False]  # for each joint of the world, whether the trajectory moves it or one that carries it
-        for joint in range(1, world.model.njoints):
-            self.moved.append(self.moved[world.model.parents[joint]] or world.model.names[joint] in trajectory.names)
-        held = {owner for phase in trajectory.phases for owner in phase.held}
-        self.attached = {name for name, placed in scene.objects.items() if placed.object.free and name in held}
-        for name in self.attached:
-            for joint in world.joints_of(name):
-                self.moved[joint] = True
-        robots = len(scene.robot.collision.geometryObjects)
-        self._robot_pairs = {frozenset((p.first, p.second)) for p in scene.robot.collision.collisionPairs}
+        rows = world.positions(trajectory)
+        self._moves = np.array([self._moved(rows[phase.first : phase.last + 1]) for phase in trajectory.phases])
+        self._phase = np.searchsorted([phase.last for phase in trajectory.phases], np.arange(len(rows)))  # the earlier of two
         labels, bodies = world.collision_labels, range(solids.bodies)
         owners = [label.partition(".")[0] if "." in label else "" for label in labels]
+        robots = len(scene.robot.collision.geometryObjects)
         self.group = ["robot" if i < robots else name if name in scene.objects else "" for i, name in enumerate(owners)]
-        self.pairs = np.concatenate(
-            [
-                np.array([(i, j) for j in bodies for i in range(j) if self._counts(i, j)], int).reshape(-1, 2),
-                self._with_obstacles(),
-            ]
-        )
+        self._robot_pairs = {frozenset((p.first, p.second)) for p in scene.robot.collision.collisionPairs}
+        self._moving_once: Bools = np.asarray(self._moves.any(axis=0))
+        own = np.array([(i, j) for j in bodies for i in range(j) if self._counts(i, j)], int).reshape(-1, 2)
+        self.pairs = np.concatenate([own, self._with_obstacles()])
         if not len(self.pairs):
             raise InputError("no pair of geometries can collide", field="scene", expected="collision geometry")
-        self.margins, self.contact = np.full(len(self.pairs), float(dist_safe)), np.zeros(len(self.pairs))
-        self.together = np.zeros(len(self.pairs), bool)
-        for pair, overlap in touching.items():
-            which = (self.pairs == pair).all(axis=1)
-            self.margins[which], self.contact[which], self.together[which] = 0.0, overlap, overlap == 0.0
-        for owner, link in {(hold.object, hold.frame) for phase in trajectory.phases for hold in phase.holds if hold.by}:
-            ones, others = np.array(self.group) == owner, np.array(labels) == link
-            first, second = self.pairs.T
-            self.together |= (ones[first] & others[second]) | (others[first] & ones[second])
+        self._windows = self._by_pair(windows)
+        self._special = np.zeros(len(self.pairs), bool)
+        self._special[list(self._windows)] = True
         self._sort()
+
+    def _moved(self, rows: Floats) -> Bools:
+        """Return whether each shape moves while the world goes through some configurations, shape (K, n): shape (G,)."""
+        world = self.world
+        moved = np.zeros(world.model.njoints, bool)
+        np.logical_or.at(moved, np.array(world.coordinates.joints), np.ptp(rows, axis=0) > _STILL)
+        for joint in range(1, len(moved)):
+            moved[joint] |= moved[world.model.parents[joint]]
+        robots = len(self.scene.robot.collision.geometryObjects)
+        return np.array([i < robots or moved[shape.parentJoint] for i, shape in enumerate(world.shapes)])
+
+    def _by_pair(self, windows: Sequence[Window]) -> dict[int, list[Window]]:
+        """Return pair → when it may be close."""
+        number = {pair: k for k, pair in enumerate(map(tuple, self.pairs.tolist()))}
+        found: dict[int, list[Window]] = {}
+        for window in windows:
+            for pair in map(tuple, window.pairs.tolist()):
+                if pair in number:
+                    found.setdefault(number[pair], []).append(window)
+        return found
+
+    def margins_at(self, pairs: Ints, waypoints: Ints) -> Floats:
+        """Return the clearances that pairs must keep at waypoints, both of shape (n,), shape (n,) [m]; -inf: none."""
+        margins = np.full(len(pairs), self.dist_safe)
+        for k, window in self._at(pairs, waypoints, waypoints):
+            margins[k] = min(margins[k], window.margin)
+        return margins
+
+    def contact_at(self, pairs: Ints, first: Ints, last: Ints) -> Floats:
+        """Return the overlap that counts as contact between waypoints `first` and `last`, all of shape (n,), shape (n,) [m]."""
+        overlap = np.zeros(len(pairs))
+        for k, window in self._at(pairs, first, last):
+            overlap[k] = max(overlap[k], window.contact)
+        return overlap
+
+    def together_at(self, pairs: Ints, first: Ints, last: Ints) -> Bools:
+        """Return whether pairs move as one between waypoints `first` and `last`, all of shape (n,), shape (n,)."""
+        as_one = np.zeros(len(pairs), bool)
+        for k, window in self._at(pairs, first, last):
+            as_one[k] |= window.together
+        return as_one
+
+    def _at(self, pairs: Ints, first: Ints, last: Ints) -> Iterator[tuple[int, Window]]:
+        """Yield for each of some pairs the windows that hold all the time from waypoint `first` to `last`."""
+        for k in np.flatnonzero(self._special[pairs]).tolist():
+            for window in self._windows[int(pairs[k])]:
+                if window.first <= first[k] and last[k] <= window.last:
+                    yield k, window
 
     def _counts(self, i: int, j: int) -> bool:
         """Return whether two bodies i < j (robot first, then objects) can collide at all."""
-        shapes, a, b = self.world.shapes, self.group[i], self.group[j]
+        a, b = self.group[i], self.group[j]
         if a == "robot" and b == "robot":
             return frozenset((i, j)) in self._robot_pairs
         if a == "robot":
             return True
         if a == b:  # an object with itself
-            return False
-        return self.moved[shapes[i].parentJoint] or self.moved[shapes[j].parentJoint]
+            links = frozenset(self.world.collision_labels[k].partition(".")[2] for k in (i, j))
+            return links in self.scene.objects[a].object.own_pairs
+        return bool(self._moving_once[i] or self._moving_once[j])
 
     def _with_obstacles(self) -> Ints:
         """Return the pairs of what moves with the obstacles, shape (n, 2), by obstacle."""
         bodies, labels = range(self.solids.bodies), self.world.collision_labels
         joints = [self.world.shapes[i].parentJoint for i in bodies]
-        moving = [i for i in bodies if self.group[i] == "robot" or self.moved[joints[i]]]
+        moving = [i for i in bodies if self._moving_once[i]]
         # Wheels stand on the floor, objects hang as their makers hung them.
-        above = [i for i in moving if self.group[i] in self.attached or (self.group[i] == "robot" and joints[i] > 1)]
+        free = {name for name, placed in self.scene.objects.items() if placed.object.free}
+        above = [i for i in moving if self.group[i] in free or (self.group[i] == "robot" and joints[i] > 1)]
         obstacles = range(self.solids.bodies, len(labels))
         found = [np.zeros((0, 2), int)]
         for floor, ones in ((False, moving), (True, above)):
@@ -108,7 +136,7 @@ class PairTable:
 
     def _sort(self) -> None:
         """Part the pairs of which both move from those of which one stands still all along the motion."""
-        moves = np.array([self.group[i] == "robot" or self.moved[shape.parentJoint] for i, shape in enumerate(self.world.shapes)])
+        moves = self._moving_once
         both = moves[self.pairs].all(axis=1)
         self._both, mixed = np.flatnonzero(both), np.flatnonzero(~both)
         pairs = self.pairs[mixed]
@@ -119,6 +147,8 @@ class PairTable:
 
     def close(self, placed: Placed, states: Ints, reach: Floats, also: Ints | None = None) -> tuple[Ints, Ints]:
         """Return (k, pair) of all pairs but those of which one stands still and the other is at least `reach` from it.
+
+        Neither are those among them of which nothing moves then: what stands where it stood is as close as it was.
 
         Args:
             placed: The world at some states.
@@ -147,5 +177,8 @@ class PairTable:
             at, *which = np.nonzero(near)
             found.append((at + k, number[tuple(which)]))
         at, pairs = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        phase = self._phase[(states if also is None else also)[at]]
+        active = (self._moves[phase[:, None], self.pairs[pairs]]).any(axis=1)
+        at, pairs = at[active], pairs[active]
         order = np.lexsort((pairs, at))
         return at[order], pairs[order]

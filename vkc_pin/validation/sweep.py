@@ -51,12 +51,14 @@ def sweep(table: PairTable, z: Floats, waypoints: Ints) -> Iterator[Hit]:
 class _Sweep:
     def __init__(self, table: PairTable) -> None:
         self._table, self._solids = table, table.solids
+        self._waypoints = np.zeros(0, int)
 
     def along(self, z: Floats, waypoints: Ints) -> Iterator[Hit]:
         placed = self._solids.at(self._solids.world.coordinates.q(z[waypoints]))
         at, pairs, distances = self._nearest(placed)
         closest = _least(at, distances)
-        chosen = np.union1d(closest, np.flatnonzero(distances < self._table.margins[pairs]))
+        self._waypoints = waypoints
+        chosen = np.union1d(closest, np.flatnonzero(distances < self._table.margins_at(pairs, at)))
         for row, k, distance in zip(waypoints[at[chosen]], pairs[chosen], distances[chosen], strict=True):
             yield self._hit(row, k, distance, at_waypoint=True)
         smallest = max(RESOLUTION, float(distances[closest].min()))  # what cannot come closer than that changes nothing
@@ -110,12 +112,10 @@ class _Sweep:
             todo: Stretches from one sample to the next.
             moved: See `travelled`.
         """
-        overlap, motion = self._table.contact[todo.pair], self._motion(todo, moved)
-        free = (
-            (np.minimum(todo.before, todo.after) >= -overlap)
-            & (todo.before + todo.after < motion)
-            & ~self._table.together[todo.pair]
-        )
+        first, motion = self._stretch(todo.low), self._motion(todo, moved)
+        overlap = self._table.contact_at(todo.pair, first, first + 1)
+        free = (np.minimum(todo.before, todo.after) >= -overlap) & (todo.before + todo.after < motion)
+        free &= ~self._table.together_at(todo.pair, first, first + 1)
         for c in np.flatnonzero(free).tolist():
             row, k = todo.low[c], todo.pair[c]
             stack = [(0.0, 1.0, todo.before[c], todo.after[c])]
@@ -140,7 +140,7 @@ class _Sweep:
 
     def _nearest_at(self, placed: Placed, todo: Ints) -> Iterator[tuple[Ints, Ints, Floats]]:
         """Yield those of some states, in no order."""
-        reach = max(float(self._table.margins.max()), RESOLUTION)
+        reach = max(self._table.dist_safe, RESOLUTION)
         while len(todo):
             at, pairs = self._table.close(placed, todo, np.full((len(todo), len(self._table.group)), reach))
             near = placed.bounds(todo[at], self._table.pairs[pairs]) < reach
@@ -173,10 +173,16 @@ class _Sweep:
         at, some = (np.concatenate(parts) for parts in zip(*found, strict=True))
         return at, some
 
+    def _stretch(self, rows: Ints) -> Ints:
+        """Return the waypoints from which the stretches begin in which samples are, shape (n,)."""
+        return np.searchsorted(self._waypoints, rows, side="right") - 1
+
     def _hit(self, row: int, k: int, distance: float, *, at_waypoint: bool = False) -> Hit:
         first, second = (self._solids.world.collision_labels[i] for i in self._table.pairs[k])
-        limits = {"margin": float(self._table.margins[k]), "contact": float(self._table.contact[k])}
-        return Hit(int(row), first, second, float(distance), **limits, at_waypoint=at_waypoint)
+        pair, at = np.array([k]), self._stretch(np.array([row]))
+        margin = float(self._table.margins_at(pair, at)[0])
+        contact = float(self._table.contact_at(pair, at, at if at_waypoint else at + 1)[0])
+        return Hit(int(row), first, second, float(distance), margin, contact, at_waypoint=at_waypoint)
 
 
 def _in_parts(count: int) -> list[Ints]:

@@ -1,77 +1,190 @@
-"""Which pairs may touch: a hand and what it grasps, an object and what it stands on, a frame and what it is told to touch."""
+"""Which pairs may be close, and when: by the rules of `scene.contact`, found in the motion itself."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.motion.trajectory import Trajectory
+from vkc_pin.arrays import Ints
+from vkc_pin.motion.carrying import FreeObjects
+from vkc_pin.options import Options
+from vkc_pin.scene.contact import CONTACT, EASED_TIME, grasped, moves_as_one, touching
+from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.steps import Grasp, Step, Touch
 from vkc_pin.validation.distances import Solids
+from vkc_pin.validation.samples import Samples
 
-__all__ = ["may_touch"]
+__all__ = ["Window", "windows"]
 
-CONTACT = 1e-4  # [m] of overlap that is contact: what stands on a table overlaps it by rounding
+_STILL = 1e-9  # [m] or [rad]
+_T = TypeVar("_T")
 
 
-def may_touch(
-    scene: Scene, solids: Solids, trajectory: Trajectory, steps: Sequence[Step], dist_safe: float
-) -> dict[tuple[int, int], float]:
-    """Return pairs of geometries (indices in the world's collision model) → overlap that counts as contact [m].
+class Window(NamedTuple):
+    """Pairs that may be closer than others for a while.
 
-    These pairs need no clearance: the robot's touch links and the link that is grasped; what is held through something and
-    the link that holds it; a free object that is carried, and what is within `dist_safe` of it where it is taken or left;
-    the link that a `Touch` brings somewhere, and what is within `dist_safe` of the target at the end of some phase.
+    Attributes:
+        pairs: Of indices of the world's shapes, the smaller first, shape (k, 2).
+        first, last: Between which waypoints.
+        margin: What they must keep at these [m].
+        contact: Overlap that counts as contact [m].
+        together: Whether they move as one, so that they need not be looked at between samples.
+    """
+
+    pairs: Ints
+    first: int
+    last: int
+    margin: float
+    contact: float = CONTACT
+    together: bool = False
+
+
+def windows(samples: Samples, solids: Solids, steps: Sequence[Step], options: Options) -> list[Window]:
+    """Return all pairs of a motion that may be close, and when.
 
     Args:
-        scene: Where it happens.
-        solids: The shapes of the scene as one plain tree.
-        trajectory: The motion.
+        samples: The motion.
+        solids: The shapes of its world.
         steps: What was asked for.
-        dist_safe: [m].
+        options: Clearances, and the time between waypoints that counts as one.
     """
-    world = solids.world
-    labels = world.collision_labels
-    allowed: dict[tuple[int, int], float] = {}
+    return list(_Windows(samples, solids, options).of(steps))
 
-    def allow(first: set[str], second: set[str], overlap: float) -> None:
-        for i, one in enumerate(labels):
-            if one in first:
-                for j, other in enumerate(labels):
-                    if other in second:
-                        allowed.setdefault((min(i, j), max(i, j)), overlap)
 
-    hands = set(scene.robot.touch_links)
-    grips = [(step.object, step.attachment, step.by) for step in steps if isinstance(step, Grasp)]
-    holds = [*(hold for phase in trajectory.phases for hold in phase.holds), *scene.holds]
-    grips += [(hold.object, hold.attachment, hold.frame) for hold in holds]
-    for owner, attachment, by in grips:
-        grasped = f"{owner}.{scene.objects[owner].object.attachment(attachment).link}"
-        allow({by} if by else hands, {grasped}, CONTACT if by else 0.0)
+class _Windows:
+    def __init__(self, samples: Samples, solids: Solids, options: Options) -> None:
+        self.samples, self.solids, self.options = samples, solids, options
+        self.scene, self.trajectory, world = samples.scene, samples.trajectory, samples.world
+        self.labels = np.array(world.collision_labels)
+        self.q = world.coordinates.q(samples.z[samples.waypoint_rows])
+        self.steps = np.abs(np.diff(self.trajectory.positions, axis=0)).max(axis=1) > _STILL
+        self.robots = len(self.scene.robot.collision.geometryObjects)
+        self.rides = FreeObjects(self.scene, self.trajectory).rides
 
-    robots = len(scene.robot.collision.geometryObjects)
-    rows = world.positions(trajectory)
-    for owner, waypoint in _taken_and_left(scene, trajectory):
-        placed = solids.at(world.coordinates.q(rows[[waypoint]]))
-        mine = [i for i, label in enumerate(labels) if label.partition(".")[0] == owner]
-        others = [j for j in range(robots, len(labels)) if j not in mine]
-        pairs = np.array([(min(i, j), max(i, j)) for i in mine for j in others], int).reshape(-1, 2)
-        pairs = pairs[placed.bounds(np.zeros(len(pairs), int), pairs) < dist_safe]
-        for i, j in pairs[placed.distances(np.zeros(len(pairs), int), pairs) < dist_safe].tolist():
-            allowed.setdefault((i, j), CONTACT)
+    def of(self, steps: Sequence[Step]) -> Iterator[Window]:
+        holds = [set(phase.holds) for phase in self.trajectory.phases]
+        for hold, first, last in self._runs([set(self.scene.holds), *holds]):
+            yield from self._hand(hold, first, last)
+        yield from self._grasps([step for step in steps if isinstance(step, Grasp)])
+        for owner, first, last in self._runs(self._carried()):
+            yield from (self._beside(owner, at, self._until(at)) for at in ([first] if first is not None else []))
+            yield from (self._beside(owner, at, self._since(at), begin=False) for at in ([last] if last is not None else []))
+        for phase, riding in zip(self.trajectory.phases, self.rides, strict=True):
+            for owner, label in riding.items():
+                as_one = {other for other, on in riding.items() if on == label and other != owner}
+                mates = [k for k, one in enumerate(self.labels) if one == label or one.partition(".")[0] in as_one]
+                yield Window(self._pairs(self._shapes(owner), mates), phase.first, phase.last, -np.inf, together=True)
+        yield from self._touches([step for step in steps if isinstance(step, Touch)])
 
-    touches = [step for step in steps if isinstance(step, Touch)]
-    for phase in trajectory.phases if touches else ():
-        placed = solids.at(world.coordinates.q(rows[[phase.last]]))
-        for step in touches:
+    def _hand(self, hold: Hold, first: int | None, last: int | None) -> Iterator[Window]:
+        """Yield what a hold that lasts between two waypoints, or from the start or up to the end, means for what holds."""
+        pairs = self._gripping(hold)
+        clearance, contact = (0.0, CONTACT) if hold.by else (self.options.grasp_clearance, 0.0)
+        begin, end = 0 if first is None else first, len(self.steps) if last is None else last
+        if moves_as_one(self.scene, hold):
+            yield Window(pairs, begin, end, -np.inf, together=True)
+        else:
+            yield Window(pairs, begin, end, clearance, CONTACT)
+        if first is not None:
+            yield Window(pairs, self._since(first), first, clearance, contact)
+        if last is not None:
+            yield Window(pairs, last, self._until(last), clearance, contact)
+
+    def _grasps(self, steps: Sequence[Grasp]) -> Iterator[Window]:
+        """Yield what it means that the hand is at a grasp at the end of a phase, whether it holds on or not."""
+        ends = np.array([phase.last for phase in self.trajectory.phases])
+        for step in steps:
+            thing = self.scene.objects[step.object].object
+            for name in [step.attachment] if step.attachment is not None else list(thing.attachments):
+                errors = self.samples.grasp_errors(step.object, name, self.samples.waypoint_rows[ends], step.by)
+                for at in ends[(errors <= (self.options.goal_position, self.options.goal_angle)).all(axis=1)].tolist():
+                    pairs = self._between(
+                        {step.by} if step.by else set(self.scene.robot.touch_links),
+                        {f"{step.object}.{thing.attachment(name).link}"},
+                    )
+                    least = 0.0 if step.by else self.options.grasp_clearance
+                    yield Window(pairs, self._since(at), self._until(at), least, CONTACT if step.by else 0.0)
+
+    def _beside(self, owner: str, at: int, other: int, *, begin: bool = True) -> Window:
+        """Return what a free object is next to where it begins or ends to be carried, at waypoint `at`."""
+        mine = self._shapes(owner)
+        pairs = self._pairs(mine, [k for k in range(self.robots, len(self.labels)) if k not in mine])
+        placed, here = self.solids.at(self.q[[at]]), np.zeros(len(pairs), int)
+        pairs = pairs[placed.bounds(here, pairs) < self.options.dist_safe]
+        pairs = pairs[placed.distances(here[: len(pairs)], pairs) < self.options.dist_safe]
+        return Window(pairs, at if begin else other, other if begin else at, 0.0)
+
+    def _touches(self, steps: Sequence[Touch]) -> Iterator[Window]:
+        """Yield what is at the target of a touch, wherever a phase ends with that."""
+        for step in steps:
             target = step.target.translation if isinstance(step.target, pin.SE3) else np.array(step.target)
-            owner = step.frame.partition(".")[0]
-            close = [int(j) for j in placed.around(target, dist_safe) if j >= robots and labels[j].partition(".")[0] != owner]
-            allow(_links_of(scene, step.frame), {labels[j] for j in close}, CONTACT)
-    return allowed
+            ends = [phase.last for phase in self.trajectory.phases]
+            frames = self.samples.placements(self.samples.waypoint_rows[ends], step.frame)
+            owner, links = step.frame.partition(".")[0], _links_of(self.scene, step.frame)
+            mine = [k for k, label in enumerate(self.labels) if label in links]
+            for at, frame in zip(ends, frames, strict=True):
+                if np.linalg.norm(frame.translation - target) <= self.options.dist_safe:
+                    around = self.solids.at(self.q[[at]]).around(target, self.options.dist_safe)
+                    close = [k for k in around if k >= self.robots and self.labels[k].partition(".")[0] != owner]
+                    yield Window(self._pairs(mine, close), self._since(at), self._until(at), 0.0)
+
+    def _carried(self) -> list[set[str]]:
+        """Return the free objects that are held or ride, at the start and in every phase."""
+        free = {name for name, placed in self.scene.objects.items() if placed.object.free}
+        phases = zip(self.trajectory.phases, self.rides, strict=True)
+        return [free & self.scene.held.keys(), *(free & (phase.held.keys() | riding.keys()) for phase, riding in phases)]
+
+    def _runs(self, phases: Sequence[Collection[_T]]) -> Iterator[tuple[_T, int | None, int | None]]:
+        """Yield what lasts, from and up to which waypoint: None is the start, where it has lasted already, and the end.
+
+        Args:
+            phases: What there is at the start, and in every phase.
+        """
+        spans, begun = self.trajectory.phases, dict[_T, int | None]()
+        for number, now in enumerate(phases):
+            at = spans[number - 1].first if number else None
+            for item in [item for item in begun if item not in now]:
+                yield item, begun.pop(item), at
+            for item in now:
+                begun.setdefault(item, at)
+        yield from ((item, first, None) for item, first in begun.items())
+
+    def _gripping(self, hold: Hold) -> Ints:
+        return self._between(touching(self.scene, hold), {grasped(self.scene, hold)})
+
+    def _between(self, ones: Collection[str], others: Collection[str]) -> Ints:
+        """Return the pairs of shapes of some links with those of others, by their labels."""
+        return self._pairs(*([k for k, label in enumerate(self.labels) if label in links] for links in (ones, others)))
+
+    def _shapes(self, owner: str) -> list[int]:
+        return [k for k, label in enumerate(self.labels) if label.partition(".")[0] == owner and k < self.solids.bodies]
+
+    def _pairs(self, ones: Iterable[int], others: Collection[int]) -> Ints:
+        return np.array([(min(i, j), max(i, j)) for i in ones for j in others], int).reshape(-1, 2)
+
+    def _until(self, at: int) -> int:
+        """Return the waypoint up to which what was in contact at one may be close: `EASED_TIME`, or as many steps that move."""
+        times, moved, last = self.trajectory.times, 0, at
+        while last < len(self.steps):
+            moved += int(self.steps[last])
+            if times[last + 1] - times[at] > EASED_TIME + _STILL and moved > self.options.steps(EASED_TIME):
+                break
+            last += 1
+        return last
+
+    def _since(self, at: int) -> int:
+        """Return the waypoint since which what comes into contact at one may be close; see `_until`."""
+        times, moved, first = self.trajectory.times, 0, at
+        while first > 0:
+            moved += int(self.steps[first - 1])
+            if times[at] - times[first - 1] > EASED_TIME + _STILL and moved > self.options.steps(EASED_TIME):
+                break
+            first -= 1
+        return first
 
 
 def _links_of(scene: Scene, frame: str) -> set[str]:
@@ -81,19 +194,3 @@ def _links_of(scene: Scene, frame: str) -> set[str]:
     robot = scene.robot
     joint = robot.model.frames[robot.model.getFrameId(frame)].parentJoint
     return {robot.link_of(i) for i, shape in enumerate(robot.collision.geometryObjects) if shape.parentJoint == joint}
-
-
-def _taken_and_left(scene: Scene, trajectory: Trajectory) -> list[tuple[str, int]]:
-    """Return every free object that is carried, with the waypoints at which it is taken or left."""
-    found, phases = [], trajectory.phases
-    for number, phase in enumerate(phases):
-        for owner in phase.held:
-            if not scene.objects[owner].object.free:
-                continue
-            before = phases[number - 1].held if number else scene.held
-            after = phases[number + 1].held if number + 1 < len(phases) else phase.held
-            if owner not in before:
-                found.append((owner, phase.first))
-            if owner not in after:
-                found.append((owner, phase.last))
-    return found

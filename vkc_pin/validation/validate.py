@@ -10,8 +10,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from vkc_pin.motion.carrying import FreeObjects
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.options import Options
+from vkc_pin.scene.resting import LEVEL, tilt
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.steps import Step
 from vkc_pin.task.terms import Term, traced
@@ -22,7 +24,7 @@ from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.report import Report, Violation
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.sweep import sweep
-from vkc_pin.validation.touching import may_touch
+from vkc_pin.validation.touching import windows
 
 __all__ = ["validate"]
 
@@ -33,6 +35,7 @@ ACCEPTED_RATE_TOLERANCE = 1e-3  # excess over a limit, relative to it
 LATCH_TOLERANCE = 1e-4
 WAYPOINT_TOLERANCE = 1e-3  # [m] that clearance at a waypoint may fall short of dist_safe
 SLIP_TOLERANCE = 1e-4  # [m] per step
+DWELL_TOLERANCE = 1e-6  # [s]
 
 
 def validate(
@@ -49,8 +52,9 @@ def validate(
 
     Returns:
         Every violated constraint: start, limits, velocity, acceleration, slip of a differential base, closure, latches,
-        joints of objects that nobody holds, hands that slide on what they clamp, goals and their order, clearance at
-        waypoints and penetration anywhere, and own constraints.
+        rests in which the gripper closes or opens, joints of objects that nobody holds, what tips on what it stands on, hands
+        that slide on what they clamp, goals and their order, clearance at waypoints and penetration anywhere, and own
+        constraints.
 
     Raises:
         InputError: The trajectory is none of this scene's robot and objects, or a step or term names what is not there.
@@ -69,7 +73,7 @@ class _Check:
 
     def report(self) -> Report:
         """Run every check."""
-        for check in (self._start, self._limits, self._rates, self._slip, self._unheld, self._latches):
+        for check in (self._start, self._limits, self._rates, self._slip, self._dwell, self._unheld, self._tips, self._latches):
             check()
         self.found += check_goals(self.samples, self.steps, self.options)
         self.found += check_terms(self.samples, self.terms)
@@ -145,6 +149,36 @@ class _Check:
         if not slip[worst] <= SLIP_TOLERANCE:
             detail = f"the base slips sideways by {1e3 * slip[worst]:.2f} mm in a step"
             self._add("slip", "base", slip[worst], "m", detail, waypoint=worst)
+
+    def _dwell(self) -> None:
+        """The robot stands still while its gripper closes or opens."""
+        times, robot = self.trajectory.times, self.trajectory.positions[:, : self.trajectory.robot_size]
+        before = set(self.scene.holds)
+        for phase in self.trajectory.phases:
+            changed, before, at = before ^ set(phase.holds), set(phase.holds), phase.first
+            if not changed:
+                continue
+            moved = np.flatnonzero(np.abs(robot - robot[at]).max(axis=1) > MOTION_TOLERANCE)
+            k = int(np.searchsorted(moved, at))
+            begin = moved[k - 1] + 1 if k else 0
+            end = moved[k] - 1 if k < len(moved) else len(times) - 1
+            rest = float(times[end] - times[begin])
+            if not rest >= self.options.grasp_time - DWELL_TOLERANCE:
+                detail = f"the robot stands still for {rest:.2f} s, {self.options.grasp_time:g} s are asked for"
+                subject = ", ".join(sorted(map(str, changed)))
+                self._add("dwell", subject, self.options.grasp_time - rest, "s", detail, waypoint=at)
+
+    def _tips(self) -> None:
+        """What something stands on stays level while it moves."""
+        for phase, riding in zip(self.trajectory.phases, FreeObjects(self.scene, self.trajectory).rides, strict=True):
+            rows = self.samples.rows(phase)
+            for owner, label in riding.items():
+                links = self.samples.placements(rows, label)
+                angles = np.array([tilt(links[0], link) for link in links])
+                worst = int(np.argmax(angles))
+                if not angles[worst] <= LEVEL:
+                    detail = f"'{label}', on which it stands, tilts by {angles[worst]:.2f} rad, more than {LEVEL:g} rad"
+                    self._add("tips", owner, angles[worst] - LEVEL, "rad", detail, row=int(rows[worst]))
 
     def _unheld(self) -> None:
         """What no hand moves does not move."""
@@ -228,8 +262,8 @@ class _Check:
         """
         samples, smallest = self.samples, np.inf
         solids = Solids(samples.world)
-        touching = may_touch(self.scene, solids, self.trajectory, self.steps, self.options.dist_safe)
-        pairs = PairTable(self.scene, solids, self.trajectory, self.options.dist_safe, touching=touching)
+        near = windows(samples, solids, self.steps, self.options)
+        pairs = PairTable(self.scene, solids, self.trajectory, self.options.dist_safe, windows=near)
         for hit in sweep(pairs, samples.z, samples.waypoint_rows):
             smallest = min(smallest, hit.distance)
             subject, millimetres = f"{hit.first} – {hit.second}", 1e3 * abs(hit.distance)

@@ -1,0 +1,108 @@
+"""Which pairs of a phase may be closer than others for a while, where something is taken, put down or touched."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+
+import coal
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.chain.chain import VirtualKinematicChain
+from vkc_pin.chain.phase_geometry import PhaseGeometry
+from vkc_pin.models.shapes import own_name, shape_distance, world_box
+from vkc_pin.options import Options
+from vkc_pin.scene.contact import EASED_TIME, grasped, touching
+from vkc_pin.scene.placed import PlacedObject, standing_geometry
+from vkc_pin.scene.resting import Ride
+from vkc_pin.scene.scene import Scene
+from vkc_pin.task.phases import Phase, Task
+
+__all__ = ["EASED_SHARE", "eased_pairs"]
+
+EASED_SHARE = 0.5  # margin, as a share of the distance at the contact itself
+
+Eased = dict[int, list[tuple[int, int, float]]]
+
+
+def eased_pairs(
+    scene: Scene, chain: VirtualKinematicChain, task: Task, number: int, part: PhaseGeometry, options: Options
+) -> Eased:
+    """Return pair → (first waypoint, last waypoint, margin [m]) for what may be close for a while; see `scene.contact`.
+
+    A hand keeps `Options.grasp_clearance` from the link that it takes or lets go of. A free object rests on something where it is
+    lifted from and where it is put down, with what rides on it; a frame that touches a target may come close to what the target
+    is on: there the margin is half the distance at the contact.
+
+    Args:
+        scene: Where it happens.
+        chain: The chain.
+        task: What is held when.
+        number: Of the phase.
+        part: Its geometry and pairs.
+        options: Waypoints' time, and clearances.
+    """
+    phase, before = task.phases[number], task.phases[number - 1] if number else None
+    first = sum(earlier.segments for earlier in task.phases[:number])
+    last, steps = first + phase.segments, options.steps(EASED_TIME)
+    shapes, eased = part.shapes, Eased()
+
+    def ease(moving: int, shape: coal.CollisionGeometry, where: pin.SE3, begin: int, end: int) -> None:
+        """Ease the pairs of a geometry that moves with what stands next to a shape."""
+        beside = part.within(float(part.margins.max()), *world_box(shape, where))
+        for k in part.pairs_of(moving, beside).tolist():
+            other = shapes[int(part.pairs[k, 1])]
+            distance = shape_distance(shape, where, other.geometry, other.placement)
+            if distance < part.margins[k]:
+                eased.setdefault(k, []).append((begin, end, EASED_SHARE * max(distance, 0.0)))
+
+    for holds, begin, end in ((phase.leaves, first, first + steps), (phase.grasps, last - steps, last)):
+        for hold in holds:
+            margin, links, link = 0.0 if hold.by else options.grasp_clearance, touching(scene, hold), grasped(scene, hold)
+            for k, (i, j) in enumerate(part.pairs.tolist()):
+                if part.labels[i] in links and part.labels[j] == link:
+                    eased.setdefault(k, []).append((begin, end, margin))
+    for geometries, placed, begins in _moments(scene, chain, phase):
+        stands = {shape.name: shape.placement for shape in standing_geometry(placed)}
+        for i in geometries:
+            begin, end = (first, first + steps) if begins else (last - steps, last)
+            ease(i, shapes[i].geometry, stands[own_name(shapes[i].name)], begin, end)
+    touches = [(goal, last - steps, last) for goal in phase.frames]
+    touches += [(goal, first, first + steps) for goal in (before.frames if before else ())]
+    for goal, begin, end in touches:
+        if not goal.touches:
+            continue
+        point, where = coal.Sphere(1e-4), pin.SE3(np.eye(3), goal.placement.translation)
+        joint, _ = chain.frame(goal.frame, goal.hold)
+        for i in range(len(chain.collision.geometryObjects)):
+            if part.labels[i] == str(goal) if goal.hold else shapes[i].parentJoint == joint:
+                ease(i, point, where, begin, end)
+    return eased
+
+
+def _moments(scene: Scene, chain: VirtualKinematicChain, phase: Phase) -> Iterator[tuple[Sequence[int], PlacedObject, bool]]:
+    """Yield the geometries, and where their object stands, of what begins or ends to be carried in a phase: (..., begins)."""
+    for moments, begins in ((phase.lifted, True), (phase.lowered, False)):
+        for hold, placement in moments.items():
+            placed = dataclasses.replace(scene.objects[hold.object], placement=placement)
+            yield chain.held_geometries[hold], placed, begins
+            for ride in phase.rides:
+                if ride.hold == hold:
+                    yield chain.ride_geometries[ride], _ridden(scene, ride, placed), begins
+    for ride in phase.rides:
+        carrier = scene.objects[ride.hold.object]
+        if not carrier.object.free:
+            goals = {name: float(np.clip(value, *phase.ranges[name])) for name, value in phase.values.items()}
+            for state, begins in ((phase.before, True), ({**phase.before, **goals}, False)):
+                yield chain.ride_geometries[ride], _ridden(scene, ride, _with(carrier, state)), begins
+
+
+def _ridden(scene: Scene, ride: Ride, carrier: PlacedObject) -> PlacedObject:
+    """Return what rides, where it stands on a carrier."""
+    return dataclasses.replace(scene.objects[ride.object], placement=carrier.link_placement(ride.link) * ride.local)
+
+
+def _with(placed: PlacedObject, state: Mapping[str, float]) -> PlacedObject:
+    """Return an object with those of some values, by coordinate "<object>.<joint>", that are its own."""
+    return placed.with_state({c.partition(".")[2]: v for c, v in state.items() if c.partition(".")[0] == placed.name})

@@ -8,6 +8,8 @@ from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from typing import Any, TypeVar, cast
 
+from vkc_pin.budget import spend
+
 __all__ = ["Cache", "CacheInfo"]
 
 T = TypeVar("T")
@@ -56,10 +58,14 @@ class Cache:
         Args:
             key: All that the result depends on, after the name of its kind.
             build: Makes it; it may ask this cache for parts.
+
+        Raises:
+            SpentError: It is not there, and the budget is at its end.
         """
         if key in self._kept:
             self._hits += 1
         else:
+            spend()
             self._misses += 1
             began, self._depth = time.perf_counter(), self._depth + 1
             try:

@@ -64,6 +64,7 @@ def _plan(arguments: argparse.Namespace) -> int:
         steps,
         initialization=arguments.initialization,
         time_limit=arguments.time_limit,
+        effort=arguments.effort,
         seed=arguments.seed,
         callback=None if arguments.quiet else _progress,
     )
@@ -159,6 +160,7 @@ def _parser() -> argparse.ArgumentParser:
     plan.add_argument("--plots", metavar="FOLDER", help="write plots")
     plan.add_argument("--initialization", default="auto", metavar="METHOD", help="auto, interpolated, astar, rrt or stationary")
     plan.add_argument("--time-limit", type=float, metavar="SECONDS", help="return the best motion found by then")
+    plan.add_argument("--effort", type=int, metavar="UNITS", help="return the best motion found with so much work")
     plan.add_argument("--seed", type=natural, default=0, help="of the random numbers (default 0)")
     plan.add_argument("--quiet", action="store_true", help="no progress")
     plan.set_defaults(run=_plan)

@@ -102,7 +102,7 @@ def test_both_methods_carry_alike() -> None:
 
 def only(monkeypatch: pytest.MonkeyPatch, index: int) -> None:
     """Leave the arm one way to be held while the base drives."""
-    monkeypatch.setattr(attempt, "postures", lambda problem, interrupt: list(postures(problem))[index:][:1])
+    monkeypatch.setattr(attempt, "postures", lambda problem: list(postures(problem))[index:][:1])
 
 
 def test_with_the_arm_at_home_the_cup_is_turned_over_and_stands_upright_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -179,7 +179,7 @@ def test_an_aisle_too_narrow_to_stand_in(method: str, monkeypatch: pytest.Monkey
     limited(monkeypatch)
     plan = failed(with_boxes(drawer_scene(), counter_2=([0.9, 4.4, 1.2], [1.0, 0.0, 0.6])), method=method)
     assert plan.status == "no base pose"
-    assert [phase.name for phase in plan.trajectory.phases] == ["go to"]
+    assert [phase.name for phase in plan.trajectory.phases] == ["stand"]
     assert np.ptp(plan.trajectory.positions, axis=0).max() == 0.0, "it stands at its start"
     assert [(v.constraint, v.subject) for v in plan.validation.violations] == [("goal", "drawer.slide")]
 
@@ -318,7 +318,7 @@ def test_of_several_places_the_one_that_came_furthest_counts(
         done(self, steps, "arm does not reach", next(reach) == "d")
 
     every = attempt.postures
-    monkeypatch.setattr(attempt, "postures", lambda problem, interrupt: list(every(problem))[:1])  # the arm as it is
+    monkeypatch.setattr(attempt, "postures", lambda problem: list(every(problem))[:1])  # the arm as it is
     monkeypatch.setattr(attempt, "_STANDS", 3)
     monkeypatch.setattr(attempt.Attempt, "_drive", driven)
     monkeypatch.setattr(attempt.Attempt, "_reach", reached)
@@ -366,14 +366,13 @@ class Tries:
         ([("collision", 2.4), ("no base path", 1.0), ("too fast", 2.5), ("collision", 2.5)], 3, "too fast"),
         ([("", np.inf), ("collision", 2.9), ("", np.inf), ("no base pose", 0.0)], 1, "rejected"),
         ([("no base pose", 0.0)] * 4, 1, "no base pose"),
-        ([("collision", 2.4), ("interrupted", 0.0), ("fine", np.inf)], 2, "interrupted"),
     ],
 )
 def test_tries(answers: list[tuple[str, float]], taken: int, status: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Up to the first that validation accepts; of failures, the one that came furthest; Ctrl-C ends them."""
+    """Up to the first that validation accepts; of failures, the one that came furthest."""
     tries = Tries(monkeypatch, *answers)
     plan = plan_separately(drawer_scene(), [PULL], method="B2", seed=3, retries=4)
-    last = taken if status in ("success", "interrupted") else 4
+    last = taken if status == "success" else 4
     assert tries.seeds == [[3, number] for number in range(last)], "each with other random numbers"
     assert (plan.status, plan.success) == (status, status == "success")
     assert plan.trajectory.positions[0, 0] == taken
@@ -387,7 +386,8 @@ def test_after_the_time_limit_there_is_no_other_try(monkeypatch: pytest.MonkeyPa
     tries = Tries(monkeypatch, *[("collision", 2.4)] * 4)
     plan = plan_separately(drawer_scene(), [PULL], retries=4, time_limit=1e-9)
     assert len(tries.seeds) == 1
-    assert plan.status == "collision"
+    assert plan.status == "time limit", "not all tries were made"
+    assert plan.validation.notes == ("the try that came furthest failed with: collision",)
 
 
 def test_a_time_limit_that_is_not_reached_changes_nothing() -> None:
@@ -409,7 +409,7 @@ def test_ctrl_c_ends_it(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
     plan = failed(open_scene(), retries=3)
     assert plan.status == "interrupted"
     assert calls == [stage]
-    before = {"solve": ["go to"], "base_poses": ["go to"], "follow": ["go to", "reach drawer.handle"]}[stage]
+    before = {"solve": ["stand"], "base_poses": ["stand"], "follow": ["go to", "reach drawer.handle"]}[stage]
     assert [phase.name for phase in plan.trajectory.phases] == before
 
 
@@ -482,6 +482,15 @@ def test_a_time_limit_ends_planning_inside_a_try(monkeypatch: pytest.MonkeyPatch
     plan = failed(open_scene(), time_limit=1e-6, retries=5)
     assert plan.status == "time limit"
     assert plan.metrics["rounds"] == 1.0
+
+
+def test_effort_ends_planning_at_the_same_place() -> None:
+    whole = open_drawer("B1")
+    used = int(whole.metrics["effort"])
+    assert digest(plan_separately(drawer_scene(), [PULL], effort=used)) == digest(whole)
+    short = [plan_separately(drawer_scene(), [PULL], effort=2 * used // 3, planner=planner) for planner in (None, vkc.Planner())]
+    assert [plan.status for plan in short] == ["effort spent"] * 2
+    assert digest(short[0]) == digest(short[1])
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from vkc_pin.benchmarks.baselines import COMPARED_PLANNERS, TASKS
 from vkc_pin.benchmarks.comparison import peaks, shown
 from vkc_pin.benchmarks.comparison_report import report
 from vkc_pin.benchmarks.harness import runner
+from vkc_pin.benchmarks.harness.limits import EFFORT, LIMITS
 from vkc_pin.cli import main
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
@@ -108,7 +109,7 @@ def test_trials(result: dict[str, Any]) -> None:
         assert t["success"] == (t["number"] in GOOD[t["method"]])
         assert t["duration"] == pytest.approx(6.0)
     meta = result["meta"]
-    assert (meta["benchmark"], meta["seed"], meta["starts"], meta["time_limit"]) == ("baselines", 5, 3, 20.0)
+    assert (meta["benchmark"], meta["seed"], meta["starts"], meta["effort"]) == ("baselines", 5, 3, EFFORT)
     assert (meta["tasks"], meta["methods"]) == (["door"], list(COMPARED_PLANNERS))
     assert (meta["scenes"], meta["goals"]) == ({"door": "corridor_door"}, {"door": {"door.hinge": 1.5}})
 
@@ -139,7 +140,7 @@ def test_the_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
         for method in COMPARED_PLANNERS:
             baselines.plan_trial("scene", {"scene": task, "method": method, "seed": 8})  # type: ignore[arg-type]
     door, drawer = vkc.Actuate("door", {"hinge": 1.5}), vkc.Actuate("drawer", {"slide": 0.6})
-    common = {"time_limit": 20.0, "seed": 8}
+    common = {**LIMITS, "seed": 8}
     hows = ({**common, "method": "B1"}, {**common, "method": "B2"}, common)
     assert asked == [("scene", [step], how) for step in (door, drawer) for how in hows]
 

@@ -20,6 +20,7 @@ import vkc_pin as vkc
 from vkc_pin.benchmarks import comparison, household
 from vkc_pin.benchmarks.comparison import placed
 from vkc_pin.benchmarks.harness import runner
+from vkc_pin.benchmarks.harness.limits import LIMITS
 from vkc_pin.benchmarks.household import COMPARED_PLANNERS, COMPARISON, TABLE_TOP, TASKS, on_the_coffee_table
 from vkc_pin.cli import main
 from vkc_pin.models.shapes import clearance, placed_shapes
@@ -100,7 +101,7 @@ def test_every_method_is_asked_for_the_same(monkeypatch: pytest.MonkeyPatch) -> 
     for task in TASKS:
         for method in COMPARED_PLANNERS:
             household.plan_trial("scene", {"scene": task, "method": method, "seed": 8})  # type: ignore[arg-type]
-    common = {"time_limit": 20.0, "seed": 8}
+    common = {**LIMITS, "seed": 8}
     hows = ({**common, "method": "B1"}, {**common, "method": "B2"}, common)
     assert asked == [("scene", task.steps, how) for task in TASKS.values() for how in hows]
 

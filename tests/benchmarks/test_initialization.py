@@ -14,6 +14,7 @@ from helpers.fake_plan import fake_plan
 import vkc_pin as vkc
 from vkc_pin.benchmarks import initialization
 from vkc_pin.benchmarks.harness import runner
+from vkc_pin.benchmarks.harness.limits import EFFORT
 from vkc_pin.benchmarks.initialization import COMPARED_INITIALIZATIONS, STEPWISE, TARGET
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.validation.report import Report, Violation
@@ -87,7 +88,7 @@ def test_trials(result: dict[str, Any]) -> None:
         assert t["success"] == (t["status"] == "success") == (not t["violations"])
     meta = result["meta"]
     assert (meta["benchmark"], meta["seed"], meta["starts"], meta["repeats"]) == ("initialization", 5, 3, 2)
-    assert (meta["target"], meta["time_limit"]) == (list(TARGET), 20.0)
+    assert (meta["target"], meta["effort"]) == (list(TARGET), EFFORT)
     assert {"pin", "casadi", "coal", "numpy", "vkc-pin"} <= set(meta["versions"])
 
 
@@ -122,7 +123,7 @@ def test_the_task(monkeypatch: pytest.MonkeyPatch) -> None:
     spec = {"seed": 8, "perturbation": 0.05}
     for method in ("stationary", "auto", STEPWISE):
         initialization.plan_trial("scene", {**spec, "method": method})  # type: ignore[arg-type]
-    assert all(scene == "scene" and how["time_limit"] == 20.0 and how["seed"] == 8 for scene, _, how in asked)
+    assert all(scene == "scene" and how["effort"] == EFFORT and how["seed"] == 8 for scene, _, how in asked)
     assert all(how["perturbation"] == 0.05 for _, _, how in asked)
     assert [(how["initialization"], how["joint"]) for _, _, how in asked] == [
         ("stationary", True),

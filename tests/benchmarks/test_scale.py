@@ -13,6 +13,7 @@ from helpers.fake_plan import fake_plan
 import vkc_pin as vkc
 from vkc_pin.benchmarks import scale
 from vkc_pin.benchmarks.harness import runner
+from vkc_pin.benchmarks.harness.limits import EFFORT
 from vkc_pin.benchmarks.scale import AXES, crowded, refined
 from vkc_pin.cli import main
 from vkc_pin.errors import InputError
@@ -83,7 +84,7 @@ def test_trials_and_table(planned: list[Any], tmp_path: Path, capsys: pytest.Cap
     (_, steps, how), *rest = planned
     assert len(rest) == 12  # and one before, to pay for what is built once
     assert [(step.object, step.joints) for step in steps] == [("door", {"hinge": 1.2})]
-    assert (how["seed"], how["time_limit"]) == (2, 60.0)
+    assert (how["seed"], how["effort"]) == (2, EFFORT)
     result = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))
     meta, trials = result["meta"], result["trials"]
     assert (meta["benchmark"], meta["seed"], meta["starts"]) == ("scale", 2, 3)

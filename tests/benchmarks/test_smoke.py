@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vkc_pin.benchmarks import comparison, initialization, scale
 from vkc_pin.benchmarks.initialization import TARGET
 from vkc_pin.cli import main
 from vkc_pin.motion.world import World
@@ -20,18 +19,11 @@ from vkc_pin.validation.validate import validate
 
 FIELDS = {
     *("key", "scene", "method", "number", "repeat", "perturbation", "start", "seed", "success", "status", "planning_time"),
-    *("base_effort", "base_effort_l1", "arm_effort", "clearance", "closure_error", "iterations", "rounds", "waypoints"),
+    *("base_effort", "base_effort_l1", "arm_effort", "clearance", "closure_error", "iterations", "rounds", "effort", "waypoints"),
     *("initialization", "build_time", "failed_constraint", "violations"),
     *(f"time_{part}" for part in ("initialization", "coal", "casadi", "ipopt", "validation")),
     "commit",
 }
-
-
-@pytest.fixture(autouse=True)
-def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let no motion be given up because the machine is busy."""
-    for module in (comparison, initialization, scale):
-        monkeypatch.setattr(module, "TIME_LIMIT", 300.0)
 
 
 def check(trial: dict[str, Any], method: str, number: int) -> None:

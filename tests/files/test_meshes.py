@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import coal
@@ -85,6 +86,9 @@ def test_less_detail_keeps_the_shape(tmp_path: Path) -> None:
         ("broken.stl", "not an STL file", "empty|cannot read"),
         ("thing.xyz3", "?", "cannot read"),
         ("flat.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "flat"),
+        ("leaf.obj", "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3\nf 1 3 4\n", "flat"),
+        ("leaves.obj", "v 0 0 1\nv 1 0 1\nv 0 1 1\nv 4 0 1\nv 5 0 1\nv 4 3 1\nf 1 2 3\nf 4 5 6\n", "flat"),
+        ("nearly.obj", "v 0 0 0\nv 1 0 0\nv 1 1 1e-12\nv 0 1 0\nf 1 2 3\nf 1 3 4\n", "flat"),
         ("number.obj", "v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "no numbers|flat|cannot|empty"),
     ],
 )
@@ -95,6 +99,24 @@ def test_bad_meshes_are_named(tmp_path: Path, name: str, text: str | None, probl
     with pytest.raises(InputError, match=problem) as caught:
         load_convex(file)
     assert caught.value.file == file
+
+
+def test_few_triangles_of_any_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """trimesh asks for networkx where Qhull shakes flat points into a hull; it is none of our dependencies."""
+    monkeypatch.setitem(sys.modules, "networkx", None)
+    rng, file = np.random.default_rng(0), tmp_path / "few.off"
+    held = 0
+    for number in range(60):
+        points = rng.normal(size=(6, 3))
+        points[:, 2] *= (1.0, 0.0, 10.0 ** -rng.integers(3, 14))[number % 3]
+        rows = "\n".join(" ".join(map(repr, row)) for row in points.tolist())
+        file.write_text(f"OFF\n6 2 0\n{rows}\n3 0 1 2\n3 3 4 5\n")
+        assert len(load_mesh(file).faces) == 2
+        try:
+            held += load_convex(file).num_points >= 4
+        except InputError as error:
+            assert "flat" in str(error)
+    assert 20 <= held <= 40
 
 
 @pytest.mark.parametrize("scale", [(1.0, 0.0, 1.0), (1.0, 2.0), (np.nan, 1.0, 1.0)])

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import signal
+import time
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -158,19 +160,26 @@ def test_what_fails_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_time_is_for_all_steps_together(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As if the first action had taken all of it: the second gets next to none, and no other is tried."""
-    limits: list[float | None] = []
-    run = OneProblem.run
+    """As if the first action had taken all of it: the second gets none, no other is tried, and what was decided is kept."""
+    real, run, asked = time.perf_counter, OneProblem.run, list[OneProblem]()
 
-    def slowly(one: OneProblem) -> vkc.Plan:
-        limits.append(one.settings.time_limit)
-        plan = run(one)
-        return dataclasses.replace(plan, metrics={**plan.metrics, "planning_time": 101.0})
+    def noted(one: OneProblem, seed: Any = None) -> vkc.Plan:
+        asked.append(one)
+        plan = run(one, seed)
+        monkeypatch.setattr(time, "perf_counter", lambda: real() + 101.0)
+        return plan
 
-    monkeypatch.setattr(OneProblem, "run", lambda one, seed=None: slowly(one))
+    monkeypatch.setattr(OneProblem, "run", noted)
     plan = vkc.plan_chore(home(), [OPEN, *CUP], time_limit=100.0)
-    assert limits == [100.0, pytest.approx(0.0, abs=2e-3)]
+    assert [one.task.steps for one in asked] == [(OPEN,)]
     assert (plan.status, plan.success) == ("time limit", False)
+    assert plan.trajectory.phases[1].name == "move refrigerator.hinge"
+
+
+def test_effort_is_for_all_steps_together() -> None:
+    alone = vkc.plan_chore(home(), [OPEN])
+    plan = vkc.plan_chore(home(), [OPEN, *CUP], effort=int(alone.metrics["effort"]) + 1000)
+    assert (plan.status, plan.success) == ("effort spent", False)
     assert "steps[1]" in plan.validation.notes[0]
     assert plan.trajectory.phases[1].name == "move refrigerator.hinge"
 

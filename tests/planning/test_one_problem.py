@@ -13,8 +13,8 @@ from helpers.drives import hall
 from helpers.small_problems import door_scene, program_of
 
 import vkc_pin as vkc
+from vkc_pin.budget import spend
 from vkc_pin.cache import Cache
-from vkc_pin.interrupt import Interrupt
 from vkc_pin.planning import one_problem as module
 from vkc_pin.planning.one_problem import OneProblem
 from vkc_pin.planning.outcome import TIMES
@@ -62,6 +62,8 @@ class Scripted:
     def note(self, event: str) -> None:
         self.events.append(event)
         self.stop(event)
+        if not event.endswith("*"):  # as the real search for seeds does
+            spend()
 
     def z(self, problem: vkc.TrajectoryProblem, name: str, height: float) -> np.ndarray:
         share = np.arange(1, problem.segments + 1) / problem.segments
@@ -81,9 +83,7 @@ class Scripted:
         z: np.ndarray,
         *,
         callback: Any,
-        deadline: float,
         radius: np.ndarray | None = None,
-        interrupt: Interrupt,
     ) -> Solution:
         name = NAMES[round((z[0, 8] - problem.start[8]) / MARK)]
         self.note(f"{name}*")
@@ -93,7 +93,6 @@ class Scripted:
         timings = {"coal": 0.5, "casadi": 0.25, "ipopt": 0.125}
         solved = z if height is None else self.z(problem, name, height)
         solution = Solution(solved, problem.timing_for(z).dt, status == "converged", status)
-        interrupt.pressed |= status == "interrupted"
         return dataclasses.replace(solution, rounds=1, iterations=5, timings=timings, history=[ROUND])
 
     def validate(self, scene: vkc.Scene, steps: Any, trajectory: vkc.Trajectory, *options: Any) -> vkc.Report:
@@ -104,7 +103,8 @@ class Scripted:
     def run(self, steps: Sequence[Any] = PULL, *, scene: vkc.Scene | None = None, **settings: Any) -> vkc.Plan:
         scene = scene or drawer_scene()
         self.one = OneProblem(scene, compile_task(scene, steps, SHORT), Settings("auto", SHORT, **settings))
-        return self.one.run()
+        with self.one.settings.budget.running():
+            return self.one.run()
 
 
 @pytest.mark.parametrize(
@@ -156,21 +156,37 @@ def test_no_seed_is_looked_for_when_time_is_up(monkeypatch: pytest.MonkeyPatch) 
     """What was best so far is returned."""
     leads: dict[str, Answer] = {"a": (2.0, "not converged"), "b": (1.0, "time limit")}
     script = Scripted(monkeypatch, [3.0, 1.0, 4.0], leads=leads, amounts=[0.5, 0.7])
-    plan = script.run(time_limit=10.0)
+    plan = script.run()
     assert script.events == ["a", "a*", "b", "b*"]
     assert (plan.status, plan.initialization, plan.success) == ("time limit", "a", False)
     assert plan.validation.violations
 
 
 def test_the_real_solver_stops() -> None:
-    """No round is begun any more, and Ipopt stops at its first iteration."""
-    plan = vkc.plan(door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], time_limit=0.01)
-    assert plan.status == "time limit"
-    assert plan.metrics["rounds"] <= 1
-    assert plan.metrics["iterations"] <= 1
-    assert plan.validation.violations
-    assert plan.initialization != "none"
-    assert np.isfinite(plan.trajectory.positions).all()
+    """Also while the program is built, and while seeds are looked for: a robot that stands is what there is then."""
+    late, spent = "time limit", "effort spent"
+    budgets: list[tuple[dict[str, Any], str]] = [({"time_limit": 1e-3}, late), ({"effort": 1}, spent), ({"effort": 3000}, spent)]
+    for budget, status in budgets:
+        plan = vkc.plan(door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], planner=vkc.Planner(), **budget)
+        assert (plan.status, plan.initialization, plan.metrics["rounds"]) == (status, "none", 0)
+        assert plan.validation.violations
+        assert np.ptp(plan.trajectory.positions, axis=0).max() == 0.0
+        assert np.isfinite(plan.metrics["duration"])
+
+
+def test_effort_that_suffices_changes_nothing() -> None:
+    """It is the same whether all has to be built or is there; with one unit less there is none."""
+    scene, steps = door_scene(), [vkc.Actuate("door", {"hinge": 1.2})]
+    whole = vkc.plan(scene, steps, planner=vkc.Planner())
+    assert whole.success
+    used = int(whole.metrics["effort"])
+    again = vkc.plan(scene, steps, effort=used)
+    assert again.success
+    assert again.metrics["effort"] == used
+    np.testing.assert_array_equal(again.trajectory.positions, whole.trajectory.positions)
+    short = [vkc.plan(scene, steps, effort=used // 2, planner=planner) for planner in (None, vkc.Planner())]
+    assert [plan.status for plan in short] == ["effort spent"] * 2
+    np.testing.assert_array_equal(short[0].trajectory.positions, short[1].trajectory.positions)
 
 
 @pytest.mark.parametrize(("amounts", "name"), [([1.0, 0.5], "b"), ([0.5, 1.0], "a")])
@@ -193,17 +209,16 @@ def test_ctrl_c_anywhere(when: str, name: str, monkeypatch: pytest.MonkeyPatch) 
     script = Scripted(monkeypatch, [2.0, 1.0, 3.0])
 
     def stop(event: str) -> None:
-        script.one.settings.interrupt.pressed |= event == when
+        script.one.settings.budget.pressed |= event == when
 
     script.stop = stop
     plan = script.run()
     assert script.events[-1] == when
     assert (plan.status, plan.initialization, plan.success) == ("interrupted", name, False)
-    z = script.one.z
     if name == "none":
-        np.testing.assert_array_equal(z, np.tile(script.one.problem.start, (len(z), 1)))
+        assert [phase.name for phase in plan.trajectory.phases] == ["stand"]
     else:
-        np.testing.assert_array_equal(z, script.z(script.one.problem, name, 2.0))
+        np.testing.assert_array_equal(script.one.z, script.z(script.one.problem, name, 2.0))
 
 
 # --- what is weighed -----------------------------------------------------------------------------------------------------

@@ -417,6 +417,8 @@ MISUSES: dict[str, tuple[dict[str, Any], str, str]] = {
     "no time": ({"time_limit": 0.0}, "time_limit", "more than 0"),
     "negative time": ({"time_limit": -1.0}, "time_limit", "-1.0"),
     "endless time": ({"time_limit": float("inf")}, "time_limit", "inf"),
+    "no effort": ({"effort": 0}, "effort", "at least 1"),
+    "half a unit": ({"effort": 1.5}, "effort", "1.5"),
     "no number": ({"time_limit": float("nan")}, "time_limit", "nan"),
     "time as text": ({"time_limit": "5"}, "time_limit", "'5'"),
     "options as a dictionary": ({"options": {"dt": 0.1}}, "options", "Options"),

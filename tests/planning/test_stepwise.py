@@ -12,6 +12,7 @@ from helpers.carrying import STICK, Script, above, carried_over, lifted, moved_b
 from helpers.small_problems import full_scene, program_of
 
 import vkc_pin as vkc
+from vkc_pin.budget import Budget
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.motion.world import scene_after
 from vkc_pin.planning import stepwise as module
@@ -112,7 +113,7 @@ def test_what_is_held_through_another_thing_stays_there() -> None:
 
 
 def fake(status: str, spent: float) -> vkc.Plan:
-    metrics = {"planning_time": spent, "build_time": 0.0, "iterations": spent, "rounds": 1.0, "own": spent}
+    metrics = {"planning_time": spent, "build_time": 0.0, "iterations": spent, "rounds": 1.0, "effort": spent, "own": spent}
     return vkc.Plan(
         scene=None,  # type: ignore[arg-type]
         steps=(),
@@ -140,21 +141,21 @@ def fake(status: str, spent: float) -> vkc.Plan:
 def test_what_is_returned_and_what_it_took(
     monkeypatch: pytest.MonkeyPatch, whole: str, apart: str | None, status: str, spent: float, own: float
 ) -> None:
-    limits: list[float | None] = []
+    budgets: list[Budget] = []
     monkeypatch.setattr(module, "OneProblem", lambda *_: SimpleNamespace(run=lambda: fake(whole, 10.0)))
 
     def step_by_step(scene: Any, task: Any, settings: Settings) -> vkc.Plan:
         assert apart is not None
-        limits.append(settings.time_limit)
+        budgets.append(settings.budget)
         return fake(apart, 3.0)
 
     monkeypatch.setattr(module, "step_by_step", step_by_step)
-    settings = Settings("auto", vkc.Options(), time_limit=100.0)
+    settings = Settings("auto", vkc.Options())
     result = module.all_at_once(None, SimpleNamespace(steps=(1, 2)), settings)  # type: ignore[arg-type]
     assert result.status == status
     assert result.metrics["planning_time"] == pytest.approx(spent)
     assert result.metrics["own"] == own  # what is no time stays that of the plan that is returned
-    assert limits == ([] if apart is None else pytest.approx([90.0]))
+    assert budgets == ([] if apart is None else [settings.budget]), "what is left of it"
 
 
 def test_one_step_that_fails_is_not_planned_again(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -113,7 +113,8 @@ def test_its_directional_derivative_is_that_of_finite_differences(kind: str, see
 def test_a_step_is_refused_that_makes_more_of_any_kind_missing(kind: str) -> None:
     """However much shorter the motion gets."""
     p = problem("drive")
-    loop = _Loop(p, p.still, np.inf, 200.0)
+    loop = _Loop(p, p.still, 200.0)
+    loop.begin()
     amounts = {name: np.full(p.segments, 0.01) for name in KINDS}
     loop.found = Infeasibility(amounts, loop.found.away, loop.found.excess, loop.found.rate_excess)
     loop.objective = 5.0

@@ -125,6 +125,14 @@ def test_without_poses_only_slacks_help(chain: VirtualKinematicChain) -> None:
     assert max(functions.hessian_pattern[1]) < chain.size
 
 
+def test_one_plane_and_no_pose(chain: VirtualKinematicChain) -> None:
+    """A single row, of which a slice would be a scalar."""
+    functions = WaypointFunctions(chain.model, 1, (), Cache())
+    assert functions.rows == functions.value.numel_out(0) == 1
+    some = WaypointFunctions(chain.model, 1, some_poses(chain), Cache())
+    assert some.rows == 1 + sum(some.pose_rows)
+
+
 def test_functions_of_one_kind_are_built_once(chain: VirtualKinematicChain) -> None:
     model, poses, cache = door_scene().robot.model, some_poses(chain)[1:2], Cache(entries=3)
     first = waypoint_functions(model, 1, poses, cache)

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import time
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
@@ -13,6 +12,7 @@ from helpers.drives import hall, moved, through
 from helpers.small_problems import door_scene, program_of
 
 import vkc_pin as vkc
+from vkc_pin.budget import Budget
 from vkc_pin.motion.timing import Timing
 from vkc_pin.program.merit import GROWTH, TOLERANCE, Infeasibility, Merit
 from vkc_pin.seeds.initialization import initialize
@@ -161,7 +161,7 @@ class Scripted:
     ) -> None:
         self.step, self.other, self.crossed, self.passages = step, other, list[Passage](), list[Passage]()
         self.problem, self.z, self.is_done = SimpleNamespace(drift=lambda _: drift), np.zeros((40, 1)), done
-        self.deadline, self.solution = np.inf, Solution(np.zeros((40, 1)), np.full(40, 0.25))
+        self.solution = Solution(np.zeros((40, 1)), np.full(40, 0.25))
         self.merit, self.found = Merit(200.0), missing(0.5, other)
         self.objective, self.rounds, self.radii = 10.0, iter(rounds), list[np.ndarray]()
 
@@ -199,8 +199,8 @@ class Scripted:
 
 def scripted(*rounds: tuple[float, float, bool], **how: Any) -> Scripted:
     loop = Scripted(*rounds, **how)
-    region, interrupt = trust_region.TrustRegion(40, 10), SimpleNamespace(pressed=False)
-    solver._iterate(loop, region, None, interrupt, len(rounds))  # type: ignore[arg-type]
+    region = trust_region.TrustRegion(40, 10)
+    solver._iterate(loop, region, None, len(rounds))  # type: ignore[arg-type]
     loop.radii.append(region.radius)
     return loop
 
@@ -317,7 +317,7 @@ def test_where_something_would_be_carried_through_waypoints_may_move_less() -> N
     loop.crossed = [Passage((3, 5), 12, 13)]
     region = trust_region.TrustRegion(40, 10)
     before = region.radius.copy()
-    solver._iterate(loop, region, None, SimpleNamespace(pressed=False), 1)  # type: ignore[arg-type]
+    solver._iterate(loop, region, None, 1)  # type: ignore[arg-type]
     narrowed = region.radius < before
     assert narrowed.any()
     np.testing.assert_array_equal(narrowed, np.isin(region.block, region.block[11:14]))
@@ -404,23 +404,45 @@ def test_the_motion_that_was_feasible_is_kept(monkeypatch: pytest.MonkeyPatch) -
 
 def test_no_time_at_all() -> None:
     problem, seed = round_a_pillar(), straight(round_a_pillar(), 3.2)
-    solution = solve(problem, seed, deadline=time.perf_counter() - 1.0)
+    with Budget(seconds=0.0).running():
+        solution = solve(problem, seed)
     assert (solution.status, solution.converged, solution.rounds) == ("time limit", False, 0)
     np.testing.assert_array_equal(solution.z, problem.clip(seed))
 
 
 def test_time_that_runs_out_in_the_middle() -> None:
     problem, seed = round_a_pillar(), straight(round_a_pillar(), 3.2)
-    solution = solve(problem, seed, deadline=time.perf_counter() + 1e-3)
+    with Budget(seconds=1e-3).running():
+        solution = solve(problem, seed)
     assert solution.status == "time limit"
     assert solution.rounds <= 1
     assert np.isfinite(solution.z).all()
 
 
+def test_effort_that_runs_out_ends_it_at_the_same_place() -> None:
+    """The best iterate is returned, and with enough of it nothing is different."""
+    problem, seed = round_a_pillar(), straight(round_a_pillar(), 3.2)
+    with Budget().running() as budget:
+        whole = solve(problem, seed)
+    with Budget(effort=budget.used).running():
+        same = solve(problem, seed)
+    np.testing.assert_array_equal(same.z, whole.z)
+    assert same.converged
+    cut = []
+    for _ in range(2):
+        with Budget(effort=budget.used // 2).running():
+            cut.append(solve(problem, seed))
+    assert cut[0].status == "effort spent"
+    assert 0 < cut[0].rounds < whole.rounds
+    assert (cut[0].rounds, cut[0].iterations) == (cut[1].rounds, cut[1].iterations)
+    np.testing.assert_array_equal(cut[0].z, cut[1].z)
+
+
 def test_seeds_outside_their_bounds_are_moved_inside() -> None:
     problem = round_a_pillar()
     wild = straight(problem, 3.2) + 20.0
-    solution = solve(problem, wild, deadline=time.perf_counter() - 1.0)
+    with Budget(seconds=0.0).running():
+        solution = solve(problem, wild)
     assert np.all((solution.z >= problem.lower) & (solution.z <= problem.upper))
 
 

@@ -13,13 +13,19 @@ from vkc_pin.solver.loop import _Loop
 SHORT = vkc.Options(reach_waypoints=8, turn_waypoints=4, move_waypoints=6)
 
 
+def begun(problem: vkc.TrajectoryProblem, seed: np.ndarray, weight: float) -> _Loop:
+    state = _Loop(problem, seed, weight)
+    state.begin()
+    return state
+
+
 def loop(kind: str) -> _Loop:
     if kind == "far":
         problem = program_of(door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=SHORT)
-        return _Loop(problem, problem.still, np.inf, 200.0)
+        return begun(problem, problem.still, 200.0)
     scene = hall()
     problem = program_of(scene, [vkc.GoTo(1.0, 0.0)], options=SHORT)
-    return _Loop(problem, through(scene, scene.start, moved(scene.start, x=1.0), steps=8).positions[1:], np.inf, 200.0)
+    return begun(problem, through(scene, scene.start, moved(scene.start, x=1.0), steps=8).positions[1:], 200.0)
 
 
 @pytest.mark.parametrize("kind", ["far", "there"])
@@ -71,10 +77,10 @@ def test_only_planes_that_are_short_at_the_iterate_may_stay_short(missing: bool)
     box = {"name": "box", "type": "box", "size": [0.2, 0.2, 1.0], "position": [1.6 if missing else 1.85, 0.0, 0.5]}
     scene = hall(obstacles=[box])
     problem = program_of(scene, [vkc.GoTo(1.2, 0.0)], options=SHORT)
-    still = _Loop(problem, problem.still, np.inf, 1e-3)
+    still = begun(problem, problem.still, 1e-3)
     if missing:
         driven = through(scene, scene.start, moved(scene.start, x=1.2), steps=8).positions[1:]
-        still = _Loop(problem, driven, np.inf, 1e-3)
+        still = begun(problem, driven, 1e-3)
     assert bool(still.found.amounts["clearance"].any()) == missing
     radius = np.full(problem.segments, 2.0)
     step = still.subproblem.solve(still.z, still.at, still.found, still.merit, still.timing, radius, rates=False)

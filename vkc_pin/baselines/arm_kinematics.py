@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.arrays import Floats, Ints
+from vkc_pin.budget import spend
 from vkc_pin.chain.inverse_kinematics import LONGEST_STEP
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.knots import Knots
@@ -51,6 +52,7 @@ class ArmKinematics:
         box = _Box(self.columns, chain.lower, chain.upper, z.copy())
         configuration = pink.Configuration(model, model.createData(), chain.coordinates.q(box.z))
         for _ in range(_ITERATIONS):
+            spend(1)
             if np.abs(task.compute_error(configuration)).max() < _TOLERANCE:
                 return box.z, True
             try:

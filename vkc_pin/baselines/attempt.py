@@ -14,13 +14,13 @@ from vkc_pin.arrays import Floats
 from vkc_pin.baselines.following import FailedError, follow
 from vkc_pin.baselines.paths import BasePaths, headings
 from vkc_pin.baselines.postures import at_home, base_poses, postures, through
+from vkc_pin.budget import SpentError, spend
 from vkc_pin.cache import Cache
-from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.motion.splicing import join
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.motion.world import scene_after
 from vkc_pin.options import Options
-from vkc_pin.planning.outcome import TIMES
+from vkc_pin.planning.outcome import TIMES, still
 from vkc_pin.program.merit import TOLERANCE
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.scene.scene import Scene
@@ -60,8 +60,6 @@ class Attempt:
         *,
         refine: bool,
         seed: Sequence[int],
-        deadline: float = np.inf,
-        interrupt: Interrupt = NEVER,
         cache: Cache | None = None,
     ) -> None:
         """Prepare a try.
@@ -71,11 +69,9 @@ class Attempt:
             options: How to plan.
             refine: Whether arm and object are moved out of collision at each waypoint (B2).
             seed: Of the random numbers.
-            deadline: Value of `time.perf_counter()` after which no stage is begun.
-            interrupt: Ends it with what there is.
             cache: Keeps what is built; None: one of its own.
         """
-        self.scene, self.options, self.refine, self.deadline, self.interrupt = scene, options, refine, deadline, interrupt
+        self.scene, self.options, self.refine = scene, options, refine
         self.rng = np.random.default_rng(seed)
         self.parts: list[Trajectory] = []
         self.times = dict.fromkeys([*TIMES, "following"], 0.0)
@@ -92,14 +88,10 @@ class Attempt:
                 else:  # drive somewhere, at whichever heading is best if none is asked for
                     goals = headings(step, float(self.scene.start[2]))
                     self._withdrawn(functools.partial(self._drive, goals), FailedError("no base path"))
-        except FailedError as error:
-            came = len(self.parts) + error.came
-            parts = [*self.parts, *error.parts]
-            if not parts:
-                problem = self._problem([self._here()])
-                parts = [as_trajectory(problem, problem.still, problem.timing_for(problem.still).dt)]
-            cause = "interrupted" if self.interrupt.pressed else error.cause
-            return join(parts, pause=self.options.grasp_time), came, cause
+        except (FailedError, SpentError) as error:
+            failure = error if isinstance(error, FailedError) else FailedError(str(error))
+            parts = [*self.parts, *failure.parts] or [still(self.scene, self.options)]
+            return join(parts, pause=self.options.grasp_time), len(self.parts) + failure.came, failure.cause
         return join(self.parts, pause=self.options.grasp_time), np.inf, ""
 
     def _actuate(self, step: Actuate) -> None:
@@ -140,20 +132,17 @@ class Attempt:
             self._withdraw(path)
             stage()
 
-        self._first(postures(self._problem([self._here()]), self.interrupt), held, failure)
+        self._first(postures(self._problem([self._here()])), held, failure)
 
     def _first(self, choices: Iterable[Floats], stage: Callable[[Floats], None], failure: FailedError) -> None:
         """Do a stage with the first choice with which it works; if there is none, raise the failure that came furthest."""
         scene, before = self.scene, self.parts
         for choice in choices:
-            self._in_time(failure)
             self.parts = list(before)
             try:
                 stage(choice)
                 return
             except FailedError as error:
-                if self.interrupt.pressed:
-                    raise
                 error.parts = [*self.parts[len(before) :], *error.parts]
                 failure = max(failure, error, key=lambda one: one.came)
                 self.scene, self.parts = scene, before
@@ -162,7 +151,7 @@ class Attempt:
     def _poses(self, problem: TrajectoryProblem) -> Floats:
         """Return configurations for the end of a problem, the nearest first."""
         began = time.perf_counter()
-        poses = base_poses(problem, problem.segments, problem.start, self.rng, self.interrupt)
+        poses = base_poses(problem, problem.segments, problem.start, self.rng)
         self.times["initialization"] += time.perf_counter() - began
         if not len(poses):
             raise FailedError("no base pose")
@@ -192,11 +181,7 @@ class Attempt:
         problem = self._problem([GoTo(x, y, yaw if len(goals) == 1 else None)])
         problem = _fixed(problem, slice(3, problem.chain.robot.coordinates.size))
         bare = at_home(problem) and not self.scene.held and len(goals) == 1
-        seeds = (
-            initialize(problem, "astar", self._seed(), interrupt=self.interrupt)
-            if bare
-            else BasePaths(problem, whole=True, interrupt=self.interrupt).seeds(problem, goals)
-        )
+        seeds = initialize(problem, "astar", self._seed()) if bare else BasePaths(problem, whole=True).seeds(problem, goals)
         self._take(problem, *self._solve(problem, seeds, "no base path"))
 
     def _reach(self, steps: Sequence[Step], pose: Floats) -> None:
@@ -208,20 +193,19 @@ class Attempt:
         if phase.lowered:  # from above
             above = Approach(Knots(problem, self.rng)).away(last, phase)[::-1]
             seeds = [Seed("from above", through(problem, np.vstack([above, last])))] * (len(above) > 0) + seeds
-        more = initialize(problem, "interpolated", self._seed(), interrupt=self.interrupt)
+        more = initialize(problem, "interpolated", self._seed())
         self._take(problem, *self._solve(problem, itertools.chain(seeds, more), "arm does not reach"))
 
     def _move(self, step: Actuate) -> None:
         """Move the object's joints: the base goes to the nearest pose to which the arm can follow."""
         problem = self._problem([step], replace(self.options, move_waypoints=FINER * self.options.move_waypoints))
-        paths, failure = BasePaths(problem, interrupt=self.interrupt), FailedError("no base path")
+        paths, failure = BasePaths(problem), FailedError("no base path")
         for pose in self._poses(problem)[:_ENDS]:
             base = paths.along(problem, pose[:3])
             if base is None:
                 continue
-            self._in_time(failure)
             began = time.perf_counter()
-            followed = follow(problem, base, self.rng, refine=self.refine, interrupt=self.interrupt)
+            followed = follow(problem, base, self.rng, refine=self.refine)
             rates = problem.rates(followed.z)
             timing = problem.timing_for(followed.z).stretched(*rates)
             self.times["following"] += time.perf_counter() - began
@@ -233,19 +217,9 @@ class Attempt:
             if not cause:
                 self._take(problem, followed.z, timing.dt)
                 return
-            if cause == "interrupted":
-                raise FailedError(cause)
             if not failure.parts or followed.share > failure.share:
                 failure = FailedError(cause, as_trajectory(problem, followed.z, timing.dt), followed.share)
         raise failure
-
-    def _in_time(self, failure: FailedError) -> None:
-        """Raise the error of what has failed so far if time is up, and one of its own after Ctrl-C."""
-        if self.interrupt.pressed:
-            raise FailedError("interrupted")
-        if time.perf_counter() > self.deadline:
-            failure.cause = failure.cause if failure.parts else "time limit"
-            raise failure
 
     def _here(self) -> GoTo:
         return GoTo(*self.scene.start[:3].tolist())
@@ -259,15 +233,13 @@ class Attempt:
         """Return the first solution from a seed: z_1..z_N, shape (N, n), and the time of every step, shape (N,) [s]."""
         failure = FailedError(cause)
         for seed in seeds:
-            self._in_time(failure)
-            solution = solve(problem, seed.z, rounds=_ROUNDS, deadline=self.deadline, interrupt=self.interrupt)
+            solution = solve(problem, seed.z, rounds=_ROUNDS)
             self.iterations += solution.iterations
             for key, value in solution.timings.items():
                 self.times[key] += value
             if solution.converged:
                 return solution.z, solution.dt
-            if solution.status == "time limit":
-                raise FailedError("time limit", as_trajectory(problem, solution.z, solution.dt))
+            spend()
             if not failure.parts:
                 failure = FailedError(cause, as_trajectory(problem, solution.z, solution.dt))
         raise failure

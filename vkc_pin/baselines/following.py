@@ -9,7 +9,6 @@ import numpy as np
 from vkc_pin.arrays import Floats
 from vkc_pin.baselines.arm_kinematics import ArmKinematics
 from vkc_pin.baselines.refining import CLEAR, refined
-from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.knots import Knots
@@ -49,7 +48,7 @@ class Followed:
     Attributes:
         z: z_1..z_N, shape (N, n); if it failed, all stands still from there on, in what was nearest to working.
         share: Share of the waypoints up to which it worked.
-        cause: "", "no inverse kinematics", "collision" if all there is is not free, or "interrupted".
+        cause: "", "no inverse kinematics", or "collision" if all there is is not free.
     """
 
     z: Floats
@@ -57,9 +56,7 @@ class Followed:
     cause: str
 
 
-def follow(
-    problem: TrajectoryProblem, base: Floats, rng: np.random.Generator, *, refine: bool, interrupt: Interrupt = NEVER
-) -> Followed:
+def follow(problem: TrajectoryProblem, base: Floats, rng: np.random.Generator, *, refine: bool) -> Followed:
     """Find the arm for every waypoint from the one before.
 
     Args:
@@ -68,7 +65,6 @@ def follow(
         rng: Draws seeds.
         refine: Move arm and object at each waypoint out of collision (B2), instead of taking the object where the time law has
             it and the arm as inverse kinematics finds it (B1).
-        interrupt: Ends it at the waypoint that it has come to, as if it had failed there.
     """
     knots = Knots(problem, rng)
     z = knots.objects.copy()
@@ -79,8 +75,6 @@ def follow(
         z[row, arm.kinematics.columns] = before[arm.kinematics.columns]
         found, cause = arm.at(z[row], row + 1)
         z[row] = found
-        if interrupt.pressed and not cause:
-            cause = "interrupted"
         if cause:
             z[row:] = found
             return Followed(z, row / len(z), cause)

@@ -11,7 +11,6 @@ import numpy as np
 from vkc_pin.arrays import Floats
 from vkc_pin.driving.grid import HEADINGS, BaseGrid, fine_cells
 from vkc_pin.driving.path import poses_along, shortest_path
-from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.models.coordinates import wrapped
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.knots import smooth
@@ -31,15 +30,13 @@ class BasePaths:
         grid: Where the base fits.
     """
 
-    def __init__(self, problem: TrajectoryProblem, *, whole: bool = False, interrupt: Interrupt = NEVER) -> None:
+    def __init__(self, problem: TrajectoryProblem, *, whole: bool = False) -> None:
         """Look at the floor.
 
         Args:
             problem: Whose base it is.
             whole: The arm counts as well, as it is at the start, with what it holds; otherwise the bare base alone.
-            interrupt: Ends a search, as if there were no path.
         """
-        self.interrupt = interrupt
         self.omni = problem.chain.robot.base == "omni"
         z = problem.start.copy()
         z[:3] = 0.0
@@ -71,7 +68,7 @@ class BasePaths:
             places = max(_STEPS, int(np.ceil(np.hypot(*(goal - start)[:2]) / _STEP)))
             if all(self.grid.clear(*pose) for pose in np.linspace(start, goal, places)):
                 return np.asarray(start + smooth(steps)[:, None] * (goal - start))
-        find = functools.partial(shortest_path, start=start.tolist(), goals=goals, interrupt=self.interrupt)
+        find = functools.partial(shortest_path, start=start.tolist(), goals=goals)
         found = find(self.grid) or find(self.finer)
         return None if found is None else poses_along(found, steps, turning=self.grid.turning)
 

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 import numpy as np
 
 from vkc_pin.arrays import Floats
-from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.approach import Approach
 from vkc_pin.seeds.knots import SCATTER, Knots, smooth
@@ -23,9 +22,7 @@ TRIES = 20_000
 _SAME = 1e-6  # [rad]
 
 
-def base_poses(
-    problem: TrajectoryProblem, waypoint: int, near: Floats, rng: np.random.Generator, interrupt: Interrupt = NEVER
-) -> Floats:
+def base_poses(problem: TrajectoryProblem, waypoint: int, near: Floats, rng: np.random.Generator) -> Floats:
     """Return configurations, the nearest first, that are what must hold at a waypoint and are free of collision.
 
     As in the code of Jiao et al. (IROS 2021): inverse kinematics of base and arm together from random seeds, up to `ENOUGH`
@@ -36,7 +33,6 @@ def base_poses(
         waypoint: The waypoint.
         near: The configuration that they should be near, shape (n,), as `VirtualKinematicChain.metric` measures.
         rng: Draws the seeds.
-        interrupt: Ends the search, with what was found.
 
     Returns:
         Configurations, shape (K, n); none if none is found.
@@ -47,13 +43,13 @@ def base_poses(
         z, solved = knots.knot(np.tile(near, (SCATTER, 1)), waypoint, "scatter")
         z = z[solved]
         found.extend(z[knots.depth(z, waypoint) <= 0.0] if len(z) else [])
-        if len(found) >= ENOUGH or interrupt.pressed:
+        if len(found) >= ENOUGH:
             break
     z = np.array(found[:ENOUGH]).reshape(-1, problem.chain.size)
     return z[np.argsort(np.abs(z - near) @ knots.weights, kind="stable")]
 
 
-def postures(problem: TrajectoryProblem, interrupt: Interrupt = NEVER) -> Iterator[Floats]:
+def postures(problem: TrajectoryProblem) -> Iterator[Floats]:
     """Yield configurations, shape (n,), in which the base may drive away from where it is, and the ones that lead to them.
 
     Each is a path of the arm while the base stands, shape (K, n), and ends in what the base then drives in: nothing to do (K =
@@ -62,7 +58,6 @@ def postures(problem: TrajectoryProblem, interrupt: Interrupt = NEVER) -> Iterat
 
     Args:
         problem: Lets go of what stands fixed in the world and carries the rest along.
-        interrupt: Ends the search for a folded arm.
     """
     knots, robot = Knots(problem, np.random.default_rng(0)), problem.chain.robot  # nothing is drawn
 
@@ -78,7 +73,7 @@ def postures(problem: TrajectoryProblem, interrupt: Interrupt = NEVER) -> Iterat
     paths += [] if at_home(problem) else [np.vstack([away, home])]
     yield from filter(is_free, paths)
     folded = home.copy()
-    folded[3 : robot.coordinates.size] = Routes(problem, interrupt).folded_arm(0)  # looked for only if nothing else will do
+    folded[3 : robot.coordinates.size] = Routes(problem).folded_arm(0)  # looked for only if nothing else will do
     yield from filter(is_free, [np.vstack([paths[-1], folded])])
 
 

@@ -25,22 +25,19 @@ time, clearances and validation are those of `planner.plan`, and so is the solve
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any
-
-import numpy as np
 
 from vkc_pin.baselines.attempt import Attempt, Doable
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.interrupt import interruptible
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.options import Options
 from vkc_pin.planning.outcome import outcome, spent
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import Planner, borrowed
-from vkc_pin.planning.settings import check_arguments
+from vkc_pin.planning.settings import budget_for, check_arguments
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.compiler import compile_task
 from vkc_pin.task.steps import Step
@@ -62,6 +59,7 @@ def plan_separately(
     options: Options | None = None,
     seed: int = 0,
     time_limit: float | None = None,
+    effort: int | None = None,
     retries: int = RETRIES,
     planner: Planner | None = None,
 ) -> Plan:
@@ -73,21 +71,23 @@ def plan_separately(
         method: "B1" or "B2".
         options: As for `planner.plan`.
         seed: Of the random numbers.
-        time_limit: Seconds of planning after which nothing more is begun.
+        time_limit: As for `planner.plan`.
+        effort: As for `planner.plan`; an iteration of inverse kinematics of the arm counts 1.
         retries: How often all is tried, with other random numbers, until validation accepts a motion.
         planner: As for `planner.plan`.
 
     Returns:
         The plan of the first try that validation accepts, else the one that came furthest. Its status is then the cause:
-        "no base pose", "no base path", "arm does not reach", "no inverse kinematics", "collision", "too fast", "closure",
-        "rejected" by validation, "time limit" if that was up before anything had failed, "interrupted" by Ctrl-C. Planning
-        time is that of all tries; `rounds` is their number.
+        "no base pose", "no base path", "arm does not reach", "no inverse kinematics", "collision", "too fast", "closure" or
+        "rejected" by validation; "time limit", "effort spent" or "interrupted" if not all tries were made. Planning time is
+        that of all tries; `rounds` is their number.
 
     Raises:
         InputError: Steps that cannot be done or are of another kind, or an argument is wrong.
     """
     options = Options() if options is None else options
-    check_arguments(scene, options, time_limit, seed)
+    budget = budget_for(time_limit, effort)
+    check_arguments(scene, options, seed)
     if method not in BASELINES:
         raise UnknownNameError("method", str(method), BASELINES, field="method")
     if not isinstance(retries, int) or isinstance(retries, bool) or retries < 1:
@@ -99,28 +99,31 @@ def plan_separately(
             expected = "Actuate, Place or GoTo"
             raise InputError("the baselines know no such step", field=f"steps[{number}]", expected=expected, got=repr(step))
         actions.append(step)
-    with borrowed(planner) as cache, interruptible() as interrupt:
+    with borrowed(planner) as cache, budget.running():
         began, times, iterations, before = time.perf_counter(), Counter[str](), 0, cache.building
         best: tuple[float, str, int, Trajectory, Report] | None = None
         for number in range(retries):
-            deadline = np.inf if time_limit is None else began + cache.building - before + time_limit
-            random = [int(seed), number]
-            given: dict[str, Any] = {"deadline": deadline, "interrupt": interrupt, "cache": cache}
-            attempt = Attempt(scene, options, refine=method == "B2", seed=random, **given)
+            attempt = Attempt(scene, options, refine=method == "B2", seed=[int(seed), number], cache=cache)
             trajectory, came, cause = attempt.run(actions)
             checked = time.perf_counter()
             report = validate(scene, task.steps, trajectory, options)
-            attempt.times["validation"] += time.perf_counter() - checked
+            budget.checking = time.perf_counter() - checked
+            attempt.times["validation"] += budget.checking
             status = "success" if report.ok else cause or "rejected"
             iterations += attempt.iterations
             times.update(attempt.times)
-            if best is None or status in ("success", "interrupted") or came > best[0]:
+            if best is None or status == "success" or came > best[0]:
                 best = came, status, number, trajectory, report
-            if status in ("success", "interrupted") or time.perf_counter() > deadline:
+            ended = budget.ended
+            if status == "success" or ended:
                 break
         built = cache.building - before
     assert best is not None
     _, status, tried, trajectory, report = best
-    took = spent(time.perf_counter() - began - built, built, iterations=iterations, rounds=number + 1, times=times)
+    if ended and status not in ("success", ended):
+        status, notes = ended, (*report.notes, f"the try that came furthest failed with: {status}")
+        report = dataclasses.replace(report, notes=notes)
+    counts = {"iterations": iterations, "rounds": number + 1, "effort": budget.used}
+    took = spent(time.perf_counter() - began - built, built, **counts, times=times)
     name = f"{method}, try {tried + 1}"
     return outcome(scene, task.steps, options, trajectory, report, status, took=took, random_seed=int(seed), initialization=name)

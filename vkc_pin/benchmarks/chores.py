@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.benchmarks.harness import runner
+from vkc_pin.benchmarks.harness.limits import LIMITS
 from vkc_pin.benchmarks.harness.record import Solve, distribution, trial
 from vkc_pin.benchmarks.harness.tables import decimal, failures, foot, markdown
 from vkc_pin.files.writing import write_atomically
@@ -21,7 +22,6 @@ from vkc_pin.task.steps import Actuate, Grasp, Place, Step
 
 __all__ = ["CHORES", "fetch", "home", "plan_trial", "report", "run"]
 
-TIME_LIMIT = 300.0  # [s] of planning
 WINDOW = 2
 
 BAR_TABLE = (-3.0, 1.3, 1.051)  # [m], where the cup stands in between
@@ -79,7 +79,7 @@ CHORES: dict[str, tuple[str, Callable[[Scene], list[Step]]]] = {"home": ("househ
 def plan_trial(scene: Scene, spec: Mapping[str, Any]) -> Plan:
     """Plan the chore of one trial."""
     _, steps = CHORES[spec["chore"]]
-    return plan_chore(scene, steps(scene), window=WINDOW, time_limit=TIME_LIMIT, seed=spec["seed"])
+    return plan_chore(scene, steps(scene), window=WINDOW, seed=spec["seed"], **LIMITS)
 
 
 def run(
@@ -120,7 +120,7 @@ def run(
             base = (scene.sample_start(rng) if number else scene).start[:3].tolist()
             specs.append({"key": f"{chore}/{number:04d}", "chore": chore, "number": number, "base": base, "seed": seed})
     settings = {"benchmark": "chores", "seed": seed, "starts": trials, "chores": chores}
-    settings |= {"window": WINDOW, "time_limit": TIME_LIMIT, "steps": {name: _steps(name) for name in chores}}
+    settings |= {"window": WINDOW, **LIMITS, "steps": {name: _steps(name) for name in chores}}
     result = runner.run(specs, functools.partial(_record, solve=solve), out, settings=settings, jobs=jobs, progress=progress)
     write_atomically(Path(out) / "table.md", report(result).encode())
     return result

@@ -18,6 +18,7 @@ from vkc_pin.baselines.separate import BASELINES, RETRIES, plan_separately
 from vkc_pin.benchmarks.comparison_report import report
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.charts import motions_chart
+from vkc_pin.benchmarks.harness.limits import LIMITS
 from vkc_pin.benchmarks.harness.record import Record, Solve, trial
 from vkc_pin.errors import InputError
 from vkc_pin.files.writing import write_atomically
@@ -27,10 +28,9 @@ from vkc_pin.planning.planner import plan
 from vkc_pin.scene.scene import Scene, load_scene
 from vkc_pin.task.steps import Actuate, GoTo, Place, Step, as_placement
 
-__all__ = ["COMPARED_PLANNERS", "TIME_LIMIT", "Assignment", "Comparison", "peaks"]
+__all__ = ["COMPARED_PLANNERS", "Assignment", "Comparison", "peaks"]
 
 COMPARED_PLANNERS = (*BASELINES, "VKC")
-TIME_LIMIT = 20.0  # [s] of planning
 
 Draw = Callable[[Sequence[Record], Path, Mapping[str, str], Sequence[str]], list[str]]
 """What draws an experiment's charts: takes records, folder, task → what is done in it, methods; returns them in Markdown."""
@@ -74,8 +74,8 @@ class Comparison:
         """Plan the task of one trial: `scene` (the task's name), `method` and `seed` say how."""
         steps = self.tasks[spec["scene"]].steps
         if spec["method"] == "VKC":
-            return plan(scene, steps, time_limit=TIME_LIMIT, seed=spec["seed"])
-        return plan_separately(scene, steps, method=spec["method"], time_limit=TIME_LIMIT, seed=spec["seed"])
+            return plan(scene, steps, seed=spec["seed"], **LIMITS)
+        return plan_separately(scene, steps, method=spec["method"], seed=spec["seed"], **LIMITS)
 
     def specify(self, *, trials: int, seed: int, tasks: Sequence[str], methods: Sequence[str]) -> list[dict[str, Any]]:
         """Return the trials: every task, method and start, in this order, in which a process can keep what it has built.
@@ -142,7 +142,7 @@ class Comparison:
         settings = {"benchmark": self.benchmark, "seed": seed, "starts": trials, "tasks": tasks, "methods": methods}
         settings["scenes"] = {name: self.tasks[name].scene for name in tasks}
         settings["goals"] = {name: goals(self.tasks[name].steps) for name in tasks}
-        settings |= {"time_limit": TIME_LIMIT, "retries": RETRIES}
+        settings |= {**LIMITS, "retries": RETRIES}
         trials_of = _Trials(self.tasks, out, solve or self.plan_trial)
         function = functools.partial(trials_of.record, save_failures=save_failures)
         result = runner.run(specs, function, out, settings=settings, jobs=jobs, progress=progress)

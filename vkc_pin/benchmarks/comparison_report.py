@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from itertools import product
 from typing import Any
 
+from vkc_pin.benchmarks.harness.limits import allowed
 from vkc_pin.benchmarks.harness.record import Record, distribution, values
 from vkc_pin.benchmarks.harness.tables import (
     EFFORTS,
@@ -54,8 +55,8 @@ def report(
     parts = [
         f"# {title}",
         f"{', '.join(first)}{' and ' * bool(first)}{last}. {about['starts']} random "
-        f"start{'s' * (about['starts'] != 1)} per task, the same for all methods; seed {about['seed']}. At most "
-        f"{about['time_limit']:g} s of planning per trial, in which the baselines try up to {about['retries']} times. "
+        f"start{'s' * (about['starts'] != 1)} per task, the same for all methods; seed {about['seed']}. Per "
+        f"trial {allowed(about)}, in which the baselines try up to {about['retries']} times. "
         "Success is the word of the independent validation. Standard deviations are those of samples (n − 1).",
         "## Success",
         _success(records, tasks, methods),

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.benchmarks.harness import runner
+from vkc_pin.benchmarks.harness.limits import LIMITS, allowed
 from vkc_pin.benchmarks.harness.tables import foot, markdown
 from vkc_pin.benchmarks.problems.ablation import SUMMARY, every_trial, summary
 from vkc_pin.benchmarks.problems.poses import random_start
-from vkc_pin.benchmarks.problems.trials import TIME_LIMIT, tried
+from vkc_pin.benchmarks.problems.trials import tried
 from vkc_pin.errors import InputError
 from vkc_pin.files.writing import write_atomically
 from vkc_pin.scene.scene import Scene, load_scene
@@ -54,7 +55,7 @@ def run(*, out: str | Path, trials: int = 50, seed: int = 0, jobs: int = 1, prog
     """
     if trials < 1:
         raise InputError("out of range", field="trials", expected="at least 1", got=trials)
-    settings = {"benchmark": "gap", "seed": seed, "starts": trials, "pose": POSE, "time_limit": TIME_LIMIT}
+    settings = {"benchmark": "gap", "seed": seed, "starts": trials, "pose": POSE, **LIMITS}
     specs = [{"key": f"{number:04d}", "number": number, "seed": seed} for number in range(trials)]
     result = runner.run(specs, _record, out, settings=settings, jobs=jobs, progress=progress)
     write_atomically(Path(out) / "table.md", report(result).encode())
@@ -66,7 +67,7 @@ def report(result: Mapping[str, Any]) -> str:
     about, records = result["meta"], result["trials"]
     parts = [
         "# Through a gap to a table",
-        f"{about['starts']} random starts of base and arm, seed {about['seed']}, at most {about['time_limit']:g} s of planning. "
+        f"{about['starts']} random starts of base and arm, seed {about['seed']}, {allowed(about)} each. "
         "Success is the word of the independent validation; the first seed sufficed where the solver ran once. "
         "Times are those of all trials, CPU time with building symbolic programs. Rounds and iterations are means, efforts "
         "medians of successes.",

@@ -15,6 +15,7 @@ import numpy as np
 
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.charts import success_chart
+from vkc_pin.benchmarks.harness.limits import LIMITS, allowed
 from vkc_pin.benchmarks.harness.record import Solve, trial
 from vkc_pin.benchmarks.harness.tables import comparison_table, foot, methods_table
 from vkc_pin.files.writing import write_atomically
@@ -31,7 +32,6 @@ STEPWISE = "step after step"
 """The method that plans the steps one after the other, initialised as by "auto"."""
 TARGET = (-1.0, 3.897, 0.1)
 """Where the stick's tip has to be, in the world frame [m]: 3 mm before the middle of the cube's south face."""
-TIME_LIMIT = 20.0  # [s] of planning
 PERTURBATION = 0.05  # of the seed trajectory, in all repeats but the first
 _NAMES = {"init_1": "no obstacle", "init_2": "two small obstacles", "init_3": "one large obstacle"}
 
@@ -43,7 +43,7 @@ def plan_trial(scene: Scene, spec: Mapping[str, Any]) -> Plan:
         "joint": spec["method"] != STEPWISE,
         "perturbation": spec["perturbation"],
     }
-    return plan(scene, [Grasp("stick"), Touch("stick.tip", TARGET)], time_limit=TIME_LIMIT, seed=spec["seed"], **how)
+    return plan(scene, [Grasp("stick"), Touch("stick.tip", TARGET)], seed=spec["seed"], **LIMITS, **how)
 
 
 def specify(*, starts: int, repeats: int, seed: int, scenes: Sequence[str], methods: Sequence[str]) -> list[dict[str, Any]]:
@@ -103,7 +103,7 @@ def run(
     methods = runner.chosen("method", methods, COMPARED_INITIALIZATIONS)
     trials = specify(starts=starts, repeats=repeats, seed=seed, scenes=scenes, methods=methods)
     settings = {"benchmark": "initialization", "seed": seed, "starts": starts, "repeats": repeats, "scenes": scenes}
-    settings |= {"methods": methods, "target": TARGET, "time_limit": TIME_LIMIT, "perturbation": PERTURBATION}
+    settings |= {"methods": methods, "target": TARGET, **LIMITS, "perturbation": PERTURBATION}
     function = functools.partial(_record, solve=solve)
     result = runner.run(trials, function, out, settings=settings, jobs=jobs, progress=progress)
     write_atomically(Path(out) / "table.md", report(result).encode())
@@ -119,8 +119,8 @@ def report(result: Mapping[str, Any]) -> str:
     several = f", {about['repeats']} trials from each, all but the first with a perturbed seed trajectory"
     parts = [
         "# Initialising the trajectory",
-        f"{about['starts']} random starts per scene{several if about['repeats'] > 1 else ''}; seed {about['seed']}, at most "
-        f"{about['time_limit']:g} s of planning per trial. Success is the word of the independent validation. "
+        f"{about['starts']} random starts per scene{several if about['repeats'] > 1 else ''}; seed {about['seed']}, "
+        f"{allowed(about)} per trial. Success is the word of the independent validation. "
         "Planning times are those of all trials, efforts those of successes (medians).",
         methods_table(records, scenes, [*methods, STEPWISE]),
         "![Success rates](success.png)",

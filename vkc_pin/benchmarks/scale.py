@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vkc_pin.benchmarks.harness import runner
+from vkc_pin.benchmarks.harness.limits import LIMITS
 from vkc_pin.benchmarks.harness.record import Record, distribution, trial
 from vkc_pin.benchmarks.harness.tables import TIMES, decimal, foot, markdown, quartiles
 from vkc_pin.errors import InputError
@@ -26,8 +27,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = ["AXES", "Axis", "crowded", "refined", "report", "run", "scale_chart", "specify"]
-
-TIME_LIMIT = 60.0  # [s] of planning
 
 
 @dataclass(frozen=True)
@@ -151,7 +150,7 @@ def run(
     if not counts or counts[0] < least:
         raise InputError("out of range", field="counts", expected=f"numbers of at least {least}", got=counts)
     trials = specify(starts=starts, seed=seed, counts=counts, of=of)
-    settings = {"benchmark": "scale", "of": of, "seed": seed, "starts": starts, "counts": counts, "time_limit": TIME_LIMIT}
+    settings = {"benchmark": "scale", "of": of, "seed": seed, "starts": starts, "counts": counts, **LIMITS}
     result = runner.run(trials, _record, out, settings=settings, jobs=jobs, progress=progress)
     write_atomically(Path(out) / "table.md", report(result).encode())
     scale_chart(result["trials"], Path(out) / "scale.png", of=of, title=AXES[of].title)
@@ -239,7 +238,7 @@ def _record(spec: dict[str, Any]) -> dict[str, Any]:
 
 
 def _solve(scene: Scene, seed: int, hinge: float, options: Options) -> Plan:
-    return plan(scene, [Actuate("door", {"hinge": hinge})], options=options, time_limit=TIME_LIMIT, seed=seed)
+    return plan(scene, [Actuate("door", {"hinge": hinge})], options=options, seed=seed, **LIMITS)
 
 
 @functools.cache

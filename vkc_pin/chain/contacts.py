@@ -18,6 +18,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from vkc_pin.arrays import Floats, Ints
+from vkc_pin.budget import spend
 from vkc_pin.chain.chain import VirtualKinematicChain
 from vkc_pin.chain.collision_pairs import phase_geometries
 from vkc_pin.distances.placements import ShapePlacements
@@ -160,6 +161,7 @@ class ContactModel:
             nearest: How many of them to return per configuration, those that fall shortest of their margins; None: all.
             standing: Whether what stands in the world counts, too; otherwise only pairs of which both move.
         """
+        spend(len(z))
         rotations, translations = self.placements(z)
         phase_of = self.phases_of(waypoints)
         parts: list[tuple[NDArray[Any], ...]] = []

@@ -7,6 +7,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.arrays import Bools, Floats
+from vkc_pin.budget import spend
 from vkc_pin.cache import Cache
 from vkc_pin.chain.kinematics import kinematics_of
 from vkc_pin.chain.pose import PoseRow, pose_residual, target_vector
@@ -41,6 +42,7 @@ class PoseSolver:
 
     def evaluate(self, z: Floats, target: pin.SE3) -> tuple[Floats, Floats]:
         """Return residuals, shape (B, m) ([m], [rad]), and their Jacobians, shape (B, m, n), at `z`, shape (B, n)."""
+        spend(len(z))
         residual, jacobian = self._function(z, target_vector(target))
         return residual, jacobian.reshape(len(z), self.size, self.rows).swapaxes(1, 2)
 

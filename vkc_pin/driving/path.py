@@ -13,7 +13,6 @@ from vkc_pin.driving.grid import BaseGrid
 from vkc_pin.driving.ground import Drive, Ground, wrapped
 from vkc_pin.driving.search import cheapest
 from vkc_pin.errors import InputError
-from vkc_pin.interrupt import NEVER, Interrupt
 
 __all__ = ["BasePath", "poses_along", "shortest_path"]
 
@@ -44,7 +43,6 @@ def shortest_path(
     *,
     costs: Sequence[float] | Floats | None = None,
     smooth: bool = True,
-    interrupt: Interrupt = NEVER,
 ) -> BasePath | None:
     """Return the cheapest path from the start to one of the goals, or None if there is none.
 
@@ -56,7 +54,6 @@ def shortest_path(
         goals: The same for each goal, shape (G, 3).
         costs: What reaching each goal costs beside the path, shape (G,) [m]; None: nothing.
         smooth: Shorten the path over the grid where it turns more often than needed.
-        interrupt: Ends the search, as if there were no path.
 
     Raises:
         InputError: Shapes do not fit, or a number is not finite.
@@ -70,7 +67,7 @@ def shortest_path(
     if np.any(extra < 0.0):
         raise InputError("a cost is negative", field="costs", expected="numbers >= 0", got=extra.tolist())
     ground = Ground(grid, begin, ends)
-    found = cheapest(ground, extra, interrupt)
+    found = cheapest(ground, extra)
     if found is None:
         return None
     _, goal, drives, yaw = found

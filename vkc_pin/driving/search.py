@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vkc_pin.arrays import Floats
+from vkc_pin.budget import spend
 from vkc_pin.compiled import compiled_module
 from vkc_pin.driving.grid import HEADINGS
 from vkc_pin.driving.ground import BACKWARDS, UNIT, Drive, Ground, wrapped
 from vkc_pin.driving.query import Query
-from vkc_pin.interrupt import NEVER, Interrupt
 
 __all__ = ["cheapest"]
 
@@ -29,13 +29,12 @@ _BLOCKED, _NO_AHEAD, _NO_LEFT = 1, 2, 4  # flags of nodes
 _NONE = 2**60  # [UNIT] more than any path costs
 
 
-def cheapest(ground: Ground, extra: Floats, interrupt: Interrupt = NEVER) -> tuple[float, int, list[Drive], float] | None:
+def cheapest(ground: Ground, extra: Floats) -> tuple[float, int, list[Drive], float] | None:
     """Return the cheapest path to a goal that is not blocked, or None if there is none.
 
     Args:
         ground: Where the base may move, from where to where.
         extra: What reaching each goal costs beside the path, shape (G,) [m].
-        interrupt: Ends the search, as if there were no path.
 
     Returns:
         The cost [m], the goal, the drives up to it, with continuous yaws, and the yaw at the goal.
@@ -44,7 +43,8 @@ def cheapest(ground: Ground, extra: Floats, interrupt: Interrupt = NEVER) -> tup
     if not len(query.goal):
         return None
     search = _Search(query)
-    while not interrupt.pressed:
+    while True:
+        spend(1)
         limit = query.direct[-1][0] if query.direct else _NONE
         cost, end, begin, nodes = search.paths.cheapest(limit)
         if len(nodes):
@@ -58,7 +58,6 @@ def cheapest(ground: Ground, extra: Floats, interrupt: Interrupt = NEVER) -> tup
             direct = ground.direct(goal, how)
             if direct is not None and query.leads(goal, how):
                 return cost * UNIT, goal, [direct[0]], direct[1]
-    return None
 
 
 class _Search:

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 __all__ = ["MeshPart", "coarser", "convex_hull", "indices", "load_convex", "load_mesh", "load_parts", "to_bvh"]
 
 _NEIGHBOURS = 255  # coal's corners have no more
+_FLAT = 1e-9  # of the extent of points that is too thin for a hull
 _TOLERANCE = 1e-6  # how far, relatively, coal's volume and area may be from trimesh's
 
 
@@ -104,11 +105,14 @@ def convex_hull(points: ArrayLike, *, file: str | Path | None = None) -> coal.Co
     import trimesh
     from scipy.spatial import QhullError
 
+    given = np.asarray(points, float)
+    flat = InputError("the mesh has no convex hull: it is flat", file=file, expected="points that span a volume")
+    if _thickness(given) < _FLAT:  # Qhull may shake such points into a volume, of which trimesh makes what it can
+        raise flat
     try:
-        hull = trimesh.convex.convex_hull(np.asarray(points, float))
+        hull = trimesh.convex.convex_hull(given)
     except (QhullError, ValueError, IndexError) as error:
-        expected = "points that span a volume"
-        raise InputError("the mesh has no convex hull: it is flat", file=file, expected=expected) from error
+        raise flat from error
     if np.bincount(np.asarray(hull.faces).ravel()).max() > _NEIGHBOURS:  # the tip of a finely meshed cone, a fine disc
         hull = outer_hull(hull.vertices, vertices=60)
     vertices, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
@@ -122,6 +126,14 @@ def convex_hull(points: ArrayLike, *, file: str | Path | None = None) -> coal.Co
             raise InputError(f"coal does not hold this hull: wrong {what}", file=file, expected=wanted, got=held)
     shape.computeLocalAABB()
     return shape
+
+
+def _thickness(points: Floats) -> float:
+    """Return how thin points, shape (n, 3), are: their least spread relative to their largest; 0 for points in one plane."""
+    if len(points) < 4:
+        return 0.0
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return float(spread[-1] / spread[0]) if spread[0] > 0.0 else 0.0
 
 
 def load_parts(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0), *, detail: float = 0.0) -> list[MeshPart]:

@@ -29,6 +29,7 @@ def plan_chore(
     options: Options | None = None,
     callback: Callable[[Iteration], None] | None = None,
     time_limit: float | None = None,
+    effort: int | None = None,
     seed: int = 0,
     progress: bool = False,
     terms: Sequence[Term] = (),
@@ -48,7 +49,8 @@ def plan_chore(
         initialization: As for `planner.plan`.
         options: As for `planner.plan`.
         callback: As for `planner.plan`.
-        time_limit: Seconds of planning for all steps together.
+        time_limit: As for `planner.plan`, for all steps together.
+        effort: The same.
         seed: Of the random numbers.
         progress: As for `planner.plan`.
         terms: Own constraints and costs, as for `planner.plan`.
@@ -62,7 +64,14 @@ def plan_chore(
         InputError: A step names something that is not there, or cannot be done at its place in the list; the error names it.
     """
     settings = settings_for(
-        scene, initialization=initialization, options=options, callback=callback, time_limit=time_limit, seed=seed, terms=terms
+        scene,
+        initialization=initialization,
+        options=options,
+        callback=callback,
+        time_limit=time_limit,
+        effort=effort,
+        seed=seed,
+        terms=terms,
     )
     if not isinstance(window, int) or isinstance(window, bool) or window < 1:
         raise InputError("out of range", field="window", expected="a whole number of at least 1", got=repr(window))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from vkc_pin.arrays import Floats
-from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.program.merit import TOLERANCE
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.knots import depth, scatter
@@ -48,19 +47,16 @@ def impossible(problem: TrajectoryProblem) -> list[Violation]:
     return found
 
 
-def explain(problem: TrajectoryProblem, random_seed: int, interrupt: Interrupt = NEVER) -> list[str]:
+def explain(problem: TrajectoryProblem, random_seed: int) -> list[str]:
     """Return, for every goal that no free configuration was found for, the nearest miss or what collides with what.
 
     Args:
         problem: What could not be solved.
         random_seed: Of the random configurations tried.
-        interrupt: Ends the search, with what was found out.
     """
     lines = []
     for phase, end in zip(problem.task.phases, problem.ends, strict=True):
-        tried = _try(problem, int(end), np.random.default_rng(random_seed), interrupt)
-        if interrupt.pressed:
-            break
+        tried = _try(problem, int(end), np.random.default_rng(random_seed))
         if tried is None:
             continue
         z, residual = tried
@@ -86,9 +82,7 @@ def explain(problem: TrajectoryProblem, random_seed: int, interrupt: Interrupt =
     return lines
 
 
-def _try(
-    problem: TrajectoryProblem, waypoint: int, rng: np.random.Generator, interrupt: Interrupt
-) -> tuple[Floats, Floats] | None:
+def _try(problem: TrajectoryProblem, waypoint: int, rng: np.random.Generator) -> tuple[Floats, Floats] | None:
     """Return what `scatter` does, drawn again and again until something is free, up to `_DRAWS` times."""
     found: list[tuple[Floats, Floats]] = []
     for _ in range(_DRAWS):
@@ -97,7 +91,7 @@ def _try(
             return None
         found.append(tried)
         z = tried[0][tried[1] < TOLERANCE]
-        if interrupt.pressed or (len(z) and depth(problem, z, waypoint).min() <= 0.0):
+        if len(z) and depth(problem, z, waypoint).min() <= 0.0:
             break
     return np.concatenate([z for z, _ in found]), np.concatenate([residual for _, residual in found])
 

@@ -5,15 +5,17 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from vkc_pin.arrays import Floats
+from vkc_pin.budget import ENDINGS, SpentError, spend, unlimited
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.planning.diagnosis import explain, impossible
-from vkc_pin.planning.outcome import TIMES, outcome, spent
+from vkc_pin.planning.outcome import TIMES, outcome, spent, still
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.settings import Settings
 from vkc_pin.program.problem import TrajectoryProblem
@@ -28,6 +30,8 @@ from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import validate
 
 __all__ = ["OneProblem"]
+
+_CHECK = 2e-3  # [s] a waypoint that checking a motion takes, rather more than less; counts until it was done once
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,43 +68,52 @@ class OneProblem:
     Attributes:
         scene: Where it begins.
         task: What is asked for.
-        problem: The program, once `run` has begun.
-        z: Its best z_1..z_N, shape (N, n), once `run` has ended.
+        problem: The program, once it is built.
+        z: Its best z_1..z_N, shape (N, n), once `run` has found something.
         initialization: The name of the seed that led there.
+        checking: How long the last check of a motion took [s].
     """
 
     def __init__(self, scene: Scene, task: Task, settings: Settings) -> None:
         self.scene, self.task, self.settings = scene, task, settings
         self.times = dict.fromkeys(TIMES, 0.0)
         self.rounds = self.iterations = 0
+        self.checking = 0.0
         self.history: list[dict[str, float]] = []
         self.blocked: list[str] = []  # phases in which there is no way for the base
+        self._best: _Try | None = None
 
     def run(self, seed: Callable[[TrajectoryProblem], Seed] | None = None) -> Plan:
-        """Try seeds until validation accepts a motion, there are no more, time is up, or Ctrl-C is pressed.
+        """Try seeds until validation accepts a motion, there are no more, or the budget is at its end.
 
         Args:
             seed: Makes the only seed to try, a motion that is nearly good as it is, so that there is no need of patience with it;
                 None: those of the settings' initialization.
         """
         began = time.perf_counter()
-        limit, cache = self.settings.time_limit, self.settings.cache
-        built = cache.building
+        cache, budget = self.settings.cache, self.settings.budget
+        built, used, self._best = cache.building, budget.used, None
         self.settings.progress.begin([phase.name for phase in self.task.phases])
-        problem = TrajectoryProblem(self.scene, self.task, self.settings.options, self.settings.terms, cache=cache)
-        self.problem = problem
-        reasons = impossible(problem)
-        if reasons:
-            best, status = self._stationary(problem), "infeasible"
-            best = dataclasses.replace(best, report=best.report.with_reasons(reasons))
-        else:
-            deadline = np.inf if limit is None else began + cache.building - built + limit
-            seeds = self._seeds(problem) if seed is None else iter([seed(problem)])
-            best, status = self._try_seeds(problem, seeds, deadline, searched=seed is None)
+        try:
+            best, status = self._planned(seed)
+        except SpentError as end:
+            best, status = self._best or self._standing(), str(end)
         self.z, self.initialization = best.z, best.name
         cache.trim()  # a chore has many problems, whose solvers grow while they are used
-        build_time = cache.building - built
-        return self._plan(best, status, time.perf_counter() - began - build_time, build_time)
+        build_time, took = cache.building - built, time.perf_counter() - began
+        return self._plan(best, status, spent(took - build_time, build_time, effort=budget.used - used, **self._counts()))
+
+    def _planned(self, seed: Callable[[TrajectoryProblem], Seed] | None) -> tuple[_Try, str]:
+        """Return the best try and the plan's status; see `run`."""
+        s = self.settings
+        problem = self.problem = TrajectoryProblem(self.scene, self.task, s.options, s.terms, cache=s.cache)
+        s.budget.checking = s.budget.checking or _CHECK * problem.segments
+        reasons = impossible(problem)
+        if reasons:
+            best = self._stationary(problem)
+            return dataclasses.replace(best, report=best.report.with_reasons(reasons)), "infeasible"
+        seeds = self._seeds(problem) if seed is None else iter([seed(problem)])
+        return self._try_seeds(problem, seeds, searched=seed is None)
 
     def piece(self) -> PhaseWaypoints:
         """Return the best waypoints, once `run` has ended, for problems of more phases to start from."""
@@ -109,44 +122,28 @@ class OneProblem:
         waypoints = tuple(path[first : last + 1] for first, last in itertools.pairwise(ends))
         return PhaseWaypoints(phases, self.problem.chain.names, waypoints, self.initialization)
 
-    def _try_seeds(
-        self, problem: TrajectoryProblem, seeds: Iterator[Seed], deadline: float, *, searched: bool
-    ) -> tuple[_Try, str]:
+    def _try_seeds(self, problem: TrajectoryProblem, seeds: Iterator[Seed], *, searched: bool) -> tuple[_Try, str]:
         """Return the best try, with what is in the way of the task if it is no success, and the plan's status."""
-        best: _Try | None = None
         notes: list[str] = []
-        ended = ""  # why nothing else is to be tried
         for number, seed in enumerate(seeds, start=1):
-            solution, found = self._try(problem, seed, deadline)
-            best = found if best is None or found.better(best) else best
-            ended = self._ended(best, solution)
-            if ended:
-                break
+            solution = self._solve(problem, seed)
+            found = self._judge(problem, solution, seed.name)
+            if self._best is None or found.better(self._best):
+                self._best = found
+            if self._best.status == "success":
+                return self._best, "success"
+            if solution.status in ENDINGS:
+                return self._best, solution.status
+            spend()
             if number == 1 and searched and not _ends_free(problem, seed):
-                notes = explain(problem, self.settings.random_seed, self.settings.interrupt)
+                notes = explain(problem, self.settings.random_seed)
             elif notes:  # two seeds failed, and random configurations find no free one at a goal either
                 break
+        best = self._best
         if best is None:
             best, notes = self._stationary(problem), notes + self.blocked
-        if not ended and self.settings.interrupt.pressed:
-            ended = "interrupted"
-        if not ended:
-            ended = "infeasible" if notes else best.status
-            best = dataclasses.replace(best, report=dataclasses.replace(best.report, notes=tuple(notes)))
-        return best, ended
-
-    def _try(self, problem: TrajectoryProblem, seed: Seed, deadline: float) -> tuple[Solution, _Try]:
-        """Return what the solver makes of a seed, and what that is worth."""
-        solution = self._solve(problem, seed, deadline)
-        return solution, self._judge(problem, solution, seed.name)
-
-    def _ended(self, best: _Try, solution: Solution) -> str:
-        """Return the plan's status if nothing else is to be tried after a solution; "" otherwise."""
-        if best.status == "success":
-            return best.status
-        if self.settings.interrupt.pressed:
-            return "interrupted"
-        return solution.status if solution.status == "time limit" else ""
+        report = dataclasses.replace(best.report, notes=tuple(notes))
+        return dataclasses.replace(best, report=report), "infeasible" if notes else best.status
 
     def _seeds(self, problem: TrajectoryProblem) -> Iterator[Seed]:
         s = self.settings
@@ -157,26 +154,21 @@ class OneProblem:
             count=s.options.max_restarts,
             perturbation=s.perturbation,
             notes=self.blocked,
-            interrupt=s.interrupt,
         )
-        while not s.interrupt.pressed:
-            began = time.perf_counter()
+        while True:
+            began, built = time.perf_counter(), s.cache.building
             s.progress.doing("looking for a seed")
-            seed = next(seeds, None)
-            self.times["initialization"] += time.perf_counter() - began
-            if seed is None or s.interrupt.pressed:
+            try:
+                seed = next(seeds, None)
+            finally:
+                self.times["initialization"] += time.perf_counter() - began - (s.cache.building - built)
+            if seed is None:
                 return
             yield seed
 
-    def _solve(self, problem: TrajectoryProblem, seed: Seed, deadline: float) -> Solution:
-        solution = solve(
-            problem,
-            seed.z,
-            callback=self._report,
-            deadline=deadline,
-            radius=seed.radius,
-            interrupt=self.settings.interrupt,
-        )
+    def _solve(self, problem: TrajectoryProblem, seed: Seed) -> Solution:
+        """Return what the solver makes of a seed."""
+        solution = solve(problem, seed.z, callback=self._report, radius=seed.radius)
         self.rounds += solution.rounds
         self.iterations += solution.iterations
         for key, value in solution.timings.items():
@@ -190,18 +182,35 @@ class OneProblem:
             self.settings.callback(row)
 
     def _judge(self, problem: TrajectoryProblem, solution: Solution, name: str) -> _Try:
-        began = time.perf_counter()
-        self.settings.progress.doing("checking")
-        trajectory = as_trajectory(problem, solution.z, solution.dt)
-        report = validate(self.scene, self.task.steps, trajectory, self.settings.options, self.settings.terms)
-        self.times["validation"] += time.perf_counter() - began
+        """Return what a solution is worth."""
+        with unlimited():
+            trajectory = as_trajectory(problem, solution.z, solution.dt)
+        report = self._check(trajectory)
         status = "success" if report.ok else "rejected" if solution.converged else "not converged"
         return _Try(name, solution.z, trajectory, report, status)
 
+    def _check(self, trajectory: Trajectory) -> Report:
+        """Check a motion, and note how long that takes."""
+        began = time.perf_counter()
+        self.settings.progress.doing("checking")
+        report = validate(self.scene, self.task.steps, trajectory, self.settings.options, self.settings.terms)
+        self.checking = self.settings.budget.checking = time.perf_counter() - began
+        self.times["validation"] += self.checking
+        return report
+
     def _stationary(self, problem: TrajectoryProblem) -> _Try:
+        """Return a motion in which all stands still for as long as the task takes."""
         return self._judge(problem, Solution(problem.still, problem.timing_for(problem.still).dt), "none")
 
-    def _plan(self, best: _Try, status: str, planning_time: float, build_time: float) -> Plan:
+    def _standing(self) -> _Try:
+        """Return one in which all stands still for a moment: what there is before the first seed."""
+        trajectory = still(self.scene, self.settings.options)
+        return _Try("none", np.zeros((0, 0)), trajectory, self._check(trajectory), "not converged")
+
+    def _counts(self) -> dict[str, Any]:
+        return {"iterations": self.iterations, "rounds": self.rounds, "times": self.times}
+
+    def _plan(self, best: _Try, status: str, took: Mapping[str, float]) -> Plan:
         s = self.settings
         return outcome(
             self.scene,
@@ -210,7 +219,7 @@ class OneProblem:
             best.trajectory,
             best.report,
             status,
-            took=spent(planning_time, build_time, iterations=self.iterations, rounds=self.rounds, times=self.times),
+            took=took,
             random_seed=s.random_seed,
             initialization=best.name,
             history=self.history,

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from vkc_pin.budget import ENDINGS
 from vkc_pin.motion.splicing import join
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.options import Options
@@ -19,15 +20,12 @@ from vkc_pin.task.terms import Term
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import validate
 
-__all__ = ["FINAL", "STOPPED", "TIMES", "charged", "joined", "outcome", "spent", "summed"]
+__all__ = ["FINAL", "TIMES", "charged", "joined", "outcome", "spent", "still", "summed"]
 
 TIMES = ("initialization", "coal", "casadi", "ipopt", "validation")
 """What planning spends its time on."""
 
-STOPPED = ("interrupted", "time limit")
-"""Statuses after which there is no time left."""
-
-FINAL = (*STOPPED, "infeasible")
+FINAL = (*ENDINGS, "infeasible")
 """Statuses after which nothing else is tried."""
 
 
@@ -37,6 +35,7 @@ def spent(
     *,
     iterations: float = 0,
     rounds: float = 0,
+    effort: float = 0,
     times: Mapping[str, float] | None = None,
 ) -> dict[str, float]:
     """Return what planning took, as the metrics of a plan have it.
@@ -46,15 +45,16 @@ def spent(
         build_time: On symbolic programs that were built for the first time [s].
         iterations: Of Ipopt.
         rounds: Of the solver.
+        effort: Units; see `Budget`.
         times: What was spent on `TIMES`, and whatever else [s]; None: nothing.
     """
     parts = {f"time_{name}": value for name, value in {**dict.fromkeys(TIMES, 0.0), **(times or {})}.items()}
-    counts = {"iterations": float(iterations), "rounds": float(rounds)}
+    counts = {"iterations": float(iterations), "rounds": float(rounds), "effort": float(effort)}
     return {"planning_time": planning_time, "build_time": build_time, **counts, **parts}
 
 
 def summed(metrics: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Return what several plans took: times, iterations and rounds."""
+    """Return what several plans took: times, iterations, rounds and effort."""
     return {key: float(sum(part[key] for part in metrics)) for key in spent()}
 
 
@@ -135,16 +135,16 @@ def joined(
     rows = [row for part in parts for row in part.history] if history is None else history
     if parts:
         settings.progress.doing("checking all of it")
+        status = settings.budget.ended or ("rejected" if parts[-1].success else parts[-1].status)
         trajectory = join([part.trajectory for part in parts], pause=settings.options.grasp_time)
         checked = time.perf_counter()
         report = validate(scene, steps, trajectory, settings.options, settings.terms)
         for key in ("planning_time", "time_validation"):
             took[key] += time.perf_counter() - checked
         report = dataclasses.replace(report, notes=(*notes, *parts[-1].validation.notes))
-        status = "interrupted" if settings.interrupt.pressed else "rejected" if parts[-1].success else parts[-1].status
         status, name = "success" if report.ok else status, ", ".join(part.initialization for part in parts)
     else:
-        trajectory, status, name = _still(scene, settings.options), "interrupted", "none"
+        trajectory, status, name = still(scene, settings.options), settings.budget.ended or "interrupted", "none"
         report = validate(scene, steps, trajectory, settings.options, settings.terms)
     if began is not None:
         took["planning_time"] = time.perf_counter() - began - took["build_time"]
@@ -163,7 +163,7 @@ def joined(
     )
 
 
-def _still(scene: Scene, options: Options) -> Trajectory:
+def still(scene: Scene, options: Options) -> Trajectory:
     """Return the motion of a robot that stays where it is for a step of time, with what it holds."""
     values = dict(zip(scene.robot.coordinates.names, scene.start.tolist(), strict=True))
     for name, placed in scene.objects.items():

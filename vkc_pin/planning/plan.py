@@ -61,11 +61,11 @@ class Plan:
         options: How it was planned.
         trajectory: The motion; if planning failed, the best there was.
         validation: What the independent check says of it.
-        status: "success", or why not: "infeasible", "not converged", "time limit", "interrupted", "rejected"; plans of the
-            baselines name the stage that failed.
+        status: "success", or why not: "infeasible", "not converged", "time limit", "effort spent", "interrupted", "rejected";
+            plans of the baselines name the stage that failed.
         metrics: planning_time [s], build_time [s], base_effort [m], base_effort_l1 [m], arm_effort [rad], clearance [m],
-            closure_error [m], duration [s], iterations, rounds, and the split time_coal, time_casadi, time_ipopt,
-            time_initialization, time_validation [s].
+            closure_error [m], duration [s], iterations, rounds, effort [units, see `planner.plan`], and the split time_coal,
+            time_casadi, time_ipopt, time_initialization, time_validation [s].
         seed: Of the random numbers.
         initialization: Which seed trajectory it came from.
         history: One row per round of the solver.
@@ -101,7 +101,8 @@ class Plan:
             f"  planning    {m['planning_time']:.3f} s after {m['build_time']:.2f} s of symbolic build: "
             f"seeds {m['time_initialization']:.3f}, coal {m['time_coal']:.3f}, CasADi {m['time_casadi']:.3f}, "
             f"Ipopt {m['time_ipopt']:.3f}, validation {m['time_validation']:.3f}; "
-            f"{int(m['rounds'])} rounds, {int(m['iterations'])} Ipopt iterations, seed {self.initialization}",
+            f"{int(m['rounds'])} rounds, {int(m['iterations'])} Ipopt iterations, "
+            f"effort {int(m.get('effort', 0))}, seed {self.initialization}",
             *(f"  {line}" for line in self.validation.lines()),
         ]
         return "\n".join(lines)

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Sequence
 
 from vkc_pin.cache import Cache, CacheInfo
 from vkc_pin.errors import InputError
-from vkc_pin.interrupt import interruptible
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.progress import shown
@@ -98,6 +97,7 @@ def plan(
     options: Options | None = None,
     callback: Callable[[Iteration], None] | None = None,
     time_limit: float | None = None,
+    effort: int | None = None,
     seed: int = 0,
     joint: bool = True,
     perturbation: float = 0.0,
@@ -113,9 +113,13 @@ def plan(
         initialization: "auto", "interpolated", "astar", "rrt" or "stationary"; see `initialization.initialize`.
         options: How to plan; `Options()` if left out.
         callback: Called after every round of the solver with an `Iteration`, whose fields are named columns.
-        time_limit: Seconds of planning after which the best iterate is returned, with status "time limit".
+        time_limit: Seconds by the clock, from the call on and with all that is built and checked, after which the best motion so
+            far is returned, with status "time limit". What succeeds within it depends on the machine and on what else runs there.
+        effort: The same as a count of work, with status "effort spent": how many configurations may be looked at, by searches for
+            seeds, and in every iteration of Ipopt at each waypoint. The same call succeeds with it on every machine, or fails.
+            What a plan took is in `metrics["effort"]`; 100 000 take some ten seconds.
         seed: Of the random numbers. The same call gives the same trajectory on the same machine, bit for bit, whatever was
-            planned before; only a time limit can make a difference.
+            planned before; only `time_limit` can make a difference.
         joint: Plan all steps as one problem; otherwise each from where the one before it ends, for comparison.
         perturbation: Standard deviation of smooth noise on the seeds, [m] and [rad], to see how much hangs on them.
         progress: Show one line that changes in its place: in a notebook or a terminal; elsewhere nothing is shown.
@@ -136,6 +140,7 @@ def plan(
         options=options,
         callback=callback,
         time_limit=time_limit,
+        effort=effort,
         seed=seed,
         perturbation=perturbation,
         terms=terms,
@@ -150,8 +155,8 @@ def plan(
 
 
 def guarded(run: Callable[[Settings], Plan], settings: Settings, progress: bool, planner: Planner | None = None) -> Plan:
-    """Return what `run` returns, which is told of Ctrl-C by its settings and lent a cache; show its progress."""
-    with borrowed(planner) as cache, shown(progress) as line, interruptible(settings.interrupt):
+    """Return what `run` returns, whose settings' budget runs, and which is lent a cache; show its progress."""
+    with borrowed(planner) as cache, shown(progress) as line, settings.budget.running():
         found = run(dataclasses.replace(settings, progress=line, cache=cache))
         line.end(found)
     return found

@@ -20,7 +20,7 @@ def step_by_step(scene: Scene, task: Task, settings: Settings) -> Plan:
     Args:
         scene: Robot, objects and obstacles.
         task: What should change in the world.
-        settings: How to plan; the time limit is for all steps together.
+        settings: How to plan.
     """
     return joined(scene, task.steps, settings, [plan for _, plan in stages(scene, task, settings)])
 
@@ -38,18 +38,18 @@ def all_at_once(scene: Scene, task: Task, settings: Settings) -> Plan:
     result = OneProblem(scene, task, settings).run()
     if result.success or len(task.steps) == 1 or result.status in FINAL:
         return result
-    apart = step_by_step(scene, task, settings.after([result.metrics]))
+    apart = step_by_step(scene, task, settings)
     spent = [result.metrics, apart.metrics]
     return charged(apart if apart.success else result, spent)
 
 
 def stages(scene: Scene, task: Task, settings: Settings) -> list[tuple[OneProblem, Plan]]:
-    """Plan every step that changes something from where the one before it ends, up to the first that fails, or to Ctrl-C.
+    """Plan every step that changes something from where the one before it ends, up to the first that fails.
 
     Args:
         scene: Robot, objects and obstacles.
         task: What should change in the world.
-        settings: How to plan; the time limit is for all steps together.
+        settings: How to plan.
     """
     current = scene
     parts: list[tuple[OneProblem, Plan]] = []
@@ -59,9 +59,10 @@ def stages(scene: Scene, task: Task, settings: Settings) -> list[tuple[OneProble
         if not own.phases:
             continue
         settings.progress.part(number, 1, len(task.steps))
-        one = OneProblem(current, own, settings.after(plan.metrics for _, plan in parts))
+        one = OneProblem(current, own, settings)
         parts.append((one, one.run()))
-        if not parts[-1][1].success or settings.interrupt.pressed:
+        if not parts[-1][1].success or settings.budget.ended:
             break
+        settings.budget.decided += one.checking
         current = scene_after(current, parts[-1][1].trajectory, own.after)
     return parts

@@ -7,12 +7,13 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+from vkc_pin.budget import ENDINGS
 from vkc_pin.errors import InputError
 from vkc_pin.motion.splicing import cut
 from vkc_pin.motion.world import scene_after
 from vkc_pin.options import Options
 from vkc_pin.planning.one_problem import OneProblem
-from vkc_pin.planning.outcome import FINAL, STOPPED, joined
+from vkc_pin.planning.outcome import FINAL, joined
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.settings import Settings
 from vkc_pin.program.problem import TrajectoryProblem
@@ -37,12 +38,14 @@ class _Part:
         piece: Its waypoints.
         after: The scene in which it ends.
         rests: Whether the robot stands still at its end.
+        checking: How long it took to check [s].
     """
 
     plan: Plan | None
     piece: PhaseWaypoints
     after: Scene
     rests: bool = True
+    checking: float = 0.0
 
 
 class SlidingWindow:
@@ -65,11 +68,11 @@ class SlidingWindow:
         self.began = time.perf_counter()
 
     def run(self) -> Plan:
-        """Plan action after action, until all is done, one fails or Ctrl-C is pressed."""
+        """Plan action after action, until all is done, one fails or the budget is at its end."""
         window, back, failed = self.window, self._searches, None
         while len(self.kept) < len(self.actions):
             failed = self._plan_window(window)
-            if self._stopped:
+            if self.settings.budget.ended:
                 self.kept, self.ahead = self.kept + self.ahead, []
                 break
             if failed is None:
@@ -83,10 +86,6 @@ class SlidingWindow:
                 self.kept, self.ahead = self.kept + self.ahead, []
                 break
         return self._joined(failed)
-
-    @property
-    def _stopped(self) -> bool:
-        return self.settings.interrupt.pressed
 
     @property
     def _searches(self) -> int:
@@ -106,9 +105,9 @@ class SlidingWindow:
         last = self._last(first, window)
         self.ahead = self.ahead[: last - first]
         alone = None
-        while alone is None and first + len(self.ahead) < last and not self._stopped:
+        while alone is None and first + len(self.ahead) < last and not self.settings.budget.ended:
             alone = self._look_ahead()
-        if self._stopped:
+        if self.settings.budget.ended:
             return alone
         if alone is None and sum(part.plan is not None for part in self.ahead) > 1:
             pieces = [part.piece for part in self.ahead]
@@ -117,7 +116,7 @@ class SlidingWindow:
             if plan.success:
                 self.ahead = self._parts(one, plan, first, last)
         for attempt in range(1, 1 + self._searches):
-            if alone is None or alone.status in STOPPED:
+            if alone is None or alone.status in ENDINGS:
                 break
             one = self._problem(self._now, first, last, attempt)
             together = self._solved(first, one)
@@ -163,6 +162,7 @@ class SlidingWindow:
         """Return the plan of a problem that begins with the action `first`."""
         done = len(self._steps(0, first))
         self.settings.progress.part(done + 1, len(one.task.steps), len(self.steps))
+        self.settings.budget.decided = sum(part.checking for part in (*self.kept, *self.ahead))
         plan = one.run(seed)
         self.spent.append(plan.metrics)
         self.history += plan.history
@@ -186,7 +186,7 @@ class SlidingWindow:
                 ends = one.problem.ends
                 rests = end == len(ends) or ends[end - 1] in one.problem.transcription.structure.stops
                 scene = scene_after(scene, trajectory, task.after)
-            parts.append(_Part(part, piece, scene, rests))
+            parts.append(_Part(part, piece, scene, rests, one.checking / (last - first)))
             begin = end
         return parts
 
@@ -198,22 +198,20 @@ class SlidingWindow:
         return compile_task(scene, self._steps(first, last), options, nothing=True)
 
     def _problem(self, scene: Scene, first: int, last: int, attempt: int = 0) -> OneProblem:
-        """Return the problem of the actions from `first` to before `last`; see `_left`."""
-        settings = self._left(attempt)
-        return OneProblem(scene, self._task(scene, first, last, settings.options), settings)
-
-    def _left(self, attempt: int) -> Settings:
-        """Return the settings with what is left of the time limit.
+        """Return the problem of the actions from `first` to before `last`.
 
         There are few seeds to an attempt: where an action cannot be done from where the last one ends, all others fail as well,
         slowly, and to plan the two together is the way out.
 
         Args:
+            scene: Where they begin.
+            first: Their number.
+            last: That of what follows.
             attempt: Other random numbers for each.
         """
-        left = self.settings.after(self.spent)
-        options = dataclasses.replace(left.options, max_restarts=1)
-        return dataclasses.replace(left, options=options, random_seed=left.random_seed + attempt)
+        options = dataclasses.replace(self.settings.options, max_restarts=1)
+        settings = dataclasses.replace(self.settings, options=options, random_seed=self.settings.random_seed + attempt)
+        return OneProblem(scene, self._task(scene, first, last, options), settings)
 
     def _joined(self, failed: Plan | None) -> Plan:
         """Return one plan of all that is decided, and of what failed."""

@@ -1,12 +1,12 @@
-"""Ipopt on a program whose derivatives are given, stopped between two of its iterations when time is up."""
+"""Ipopt on a program whose derivatives are given, stopped between two of its iterations when the budget is at its end."""
 
 from __future__ import annotations
 
-import time
 from typing import Any, NamedTuple
 
 import casadi as ca
-import numpy as np
+
+from vkc_pin.budget import SpentError, spend
 
 __all__ = ["ENTRY", "Ipopt", "Monitor", "ipopt"]
 
@@ -14,15 +14,18 @@ ENTRY = 600  # [bytes] that an entry of Jacobian or Hessian takes, in a program 
 
 
 class Monitor(ca.Callback):
-    """CasADi's iteration callback; `deadline` can be set before every solve.
+    """CasADi's iteration callback.
 
-    Attributes:
-        deadline: Value of `time.perf_counter()` at which to stop.
+    Args:
+        variables: Number of variables of the program.
+        rows: Of rows.
+        parameters: Of parameters.
+        waypoints: Units of effort of an iteration.
     """
 
-    def __init__(self, variables: int, rows: int, parameters: int) -> None:
+    def __init__(self, variables: int, rows: int, parameters: int, waypoints: int) -> None:
         ca.Callback.__init__(self)
-        self.deadline = np.inf
+        self._waypoints = waypoints
         self._sizes = {"x": variables, "f": 1, "g": rows, "lam_x": variables, "lam_g": rows, "lam_p": parameters}
         self.construct("monitor", {})
 
@@ -35,15 +38,19 @@ class Monitor(ca.Callback):
         return ca.Sparsity.dense(self._sizes[ca.nlpsol_out(i)], 1)
 
     def eval(self, arguments: list[ca.DM]) -> list[int]:
-        """Return [1] when time is up."""
-        return [int(time.perf_counter() > self.deadline)]
+        """Return [1] when the budget is at its end."""
+        try:
+            spend(self._waypoints)
+        except SpentError:
+            return [1]
+        return [0]
 
 
 class Ipopt(NamedTuple):
     """A solver, what stops it, and how much memory it takes [bytes]."""
 
     solver: ca.Function
-    monitor: Monitor | None
+    monitor: Monitor
     nbytes: int
 
 
@@ -55,7 +62,7 @@ def ipopt(
     lagrangian: tuple[ca.MX, ca.MX, ca.MX],
     options: dict[str, Any],
     *,
-    timed: bool,
+    waypoints: int,
 ) -> Ipopt:
     """Return Ipopt on min f(x) subject to bounds on g(x).
 
@@ -66,7 +73,7 @@ def ipopt(
         rows: g and its Jacobian.
         lagrangian: Symbols of the weight σ of f and of the multipliers λ, and the upper triangle of the Hessian of σ·f + λᵀ·g.
         options: For CasADi's nlpsol.
-        timed: Whether a deadline can be set.
+        waypoints: Units of effort of an iteration.
     """
     weight, multipliers, hessian = lagrangian
     given, (f, g) = [x, parameters], (objective[0], rows[0])
@@ -78,8 +85,9 @@ def ipopt(
         ),
     }
     quiet = {"print_time": False, "record_time": True, "calc_lam_p": False, "no_nlp_grad": True}
-    monitor = Monitor(x.numel(), g.numel(), parameters.numel()) if timed else None
-    callback = {"iteration_callback": monitor} if timed else {}
+    monitor = Monitor(x.numel(), g.numel(), parameters.numel(), waypoints)
+    callback = {"iteration_callback": monitor}
+    spend()
     program = {"x": x, "p": parameters, "f": f, "g": g}
     solver = ca.nlpsol("trajectory", "ipopt", program, {**quiet, **functions, **callback, **options})
     return Ipopt(solver, monitor, ENTRY * (rows[1].nnz() + hessian.nnz()))

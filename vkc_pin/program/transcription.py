@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 
 from vkc_pin.arrays import Floats, Ints
+from vkc_pin.budget import spend
 from vkc_pin.cache import Cache
 from vkc_pin.chain.inverse_kinematics import PoseSolver
 from vkc_pin.chain.pose import AWAY
@@ -58,9 +59,9 @@ class Transcription:
         self.size = self.segments * self.width
         self.interpreted: list[MachineCode] = []
         self._symbols()
-        self._objective()
-        self._constraints()
-        self._rates()
+        for part in (self._objective, self._constraints, self._rates):
+            spend()
+            part()
         self.pose_solvers = [PoseSolver(structure.model, pose, cache) for pose in structure.poses]
 
     @property
@@ -260,22 +261,17 @@ class Transcription:
         starts = (self.start_first[:, None], self.start_second[:, None])
         self.rate_start = ca.vertcat(*(ca.kron(sparse(part), identity) for part in starts))
 
-    def solver(self, *, rates: bool, options: dict[str, Any], deadline: float = np.inf) -> ca.Function:
+    def solver(self, *, rates: bool, options: dict[str, Any]) -> ca.Function:
         """Return Ipopt on this program.
 
         Args:
             rates: Whether velocity and acceleration rows follow the others, and their excess the other parameters.
             options: For CasADi's nlpsol.
-            deadline: Value of `time.perf_counter()` at which it stops; applies to the solver's next call.
         """
-        timed = bool(np.isfinite(deadline))
-        key = ("ipopt", self.structure.key, rates, timed, tuple(sorted(options.items())))
-        found = self.cache.get(key, lambda: self._make_solver(rates, timed, options))
-        if found.monitor is not None:
-            found.monitor.deadline = deadline
-        return found.solver
+        key = ("ipopt", self.structure.key, rates, tuple(sorted(options.items())))
+        return self.cache.get(key, lambda: self._make_solver(rates, options)).solver
 
-    def _make_solver(self, rates: bool, timed: bool, options: dict[str, Any]) -> Ipopt:
+    def _make_solver(self, rates: bool, options: dict[str, Any]) -> Ipopt:
         g, jacobian, multipliers, parameters = self.g, self.jacobian, self.multipliers, self.parameters
         weight, firm = ca.MX.sym("lam_f"), self.rows
         hessian = weight * self.objective_curvature + self.hessian
@@ -287,7 +283,7 @@ class Transcription:
             parameters = ca.vertcat(parameters, excess)
             (hessian,) = ca.substitute([hessian], [self.multipliers], [multipliers[:firm]])
         lagrangian = (weight, multipliers, hessian)
-        return ipopt(self.x, parameters, (self.f, self.gradient), (g, jacobian), lagrangian, options, timed=timed)
+        return ipopt(self.x, parameters, (self.f, self.gradient), (g, jacobian), lagrangian, options, waypoints=self.segments)
 
 
 def transcribe(structure: Structure, cache: Cache) -> Transcription:

@@ -9,6 +9,7 @@ from typing import Any
 import casadi as ca
 import pinocchio as pin
 
+from vkc_pin.budget import spend
 from vkc_pin.cache import Cache
 from vkc_pin.chain.kinematics import kinematics_of
 from vkc_pin.chain.pose import AWAY, PoseRow, pose_rows, receded
@@ -92,17 +93,21 @@ class WaypointFunctions:
         self.rows = slots + sum(self.pose_rows)
         rows = ca.vertcat(planes @ stacked - offsets + s, pose_values)
         multipliers = ca.SX.sym("lam", self.rows)
+        of_planes, of_poses = ca.vertsplit(multipliers, [0, slots, self.rows])  # a slice of a scalar would be a row
         own = ca.vertcat(z, s, share)
         slopes = ca.horzcat(_slopes(model, coordinates, z, placements, planes), ca.SX.eye(slots), ca.SX(slots, 1))
         jacobian = ca.vertcat(slopes, ca.jacobian(pose_values, own))
+        spend()
         w = ca.SX.sym("w", 12 * joints)
-        hessian = ca.triu(ca.hessian(ca.dot(w, stacked) + ca.dot(multipliers[slots:], pose_values), own)[0])
+        hessian = ca.triu(ca.hessian(ca.dot(w, stacked) + ca.dot(of_poses, pose_values), own)[0])
         inner = ca.Function("inner", [z, share, targets, away, w, multipliers], [hessian])
-        hessian = inner(z, share, targets, away, planes.T @ multipliers[:slots], multipliers)
+        hessian = inner(z, share, targets, away, planes.T @ of_planes, multipliers)
         inputs = [own, ca.vec(planes), offsets, ca.vec(targets), ca.vec(away)]
         options = {"cse": True}
+        spend()
         self.value = ca.Function("g", inputs, [rows], options)
         self.jacobian = ca.Function("rows_jacobian", inputs, [ca.vertcat(*jacobian.nonzeros())], options)
+        spend()
         self.jacobian_pattern = jacobian.sparsity().get_triplet()
         self.hessian = ca.Function("lagrangian_hessian", [*inputs, multipliers], [ca.vertcat(*hessian.nonzeros())], options)
         self.hessian_pattern = hessian.sparsity().get_triplet()

@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 
 from vkc_pin.arrays import Bools, Floats, Ints
-from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.program.pose_goals import approach_at
 from vkc_pin.seeds.knots import SCATTER, Knots
 from vkc_pin.seeds.routes import Routes
@@ -60,14 +59,10 @@ class Beam:
         routes: The paths that the base would drive; None: as if it drove straight.
         careful: Whether grasps count as free only if the straight path to them is free, too, none are shortened, and paths of the
             base are those with the arm folded: for narrow places.
-        interrupt: Ends a search.
     """
 
-    def __init__(
-        self, knots: Knots, routes: Routes | None = None, *, careful: bool = False, interrupt: Interrupt = NEVER
-    ) -> None:
+    def __init__(self, knots: Knots, routes: Routes | None = None, *, careful: bool = False) -> None:
         self.knots, self.problem, self.routes, self.careful = knots, knots.problem, routes, careful
-        self.interrupt = interrupt
         self.metric = np.sqrt(self.problem.effort.metric / self.problem.options.velocity_weight_arm)
         self.approaches = {
             int(end): approach_at(int(end) - phase.segments, int(end), self.problem.options)
@@ -75,8 +70,8 @@ class Beam:
             if phase.grasps
         }
 
-    def search(self, *, thorough: bool, backwards: bool = False) -> Found | None:
-        """Go from knot to knot, keeping the cheapest paths; None if that was interrupted.
+    def search(self, *, thorough: bool, backwards: bool = False) -> Found:
+        """Go from knot to knot, keeping the cheapest paths.
 
         Args:
             thorough: Draw more, and shake the arms at every knot at which something fixed is held.
@@ -100,11 +95,7 @@ class Beam:
                 found = self._go_back(found, knots, number, mode)
             else:
                 for knot in knots:
-                    if self.interrupt.pressed:
-                        return None
                     found = self._go_on(found, knot, number, mode)
-            if self.interrupt.pressed:
-                return None
             number = last + 1
         return found
 
@@ -175,8 +166,6 @@ class Beam:
         known = found.paths.shape[1]
         found = self._go_on(found, knots[-1], phase, mode)
         for knot in knots[-2::-1]:
-            if self.interrupt.pressed:
-                break
             found = self._go_on(found, knot, phase + 1, mode)
         paths = np.concatenate([found.paths[:, :known], found.paths[:, : known - 1 : -1]], axis=1)
         start, grasp, end = paths[:, known - 1], paths[:, known], paths[:, -1]
@@ -245,8 +234,6 @@ class Beam:
         share = np.full((len(paths), len(at), 1), 0.5)
         hit = {k: self._bad(paths[:, k], np.ones(len(paths), bool), at[k]) for k in moved}
         for k in moved * _SHORTENINGS:
-            if self.interrupt.pressed:
-                break
             drawn = paths[:, k].copy()
             middle = paths[:, [k - 1, *([k + 1] if k + 1 < len(at) else [])]].mean(axis=1)
             drawn[:, :robot] += share[:, k] * (middle - drawn)[:, :robot]

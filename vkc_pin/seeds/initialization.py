@@ -10,7 +10,6 @@ from typing import ClassVar
 import numpy as np
 
 from vkc_pin.arrays import Floats, Ints
-from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.program.merit import Merit, infeasibility
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.approach import Approach
@@ -37,7 +36,6 @@ def initialize(
     count: int = 1,
     perturbation: float = 0.0,
     notes: list[str] | None = None,
-    interrupt: Interrupt = NEVER,
 ) -> Iterator[Seed]:
     """Yield up to `count` seeds of each kind, best first; each is looked for when it is asked for.
 
@@ -53,13 +51,12 @@ def initialize(
         count: How many different seeds to return.
         perturbation: Standard deviation of what is added to the robot's coordinates, smoothly over time, [m] and [rad].
         notes: Gets a line for every phase in which there is no way for the base.
-        interrupt: Ends the search; there are no more seeds then.
     """
     said: list[str] = [] if notes is None else notes
     if method == "stationary":
         seeds = _stationary(problem, count, np.random.default_rng([random_seed, 2]))
     else:
-        shared = _Shared(problem, random_seed, said, Routes(problem, interrupt), Known(), interrupt)
+        shared = _Shared(problem, random_seed, said, Routes(problem), Known())
         kinds = ("interpolated", "astar", "rrt") if method == "auto" else (method,)
         seeds = _in_turn(*(_kind(kind, shared, count) for kind in kinds))
     rng = np.random.default_rng([random_seed, 1])
@@ -155,7 +152,6 @@ class _Shared:
     notes: list[str]
     routes: Routes
     known: Known
-    interrupt: Interrupt
 
     @property
     def driven(self) -> Routes | None:
@@ -181,13 +177,13 @@ class _SeedSearch:
     alike: ClassVar[int | None] = None
 
     def __init__(self, shared: _Shared, method: str) -> None:
-        self.problem, self.notes, self.method, self.interrupt = shared.problem, shared.notes, method, shared.interrupt
+        self.problem, self.notes, self.method = shared.problem, shared.notes, method
         self.beam, self.joiner = self._parts(shared)
 
     def _parts(self, shared: _Shared) -> tuple[Beam, Joiner]:
         """Return what finds knots, and what joins them."""
         knots, routes = shared.knots(), shared.driven if self.method == "astar" else None
-        beam = Beam(knots, routes, interrupt=shared.interrupt)
+        beam = Beam(knots, routes)
         return beam, Joiner(knots, Approach(knots), None if routes is None else DrivenPaths(routes))
 
     def seeds(self, count: int) -> Iterator[Seed | None]:
@@ -197,8 +193,6 @@ class _SeedSearch:
         """
         given: list[Floats] = []
         for attempt in range(count + 1):
-            if self.interrupt.pressed:
-                return
             found = self._search(attempt)
             best = None if found is None else self._best(found, given)
             if best is None:
@@ -213,7 +207,7 @@ class _SeedSearch:
     def _search(self, attempt: int) -> Found | None:
         """Return what a search finds: a quick one, None if it is no good, then thorough ones."""
         found = self.beam.search(thorough=attempt > 0)
-        return found if found is not None and (attempt > 0 or self.beam.tolerable(found)) else None
+        return found if attempt > 0 or self.beam.tolerable(found) else None
 
     def _ordered(self, found: Found) -> Iterable[Floats]:
         """Return paths in the order in which they are to be joined, each after what it comes to when it is shortened.
@@ -251,8 +245,6 @@ class _SeedSearch:
         best, least = None, np.inf
         for path in self._tried(new):
             z = self.joiner.join(path, found.at)
-            if self.interrupt.pressed:  # what was not found may be there all the same
-                return None
             self.notes += [line for line in self.joiner.blocked if line not in self.notes]
             if z is None:
                 continue
@@ -282,13 +274,13 @@ class _Rrt(_SeedSearch):
     def _parts(self, shared: _Shared) -> tuple[Beam, Joiner]:
         """Return what finds knots, and what joins them."""
         knots = shared.knots()
-        beam = Beam(knots, shared.driven, careful=True, interrupt=shared.interrupt)
-        return beam, Joiner(knots, Approach(knots, stands=True), RrtPaths(knots, shared.routes, shared.interrupt))
+        beam = Beam(knots, shared.driven, careful=True)
+        return beam, Joiner(knots, Approach(knots, stands=True), RrtPaths(knots, shared.routes))
 
     def _search(self, attempt: int) -> Found | None:
         """Return what a search finds, None if it is no good: a quick one, then thorough ones, every other backwards."""
         found = self.beam.search(thorough=attempt > 0, backwards=attempt % 2 == 1)
-        return found if found is not None and self.beam.tolerable(found) else None
+        return found if self.beam.tolerable(found) else None
 
     def _will_do(self, short: float, overlap: float) -> bool:
         return overlap <= _POOR

@@ -7,7 +7,6 @@ from collections import Counter
 import numpy as np
 
 from vkc_pin.arrays import Floats
-from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.seeds.approach import Approach
 from vkc_pin.seeds.knots import Knots, smooth
 from vkc_pin.seeds.routes import Routes
@@ -43,8 +42,8 @@ class RrtPaths:
 
     careful = True
 
-    def __init__(self, knots: Knots, routes: Routes, interrupt: Interrupt = NEVER) -> None:
-        self.knots, self.problem, self.routes, self.interrupt = knots, knots.problem, routes, interrupt
+    def __init__(self, knots: Knots, routes: Routes) -> None:
+        self.knots, self.problem, self.routes = knots, knots.problem, routes
         self.failed: Counter[int] = Counter()  # how often in a row in each phase
 
     def path(self, phase: int, first: Floats, last: Floats, steps: int, *, turns: bool, reaches: bool) -> Floats | None:
@@ -66,7 +65,7 @@ class RrtPaths:
         if not reaches:
             ends[:, 3:] = arms
         tries = max(1, TRIES // 2 ** self.failed[phase])  # what failed before is likely to fail again
-        given = {"poses": poses, "arms": np.array(arms), "rng": self.knots.rng, "tries": tries, "interrupt": self.interrupt}
+        given = {"poses": poses, "arms": np.array(arms), "rng": self.knots.rng, "tries": tries}
         path = connect(problem, phase, first, ends, **given)
         self.failed[phase] = 0 if path is not None else self.failed[phase] + 1
         return None if path is None else spread(path, steps, self.knots.chain.metric[: path.shape[1]])

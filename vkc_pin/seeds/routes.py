@@ -11,7 +11,6 @@ from vkc_pin.arrays import Floats
 from vkc_pin.driving.body import Shape
 from vkc_pin.driving.grid import BaseGrid, fine_cells
 from vkc_pin.driving.path import BasePath, poses_along, shortest_path
-from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.obstacles import FLOOR
@@ -30,8 +29,8 @@ class Routes:
     passage in which there is room for the margins, and there nothing but contact counts.
     """
 
-    def __init__(self, problem: TrajectoryProblem, interrupt: Interrupt = NEVER) -> None:
-        self.problem, self.interrupt = problem, interrupt
+    def __init__(self, problem: TrajectoryProblem) -> None:
+        self.problem = problem
         self.arm = slice(3, problem.chain.robot.coordinates.size)
         self._grids: dict[tuple[int, bool], BaseGrid] = {}
         self._folded: dict[tuple[Hold, ...], Floats] = {}
@@ -95,7 +94,7 @@ class Routes:
         """
         key = (phase, start.tobytes(), goal.tobytes())
         if key not in self._paths:
-            self._paths[key] = shortest_path(self.grid(phase), start.tolist(), goal[None], interrupt=self.interrupt)
+            self._paths[key] = shortest_path(self.grid(phase), start.tolist(), goal[None])
         path = self._paths[key]
         return None if path is None else poses_along(path, steps, turning=self.problem.chain.robot.lever)
 
@@ -106,7 +105,7 @@ class Routes:
         """
         for folded in (False, True):
             grid = self.grid(phase, folded=folded)  # the fine one only where it is needed
-            path = shortest_path(grid, start.tolist(), goal[None], interrupt=self.interrupt)
+            path = shortest_path(grid, start.tolist(), goal[None])
             if path is not None:
                 return poses_along(path, steps, turning=grid.turning)
         return None

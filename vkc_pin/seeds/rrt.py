@@ -12,7 +12,6 @@ from functools import cached_property
 import numpy as np
 
 from vkc_pin.arrays import Floats
-from vkc_pin.interrupt import NEVER, Interrupt
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.knots import depth, smooth
 
@@ -36,7 +35,6 @@ def connect(
     arms: Floats,
     rng: np.random.Generator,
     tries: int = TRIES,
-    interrupt: Interrupt = NEVER,
 ) -> Floats | None:
     """Return configurations of the robot, straight between which hardly anything is hit, shape (K, m), or None if none are found.
 
@@ -49,13 +47,12 @@ def connect(
         arms: Postures that are likely to be needed, shape (A, m - 3) [m] and [rad].
         rng: Random numbers.
         tries: How often a tree may grow.
-        interrupt: Ends the search.
     """
     coarse, fine = (_Search(problem, phase, first, poses, arms, rng, step) for step in _STEPS)
-    path = coarse.run(ends, tries, interrupt)
+    path = coarse.run(ends, tries)
     if path is None or fine.free(path):
         return path
-    finer = fine.run(ends, tries, interrupt)
+    finer = fine.run(ends, tries)
     return path if finer is None else finer
 
 
@@ -86,7 +83,7 @@ class _Search:
         limits = np.array([problem.limits(name) for name in problem.chain.names[: self.size]])
         self.lower, self.upper = limits.T
 
-    def run(self, ends: Floats, tries: int, interrupt: Interrupt) -> Floats | None:
+    def run(self, ends: Floats, tries: int) -> Floats | None:
         """Return the path to one of `ends`."""
         start = self.first[: self.size]
         short = self._depth(ends)
@@ -94,8 +91,6 @@ class _Search:
         trees = _Tree(start[None], self.weights), _Tree(ends, self.weights)
         direct = [*ends]
         for number in range(tries):
-            if interrupt.pressed:
-                break
             tree, other = (trees[0], trees[1]) if direct or number % 2 else (trees[1], trees[0])
             if direct:
                 node = self._grow(tree, direct.pop(0))

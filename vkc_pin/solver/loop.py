@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
 from collections.abc import Callable
 
 import numpy as np
 
 from vkc_pin.arrays import Floats
+from vkc_pin.budget import SpentError, spend
 from vkc_pin.chain.contacts import Contacts
-from vkc_pin.interrupt import Interrupt, interruptible
 from vkc_pin.program.merit import TOLERANCE, Infeasibility, Merit, infeasibility
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.solver.between import collisions_between, merge
@@ -30,15 +29,18 @@ WORTHWHILE = 0.05  # relative decrease of the objective for which a feasible mot
 class _Loop:
     """The state between rounds: the current waypoints, their contacts, what does not hold there, and weights."""
 
-    def __init__(self, problem: TrajectoryProblem, seed: Floats, deadline: float, weight: float) -> None:
-        self.deadline = deadline
+    def __init__(self, problem: TrajectoryProblem, seed: Floats, weight: float) -> None:
         self.problem, self.options = problem, problem.options
         self.z = problem.clip(seed)
         self.timing = problem.timing_for(self.z)
         self.rates = False
         self.merit = Merit(weight)
         self.solution = Solution(self.z, self.timing.dt)
-        self.subproblem = Subproblem(problem, self.solution, deadline)
+        self.subproblem = Subproblem(problem, self.solution)
+        self.feasible: tuple[Floats, Floats] | None = None  # the last motion at which everything held
+
+    def begin(self) -> None:
+        """Find what is close and what does not hold at the seed."""
         self.at, _, self.passages = self.contacts(self.z)
         self.look()
 
@@ -138,49 +140,39 @@ def solve(
     seed: Floats,
     *,
     callback: Callable[[Iteration], None] | None = None,
-    deadline: float = np.inf,
     rounds: int | None = None,
     radius: Floats | None = None,
-    interrupt: Interrupt | None = None,
 ) -> Solution:
-    """Return the trajectory that the witness-plane loop reaches from `seed`.
+    """Return the trajectory that the witness-plane loop reaches from `seed`, or the best iterate when the budget is at its end.
 
     Args:
         problem: What to solve.
         seed: z_1..z_N, shape (N, n).
         callback: Called after every round.
-        deadline: Value of `time.perf_counter()` at which to stop with the best iterate.
         rounds: At most so many rounds; None: `Options.max_outer`.
         radius: How far planes are believed at first, shape (N,): `Solution.radius` where another solution goes on.
-        interrupt: Ends it after the round that is running; None: Ctrl-C does.
     """
-    loop = _Loop(problem, seed, deadline, problem.options.penalty)
+    loop = _Loop(problem, seed, problem.options.penalty)
     solution = loop.solution
-    with interruptible() if interrupt is None else contextlib.nullcontext(interrupt) as noted:
-        region = TrustRegion(problem.segments, problem.options.steps(BLOCK_TIME), radius)
-        _iterate(loop, region, callback, noted, loop.options.max_outer if rounds is None else rounds)
+    region = TrustRegion(problem.segments, problem.options.steps(BLOCK_TIME), radius)
+    try:
+        loop.begin()
+        _iterate(loop, region, callback, loop.options.max_outer if rounds is None else rounds)
+    except SpentError as end:
+        solution.status = "converged" if solution.converged else str(end)
+    if loop.feasible is not None:  # rounds after the first feasible one only made it shorter, or failed to
+        solution.z, solution.dt = loop.feasible
     solution.radius = region.radius
-    if noted.pressed:  # whichever way the loop ended, nothing else is to be tried
-        solution.status = "interrupted"
     return solution
 
 
-def _iterate(
-    loop: _Loop,
-    region: TrustRegion,
-    callback: Callable[[Iteration], None] | None,
-    interrupt: Interrupt,
-    rounds: int,
-) -> None:
-    """Run rounds until everything holds, nothing helps any more, or time is up."""
+def _iterate(loop: _Loop, region: TrustRegion, callback: Callable[[Iteration], None] | None, rounds: int) -> None:
+    """Run rounds until everything holds or nothing helps any more."""
     solution, started = loop.solution, time.perf_counter()
-    feasible: tuple[Floats, Floats] | None = None
     missing, since = loop.found.total, 0  # what was missing when rounds were last counted
     good = float("inf")  # objective of the last motion at which everything held
     for _ in range(rounds):
-        if time.perf_counter() > loop.deadline:
-            solution.status = solution.status if solution.converged else "time limit"
-            break
+        spend()
         trial = loop.try_step(region.radius)
         before, after = loop.prices(trial)
         accepted = loop.judge(trial, before, after)
@@ -207,13 +199,10 @@ def _iterate(
             if done := loop.done(trial):
                 last, good = good, trial.objective
                 if loop.problem.drift(trial.z) <= 1.0:  # that waypoints are too far apart along an arc no round can help
-                    solution.converged, solution.status, feasible = True, "converged", (trial.z, solution.dt)
+                    solution.converged, solution.status, loop.feasible = True, "converged", (trial.z, solution.dt)
                 improved = good < (1.0 - WORTHWHILE) * last
                 if not improved or (trial.step < INSIDE * used).all():
                     break
-        if interrupt.pressed:
-            solution.status = solution.status if solution.converged else "interrupted"
-            break
         region.adapt(before, after, trial, accepted)
         since += 1
         if not PROGRESS * missing < loop.found.total <= missing:  # more is missing where the objective fell instead
@@ -228,5 +217,3 @@ def _iterate(
             if not nearly or not loop.grow():
                 break
             region.restart()
-    if feasible is not None:  # rounds after the first feasible one only made it shorter, or failed to
-        solution.z, solution.dt = feasible

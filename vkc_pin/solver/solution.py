@@ -48,7 +48,7 @@ class Solution:
         z: z_1..z_N, shape (N, n), the best iterate.
         dt: Time of every step of it [s], shape (N,).
         converged: Whether the loop ended by its own criteria.
-        status: "converged", "not converged", "time limit" or "interrupted".
+        status: "converged", "not converged", or one of `budget.ENDINGS`.
         radius: How far planes were believed in the end, shape (N,).
         rounds, iterations: Of the outer loop and of Ipopt.
         timings: Seconds in "coal", "casadi" (evaluating functions) and "ipopt" (all the rest of it).

@@ -67,11 +67,10 @@ class Subproblem:
     Args:
         problem: The problem.
         solution: Where iterations and times are counted.
-        deadline: Value of `time.perf_counter()` at which Ipopt stops.
     """
 
-    def __init__(self, problem: TrajectoryProblem, solution: Solution, deadline: float) -> None:
-        self.problem, self.solution, self.deadline = problem, solution, deadline
+    def __init__(self, problem: TrajectoryProblem, solution: Solution) -> None:
+        self.problem, self.solution = problem, solution
         self._targets = problem.target_matrix()
         self._multipliers: dict[str, Any] = {}
 
@@ -104,7 +103,7 @@ class Subproblem:
             self.forget()
         how = _ROUGH if relaxed else _WARM if self._multipliers else {}
         options = {"ipopt.max_iter": problem.options.max_iterations, **_IPOPT, **how}
-        solver = t.solver(rates=rates, options=options, deadline=self.deadline)
+        solver = t.solver(rates=rates, options=options)
         prices = merit.price(found, clearance=False)
         shares = np.where(relaxed & (prices > 0.0), 1.0, 0.0)
         parameters = t.parameter_vector(

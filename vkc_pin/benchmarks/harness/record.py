@@ -91,6 +91,7 @@ def trial(plan: Plan, *, method: str, seed: int, **more: Any) -> dict[str, Any]:
         "closure_error": m["closure_error"],
         "iterations": int(m["iterations"]),
         "rounds": int(m["rounds"]),
+        "effort": int(m.get("effort", 0)),
         "waypoints": len(plan.trajectory.times),
         "initialization": plan.initialization,
         "build_time": m["build_time"],

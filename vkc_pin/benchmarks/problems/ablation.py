@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.benchmarks.harness import runner
+from vkc_pin.benchmarks.harness.limits import LIMITS, allowed
 from vkc_pin.benchmarks.harness.record import Record, distribution, values
 from vkc_pin.benchmarks.harness.tables import decimal, failures, foot, markdown, quartiles
 from vkc_pin.benchmarks.problems import trials
@@ -67,7 +68,7 @@ def run(
     numbers = chosen(problems)
     chosen_changes = list(dict.fromkeys([UNCHANGED, *(parsed(text) for text in changes)]))
     settings = {"benchmark": "ablation", "seed": seed, "problems": numbers, "changes": [str(change) for change in chosen_changes]}
-    settings["time_limit"] = trials.TIME_LIMIT
+    settings |= LIMITS
     specs = specify(problems=numbers, changes=chosen_changes, seed=seed)
     result = runner.run(specs, _record, out, settings=settings, jobs=jobs, progress=progress)
     write_atomically(Path(out) / "table.md", report(result).encode())
@@ -96,7 +97,7 @@ def report(result: Mapping[str, Any]) -> str:
     kinds = [["unchanged", kind, *summary([r for r in base.values() if r.get("kind") == kind])] for kind in KINDS]
     parts = [
         "# One setting changed at a time",
-        f"{len(about['problems'])} problems, planning seed {about['seed']}, at most {about['time_limit']:g} s of planning. "
+        f"{len(about['problems'])} problems, planning seed {about['seed']}, {allowed(about)} each. "
         "Success is the word of the independent validation; the first seed sufficed where the solver ran once. "
         "Times are those of all trials: of planning, and of the process's CPU for all of the call, with building symbolic "
         "programs. Rounds and iterations are means, efforts medians of successes.",
@@ -168,4 +169,4 @@ def _record(spec: dict[str, Any]) -> dict[str, Any]:
     own: Problem = _problem(spec["number"])
     change = UNCHANGED if spec["method"] == str(UNCHANGED) else parsed(spec["method"])
     more = {"number": own.number, "problem": own.name, "kind": own.kind}
-    return trials.tried(own.scene, own.steps, seed=spec["seed"], change=change, time_limit=trials.TIME_LIMIT, **more)
+    return trials.tried(own.scene, own.steps, seed=spec["seed"], change=change, **more)

@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from vkc_pin.benchmarks.harness import runner
+from vkc_pin.benchmarks.harness.limits import LIMITS
 from vkc_pin.benchmarks.harness.record import distribution
 from vkc_pin.benchmarks.harness.tables import decimal, failures, foot, markdown, wilson
 from vkc_pin.benchmarks.problems.ablation import every_trial
 from vkc_pin.benchmarks.problems.problem_set import TASKS, started
-from vkc_pin.benchmarks.problems.trials import TIME_LIMIT, tried
+from vkc_pin.benchmarks.problems.trials import tried
 from vkc_pin.errors import InputError
 from vkc_pin.files.writing import write_atomically
 
@@ -48,7 +49,7 @@ def run(
     if trials < 1:
         raise InputError("out of range", field="trials", expected="at least 1", got=trials)
     names = runner.chosen("task", tasks, TASKS)
-    settings = {"benchmark": "first-seed", "seed": seed, "starts": trials, "tasks": names, "time_limit": TIME_LIMIT}
+    settings = {"benchmark": "first-seed", "seed": seed, "starts": trials, "tasks": names, **LIMITS}
     specs = [
         {"key": f"{list(TASKS).index(name):02d}/{number:04d}", "task": name, "number": number, "seed": seed}
         for name in names

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.benchmarks.harness import runner
+from vkc_pin.benchmarks.harness.limits import LIMITS
 from vkc_pin.benchmarks.harness.record import Record, values
 from vkc_pin.benchmarks.harness.tables import foot, markdown, quartiles
 from vkc_pin.benchmarks.problems import trials
@@ -54,7 +55,7 @@ def run(
     if isinstance(seeds, bool) or not isinstance(seeds, int) or seeds < 2:
         raise InputError("out of range", field="seeds", expected="a whole number of at least 2", got=repr(seeds))
     numbers = chosen(problems)
-    settings = {"benchmark": "spread", "seed": seed, "seeds": seeds, "problems": numbers, "time_limit": trials.TIME_LIMIT}
+    settings = {"benchmark": "spread", "seed": seed, "seeds": seeds, "problems": numbers, **LIMITS}
     specs = [
         {"key": f"{number:02d}/{own:04d}", "number": number, "seed": own}
         for number in numbers
@@ -111,4 +112,4 @@ _problem = functools.lru_cache(maxsize=2)(problem)  # once for all seeds
 def _record(spec: dict[str, Any]) -> dict[str, Any]:
     own = _problem(spec["number"])
     more: dict[str, Any] = {"number": own.number, "problem": own.name, "kind": own.kind}
-    return trials.tried(own.scene, own.steps, seed=spec["seed"], time_limit=trials.TIME_LIMIT, **more)
+    return trials.tried(own.scene, own.steps, seed=spec["seed"], **more)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from vkc_pin.benchmarks.harness.limits import LIMITS
 from vkc_pin.benchmarks.harness.record import trial
 from vkc_pin.benchmarks.problems.changes import UNCHANGED, Change
 from vkc_pin.planning.plan import Plan
@@ -18,14 +19,10 @@ from vkc_pin.solver.solution import Iteration
 from vkc_pin.task.compiler import compile_task
 from vkc_pin.task.steps import Reach, Step
 
-__all__ = ["TIME_LIMIT", "first_seed", "objective", "tried"]
-
-TIME_LIMIT = 60.0  # [s] of planning
+__all__ = ["first_seed", "objective", "tried"]
 
 
-def tried(
-    scene: Scene, steps: tuple[Step, ...], *, seed: int, change: Change = UNCHANGED, time_limit: float = TIME_LIMIT, **more: Any
-) -> dict[str, Any]:
+def tried(scene: Scene, steps: tuple[Step, ...], *, seed: int, change: Change = UNCHANGED, **more: Any) -> dict[str, Any]:
     """Plan and return the record: `record.trial`, and `solves`, `first_seed`, `objective`, `cpu_time` and `wall_time` of it all.
 
     Args:
@@ -33,7 +30,6 @@ def tried(
         steps: What should change.
         seed: Of the random numbers of planning.
         change: The setting that is another.
-        time_limit: Of planning [s].
         more: Further fields of the record.
     """
     _warm()
@@ -45,7 +41,7 @@ def tried(
     planner = _planner(change)
     with change.applied():  # before the clock starts: looking for where a constant is imported takes a while
         wall, cpu = time.perf_counter(), time.process_time()
-        found = plan(scene, steps, options=change.options, seed=seed, time_limit=time_limit, callback=count, planner=planner)
+        found = plan(scene, steps, options=change.options, seed=seed, callback=count, planner=planner, **LIMITS)
         took = {"wall_time": time.perf_counter() - wall, "cpu_time": time.process_time() - cpu}
     own: dict[str, Any] = {
         **took,

@@ -1,0 +1,10 @@
+"""What trials may take, in words; also of records from before there was effort."""
+
+from __future__ import annotations
+
+from vkc_pin.benchmarks.harness.limits import LIMITS, allowed
+
+
+def test_in_words() -> None:
+    assert allowed({**LIMITS, "seed": 3}) == "at most 1 000 000 units of effort"
+    assert allowed({"time_limit": 20.0}) == "at most 20 s of planning"

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from typing import Any
 
 import pytest
+from helpers.second_opinion import SecondOpinion
 from hypothesis import settings
 
 import vkc_pin as vkc
@@ -16,6 +19,46 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeatable"))
 
 # Nothing is compiled in the background and nothing is written to the user's home; tests of that name folders of their own.
 os.environ["VKC_PIN_CACHE"] = "off"
+
+
+# Every motion that succeeds in a test is judged by the oracle as well, before the test is over.
+OPINION = SecondOpinion()
+OPINION.attach()
+OPINIONS: dict[str, dict[str, float]] = {}  # of the processes that tests run in
+
+
+@pytest.fixture(autouse=True)
+def second_opinion(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Fail where the oracle finds something wrong with a motion that the test's planner was content with."""
+    yield
+    if request.node.get_closest_marker("made_up"):
+        OPINION.forget()
+    if wrong := OPINION.verdicts(tmp_path_factory.getbasetemp()):
+        pytest.fail("\n".join(f"{verdict.path}: {found}" for verdict in wrong for found in verdict.found), pytrace=False)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Say what was judged; with pytest-xdist, to the process that the others work for."""
+    counts = {name: value for name, value in vars(OPINION).items() if not name.startswith("_")}
+    output: dict[str, Any] = getattr(session.config, "workeroutput", OPINIONS)
+    output["second opinion"] = counts
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any) -> None:
+    """Take what a process of pytest-xdist says at its end."""
+    if "second opinion" in getattr(node, "workeroutput", {}):
+        OPINIONS[node.gateway.id] = node.workeroutput["second opinion"]
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """Write a line about the oracle."""
+    planned, judged, unjudged, seconds = (
+        sum(counts[name] for counts in OPINIONS.values()) for name in ("planned", "judged", "unjudged", "seconds")
+    )
+    terminalreporter.write_line(
+        f"oracle: {planned} motions planned, {judged} different ones judged in {seconds:.1f} s, {unjudged} not judged"
+    )
 
 
 @pytest.fixture(scope="session")

@@ -107,6 +107,7 @@ class Scripted:
             return self.one.run()
 
 
+@pytest.mark.made_up
 @pytest.mark.parametrize(
     ("amounts", "expected"),
     [([], "a a* b b* c c*"), ([1.0, 0.0], "a a* b b*"), ([0.0], "a a*")],

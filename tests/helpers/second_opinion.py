@@ -1,0 +1,70 @@
+"""Lets the oracle judge every motion that is planned: `planning.outcome` puts plans together, and those are kept until asked."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from oracle.judge import Verdict, judge
+
+import vkc_pin.planning.outcome as outcome
+from vkc_pin.planning.plan import Plan
+
+__all__ = ["SecondOpinion"]
+
+
+class SecondOpinion:
+    """Keeps the plans that succeed, and judges them.
+
+    Attributes:
+        planned, judged, unjudged: How many motions were planned, were judged, and are of a kind that the oracle does not know.
+        seconds: What judging took.
+    """
+
+    def __init__(self) -> None:
+        self.planned = self.judged = self.unjudged = 0
+        self.seconds = 0.0
+        self._waiting: list[Plan] = []
+        self._known: set[str] = set()
+
+    def attach(self) -> None:
+        """Listen from now on."""
+
+        def kept(**fields: Any) -> Plan:
+            plan = Plan(**fields)
+            if plan.success:
+                self._waiting.append(plan)
+            return plan
+
+        outcome.Plan = kept  # type: ignore[misc, assignment]
+
+    def forget(self) -> None:
+        """Do not judge what has been planned since `verdicts` was asked last."""
+        self._waiting.clear()
+
+    def verdicts(self, folder: Path) -> list[Verdict]:
+        """Judge what has been planned since this was asked last, each motion once; return the verdicts that do not agree."""
+        found, waiting, self._waiting = [], self._waiting, []
+        self.planned += len(waiting)
+        for plan in waiting:
+            if (digest := _digest(plan)) in self._known:
+                continue
+            self._known.add(digest)
+            path = plan.save(folder / f"{digest}.npz")
+            verdict = judge(path)
+            self.judged += not verdict.unjudged
+            self.unjudged += bool(verdict.unjudged)
+            self.seconds += verdict.seconds
+            if verdict.agrees:
+                path.unlink()
+            else:
+                found.append(verdict)
+        return found
+
+
+def _digest(plan: Plan) -> str:
+    about = [plan.scene.document, str(plan.scene.folder), plan.to_dict()["steps"], vars(plan.options)]
+    content = json.dumps([about, plan.trajectory.to_dict()], sort_keys=True)
+    return hashlib.sha256(content.encode()).hexdigest()[:16]

@@ -1,0 +1,29 @@
+"""`python -m tests.oracle FOLDER_OR_PLAN ...`: judges saved plans, and writes verdicts.jsonl and agreement.md into a folder."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from .agreement import judged, table, written
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Judge; 1 if a plan is a success by its own word and not by the oracle's."""
+    parser = argparse.ArgumentParser(prog="python -m tests.oracle", description=__doc__)
+    parser.add_argument("paths", nargs="+", type=Path, help="saved plans (.npz), or folders with some")
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    given = parser.parse_args(arguments)
+    wrong = 0
+    for path in given.paths:
+        verdicts = judged(sorted(path.rglob("*.npz")) if path.is_dir() else [path], jobs=given.jobs)
+        if path.is_dir():
+            written(verdicts, path)
+        print(table(verdicts))
+        wrong += sum(bool(verdict.success and verdict.found) for verdict in verdicts)
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

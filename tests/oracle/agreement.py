@@ -1,0 +1,58 @@
+"""What plans say of themselves against what the oracle says: verdicts as lines of JSON, and a table."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict
+from pathlib import Path
+
+from .judge import Verdict, judge
+
+__all__ = ["judged", "table", "written"]
+
+
+def judged(paths: Sequence[Path], *, jobs: int = 1) -> list[Verdict]:
+    """Return the verdicts on saved plans, in their order."""
+    if jobs == 1:
+        return [judge(path) for path in paths]
+    with ProcessPoolExecutor(jobs) as pool:
+        return list(pool.map(judge, paths, chunksize=4))
+
+
+def written(verdicts: Iterable[Verdict], folder: Path) -> None:
+    """Write verdicts.jsonl, a line a plan, and agreement.md into a folder."""
+    verdicts = list(verdicts)
+    lines = [json.dumps({**asdict(one), "path": one.path.relative_to(folder).as_posix()}) for one in verdicts]
+    (folder / "verdicts.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    (folder / "agreement.md").write_text(table(verdicts) + "\n", encoding="utf-8")
+
+
+def table(verdicts: Sequence[Verdict]) -> str:
+    """Return how often both agree, and every plan of which they do not, in Markdown."""
+    said = [one for one in verdicts if not one.unjudged]
+    rows = ["| plan | oracle | plans |", "| --- | --- | ---: |"]
+    for success, right, what in (
+        (True, True, "success, and nothing found"),
+        (True, False, "**false success**"),
+        (False, False, "failure, and something found"),
+        (False, True, "failure, and nothing found"),
+    ):
+        count = sum(one.success == success and (not one.found) == right for one in said)
+        rows.append(f"| {'success' if success else 'failure'} | {what} | {count} |")
+    rows.append(f"| any | not judged | {len(verdicts) - len(said)} |")
+    for one in said:
+        if not one.agrees:
+            rows += ["", f"- {one.path.name}: {one.status}; the plan finds {', '.join(one.says) or 'nothing'}"]
+            rows += [f"  - {violation}" for violation in one.found]
+    for reason, count in Counter(one.unjudged for one in verdicts if one.unjudged).items():
+        rows += ["", f"- not judged, {count}: {reason}"]
+    lingering = sum(bool(one.notes) for one in said)
+    seconds = sum(one.seconds for one in verdicts)
+    rows += [
+        "",
+        f"{len(verdicts)} plans in {seconds:.1f} s; in {lingering} what may touch stays near for long.",
+    ]
+    return "\n".join(rows)

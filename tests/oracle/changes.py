@@ -1,0 +1,34 @@
+"""Changed copies of saved plans, to see that what is wrong with them is found."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+__all__ = ["changed"]
+
+Content = dict[str, Any]
+
+
+def changed(source: Path, target: Path, change: Callable[[Content], None]) -> Path:
+    """Write a copy of a plan to `target` that `change` has changed.
+
+    It gets a dictionary with `scene`, `steps`, `options`, `names`, `times`, `positions`, `phases` and `column`, which returns one
+    of the positions' columns by name.
+    """
+    with np.load(source, allow_pickle=False) as archive:
+        about = json.loads(str(archive["about"]))
+        content: Content = {"times": archive["times"].copy(), "positions": archive["positions"].copy()}
+    motion = about["trajectory"]
+    content |= {"scene": about["scene"], "steps": about["steps"], "options": about["options"]}
+    content |= {"names": motion["names"], "phases": motion["phases"]}
+    content["column"] = lambda name: content["positions"][:, motion["names"].index(name)]
+    change(content)
+    about |= {"scene": content["scene"], "steps": content["steps"]}
+    about["trajectory"] = {**motion, "phases": content["phases"], "names": content["names"]}
+    np.savez_compressed(target, about=np.array(json.dumps(about)), times=content["times"], positions=content["positions"])
+    return target

@@ -1,0 +1,77 @@
+"""Judges a saved plan."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from .collisions import check_collisions
+from .goals import check_goals
+from .plan import NotJudged, SavedPlan, Violation, read_plan
+from .rules import check_motion, check_stage
+from .stage import World
+from .touching import licences
+
+__all__ = ["Verdict", "judge", "violations"]
+
+NOTED = ("lingers",)
+
+
+@dataclass
+class Verdict:
+    """What is to be said of a plan: its own verdict, and what is found here.
+
+    `notes` are found as well, but within what docs/ promise: hands that stay near what they hold for longer than needed.
+    `unjudged` says why nothing is said.
+    """
+
+    path: Path
+    success: bool
+    status: str
+    says: list[str]
+    found: list[Violation] = field(default_factory=list)
+    notes: list[Violation] = field(default_factory=list)
+    unjudged: str = ""
+    seconds: float = 0.0
+
+    @property
+    def agrees(self) -> bool:
+        return bool(self.unjudged) or self.success == (not self.found)
+
+
+def judge(path: Path) -> Verdict:
+    """Return the verdict on a saved plan."""
+    began = time.perf_counter()
+    plan = read_plan(path)
+    verdict = Verdict(path, plan.success, plan.status, plan.says)
+    try:
+        found = violations(plan)
+        verdict.found = [one for one in found if one.rule not in NOTED]
+        verdict.notes = [one for one in found if one.rule in NOTED]
+    except NotJudged as error:
+        verdict.unjudged = str(error)
+    except FileNotFoundError as error:  # the scene has moved away from its plan
+        verdict.unjudged = f"no longer there: {error}"
+    verdict.seconds = time.perf_counter() - began
+    return verdict
+
+
+def violations(plan: SavedPlan) -> list[Violation]:
+    """Return what is wrong with a motion: of each rule and subject the worst, by time."""
+    world = World(plan)
+    stages = list(world.stages())
+    found = [*check_motion(world), *check_goals(world, stages)]
+    allowed = licences(world, stages)
+    for stage in stages:
+        found += check_stage(world, stage)
+        found += check_collisions(world, stage, allowed)
+    worst: dict[tuple[str, str], Violation] = {}
+    for one in found:
+        key = (one.rule, one.subject)
+        if key not in worst or worst[key].amount < one.amount:
+            worst[key] = one
+    for rule, subject in list(worst):
+        if rule == "overlap":
+            worst.pop(("clearance", subject), None), worst.pop(("lingers", subject), None)
+    return sorted(worst.values(), key=lambda one: (one.time, one.rule, one.subject))

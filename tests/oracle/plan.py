@@ -1,0 +1,117 @@
+"""Reads a saved plan: an .npz with a JSON text `about`, `times` and `positions`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+__all__ = ["ROOT", "Hold", "NotJudged", "Phase", "SavedPlan", "Violation", "read_plan"]
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+class NotJudged(Exception):
+    """The plan is of a kind that cannot be judged here."""
+
+
+@dataclass(frozen=True)
+class Violation:
+    """What is wrong: which rule, about what, when [s], by how much."""
+
+    rule: str
+    subject: str
+    time: float
+    amount: float
+    detail: str
+
+    def __str__(self) -> str:
+        return f"{self.rule} {self.subject} at {self.time:.2f} s by {self.amount:.3g}: {self.detail}"
+
+
+@dataclass(frozen=True)
+class Hold:
+    """An object held at an attachment, by the tool or by a frame "<object>.<link>"."""
+
+    object: str
+    attachment: str
+    by: str | None
+
+
+@dataclass(frozen=True)
+class Phase:
+    """A stretch of the motion, from waypoint `first` to waypoint `last`."""
+
+    name: str
+    first: int
+    last: int
+    holds: tuple[Hold, ...]
+
+
+@dataclass(frozen=True)
+class SavedPlan:
+    """What a file says; `says` is the plan's own verdict: its violated constraints, by name and subject."""
+
+    scene: dict[str, Any]
+    folder: Path
+    steps: list[dict[str, Any]]
+    options: dict[str, Any]
+    names: list[str]
+    times: np.ndarray
+    positions: np.ndarray
+    robot_size: int
+    phases: list[Phase]
+    status: str
+    says: list[str]
+    terms: int
+
+    @property
+    def success(self) -> bool:
+        return self.status == "success" and not self.says
+
+    def index(self, name: str) -> int | None:
+        return self.names.index(name) if name in self.names else None
+
+
+def in_order(held: dict[str, str], by: dict[str, str]) -> tuple[Hold, ...]:
+    """Return holds, each after the one that it hangs on."""
+    found: list[Hold] = []
+    left = dict(held)
+    while left:
+        ready = [name for name in left if by.get(name, "").partition(".")[0] not in left]
+        if not ready:
+            raise ValueError(f"objects hold each other: {left}")
+        found += [Hold(name, left.pop(name), by.get(name)) for name in ready]
+    return tuple(found)
+
+
+def read_plan(path: Path) -> SavedPlan:
+    """Return what the file at `path` says."""
+    with np.load(path, allow_pickle=False) as archive:
+        about = json.loads(str(archive["about"]))
+        times, positions = np.array(archive["times"]), np.array(archive["positions"])
+    where = about["folder"]
+    if "package" in where:
+        folder = ROOT / where["package"]
+    else:
+        beside = path.resolve().parent / where["relative"]
+        folder = beside if beside.is_dir() else Path(where["absolute"])
+    motion = about["trajectory"]
+    phases = [Phase(p["name"], p["first"], p["last"], in_order(p["held"], p.get("by") or {})) for p in motion["phases"]]
+    return SavedPlan(
+        scene=about["scene"],
+        folder=folder,
+        steps=about["steps"],
+        options=about["options"],
+        names=motion["names"],
+        times=times,
+        positions=positions,
+        robot_size=motion["robot_size"],
+        phases=phases,
+        status=about["status"],
+        says=[f"{v['constraint']} {v['subject']}" for v in about["validation"]["violations"]],
+        terms=len(about.get("terms", ())),
+    )

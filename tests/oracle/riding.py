@@ -1,0 +1,61 @@
+"""What stands on something that moves, and goes with it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import coal
+
+from .poses import Poses, pose
+
+if TYPE_CHECKING:
+    from .stage import World
+
+__all__ = ["distance", "riders", "stands_on"]
+
+DROP = 5e-3  # [m] by which something is lowered to see what is below it
+SUPPORT = 2.5e-3  # [m] by which it then overlaps what it stands on, at least
+
+_REQUEST, _RESULT = coal.DistanceRequest(), coal.DistanceResult()
+
+
+def distance(one: object, here: Poses, other: object, there: Poses, k: int = 0) -> float:
+    """Return the signed distance of two shapes at moment k [m]."""
+    i, j = (0 if len(place.turn) == 1 else k for place in (here, there))
+    a, b = coal.Transform3s(here.turn[i], here.at[i]), coal.Transform3s(there.turn[j], there.at[j])
+    _RESULT.clear()
+    return float(coal.distance(one, a, other, b, _REQUEST, _RESULT))
+
+
+def stands_on(world: World, links: dict[tuple[str, str], Poses], name: str, support: tuple[str, str]) -> bool:
+    """Whether an object, lowered by 5 mm, overlaps a link by more than 2.5 mm, and, lifted as much, does not."""
+    ours = world.things[name].tree.urdf.shapes
+    theirs = [shape for shape in world.things[support[0]].tree.urdf.shapes if shape.link == support[1]]
+
+    def overlap(height: float) -> float:
+        moved, there = pose((0.0, 0.0, height)), links[support].row(0)
+        found = [
+            -distance(one.solid, moved @ links[name, one.link].row(0) @ one.place, other.solid, there @ other.place)
+            for one in ours
+            for other in theirs
+        ]
+        return max(found, default=-1.0)
+
+    return overlap(-DROP) > SUPPORT >= overlap(DROP)
+
+
+def riders(
+    world: World, links: dict[tuple[str, str], Poses], moving: set[tuple[str, str]], waiting: list[str]
+) -> dict[str, tuple[str, str]]:
+    """Return what of some free objects nobody holds stands on a moving link, or on what does: object → (owner, link)."""
+    found: dict[str, tuple[str, str]] = {}
+    below = sorted(moving)
+    while below:
+        new = {}
+        for name in (name for name in waiting if name not in found):
+            support = next((key for key in below if key[0] != name and stands_on(world, links, name, key)), None)
+            if support is not None:
+                new[name] = support
+        found |= new
+        below = [(name, link) for name in new for link in world.things[name].tree.urdf.links]
+    return found

@@ -1,0 +1,146 @@
+"""Start, limits, rates, rolling, standing still, latches and grasps of a motion."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from .plan import Hold, Violation
+from .poses import turn_between
+from .stage import Stage, World
+
+__all__ = ["check_motion", "check_stage"]
+
+TIP = 0.1  # [rad] by which what something stands on may tilt
+STILL = 1e-5  # [m] or [rad]
+
+
+def check_motion(world: World) -> Iterator[Violation]:
+    """Check what the waypoints alone tell."""
+    plan = world.plan
+    for k, name in enumerate(plan.names):
+        column = plan.positions[:, k]
+        if name in world.start and (off := abs(column[0] - world.start[name])) > 1e-9:
+            yield Violation("start", name, 0.0, off, f"{column[0]:.6g} instead of {world.start[name]:.6g}")
+        low, high, fastest, strongest = _limits(world, name)
+        outside = np.maximum(low - column, column - high)
+        outside[0] -= 1e-2  # the robot is where it is
+        yield from _worst("limit", name, outside - 1e-5, plan.times, f"limits {low:.4g} to {high:.4g}")
+        spans = np.diff(plan.times)
+        speed = np.diff(column) / spans
+        yield from _worst("velocity", name, np.abs(speed) - 1.001 * fastest - 1e-9, plan.times, f"limit {fastest:g}")
+        change = np.abs(np.diff(np.concatenate([[0.0], speed, [0.0]])))  # from rest, to rest
+        shorter = np.minimum(np.append(spans, np.inf), np.append(np.inf, spans))
+        excess = change / shorter - 1.001 * strongest - 1e-9
+        yield from _worst("acceleration", name, excess, plan.times, f"limit {strongest:g}")
+    if world.robot.base == "differential":
+        step = np.diff(plan.positions[:, :3], axis=0)
+        heading = plan.positions[:-1, 2] + step[:, 2] / 2
+        slip = np.abs(np.cos(heading) * step[:, 1] - np.sin(heading) * step[:, 0])
+        yield from _worst("slip", "base", slip - 1e-4, plan.times, "moves sideways")
+    yield from _dwell(world)
+
+
+def _worst(rule: str, subject: str, excess: np.ndarray, times: np.ndarray, detail: str) -> Iterator[Violation]:
+    k = int(np.argmax(excess))
+    if not excess[k] <= 0.0:
+        yield Violation(rule, subject, float(times[k]), float(excess[k]), detail)
+
+
+def _limits(world: World, name: str) -> tuple[float, float, float, float]:
+    owner, _, own = name.partition(".")
+    if not own:
+        low, high, fastest, strongest = world.robot.limits[name]
+        if name.startswith("base_") and world.robot.base == "fixed":
+            low = high = world.start[name]
+        elif name in ("base_x", "base_y"):
+            first = 0 if name == "base_x" else 2
+            low, high = max(low, world.arena[first]), min(high, world.arena[first + 1])
+        return low, high, fastest, strongest
+    thing = world.things[owner]
+    if own in thing.limits:
+        return thing.limits[own]
+    low, high = next(f[3:] for grasp in thing.grasps.values() for f in grasp.freedoms if f[0] == own)
+    return low, high, np.inf, np.inf
+
+
+def _dwell(world: World) -> Iterator[Violation]:
+    """Where a hand closes or opens inside the motion, everything rests for `grasp_time`."""
+    plan, still = world.plan, world.resting
+    for one, other in zip(plan.phases, plan.phases[1:], strict=False):
+        if set(one.holds) == set(other.holds):
+            continue
+        first = last = one.last
+        while first > 0 and still[first - 1]:
+            first -= 1
+        while last < len(still) and still[last]:
+            last += 1
+        rest = plan.times[last] - plan.times[first]
+        short = float(plan.options["grasp_time"] - rest)
+        if short > 1e-9:
+            what = ", ".join(sorted(hold.object for hold in set(one.holds) ^ set(other.holds)))
+            yield Violation("dwell", what, float(plan.times[one.last]), short, f"rests for {rest:.3f} s while the hand moves")
+
+
+def check_stage(world: World, stage: Stage) -> Iterator[Violation]:
+    """Check what is seen between waypoints as well."""
+    yield from _unheld(world, stage)
+    yield from _latches(world, stage)
+    for hold in stage.phase.holds:
+        yield from _closure(world, stage, hold)
+        grasp = world.things[hold.object].grasps[hold.attachment]
+        for name, *_ in grasp.freedoms if grasp.firm else ():
+            column = stage.columns[:, world.plan.names.index(f"{hold.object}.{name}")]
+            yield from _worst("slide", f"{hold.object}.{name}", np.abs(column - column[0]) - STILL, stage.times, "firm grasp")
+    for name, (owner, link) in stage.riding.items():
+        turn = stage.links[name, world.things[name].tree.urdf.base].turn
+        lean = np.arccos(np.clip((turn @ stage.upright[name])[:, 2], -1.0, 1.0))
+        yield from _worst("tips", name, lean - TIP, stage.times, f"{owner}.{link} tilts under it")
+
+
+def _unheld(world: World, stage: Stage) -> Iterator[Violation]:
+    """Joints of objects move only between the base link and a link that is held."""
+    driven = set()
+    for hold in stage.phase.holds:
+        thing = world.things[hold.object]
+        driven |= {f"{hold.object}.{joint}" for joint in thing.tree.urdf.path_to(thing.grasps[hold.attachment].link)}
+    for k, name in enumerate(world.plan.names):
+        owner, _, own = name.partition(".")
+        if own and own in world.things[owner].limits and name not in driven:
+            column = stage.columns[:, k]
+            yield from _worst("unheld", name, np.abs(column - column[0]) - STILL, stage.times, f"moves in '{stage.phase.name}'")
+
+
+def _latches(world: World, stage: Stage) -> Iterator[Violation]:
+    """A latched joint goes away from where it is held only while the release is far enough."""
+    for owner, thing in world.things.items():
+        for latch in thing.latches:
+            indices = [world.plan.index(f"{owner}.{latch[key]}") for key in ("joint", "released_by")]
+            if indices[0] is None:
+                continue
+            off = np.abs(stage.columns[:, indices[0]] - latch["held_at"])
+            resting = np.full(len(off), thing.state[latch["released_by"]])
+            release = resting if indices[1] is None else stage.columns[:, indices[1]]
+            side = np.sign(stage.columns[:, indices[0]] - latch["held_at"])
+            leaves = ((np.diff(off) > 1e-12) | (side[1:] * side[:-1] < 0)) & (off[1:] > 1e-4)
+            leaves &= np.minimum(off[:-1], off[1:]) <= latch["engaged_within"]
+            short = np.where(leaves, latch["threshold"] - 1e-4 - np.minimum(release[:-1], release[1:]), -1.0)
+            yield from _worst("latch", f"{owner}.{latch['joint']}", short, stage.times, f"needs {latch['released_by']}")
+
+
+def _closure(world: World, stage: Stage, hold: Hold) -> Iterator[Violation]:
+    """The tool, or what takes its place, is where the attachment has it."""
+    grasp = world.things[hold.object].grasps[hold.attachment]
+    holder = stage.tool
+    if hold.by is not None:
+        owner, _, link = hold.by.partition(".")
+        holder = stage.links[owner, link]
+    right = stage.links[hold.object, grasp.link] @ grasp.tool(world.freedoms(hold, stage.columns))
+    size = len(stage.times)
+    off = np.broadcast_to(np.linalg.norm(holder.at - right.at, axis=1), size)
+    turned = np.broadcast_to(turn_between(holder.turn, right.turn), size)
+    for amount, key, unit in ((off, "closure_position", "m"), (turned, "closure_angle", "rad")):
+        limit = world.plan.options[key]
+        subject, why = f"{hold.object}.{hold.attachment}", f"more than {limit:g} {unit}"
+        yield from _worst("closure", subject, amount - limit - 1e-7, stage.times, why)

@@ -1,0 +1,234 @@
+"""A motion phase by phase: densely sampled, with the placement of everything at every sample."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import coal
+import numpy as np
+
+from .plan import Hold, Phase, SavedPlan
+from .poses import IDENTITY, Poses, pose, rpy
+from .riding import riders
+from .things import Thing, Tree, load_robot, load_thing
+from .urdf import Shape, mesh_hull, read_urdf, solid
+
+__all__ = ["FLOOR", "Solid", "Stage", "World"]
+
+LENGTH, ANGLE = 2e-3, 5e-3  # [m], [rad] from sample to sample, at most
+FLOOR = "floor"
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A shape that belongs to a link of an owner ("robot", an object or an obstacle), and where it is."""
+
+    owner: str
+    link: str
+    shape: Shape
+    at: Poses
+
+    @property
+    def label(self) -> str:
+        return self.link if self.owner == "robot" else f"{self.owner}.{self.link}" if self.link else self.owner
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A phase.
+
+    `rows` are the samples that are waypoints; `links` has where every link is, by (owner, link); `tool` the robot's tool frame;
+    `moving` the links of objects that move; `riding` what stands on what and is carried along, object → (owner, link);
+    `upright` the direction, in the object's own frame, that was up when it was last put down.
+    """
+
+    number: int
+    phase: Phase
+    times: np.ndarray
+    columns: np.ndarray
+    rows: np.ndarray
+    tool: Poses
+    links: dict[tuple[str, str], Poses]
+    solids: list[Solid]
+    moving: set[tuple[str, str]]
+    riding: dict[str, tuple[str, str]]
+    upright: dict[str, np.ndarray]
+
+
+class World:
+    """All that a plan's scene describes."""
+
+    def __init__(self, plan: SavedPlan) -> None:
+        self.plan = plan
+        scene = plan.scene
+        self.robot = load_robot(scene["robot"], plan.folder, plan.names[3 : plan.robot_size])
+        self.things = {item["name"]: load_thing(item, plan.folder) for item in scene.get("objects") or ()}
+        arena = scene.get("arena") or {}
+        self.arena = (*arena.get("x", (-5.0, 5.0)), *arena.get("y", (-5.0, 5.0)))
+        self.obstacles = [part for item in scene.get("obstacles") or () for part in self._obstacle(item)]
+        if scene.get("floor", True):
+            ground = Shape(FLOOR, coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0), IDENTITY, np.array([0.0, 0.0, -50.0]),
+                           np.array([1e3, 1e3, 50.0]), 1e3)  # fmt: skip
+            self.obstacles.append(Solid(FLOOR, "", ground, IDENTITY))
+        start = scene["start"]
+        arm = start.get("arm", "home")
+        self.start: dict[str, float] = dict(zip(("base_x", "base_y", "base_yaw"), start["base"], strict=True))
+        angles = [self.robot.home[joint] for joint in self.robot.arm] if arm == "home" else arm
+        self.start |= dict(zip(self.robot.arm, angles, strict=True))
+        self.start |= {f"{name}.{joint}": value for name, thing in self.things.items() for joint, value in thing.state.items()}
+        self.held: list[Hold] = []
+        for name, said in (start.get("held") or {}).items():
+            about = {"attachment": said} if isinstance(said, str) else said
+            self.held.append(Hold(name, about["attachment"], about.get("by")))
+            grasp, values = self.things[name].grasps[about["attachment"]], about.get("at")
+            for k, (freedom, *_) in enumerate(grasp.freedoms):
+                self.start[f"{name}.{freedom}"] = values[k] if values else 0.0
+        self.held.sort(key=lambda hold: hold.by is not None and hold.by.partition(".")[0] in {h.object for h in self.held})
+
+    def _obstacle(self, item: dict[str, Any]) -> list[Solid]:
+        angles = item.get("rpy") or (0.0, 0.0, item.get("yaw") or 0.0)
+        here, name = pose(item["position"], rpy(*angles)), item["name"]
+        if item["type"] == "urdf":
+            urdf = read_urdf(self.plan.folder / item["file"])
+            links = Tree(urdf, drives=False).links({}, None, sorted({shape.link for shape in urdf.shapes}))
+            return [Solid(name, "", shape, here @ links[shape.link] @ shape.place) for shape in urdf.shapes]
+        if item["type"] == "mesh":
+            scale = np.broadcast_to(np.array(item.get("scale", 1.0), float), (3,))
+            return [Solid(name, "", Shape.of("", mesh_hull(self.plan.folder / item["file"], scale), IDENTITY), here)]
+        return [Solid(name, "", Shape.of("", solid(item["type"], item), IDENTITY), here)]
+
+    def slides(self, name: str) -> bool:
+        """Whether a coordinate is a length."""
+        if name in ("base_x", "base_y"):
+            return True
+        owner, _, own = name.partition(".")
+        if not own:
+            return name != "base_yaw" and self.robot.tree.urdf.kind(name) == "prismatic"
+        thing = self.things[owner]
+        if own in thing.limits:
+            return thing.slides(own)
+        return next(f[1] for grasp in thing.grasps.values() for f in grasp.freedoms if f[0] == own)
+
+    @cached_property
+    def resting(self) -> np.ndarray:
+        """For every step between waypoints, whether robot and objects stand still; freedoms of grasps are not looked at."""
+        things = {f"{name}.{joint}" for name, thing in self.things.items() for joint in thing.limits}
+        bodies = [k < self.plan.robot_size or name in things for k, name in enumerate(self.plan.names)]
+        return np.asarray(np.abs(np.diff(self.plan.positions[:, bodies], axis=0)).max(axis=1) < 1e-9)
+
+    def samples(self, phase: Phase) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return times, coordinates and which rows are waypoints, of a phase."""
+        plan = self.plan
+        z, t = plan.positions[phase.first : phase.last + 1], plan.times[phase.first : phase.last + 1]
+        steps = np.abs(np.diff(z, axis=0))
+        units = np.array([LENGTH if self.slides(name) else ANGLE for name in plan.names])
+        ratio = np.maximum((steps / units).max(axis=1), np.linalg.norm(steps[:, :2], axis=1) / LENGTH)
+        counts = np.maximum(1, np.ceil(ratio - 1e-9)).astype(int)
+        share = np.concatenate([k + np.arange(n) / n for k, n in enumerate(counts)] + [[len(counts)]])
+        waypoints = np.arange(len(t))
+        columns = np.stack([np.interp(share, waypoints, column) for column in z.T], axis=1)
+        return np.interp(share, waypoints, t), columns, np.concatenate([[0], np.cumsum(counts)])
+
+    def stages(self) -> Iterator[Stage]:
+        """Yield the phases, one after the other; free objects stay where the phase before has left them."""
+        free = {name: thing.at for name, thing in self.things.items() if thing.free}
+        upright: dict[str, np.ndarray] = {}
+        robot, plan = self.robot, self.plan
+        wanted = sorted({shape.link for shape in robot.tree.urdf.shapes} | {robot.tool} | self._asked())
+        for number, phase in enumerate(plan.phases):
+            times, columns, rows = self.samples(phase)
+            arm = {name: columns[:, 3 + k] for k, name in enumerate(robot.arm)}
+            frames = robot.tree.links({**robot.locked, **arm}, columns[:, :3], wanted)
+            if number == 0:
+                first = {name: frame.row(0) for name, frame in frames.items()}
+                free |= self._in_hand(first[robot.tool], free)
+            links = {("robot", name): frame for name, frame in frames.items()}
+            for name, thing in self.things.items():
+                own = self.links_of(thing, columns)
+                links |= {(name, link): (free[name] if thing.free else thing.at) @ place for link, place in own.items()}
+            moving = {key for key, place in links.items() if key[0] != "robot" and not place.still}
+            carried = self._carry(phase, columns, links, free)
+            moving |= {(name, link) for name in carried for link in self.things[name].tree.urdf.links}
+            waiting = [name for name in free if name not in carried]
+            upright = {name: upright.get(name, free[name].turn[0, 2]) for name in waiting}
+            riding = riders(self, links, moving, waiting)
+            for name, support in riding.items():  # in the order in which they stand on each other
+                there = links[support]
+                self._set_down(name, there @ (there.row(0).inverse() @ free[name]), links)
+            moving |= {(name, link) for name in riding for link in self.things[name].tree.urdf.links}
+            free = {name: links[name, self.things[name].tree.urdf.base].row(len(times) - 1) for name in free}
+            solids = [
+                Solid(owner, shape.link, shape, links[owner, shape.link] @ shape.place)
+                for owner, tree in [("robot", robot.tree), *((name, thing.tree) for name, thing in self.things.items())]
+                for shape in tree.urdf.shapes
+            ]
+            tool = frames[robot.tool]
+            solids += self.obstacles
+            yield Stage(number, phase, times, columns, rows, tool, links, solids, moving, riding, upright)
+
+    def _asked(self) -> set[str]:
+        """Return frames of the robot that steps name."""
+        named = {step.get("frame") for step in self.plan.steps if step["step"] in ("Reach", "Touch")}
+        return {name for name in named if name and name.partition(".")[0] not in self.things}
+
+    def links_of(self, thing: Thing, columns: np.ndarray) -> dict[str, Poses]:
+        """Return an object's links in the frame of its base link, along samples of the motion."""
+        values: dict[str, np.ndarray | float] = {}
+        for joint, value in thing.state.items():
+            index = self.plan.index(f"{thing.name}.{joint}")
+            column = None if index is None else columns[:, index]
+            values[joint] = value if column is None else column if np.ptp(column) > 0.0 else float(column[0])
+        return thing.tree.links(values, None, thing.tree.urdf.links)
+
+    def freedoms(self, hold: Hold, columns: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the values of a grasp's freedoms along samples."""
+        found = {}
+        for name, *_ in self.things[hold.object].grasps[hold.attachment].freedoms:
+            index = self.plan.index(f"{hold.object}.{name}")
+            found[name] = np.zeros(len(columns)) if index is None else columns[:, index]
+        return found
+
+    def in_object(self, hold: Hold, columns: np.ndarray, links: dict[str, Poses]) -> Poses:
+        """Return where a grasp has the tool, in the frame of the object's base link."""
+        grasp = self.things[hold.object].grasps[hold.attachment]
+        return links[grasp.link] @ grasp.tool(self.freedoms(hold, columns))
+
+    def _in_hand(self, tool: Poses, free: dict[str, Poses]) -> dict[str, Poses]:
+        """Return where free objects are that the hand holds at the start."""
+        found: dict[str, Poses] = {}
+        columns = np.array([[self.start.get(name, 0.0) for name in self.plan.names]])
+        for hold in self.held:
+            thing = self.things[hold.object]
+            if thing.free:
+                links = self.links_of(thing, columns)
+                holder = tool
+                if hold.by is not None:
+                    owner, _, link = hold.by.partition(".")
+                    holder = found[owner] @ self.links_of(self.things[owner], columns)[link]
+                values = {name: np.array([self.start[f"{hold.object}.{name}"]]) for name, *_ in
+                          thing.grasps[hold.attachment].freedoms}  # fmt: skip
+                grasp = thing.grasps[hold.attachment]
+                found[hold.object] = holder @ (links[grasp.link] @ grasp.tool(values)).inverse()
+        return found
+
+    def _carry(self, phase: Phase, columns: np.ndarray, links: dict[tuple[str, str], Poses], free: dict[str, Poses]) -> list[str]:
+        """Move what is held with what holds it, from where it was when that took hold; return what that is."""
+        carried = []
+        for hold in phase.holds:
+            if not self.things[hold.object].free:
+                continue
+            owner, _, link = (hold.by or "").partition(".")
+            holder = links[owner, link] if hold.by else links["robot", self.robot.tool]
+            ideal = holder @ self.in_object(hold, columns, self.links_of(self.things[hold.object], columns)).inverse()
+            self._set_down(hold.object, ideal @ (ideal.row(0).inverse() @ free[hold.object]), links)
+            carried.append(hold.object)
+        return carried
+
+    def _set_down(self, name: str, where: Poses, links: dict[tuple[str, str], Poses]) -> None:
+        """Put a free object's base link somewhere."""
+        tree = self.things[name].tree
+        for link, place in tree.links(self.things[name].state, None, tree.urdf.links).items():
+            links[name, link] = where @ place

@@ -1,0 +1,231 @@
+"""The oracle finds what is wrong with changed plans, nothing with good ones, and shares nothing with the package."""
+
+from __future__ import annotations
+
+import ast
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import vkc_pin as vkc
+from oracle.__main__ import main
+from oracle.changes import changed
+from oracle.judge import judge
+from oracle.plan import read_plan
+from oracle.stage import World
+
+FOLDER = Path(__file__).parent
+ALLOWED = {"coal", "numpy", "pinocchio", "trimesh", "yaml", *sys.stdlib_module_names}
+Content = dict[str, Any]
+
+TASKS = {
+    "drawer": ("drawer", [vkc.Actuate("drawer", {"slide": 0.3})]),
+    "cup": ("household", [vkc.Place("cup", (-0.6, -1.6, 0.751))]),
+    "stick": ("init_1", [vkc.Grasp("stick"), vkc.Touch("stick.tip", (-1.0, 3.897, 0.1))]),
+}
+
+
+@pytest.fixture(scope="module")
+def plans(tmp_path_factory: pytest.TempPathFactory, door_plan: vkc.Plan) -> dict[str, Path]:
+    """Saved plans of a door, a drawer, a cup and a stick."""
+    folder, found = tmp_path_factory.mktemp("plans"), {"door": door_plan}
+    for name, (scene, steps) in TASKS.items():
+        found[name] = vkc.plan(vkc.load_scene(scene), steps)
+        assert found[name].success, found[name].report()
+    return {name: plan.save(folder / f"{name}.npz") for name, plan in found.items()}
+
+
+def test_good_plans_pass(plans: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, path in plans.items():
+        verdict = judge(path)
+        assert verdict.agrees, (name, [str(one) for one in verdict.found])
+        assert not verdict.unjudged
+    assert main([str(next(iter(plans.values())).parent)]) == 0
+    assert "| success | success, and nothing found | 4 |" in capsys.readouterr().out
+
+
+# Changes: plan, what to change, the rule that breaks and what it must name.
+
+
+def _start(c: Content) -> None:
+    c["scene"]["start"]["base"][0] += 0.01
+
+
+def _limit(c: Content) -> None:
+    c["column"]("elbow_joint")[20:30] = 3.3
+
+
+def _jump(c: Content) -> None:
+    c["column"]("base_x")[20] += 0.5
+
+
+def _hurry(c: Content) -> None:
+    c["times"][:] *= 0.2
+
+
+def _arena(c: Content) -> None:
+    c["scene"]["arena"]["x"][0] = float(c["column"]("base_x").min()) + 0.05
+
+
+def _wall(c: Content) -> None:
+    k = int(np.argmax(np.abs(np.diff(c["column"]("base_x")))))
+    x, y = (float(c["column"](name)[k : k + 2].mean()) for name in ("base_x", "base_y"))
+    c["scene"]["obstacles"].append({"name": "post", "type": "cylinder", "radius": 0.02, "length": 0.2, "position": [x, y, 0.3]})
+
+
+def _drift(c: Content) -> None:
+    c["column"]("base_x")[48:] += np.linspace(0.0, 0.004, len(c["times"]) - 48)
+
+
+def _latch(c: Content) -> None:
+    c["column"]("door.knob")[47:] = 0.3
+
+
+def _short(c: Content) -> None:
+    c["steps"][-1]["joints"] = {"hinge": 1.21}
+
+
+def _hands_off(c: Content) -> None:
+    c["phases"][-1]["held"] = {}
+
+
+def _slide(c: Content) -> None:
+    c["column"]("cup.side_turn")[60:] += 0.02
+
+
+def _no_rest(c: Content) -> None:
+    c["times"][41:] -= 0.9
+
+
+def _beside(c: Content) -> None:
+    c["steps"][-1]["pose"][0] += 0.005
+
+
+def _clings(c: Content) -> None:
+    c["phases"][-1]["held"] = dict(c["phases"][-2]["held"])
+
+
+def _elsewhere(c: Content) -> None:
+    for item in c["scene"]["objects"]:
+        if item["name"] == "stick":
+            item["position"][0] += 0.003
+
+
+def _out_of_turn(c: Content) -> None:
+    x, y = (float(c["column"](name)[-1]) for name in ("base_x", "base_y"))
+    c["steps"].insert(0, {"step": "GoTo", "x": x, "y": y, "yaw": None})
+
+
+def _blocked(c: Content) -> None:
+    drawer = c["scene"]["objects"][0]
+    spot = [*drawer["position"][:2], 0.0]
+    c["scene"]["obstacles"].append({"name": "box", "type": "box", "size": [0.05, 0.05, 3.0], "position": spot})
+
+
+CHANGES: list[tuple[str, Callable[[Content], None], str, str]] = [
+    ("door", _start, "start", "base_x"),
+    ("door", _limit, "limit", "elbow_joint"),
+    ("door", _jump, "velocity", "base_x"),
+    ("door", _jump, "acceleration", "base_x"),
+    ("cup", _hurry, "acceleration", "shoulder"),
+    ("drawer", _arena, "limit", "base_x"),
+    ("drawer", _wall, "overlap", "base_link - post"),
+    ("door", _drift, "closure", "door.handle"),
+    ("door", _latch, "latch", "door.hinge"),
+    ("door", _short, "goal", "door.hinge"),
+    ("door", _hands_off, "unheld", "door.hinge"),
+    ("cup", _slide, "slide", "cup.side_turn"),
+    ("drawer", _no_rest, "dwell", "drawer"),
+    ("cup", _beside, "goal", "cup.cup"),
+    ("cup", _clings, "goal", "cup"),
+    ("stick", _elsewhere, "closure", "stick.grip"),
+    ("door", _out_of_turn, "order", "steps"),
+    ("drawer", _blocked, "overlap", "drawer."),
+]
+
+
+@pytest.mark.parametrize(("name", "change", "rule", "subject"), CHANGES, ids=[f"{c[0]}{c[1].__name__}-{c[2]}" for c in CHANGES])
+def test_changes_are_found(
+    plans: dict[str, Path], tmp_path: Path, name: str, change: Callable[[Content], None], rule: str, subject: str
+) -> None:
+    verdict = judge(changed(plans[name], tmp_path / "changed.npz", change))
+    assert verdict.success  # by its own word, which nobody changed
+    assert any(one.rule == rule and one.subject.startswith(subject) for one in verdict.found), list(map(str, verdict.found))
+
+
+def test_clearance_is_measured(plans: dict[str, Path], tmp_path: Path) -> None:
+    """A ball 15 mm above the robot's top plate, at the highest of its shapes there, is too close, and at 25 mm it is not."""
+
+    def ball(height: float) -> Callable[[Content], None]:
+        def change(c: Content) -> None:
+            x, y = (float(c["column"](key)[0]) for key in ("base_x", "base_y"))
+            yaw = float(c["column"]("base_yaw")[0])
+            at = [x - 0.3 * np.cos(yaw), y - 0.3 * np.sin(yaw), 0.39 + height + 0.01]
+            for column in c["positions"].T:
+                column[1:] = column[0]
+            c["scene"]["obstacles"].append({"name": "ball", "type": "sphere", "radius": 0.01, "position": at})
+
+        return change
+
+    near, far = (judge(changed(plans["drawer"], tmp_path / "b.npz", ball(height))).found for height in (0.015, 0.025))
+    (found,) = [one for one in near if one.rule == "clearance"]
+    assert found.subject == "base_link - ball"
+    assert found.amount == pytest.approx(0.019 - 0.015, abs=1e-3)
+    assert not [one for one in far if one.rule == "clearance"]
+
+
+def test_what_stands_in_a_drawer_goes_with_it(plans: dict[str, Path], tmp_path: Path) -> None:
+    """A cup in the drawer's tray is 0.3 m further out at the end, towards the robot; nothing says that its place has changed."""
+    path = changed(plans["drawer"], tmp_path / "changed.npz", _with_cup)
+    stages = list(World(read_plan(path)).stages())
+    assert [stage.riding for stage in stages[:-1]] == [{}] * (len(stages) - 1)
+    assert stages[-1].riding == {"cup": ("drawer", "tray")}
+    moved = stages[-1].links["cup", "cup"].at
+    assert np.linalg.norm(moved[-1] - moved[0]) == pytest.approx(0.3, abs=2e-3)
+    assert judge(path).agrees
+
+
+def _with_cup(c: Content) -> None:
+    x, y, _ = c["scene"]["objects"][0]["position"]
+    c["scene"]["objects"].append({"name": "cup", "type": "cup", "position": [x + 0.15, y, 0.653]})  # 1 mm above the tray's bottom
+
+
+def test_what_stands_on_something_that_tilts_tips(plans: dict[str, Path], tmp_path: Path) -> None:
+    """A cup on the open door of a dishwasher, which is closed a little in another plan; nobody holds it, as is found, too."""
+
+    def change(c: Content) -> None:
+        washer = next(item for item in c["scene"]["objects"] if item["type"] == "dishwasher")
+        x, y, _ = washer["position"]
+        (other,) = [item for item in c["scene"]["objects"] if item["name"] == "cold_cup"]
+        other["position"] = [x, y - 0.35, 0.1335]  # 1 mm above the door
+        c["names"].append("dishwasher.door")
+        values = np.full(len(c["times"]), 1.57)
+        values[60:] = 1.4
+        c["positions"] = np.column_stack([c["positions"], values])
+
+    found = judge(changed(plans["cup"], tmp_path / "changed.npz", change)).found
+    (tipped,) = [one for one in found if one.rule == "tips"]
+    assert (tipped.subject, tipped.amount) == ("cold_cup", pytest.approx(0.17 - 0.1, abs=2e-3))
+    assert "unheld dishwasher.door" in {f"{one.rule} {one.subject}" for one in found}
+
+
+def test_nothing_is_shared_with_the_package(plans: dict[str, Path]) -> None:
+    files = [file for file in FOLDER.glob("*.py") if not file.name.startswith("test_")]
+    assert len(files) > 8
+    for file in files:
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) and not node.level else []
+            assert {name.partition(".")[0] for name in names} <= ALLOWED, file.name
+    blocked = "import sys; sys.modules['vkc_pin'] = None; sys.path.insert(0, sys.argv[1])\n"
+    blocked += "from oracle.judge import judge; from pathlib import Path\n"
+    blocked += "import json; print(json.dumps([judge(Path(path)).agrees for path in sys.argv[2:]]))"
+    command = [sys.executable, "-c", blocked, str(FOLDER.parent), *map(str, plans.values())]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    assert json.loads(done.stdout) == [True] * len(plans)

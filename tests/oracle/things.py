@@ -1,0 +1,270 @@
+"""The robot and the objects of a scene, as their files describe them: kinematics, limits, grasps, latches."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import yaml
+
+from .plan import ROOT, NotJudged
+from .poses import Poses, axis_turn, pose, rpy
+from .urdf import Urdf, read_urdf
+
+__all__ = ["Grasp", "Robot", "Thing", "Tree", "load_robot", "load_thing"]
+
+
+class Tree:
+    """The kinematics of a URDF, by Pinocchio, on a planar joint if it drives."""
+
+    def __init__(self, urdf: Urdf, *, drives: bool) -> None:
+        self.urdf = urdf
+        self.model = pin.buildModelFromXML(urdf.text, *((pin.JointModelPlanar(), "base") if drives else ()))
+        self.data = self.model.createData()
+
+    def links(self, values: Mapping[str, np.ndarray | float], base: np.ndarray | None, wanted: list[str]) -> dict[str, Poses]:
+        """Return where links (or other frames) are in the frame of the root's parent.
+
+        Args:
+            values: Joint → values, shape (S,) or one number [m] or [rad]; all others are neutral.
+            base: x, y [m] and yaw [rad] of one that drives, shape (S, 3).
+            wanted: Names of frames.
+        """
+        rows = max([1 if base is None else len(base), *(np.size(value) for value in values.values())])
+        q = np.tile(pin.neutral(self.model), (rows, 1))
+        if base is not None:
+            q[:, :2], q[:, 2], q[:, 3] = base[:, :2], np.cos(base[:, 2]), np.sin(base[:, 2])
+        for name, value in values.items():
+            joint = self.model.joints[self.model.getJointId(name)]
+            if joint.nq == 2:
+                q[:, joint.idx_q], q[:, joint.idx_q + 1] = np.cos(value), np.sin(value)
+            else:
+                q[:, joint.idx_q] = value
+        frames = {name: self.frame(name) for name in wanted}
+        joints = sorted({frame.parentJoint for frame in frames.values()})
+        found = np.empty((rows, len(joints), 4, 4))
+        for k in range(rows):
+            pin.forwardKinematics(self.model, self.data, q[k])
+            for column, joint in enumerate(joints):
+                found[k, column] = self.data.oMi[joint].homogeneous
+        of_joint = {joint: Poses(found[:, i, :3, :3], found[:, i, :3, 3]) for i, joint in enumerate(joints)}
+        return {
+            name: of_joint[frame.parentJoint] @ pose(frame.placement.translation, frame.placement.rotation)
+            for name, frame in frames.items()
+        }
+
+    def frame(self, name: str) -> Any:
+        """The frame of a link, or else of another of that name."""
+        for kind in (pin.FrameType.BODY, pin.FrameType.OP_FRAME, pin.FrameType.FIXED_JOINT, pin.FrameType.JOINT):
+            if self.model.existFrame(name, kind):
+                return self.model.frames[self.model.getFrameId(name, kind)]
+        raise KeyError(f"{self.urdf.path.name} has no frame {name}")
+
+
+@dataclass(frozen=True)
+class Grasp:
+    """An attachment: the tool in a link's frame is place · J(v) · standoff back along the tool's z axis.
+
+    `freedoms` are (name of the coordinate in the object, slides or not, axis, lower, upper).
+    """
+
+    name: str
+    link: str
+    place: Poses
+    freedoms: tuple[tuple[str, bool, np.ndarray, float, float], ...]
+    standoff: float
+    firm: bool
+
+    def tool(self, values: Mapping[str, np.ndarray]) -> Poses:
+        """Return the tool in the link's frame at values of the freedoms, shape (S,) each."""
+        found = self.place
+        for name, slides, axis, _, _ in self.freedoms:
+            value = np.atleast_1d(values[name])
+            if slides:
+                found = found @ Poses(np.tile(np.eye(3), (len(value), 1, 1)), value[:, None] * axis)
+            else:
+                found = found @ Poses(axis_turn(axis, value), np.zeros((len(value), 3)))
+        return found @ pose((0.0, 0.0, -self.standoff))
+
+
+@dataclass(frozen=True)
+class Thing:
+    """An object: where it stands, its kinematics and joint limits (lower, upper, velocity, acceleration), grasps, latches."""
+
+    name: str
+    tree: Tree
+    free: bool
+    at: Poses
+    state: dict[str, float]
+    limits: dict[str, tuple[float, float, float, float]]
+    grasps: dict[str, Grasp]
+    latches: list[dict[str, Any]]
+
+    def grasp(self, name: str | None) -> Grasp:
+        return next(iter(self.grasps.values())) if name is None else self.grasps[name]
+
+    def slides(self, joint: str) -> bool:
+        return self.tree.urdf.kind(joint) == "prismatic"
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A robot: `arm` are its planned joints; `exempt` pairs of links that need no check."""
+
+    tree: Tree
+    base: str
+    tool: str
+    touch: set[str]
+    arm: list[str]
+    locked: dict[str, float]
+    limits: dict[str, tuple[float, float, float, float]]
+    home: dict[str, float]
+    exempt: set[frozenset[str]]
+
+    @cached_property
+    def moved_by(self) -> dict[str, tuple[str, ...]]:
+        """Link → the planned joints between it and the base."""
+        urdf = self.tree.urdf
+        return {link: tuple(joint for joint in urdf.path_to(link) if joint in self.arm) for link in urdf.links}
+
+    def apart(self, one: str, other: str) -> bool:
+        """Whether two of its links move against each other and are to stay apart."""
+        return self.moved_by[one] != self.moved_by[other] and frozenset((one, other)) not in self.exempt
+
+    @cached_property
+    def on_the_floor(self) -> set[str]:
+        """The links that no planned joint moves: wheels stand on the floor."""
+        return {link for link, joints in self.moved_by.items() if not joints}
+
+
+def load_thing(item: Mapping[str, Any], folder: Path) -> Thing:
+    """Return the object of an entry in a scene's `objects`."""
+    kind = str(item["type"])
+    by_path = kind.endswith((".yaml", ".yml")) or "/" in kind
+    file = folder / kind if by_path else ROOT / "scenes" / "objects" / f"{kind}.yaml"
+    about = yaml.safe_load(file.read_text(encoding="utf-8"))
+    urdf = read_urdf(file.parent / about["urdf"])
+    joints = [joint for joint in urdf.joints if urdf.moves(joint)]
+    limits, rest = {}, {}
+    for joint in joints:
+        low, high, fastest = urdf.limits(joint)
+        own = (about.get("joints") or {}).get(joint, {})
+        fastest = own.get("velocity", fastest if np.isfinite(fastest) else 1.0)
+        limits[joint] = (low, high, float(fastest), float(own.get("acceleration", 2.0)))
+        rest[joint] = float(np.clip(0.0, low, high))
+    free = bool(about.get("free", False))
+    grasps = {entry["name"]: _grasp(entry, free) for entry in about["attachments"]}
+    angles = item.get("rpy") or (0.0, 0.0, item.get("yaw") or 0.0)
+    return Thing(
+        name=item["name"],
+        tree=Tree(urdf, drives=False),
+        free=free,
+        at=pose(item["position"], rpy(*angles)),
+        state={**rest, **(item.get("state") or {})},
+        limits=limits,
+        grasps=grasps,
+        latches=[{"held_at": 0.0, **latch} for latch in about.get("latches") or ()],
+    )
+
+
+def _grasp(entry: Mapping[str, Any], free: bool) -> Grasp:
+    if "approach" in entry:
+        z, x = (np.array(entry[key], float) / np.linalg.norm(entry[key]) for key in ("approach", "closing"))
+        turn = np.column_stack([x, np.cross(z, x), z])
+    else:
+        turn = rpy(*entry.get("rpy", (0.0, 0.0, 0.0)))
+    name, joint = entry["name"], entry.get("joint", "fixed")
+    axis = np.array(entry["axis"], float) / np.linalg.norm(entry["axis"]) if "axis" in entry else np.zeros(3)
+    freedoms: list[tuple[str, bool, np.ndarray, float, float]] = []
+    if joint == "spherical":
+        low, high = entry.get("limits", (-np.pi, np.pi))
+        freedoms = [(f"{name}_{letter}", False, np.eye(3)[i], low, high) for i, letter in enumerate("xyz")]
+    elif joint == "cylindrical":
+        freedoms = [(f"{name}_slide", True, axis, *entry["limits"]), (f"{name}_turn", False, axis, *entry["turn"])]
+    elif joint != "fixed":
+        freedoms = [(name, joint == "prismatic", axis, *entry["limits"])]
+    place = pose(entry.get("position", (0.0, 0.0, 0.0)), turn)
+    return Grasp(name, entry["link"], place, tuple(freedoms), float(entry.get("standoff", 0.0)), bool(entry.get("firm", free)))
+
+
+def load_robot(item: Mapping[str, Any] | str, folder: Path, arm: list[str]) -> Robot:
+    """Return the robot of a scene's `robot`; `arm` are its planned joints, which a saved motion names."""
+    about = {"name": item} if isinstance(item, str) else dict(item)
+    file = _robot_file(about["name"], folder)
+    own: dict[str, Any] = {"urdf": file.name}
+    if file.suffix != ".yaml" and (file.parent / "robot.yaml").is_file():
+        beside = yaml.safe_load((file.parent / "robot.yaml").read_text(encoding="utf-8"))
+        own, file = (beside, file.parent / "robot.yaml") if beside["urdf"] == file.name else (own, file)
+    elif file.suffix == ".yaml":
+        own = yaml.safe_load(file.read_text(encoding="utf-8"))
+    urdf = read_urdf(file.parent / own["urdf"])
+    tool = about.get("tool_frame") or own.get("tool_frame")
+    if tool is None:
+        raise NotJudged("no file names the robot's tool frame")
+    if about.get("base", "omni") not in ("omni", "differential", "fixed"):
+        raise NotJudged(f"base {about['base']}")
+    semantics = _srdf(urdf.path, file.parent, own.get("srdf"))
+    if semantics is None:
+        raise NotJudged("no SRDF says which links of the robot may touch")
+    base, joints = own.get("base") or {}, own.get("joints") or {}
+    speeds, strengths = base.get("velocity", (1.0, 1.0, 2.0)), base.get("acceleration", (3.0, 3.0, 6.0))
+    (x, y) = base.get("position", ((-20.0, 20.0), (-20.0, 20.0)))
+    spans = (x, y, (-np.inf, np.inf))
+    limits = {f"base_{k}": (*span, v, a) for k, span, v, a in zip(("x", "y", "yaw"), spans, speeds, strengths, strict=True)}
+    for joint in arm:
+        low, high, fastest = urdf.limits(joint)
+        said = joints.get(joint, {})
+        fastest = said.get("velocity", fastest if 0.0 < fastest < 1e3 else np.pi)
+        limits[joint] = (low, high, float(fastest), float(said.get("acceleration", 1.4)))
+    locked = {**own.get("home", {}), **own.get("locked_joints", {})}
+    rest = {}
+    for joint in (name for name in urdf.joints if urdf.moves(name) and name not in arm):
+        low, high, _ = urdf.limits(joint)
+        rest[joint] = locked.get(joint, 0.0 if low <= 0.0 <= high else (low + high) / 2)
+    for joint in rest:
+        if (mimic := urdf.mimics(joint)) is not None and joint not in locked and mimic[0] in rest:
+            rest[joint] = mimic[1] * rest[mimic[0]] + mimic[2]
+    return Robot(
+        tree=Tree(urdf, drives=True),
+        base=about.get("base", "omni"),
+        tool=tool,
+        touch=set(own.get("touch_links", ())),
+        arm=arm,
+        locked=rest,
+        limits=limits,
+        home={**_home(semantics, arm), **{joint: value for joint, value in own.get("home", {}).items() if joint in arm}},
+        exempt={frozenset((pair.get("link1", ""), pair.get("link2", ""))) for pair in semantics.findall("disable_collisions")},
+    )
+
+
+def _robot_file(name: str, folder: Path) -> Path:
+    if name.endswith((".urdf", ".yaml", ".yml")) or "/" in name:
+        file = folder / name
+        return file / "robot.yaml" if file.is_dir() else file
+    file = ROOT / "robots" / name / "robot.yaml"
+    if not file.is_file():
+        raise NotJudged(f"{name} is no robot of this repository")
+    return file
+
+
+def _srdf(urdf: Path, folder: Path, named: str | None) -> ElementTree.Element | None:
+    stems = dict.fromkeys((urdf.stem, urdf.stem.removesuffix("_robot")))
+    places = [folder / named] if named else [p / f"{s}.srdf" for s in stems for p in (urdf.parent, urdf.parent.parent / "srdf")]
+    file = next((place for place in places if place.is_file()), None)
+    return None if file is None else ElementTree.parse(file).getroot()
+
+
+def _home(semantics: ElementTree.Element, arm: list[str]) -> dict[str, float]:
+    """Return where an SRDF says that all planned joints rest, a state called home first."""
+    states = sorted(semantics.findall("group_state"), key=lambda state: state.get("name") != "home")
+    for state in states:
+        values = {joint.get("name", ""): float(joint.get("value", "0").split()[0]) for joint in state.findall("joint")}
+        if set(arm) <= set(values):
+            return {joint: values[joint] for joint in arm}
+    return dict.fromkeys(arm, 0.0)

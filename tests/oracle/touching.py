@@ -1,0 +1,116 @@
+"""What may touch what, and when: the least that is right.
+
+- The hand's touch links and the link that is grasped, from shortly before the grasp until shortly after letting go.
+- What is held through something, and the link that holds it, for as long.
+- A free object and what it stands on, where it is lifted and put down.
+- The link that a `Touch` brings somewhere and what is there, around the moment when it is.
+- What rides on something, and that.
+
+Shortly is a second, or four waypoints where these take longer: the program's margins are eased over four waypoints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from .goals import touched
+from .plan import Hold
+from .riding import distance
+from .stage import Solid, Stage, World
+
+__all__ = ["Licence", "licences"]
+
+SHORTLY, WAYPOINTS = 1.0, 4  # [s], and at least as many waypoints
+
+
+@dataclass(frozen=True)
+class Licence:
+    """Two groups of links, by label, that may touch from one time to another [s]."""
+
+    ones: frozenset[str]
+    others: frozenset[str]
+    begin: float
+    end: float
+
+    def names(self, one: str, other: str) -> bool:
+        return (one in self.ones and other in self.others) or (other in self.ones and one in self.others)
+
+    def covers(self, one: str, other: str, time: float) -> bool:
+        return self.names(one, other) and self.begin - 1e-9 <= time <= self.end + 1e-9
+
+
+class _Clock:
+    def __init__(self, world: World) -> None:
+        self.times = world.plan.times
+        self.still = world.resting
+
+    def before(self, waypoint: int) -> float:
+        return float(min(self.times[waypoint] - SHORTLY, self.times[max(waypoint - WAYPOINTS, 0)]))
+
+    def after(self, waypoint: int) -> float:
+        while waypoint < len(self.still) and self.still[waypoint]:  # the hand opens or closes
+            waypoint += 1
+        return float(max(self.times[waypoint] + SHORTLY, self.times[min(waypoint + WAYPOINTS, len(self.times) - 1)]))
+
+
+def licences(world: World, stages: list[Stage]) -> list[Licence]:
+    """Return all of a motion."""
+    clock = _Clock(world)
+    found = [*_held(world, clock), *_lifted(world, stages, clock), *_touches(world, stages, clock)]
+    for stage in stages:
+        for name, (owner, link) in stage.riding.items():
+            ours = frozenset(f"{name}.{own}" for own in world.things[name].tree.urdf.links)
+            found.append(Licence(ours, frozenset({f"{owner}.{link}"}), stage.times[0], stage.times[-1]))
+    return found
+
+
+def _held(world: World, clock: _Clock) -> Iterator[Licence]:
+    plan = world.plan
+    last = len(plan.times) - 1
+    spans: list[tuple[Hold, float, float]] = []
+    for number, phase in enumerate(plan.phases):
+        before = set(world.held if number == 0 else plan.phases[number - 1].holds)
+        after = set(plan.phases[number + 1].holds) if number + 1 < len(plan.phases) else set(phase.holds)
+        for hold in phase.holds:
+            begin = float(plan.times[phase.first]) if hold in before else clock.before(phase.first)
+            end = float(plan.times[phase.last]) if hold in after else clock.after(phase.last)
+            spans.append((hold, begin, end))
+    spans += [(hold, -np.inf, clock.after(0)) for hold in world.held]
+    for step in plan.steps:
+        if step["step"] == "Grasp":  # the motion may end where the hand closes
+            grasp = world.things[step["object"]].grasp(step["attachment"])
+            spans.append((Hold(step["object"], grasp.name, step["by"]), clock.before(last), np.inf))
+    for hold, begin, end in spans:
+        grasped = frozenset({f"{hold.object}.{world.things[hold.object].grasps[hold.attachment].link}"})
+        yield Licence(frozenset({hold.by}) if hold.by else frozenset(world.robot.touch), grasped, begin, end)
+
+
+def _lifted(world: World, stages: list[Stage], clock: _Clock) -> Iterator[Licence]:
+    for number, stage in enumerate(stages):
+        before = {hold.object for hold in (world.held if number == 0 else stages[number - 1].phase.holds)}
+        now = {hold.object for hold in stage.phase.holds}
+        after = {hold.object for hold in stages[number + 1].phase.holds} if number + 1 < len(stages) else now
+        for name in now:
+            if not world.things[name].free:
+                continue
+            for there, row, waypoint in ((before, 0, stage.phase.first), (after, len(stage.times) - 1, stage.phase.last)):
+                if name not in there:
+                    ours = [part for part in stage.solids if part.owner == name]
+                    others = [part for part in stage.solids if part.owner not in (name, "robot")]
+                    near = frozenset(other.label for other in others for part in ours if _close(world, part, other, row))
+                    labels = frozenset(part.label for part in ours)
+                    yield Licence(labels, near, clock.before(waypoint), clock.after(waypoint))
+
+
+def _close(world: World, one: Solid, other: Solid, row: int) -> bool:
+    return distance(one.shape.solid, one.at, other.shape.solid, other.at, row) < world.plan.options["dist_safe"]
+
+
+def _touches(world: World, stages: list[Stage], clock: _Clock) -> Iterator[Licence]:
+    for stage in stages:
+        for links, near in touched(world, stage):
+            waypoint = stage.phase.last
+            yield Licence(frozenset(links), frozenset(near), clock.before(waypoint), clock.after(waypoint))

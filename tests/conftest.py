@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
@@ -24,7 +25,7 @@ os.environ["VKC_PIN_CACHE"] = "off"
 # Every motion that succeeds in a test is judged by the oracle as well, before the test is over.
 OPINION = SecondOpinion()
 OPINION.attach()
-OPINIONS: dict[str, dict[str, float]] = {}  # of the processes that tests run in
+OPINIONS: dict[str, dict[str, Any]] = {}  # of the processes that tests run in
 
 
 @pytest.fixture(autouse=True)
@@ -52,13 +53,11 @@ def pytest_testnodedown(node: Any) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:
-    """Write a line about the oracle."""
-    planned, judged, unjudged, seconds = (
-        sum(counts[name] for counts in OPINIONS.values()) for name in ("planned", "judged", "unjudged", "seconds")
-    )
-    terminalreporter.write_line(
-        f"oracle: {planned} motions planned, {judged} different ones judged in {seconds:.1f} s, {unjudged} not judged"
-    )
+    """Say how much the oracle has judged, and what it could not."""
+    planned, judged, seconds = (sum(counts[name] for counts in OPINIONS.values()) for name in ("planned", "judged", "seconds"))
+    terminalreporter.write_line(f"oracle: {planned} motions planned, {judged} different ones judged in {seconds:.1f} s")
+    for reason, count in Counter(reason for counts in OPINIONS.values() for reason in counts["unjudged"]).items():
+        terminalreporter.write_line(f"oracle: {count} not judged: {reason}")
 
 
 @pytest.fixture(scope="session")

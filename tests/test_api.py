@@ -21,7 +21,7 @@ BARE = set(vars(types.ModuleType("bare"))) | {"__builtins__", "__cached__", "__f
 
 
 def _submodules(name: str) -> set[str]:
-    return {other.rpartition(".")[2] for other in MODULES if other.rpartition(".")[0] == name}
+    return {other.rpartition(".")[2] for other in (*MODULES, *SCRIPTS) if other.rpartition(".")[0] == name}
 
 
 @pytest.mark.parametrize("name", ["vkc_pin", *MODULES])

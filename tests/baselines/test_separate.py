@@ -368,6 +368,7 @@ class Tries:
         ([("no base pose", 0.0)] * 4, 1, "no base pose"),
     ],
 )
+@pytest.mark.made_up
 def test_tries(answers: list[tuple[str, float]], taken: int, status: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Up to the first that validation accepts; of failures, the one that came furthest."""
     tries = Tries(monkeypatch, *answers)

@@ -19,12 +19,14 @@ class SecondOpinion:
     """Keeps the plans that succeed, and judges them.
 
     Attributes:
-        planned, judged, unjudged: How many motions were planned, were judged, and are of a kind that the oracle does not know.
+        planned, judged: How many motions were planned, and how many different ones were judged.
+        unjudged: Why others were not.
         seconds: What judging took.
     """
 
     def __init__(self) -> None:
-        self.planned = self.judged = self.unjudged = 0
+        self.planned = self.judged = 0
+        self.unjudged: list[str] = []
         self.seconds = 0.0
         self._waiting: list[Plan] = []
         self._known: set[str] = set()
@@ -55,7 +57,7 @@ class SecondOpinion:
             path = plan.save(folder / f"{digest}.npz")
             verdict = judge(path)
             self.judged += not verdict.unjudged
-            self.unjudged += bool(verdict.unjudged)
+            self.unjudged += [verdict.unjudged] if verdict.unjudged else []
             self.seconds += verdict.seconds
             if verdict.agrees:
                 path.unlink()

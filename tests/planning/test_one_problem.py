@@ -121,6 +121,7 @@ def test_seeds_are_tried_in_turn_until_a_motion_is_good(
     assert plan.success == bool(amounts)
 
 
+@pytest.mark.made_up
 def test_rounds_of_all_seeds_count(monkeypatch: pytest.MonkeyPatch) -> None:
     rows: list[Iteration] = []
     script = Scripted(monkeypatch, [2.0, 1.0], amounts=[1.0, 0.0])

@@ -83,6 +83,10 @@ def _add_problems(benches: Any) -> None:
     about = "Measure how often the first seed trajectory suffices, at the tasks of all experiments, from random starts."
     first = _add_experiment(benches, "first-seed", "how often the first seed trajectory suffices", about, default=10, jobs=1)
     first.set_defaults(benchmark="problems.first_seed")
+    about = "Plan problems drawn at random, in rooms and in scenes that come along, and keep every plan to be judged by others."
+    shown, what = "problems drawn at random, whose plans are kept", "problems"
+    drawn = _add_experiment(benches, "random", shown, about, "--problems", default=100, jobs=1, what=what)
+    drawn.set_defaults(benchmark="problems.random_problems")
     _add_choice(first, "tasks", "door drawer init_1 init_2 init_3 corridor_door aisle_drawer household_cup ... (default: all)")
 
 
@@ -95,13 +99,14 @@ def _add_experiment(
     *,
     default: int = 50,
     jobs: int | None = None,
+    what: str | None = None,
 ) -> argparse.ArgumentParser:
     """Add an experiment with what all have, by default `default` starts and `jobs` processes, or one per core.
 
-    Without an option for their `number` the starts are fixed.
+    Without an option for their `number` the starts are fixed; `what` there are so many of, if not starts.
     """
     parser: argparse.ArgumentParser = benches.add_parser(name, help=shown, description=about)
-    _add_starts(parser, number, default, f"random starts per {'task' if number == '--trials' else 'scene'}")
+    _add_starts(parser, number, default, what or f"random starts per {'task' if number == '--trials' else 'scene'}")
     processes = f"processes (default: {'one per core' if jobs is None else jobs})"
     parser.add_argument("--jobs", type=positive, default=jobs or os.cpu_count() or 1, metavar="J", help=processes)
     about = "folder for results, table and charts; trials that it has already are not run again"

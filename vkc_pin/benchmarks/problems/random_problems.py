@@ -1,0 +1,87 @@
+"""Problems drawn at random, each planned once and its plan kept: is what a plan says of itself right?
+
+Whoever judges that judges the saved plans; `tests/oracle` does, which is not part of the package.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from vkc_pin.benchmarks.harness import runner
+from vkc_pin.benchmarks.harness.record import Record, distribution, trial
+from vkc_pin.benchmarks.harness.tables import decimal, foot, markdown
+from vkc_pin.benchmarks.problems.ablation import every_trial
+from vkc_pin.benchmarks.problems.drawn import drawn
+from vkc_pin.errors import InputError
+from vkc_pin.files.writing import write_atomically
+from vkc_pin.planning.planner import plan
+
+__all__ = ["TIME_LIMIT", "report", "run"]
+
+TIME_LIMIT = 10.0  # [s] of planning
+KINDS = ("room", "scene")
+
+
+def run(*, out: str | Path, problems: int = 100, seed: int = 0, jobs: int = 1, progress: bool = True) -> dict[str, Any]:
+    """Run the experiment, or what is left of it, and write results.json, results.csv, table.md and plans/*.npz to `out`.
+
+    Args:
+        out: The folder; if it has trials of the same settings already, they are not run again.
+        problems: How many, at least 1.
+        seed: Of the problems and of planning.
+        jobs: Number of processes.
+        progress: Whether to show a progress bar.
+
+    Returns:
+        {"meta": ..., "trials": [...]}; see `runner.run`.
+
+    Raises:
+        InputError: No problems, or `out` has trials of other settings.
+        KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
+    """
+    if problems < 1:
+        raise InputError("out of range", field="problems", expected="at least 1", got=problems)
+    settings = {"benchmark": "random", "seed": seed, "problems": problems, "time_limit": TIME_LIMIT}
+    specs = [{"key": f"{number:05d}", "number": number, "seed": seed} for number in range(problems)]
+    function = functools.partial(_record, folder=str(Path(out) / "plans"))
+    result = runner.run(specs, function, out, settings=settings, jobs=jobs, progress=progress)
+    write_atomically(Path(out) / "table.md", report(result).encode())
+    return result
+
+
+def report(result: Mapping[str, Any]) -> str:
+    """Return the tables of a result in Markdown, with versions and machine at the foot."""
+    about, records = result["meta"], result["trials"]
+    statuses = sorted({record["status"] for record in records} - {"success"})
+    rows = []
+    for kind in (*KINDS, "all"):
+        own = [record for record in records if kind in (record.get("kind"), "all")]
+        counts = [str(_count(own, status)) for status in statuses]
+        times = map(decimal, distribution(own, "planning_time"))
+        rows.append([kind, str(len(own)), str(_count(own, "success")), *counts, *times])
+    parts = [
+        "# Random problems",
+        f"{about['problems']} problems, seed {about['seed']}, at most {about['time_limit']:g} s of planning. Not all of them can "
+        "be done. Success is the word of the independent validation.",
+        markdown(["kind", "problems", "success", *statuses, "time, median [s]", "95th percentile [s]"], rows),
+        "## Every trial",
+        every_trial(records),
+    ]
+    return "\n\n".join([*parts, foot(about)]) + "\n"
+
+
+def _count(records: list[Record], status: str) -> int:
+    return sum(record["status"] == status for record in records)
+
+
+def _record(spec: dict[str, Any], *, folder: str) -> dict[str, Any]:
+    number, seed = spec["number"], spec["seed"]
+    own = drawn(seed, number)
+    found = plan(own.scene, own.steps, seed=seed, time_limit=TIME_LIMIT)
+    if found.status != "interrupted":
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        found.save(Path(folder) / f"{spec['key']}.npz")
+    return trial(found, method="VKC", seed=seed, number=number, problem=own.name, kind=own.kind)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from vkc_pin.errors import InputError, UnknownNameError, VkcError, nearest_name
+from vkc_pin.errors import InputError, UnknownNameError, VkcError, nearest_name, shown
 
 
 @pytest.mark.parametrize(
@@ -33,3 +33,13 @@ def test_the_name_that_was_meant() -> None:
     assert str(many).endswith("l11, ...")
     assert nearest_name("abc", ["abd", "xyz"]) == "abd"
     assert nearest_name("abc", ["xyz"]) is None
+
+
+def test_messages_are_short_whatever_came() -> None:
+    long, deep = "x" * 100_000, []  # type: ignore[var-annotated]
+    deep.append(deep)
+    for value in (long, [long] * 1000, 10**5000, deep, dict.fromkeys(range(1000), long)):
+        assert len(str(InputError("wrong", field=long, file=long, expected=value, got=value))) < 3000
+        assert len(shown(value)) < 3000
+    assert len(str(UnknownNameError(long, long, [long, "door"], field="it"))) < 3000
+    assert (shown([1, 2.5, "door"]), shown(10**30)) == ("[1, 2.5, 'door']", str(10**30))

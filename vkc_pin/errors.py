@@ -3,15 +3,45 @@
 from __future__ import annotations
 
 import difflib
+import reprlib
 from collections.abc import Iterable
 from pathlib import Path
 
-__all__ = ["BuildError", "InputError", "UnknownNameError", "VkcError", "nearest_name"]
+__all__ = ["BuildError", "InputError", "UnknownNameError", "VkcError", "nearest_name", "shown"]
+
+_LONGEST = 300  # characters of what came, or was expected, that a message shows
+_NAME = 80  # characters of a name
+
+
+class _Brief(reprlib.Repr):
+    def repr_int(self, x: int, level: int) -> str:
+        bits = x.bit_length()  # Python refuses to write out very large ones
+        return repr(x) if bits <= 256 else f"an integer of {bits} bits"
+
+
+_brief = _Brief()
+_brief.maxlevel, _brief.maxtuple, _brief.maxlist, _brief.maxdict, _brief.maxset = 5, 12, 12, 8, 8
+_brief.maxstring = _brief.maxother = 200
+
+
+def shown(value: object) -> str:
+    """Return a value as messages show it: its `repr`, but neither long nor deep, and without failing where that does."""
+    return _brief.repr(value)
+
+
+def _short(text: str, most: int = _LONGEST) -> str:
+    return text if len(text) <= most else f"{text[: most - 43]}...{text[-40:]}"
+
+
+def _told(value: object) -> str:
+    if isinstance(value, float | Path):
+        return _short(str(value))
+    return _short(value if isinstance(value, str) else shown(value))
 
 
 def nearest_name(name: str, choices: Iterable[str]) -> str | None:
     """Return the choice that resembles `name` most, or None if none does."""
-    matches = difflib.get_close_matches(str(name), [str(c) for c in choices], n=1, cutoff=0.5)
+    matches = difflib.get_close_matches(_short(name, _NAME), [str(c) for c in choices], n=1, cutoff=0.5)
     return matches[0] if matches else None
 
 
@@ -47,10 +77,11 @@ class InputError(VkcError, ValueError):
     ) -> None:
         self.problem, self.file, self.line, self.field = problem, file, line, field
         self.expected, self.got = expected, got
-        where = "" if file is None else f"{file}:{line}: " if line is not None else f"{file}: "
-        what = problem if field is None else f"{field}: {problem}"
-        details = [f"{label} {value}" for label, value in (("expected", expected), ("got", got)) if value is not None]
-        super().__init__(where + what + (f" ({', '.join(details)})" if details else ""))
+        named = None if file is None else _short(str(file))
+        where = "" if named is None else f"{named}:{line}: " if line is not None else f"{named}: "
+        what = problem if field is None else f"{_short(field)}: {problem}"
+        details = [f"{label} {_told(value)}" for label, value in (("expected", expected), ("got", got)) if value is not None]
+        super().__init__(_short(where + what, 6 * _LONGEST) + (f" ({', '.join(details)})" if details else ""))
 
 
 class UnknownNameError(InputError):
@@ -68,7 +99,7 @@ class UnknownNameError(InputError):
     ) -> None:
         self.kind, self.name, self.choices = kind, name, tuple(str(c) for c in choices)
         self.nearest = nearest_name(name, self.choices)
-        listed = ", ".join(self.choices[:12]) + (", ..." if len(self.choices) > 12 else "")
+        listed = ", ".join(_short(choice, _NAME) for choice in self.choices[:12]) + (", ..." if len(self.choices) > 12 else "")
         hint = f"; did you mean '{self.nearest}'?" if self.nearest else ""
-        problem = f"there is no {kind} '{name}'{hint} There are: {listed or 'none'}"
+        problem = f"there is no {kind} '{_short(name, _NAME)}'{hint} There are: {listed or 'none'}"
         super().__init__(problem if hint else problem.replace(" There are", "; there are", 1), file=file, line=line, field=field)

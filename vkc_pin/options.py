@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any, Self
 
-import numpy as np
-
-from vkc_pin.errors import InputError
+from vkc_pin.arguments import number, whole
+from vkc_pin.errors import InputError, shown
 
 __all__ = ["Options"]
 
@@ -77,17 +76,13 @@ class Options:
             value = getattr(self, item.name)
             field = f"Options.{item.name}"
             if item.type == "str":
-                if value not in EFFORTS:
-                    raise InputError("unknown", field=field, expected=" or ".join(map(repr, EFFORTS)), got=repr(value))
+                if not isinstance(value, str) or value not in EFFORTS:
+                    raise InputError("unknown", field=field, expected=" or ".join(map(repr, EFFORTS)), got=shown(value))
+                object.__setattr__(self, item.name, str(value))
             elif item.type == "int":
-                if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-                    raise InputError("out of range", field=field, expected="a whole number of at least 1", got=repr(value))
-                object.__setattr__(self, item.name, int(value))  # NumPy's own integers do not go into JSON
+                object.__setattr__(self, item.name, whole(value, field, low=1))  # NumPy's own integers do not go into JSON
             else:
-                number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
-                if not number or not 0 < value < np.inf:
-                    raise InputError("out of range", field=field, expected="a positive finite number", got=repr(value))
-                object.__setattr__(self, item.name, float(value))
+                object.__setattr__(self, item.name, number(value, field, "a positive finite number", low=0.0, above=True))
 
     @classmethod
     def paper(cls, **changes: Any) -> Self:

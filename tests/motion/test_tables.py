@@ -146,7 +146,7 @@ def test_files_that_are_not_there_or_no_text(tmp_path: Path) -> None:
         ("{}", "bad.json: phases: this is missing"),
         ('{"trajectory": 3}', "bad.json: trajectory: not a trajectory"),
         ('{"trajectory": {"names": []}}', "bad.json: trajectory.phases: this is missing"),
-        ('{"names": [], "phases": 3}', "bad.json: not a trajectory"),
+        ('{"names": [], "phases": 3}', "bad.json: phases: not a list"),
         (
             '{"names": ["a"], "times": [0, 1], "positions": [[1], ["x"]], "robot_size": 3, "phases": []}',
             r"bad.json: Trajectory.positions: not numbers",

@@ -11,6 +11,7 @@ import pytest
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.scene.poses import as_placement, as_target
 from vkc_pin.task.steps import (
     STEPS,
     Actuate,
@@ -21,8 +22,6 @@ from vkc_pin.task.steps import (
     Release,
     Step,
     Touch,
-    as_placement,
-    as_target,
     step_from_dict,
     step_to_dict,
 )

@@ -30,8 +30,9 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 
+from vkc_pin.arguments import known, whole
 from vkc_pin.baselines.attempt import Attempt, Doable
-from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.errors import InputError, shown
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.options import Options
 from vkc_pin.planning.outcome import outcome, spent
@@ -88,16 +89,14 @@ def plan_separately(
     options = Options() if options is None else options
     budget = budget_for(time_limit, effort)
     check_arguments(scene, options, seed)
-    if method not in BASELINES:
-        raise UnknownNameError("method", str(method), BASELINES, field="method")
-    if not isinstance(retries, int) or isinstance(retries, bool) or retries < 1:
-        raise InputError("out of range", field="retries", expected="a whole number of at least 1", got=repr(retries))
+    known(method, BASELINES, "method", "method")
+    whole(retries, "retries", low=1)
     task = compile_task(scene, steps, options)
     actions: list[Doable] = []
     for number, step in enumerate(task.steps):
         if not isinstance(step, Doable):
             expected = "Actuate, Place or GoTo"
-            raise InputError("the baselines know no such step", field=f"steps[{number}]", expected=expected, got=repr(step))
+            raise InputError("the baselines know no such step", field=f"steps[{number}]", expected=expected, got=shown(step))
         actions.append(step)
     with borrowed(planner) as cache, budget.running():
         began, times, iterations, before = time.perf_counter(), Counter[str](), 0, cache.building

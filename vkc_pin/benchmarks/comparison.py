@@ -25,8 +25,9 @@ from vkc_pin.files.writing import write_atomically
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
+from vkc_pin.scene.poses import as_placement
 from vkc_pin.scene.scene import Scene, load_scene
-from vkc_pin.task.steps import Actuate, GoTo, Place, Step, as_placement
+from vkc_pin.task.steps import Actuate, GoTo, Place, Step
 
 __all__ = ["COMPARED_PLANNERS", "Assignment", "Comparison", "peaks"]
 

@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 import pinocchio as pin
 
+from vkc_pin.arguments import instance
 from vkc_pin.arrays import Bools, Floats, Ints
 from vkc_pin.cache import Cache
 from vkc_pin.chain.inversion import invert
@@ -18,7 +19,7 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.models.coordinates import Coordinates
 from vkc_pin.models.grafting import clean, graft, graft_geometry
 from vkc_pin.models.robot import Robot
-from vkc_pin.scene.hold import Hold, holds_of
+from vkc_pin.scene.hold import Hold, checked_holds, holds_of
 from vkc_pin.scene.placed import standing_geometry
 from vkc_pin.scene.resting import Ride
 from vkc_pin.scene.scene import Scene
@@ -193,7 +194,9 @@ def consolidate(
         UnknownNameError: The scene has no such object, or the object no such attachment.
         InputError: A grasp that leaves a freedom is called like a joint of its object.
     """
-    robot, holds = scene.robot, holds_of(holds) if isinstance(holds, Mapping) else tuple(holds)
+    robot = instance(scene, Scene, "scene").robot
+    holds = checked_holds(scene.objects, holds_of(holds) if isinstance(holds, Mapping) else holds)
+    cache = Cache() if cache is None else instance(cache, Cache, "cache")
     model, collision = pin.Model(robot.model), pin.GeometryModel()
     graft_geometry(collision, robot.collision.geometryObjects, joints=list(range(model.njoints)), placement=pin.SE3.Identity())
     names = list(robot.coordinates.names)
@@ -202,8 +205,6 @@ def consolidate(
     prefixes: dict[Hold, str] = {}
     for hold in holds:
         name = hold.object
-        if name not in scene.objects:
-            raise UnknownNameError("object", name, scene.objects, field="grasps")
         placed = scene.objects[name]
         attachment = placed.object.attachment(hold.attachment)
         # Pinocchio finds a frame only by a name that no other has: the second branch of an object needs another prefix.
@@ -272,5 +273,5 @@ def consolidate(
         virtual=virtual,
         added=with_hold,
         prefixes=prefixes,
-        cache=cache or Cache(),
+        cache=cache,
     )

@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
+from vkc_pin.arguments import instance
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
 from vkc_pin.models.articulation import ArticulatedObject
@@ -57,7 +58,7 @@ def invert(obj: ArticulatedObject, link: str, state: ArrayLike) -> InvertedTree:
         UnknownNameError: The object has no such link.
         InputError: `state` has the wrong size, or a joint on the path cannot be inverted.
     """
-    source = obj.model
+    source = instance(obj, ArticulatedObject, "obj").model
     root = source.frames[obj.link_frame(link)]
     data = source.createData()
     pin.forwardKinematics(source, data, obj.coordinates.q(state))

@@ -13,8 +13,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import cache
 from importlib import import_module
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
+from vkc_pin.arguments import instance, items, known, whole
 from vkc_pin.errors import InputError, UnknownNameError
 
 if TYPE_CHECKING:
@@ -75,9 +76,8 @@ def frame_placements(model: pin.Model, frames: Sequence[str | int]) -> casadi.Fu
         InputError: Several different frames of the model share the name.
         BuildError: The compiled module is missing or does not fit the installed packages.
     """
-    if isinstance(frames, str):
-        frames = [frames]
-    indices = [_frame_index(model, frame, f"frames[{i}]") for i, frame in enumerate(frames)]
+    listed: tuple[Any, ...] = items([frames] if isinstance(frames, str) else frames, "frames", "a list of frames")
+    indices = [_frame_index(model, frame, f"frames[{i}]") for i, frame in enumerate(listed)]
     return _backend()("frame_placements", _exact(model), indices)
 
 
@@ -100,8 +100,7 @@ def frame_jacobian(
         InputError: Several different frames of the model share the name.
         BuildError: The compiled module is missing or does not fit the installed packages.
     """
-    if reference not in _REFERENCES:
-        raise UnknownNameError("reference", str(reference), _REFERENCES, field="reference")
+    known(reference, _REFERENCES, "reference", "reference")
     index = _frame_index(model, frame, "frame")
     return _backend()("frame_jacobian", _exact(model), index, _REFERENCES[reference])
 
@@ -138,11 +137,12 @@ def center_of_mass(model: pin.Model) -> casadi.Function:
 
 def _frame_index(model: pin.Model, frame: str | int, field: str) -> int:
     """Return the index of `frame` in `model.frames`, checked."""
-    names = [f.name for f in model.frames]
+    names = [f.name for f in _exact(model).frames]
     if not isinstance(frame, str):
-        if not 0 <= int(frame) < len(names):
-            raise UnknownNameError("frame", str(frame), [f"0 to {len(names) - 1}"], field=field)
-        return int(frame)
+        number = whole(frame, field, low=-1)
+        if not 0 <= number < len(names):
+            raise UnknownNameError("frame", str(number), [f"0 to {len(names) - 1}"], field=field)
+        return number
     found = [index for index, name in enumerate(names) if name == frame]
     if not found:
         raise UnknownNameError("frame", frame, names, field=field)
@@ -161,8 +161,9 @@ def _exact(model: pin.Model) -> pin.Model:
     this a UR5e on a planar base takes a tenth more. The change is below the rounding of the numeric algorithms.
     """
     import numpy as np
+    import pinocchio as pin
 
-    copy = model.copy()
+    copy = instance(model, pin.Model, "model").copy()
     for placement in [*copy.jointPlacements, *(frame.placement for frame in copy.frames)]:
         rotation, nearest = placement.rotation, np.round(placement.rotation)
         placement.rotation = np.where(np.abs(rotation - nearest) <= 4e-16, nearest, rotation)

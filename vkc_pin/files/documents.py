@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import pydantic
 import yaml
 
-from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.errors import InputError, UnknownNameError, shown
 from vkc_pin.files.xml import parse_xml
 
 __all__ = ["Document", "check", "field_name", "read_text", "read_xml", "read_yaml"]
@@ -165,6 +165,8 @@ def check(document: Document, schema: type[T]) -> T:
         return schema.model_validate(document.data)
     except pydantic.ValidationError as problem:
         errors = problem.errors(include_url=False)
+    except UnicodeEncodeError as problem:  # the name of a field is half of a surrogate pair
+        raise InputError("not text", file=document.file, expected="names of fields in UTF-8", got=str(problem)) from None
     located = [(_path(document.data, error), error) for error in errors]
     path, first = min(located, key=lambda item: document.line(item[0]) or 0)
     raise _translate(document, path, first)
@@ -237,9 +239,9 @@ def _translate(document: Document, path: tuple[Key, ...], error: Any) -> InputEr
         choices = re.findall(r"'([^']*)'", context["expected_tags" if kind == "union_tag_invalid" else "expected"])
         return document.unknown(path, str(path[-1]), context.get("tag", got), choices)
     if kind == "vkc":
-        return document.error(path, context["problem"], expected=context["expected"], got=repr(got))
+        return document.error(path, context["problem"], expected=context["expected"], got=shown(got))
     if kind in _SIGNS:
         problem, expected = "out of range", f"a number {_SIGNS[kind]} {next(iter(context.values())):g}"
     else:
         problem, expected = "wrong value", _EXPECTED.get(kind, error["msg"])
-    return document.error(path, problem, expected=expected, got=repr(got))
+    return document.error(path, problem, expected=expected, got=shown(got))

@@ -9,8 +9,9 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
+from vkc_pin.arguments import LARGEST
+
 __all__ = [
-    "LARGEST",
     "JointSchema",
     "Name",
     "NotNegative",
@@ -23,10 +24,6 @@ __all__ = [
     "require",
     "text_for",
 ]
-
-
-LARGEST = 1e4
-"""Largest length [m] or angle [rad] that a file may name."""
 
 
 def fail(problem: str, expected: str) -> PydanticCustomError:

@@ -11,8 +11,8 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+from vkc_pin.arguments import LARGEST
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.files.fields import LARGEST
 from vkc_pin.files.xml import line_of
 
 __all__ = ["check_tree", "numbers_of"]

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pinocchio as pin
 
+from vkc_pin.arguments import file_path
 from vkc_pin.errors import UnknownNameError
 
-__all__ = ["available", "example_robot_data", "find", "folder", "package_folder"]
+__all__ = ["available", "example_robot_data", "find", "folder", "located", "package_folder"]
 
 
 def package_folder() -> Path:
@@ -39,6 +40,19 @@ def find(kind: str, pattern: str, name: str, *, what: str) -> Path:
     if name not in found:
         raise UnknownNameError(what, name, found)
     return found[name]
+
+
+def located(name_or_path: str | Path, kind: str, pattern: str, *, what: str) -> Path:
+    """Return a file by its path (of a .yaml file, or with a slash in it), or by its name; see `find`.
+
+    Raises:
+        UnknownNameError: There is none of that name.
+        InputError: It is neither a name nor a path.
+    """
+    path = file_path(name_or_path, what, f"the name of a {what}, or a path")
+    name = str(name_or_path)
+    by_path = isinstance(name_or_path, Path) or name.endswith((".yaml", ".yml")) or "/" in name
+    return path if by_path else find(kind, pattern, name, what=what)
 
 
 def example_robot_data() -> Path | None:

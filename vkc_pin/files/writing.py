@@ -6,12 +6,14 @@ import os
 import tempfile
 from pathlib import Path
 
+from vkc_pin.arguments import file_path
+
 __all__ = ["write_atomically"]
 
 
 def write_atomically(path: str | Path, data: bytes) -> Path:
     """Write `data` to `path` whole or not at all, making its folder if need be; return the path."""
-    path = Path(path)
+    path = file_path(path, "path")
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     temporary = Path(name)

@@ -13,8 +13,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
+from vkc_pin.arguments import known, number, numbers
 from vkc_pin.arrays import Floats
-from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.errors import InputError
 from vkc_pin.models.coordinates import Coordinates
 
 __all__ = ["DEFAULT_ACCELERATION", "DEFAULT_VELOCITY", "ArticulatedObject", "Attachment", "Freedom", "Latch"]
@@ -48,7 +49,8 @@ class Freedom:
         return "m" if self.kind == "prismatic" else "rad"
 
     def motion(self, value: float) -> pin.SE3:
-        """Return the motion at `value`, [rad] or [m]."""
+        """Return the motion at `value`, [rad] or [m]. Raises `InputError` if that is no finite number."""
+        value = number(value, "value")
         if self.kind == "revolute":
             return pin.SE3(pin.exp3(self.axis * value), np.zeros(3))
         return pin.SE3(np.eye(3), self.axis * value)
@@ -97,7 +99,7 @@ class Attachment:
         Raises:
             InputError: There are not as many values as freedoms.
         """
-        given = np.asarray(values, float)
+        given = numbers(values, self.name)
         if given.shape != (len(self.freedoms),):
             expected = f"{len(self.freedoms)}, one a freedom"
             raise InputError("wrong number of values", field=self.name, expected=expected, got=given)
@@ -188,15 +190,11 @@ class ArticulatedObject:
         """Return the attachment `name`, or the default one. Raises `UnknownNameError` if there is none."""
         if name is None:
             return next(iter(self.attachments.values()))
-        if name not in self.attachments:
-            raise UnknownNameError(f"attachment of {self.name}", name, self.attachments)
-        return self.attachments[name]
+        return self.attachments[known(name, self.attachments, f"attachment of {self.name}")]
 
     def link_frame(self, link: str) -> int:
         """Return the index in `model` of the frame of `link`. Raises `UnknownNameError` if there is none."""
-        if link not in self.links:
-            raise UnknownNameError(f"link of {self.name}", link, self.links)
-        return int(self.model.getFrameId(link, pin.FrameType.BODY))
+        return int(self.model.getFrameId(known(link, self.links, f"link of {self.name}"), pin.FrameType.BODY))
 
     def link_placement(self, link: str, state: ArrayLike) -> pin.SE3:
         """Return the placement of `link` in the base link's frame at the joint values `state`, shape (n,)."""

@@ -12,8 +12,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
+from vkc_pin.arguments import known, numbers
 from vkc_pin.arrays import Floats
-from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.errors import InputError
 
 __all__ = ["Coordinates", "wrapped"]
 
@@ -83,7 +84,7 @@ class Coordinates:
 
     def q(self, z: ArrayLike) -> Floats:
         """Return Pinocchio's configuration(s), shape (..., nq), of minimal coordinates `z`, shape (..., n)."""
-        z = np.asarray(z, float)
+        z = numbers(z, "z")
         if z.shape[-1:] != (self.size,):
             raise InputError("wrong number of coordinates", field="z", expected=f"(..., {self.size})", got=z.shape)
         q = np.empty((*z.shape[:-1], self.nq))
@@ -96,7 +97,7 @@ class Coordinates:
 
     def z(self, q: ArrayLike) -> Floats:
         """Return the minimal coordinates, shape (..., n), of `q`, shape (..., nq); angles in (-π, π]."""
-        q = np.asarray(q, float)
+        q = numbers(q, "q")
         if q.shape[-1:] != (self.nq,):
             raise InputError("wrong size of configuration", field="q", expected=f"(..., {self.nq})", got=q.shape)
         z = np.empty((*q.shape[:-1], self.size))
@@ -119,9 +120,7 @@ class Coordinates:
 
     def index(self, name: str) -> int:
         """Return the position of coordinate `name` in z. Raises `UnknownNameError` if there is none."""
-        if name not in self.names:
-            raise UnknownNameError("coordinate", name, self.names)
-        return self.names.index(name)
+        return self.names.index(known(name, self.names, "coordinate"))
 
 
 def wrapped(angle: Any) -> Any:

@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 from vkc_pin.errors import InputError
 from vkc_pin.files.documents import Document, check, read_yaml
 from vkc_pin.files.fields import JointSchema, Name, NotNegative, Number, Positive, Schema, Vector3, count, fail, require
-from vkc_pin.files.resources import find
+from vkc_pin.files.resources import located
 from vkc_pin.files.urdf import load_urdf
 from vkc_pin.models.articulation import DEFAULT_ACCELERATION, DEFAULT_VELOCITY, ArticulatedObject, Attachment, Freedom, Latch
 from vkc_pin.models.coordinates import Coordinates
@@ -98,9 +98,7 @@ def load_object(name_or_path: str | Path) -> ArticulatedObject:
         UnknownNameError: There is no such object, or its description names a field, link or joint that does not exist.
         InputError: The description or its URDF is wrong.
     """
-    text = str(name_or_path)
-    by_path = isinstance(name_or_path, Path) or text.endswith((".yaml", ".yml")) or "/" in text
-    file = Path(name_or_path) if by_path else find("scenes", "objects/*.yaml", text, what="object")
+    file = located(name_or_path, "scenes", "objects/*.yaml", what="object")
     document = read_yaml(file)
     schema = check(document, ObjectSchema)
     urdf = file.parent / schema.urdf

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 import pinocchio as pin
 
+from vkc_pin.arguments import whole
 from vkc_pin.arrays import Floats
 from vkc_pin.files.urdf import UrdfFile
 from vkc_pin.models.coordinates import Coordinates
@@ -98,7 +99,12 @@ class Robot:
         return f"<Robot {self.name}: {len(self.home)} joints on a base that is {self.base}, tool frame {self.tool_frame}>"
 
     def link_of(self, geometry: int) -> str:
-        """Return the name of the link that shape number `geometry` of `collision` belongs to."""
+        """Return the name of the link that shape number `geometry` of `collision` belongs to.
+
+        Raises:
+            InputError: There is no such shape.
+        """
+        geometry = whole(geometry, "geometry", low=0, high=len(self.collision.geometryObjects) - 1)
         return link_name(self.collision.geometryObjects[geometry].name)
 
     @property

@@ -10,8 +10,9 @@ from typing import Literal
 import numpy as np
 import pinocchio as pin
 
+from vkc_pin.arguments import file_path, mapping, quantity, text
 from vkc_pin.arrays import Floats
-from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.errors import InputError, UnknownNameError, shown
 from vkc_pin.files import resources
 from vkc_pin.files.documents import Document
 from vkc_pin.files.srdf import Srdf, read_srdf
@@ -115,24 +116,31 @@ def load_robot(
         InputError: A file or value is wrong, no joint would be planned, or nothing could collide.
     """
     for value, field, choices, kind in ((base, "base", _BASES, "kind of base"), (pairs, "pairs", _PAIRS, "source of pairs")):
-        if value not in choices:
-            raise InputError(f"wrong {kind}", field=field, expected=" or ".join(choices), got=value)
-    files = _read(name, packages or {})
+        if not isinstance(value, str) or value not in choices:
+            raise InputError(f"wrong {kind}", field=field, expected=" or ".join(choices), got=shown(value))
+    if tool_frame is not None:
+        text(tool_frame, "tool_frame", "the name of a frame")
+    positions = {}
+    for field, values in (("locked_joints", locked_joints), ("home", home)):
+        named = mapping({} if values is None else values, field, "joints, each with its position")
+        positions[field] = {joint: quantity(value, f"{field}.{joint}") for joint, value in named.items()}
+    home, locked_joints = positions["home"], positions["locked_joints"]
+    files = _read(name, mapping({} if packages is None else packages, "packages", "packages, each with its folder"))
     urdf, settings = files.urdf, files.settings
-    beside = Path(srdf) if srdf is not None else files.srdf()
+    beside = file_path(srdf, "srdf") if srdf is not None else files.srdf()
     semantics = read_srdf(beside, links=urdf.links) if beside is not None and pairs == "srdf" else None
 
     full = full_model(urdf)
     tool = tool_frame if tool_frame is not None else settings.tool_frame or default_tool_frame(full, urdf)
     if tool not in (frames := dict.fromkeys(frame.name for frame in full.frames)):
         raise UnknownNameError("frame", tool, frames, file=urdf.path, field="tool_frame")
-    locked = {**settings.locked_joints, **(locked_joints or {})}
-    given = {**settings.home, **(home or {}), **locked}
+    locked = {**settings.locked_joints, **locked_joints}
+    given = {**settings.home, **home, **locked}
     rest = rest_positions(full, urdf, given)
     files.check_names(rest)
     for joint in given:
         if joint not in rest:
-            field = "home" if joint in (home or {}) else "locked_joints"
+            field = "home" if joint in home else "locked_joints"
             raise UnknownNameError("joint", joint, rest, file=urdf.path, field=field)
     model = planned_model(full, urdf, tool, rest, locked)
     coordinates, lower, upper, velocity, acceleration = _limits(model, settings, base)
@@ -198,7 +206,7 @@ class _Files:
 
 def _read(name: str | Path, packages: Mapping[str, str | Path]) -> _Files:
     """Find and read a robot's URDF, and the robot.yaml that belongs to it if there is one."""
-    source = find_robot(str(name))
+    source = find_robot(str(file_path(name, "name", "a robot's name, or a path")))
     document = Document({})
     settings = RobotSchema(urdf=source.name)
     if source.suffix != ".yaml" and (source.parent / "robot.yaml").is_file():
@@ -206,7 +214,7 @@ def _read(name: str | Path, packages: Mapping[str, str | Path]) -> _Files:
         source = source.parent / "robot.yaml" if beside.urdf == source.name else source
     if source.suffix == ".yaml":
         settings, document = read_robot(source)
-    folders = {key: Path(folder) for key, folder in packages.items()}
+    folders = {key: file_path(folder, f"packages.{key}", "a folder") for key, folder in packages.items()}
     folders = {**python_packages(tuple(p for p in settings.packages if p not in folders), document), **folders}
     return _Files(source, settings, document, read_urdf(source.parent / settings.urdf, folders))
 

@@ -13,13 +13,15 @@ from typing import Any
 
 import numpy as np
 
+from vkc_pin.arguments import file_path, flag, is_number, number, text, whole
 from vkc_pin.arrays import Floats
-from vkc_pin.errors import InputError
+from vkc_pin.errors import InputError, shown
 from vkc_pin.motion.tables import chosen_columns, one_phase, read_json, size_of_robot
 
 __all__ = ["along", "from_ros", "rates", "to_ros"]
 
 _NANO = 1_000_000_000
+_MOST_NUMBERS = 1e6
 
 
 def to_ros(
@@ -57,17 +59,17 @@ def to_ros(
         UnknownNameError: There is no such group or coordinate.
         InputError: `rate`, `derivatives` or `stamp` is out of range.
     """
-    if derivatives not in (0, 1, 2):
-        raise InputError("out of range", field="derivatives", expected="0, 1 or 2", got=repr(derivatives))
-    if not (isinstance(stamp, int | float) and 0.0 <= stamp < 2.0**31):
-        raise InputError("out of range", field="stamp", expected="seconds, at least 0", got=repr(stamp))
+    derivatives, smooth, frame = whole(derivatives, "derivatives", low=0, high=2), flag(smooth, "smooth"), text(frame, "frame")
+    if (stamp := number(stamp, "stamp", "seconds, at least 0", low=0.0)) >= 2.0**31:
+        raise InputError("out of range", field="stamp", expected="seconds, less than 2^31", got=stamp)
     columns = chosen_columns(motion, joints)
     times, positions = np.array(motion["times"], float), np.array(motion["positions"], float)[:, columns]
     times = times - times[0]
     velocities, accelerations = rates(times, positions)
     if rate is not None:
-        if not (isinstance(rate, int | float) and 0.0 < rate < math.inf):
-            raise InputError("out of range", field="rate", expected="points a second, more than 0", got=repr(rate))
+        rate = number(rate, "rate", "points a second, more than 0", low=0.0, above=True)
+        if rate * times[-1] * len(columns) > _MOST_NUMBERS:
+            raise InputError("too many points", field="rate", expected=f"at most {_MOST_NUMBERS:g} positions in all", got=rate)
         moments = np.append(np.arange(math.ceil(times[-1] * rate - 1e-6)) / rate, times[-1])
         if smooth:
             positions, velocities, accelerations = along(times, positions, velocities, moments)
@@ -101,8 +103,8 @@ def from_ros(
     Raises:
         InputError: Something is missing or does not fit; the error names the field.
     """
-    file = None if isinstance(message, Mapping) else Path(message)
-    data = message if isinstance(message, Mapping) else read_json(message)
+    file = None if isinstance(message, Mapping) else file_path(message, "message", "a JointTrajectory as data, or a JSON file")
+    data = read_json(file) if file is not None else message
     names = _field(data, "joint_names", list, file, "")
     times: list[float] = []
     rows: list[list[float]] = []
@@ -111,15 +113,15 @@ def from_ros(
         row = _field(point, "positions", list, file, where)
         if len(row) != len(names):
             raise InputError("wrong number of values", file=file, field=where + "positions", expected=len(names), got=len(row))
-        for number, value in enumerate(row):
-            if isinstance(value, bool) or not isinstance(value, int | float):
-                field = f"{where}positions[{number}]"
-                raise InputError("not a number", file=file, field=field, expected="a number", got=repr(value))
+        for place, value in enumerate(row):
+            if not is_number(value):
+                field = f"{where}positions[{place}]"
+                raise InputError("not a number", file=file, field=field, expected="a number", got=shown(value))
         since = _field(point, "time_from_start", dict, file, where)
         sec, nanosec = (_field(since, key, int, file, f"{where}time_from_start.") for key in ("sec", "nanosec"))
         rows.append(row)
-        times.append(sec + nanosec / _NANO)
-    size = size_of_robot(names) if robot_size is None else robot_size
+        times.append(number(sec, f"{where}time_from_start.sec") + number(nanosec, f"{where}time_from_start.nanosec") / _NANO)
+    size = size_of_robot(names) if robot_size is None else whole(robot_size, "robot_size", low=3)
     phases = [one_phase(len(rows))] if len(rows) > 1 else []
     if like is not None:
         size, began = like["robot_size"], np.array(like["times"], float)
@@ -127,7 +129,7 @@ def from_ros(
         at = np.abs(np.asarray(times)[:, None] - edges).argmin(axis=0).tolist() if times else []
         ends = zip(like["phases"], at, at[1:], strict=False)
         phases = [{**phase, "first": first, "last": last} for phase, first, last in ends]
-    return {"names": [str(name) for name in names], "times": times, "positions": rows, "robot_size": size, "phases": phases}
+    return {"names": names, "times": times, "positions": rows, "robot_size": size, "phases": phases}
 
 
 def rates(times: Floats, positions: Floats) -> tuple[Floats, Floats]:
@@ -172,5 +174,5 @@ def _field(data: Any, key: str, kind: type, file: Path | None, where: str) -> An
         raise InputError("this is missing from a JointTrajectory", file=file, field=where + key, expected=expected)
     value = data[key]
     if not isinstance(value, Mapping if kind is dict else kind) or isinstance(value, bool):
-        raise InputError("wrong kind of value", file=file, field=where + key, expected=expected, got=repr(value)[:60])
+        raise InputError("wrong kind of value", file=file, field=where + key, expected=expected, got=shown(value))
     return value

@@ -16,7 +16,8 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.arguments import file_path, items, mapping, text, whole
+from vkc_pin.errors import InputError, UnknownNameError, shown
 from vkc_pin.files.writing import write_atomically
 
 __all__ = [
@@ -55,7 +56,9 @@ def write_csv(
     """
     columns, phases = chosen_columns(motion, joints), motion["phases"]
     x, y, yaw = motion["names"][:3]
-    known = {x: "m", y: "m", yaw: "rad", **({} if units is None else units)}
+    known = {x: "m", y: "m", yaw: "rad"}
+    for name, unit in mapping({} if units is None else units, "units", "names of coordinates, each with its unit").items():
+        known[name] = text(unit, f"units[{name!r}]")
     lines: list[str] = []
     table = csv.writer(SimpleNamespace(write=lines.append))  # its lines end with "\r\n", so it puts either of them in quotes
     names = [motion["names"][k] for k in columns]
@@ -80,13 +83,15 @@ def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, An
     Raises:
         InputError: The file is missing, or something in it does not fit; the error names line and column.
     """
-    path = Path(path)
+    path = file_path(path, "path")
     reader = csv.reader(io.StringIO(_text(path), newline=""))
     header = [re.sub(r" \[(s|m|rad)\]$", "", name) for name in next(reader, [])]
     if not header:
         raise InputError("an empty file", file=path, expected="a table with a line of names")
     if header[0] != _TIME:
-        raise InputError("not a table of waypoints", file=path, line=1, field="first column", expected=_TIME, got=repr(header[0]))
+        raise InputError(
+            "not a table of waypoints", file=path, line=1, field="first column", expected=_TIME, got=shown(header[0])
+        )
     told = tuple(header[-3:]) == _PHASES
     names = header[1 : -3 if told else None]
     rows: list[list[float]] = []
@@ -106,7 +111,7 @@ def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, An
         "names": names,
         "times": [row[0] for row in rows],
         "positions": [row[1:] for row in rows],
-        "robot_size": size_of_robot(names) if robot_size is None else robot_size,
+        "robot_size": size_of_robot(names) if robot_size is None else whole(robot_size, "robot_size", low=3),
         "phases": phases,
     }
 
@@ -122,11 +127,13 @@ def read_json(path: str | Path) -> Any:
     Raises:
         InputError: The file is missing or is no JSON; the error names the line.
     """
-    path = Path(path)
+    path = file_path(path, "path")
     try:
         return json.loads(_text(path))
     except json.JSONDecodeError as error:
         raise InputError("not JSON", file=path, line=error.lineno, got=error.msg) from None
+    except (RecursionError, ValueError) as error:  # too deep, or a number of too many digits
+        raise InputError("not JSON that can be read", file=path, got=str(error)) from None
 
 
 def chosen_columns(motion: Mapping[str, Any], joints: str | Sequence[str]) -> list[int]:
@@ -142,10 +149,10 @@ def chosen_columns(motion: Mapping[str, Any], joints: str | Sequence[str]) -> li
         if joints not in groups:
             raise UnknownNameError("group of joints", joints, GROUPS, field="joints")
         return list(range(*groups[joints]))
-    names = list(joints)
+    names = items(joints, "joints", f"one of {', '.join(GROUPS)}, or a list of names", str)
     for k, name in enumerate(names):
         if name not in known:
-            raise UnknownNameError("coordinate", str(name), known, field=f"joints[{k}]")
+            raise UnknownNameError("coordinate", name, known, field=f"joints[{k}]")
         if name in names[:k]:
             raise InputError("a name occurs twice", field=f"joints[{k}]", got=name)
     return [known.index(name) for name in names]
@@ -162,10 +169,12 @@ def one_phase(waypoints: int) -> dict[str, Any]:
 
 
 def _text(path: Path) -> str:
-    if not path.is_file():
-        raise InputError("no such file", file=path)
     try:
+        if not path.is_file():
+            raise InputError("no such file", file=path)
         return path.read_bytes().decode("utf-8-sig")
+    except OSError as error:
+        raise InputError("cannot read the file", file=path, got=error.strerror) from None
     except UnicodeDecodeError as error:
         raise InputError("not text", file=path, expected="UTF-8", got=str(error)) from None
 
@@ -176,7 +185,7 @@ def _number(cell: str, path: Path, line: int, column: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise InputError("not a number", file=path, line=line, field=column, expected="a finite number", got=repr(cell))
+        raise InputError("not a number", file=path, line=line, field=column, expected="a finite number", got=shown(cell))
     return value
 
 
@@ -185,7 +194,7 @@ def _add_phase(phases: list[dict[str, Any]], cells: Sequence[str], row: int, pat
     number, name, held = cells
     expected = f"{len(phases)} or {len(phases) + 1}" if phases else "1"
     if number not in expected.split(" or "):
-        raise InputError("not the next phase", file=path, line=line, field="phase", expected=expected, got=repr(number))
+        raise InputError("not the next phase", file=path, line=line, field="phase", expected=expected, got=shown(number))
     if int(number) == len(phases):
         phases[-1]["last"] = row
         return
@@ -195,5 +204,5 @@ def _add_phase(phases: list[dict[str, Any]], cells: Sequence[str], row: int, pat
         by = {thing: where[1] for thing, where in found.items() if not isinstance(where, str)}
     except (ValueError, AttributeError, TypeError, LookupError):
         wanted = 'JSON such as {"door": "handle"}'
-        raise InputError("not what is held", file=path, line=line, field="held", expected=wanted, got=repr(held)) from None
+        raise InputError("not what is held", file=path, line=line, field="held", expected=wanted, got=shown(held)) from None
     phases.append({"name": name, "first": max(row - 1, 0), "last": row, "held": at, "by": by})

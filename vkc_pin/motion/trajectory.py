@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from vkc_pin.arguments import instance, items, known, mapping, numbers, text, whole
 from vkc_pin.arrays import Floats
-from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.errors import InputError
 from vkc_pin.motion import ros, tables
 from vkc_pin.scene.hold import Hold, holds_of, in_order
 
@@ -37,6 +39,9 @@ class PhaseSpan:
     holds: tuple[Hold, ...] = ()
 
     def __post_init__(self) -> None:
+        text(self.name, "PhaseSpan.name")
+        for name in ("first", "last"):
+            object.__setattr__(self, name, whole(getattr(self, name), f"PhaseSpan.{name}", low=0))
         object.__setattr__(self, "holds", in_order(self.holds))
 
     @property
@@ -73,17 +78,19 @@ class Trajectory:
     robot_size: int
 
     def __post_init__(self) -> None:
-        names, phases = tuple(self.names), tuple(self.phases)
+        listed: tuple[Any, ...] = items(self.names, "Trajectory.names", "a list of names")
+        names = tuple(text(name, f"Trajectory.names[{k}]", "a name") for k, name in enumerate(listed))
+        phases = items(self.phases, "Trajectory.phases", "a list of PhaseSpan", PhaseSpan)
         times, positions = _numbers(self.times, "times"), _numbers(self.positions, "positions")
-        if (twice := next((name for name in names if names.count(name) > 1), None)) is not None:
+        counts = Counter(names)
+        if (twice := next((name for name in names if counts[name] > 1), None)) is not None:
             raise InputError("a name occurs twice", field="Trajectory.names", got=twice)
         if times.ndim != 1 or len(times) < 2 or not np.all(np.diff(times) > 0):
             raise InputError("times do not increase", field="Trajectory.times", expected="at least 2 increasing numbers")
         shape = (len(times), len(names))
         if positions.shape != shape:
             raise InputError("wrong shape", field="Trajectory.positions", expected=shape, got=positions.shape)
-        if not 3 <= self.robot_size <= len(names):
-            raise InputError("out of range", field="Trajectory.robot_size", expected=f"3 to {len(names)}", got=self.robot_size)
+        size = whole(self.robot_size, "Trajectory.robot_size", low=3, high=len(names))
         edges = [0, *(phase.last for phase in phases)]
         if edges[-1] != len(times) - 1 or any(
             phase.first != before or phase.last <= before for phase, before in zip(phases, edges, strict=False)
@@ -93,12 +100,22 @@ class Trajectory:
             raise InputError(problem, field="Trajectory.phases", expected=f"0 to {len(times) - 1}", got=got)
         for array in (times, positions):
             array.setflags(write=False)
-        for key, value in (("names", names), ("times", times), ("positions", positions), ("phases", phases)):
+        for key, value in (
+            ("names", names),
+            ("times", times),
+            ("positions", positions),
+            ("phases", phases),
+            ("robot_size", size),
+        ):
             object.__setattr__(self, key, value)
 
     def at(self, time: ArrayLike) -> Floats:
-        """Return the positions, shape (..., n), at `time` [s], shape (...,); outside the motion, its first or last."""
-        time = np.asarray(time, float)
+        """Return the positions, shape (..., n), at `time` [s], shape (...,); outside the motion, its first or last.
+
+        Raises:
+            InputError: `time` is none.
+        """
+        time = numbers(time, "time")
         columns = [np.interp(time, self.times, column) for column in self.positions.T]
         return np.stack(columns, axis=-1)
 
@@ -108,9 +125,7 @@ class Trajectory:
         Raises:
             UnknownNameError: There is no such coordinate.
         """
-        if name not in self.names:
-            raise UnknownNameError("coordinate", name, self.names)
-        return np.array(self.positions[:, self.names.index(name)])
+        return np.array(self.positions[:, self.names.index(known(name, self.names, "coordinate"))])
 
     def velocities(self) -> Floats:
         """Return the velocity of every segment, shape (T − 1, n), [m/s] and [rad/s]."""
@@ -164,13 +179,16 @@ class Trajectory:
         Raises:
             InputError: Something is missing from it or does not fit.
         """
-        try:
-            phases = tuple(
-                PhaseSpan(p["name"], int(p["first"]), int(p["last"]), holds_of(p["held"], p.get("by"))) for p in data["phases"]
-            )
-            return cls(tuple(data["names"]), data["times"], data["positions"], phases, int(data["robot_size"]))
-        except KeyError as error:
-            raise InputError("this is missing from a trajectory", field=str(error.args[0])) from None
+        phases = []
+        if not isinstance(data, Mapping):
+            raise InputError("not a trajectory", expected="an object", got=type(data).__name__)
+        listed: tuple[Any, ...] = items(_part(data, "phases"), "phases", "a list of phases")
+        for number, item in enumerate(listed):
+            phase = mapping(item, f"phases[{number}]")
+            held = holds_of(_part(phase, "held"), phase.get("by"))
+            phases.append(PhaseSpan(_part(phase, "name"), _part(phase, "first"), _part(phase, "last"), held))
+        names, times, positions, size = (_part(data, key) for key in ("names", "times", "positions", "robot_size"))
+        return cls(names, times, positions, tuple(phases), size)
 
     def to_csv(self, path: str | Path, **options: Any) -> Path:
         """Write a table with a line a waypoint: times [s], positions [m] and [rad], phases; see `tables.write_csv`."""
@@ -214,30 +232,30 @@ class Trajectory:
         Raises:
             InputError: Something is missing or does not fit; the error names the field.
         """
-        data = ros.from_ros(message, like=None if like is None else like.to_dict(), robot_size=robot_size)
+        motion = None if like is None else instance(like, Trajectory, "like").to_dict()
+        data = ros.from_ros(message, like=motion, robot_size=robot_size)
         return cls._read(data, None if isinstance(message, Mapping) else message)
 
     @classmethod
     def _read(cls, data: Any, file: str | Path | None, inside: str = "") -> Trajectory:
         """Return the trajectory that a file holds, in its field `inside`; what is wrong with it is the file's fault."""
         try:
-            if not isinstance(data, Mapping):
-                raise InputError("not a trajectory", expected="an object", got=type(data).__name__)
             return cls.from_dict(data)
         except InputError as error:
             field = ".".join(part for part in (inside, error.field) if part) or None
             raise InputError(error.problem, file=file, field=field, expected=error.expected, got=error.got) from error
-        except (TypeError, ValueError, AttributeError, LookupError) as error:
-            expected, got = "what Trajectory.to_dict returns", str(error)
-            raise InputError("not a trajectory", file=file, field=inside or None, expected=expected, got=got) from error
+
+
+def _part(data: Mapping[str, Any], name: str) -> Any:
+    """Return an entry of data. Raises `InputError` if it is not there."""
+    if name not in data:
+        raise InputError("this is missing from a trajectory", field=name)
+    return data[name]
 
 
 def _numbers(values: Any, name: str) -> Floats:
     """Return a copy of an array of finite numbers."""
-    try:
-        array = np.array(values, float)
-    except (TypeError, ValueError):
-        raise InputError("not numbers", field=f"Trajectory.{name}", expected="an array of numbers", got=repr(values)) from None
+    array = numbers(values, f"Trajectory.{name}")
     if not np.isfinite(array).all():
         where = np.argwhere(~np.isfinite(array))[0].tolist()
         raise InputError("not finite", field=f"Trajectory.{name}{where}", expected="finite numbers", got=array[tuple(where)])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from vkc_pin.errors import InputError
+from vkc_pin.arguments import whole
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import Planner, guarded
@@ -14,7 +14,7 @@ from vkc_pin.scene.scene import Scene
 from vkc_pin.solver.solution import Iteration
 from vkc_pin.task.actions import foresee
 from vkc_pin.task.phases import stretches
-from vkc_pin.task.steps import Step
+from vkc_pin.task.steps import Step, as_list
 from vkc_pin.task.terms import Term, check_active
 
 __all__ = ["plan_chore"]
@@ -73,12 +73,11 @@ def plan_chore(
         seed=seed,
         terms=terms,
     )
-    if not isinstance(window, int) or isinstance(window, bool) or window < 1:
-        raise InputError("out of range", field="window", expected="a whole number of at least 1", got=repr(window))
+    window, asked = whole(window, "window", low=1), as_list(steps)
 
     def run(settings: Settings) -> Plan:
-        tasks = foresee(scene, steps, settings.options)
+        tasks = foresee(scene, asked, settings.options)
         check_active(settings.terms, [stretch for task in tasks for stretch in stretches(task)])
-        return SlidingWindow(scene, tuple(steps), window, settings).run()
+        return SlidingWindow(scene, asked, window, settings).run()
 
     return guarded(run, settings, progress, planner)

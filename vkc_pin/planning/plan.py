@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vkc_pin.arguments import file_path
 from vkc_pin.errors import InputError
 from vkc_pin.files.resources import folder
 from vkc_pin.files.writing import write_atomically
@@ -168,7 +169,7 @@ class Plan:
         about = {
             "format": FORMAT,
             "scene": self.scene.document,
-            "folder": _folder_to_data(self.scene.folder, Path(path)),
+            "folder": _folder_to_data(self.scene.folder, file_path(path, "path")),
             "steps": [step_to_dict(step) for step in self.steps],
             "options": asdict(self.options),
             "trajectory": {k: v for k, v in self.trajectory.to_dict().items() if k not in ("times", "positions")},
@@ -193,7 +194,7 @@ class Plan:
         Raises:
             InputError: The file is missing, damaged, no plan, or of a newer format, or what its scene names is not there.
         """
-        path = Path(path)
+        path = file_path(path, "path", "a saved plan (.npz)")
         if not path.is_file():
             raise InputError("no such file", file=path, expected="a saved plan (.npz)")
         try:

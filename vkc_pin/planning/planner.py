@@ -7,8 +7,8 @@ import dataclasses
 import threading
 from collections.abc import Callable, Iterator, Sequence
 
+from vkc_pin.arguments import flag, instance, number, whole
 from vkc_pin.cache import Cache, CacheInfo
-from vkc_pin.errors import InputError
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.progress import shown
@@ -37,11 +37,8 @@ class Planner:
     """
 
     def __init__(self, *, entries: int = 512, megabytes: float = 128.0) -> None:
-        if isinstance(entries, bool) or not isinstance(entries, int) or entries < 1:
-            raise InputError("out of range", field="entries", expected="a whole number of at least 1", got=repr(entries))
-        if isinstance(megabytes, bool) or not isinstance(megabytes, int | float) or not megabytes > 0.0:
-            raise InputError("out of range", field="megabytes", expected="more than 0", got=repr(megabytes))
-        self.entries, self.megabytes = entries, float(megabytes)
+        self.entries = whole(entries, "entries", low=1)
+        self.megabytes = number(megabytes, "megabytes", "more than 0", low=0.0, above=True)
         self._idle: list[Cache] = []
         self._lock = threading.Lock()
 
@@ -86,7 +83,7 @@ _shared = Planner()
 
 def borrowed(planner: Planner | None) -> contextlib.AbstractContextManager[Cache]:
     """Return what lends a cache of a planner, or of the process's own if there is none; see `Planner.lent`."""
-    return (_shared if planner is None else planner).lent()
+    return (_shared if planner is None else instance(planner, Planner, "planner")).lent()
 
 
 def plan(
@@ -145,6 +142,8 @@ def plan(
         perturbation=perturbation,
         terms=terms,
     )
+
+    joint = flag(joint, "joint")
 
     def run(settings: Settings) -> Plan:
         task = compile_task(scene, steps, settings.options)

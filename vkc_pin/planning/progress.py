@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, TextIO
 
 from vkc_pin.errors import InputError
+from vkc_pin.errors import shown as told
 from vkc_pin.notebook import in_notebook
 
 if TYPE_CHECKING:
@@ -86,7 +87,7 @@ def shown(progress: object) -> Iterator[Progress]:
         InputError: `progress` is neither True nor False.
     """
     if not isinstance(progress, bool):
-        raise InputError("wrong kind of argument", field="progress", expected="True or False", got=repr(progress))
+        raise InputError("wrong kind of argument", field="progress", expected="True or False", got=told(progress))
     line = Progress(_screen() if progress else None)
     try:
         yield line

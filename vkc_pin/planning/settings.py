@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TypeGuard
 
-import numpy as np
-
+from vkc_pin.arguments import instance, known, number, whole
 from vkc_pin.budget import Budget
 from vkc_pin.cache import Cache
-from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.errors import InputError, shown
 from vkc_pin.options import Options
 from vkc_pin.planning.progress import Progress
 from vkc_pin.scene.scene import Scene
@@ -19,6 +17,8 @@ from vkc_pin.solver.solution import Iteration
 from vkc_pin.task.terms import Term, traced
 
 __all__ = ["Settings", "budget_for", "check_arguments", "settings_for"]
+
+LARGEST_NOISE = 3.0  # [m] and [rad]: seeds with more are further apart than rooms are wide
 
 
 @dataclass(frozen=True)
@@ -62,11 +62,12 @@ def settings_for(
     options = Options() if options is None else options
     budget = budget_for(time_limit, effort)
     check_arguments(scene, options, seed)
-    if initialization not in INITIALIZATIONS:
-        raise UnknownNameError("initialization", str(initialization), INITIALIZATIONS, field="initialization")
-    if not (_is_number(perturbation) and 0 <= perturbation < np.inf):
-        raise InputError("out of range", field="perturbation", expected="a number of at least 0", got=repr(perturbation))
-    return Settings(initialization, options, callback, int(seed), float(perturbation), traced(scene, terms), budget=budget)
+    known(initialization, INITIALIZATIONS, "initialization", "initialization")
+    if (noise := number(perturbation, "perturbation", "a number of at least 0", low=0.0)) > LARGEST_NOISE:
+        raise InputError("out of range", field="perturbation", expected=f"at most {LARGEST_NOISE:g}", got=noise)
+    if callback is not None and not callable(callback):
+        raise InputError("cannot be called", field="callback", expected="a function of an Iteration", got=shown(callback))
+    return Settings(initialization, options, callback, int(seed), noise, traced(scene, terms), budget=budget)
 
 
 def budget_for(time_limit: object, effort: object) -> Budget:
@@ -75,21 +76,13 @@ def budget_for(time_limit: object, effort: object) -> Budget:
     Raises:
         InputError: One of these is wrong.
     """
-    if time_limit is not None and not (_is_number(time_limit) and 0 < time_limit < np.inf):
-        raise InputError("out of range", field="time_limit", expected="seconds, more than 0", got=repr(time_limit))
-    if effort is not None and not (isinstance(effort, int | np.integer) and not isinstance(effort, bool) and effort > 0):
-        raise InputError("out of range", field="effort", expected="a whole number of at least 1", got=repr(effort))
-    return Budget(None if time_limit is None else float(time_limit), None if effort is None else int(effort))
+    if time_limit is not None:
+        time_limit = number(time_limit, "time_limit", "seconds, more than 0", low=0.0, above=True)
+    return Budget(time_limit, None if effort is None else whole(effort, "effort", low=1))
 
 
 def check_arguments(scene: object, options: object, seed: object) -> None:
     """Raise an InputError that says what is wrong if one of these is not what planning needs; see `plan`."""
     for name, value, kind in (("scene", scene, Scene), ("options", options, Options)):
-        if not isinstance(value, kind):
-            raise InputError("wrong kind of argument", field=name, expected=f"a {kind.__name__}", got=repr(value))
-    if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:
-        raise InputError("out of range", field="seed", expected="a whole number of at least 0", got=repr(seed))
-
-
-def _is_number(value: object) -> TypeGuard[float]:
-    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+        instance(value, kind, name)
+    whole(seed, "seed", low=0)

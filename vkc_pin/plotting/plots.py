@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vkc_pin.arguments import file_path
 from vkc_pin.errors import InputError
 from vkc_pin.motion.world import World
 from vkc_pin.plotting.style import COLOURS, new_figure, save_figure, shade_phases, styled
@@ -42,9 +43,8 @@ def plot(plan: Judged, path: str | Path | None = None) -> Figure | dict[str, Fig
     Raises:
         InputError: Not a plan, or the folder's name is that of a file.
     """
-    if not isinstance(plan, Judged):
-        raise InputError("this cannot be plotted", field="plan", expected="a Plan", got=type(plan).__name__)
-    target = None if path is None else Path(path)
+    _check(plan)
+    target = None if path is None else file_path(path, "path")
     if target is None or target.suffix.lower() in _SUFFIXES:
         return save_figure(_combined(plan), target)
     if target.is_file():
@@ -58,6 +58,7 @@ def plot(plan: Judged, path: str | Path | None = None) -> Figure | dict[str, Fig
 
 def plot_joints(plan: Judged) -> Figure:
     """Return a figure of positions and velocities over time, a row each for base, arm and objects, with velocity limits."""
+    _check(plan)
     with styled():
         figure = new_figure(12.0, 2.5 * len(_groups(plan)) + 0.4)
         _draw_joints(figure, plan)
@@ -66,6 +67,7 @@ def plot_joints(plan: Judged) -> Figure:
 
 def plot_clearance(plan: Judged) -> Figure:
     """Return a figure of the smallest distances over time; the legend names the closest pairs."""
+    _check(plan)
     with styled():
         figure = new_figure(9.0, 4.2)
         _draw_clearance(figure, plan)
@@ -74,11 +76,17 @@ def plot_clearance(plan: Judged) -> Figure:
 
 def plot_top_view(plan: Judged) -> Figure:
     """Return a figure of the motion from above: obstacles, objects, the base at several times, paths of base and tool."""
+    _check(plan)
     x_min, x_max, y_min, y_max = plan.scene.arena
     with styled():
         figure = new_figure(9.0, float(np.clip(9.0 * (y_max - y_min) / (x_max - x_min) + 0.7, 4.0, 10.0)))
         draw_top_view(figure, World(plan.scene), plan.trajectory)
     return figure
+
+
+def _check(plan: Judged) -> None:
+    if not isinstance(plan, Judged):
+        raise InputError("this cannot be plotted", field="plan", expected="a Plan", got=type(plan).__name__)
 
 
 def _combined(plan: Judged) -> Figure:

@@ -9,6 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from vkc_pin.arguments import instance
 from vkc_pin.arrays import Floats, Ints
 from vkc_pin.cache import Cache
 from vkc_pin.chain.contacts import ContactModel
@@ -150,7 +151,9 @@ def build(
     Raises:
         InputError: The steps or terms name something that is not there, or ask for what cannot be done.
     """
-    options = options or Options()
+    options = Options() if options is None else instance(options, Options, "options")
+    cache = None if cache is None else instance(cache, Cache, "cache")
+    instance(scene, Scene, "scene")
     task, terms = compile_task(scene, steps, options), traced(scene, terms)
     check_active(terms, stretches(task))
     return TrajectoryProblem(scene, task, options, terms, cache=cache)

@@ -9,7 +9,8 @@ from types import MappingProxyType
 
 import pinocchio as pin
 
-from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.arguments import instance, items, mapping, numbers, text
+from vkc_pin.errors import InputError, UnknownNameError, shown
 from vkc_pin.models.shapes import within_limits
 from vkc_pin.scene.placed import PlacedObject
 
@@ -36,6 +37,14 @@ class Hold:
     link: str | None = None
     at: tuple[float, ...] = field(default=(), compare=False)
 
+    def __post_init__(self) -> None:
+        for name in ("object", "attachment", "link"):
+            if name != "link" or self.link is not None:
+                text(getattr(self, name), f"Hold.{name}", "a name")
+        if self.by is not None:
+            instance(self.by, Hold, "Hold.by")
+        object.__setattr__(self, "at", tuple(numbers(self.at, "Hold.at", "a list of numbers").ravel().tolist()))
+
     @property
     def frame(self) -> str | None:
         """The frame that holds it, "<object>.<link>"; None is the tool frame."""
@@ -59,7 +68,8 @@ def holds_of(
         UnknownNameError: `by` or `at` name an object that is not held.
         InputError: Objects hold each other in a circle, or `by` is not of that form.
     """
-    by, at = {} if by is None else by, {} if at is None else at
+    held = mapping(held, "held", "object names, each with that of an attachment")
+    by, at = mapping({} if by is None else by, "by"), mapping({} if at is None else at, "at")
     for field_name, names in (("by", by), ("at", at)):
         for name in names:
             if name not in held:
@@ -72,14 +82,14 @@ def holds_of(
         if name not in found:
             holder, link = None, None
             if name in by:
-                owner, _, link = str(by[name]).partition(".")
+                expected = "<object>.<link>, e.g. stick.tip"
+                owner, _, link = by[name].partition(".") if isinstance(by[name], str) else ("", "", "")
                 if not link:
-                    expected, got = "<object>.<link>, e.g. stick.tip", repr(by[name])
-                    raise InputError("not a link of an object", field="by", expected=expected, got=got)
+                    raise InputError("not a link of an object", field="by", expected=expected, got=shown(by[name]))
                 if owner not in held:
                     raise UnknownNameError("held object", owner, held, field="by")
                 holder = find(owner, (*above, name))
-            found[name] = Hold(name, held[name], holder, link, tuple(float(value) for value in at.get(name, ())))
+            found[name] = Hold(name, held[name], holder, link, at.get(name, ()))
         return found[name]
 
     for name in held:
@@ -89,7 +99,7 @@ def holds_of(
 
 def in_order(holds: Iterable[Hold]) -> tuple[Hold, ...]:
     """Return holds as they are, if each comes after the one it depends on. Raises `InputError` if one does not."""
-    holds = tuple(holds)
+    holds = items(holds, "holds", "a list of Hold", Hold)
     for number, hold in enumerate(holds):
         if hold.by not in (None, *holds[:number]):
             raise InputError("held through what is not held before it", field="holds", got=str(hold))

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import pinocchio as pin
 
+from vkc_pin.arguments import mapping, number
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import UnknownNameError
 from vkc_pin.models.articulation import ArticulatedObject
@@ -44,10 +45,10 @@ class PlacedObject:
             InputError: A value is not finite or outside the joint's limits.
         """
         state, coordinates = self.state.copy(), self.object.coordinates
-        for joint, value in values.items():
+        for joint, given in mapping(values, "values", "joints, each with its value").items():
             if joint not in coordinates.names:
                 raise UnknownNameError(f"joint of {self.name}", joint, coordinates.names, field=f"{self.name}.{joint}")
-            index = coordinates.index(joint)
+            index, value = coordinates.index(joint), number(given, f"{self.name}.{joint}")
             state[index] = within_limits(value, self.object.lower[index], self.object.upper[index], f"{self.name}.{joint}")
         return dataclasses.replace(self, state=state)
 

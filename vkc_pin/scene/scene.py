@@ -14,14 +14,16 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
+from vkc_pin.arguments import file_path, instance, is_number, known, mapping, numbers
 from vkc_pin.arrays import Floats
-from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.files.resources import find
+from vkc_pin.errors import InputError, shown
+from vkc_pin.files.resources import located
 from vkc_pin.models.shapes import clearance, placed_shapes, within_limits
 from vkc_pin.notebook import show
 from vkc_pin.scene.hold import Hold, checked_holds, holds_of, in_hand
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.placed import PlacedObject, standing_geometry
+from vkc_pin.scene.poses import as_placement
 
 if TYPE_CHECKING:
     from vkc_pin.models.robot import Robot
@@ -108,7 +110,7 @@ class Scene:
         from vkc_pin.files.documents import Document
         from vkc_pin.scene.scene_file import scene_fields
 
-        fields = scene_fields(Document(dict(document)), Path(folder))
+        fields = scene_fields(Document(mapping(document, "document")), file_path(folder, "folder"))
         return Scene(**fields)._with()
 
     def with_start(self, base: ArrayLike | None = None, arm: ArrayLike | None = None) -> Scene:
@@ -125,7 +127,7 @@ class Scene:
         for part_name, values, part in (("base", base, slice(0, 3)), ("arm", arm, slice(3, None))):
             if values is None:
                 continue
-            given = np.asarray(values, float)
+            given = numbers(values, part_name)
             if given.shape != start[part].shape:
                 raise InputError("wrong number of values", field=part_name, expected=start[part].shape, got=given.shape)
             lower, upper = (limits[part] for limits in self.robot.start_limits)
@@ -149,12 +151,13 @@ class Scene:
         return self._with(objects=MappingProxyType({**self.objects, name: placed}))
 
     def with_placement(self, name: str, placement: pin.SE3) -> Scene:
-        """Return the scene with object `name` at `placement` (of its base link, in the world frame).
+        """Return the scene with object `name` at `placement` (of its base link, in the world frame); see `as_placement`.
 
         Raises:
             UnknownNameError: There is no such object.
+            InputError: `placement` is no pose.
         """
-        placed = dataclasses.replace(self._placed(name), placement=pin.SE3(placement))
+        placed = dataclasses.replace(self._placed(name), placement=as_placement(placement, name="placement"))
         return self._with(objects=MappingProxyType({**self.objects, name: placed}))
 
     def with_held(
@@ -179,9 +182,7 @@ class Scene:
         return self._with(holds=checked_holds(self.objects, holds))
 
     def _placed(self, name: str) -> PlacedObject:
-        if name not in self.objects:
-            raise UnknownNameError("object", name, self.objects)
-        return self.objects[name]
+        return self.objects[known(name, self.objects, "object")]
 
     def _with(self, **fields: Any) -> Scene:
         """Return the scene with other attributes, and every free object that is held where the robot then holds it."""
@@ -203,6 +204,9 @@ class Scene:
         Args:
             reach: Distances above this do not matter [m]: the result is then some number ≥ `reach`.
         """
+        if not is_number(reach) or reach != reach:
+            raise InputError("not a number", field="reach", expected="a distance [m]", got=shown(reach))
+        reach = float(min(reach, 1e300))
         model, geometry = self.robot.model, self.robot.collision
         data, shapes = model.createData(), geometry.createData()
         pin.updateGeometryPlacements(model, data, geometry, shapes, self.robot.coordinates.q(self.start))
@@ -230,6 +234,7 @@ class Scene:
             InputError: The scene has no start region, the robot holds something that stands fixed in the world, or no
                 free place was found.
         """
+        instance(rng, np.random.Generator, "rng")
         region, file = self.start_region, self.file
         if region is None:
             raise InputError("the scene has no start region", file=file, field="start_region", expected="x and y intervals")
@@ -254,7 +259,5 @@ def load_scene(name_or_path: str | Path) -> Scene:
     from vkc_pin.files.documents import read_yaml
     from vkc_pin.scene.scene_file import scene_fields
 
-    text = str(name_or_path)
-    by_path = isinstance(name_or_path, Path) or text.endswith((".yaml", ".yml")) or "/" in text
-    file = Path(name_or_path) if by_path else find("scenes", "*.yaml", text, what="scene")
+    file = located(name_or_path, "scenes", "*.yaml", what="scene")
     return Scene(**scene_fields(read_yaml(file), file.parent))._with()

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.errors import InputError, UnknownNameError, shown
 from vkc_pin.options import Options
 from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.placed import PlacedObject
@@ -17,7 +17,7 @@ from vkc_pin.scene.scene import Scene
 from vkc_pin.task.lookup import attachment_of, check_link, joint_limits, path_joints, placed_object, robot_frame
 from vkc_pin.task.phases import FrameGoal, Mark, Phase, PhaseKind, Task
 from vkc_pin.task.rides import Riders
-from vkc_pin.task.steps import STEPS, Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch, as_list
+from vkc_pin.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch, as_list
 
 __all__ = ["compile_task", "nothing_to_do"]
 
@@ -102,7 +102,9 @@ class _Compiler:
                 kind = "the robot has one hand, and it holds"
                 raise InputError(f"{kind} {self.held[0]}", field=f"{where}.object", expected="Place or Release before", got=name)
         if not placed.object.free and through is not None:
-            raise InputError(f"'{name}' stands fixed in the world", field=f"{where}.by", expected="the hand itself", got=repr(by))
+            raise InputError(
+                f"'{name}' stands fixed in the world", field=f"{where}.by", expected="the hand itself", got=shown(by)
+            )
         if not placed.object.free:
             other = next((h for h in self.holds if h.object == name and h != hold), None)
             if other is not None:
@@ -130,13 +132,13 @@ class _Compiler:
         """Return the hold and link of `frame`, "<object>.<link>", that object `name` is to be held through."""
         owner, dot, link = str(frame).partition(".")
         if not dot:
-            raise InputError("not a link of an object", field=where, expected="<object>.<link>, e.g. stick.tip", got=repr(frame))
+            raise InputError("not a link of an object", field=where, expected="<object>.<link>, e.g. stick.tip", got=shown(frame))
         placed = placed_object(self.scene, owner, where)
         hold = self._hold_of(owner)
         if hold is None or not placed.object.free:
             held = ", ".join(str(h) for h in self.held if self.scene.objects[h.object].object.free) or "nothing"
             problem = f"'{name}' cannot be grasped through '{owner}', which the robot does not carry"
-            raise InputError(problem, field=where, expected=f"a link of what it carries ({held})", got=repr(frame))
+            raise InputError(problem, field=where, expected=f"a link of what it carries ({held})", got=shown(frame))
         check_link(placed, link, where)
         return hold, link
 
@@ -224,7 +226,7 @@ class _Compiler:
     def release(self, step: Release, where: str) -> None:
         """Let go of one thing, or of everything."""
         if not self.held:
-            raise InputError("the hand is empty", field=where, expected="something held", got=repr(step))
+            raise InputError("the hand is empty", field=where, expected="something held", got=shown(step))
         if step.object is not None and self._hold_of(step.object) is None:
             held = [hold.object for hold in self.held]
             raise UnknownNameError("held object", step.object, held, field=f"{where}.object")
@@ -259,9 +261,6 @@ class _Compiler:
         elif isinstance(step, GoTo):
             self._let_go_of_fixed()
             self._append("go", (), self.options.reach_waypoints, base=(step.x, step.y, step.yaw))
-        else:
-            expected = ", ".join(kind.__name__ for kind in STEPS)
-            raise InputError("not a step", field=where, expected=expected, got=repr(step))
 
 
 def compile_task(scene: Scene, steps: Sequence[Step], options: Options, *, nothing: bool = False, first: int = 0) -> Task:

@@ -10,8 +10,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from vkc_pin.arguments import known
 from vkc_pin.arrays import Floats
-from vkc_pin.errors import UnknownNameError
 
 __all__ = ["Formula", "State"]
 
@@ -63,8 +63,7 @@ class State:
 
     def _of(self, kind: str, name: str) -> tuple[Any, Any]:
         """Return symbols of a coordinate, or of a frame's rotation (by columns) and position: now and before."""
-        if name not in self._known[kind]:
-            raise UnknownNameError(kind, str(name), self._known[kind], field=self._field)
+        known(name, self._known[kind], kind, self._field)
         size = 12 if kind == "frame" else 1
         return self._symbols[kind].setdefault(name, (ca.SX.sym("now", size), ca.SX.sym("before", size)))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pinocchio as pin
 
+from vkc_pin.arguments import known
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.models.articulation import Attachment
 from vkc_pin.scene.placed import PlacedObject
@@ -23,9 +24,7 @@ def placed_object(scene: Scene, name: str, where: str) -> PlacedObject:
     Raises:
         UnknownNameError: There is none.
     """
-    if name not in scene.objects:
-        raise UnknownNameError("object", name, scene.objects, field=where)
-    return scene.objects[name]
+    return scene.objects[known(name, scene.objects, "object", where)]
 
 
 def attachment_of(placed: PlacedObject, name: str | None, where: str) -> Attachment:

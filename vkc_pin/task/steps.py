@@ -6,10 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from typing import Any
 
-import numpy as np
 import pinocchio as pin
 
-from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.arguments import items, known, mapping, quantity, text
+from vkc_pin.errors import InputError, UnknownNameError, shown
+from vkc_pin.scene.poses import as_placement, as_target
 
 __all__ = [
     "STEPS",
@@ -22,71 +23,17 @@ __all__ = [
     "Step",
     "Touch",
     "as_list",
-    "as_placement",
-    "as_target",
     "step_from_dict",
     "step_to_dict",
 ]
 
 
-def as_placement(pose: Any, *, name: str = "pose") -> pin.SE3:
-    """Return `pose` as a `pinocchio.SE3`.
-
-    Args:
-        pose: An SE3, a 4 × 4 homogeneous matrix, or (x, y, z, roll, pitch, yaw) in [m] and [rad].
-        name: The argument's name, for the message.
-
-    Raises:
-        InputError: It is none of these, not finite, or its rotation is no rotation.
-    """
-    expected = "a pinocchio.SE3, a 4 x 4 matrix or (x, y, z, roll, pitch, yaw)"
-    try:
-        array = np.asarray(pose.homogeneous if isinstance(pose, pin.SE3) else pose, float)
-    except (TypeError, ValueError):
-        raise InputError("not a pose", field=name, expected=expected, got=repr(pose)) from None
-    if array.shape not in ((6,), (4, 4)):
-        got = f"an array of shape {array.shape}" if array.ndim else repr(pose)
-        raise InputError("not a pose", field=name, expected=expected, got=got)
-    if not np.all(np.isfinite(array)):
-        raise InputError("not finite", field=name, expected=expected, got=array.tolist())
-    if array.shape == (6,):
-        return pin.SE3(pin.rpy.rpyToMatrix(*array[3:]), array[:3])
-    rotation = array[:3, :3]
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-6 or np.linalg.det(rotation) < 0:
-        raise InputError("its upper left 3 x 3 block is not a rotation", field=name, got=rotation.tolist())
-    if np.abs(array[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-6:
-        raise InputError("its last row is wrong", field=name, expected=[0, 0, 0, 1], got=array[3].tolist())
-    return pin.SE3(rotation, array[:3, 3])
-
-
-def as_target(target: Any, *, name: str) -> pin.SE3 | tuple[float, float, float]:
-    """Return `target` as a point [m] if it is three numbers, otherwise as a placement; see `as_placement`.
-
-    Raises:
-        InputError: It is neither.
-    """
-    try:
-        point = np.asarray(target, float) if not isinstance(target, pin.SE3) else None
-    except (TypeError, ValueError):
-        point = None
-    if point is not None and point.ndim == 1 and point.shape not in ((3,), (6,)):
-        expected = "a point (x, y, z), or a pose: a pinocchio.SE3, a 4 x 4 matrix or (x, y, z, roll, pitch, yaw)"
-        raise InputError("not a pose or a point", field=name, expected=expected, got=repr(target))
-    if point is None or point.shape != (3,):
-        return as_placement(target, name=name)
-    if not np.all(np.isfinite(point)):
-        raise InputError("not finite", field=name, expected="a point (x, y, z)", got=point.tolist())
-    return (float(point[0]), float(point[1]), float(point[2]))
-
-
-def _finite(value: Any, field: str) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        raise InputError("not a number", field=field, got=repr(value)) from None
-    if not np.isfinite(number):
-        raise InputError("not finite", field=field, got=value)
-    return number
+def _names(step: Any, **optional: bool) -> None:
+    """Check that fields of a step are text, or None where that is optional."""
+    for name, may_be_none in optional.items():
+        value = getattr(step, name)
+        if value is not None or not may_be_none:
+            object.__setattr__(step, name, text(value, f"{type(step).__name__}.{name}", "a name"))
 
 
 @dataclass(frozen=True)
@@ -103,6 +50,7 @@ class Reach:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "pose", as_placement(self.pose, name="Reach.pose"))
+        _names(self, frame=True)
 
 
 @dataclass(frozen=True)
@@ -120,6 +68,9 @@ class Grasp:
     attachment: str | None = None
     by: str | None = None
 
+    def __post_init__(self) -> None:
+        _names(self, object=False, attachment=True, by=True)
+
 
 @dataclass(frozen=True)
 class Actuate:
@@ -136,10 +87,12 @@ class Actuate:
     attachment: str | None = None
 
     def __post_init__(self) -> None:
+        _names(self, object=False, attachment=True)
+        expected = "a mapping such as {'hinge': 1.2}"
         if not isinstance(self.joints, Mapping) or not self.joints:
-            expected = "a mapping such as {'hinge': 1.2}"
-            raise InputError("nothing to actuate", field="Actuate.joints", expected=expected, got=repr(self.joints))
-        joints = {str(name): _finite(value, f"Actuate.joints[{name!r}]") for name, value in self.joints.items()}
+            raise InputError("nothing to actuate", field="Actuate.joints", expected=expected, got=shown(self.joints))
+        given = mapping(self.joints, "Actuate.joints", expected)
+        joints = {name: quantity(value, f"Actuate.joints[{name!r}]") for name, value in given.items()}
         object.__setattr__(self, "joints", joints)
 
 
@@ -156,8 +109,7 @@ class Touch:
     target: Any
 
     def __post_init__(self) -> None:
-        if not isinstance(self.frame, str):
-            raise InputError("not a frame", field="Touch.frame", expected="<object>.<link>, e.g. stick.tip", got=repr(self.frame))
+        text(self.frame, "Touch.frame", "<object>.<link>, e.g. stick.tip, or a frame of the robot")
         object.__setattr__(self, "target", as_target(self.target, name="Touch.target"))
 
 
@@ -177,6 +129,7 @@ class Place:
     attachment: str | None = None
 
     def __post_init__(self) -> None:
+        _names(self, object=False, attachment=True)
         object.__setattr__(self, "pose", as_target(self.pose, name="Place.pose"))
 
 
@@ -189,6 +142,9 @@ class Release:
     """
 
     object: str | None = None
+
+    def __post_init__(self) -> None:
+        _names(self, object=True)
 
 
 @dataclass(frozen=True)
@@ -207,7 +163,7 @@ class GoTo:
     def __post_init__(self) -> None:
         for name in ("x", "y", "yaw"):
             if name != "yaw" or self.yaw is not None:
-                object.__setattr__(self, name, _finite(getattr(self, name), f"GoTo.{name}"))
+                object.__setattr__(self, name, quantity(getattr(self, name), f"GoTo.{name}"))
 
 
 Step = Reach | Grasp | Actuate | GoTo | Touch | Place | Release
@@ -223,14 +179,15 @@ def as_list(steps: Sequence[Step]) -> tuple[Step, ...]:
         InputError: They are no list, or an empty one.
     """
     if isinstance(steps, STEPS):
-        raise InputError("one step alone", field="steps", expected="a list of steps", got=repr(steps))
-    try:
-        steps = tuple(steps)
-    except TypeError:
-        raise InputError("not steps", field="steps", expected="a list of steps", got=repr(steps)) from None
-    if not steps:
+        raise InputError("one step alone", field="steps", expected="a list of steps", got=shown(steps))
+    found: tuple[Step, ...] = items(steps, "steps", "a list of steps")
+    if not found:
         raise InputError("there is nothing to do", field="steps", expected="at least one step", got="an empty list")
-    return steps
+    for number, step in enumerate(found):
+        if not isinstance(step, STEPS):
+            expected = ", ".join(kind.__name__ for kind in STEPS)
+            raise InputError("not a step", field=f"steps[{number}]", expected=expected, got=shown(step))
+    return found
 
 
 def step_to_dict(step: Step) -> dict[str, Any]:
@@ -249,15 +206,13 @@ def step_from_dict(data: Mapping[str, Any]) -> Step:
         UnknownNameError: There is no such step, or it has no such field.
         InputError: A field is missing or wrong.
     """
-    given = dict(data)
-    kind = str(given.pop("step", ""))
-    if kind not in _KINDS:
-        raise UnknownNameError("step", kind, _KINDS, field="step")
-    known = {item.name: item for item in fields(_KINDS[kind])}
+    given = mapping(data, "step", "a step as data")
+    kind = known(given.pop("step", ""), _KINDS, "step", "step")
+    has = {item.name: item for item in fields(_KINDS[kind])}
     for name in given:
-        if name not in known:
-            raise UnknownNameError(f"field of {kind}", name, known, field=f"{kind}.{name}")
-    for name, item in known.items():
+        if name not in has:
+            raise UnknownNameError(f"field of {kind}", name, has, field=f"{kind}.{name}")
+    for name, item in has.items():
         if name not in given and item.default is MISSING and item.default_factory is MISSING:
             raise InputError("this is missing", field=f"{kind}.{name}")
     step: Step = _KINDS[kind](**given)

@@ -14,8 +14,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from vkc_pin.arguments import items, mapping, number, numbers
 from vkc_pin.arrays import Floats
-from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.errors import InputError, UnknownNameError, shown
 from vkc_pin.task.formula import Formula, State
 
 if TYPE_CHECKING:
@@ -37,17 +38,17 @@ class _Term:
 
     def _check(self) -> None:
         if not isinstance(self.name, str) or not self.name:
-            raise InputError("not a name", field=f"{type(self).__name__}.name", expected="text", got=repr(self.name))
+            raise InputError("not a name", field=f"{type(self).__name__}.name", expected="text", got=shown(self.name))
         if not callable(self.expression) and not isinstance(self.expression, Formula):
             expected = "a function of a State, e.g. lambda s: s.coordinate('elbow_joint')"
-            raise self.error("not a function", "expression", expected, repr(self.expression))
+            raise self.error("not a function", "expression", expected, shown(self.expression))
         if self.during is not None:
             names = (self.during,) if isinstance(self.during, str) else self.during
-            if not isinstance(names, Sequence) or not names or not all(isinstance(name, str) for name in names):
-                raise self.error("not phases", "during", "names of phases, e.g. ['place cup']", repr(self.during))
+            if not isinstance(names, list | tuple) or not names or not all(isinstance(name, str) for name in names):
+                raise self.error("not phases", "during", "names of phases, e.g. ['place cup']", shown(self.during))
             object.__setattr__(self, "during", tuple(names))
         if self.holding is not None and not isinstance(self.holding, str):
-            raise self.error("not an object", "holding", "an object's name", repr(self.holding))
+            raise self.error("not an object", "holding", "an object's name", shown(self.holding))
 
     def error(self, problem: str, field: str, expected: object = None, got: object = None) -> InputError:
         """Return (not raise) the error that says that one of its fields is wrong."""
@@ -55,10 +56,8 @@ class _Term:
 
     def positive(self, field: str) -> None:
         """Check that a field is a positive number."""
-        value = getattr(self, field)
-        if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not 0 < value < np.inf:
-            raise self.error("out of range", field, "a positive finite number", repr(value))
-        object.__setattr__(self, field, float(value))
+        where, expected = f"terms[{self.name!r}].{field}", "a positive finite number"
+        object.__setattr__(self, field, number(getattr(self, field), where, expected, low=0.0, above=True))
 
     def active(self, phase: str, held: Iterable[str]) -> bool:
         """Return whether it holds in a phase of this name, in which these objects are held."""
@@ -102,14 +101,11 @@ class Constraint(_Term):
         self.box(self.expression.rows if isinstance(self.expression, Formula) else None)
 
     def _bound(self, field: str, value: Any) -> float | tuple[float, ...]:
-        try:
-            numbers = np.array(value, float)
-        except (TypeError, ValueError):
-            raise self.error("not a number", field, "a number or a list of them", repr(value)) from None
-        wrong = np.isnan(numbers) | (numbers == (np.inf if field == "lower" else -np.inf))
-        if numbers.ndim > 1 or not numbers.size or wrong.any():
-            raise self.error("no such bound", field, "a number or a list of them", repr(value))
-        return float(numbers) if numbers.ndim == 0 else tuple(numbers.tolist())
+        given = numbers(value, f"terms[{self.name!r}].{field}", "a number or a list of them", problem="not a number")
+        wrong = np.isnan(given) | (given == (np.inf if field == "lower" else -np.inf))
+        if given.ndim > 1 or not given.size or wrong.any():
+            raise self.error("no such bound", field, "a number or a list of them", shown(value))
+        return float(given) if given.ndim == 0 else tuple(given.tolist())
 
     def box(self, rows: int | None) -> tuple[Floats, Floats]:
         """Return both bounds, shape (rows,); None: as many as there are bounds.
@@ -125,11 +121,11 @@ class Constraint(_Term):
                 lower, upper = (np.broadcast_to(bound, (rows,)) for bound in given)
         except ValueError:
             expected = "as many lower as upper ones" if rows is None else f"one number, or {rows}, like the expression"
-            raise self.error("wrong number of bounds", "lower, upper", expected, repr((self.lower, self.upper))) from None
+            raise self.error("wrong number of bounds", "lower, upper", expected, shown((self.lower, self.upper))) from None
         if not (np.isfinite(lower) | np.isfinite(upper)).all():
-            raise self.error("no bound", "lower, upper", "at least one of them, finite", repr((self.lower, self.upper)))
+            raise self.error("no bound", "lower, upper", "at least one of them, finite", shown((self.lower, self.upper)))
         if (lower > upper).any():
-            raise self.error("lower is more than upper", "lower, upper", "lower <= upper", repr((self.lower, self.upper)))
+            raise self.error("lower is more than upper", "lower, upper", "lower <= upper", shown((self.lower, self.upper)))
         return lower, upper
 
 
@@ -162,8 +158,7 @@ def traced(scene: Scene, terms: Sequence[Term]) -> tuple[Term, ...]:
         UnknownNameError: One asks for a frame, coordinate or object that does not exist.
         InputError: They are no terms, two share a name, or an expression is none.
     """
-    if isinstance(terms, Constraint | Cost) or not isinstance(terms, Sequence):
-        raise InputError("not terms", field="terms", expected="a list of Constraint and Cost", got=repr(terms))
+    terms = items(terms, "terms", "a list of Constraint and Cost", (Constraint, Cost))
     if not terms:
         return ()
     robot = [str(frame.name) for frame in scene.robot.model.frames if frame.name != "universe"]
@@ -171,11 +166,9 @@ def traced(scene: Scene, terms: Sequence[Term]) -> tuple[Term, ...]:
     frames = [*robot, *(f"{name}.{link}" for name, thing in things for link in thing.links)]
     joints = [f"{name}.{joint}" for name, thing in things for joint in thing.coordinates.names]
     found: list[Term] = []
-    for number, term in enumerate(terms):
-        if not isinstance(term, Constraint | Cost):
-            raise InputError("not a term", field=f"terms[{number}]", expected="a Constraint or a Cost", got=repr(term))
+    for term in terms:
         if term.name in (other.name for other in found):
-            raise InputError("two terms share a name", field="terms", expected="different names", got=repr(term.name))
+            raise InputError("two terms share a name", field="terms", expected="different names", got=shown(term.name))
         if term.holding is not None and term.holding not in scene.objects:
             raise UnknownNameError("object", term.holding, scene.objects, field=f"terms[{term.name!r}].holding")
         coordinates = [*scene.robot.coordinates.names, *joints]
@@ -194,9 +187,9 @@ def _traced(term: Term, state: State) -> Term:
     except Exception as error:
         raise term.error("it cannot be evaluated", "expression", "CasADi operations only", str(error)) from error
     if isinstance(value, int | float | np.ndarray | np.number | ca.DM):
-        raise term.error("it does not depend on the state", "expression", "an expression of what a State returns", repr(value))
+        raise term.error("it does not depend on the state", "expression", "an expression of what a State returns", shown(value))
     if not isinstance(value, ca.SX):
-        raise term.error("no CasADi expression", "expression", "a number or a column, e.g. of ca.vertcat", repr(value))
+        raise term.error("no CasADi expression", "expression", "a number or a column, e.g. of ca.vertcat", shown(value))
     if not value.is_vector() or value.is_empty() or (isinstance(term, Cost) and not value.is_scalar()):
         expected = "a number" if isinstance(term, Cost) else "a number or a column"
         raise term.error("wrong shape", "expression", expected, f"shape {value.shape}")
@@ -229,7 +222,7 @@ def check_active(terms: Iterable[Term], phases: Sequence[tuple[str, Iterable[str
                 raise UnknownNameError("phase", name, names, field=f"terms[{term.name!r}].during")
         if not any(term.active(name, held) for name, held in phases):
             held = ", ".join(f"{name!r} holds {', '.join(held) or 'nothing'}" for name, held in phases)
-            raise term.error("never held in these phases", "holding", held, repr(term.holding))
+            raise term.error("never held in these phases", "holding", held, shown(term.holding))
 
 
 def term_to_dict(term: Term) -> dict[str, Any]:
@@ -243,7 +236,7 @@ def term_from_dict(data: Mapping[str, Any]) -> Term:
     Raises:
         InputError: Something does not fit.
     """
-    fields = dict(data)
+    fields = mapping(data, "terms", "a term as data")
     kinds: dict[str, type[Constraint] | type[Cost]] = {"Constraint": Constraint, "Cost": Cost}
     try:
         given = fields.pop("expression")

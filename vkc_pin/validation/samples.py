@@ -19,6 +19,7 @@ from vkc_pin.scene.scene import Scene
 __all__ = ["ANGLE_STEP", "LENGTH_STEP", "Samples"]
 
 LENGTH_STEP, ANGLE_STEP = 5e-3, 1e-2  # [m], [rad] between two configurations that are looked at
+MOST_SAMPLES = 500_000  # 2.5 km
 
 
 class Samples:
@@ -34,7 +35,7 @@ class Samples:
 
     Raises:
         UnknownNameError: The trajectory names a coordinate, object or attachment that the scene does not have.
-        InputError: It lacks coordinates of the robot, or of a grasp that leaves the hand a freedom.
+        InputError: It lacks coordinates of the robot, or of a grasp that leaves the hand a freedom, or is longer than 2.5 km.
     """
 
     def __init__(self, scene: Scene, trajectory: Trajectory) -> None:
@@ -89,7 +90,11 @@ class Samples:
         steps = np.abs(np.diff(self.trajectory.positions, axis=0))
         units = np.array([LENGTH_STEP if self.unit(name) == "m" else ANGLE_STEP for name in self.trajectory.names])
         planar = np.linalg.norm(steps[:, :2], axis=1) / LENGTH_STEP
-        counts = np.maximum(1, np.ceil(np.maximum(planar, (steps / units).max(axis=1)) - 1e-9)).astype(int)
+        counts = np.maximum(1, np.ceil(np.maximum(planar, (steps / units).max(axis=1)) - 1e-9))
+        if not counts.sum() <= MOST_SAMPLES:
+            problem, expected = "the motion is too long to be checked", f"at most {MOST_SAMPLES} steps of 5 mm or 0.01 rad"
+            raise InputError(problem, field="trajectory.positions", expected=expected, got=f"{counts.sum():g}")
+        counts = counts.astype(int)
         edges = itertools.pairwise(self.trajectory.times)
         times = [np.linspace(a, b, n, endpoint=False) for (a, b), n in zip(edges, counts, strict=True)]
         rows = np.concatenate([[0], np.cumsum(counts)])

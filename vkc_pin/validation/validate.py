@@ -10,12 +10,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from vkc_pin.arguments import instance
 from vkc_pin.motion.carrying import FreeObjects
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.options import Options
 from vkc_pin.scene.resting import LEVEL, tilt
 from vkc_pin.scene.scene import Scene
-from vkc_pin.task.steps import Step
+from vkc_pin.task.steps import Step, as_list
 from vkc_pin.task.terms import Term, traced
 from vkc_pin.validation.distances import Solids
 from vkc_pin.validation.goals import MOTION_TOLERANCE, check_goals, check_steps
@@ -59,10 +60,10 @@ def validate(
     Raises:
         InputError: The trajectory is none of this scene's robot and objects, or a step or term names what is not there.
     """
-    options = Options() if options is None else options
-    samples = Samples(scene, trajectory)
-    check_steps(samples, steps)
-    return _Check(samples, steps, options, traced(scene, terms)).report()
+    options = Options() if options is None else instance(options, Options, "options")
+    samples, asked = Samples(instance(scene, Scene, "scene"), instance(trajectory, Trajectory, "trajectory")), as_list(steps)
+    check_steps(samples, asked)
+    return _Check(samples, asked, options, traced(scene, terms)).report()
 
 
 class _Check:

@@ -18,9 +18,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+from vkc_pin.arguments import flag, instance, mapping, whole
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.files.writing import write_atomically
 from vkc_pin.notebook import in_notebook
+from vkc_pin.scene.poses import as_placement
 from vkc_pin.scene.scene import Scene
 from vkc_pin.validation.report import Judged
 
@@ -59,11 +61,14 @@ def show(
         VkcError: The server does not start.
     """
     scene, plan = _parts(plan_or_scene)
+    height = whole(height, "height", low=1, high=100_000)
+    if open_browser is not None:
+        flag(open_browser, "open_browser")
     if in_notebook():
         from IPython.display import HTML
 
         page, name = html.escape(_page(scene, plan, frames)), html.escape(scene.name)
-        style = f"width: 100%; height: {int(height)}px; border: none"
+        style = f"width: 100%; height: {height}px; border: none"
         return cast(Any, HTML)(f'<div><iframe srcdoc="{page}" style="{style}" title="{name}"></iframe></div>')
     viewer = open_viewer()
     _draw(viewer, scene, plan, frames=frames)
@@ -89,10 +94,12 @@ def animate(plan: Judged, viewer: meshcat.Visualizer | None = None) -> meshcat.V
     Raises:
         InputError: Not a plan, or something that cannot be drawn.
     """
+    import meshcat
+
     scene, known = _parts(plan)
     if known is None:
         raise InputError("nothing moves in it", field="plan", expected="a Plan", got=type(plan).__name__)
-    viewer = open_viewer() if viewer is None else viewer
+    viewer = open_viewer() if viewer is None else instance(viewer, meshcat.Visualizer, "viewer")
     _draw(viewer, scene, known)
     return viewer
 
@@ -164,7 +171,9 @@ def _draw(
     from vkc_pin.visualization.drawing import Drawing
 
     motion = () if plan is None else (plan.trajectory, plan.validation)
-    Drawing(viewer, scene, *motion).draw(play=play, frames=frames)
+    named = mapping({} if frames is None else frames, "frames", "names, each with a pinocchio.SE3")
+    placed = {name: as_placement(where, name=f"frames.{name}") for name, where in named.items()}
+    Drawing(viewer, scene, *motion).draw(play=play, frames=placed)
 
 
 def _page(scene: Scene, plan: Judged | None, frames: Mapping[str, pin.SE3] | None = None) -> str:

@@ -22,7 +22,7 @@ import vkc_pin as vkc
         ({"height": 1.0}, "height", "a number from 2.1"),
         ({"front": 0.2}, "front", "a number from 1.5"),
         ({"gap": 0.0}, "gap", "a number from 0.02"),
-        ({"objects": "door"}, "objects", "texts"),
+        ({"objects": "door"}, "objects", "a list of types"),
         ({"carried": ("cup",) * 5}, "carried", "at most 4"),
         ({"carried": ("cup",), "tables": 0}, "carried", "at least 1"),
     ],

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from vkc_pin.arguments import instance, whole
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.files.resources import folder
 from vkc_pin.models.robot import Robot
@@ -102,19 +103,18 @@ def random_room(number: int, settings: RoomSettings | None = None, **changes: An
 
 def random_layout(number: int, settings: RoomSettings | None = None, **changes: Any) -> Layout:
     """Return what a random room is made of; see `random_room`."""
-    if isinstance(number, bool) or not isinstance(number, int | np.integer) or number < 0:
-        raise InputError("out of range", field="number", expected="a whole number of at least 0", got=repr(number))
+    number = whole(number, "number", low=0)
     known = [item.name for item in dataclasses.fields(RoomSettings)]
     for name in changes:
         if name not in known:
             raise UnknownNameError("field of RoomSettings", name, known, field=name)
-    chosen = dataclasses.replace(settings or RoomSettings(), **changes)
-    rng, radius = np.random.default_rng([1, int(number)]), _turning_radius(load_robot(chosen.robot))
+    chosen = dataclasses.replace(RoomSettings() if settings is None else instance(settings, RoomSettings, "settings"), **changes)
+    rng, radius = np.random.default_rng([1, number]), _turning_radius(load_robot(chosen.robot))
     for _ in range(_ROOMS):
         found = _Room(chosen, rng, radius).furnished()
         if found is not None:
             floor, standing, start = found
-            return Layout(int(number), chosen, floor, standing, start, radius)
+            return Layout(number, chosen, floor, standing, start, radius)
     expected = "less clutter, fewer objects or tables, or wider rooms"
     raise InputError(f"no room in {_ROOMS} had a place for everything", field="clutter", expected=expected, got=chosen.clutter)
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
-from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.arguments import is_number, items, known, text, whole
+from vkc_pin.errors import InputError, shown
 from vkc_pin.scene.rooms.parts import CARRIED, OPENED
 
 __all__ = ["RoomSettings"]
@@ -48,23 +47,19 @@ class RoomSettings:
             _within(name, getattr(self, name), low, high)
         expected = "two lengths of 4 to 20 m, the lower one first"
         if not isinstance(self.width, tuple | list) or len(self.width) != 2:
-            raise InputError("not an interval", field="width", expected=expected, got=repr(self.width))
+            raise InputError("not an interval", field="width", expected=expected, got=shown(self.width))
         for value in self.width:
             _within("width", value, 4.0, 20.0)
         if self.width[0] > self.width[1]:
-            raise InputError("the interval is empty", field="width", expected=expected, got=repr(self.width))
+            raise InputError("the interval is empty", field="width", expected=expected, got=shown(self.width))
         object.__setattr__(self, "width", tuple(map(float, self.width)))
-        if isinstance(self.tables, bool) or not isinstance(self.tables, int) or not 0 <= self.tables <= 10:
-            raise InputError("out of range", field="tables", expected="a whole number from 0 to 10", got=repr(self.tables))
-        for name in ("objects", "carried"):
-            given = getattr(self, name)
-            if given is not None and (not isinstance(given, tuple | list) or not all(isinstance(kind, str) for kind in given)):
-                raise InputError("not a list of types", field=name, expected="texts", got=repr(given))
-            object.__setattr__(self, name, None if given is None else tuple(given))
+        object.__setattr__(self, "tables", whole(self.tables, "tables", low=0, high=10))
         for name, what, choices in (("objects", "object that opens", OPENED), ("carried", "object that is carried", CARRIED)):
-            for kind in getattr(self, name) or ():
-                if kind not in choices:
-                    raise UnknownNameError(what, kind, choices, field=name)
+            given = getattr(self, name)
+            if given is not None or name == "carried":
+                kinds: tuple[Any, ...] = items(given, name, "a list of types")
+                object.__setattr__(self, name, tuple(known(kind, choices, what, name) for kind in kinds))
+        text(self.robot, "robot", "a robot's name")
         if len(self.carried) > _CARRIED:
             raise InputError("too many", field="carried", expected=f"at most {_CARRIED}", got=len(self.carried))
         if self.carried and not self.tables:
@@ -75,6 +70,5 @@ class RoomSettings:
 
 def _within(name: str, value: Any, low: float, high: float) -> None:
     """Raise an error unless a setting is a number from the lowest to the highest."""
-    number = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
-    if not number or not low <= value <= high:
-        raise InputError("out of range", field=name, expected=f"a number from {low:g} to {high:g}", got=repr(value))
+    if not is_number(value) or not low <= value <= high:
+        raise InputError("out of range", field=name, expected=f"a number from {low:g} to {high:g}", got=shown(value))

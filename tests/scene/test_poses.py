@@ -1,0 +1,34 @@
+"""Poses and points; what is no pose is in tests/task/test_steps.py, where steps take it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vkc_pin.errors import InputError
+from vkc_pin.scene.poses import as_placement, as_target
+
+
+@pytest.mark.parametrize("pose", [[2e4, 0, 0, 0, 0, 0], [0, 0, 0, 0, 1e300, 0], np.diag([1.0, 1.0, 1.0, 1.0]) + 1e5])
+def test_what_is_further_away_than_any_room(pose: Any) -> None:
+    for read in (as_placement, as_target):
+        with pytest.raises(InputError, match="out of range") as caught:
+            read(pose, name="where")
+        assert caught.value.field == "where"
+    with pytest.raises(InputError, match="out of range"):
+        as_target([0.0, -2e4, 0.0], name="where")
+
+
+@pytest.mark.parametrize("pose", [["0", "0", "0", "0", "0", "0"], [1j] * 6, [True] * 6, [10**5000] * 6, b"123456", range(0)])
+def test_numbers_are_numbers(pose: Any) -> None:
+    for read in (as_placement, as_target):
+        with pytest.raises(InputError, match="not a pose") as caught:
+            read(pose, name="where")
+        assert len(str(caught.value)) < 600
+
+
+def test_three_numbers_are_a_point_and_six_a_pose() -> None:
+    assert as_target(np.array([1, 2, 3]), name="where") == (1.0, 2.0, 3.0)
+    np.testing.assert_allclose(as_target((1, 2, 3, 0, 0, 0), name="where").translation, [1.0, 2.0, 3.0])

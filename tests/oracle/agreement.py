@@ -49,10 +49,6 @@ def table(verdicts: Sequence[Verdict]) -> str:
             rows += [f"  - {violation}" for violation in one.found]
     for reason, count in Counter(one.unjudged for one in verdicts if one.unjudged).items():
         rows += ["", f"- not judged, {count}: {reason}"]
-    lingering = sum(bool(one.notes) for one in said)
     seconds = sum(one.seconds for one in verdicts)
-    rows += [
-        "",
-        f"{len(verdicts)} plans in {seconds:.1f} s; in {lingering} what may touch stays near for long.",
-    ]
+    rows += ["", f"{len(verdicts)} plans in {seconds:.1f} s."]
     return "\n".join(rows)

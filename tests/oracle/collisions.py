@@ -83,7 +83,7 @@ class Pairs:
 
 
 def check_collisions(world: World, stage: Stage, allowed: list[Licence]) -> Iterator[Violation]:
-    """Yield what overlaps ("overlap"), and what is too close at waypoints: "clearance", or "lingers" if it may be at times."""
+    """Yield what overlaps ("overlap"), and what is too close at waypoints: "clearance"."""
     pairs = Pairs(world, stage)
     begins = np.arange(0, pairs.length, BLOCK)
     ends = np.append(begins[1:], pairs.length) - 1
@@ -106,8 +106,7 @@ def check_collisions(world: World, stage: Stage, allowed: list[Licence]) -> Iter
                 apart = distance(one.shape.solid, one.at, other.shape.solid, other.at, k)
                 time = float(stage.times[k])
                 if apart < safe and not any(own.covers(one.label, other.label, time) for own in allowed):
-                    rule = "lingers" if any(own.names(one.label, other.label) for own in allowed) else "clearance"
-                    yield Violation(rule, names, time, safe - apart, f"{1e3 * apart:.2f} mm apart at a waypoint")
+                    yield Violation("clearance", names, time, safe - apart, f"{1e3 * apart:.2f} mm apart at a waypoint")
             depth, row = _deepest(one, other, arc, blocks)
             if depth > CONTACT:
                 yield Violation("overlap", names, float(stage.times[row]), depth, f"overlap by {1e3 * depth:.2f} mm")

@@ -15,14 +15,11 @@ from .touching import licences
 
 __all__ = ["Verdict", "judge", "violations"]
 
-NOTED = ("lingers",)
-
 
 @dataclass
 class Verdict:
     """What is to be said of a plan: its own verdict, and what is found here.
 
-    `notes` are found as well, but within what docs/ promise: hands that stay near what they hold for longer than needed.
     `unjudged` says why nothing is said.
     """
 
@@ -31,7 +28,6 @@ class Verdict:
     status: str
     says: list[str]
     found: list[Violation] = field(default_factory=list)
-    notes: list[Violation] = field(default_factory=list)
     unjudged: str = ""
     seconds: float = 0.0
 
@@ -46,9 +42,7 @@ def judge(path: Path) -> Verdict:
     plan = read_plan(path)
     verdict = Verdict(path, plan.success, plan.status, plan.says)
     try:
-        found = violations(plan)
-        verdict.found = [one for one in found if one.rule not in NOTED]
-        verdict.notes = [one for one in found if one.rule in NOTED]
+        verdict.found = violations(plan)
     except NotJudged as error:
         verdict.unjudged = str(error)
     except FileNotFoundError as error:  # the scene has moved away from its plan
@@ -73,5 +67,5 @@ def violations(plan: SavedPlan) -> list[Violation]:
             worst[key] = one
     for rule, subject in list(worst):
         if rule == "overlap":
-            worst.pop(("clearance", subject), None), worst.pop(("lingers", subject), None)
+            worst.pop(("clearance", subject), None)
     return sorted(worst.values(), key=lambda one: (one.time, one.rule, one.subject))

@@ -56,12 +56,15 @@ class _Sweep:
     def along(self, z: Floats, waypoints: Ints) -> Iterator[Hit]:
         placed = self._solids.at(self._solids.world.coordinates.q(z[waypoints]))
         at, pairs, distances = self._nearest(placed)
-        closest = _least(at, distances)
-        self._waypoints = waypoints
-        chosen = np.union1d(closest, np.flatnonzero(distances < self._table.margins_at(pairs, at)))
+        self._waypoints, margins = waypoints, self._table.margins_at(pairs, at)
+        apart = np.flatnonzero(margins > -np.inf)  # what moves as one is as close as it was
+        closest = apart[_least(at[apart], distances[apart])]
+        chosen = np.union1d(closest, np.flatnonzero(distances < np.maximum(margins, 0.0)))
         for row, k, distance in zip(waypoints[at[chosen]], pairs[chosen], distances[chosen], strict=True):
             yield self._hit(row, k, distance, at_waypoint=True)
-        smallest = max(RESOLUTION, float(distances[closest].min()))  # what cannot come closer than that changes nothing
+        smallest = max(
+            RESOLUTION, float(distances[closest].min(initial=np.inf))
+        )  # what cannot come closer than that changes nothing
         moved = travelled(self._solids, z)
         stretch, pairs = self._active(placed, np.diff(moved[waypoints], axis=0), smallest)
         ends = placed.distances(np.concatenate([stretch, stretch + 1]), np.tile(self._table.pairs[pairs], (2, 1)))
@@ -146,8 +149,8 @@ class _Sweep:
             near = placed.bounds(todo[at], self._table.pairs[pairs]) < reach
             states, pairs = todo[at[near]], pairs[near]
             distances = placed.distances(states, self._table.pairs[pairs])
-            least = np.full(len(placed.corners[0]), np.inf)
-            np.minimum.at(least, states, distances)
+            least, apart = np.full(len(placed.corners[0]), np.inf), self._table.margins_at(pairs, states) > -np.inf
+            np.minimum.at(least, states[apart], distances[apart])
             done = ~(least > reach)  # all others are further apart
             kept = done[states]
             yield states[kept], pairs[kept], distances[kept]

@@ -30,7 +30,7 @@ class Window(NamedTuple):
     Attributes:
         pairs: Of indices of the world's shapes, the smaller first, shape (k, 2).
         first, last: Between which waypoints.
-        margin: What they must keep at these [m].
+        margin: What they must keep at these [m]; -inf: their distance says nothing.
         contact: Overlap that counts as contact [m].
         together: Whether they move as one, so that they need not be looked at between samples.
     """
@@ -86,7 +86,7 @@ class _Windows:
         clearance, contact = (0.0, CONTACT) if hold.by else (self.options.grasp_clearance, 0.0)
         begin, end = 0 if first is None else first, len(self.steps) if last is None else last
         if moves_as_one(self.scene, hold):
-            yield Window(pairs, begin, end, -np.inf, together=True)
+            yield Window(pairs, begin, end, 0.0, together=True)
         else:
             yield Window(pairs, begin, end, clearance, CONTACT)
         if first is not None:

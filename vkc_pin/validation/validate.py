@@ -259,6 +259,7 @@ class _Check:
     def _clearance(self) -> float:
         """Nothing comes too close at a waypoint (eqs. 6 and 7) or penetrates anywhere; return the smallest distance [m].
 
+        What moves as one does not count for that.
         The start is where the robot is: it may be close to something, but not inside.
         """
         samples, smallest = self.samples, np.inf
@@ -266,7 +267,7 @@ class _Check:
         near = windows(samples, solids, self.steps, self.options)
         pairs = PairTable(self.scene, solids, self.trajectory, self.options.dist_safe, windows=near)
         for hit in sweep(pairs, samples.z, samples.waypoint_rows):
-            smallest = min(smallest, hit.distance)
+            smallest = min(smallest, hit.distance) if hit.margin > -np.inf else smallest
             subject, millimetres = f"{hit.first} – {hit.second}", 1e3 * abs(hit.distance)
             if hit.distance < -hit.contact:
                 self._add("penetration", subject, -hit.distance, "m", f"overlap by {millimetres:.1f} mm", row=hit.row)

@@ -42,6 +42,23 @@ def test_real_numbers(name: str, value: Any) -> None:
     assert caught.value.field == f"Options.{name}"
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("reach_waypoints", 5000),
+        ("move_waypoints", 501),
+        ("contact_slots", 1000),
+        ("max_restarts", 10**9),
+        ("dt", 1e-9),
+        ("dt", 1e9),
+    ],
+)
+def test_what_would_take_hours_and_gigabytes(name: str, value: Any) -> None:
+    with pytest.raises(InputError, match=r"at most|from") as caught:
+        Options(**{name: value})
+    assert caught.value.field == f"Options.{name}"
+
+
 def test_numbers_become_plain() -> None:
     """So that a plan's options go into a file."""
     values = {name: np.int64(7) for name in WHOLE} | {name: np.float32(0.5) for name in REAL}

@@ -46,7 +46,15 @@ def is_number(value: object) -> bool:
     return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
 
 
-def number(value: Any, field: str, expected: str = "a finite number", *, low: float = -math.inf, above: bool = False) -> float:
+def number(
+    value: Any,
+    field: str,
+    expected: str = "a finite number",
+    *,
+    low: float = -math.inf,
+    high: float = math.inf,
+    above: bool = False,
+) -> float:
     """Return a finite number.
 
     Args:
@@ -54,10 +62,11 @@ def number(value: Any, field: str, expected: str = "a finite number", *, low: fl
         field: The argument's name.
         expected: What would be right, for the message.
         low: The lowest that will do.
-        above: Whether it must be more than that.
+        high: The highest that will do.
+        above: Whether it must be more than `low`.
 
     Raises:
-        InputError: It is none, not finite, or too low.
+        InputError: It is none, not finite, too low or too high.
     """
     if isinstance(value, np.ndarray) and value.ndim == 0 and value.dtype.kind in "iuf":
         value = value.item()
@@ -68,7 +77,7 @@ def number(value: Any, field: str, expected: str = "a finite number", *, low: fl
         found = float(value)
     except OverflowError:
         found = math.inf
-    if not math.isfinite(found) or found < low or (above and found == low):
+    if not (math.isfinite(found) and low <= found <= high) or (above and found == low):
         problem = "not finite" if low == -math.inf else "out of range"
         raise InputError(problem, field=field, expected=expected, got=shown(value))
     return found

@@ -11,11 +11,22 @@ from vkc_pin.errors import InputError, shown
 __all__ = ["Options"]
 
 EFFORTS = ("length", "squares")
+_SMALLEST, _LARGEST = 1e-9, 1e9  # of numbers
+_RANGES = {
+    "dt": (1e-3, 60.0),
+    "grasp_time": (_SMALLEST, 3600.0),
+    "approach_time": (_SMALLEST, 3600.0),
+    "approach": (_SMALLEST, 10.0),
+}
+_MOST = {  # of whole numbers: beyond these, planning takes hours and gigabytes
+    **dict.fromkeys(("reach_waypoints", "turn_waypoints", "move_waypoints"), 500),
+    **{"contact_slots": 64, "max_outer": 10_000, "max_iterations": 100_000, "max_restarts": 1000},
+}
 
 
 @dataclass(frozen=True)
 class Options:
-    """How to plan. Every field is checked when the object is made.
+    """How to plan. Every field is checked when the object is made; an InputError names what is out of range.
 
     Attributes:
         dt: Least time between two waypoints [s]; motions that are too long for it take more.
@@ -80,9 +91,12 @@ class Options:
                     raise InputError("unknown", field=field, expected=" or ".join(map(repr, EFFORTS)), got=shown(value))
                 object.__setattr__(self, item.name, str(value))
             elif item.type == "int":
-                object.__setattr__(self, item.name, whole(value, field, low=1))  # NumPy's own integers do not go into JSON
+                value = whole(value, field, low=1, high=_MOST[item.name])  # NumPy's own integers do not go into JSON
+                object.__setattr__(self, item.name, value)
             else:
-                object.__setattr__(self, item.name, number(value, field, "a positive finite number", low=0.0, above=True))
+                low, high = _RANGES.get(item.name, (_SMALLEST, _LARGEST))
+                expected = f"a positive finite number, from {low:g} to {high:g}"
+                object.__setattr__(self, item.name, number(value, field, expected, low=low, high=high))
 
     @classmethod
     def paper(cls, **changes: Any) -> Self:

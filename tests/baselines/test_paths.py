@@ -33,7 +33,7 @@ def base_paths(scene: vkc.Scene, name: str = "drawer", **joints: float) -> BaseP
 def room_of(scene: vkc.Scene, poses: np.ndarray, *, without: Sequence[str] = ("drawer",)) -> float:
     """Return the least distance of the base from obstacles and objects on straight lines between poses [m], asked of coal."""
     base = [(s.geometry, s.placement) for s in scene.robot.collision.geometryObjects if s.parentJoint == 1]
-    labels = zip(scene.obstacle_labels, scene.obstacles.geometryObjects, strict=True)
+    labels = zip(scene.obstacle_labels, scene.obstacles, strict=True)
     still = [shape for label, shape in labels if label != FLOOR]
     for name, placed in scene.objects.items():
         still += standing_geometry(placed) if name not in without else []

@@ -108,7 +108,7 @@ def test_every_method_is_asked_for_the_same(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_the_cup_stands_wholly_on_the_coffee_table() -> None:
     scene, rng = vkc.load_scene("household"), np.random.default_rng(0)
-    shapes = list(scene.obstacles.geometryObjects)
+    shapes = list(scene.obstacles)
     table = [shape for shape, label in zip(shapes, scene.obstacle_labels, strict=True) if label == "coffee_table"]
     plate = max(table, key=lambda shape: shape.placement.translation[2])
     assert isinstance(plate.geometry, coal.Box)

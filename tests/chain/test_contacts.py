@@ -69,7 +69,7 @@ class Counted(NamedTuple):
             sum(shape.parentJoint > 1 for shape in shapes),
             sum(robot.link_of(i) in robot.touch_links for i in range(len(shapes))),
             len(robot.collision.collisionPairs),
-            len(scene.obstacles.geometryObjects) - 1,
+            len(scene.obstacles) - 1,
         )
 
 
@@ -221,7 +221,7 @@ def test_two_objects_one_after_the_other() -> None:
 def test_a_scene_in_which_nothing_can_collide_is_refused() -> None:
     scene = door_scene()
     robot = dataclasses.replace(scene.robot, collision=pin.GeometryModel())
-    empty = dataclasses.replace(scene, robot=robot, objects={}, obstacles=pin.GeometryModel(), obstacle_labels=())
+    empty = dataclasses.replace(scene, robot=robot, objects={}, obstacles=(), obstacle_labels=())
     with pytest.raises(InputError, match="no pair"):
         program_of(empty, [GoTo(0.0, 0.0)], options=SHORT)
 

@@ -99,7 +99,7 @@ def spare(scene: Scene, row: np.ndarray, *, slide: float = 0.0, held: bool = Fal
 
 
 def _things(scene: Scene, state: Mapping[str, Mapping[str, float]]) -> list[tuple[str, pin.GeometryObject]]:
-    things = list(zip(scene.obstacle_labels, scene.obstacles.geometryObjects, strict=True))
+    things = list(zip(scene.obstacle_labels, scene.obstacles, strict=True))
     for name, placed in scene.objects.items():
         things += [(f"{name}.{link_name(s.name)}", s) for s in standing_geometry(placed.with_state(state.get(name, {})))]
     return things

@@ -128,6 +128,14 @@ def test_fewer_derivatives(plan: Plan) -> None:
         assert [len(point["velocities"]) > 0, len(point["accelerations"]) > 0] == [count > 0, count > 1]
 
 
+def test_a_rate_that_would_fill_the_memory(plan: Plan) -> None:
+    duration = float(np.ptp(plan.trajectory.times))
+    with pytest.raises(vkc.InputError, match="too many points") as caught:
+        plan.to_ros(rate=1.1e6 / duration)
+    assert caught.value.field == "rate"
+    assert f"{1e6 / duration:.4g} a second" in str(caught.value)
+
+
 @pytest.mark.parametrize("rate", [1.0, 7.0, 50])
 def test_points_at_a_rate(plan: Plan, rate: float) -> None:
     message = plan.to_ros(rate=rate, joints="all")

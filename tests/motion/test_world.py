@@ -79,7 +79,7 @@ def test_every_shape_is_where_it_is_alone(world: World, kind: str) -> None:
         for shape in standing_geometry(posed, visual=kind == "visual"):
             expected[f"{name}.{shape.name}"] = shape, shape.placement
     obstacles = scene.obstacles if kind == "collision" else scene.obstacle_visual
-    for shape in obstacles.geometryObjects:
+    for shape in obstacles:
         expected[shape.name] = shape, shape.placement
     assert list(found) == list(expected)  # none lost, none twice, robot before objects before obstacles
     assert len(geometry.geometryObjects) == len(expected)
@@ -105,9 +105,9 @@ def test_labels(world: World) -> None:
     assert len(world.collision_labels) == len(world.collision.geometryObjects)
     assert len(world.visual_labels) == len(world.visual.geometryObjects)
     names = {frame.name for frame in world.model.frames}
-    moving = len(world.visual_labels) - len(scene.obstacle_visual.geometryObjects)
+    moving = len(world.visual_labels) - len(scene.obstacle_visual)
     assert set(world.visual_labels[:moving]) | set(robots) | set(objects) <= names
-    assert world.visual_labels[moving:] == [shape.name for shape in scene.obstacle_visual.geometryObjects]
+    assert world.visual_labels[moving:] == [shape.name for shape in scene.obstacle_visual]
 
 
 def test_coordinates_and_start(world: World) -> None:

@@ -335,7 +335,7 @@ def test_the_clearance_at_the_start_is_that_of_all_pairs(seed: int, count: int, 
     data, shapes = model.createData(), geometry.createData()
     pin.updateGeometryPlacements(model, data, geometry, shapes, scene.robot.coordinates.q(scene.start))
     moving = [(shape.geometry, where) for shape, where in zip(geometry.geometryObjects, shapes.oMg, strict=True)]
-    standing = [s for s, label in zip(scene.obstacles.geometryObjects, scene.obstacle_labels, strict=True) if label != FLOOR]
+    standing = [s for s, label in zip(scene.obstacles, scene.obstacle_labels, strict=True) if label != FLOOR]
     standing += standing_geometry(scene.objects["door"])
     expected = min(shape_distance(shape, where, other.geometry, other.placement) for shape, where in moving for other in standing)
     found = scene.start_clearance(reach=reach)

@@ -461,7 +461,7 @@ def test_one_program_serves_all_problems_of_a_structure() -> None:
     steps, scene = [Actuate("door", {"hinge": 1.2})], door_scene()
     first = program_of(scene, steps, options=OPTIONS)
     spent = CACHE.building
-    fewer = dataclasses.replace(scene, obstacles=pin.GeometryModel(), obstacle_labels=())
+    fewer = dataclasses.replace(scene, obstacles=(), obstacle_labels=())
     others = [
         program_of(scene.with_start(base=[-1.0, 0.2, 0.5]), steps, options=OPTIONS),
         program_of(scene.sample_start(np.random.default_rng(0)), steps, options=OPTIONS),

@@ -40,7 +40,7 @@ def thing(name: str, **state: float) -> PlacedObject:
 
 def standing(name: str, *names: str) -> Shapes:
     """Shapes of some obstacles."""
-    found = [shape for shape in scene(name).obstacles.geometryObjects if shape.name in names]
+    found = [shape for shape in scene(name).obstacles if shape.name in names]
     assert len(found) == len(names)
     return placed_shapes(found)
 
@@ -239,7 +239,7 @@ def tool_frame(robot: Robot) -> pin.Frame:
 def room(name: str, placed: PlacedObject, robot: list[tuple[str, coal.CollisionGeometry, pin.SE3]]) -> float:
     """Smallest distance [m] between the robot and the world, without that of the fingers to what they hold."""
     here = scene(name)
-    labels = zip(here.obstacles.geometryObjects, here.obstacle_labels, strict=True)
+    labels = zip(here.obstacles, here.obstacle_labels, strict=True)
     world = placed_shapes([shape for shape, label in labels if label != FLOOR])
     others = [link for link in {link_name(shape.name) for shape in standing_geometry(placed)} if link != HELD[name]]
     held, touch = parts(placed, HELD[name]), here.robot.touch_links
@@ -314,9 +314,7 @@ def test_the_robot_fits_through_door_and_aisle() -> None:
         goal = GOALS[name][1] if name == "corridor_door" else {}
         here = here.with_state(GOALS[name][0], goal)
         placed = thing(name, **goal)
-        world = [
-            shape for shape, label in zip(here.obstacles.geometryObjects, here.obstacle_labels, strict=True) if label != FLOOR
-        ]
+        world = [shape for shape, label in zip(here.obstacles, here.obstacle_labels, strict=True) if label != FLOOR]
         arm = {"shoulder_link", "upper_arm_link", "forearm_link", "wrist_1_link", "wrist_2_link", "wrist_3_link"}
         around = placed_shapes(world) + placed_shapes(standing_geometry(placed))
         for heading in headings:

@@ -24,7 +24,7 @@ def scene() -> Scene:
 
 def distance(first: str, second: str) -> float:
     """Return coal's distance between two obstacles [m]; the objects as they are, with no function of the package between."""
-    one, two = (next(shape for shape in scene().obstacles.geometryObjects if shape.name == name) for name in (first, second))
+    one, two = (next(shape for shape in scene().obstacles if shape.name == name) for name in (first, second))
     places = [coal.Transform3s(shape.placement.rotation, shape.placement.translation) for shape in (one, two)]
     return coal.distance(one.geometry, places[0], two.geometry, places[1], coal.DistanceRequest(), coal.DistanceResult())
 

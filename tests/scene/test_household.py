@@ -75,7 +75,7 @@ def parts(placed: PlacedObject, *links: str) -> Shapes:
 
 
 def obstacles(here: Scene, *, without: Iterable[str] = (FLOOR,)) -> Shapes:
-    labels = zip(here.obstacles.geometryObjects, here.obstacle_labels, strict=True)
+    labels = zip(here.obstacles, here.obstacle_labels, strict=True)
     return placed_shapes(shape for shape, label in labels if label not in without)
 
 
@@ -203,7 +203,7 @@ def test_home_is_as_large_and_full_as_the_papers() -> None:
     assert (region.x, region.y, region.yaw) == ((0.5, 2.5), (-2.5, 0.5), None)
     inner = {"wall_west": (0, 1), "wall_east": (0, 0), "wall_south": (1, 1), "wall_north": (1, 0)}
     for wall, (axis, side) in inner.items():
-        (standing,) = [shape for shape in here.obstacles.geometryObjects if shape.name == wall]
+        (standing,) = [shape for shape in here.obstacles if shape.name == wall]
         assert abs(bounds(placed_shapes([standing]))[side, axis]) == pytest.approx(4.0)
     shapes = len(obstacles(here)) + sum(len(placed.object.collision.geometryObjects) for placed in here.objects.values())
     assert shapes >= 120
@@ -238,9 +238,7 @@ def test_nothing_stands_in_anything_else() -> None:
         "bin",
     }
     for name in movable:
-        standing = [
-            shape for shape, label in zip(here.obstacles.geometryObjects, here.obstacle_labels, strict=True) if label == name
-        ]
+        standing = [shape for shape, label in zip(here.obstacles, here.obstacle_labels, strict=True) if label == name]
         assert clearance(placed_shapes(standing), obstacles(here, without={FLOOR, name}), reach=0.1) > 0.01, name
 
 

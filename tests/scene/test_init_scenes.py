@@ -38,7 +38,7 @@ def starts(name: str) -> np.ndarray:
 
 def bounds(of: Scene, names: tuple[str, ...]) -> np.ndarray:
     """Lowest and highest x, y, z of upright boxes, shape (2, 3)."""
-    shapes = [shape for shape in of.obstacles.geometryObjects if shape.name in names]
+    shapes = [shape for shape in of.obstacles if shape.name in names]
     assert len(shapes) == len(names)
     assert all(np.array_equal(shape.placement.rotation, np.eye(3)) for shape in shapes)
     halves = [np.asarray(shape.geometry.halfSide) for shape in shapes]
@@ -133,9 +133,9 @@ def test_the_stick_lies_on_its_table_without_touching_it() -> None:
     for name in SCENES:
         here = scene(name)
         stick = placed_shapes(standing_geometry(here.objects["stick"]))
-        top = [shape for shape in here.obstacles.geometryObjects if shape.name == "table_top"]
+        top = [shape for shape in here.obstacles if shape.name == "table_top"]
         assert 0.0005 <= clearance(stick, placed_shapes(top)) < 0.002
-        others = [shape for shape in here.obstacles.geometryObjects if shape.name != "table_top"]
+        others = [shape for shape in here.obstacles if shape.name != "table_top"]
         assert clearance(stick, placed_shapes(others)) > 0.02
 
 
@@ -205,7 +205,7 @@ def test_the_hand_fits_round_the_stick_along_the_whole_range(turn: float, table:
     assert (grip.joint, grip.firm, grip.coordinates) == ("cylindrical", True, ("grip_slide", "grip_turn"))
     assert [(freedom.lower, freedom.upper) for freedom in grip.freedoms] == [(-0.095, 0.095), (-1.2, 1.2)]
     dowel, butt, front, *tip = placed_shapes(standing_geometry(placed))
-    world = [shape for shape in here.obstacles.geometryObjects if shape.name in (*TABLES, "floor")]
+    world = [shape for shape in here.obstacles if shape.name in (*TABLES, "floor")]
     for slide in SLIDES:
         tool = placed.link_placement("stick") * grip.placement * grip.motion([slide, turn])
         shapes = hand(here.robot, tool)
@@ -253,7 +253,7 @@ def test_the_hand_fits_round_a_ball_on_the_floor(turn: tuple[float, float, float
     tool = LYING * grip.placement * grip.motion(turn)
     shapes = hand(here.robot, tool)
     assert clearance(shapes, [(round_.geometry, LYING)]) > 0.005
-    assert clearance(shapes, placed_shapes([s for s in here.obstacles.geometryObjects if s.name == "floor"])) > 0.02
+    assert clearance(shapes, placed_shapes([s for s in here.obstacles if s.name == "floor"])) > 0.02
     np.testing.assert_allclose(tool.actInv(LYING).translation, [0.0, 0.0, 0.01], atol=1e-12)
 
 

@@ -21,7 +21,7 @@ def on(scene: Scene, name: str = "cup") -> set[str]:
         if other != name
         for shape in standing_geometry(placed)
     ]
-    shapes += zip(scene.obstacle_labels, scene.obstacles.geometryObjects, strict=True)
+    shapes += zip(scene.obstacle_labels, scene.obstacles, strict=True)
     return supports(scene.objects[name], shapes)
 
 

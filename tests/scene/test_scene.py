@@ -33,7 +33,7 @@ def test_the_door_is_in_an_ordinary_room(door: Scene) -> None:
     assert region.yaw is None
     assert 2.0 <= hinge[0] - region.x[1] <= hinge[0] - region.x[0] <= 4.0
     assert door.obstacle_labels[-1] == FLOOR
-    assert len(door.obstacle_labels) == len(door.obstacles.geometryObjects)
+    assert len(door.obstacle_labels) == len(door.obstacles)
     assert set(door.obstacle_labels) == {*door.obstacle_names, FLOOR}
 
 
@@ -48,9 +48,7 @@ def test_moving_parts_keep_clear_of_the_room_over_the_whole_range(name: str, joi
     scene = load_scene(name)
     placed = scene.objects[name]
     index = placed.object.coordinates.index(joint)
-    room = placed_shapes(
-        s for s, label in zip(scene.obstacles.geometryObjects, scene.obstacle_labels, strict=True) if label != FLOOR
-    )
+    room = placed_shapes(s for s, label in zip(scene.obstacles, scene.obstacle_labels, strict=True) if label != FLOOR)
     nearest = np.inf
     for value in np.linspace(placed.object.lower[index], placed.object.upper[index], 80):
         moved = standing_geometry(placed.with_state({joint: value}))
@@ -60,7 +58,7 @@ def test_moving_parts_keep_clear_of_the_room_over_the_whole_range(name: str, joi
 
 
 def test_the_frame_fills_the_opening_without_a_gap_wider_than_a_finger(door: Scene) -> None:
-    walls = [s for s in door.obstacles.geometryObjects if s.name.startswith("wall_")]
+    walls = [s for s in door.obstacles if s.name.startswith("wall_")]
     frame = [s for s in standing_geometry(door.objects["door"]) if s.name.startswith("frame_")]
     assert len(frame) == 3
     for part in frame:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 
 import coal
@@ -37,7 +38,7 @@ def test_every_kind_of_obstacle(tmp_path: Path) -> None:
   - {name: chest, type: urdf, file: chest.urdf, position: [-1, 2, 0], yaw: 1.5707963267948966}
 """
     scene = load(tmp_path, TINY + extra)
-    shapes = {s.name: s for s in scene.obstacles.geometryObjects}
+    shapes = {s.name: s for s in scene.obstacles}
     kinds = {name: type(s.geometry).__name__ for name, s in shapes.items()}
     assert kinds["crate"] == "Box"
     assert kinds["post"] == "Cylinder"
@@ -54,14 +55,27 @@ def test_every_kind_of_obstacle(tmp_path: Path) -> None:
     np.testing.assert_allclose(shapes["chest_1"].placement.translation, [-1.0, 2.0, 1.0])
     assert scene.obstacle_labels == ("crate", "post", "ball", "pole", "rock", "chest", "chest", FLOOR)
     assert scene.obstacle_names == ("crate", "post", "ball", "pole", "rock", "chest")
-    drawn = {s.name: s for s in scene.obstacle_visual.geometryObjects}
+    drawn = {s.name: s for s in scene.obstacle_visual}
     assert drawn.keys() == shapes.keys() - {FLOOR}
     assert Path(drawn["rock"].meshPath).name == "wedge.obj"
-    for s in scene.obstacles.geometryObjects:
+    for s in scene.obstacles:
         assert s.parentJoint == 0
         assert s.placement.homogeneous[3, 3] == 1.0
     again = Scene.from_document(json.loads(json.dumps(scene.document)), tmp_path)
-    assert [s.name for s in again.obstacles.geometryObjects] == [s.name for s in scene.obstacles.geometryObjects]
+    assert [s.name for s in again.obstacles] == [s.name for s in scene.obstacles]
+
+
+def test_thousands_of_obstacles(tmp_path: Path) -> None:
+    """They are loaded in time that grows as they do: a minute would be a square of it."""
+    entry = "  - {{name: b{}, type: sphere, radius: 0.01, position: [9, 9, 9]}}\n"
+    began = time.perf_counter()
+    scene = load(tmp_path, TINY + "".join(map(entry.format, range(3000))))
+    assert time.perf_counter() - began < 30.0
+    assert len(scene.obstacles) == len(scene.obstacle_labels) == len(scene.obstacle_visual) + 1 > 3000
+    with pytest.raises(InputError, match="too many") as caught:
+        load(tmp_path, TINY + "".join(map(entry.format, range(10_001))))
+    assert caught.value.field == "obstacles"
+    assert len(str(caught.value)) < 300
 
 
 def test_a_scene_without_a_floor(tmp_path: Path) -> None:
@@ -73,7 +87,7 @@ def same(a: Scene, b: Scene) -> None:
     assert (a.name, a.arena, a.floor, dict(a.held), a.start_region) == (b.name, b.arena, b.floor, dict(b.held), b.start_region)
     np.testing.assert_array_equal(a.start, b.start)
     assert a.obstacle_labels == b.obstacle_labels
-    for x, y in zip(a.obstacles.geometryObjects, b.obstacles.geometryObjects, strict=True):
+    for x, y in zip(a.obstacles, b.obstacles, strict=True):
         assert x.name == y.name
         assert type(x.geometry) is type(y.geometry)
         assert x.geometry.computeVolume() == y.geometry.computeVolume()

@@ -12,10 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from vkc_pin.errors import InputError
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.scene.hold import Hold, holds_of
 from vkc_pin.scene.scene import Scene
-from vkc_pin.validation.samples import ANGLE_STEP, LENGTH_STEP, Samples
+from vkc_pin.validation.samples import ANGLE_STEP, LENGTH_STEP, MOST, Samples
 
 VIRTUAL = {
     "grip": (),
@@ -34,6 +35,29 @@ def motion(scene: Scene, seed: int, *, grasp: str = "grip", number: int = 5) -> 
     positions = rng.uniform(-1.0, 1.0, (number, len(names))) * rng.choice([0.0, 0.01, 1.0], len(names))
     phases = (PhaseSpan("all", 0, number - 1, (Hold("cabinet", grasp),)),)
     return Trajectory(names, np.cumsum(rng.uniform(0.1, 2.0, number)), positions, phases, len(scene.start))
+
+
+@pytest.mark.parametrize("jump", [1e4, 1e9])
+def test_a_motion_that_jumps_is_seen_at_its_waypoints(jump: float) -> None:
+    scene = full_scene()
+    trajectory = motion(scene, 0)
+    positions = trajectory.positions.copy()
+    positions[2:, 1] += jump
+    samples = Samples(scene, dataclasses.replace(trajectory, positions=positions))
+    assert samples.needed == pytest.approx(jump / LENGTH_STEP, rel=1e-2)
+    assert samples.needed > MOST
+    np.testing.assert_array_equal(samples.times, trajectory.times)
+    np.testing.assert_array_equal(samples.waypoint_rows, np.arange(len(trajectory.times)))
+
+
+def test_a_motion_beyond_all_measure_is_refused() -> None:
+    scene = full_scene()
+    trajectory = motion(scene, 0)
+    positions = trajectory.positions.copy()
+    positions[2, 1] = 1e300
+    with pytest.raises(InputError, match="out of range") as caught:
+        Samples(scene, dataclasses.replace(trajectory, positions=positions))
+    assert caught.value.field == "trajectory.positions[2, 1]"
 
 
 @settings(max_examples=40, deadline=None)

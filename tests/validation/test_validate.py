@@ -396,12 +396,25 @@ def test_penetration_between_waypoints_only() -> None:
 def test_a_door_that_opens_into_something(door_plan: vkc.Plan) -> None:
     """What is held must keep clear too."""
     shape = coal.Box(0.3, 0.3, 1.0)
-    obstacles = door_plan.scene.obstacles.copy()
     place = pin.SE3(np.eye(3), np.array([3.35, 0.3, 1.5]))  # where the panel swings to, above the robot's base
-    obstacles.addGeometryObject(pin.GeometryObject("pillar", 0, place, shape))
+    obstacles = (*door_plan.scene.obstacles, pin.GeometryObject("pillar", 0, place, shape))
     labels = (*door_plan.scene.obstacle_labels, "pillar")
     scene = dataclasses.replace(door_plan.scene, obstacles=obstacles, obstacle_labels=labels)
     assert ("penetration", "door.panel – pillar") in names(check(door_plan, scene=scene))
+
+
+@pytest.mark.parametrize("name", ["base_x", "shoulder_pan_joint", "door.hinge"])
+@pytest.mark.parametrize("jump", [1e3, 1e9])
+def test_a_motion_that_jumps_is_refused_and_not_swept(door_plan: vkc.Plan, name: str, jump: float) -> None:
+    """A look every 5 mm and 10 mrad would be one at some hundred thousand configurations and more."""
+    positions = door_plan.trajectory.positions.copy()
+    positions[40:, door_plan.trajectory.names.index(name)] += jump
+    report = check(door_plan, trajectory=dataclasses.replace(door_plan.trajectory, positions=positions))
+    found = {v.constraint: v for v in report.violations}
+    assert {"sampling", "velocity", "limit"} <= set(found)
+    assert (found["sampling"].subject, found["sampling"].waypoint) == ("motion", 39)
+    assert "not looked for" in found["sampling"].detail
+    assert report.states == len(positions)
 
 
 def fatter_lever(scene: Scene, by: float) -> Scene:

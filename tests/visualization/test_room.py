@@ -42,7 +42,7 @@ def test_walls_show_their_side_towards_the_room(room: Room) -> None:
 
 def test_furniture_hides_and_walls_hide_less(room: Room, scene: Scene) -> None:
     boxes = room.obstructions()
-    assert len(boxes) == len(scene.obstacle_visual.geometryObjects)
+    assert len(boxes) == len(scene.obstacle_visual)
     sofa = [o for low, high, o in boxes if np.allclose(low, [-2.4, -1.775, 0.0], atol=1e-6)]
     assert sofa == [1.0]
     assert sum(opacity < 1.0 for _, _, opacity in boxes) == 7

@@ -51,7 +51,7 @@ class _Pairing:
         riding = [(ride.object, indices) for ride, indices in chain.ride_geometries.items()]
         for name, indices in (*held, *riding):
             self._labels += [f"{name}.{link_name(own_name(chain.collision.geometryObjects[i].name))}" for i in indices]
-        self._obstacles = tuple(scene.obstacles.geometryObjects)
+        self._obstacles = scene.obstacles
         self._boxes = _boxes([*chain.collision.geometryObjects]), _boxes(self._obstacles)
 
     def phase(self, number: int) -> PhaseGeometry:

@@ -238,6 +238,8 @@ def _translate(document: Document, path: tuple[Key, ...], error: Any) -> InputEr
     if kind in ("union_tag_invalid", "literal_error"):
         choices = re.findall(r"'([^']*)'", context["expected_tags" if kind == "union_tag_invalid" else "expected"])
         return document.unknown(path, str(path[-1]), context.get("tag", got), choices)
+    if kind == "too_long":
+        return document.error(path, "too many", expected=f"at most {context['max_length']}", got=context["actual_length"])
     if kind == "vkc":
         return document.error(path, context["problem"], expected=context["expected"], got=shown(got))
     if kind in _SIGNS:

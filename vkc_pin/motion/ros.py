@@ -20,8 +20,8 @@ from vkc_pin.motion.tables import chosen_columns, one_phase, read_json, size_of_
 
 __all__ = ["along", "from_ros", "rates", "to_ros"]
 
+_POINTS = 1_000_000  # in a message, at most: a gigabyte
 _NANO = 1_000_000_000
-_MOST_NUMBERS = 1e6
 
 
 def to_ros(
@@ -68,8 +68,9 @@ def to_ros(
     velocities, accelerations = rates(times, positions)
     if rate is not None:
         rate = number(rate, "rate", "points a second, more than 0", low=0.0, above=True)
-        if rate * times[-1] * len(columns) > _MOST_NUMBERS:
-            raise InputError("too many points", field="rate", expected=f"at most {_MOST_NUMBERS:g} positions in all", got=rate)
+        if times[-1] * rate > _POINTS:
+            expected = f"at most {_POINTS} points, {_POINTS / times[-1]:.4g} a second for this motion of {times[-1]:.4g} s"
+            raise InputError("too many points", field="rate", expected=expected, got=rate)
         moments = np.append(np.arange(math.ceil(times[-1] * rate - 1e-6)) / rate, times[-1])
         if smooth:
             positions, velocities, accelerations = along(times, positions, velocities, moments)

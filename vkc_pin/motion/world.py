@@ -57,7 +57,7 @@ class World:
             self._joints[name] = graft(self.model, placed.object.model, parent=parent, placement=placement, prefix=f"{name}.")
         objects = {name: placed.object.collision for name, placed in scene.objects.items()}
         self.bodies = self._geometry(robot.collision, objects)
-        self.shapes = (*self.bodies.geometryObjects, *scene.obstacles.geometryObjects)
+        self.shapes = (*self.bodies.geometryObjects, *scene.obstacles)
         self.collision_labels = [*(link_name(shape.name) for shape in self.bodies.geometryObjects), *scene.obstacle_labels]
         self.coordinates = Coordinates(self.model)
         states = [
@@ -70,7 +70,7 @@ class World:
     def collision(self) -> pin.GeometryModel:
         """What collides, as one; with many obstacles that takes a while, as Pinocchio's models take quadratic time to grow."""
         geometry = self.bodies.copy()
-        graft_geometry(geometry, self.scene.obstacles.geometryObjects, joints=[0], placement=pin.SE3.Identity())
+        graft_geometry(geometry, self.scene.obstacles, joints=[0], placement=pin.SE3.Identity())
         return geometry
 
     @cached_property
@@ -78,7 +78,7 @@ class World:
         """What to draw; put together when first asked for, since meshes for display are large."""
         objects = {name: placed.object.visual for name, placed in self.scene.objects.items()}
         geometry = self._geometry(self.scene.robot.visual, objects)
-        graft_geometry(geometry, self.scene.obstacle_visual.geometryObjects, joints=[0], placement=pin.SE3.Identity())
+        graft_geometry(geometry, self.scene.obstacle_visual, joints=[0], placement=pin.SE3.Identity())
         return geometry
 
     @cached_property
@@ -86,7 +86,7 @@ class World:
         """For each geometry of `visual`, the link or obstacle it belongs to."""
         links = {str(frame.name) for frame in self.model.frames if frame.type == pin.FrameType.BODY}
         shapes = list(self.visual.geometryObjects)
-        moving = len(shapes) - len(self.scene.obstacle_visual.geometryObjects)
+        moving = len(shapes) - len(self.scene.obstacle_visual)
         labels = []
         for shape in shapes[:moving]:
             label = link_name(shape.name)

@@ -14,8 +14,9 @@ __all__ = ["assemble", "curvature", "differences", "sparse"]
 
 
 def sparse(matrix: Floats) -> ca.DM:
-    """Return a small matrix without its zeros."""
-    return ca.sparsify(ca.DM(matrix))
+    """Return a matrix without its zeros."""
+    column, row = np.nonzero(matrix.T)
+    return ca.DM(ca.Sparsity.triplet(*matrix.shape, row.tolist(), column.tolist()), matrix[row, column])
 
 
 def assemble(parts: list[ca.MX], at: list[Ints], rows: int, columns: int) -> ca.MX:

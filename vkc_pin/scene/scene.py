@@ -65,10 +65,10 @@ class Scene:
     robot: Robot
     start: Floats
     objects: Mapping[str, PlacedObject]
-    obstacles: pin.GeometryModel
+    obstacles: tuple[pin.GeometryObject, ...]
     obstacle_labels: tuple[str, ...]
     obstacle_names: tuple[str, ...]
-    obstacle_visual: pin.GeometryModel
+    obstacle_visual: tuple[pin.GeometryObject, ...]
     floor: bool
     arena: tuple[float, float, float, float]
     start_region: RegionSchema | None
@@ -211,9 +211,7 @@ class Scene:
         data, shapes = model.createData(), geometry.createData()
         pin.updateGeometryPlacements(model, data, geometry, shapes, self.robot.coordinates.q(self.start))
         moving = [(shape.geometry, where) for shape, where in zip(geometry.geometryObjects, shapes.oMg, strict=True)]
-        standing = [
-            shape for shape, label in zip(self.obstacles.geometryObjects, self.obstacle_labels, strict=True) if label != FLOOR
-        ]
+        standing = [shape for shape, label in zip(self.obstacles, self.obstacle_labels, strict=True) if label != FLOOR]
         for name, placed in self.objects.items():
             if name not in self.held:
                 standing += standing_geometry(placed)

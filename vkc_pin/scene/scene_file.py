@@ -40,16 +40,14 @@ def scene_fields(document: Document, folder: Path) -> dict[str, Any]:
     _unique_names(document, description)
     objects = {item.name: _object(document, ("objects", index), item, folder) for index, item in enumerate(description.objects)}
     arena = (*description.arena.x, *description.arena.y)
-    obstacles, visual, labels = pin.GeometryModel(), pin.GeometryModel(), []
+    obstacles, visual, labels = list[pin.GeometryObject](), list[pin.GeometryObject](), list[str]()
     for index, item in enumerate(description.obstacles):
         drawn, shapes = _obstacle(document, ("obstacles", index), item, folder)
-        for shape in drawn:
-            visual.addGeometryObject(shape)
-        for shape in shapes:
-            obstacles.addGeometryObject(shape)
-            labels.append(item.name)
+        visual += drawn
+        obstacles += shapes
+        labels += [item.name] * len(shapes)
     if description.floor:
-        obstacles.addGeometryObject(floor_shape(arena))
+        obstacles.append(floor_shape(arena))
         labels.append(FLOOR)
     _check_places(document, description, arena)
     return {
@@ -59,10 +57,10 @@ def scene_fields(document: Document, folder: Path) -> dict[str, Any]:
         "robot": robot,
         "start": _start(document, description.start, robot),
         "objects": MappingProxyType(objects),
-        "obstacles": obstacles,
+        "obstacles": tuple(obstacles),
         "obstacle_labels": tuple(labels),
         "obstacle_names": tuple(item.name for item in description.obstacles),
-        "obstacle_visual": visual,
+        "obstacle_visual": tuple(visual),
         "floor": description.floor,
         "arena": arena,
         "start_region": description.start_region,

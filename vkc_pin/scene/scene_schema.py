@@ -28,6 +28,8 @@ __all__ = [
     "UrdfSchema",
 ]
 
+_MOST = 10_000  # obstacles; so many are loaded in some seconds
+
 COLOURS: dict[str, tuple[float, float, float]] = {
     "black": (0.13, 0.13, 0.14),
     "blue": (0.27, 0.42, 0.60),
@@ -221,5 +223,5 @@ class SceneSchema(Schema):
     arena: ArenaSchema = ArenaSchema()
     start_region: RegionSchema | None = None
     floor: bool = True
-    obstacles: tuple[ObstacleSchema, ...] = ()
+    obstacles: Annotated[tuple[ObstacleSchema, ...], Field(max_length=_MOST)] = ()
     objects: tuple[PlacedObjectSchema, ...] = ()

@@ -122,7 +122,7 @@ def rides_of(scene: Scene, now: Mapping[str, PlacedObject], hold: Hold, joints: 
         for shape in standing_geometry(placed)
         if name != hold.object or link_name(shape.name) not in links
     ]
-    still += zip(scene.obstacle_labels, scene.obstacles.geometryObjects, strict=True)
+    still += zip(scene.obstacle_labels, scene.obstacles, strict=True)
     found = []
     for name, label in riding.items():
         other = min(supports(now[name], still), default=None)

@@ -16,14 +16,18 @@ from vkc_pin.motion.world import World
 from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.scene import Scene
 
-__all__ = ["ANGLE_STEP", "LENGTH_STEP", "Samples"]
+__all__ = ["ANGLE_STEP", "LENGTH_STEP", "MOST", "Samples"]
 
 LENGTH_STEP, ANGLE_STEP = 5e-3, 1e-2  # [m], [rad] between two configurations that are looked at
-MOST_SAMPLES = 500_000  # 2.5 km
+MOST = 100_000
+"""Configurations that are looked at, but for the waypoints: of half a kilometre of the base, or 160 turns of a joint."""
+_LARGEST = 1e12  # [m] or [rad] of a coordinate
 
 
 class Samples:
     """A motion in a scene, sampled at least every 5 mm of the base and of every sliding joint and every 0.01 rad of the rest.
+
+    One that is longer than makes sense, as where it jumps, is sampled at its waypoints alone.
 
     Attributes:
         scene, trajectory: What it was made of.
@@ -32,10 +36,11 @@ class Samples:
         waypoint_rows: Which of these are the waypoints, shape (T,).
         z: Minimal coordinates of the world, shape (S, n).
         virtual: Coordinate → the freedom of a grasp that it is.
+        needed: How many configurations would have to be looked at; more than `MOST`: only the waypoints are.
 
     Raises:
         UnknownNameError: The trajectory names a coordinate, object or attachment that the scene does not have.
-        InputError: It lacks coordinates of the robot, or of a grasp that leaves the hand a freedom, or is longer than 2.5 km.
+        InputError: It lacks coordinates of the robot, or of a grasp that leaves the hand a freedom, or one is beyond all measure.
     """
 
     def __init__(self, scene: Scene, trajectory: Trajectory) -> None:
@@ -48,8 +53,16 @@ class Samples:
             for name, freedom in zip(attachment.coordinates, attachment.freedoms, strict=True)
         }
         self._check_names()
+        self._check_size()
         self.times, self.waypoint_rows = self._sample()
         self.z = self.world.positions(trajectory, self.times)
+
+    def _check_size(self) -> None:
+        far = np.argwhere(np.abs(self.trajectory.positions) > _LARGEST)
+        if len(far):
+            where, expected = far[0].tolist(), f"numbers up to {_LARGEST:g}"
+            got = self.trajectory.positions[tuple(where)]
+            raise InputError("out of range", field=f"trajectory.positions{where}", expected=expected, got=got)
 
     def _check_names(self) -> None:
         names, robot = self.trajectory.names, self.scene.robot.coordinates.names
@@ -91,10 +104,8 @@ class Samples:
         units = np.array([LENGTH_STEP if self.unit(name) == "m" else ANGLE_STEP for name in self.trajectory.names])
         planar = np.linalg.norm(steps[:, :2], axis=1) / LENGTH_STEP
         counts = np.maximum(1, np.ceil(np.maximum(planar, (steps / units).max(axis=1)) - 1e-9))
-        if not counts.sum() <= MOST_SAMPLES:
-            problem, expected = "the motion is too long to be checked", f"at most {MOST_SAMPLES} steps of 5 mm or 0.01 rad"
-            raise InputError(problem, field="trajectory.positions", expected=expected, got=f"{counts.sum():g}")
-        counts = counts.astype(int)
+        self.needed = float(counts.sum())
+        counts = np.minimum(counts, 1 if self.needed > max(MOST, len(counts)) else np.inf).astype(int)
         edges = itertools.pairwise(self.trajectory.times)
         times = [np.linspace(a, b, n, endpoint=False) for (a, b), n in zip(edges, counts, strict=True)]
         rows = np.concatenate([[0], np.cumsum(counts)])

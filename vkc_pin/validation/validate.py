@@ -23,7 +23,7 @@ from vkc_pin.validation.goals import MOTION_TOLERANCE, check_goals, check_steps
 from vkc_pin.validation.own_terms import check_terms
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.report import Report, Violation
-from vkc_pin.validation.samples import Samples
+from vkc_pin.validation.samples import MOST, Samples
 from vkc_pin.validation.sweep import sweep
 from vkc_pin.validation.touching import windows
 
@@ -55,7 +55,7 @@ def validate(
         Every violated constraint: start, limits, velocity, acceleration, slip of a differential base, closure, latches,
         rests in which the gripper closes or opens, joints of objects that nobody holds, what tips on what it stands on, hands
         that slide on what they clamp, goals and their order, clearance at waypoints and penetration anywhere, and own
-        constraints.
+        constraints; or that it is longer than can be looked at.
 
     Raises:
         InputError: The trajectory is none of this scene's robot and objects, or a step or term names what is not there.
@@ -80,7 +80,7 @@ class _Check:
         self.found += check_terms(self.samples, self.terms)
         error, angle = self._closure()
         self._slides()
-        clearance = self._clearance()
+        clearance = self._clearance() if self._within_reason() else np.inf
         worst: dict[tuple[str, str, str], Violation] = {}
         for violation in self.found:
             key = (violation.constraint, violation.subject, violation.unit)
@@ -101,6 +101,15 @@ class _Check:
         self.found.append(
             Violation(constraint, subject, waypoint=int(at), time=float(time), amount=float(amount), unit=unit, detail=detail)
         )
+
+    def _within_reason(self) -> bool:
+        """The motion is no longer than can be looked at; otherwise nothing is said of collisions."""
+        needed, most = self.samples.needed, max(MOST, len(self.trajectory.times))
+        if needed > most:
+            detail = f"{needed:.3g} configurations would have to be looked at, more than {most}: collisions were not looked for"
+            step = int(np.argmax(np.abs(np.diff(self.trajectory.positions, axis=0)).max(axis=1)))
+            self._add("sampling", "motion", needed - most, "configurations", detail, waypoint=step)
+        return needed <= most
 
     def _start(self) -> None:
         """The motion begins where the robot and the objects are."""

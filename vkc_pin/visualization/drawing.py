@@ -149,7 +149,7 @@ class Drawing:
         items: list[Item] = []
         shapes, labels = list(self.world.visual.geometryObjects), self.world.visual_labels
         first = len(self.scene.robot.visual.geometryObjects)
-        end = len(shapes) - len(self.scene.obstacle_visual.geometryObjects)
+        end = len(shapes) - len(self.scene.obstacle_visual)
         for shape, label in zip(shapes[first:end], labels[first:end], strict=True):
             owner, _, link = label.partition(".")
             root = self.nodes[shape.parentJoint] if shape.parentJoint else f"objects/{owner}"

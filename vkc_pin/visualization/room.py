@@ -57,7 +57,7 @@ class Room:
         self.reach = float(np.hypot(x_max - x_min, y_max - y_min)) / 2.0
         self._walls: list[pin.GeometryObject] = []
         self._furniture: list[pin.GeometryObject] = []
-        for shape in scene.obstacle_visual.geometryObjects:
+        for shape in scene.obstacle_visual:
             (self._walls if _is_wall(shape) else self._furniture).append(shape)
 
     def parts(self) -> list[Part]:

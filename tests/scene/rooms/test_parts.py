@@ -23,7 +23,7 @@ def scene(*standing: parts.Part, walls: bool = False) -> vkc.Scene:
 
 
 def extent(found: vkc.Scene) -> np.ndarray:
-    boxes = np.array([world_box(shape.geometry, shape.placement) for shape in found.obstacles.geometryObjects])
+    boxes = np.array([world_box(shape.geometry, shape.placement) for shape in found.obstacles])
     return np.array([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
 
 
@@ -62,7 +62,7 @@ def test_what_opens_stands_at_its_wall_and_has_room_to(kind: str, side: int) -> 
     part = parts.opened(kind, kind, FLOOR, side, 0.5, 1.8)
     room = scene(part, walls=True)
     placed = room.objects[kind]
-    walls = placed_shapes(room.obstacles.geometryObjects)
+    walls = placed_shapes(room.obstacles)
     assert clearance(placed_shapes(standing_geometry(placed)), walls) > -2e-3  # frames of doors touch their wall
     joint = placed.object.coordinates.names[0]
     for share in np.linspace(0.0, 1.0, 6):  # moving parts keep the clearance that plans do
@@ -96,7 +96,7 @@ def test_what_is_carried_stands_on_its_table(kind: str) -> None:
     table = parts.table("table", Frame(1.0, -0.5, np.pi), (0.8, 1.4, 0.74))
     room = scene(table, parts.carried(kind, kind, table, -0.2, 0.3))
     placed = room.objects[kind]
-    gap = clearance(placed_shapes(standing_geometry(placed)), placed_shapes(room.obstacles.geometryObjects))
+    gap = clearance(placed_shapes(standing_geometry(placed)), placed_shapes(room.obstacles))
     assert gap == pytest.approx(1e-3, abs=1e-4)
     assert placed.placement.translation[:2] == pytest.approx([1.2, -0.8])
 

@@ -29,7 +29,7 @@ def groups(layout: Layout, scene: vkc.Scene) -> dict[str, list]:
     """Return the collision shapes of every part and of the walls."""
     found: dict[str, list] = {part.name: [] for part in layout.parts}
     owners = {entry["name"]: part.name for part in layout.parts for entry in part.obstacles}
-    for shape, label in zip(scene.obstacles.geometryObjects, scene.obstacle_labels, strict=True):
+    for shape, label in zip(scene.obstacles, scene.obstacle_labels, strict=True):
         if label != FLOOR:
             found.setdefault(owners.get(label, "walls"), []).append(shape)
     for name, placed in scene.objects.items():
@@ -97,7 +97,7 @@ def test_a_room_can_be_saved(tmp_path: Path) -> None:
     file.write_text(yaml.safe_dump(room.document), encoding="utf-8")
     again = vkc.load_scene(file)
     assert again.document == room.document
-    for one, other in zip(room.obstacles.geometryObjects, again.obstacles.geometryObjects, strict=True):
+    for one, other in zip(room.obstacles, again.obstacles, strict=True):
         assert one.placement.isApprox(other.placement)
         assert shape_distance(one.geometry, one.placement, other.geometry, other.placement) < 0.0
 

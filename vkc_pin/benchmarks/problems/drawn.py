@@ -143,7 +143,7 @@ def _place(scene: Scene, name: str, rng: np.random.Generator) -> Step:
     """Put an object on the floor, or on top of an obstacle."""
     placed = scene.objects[name]
     below = min(world_box(shape.geometry, shape.placement)[0][2] for shape in standing_geometry(placed))
-    shapes = zip(scene.obstacles.geometryObjects, scene.obstacle_labels, strict=True)
+    shapes = zip(scene.obstacles, scene.obstacle_labels, strict=True)
     boxes = [world_box(shape.geometry, shape.placement) for shape, label in shapes if label != FLOOR]
     tops = [(low, high) for low, high in boxes if 0.3 < high[2] < 1.3 and min(high[:2] - low[:2]) > 0.2]
     if tops and rng.random() < 0.8:

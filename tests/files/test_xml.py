@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vkc_pin.errors import InputError
-from vkc_pin.files.xml import line_of, parse_xml
+from vkc_pin.files.xml import check_indices, line_of, parse_xml
 
 FILE = Path("thing.urdf")
 
@@ -57,3 +57,23 @@ def test_entities_are_refused() -> None:
 def test_a_hundred_thousand_elements_inside_each_other() -> None:
     root = parse_xml("<a>" * 100_000 + "</a>" * 100_000, FILE)
     assert line_of(root) == 1
+
+
+@pytest.mark.parametrize("indices", ["0 ~ 1", "0 1.5 2", "zero", "0 1 2x", "<![CDATA[0 ~ 1]]>"])
+def test_what_is_no_index_is_found_before_assimp_reads_it(tmp_path: Path, indices: str) -> None:
+    file = tmp_path / "mesh.dae"
+    for tag in ("p", "v", "h", "vcount", "c:p"):
+        file.write_text(f"<a xmlns:c='c'>\n<{tag}>{indices}</{tag}></a>", encoding="utf-8")
+        with pytest.raises(InputError, match=r"mesh.dae:2: <.*>: not indices"):
+            check_indices(file)
+
+
+def test_indices(tmp_path: Path) -> None:
+    file = tmp_path / "mesh.dae"
+    file.write_text("<a><p>0 1 -1\n2 &#51;<!-- x --></p><n>x</n><p/></a>", encoding="utf-16")
+    check_indices(file)
+    file.write_text("<a><p>0", encoding="utf-8")
+    with pytest.raises(InputError, match="not valid XML"):
+        check_indices(file)
+    with pytest.raises(InputError, match="cannot read"):
+        check_indices(tmp_path)

@@ -164,9 +164,10 @@ def check(document: Document, schema: type[T]) -> T:
     try:
         return schema.model_validate(document.data)
     except pydantic.ValidationError as problem:
-        errors = problem.errors(include_url=False)
-    except UnicodeEncodeError as problem:  # the name of a field is half of a surrogate pair
-        raise InputError("not text", file=document.file, expected="names of fields in UTF-8", got=str(problem)) from None
+        try:
+            errors = problem.errors(include_url=False)
+        except UnicodeEncodeError as unwritten:  # the name of a field is half of a surrogate pair
+            raise InputError("not text", file=document.file, expected="names in UTF-8", got=str(unwritten)) from None
     located = [(_path(document.data, error), error) for error in errors]
     path, first = min(located, key=lambda item: document.line(item[0]) or 0)
     raise _translate(document, path, first)

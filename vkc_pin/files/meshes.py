@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from vkc_pin.arrays import Floats, Ints
 from vkc_pin.errors import InputError
 from vkc_pin.files.hulls import outer_hull
+from vkc_pin.files.xml import check_indices
 
 if TYPE_CHECKING:
     import trimesh
@@ -64,6 +65,8 @@ def load_mesh(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0)) -> trimesh.T
     if not file.is_file():
         raise InputError("there is no such mesh", file=file, expected="a mesh file")
     by_coal = file.suffix.lower() == ".dae"
+    if by_coal:
+        check_indices(file)
     try:
         if by_coal:
             shape = coal.MeshLoader().load(str(file), np.ones(3))

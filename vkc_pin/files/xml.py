@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import Any
 from xml.parsers import expat
 
-from vkc_pin.errors import InputError
+from vkc_pin.errors import InputError, shown
 
-__all__ = ["line_of", "parse_xml"]
+__all__ = ["check_indices", "line_of", "parse_xml"]
+
+_INDICES = ("h", "p", "v", "vcount")
 
 
 class _Element(ElementTree.Element):
@@ -52,3 +54,33 @@ def parse_xml(text: str, file: Path) -> ElementTree.Element:
         return builder.close()
     except expat.ExpatError as error:
         raise InputError(f"not valid XML: {error}", file=file, line=error.lineno) from error
+
+
+def check_indices(file: Path) -> None:
+    """Check that the lists of indices in a COLLADA file hold whole numbers.
+
+    assimp, which reads these files, does not get past anything else in them, and takes ever more memory meanwhile.
+
+    Raises:
+        InputError: One holds something else, the file is no XML, or it cannot be read.
+    """
+    parser, inside = expat.ParserCreate(), list[str]()
+
+    def start(tag: str, _: dict[str, str]) -> None:
+        inside.append(tag.rpartition(":")[2])
+
+    def text(data: str) -> None:
+        if inside and inside[-1] in _INDICES and data.strip("0123456789+- \t\r\n"):
+            line, field = parser.CurrentLineNumber, f"<{inside[-1]}>"
+            raise InputError("not indices", file=file, line=line, field=field, expected="whole numbers", got=shown(data))
+
+    def end(_: str) -> None:
+        inside.pop()
+
+    parser.StartElementHandler, parser.EndElementHandler, parser.CharacterDataHandler = start, end, text
+    try:
+        parser.Parse(file.read_bytes(), True)
+    except expat.ExpatError as error:
+        raise InputError(f"not valid XML: {error}", file=file, line=error.lineno) from error
+    except OSError as error:
+        raise InputError("cannot read the file", file=file, got=error.strerror) from error

@@ -246,5 +246,5 @@ def term_from_dict(data: Mapping[str, Any]) -> Term:
         formula = Formula(tuple(given["frames"]), tuple(given["coordinates"]), int(given["rows"]), code)
         formula.function  # noqa: B018 - what cannot be built is no expression
         return kinds[fields.pop("term")](expression=formula, **fields)
-    except (LookupError, TypeError, ValueError, NotImplementedError, RuntimeError) as error:
+    except (LookupError, TypeError, ValueError, OverflowError, NotImplementedError, RuntimeError) as error:
         raise InputError("not a saved term", field="terms", expected="what Plan.save wrote", got=str(error)) from error

@@ -1,0 +1,170 @@
+"""Description files, changed at random where they stand: a copy of all robots and scenes, with one file spoiled."""
+
+from __future__ import annotations
+
+import functools
+import random
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+import vkc_pin as vkc
+from vkc_pin.files.resources import folder
+
+from . import odd
+from .calls import TINY
+from .mutate import changed, data_changes, spoiled
+
+__all__ = ["case", "document_case", "options_case", "run", "run_document", "run_options"]
+
+MESHES = {"stl": "box.stl", "obj": "box.obj", "ply": "box.ply", "dae": "box.dae"}
+PLANNED = 0.02  # the share of what loads that is planned in
+
+
+@functools.cache
+def pool() -> Path:
+    """A copy of robots and scenes, with a mesh of each kind and a scene that has them."""
+    root = Path(tempfile.mkdtemp(prefix="vkc_fuzz_files_"))
+    for kind in ("robots", "scenes"):
+        shutil.copytree(folder(kind), root / kind)
+    for name in MESHES.values():
+        if not name.endswith("dae"):
+            trimesh.creation.box(extents=(0.5, 0.4, 0.3)).export(root / "scenes" / name)
+    (root / "scenes" / "box.dae").write_text(_DAE, encoding="utf-8")
+    entries = [
+        f"  - {{name: {kind}, type: mesh, file: {name}, position: [{k}, 2.0, 0.5]}}"
+        for k, (kind, name) in enumerate(MESHES.items())
+    ]
+    shown = "\n".join(entries)
+    text = "robot: ../robots/husky_ur5e/robot.yaml\nstart: {base: [0, 0, 0]}\narena: {x: [-9, 9], y: [-9, 9]}\nobstacles:\n"
+    (root / "scenes" / "meshes.yaml").write_text(f"{text}{shown}\n", encoding="utf-8")
+    return root
+
+
+@functools.cache
+def _files() -> tuple[str, ...]:
+    found = [
+        path for path in sorted(pool().rglob("*")) if path.suffix in (".yaml", ".urdf", ".srdf", ".stl", ".obj", ".ply", ".dae")
+    ]
+    return tuple(str(path.relative_to(pool())) for path in found)
+
+
+def case(rng: random.Random) -> dict[str, Any]:
+    """Return a case: a file, and what is in it instead."""
+    name = rng.choice(_files())
+    if name.endswith(".stl") and rng.random() < 0.7:  # there are many
+        name = rng.choice([other for other in _files() if not other.endswith(".stl")])
+    data = spoiled(rng, (pool() / name).read_bytes())
+    return {"file": name, "content": data.decode("latin-1"), "plan": rng.random() < PLANNED}
+
+
+def run(given: dict[str, Any]) -> str:
+    """Load what the file belongs to, and use it."""
+    file = pool() / given["file"]
+    kept = file.read_bytes() if file.is_file() else None
+    file.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        file.write_bytes(given["content"].encode("latin-1"))
+        return _used(_loaded(file), planned=given.get("plan", False))
+    finally:
+        if kept is None:
+            file.unlink()
+        else:
+            file.write_bytes(kept)
+
+
+def _loaded(file: Path) -> vkc.Scene:
+    scenes, robot = pool() / "scenes", "../robots/husky_ur5e/robot.yaml"
+    bare: dict[str, Any] = {"robot": "husky_ur5e", "start": {"base": [0, 0, 0]}, "arena": {"x": [-9, 9], "y": [-9, 9]}}
+    where = file.relative_to(pool()).parts
+    if where[0] == "robots":
+        vkc.load_robot(file if file.suffix in (".yaml", ".urdf") else file.parent / "husky_ur5e.urdf")
+        return vkc.Scene.from_document({**bare, "robot": robot}, scenes)
+    if where[1] == "objects":
+        file = file.with_suffix(".yaml")
+        vkc.load_object(file)
+        entry = {"name": "thing", "type": f"objects/{file.name}", "position": [3.0, 0.0, 0.5]}
+        return vkc.Scene.from_document({**bare, "objects": [entry]}, scenes)
+    if where[1] == "furniture":
+        entry = {"name": "thing", "type": "urdf", "file": f"furniture/{file.name}", "position": [3.0, 0.0, 0.0]}
+        return vkc.Scene.from_document({**bare, "obstacles": [entry]}, scenes)
+    return vkc.load_scene(file if file.suffix == ".yaml" else scenes / "meshes.yaml")
+
+
+def _used(scene: vkc.Scene, *, planned: bool) -> str:
+    assert not np.isnan(scene.start_clearance()), "a clearance that is no number"
+    repr(scene)
+    vkc.Scene.from_document(scene.document, scene.folder)
+    if not planned:
+        return "loaded"
+    steps: list[Any] = [vkc.GoTo(float(scene.start[0]), float(scene.start[1]), 0.5)]
+    for name, placed in scene.objects.items():
+        if not placed.object.free and placed.object.coordinates.names:
+            steps = [vkc.Actuate(name, {placed.object.coordinates.names[0]: 0.1})]
+    plan = vkc.plan(scene, steps, options=vkc.Options(**TINY), time_limit=0.2)
+    plan.report()
+    return "planned"
+
+
+@functools.cache
+def _documents() -> dict[str, Any]:
+    names = ("door", "drawer", "fetch", "household", "init_1", "gap_table")
+    return {name: vkc.load_scene(name).document for name in names}
+
+
+def document_case(rng: random.Random) -> dict[str, Any]:
+    """Return a case: a scene, and what is changed in its description."""
+    name = rng.choice(tuple(_documents()))
+    values = odd.VALUES if rng.random() < 0.2 else tuple(odd.JSON_VALUES)
+    return {"scene": name, "changes": data_changes(rng, _documents()[name], values), "plan": rng.random() < PLANNED}
+
+
+def run_document(given: dict[str, Any]) -> str:
+    """Build the scene from its description, and use it."""
+    document = changed(_documents()[given["scene"]], given["changes"])
+    return _used(vkc.Scene.from_document(document, folder("scenes")), planned=given.get("plan", False))
+
+
+def options_case(rng: random.Random) -> dict[str, Any]:
+    """Return a case: options with fields at random, most of them numbers that are allowed."""
+    fields = {}
+    for name in rng.sample(tuple(vkc.Options.__dataclass_fields__), rng.choice((1, 2, 3, 6))):
+        usual = getattr(vkc.Options(), name)
+        if rng.random() < 0.5 or isinstance(usual, str):
+            fields[name] = {"odd": rng.choice(odd.VALUES)}
+        elif isinstance(usual, int):
+            fields[name] = rng.choice((1, 2, 3, 5, usual))
+        else:
+            fields[name] = usual * 10.0 ** rng.uniform(-3.0, 3.0)
+    return {"fields": fields, "plan": rng.random() < 0.15}
+
+
+def run_options(given: dict[str, Any]) -> str:
+    """Make the options, and plan with them."""
+    chosen = {name: odd.value(value["odd"]) if isinstance(value, dict) else value for name, value in given["fields"].items()}
+    options = vkc.Options(**{**(TINY if given.get("plan") else {}), **chosen})
+    if not given.get("plan"):
+        return "made"
+    counts = (options.reach_waypoints, options.move_waypoints, options.turn_waypoints, options.contact_slots)
+    if max(counts) > 50:
+        return "made"  # as large as was asked for
+    scene = vkc.load_scene("drawer")
+    vkc.plan(scene, [vkc.Actuate("drawer", {"slide": 0.2})], options=options, time_limit=0.2).report()
+    return "planned"
+
+
+_DAE = """<?xml version="1.0"?>
+<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit meter="1"/><up_axis>Z_UP</up_axis></asset>
+<library_geometries><geometry id="g"><mesh><source id="p"><float_array id="a" count="12">0 0 0 1 0 0 0 1 0 0 0 1</float_array>
+<technique_common><accessor source="#a" count="4" stride="3"><param name="X" type="float"/><param name="Y" type="float"/>
+<param name="Z" type="float"/></accessor></technique_common></source><vertices id="v"><input semantic="POSITION" source="#p"/>
+</vertices><triangles count="4"><input semantic="VERTEX" source="#v" offset="0"/><p>0 2 1 0 1 3 0 3 2 1 2 3</p></triangles></mesh>
+</geometry></library_geometries><library_visual_scenes><visual_scene id="s">
+<node><instance_geometry url="#g"/></node></visual_scene>
+</library_visual_scenes><scene><instance_visual_scene url="#s"/></scene></COLLADA>
+"""

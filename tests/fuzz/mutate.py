@@ -1,0 +1,222 @@
+"""Changes at random: of text and bytes, and of plain data at places in it."""
+
+from __future__ import annotations
+
+import copy
+import random
+import re
+from collections.abc import Iterator
+from typing import Any
+
+from . import odd
+
+__all__ = ["changed", "data_changes", "places", "spoiled"]
+
+_NUMBER = re.compile(rb"-?\d+\.?\d*(?:e-?\d+)?")
+_WORD = re.compile(rb"[A-Za-z_][\w.]*")
+_TAG = re.compile(rb"</?[A-Za-z_][^<>]*>")
+_ATTRIBUTE = re.compile(rb"\s[\w:]+=\"[^\"]*\"")
+_NUMBERS = (b"nan", b"inf", b"-inf", b"1e300", b"-1", b"0", b"0,2", b"1e-300", b"1e5", b"0x10", b"1_0", b"9" * 400, b"", b"true")
+_WORDS = (
+    b"",
+    b"null",
+    b"~",
+    b"yes",
+    b"!!python/object:os.system",
+    b"&a",
+    b"*a",
+    b"- ",
+    b"?",
+    b"{",
+    b"[",
+    b"<",
+    b"&amp;",
+    b"..",
+    b"/",
+)
+
+
+def spoiled(rng: random.Random, data: bytes, most: int = 3) -> bytes:
+    """Return a file's content with one to a few changes."""
+    for _ in range(rng.choice((1, 1, 2, most))):
+        data = rng.choice(_CHANGES)(rng, data)[:2_000_000]
+    return data
+
+
+def _flip(rng: random.Random, data: bytes) -> bytes:
+    found = bytearray(data)
+    for _ in range(rng.choice((1, 1, 2, 8, 64))):
+        if found:
+            found[rng.randrange(len(found))] = rng.randrange(256)
+    return bytes(found)
+
+
+def _cut(rng: random.Random, data: bytes) -> bytes:
+    return data[: rng.randrange(len(data) + 1)]
+
+
+def _span(rng: random.Random, data: bytes) -> tuple[int, int]:
+    start = rng.randrange(len(data) + 1)
+    return start, min(len(data), start + rng.choice((1, 3, 10, 40, 200, 1000)))
+
+
+def _delete(rng: random.Random, data: bytes) -> bytes:
+    start, end = _span(rng, data)
+    return data[:start] + data[end:]
+
+
+def _double(rng: random.Random, data: bytes) -> bytes:
+    start, end = _span(rng, data)
+    return data[:end] + data[start:end] * rng.choice((1, 1, 2, 50, 1000)) + data[end:]
+
+
+def _line(rng: random.Random, data: bytes) -> bytes:
+    lines = data.split(b"\n")
+    k, other = rng.randrange(len(lines)), rng.randrange(len(lines))
+    match rng.randrange(5):
+        case 0:
+            del lines[k]
+        case 1:
+            lines.insert(k, lines[other])
+        case 2:
+            lines[k], lines[other] = lines[other], lines[k]
+        case 3:
+            lines[k] = b" " * rng.choice((1, 2, 7)) + lines[k]
+        case _:
+            lines[k] = lines[k].strip()
+    return b"\n".join(lines)
+
+
+def _replaced(rng: random.Random, data: bytes, pattern: re.Pattern[bytes], by: tuple[bytes, ...] = ()) -> bytes:
+    found = list(pattern.finditer(data))
+    if not found:
+        return _flip(rng, data)
+    match = rng.choice(found)
+    new = rng.choice(by) if by and rng.random() < 0.7 else rng.choice(found)[0]
+    return data[: match.start()] + new + data[match.end() :]
+
+
+def _number(rng: random.Random, data: bytes) -> bytes:
+    if rng.random() < 0.4:  # another one that may well do
+        return _replaced(
+            rng, data, _NUMBER, tuple(b"%g" % rng.choice((rng.uniform(-3, 3), rng.uniform(0, 0.1), 1e3)) for _ in "abc")
+        )
+    return _replaced(rng, data, _NUMBER, _NUMBERS)
+
+
+def _word(rng: random.Random, data: bytes) -> bytes:
+    return _replaced(rng, data, _WORD, _WORDS)
+
+
+def _attribute(rng: random.Random, data: bytes) -> bytes:
+    return _replaced(rng, data, _ATTRIBUTE, (b"",))
+
+
+def _tag(rng: random.Random, data: bytes) -> bytes:
+    found = list(_TAG.finditer(data))
+    if not found:
+        return _word(rng, data)
+    match, other = rng.choice(found), rng.choice(found)
+    new = rng.choice((b"", other[0], match[0] * 2, b"<x>" + match[0], match[0] + b"</x>", b"<link/>", b"<joint/>", b"<mesh/>"))
+    return data[: match.start()] + new + data[match.end() :]
+
+
+def _coded(rng: random.Random, data: bytes) -> bytes:
+    text = data.decode("latin-1")
+    return rng.choice(
+        (
+            text.encode("utf-16"),
+            text.encode("utf-32"),
+            b"\xef\xbb\xbf" + data,
+            data.replace(b"\n", b"\r"),
+            data.replace(b" ", b"\t"),
+            data.replace(b"\n", b"\x00"),
+            b"\x00" * len(data),
+            b"",
+            data.upper(),
+        )
+    )
+
+
+def _around(rng: random.Random, data: bytes) -> bytes:
+    return rng.choice(
+        (
+            b"- " * 5000 + data,
+            b"[" * 20000,
+            b"{a: " * 3000,
+            b"<robot name='x'>" * 3000,
+            data * 20,
+            b'<?xml version="1.0"?><!DOCTYPE r [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;">]><robot name="&b;"/>',
+            b"a: &a [x, x]\nb: &b [*a, *a]\nc: &c [*b, *b]\n" + data,
+            b"---\n" + data + b"\n---\n" + data,
+        )
+    )
+
+
+_CHANGES = (
+    _flip,
+    _cut,
+    _delete,
+    _double,
+    _line,
+    _line,
+    *[_number] * 6,
+    _word,
+    _word,
+    _attribute,
+    _tag,
+    _tag,
+    _coded,
+    _around,
+)
+
+
+def places(data: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Return the paths of everything in plain data."""
+    yield path
+    if isinstance(data, dict | list):
+        for key, value in data.items() if isinstance(data, dict) else enumerate(data):
+            yield from places(value, (*path, key))
+
+
+def data_changes(rng: random.Random, data: Any, values: tuple[str, ...] = tuple(odd.JSON_VALUES)) -> list[list[Any]]:
+    """Return one to a few changes for `changed`: a path, what happens there, and an odd value's name, key or path."""
+    everywhere = [path for path in places(data) if path]
+    made: list[list[Any]] = []
+    for _ in range(rng.choice((1, 1, 1, 2, 3))):
+        path, what = rng.choice(everywhere), rng.choice(("set", "set", "set", "remove", "rename", "copy", "double"))
+        with_what: Any = rng.choice(values)
+        if what == "copy":
+            with_what = list(rng.choice(everywhere))
+        elif what == "rename":
+            with_what = rng.choice(("x", "", "name", "type", "a.b", "\ud800", "position"))
+        made.append([list(path), what, with_what])
+    return made
+
+
+def changed(data: Any, changes: list[list[Any]]) -> Any:
+    """Return a copy of plain data with changes; those whose place is gone by then are left out."""
+    data = copy.deepcopy(data)
+    for path, what, value in changes:
+        try:
+            around, key = _at(data, path[:-1]), path[-1]
+            around[key]
+            if what == "set":
+                around[key] = odd.value(value)
+            elif what == "remove":
+                del around[key]
+            elif what == "copy":
+                around[key] = copy.deepcopy(_at(data, value))
+            elif what == "rename" and isinstance(around, dict):
+                around[value] = around.pop(key)
+            elif what == "double" and isinstance(around, list):
+                around.insert(key, copy.deepcopy(around[key]))
+        except (LookupError, TypeError):
+            continue
+    return data
+
+
+def _at(data: Any, path: list[Any]) -> Any:
+    for key in path:
+        data = data[key]
+    return data

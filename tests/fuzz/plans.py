@@ -1,0 +1,132 @@
+"""Saved plans, changed at random: what is said in them, their arrays, the archive, its bytes."""
+
+from __future__ import annotations
+
+import functools
+import io
+import json
+import random
+import zipfile
+from typing import Any
+
+import numpy as np
+
+import vkc_pin as vkc
+
+from . import odd
+from .calls import folder, motion, saved, scene
+from .mutate import changed, data_changes
+
+__all__ = ["case", "run"]
+
+ARRAYS = ("times", "positions")
+
+
+@functools.cache
+def _base() -> tuple[dict[str, Any], dict[str, Any]]:
+    """A plan of all that plans can have: what it says, and its arrays."""
+    terms = [
+        vkc.Constraint("elbow", lambda s: s.coordinate("elbow_joint"), lower=-3.0),
+        vkc.Cost("x", lambda s: s.position("tool0")[0]),
+    ]
+    steps: list[Any] = [vkc.Actuate("drawer", {"slide": 0.1}), vkc.GoTo(0.1, 0.1)]
+    report = vkc.validate(scene(), steps, motion(), terms=terms)
+    planned = saved()
+    from vkc_pin.task.terms import traced
+
+    plan = vkc.Plan(
+        scene(),
+        tuple(steps),
+        vkc.Options(),
+        motion(),
+        report,
+        "rejected",
+        planned.metrics,
+        history=planned.history,
+        terms=traced(scene(), terms),
+    )
+    file = plan.save(folder() / "base.npz")
+    with np.load(file) as archive:
+        return json.loads(str(archive["about"])), {name: archive[name] for name in ARRAYS}
+
+
+def _archive(about: Any, arrays: dict[str, Any]) -> bytes:
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, about=about, **arrays)
+    return buffer.getvalue()
+
+
+def case(rng: random.Random) -> dict[str, Any]:
+    """Return a case: changes of what is said, of arrays, of the members of the archive, or of bytes."""
+    about, _ = _base()
+    match rng.randrange(8):
+        case 0 | 1 | 2 | 3:
+            return {"about": data_changes(rng, about)}
+        case 4:
+            return {"array": rng.choice((*ARRAYS, "about")), "odd": rng.choice(odd.VALUES)}
+        case 5:
+            name = rng.choice(("about.npy", "times.npy", "positions.npy"))
+            return {"member": name, "does": rng.choice(("remove", "double", "empty", "garbage", "liar", "text", "deep"))}
+        case 6:
+            return {"cut": rng.randrange(5000)}
+        case _:
+            return {"bytes": [[rng.randrange(6000), rng.randrange(256)] for _ in range(rng.choice((1, 1, 4, 30)))]}
+
+
+def _content(given: dict[str, Any]) -> bytes:
+    about, arrays = _base()
+    if "about" in given:
+        return _archive(np.array(json.dumps(changed(about, given["about"]))), arrays)
+    if "array" in given:
+        parts = {"about": np.array(json.dumps(about)), **arrays}
+        value = odd.value(given["odd"])
+        try:
+            parts[given["array"]] = np.asarray(value)
+            return _archive(parts.pop("about"), parts)
+        except (ValueError, TypeError, RuntimeError, AttributeError, RecursionError):  # it is no array, and cannot be pickled
+            return b""
+    data = _archive(np.array(json.dumps(about)), arrays)
+    if "member" in given:
+        return _members(data, given["member"], given["does"])
+    if "cut" in given:
+        return data[: given["cut"]]
+    found = bytearray(data)
+    for at, byte in given["bytes"]:
+        found[at % len(found)] = byte
+    return bytes(found)
+
+
+def _members(data: bytes, name: str, does: str) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as new:
+        for member in old.namelist():
+            content = old.read(member)
+            if member == name:
+                if does == "remove":
+                    continue
+                lie = (
+                    b"\x93NUMPY\x01\x00v\x00"
+                    + b"{'descr': '<f8', 'fortran_order': False, 'shape': (9000000000,), }".ljust(117)
+                    + b"\n"
+                )
+                nested = io.BytesIO()
+                np.save(nested, np.array("[" * 100_000))
+                content = {"empty": b"", "garbage": content[::-1], "liar": lie, "text": b"{}", "deep": nested.getvalue()}.get(
+                    does, content
+                )
+            new.writestr(member, content)
+            if does == "double" and member == name:
+                new.writestr(f"x{member}", content)
+    return buffer.getvalue()
+
+
+def run(given: dict[str, Any]) -> str:
+    """Load it, look at it, and check it."""
+    file = folder() / "spoiled.npz"
+    file.write_bytes(_content(given))
+    plan = vkc.Plan.load(file)
+    plan.report()
+    json.dumps(plan.to_dict())
+    repr(plan)
+    vkc.validate(plan.scene, plan.steps, plan.trajectory, plan.options, plan.terms)
+    return "loaded"

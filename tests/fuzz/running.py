@@ -1,0 +1,183 @@
+"""Runs cases in a process of their own that is watched: what crashes, hangs, or takes too much is known by its case."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import resource
+import select
+import subprocess
+import sys
+import time
+import traceback
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+__all__ = ["BAD", "KINDS", "Worker", "made", "serve"]
+
+SECONDS, MEGABYTES = 2.0, 500.0  # of processor time and memory that a case may take
+PLANNING = 6.0  # seconds more where there is a problem to build, and to plan for its time limit
+HUNG = 40.0  # seconds of the clock after which a case is given up
+FRESH = 1500  # cases after which a new process begins
+BAD = ("raw", "slow", "memory", "crashed", "hung")
+TESTS = Path(__file__).resolve().parents[1]
+
+
+def _kinds() -> dict[str, tuple[Callable[[random.Random], dict[str, Any]], Callable[[dict[str, Any]], str]]]:
+    from . import calls, files, lines, plans
+
+    return {
+        "files": (files.case, files.run),
+        "documents": (files.document_case, files.run_document),
+        "options": (files.options_case, files.run_options),
+        "calls": (calls.case, calls.run),
+        "plans": (plans.case, plans.run),
+        "lines": (lines.case, lines.run),
+        "planted": (lambda rng: {"does": rng.choice(_PLANTED)}, _plant),
+    }
+
+
+KINDS = {"files": 0.35, "documents": 0.2, "options": 0.05, "calls": 0.25, "plans": 0.1, "lines": 0.05}
+"""The kinds of cases, and the share of each."""
+
+
+_PLANTED = ("refuse", "raise", "exit", "spin", "eat", "sleep", "crash")
+
+
+def _plant(case: dict[str, Any]) -> str:
+    """Go wrong in a way that must be noticed."""
+    from vkc_pin.errors import InputError
+
+    match case["does"]:
+        case "refuse":
+            raise InputError("wrong")
+        case "raise":
+            raise KeyError("planted")
+        case "exit":
+            sys.exit(3)
+        case "spin":
+            began = time.process_time()
+            while time.process_time() < began + 1.1 * SECONDS:
+                pass
+        case "eat":
+            bytearray(int(1.5e6 * MEGABYTES))
+        case "sleep":
+            time.sleep(10.0 * HUNG)
+        case "crash":
+            os.abort()
+    return "done"
+
+
+def made(kind: str, seed: int, number: int) -> dict[str, Any]:
+    """Return case number `number` of a kind; seed and number say which."""
+    return _kinds()[kind][0](random.Random(f"{kind} {seed} {number}"))
+
+
+def serve() -> None:
+    """Take cases from standard input, a line each, and say what came of each on standard output."""
+    answers = os.fdopen(os.dup(1), "w")
+    silent = os.open(os.devnull, os.O_RDWR)
+    os.dup2(silent, 1)
+    os.dup2(silent, 2)
+    warnings.simplefilter("ignore")
+    kinds = _kinds()
+    _limit_memory()
+    requests, sys.stdin = sys.stdin, open(os.devnull)  # noqa: SIM115, PTH123 - for as long as the process lives
+    for line in requests:
+        asked = json.loads(line)
+        case = asked["case"] if "case" in asked else made(asked["kind"], asked["seed"], asked["number"])
+        if asked.get("only") == "make":
+            answers.write(json.dumps({"case": case}) + "\n")
+        else:
+            answers.write(json.dumps(_run(kinds[asked["kind"]][1], case)) + "\n")
+        answers.flush()
+
+
+def _limit_memory() -> None:
+    """Let an allocation fail that is far too large, before the machine has to find room for it."""
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + 6 * 2**30, resource.RLIM_INFINITY))
+
+
+def _memory(name: str) -> float:
+    text = Path("/proc/self/status").read_text(encoding="ascii")
+    return next(float(line.split()[1]) for line in text.splitlines() if line.startswith(name)) / 1024.0
+
+
+def _run(does: Callable[[dict[str, Any]], str], case: dict[str, Any]) -> dict[str, Any]:
+    from vkc_pin.errors import VkcError
+
+    Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # the peak begins anew
+    before, began, error = _memory("VmRSS"), time.process_time(), ""
+    try:
+        outcome = does(case)
+    except VkcError as refusal:
+        outcome, error = "refused", str(refusal)[:300]
+        if len(text := str(refusal)) > 4000 or not text.strip():
+            outcome, error = "raw", f"a message of {len(text)} characters: {text[:200]}"
+    except BaseException as raised:
+        frames = [frame for frame in traceback.extract_tb(raised.__traceback__) if "/vkc_pin/" in frame.filename]
+        where = f"{frames[-1].filename.rpartition('/vkc_pin/')[2]}:{frames[-1].lineno}" if frames else "the call"
+        outcome, error = "raw", f"{type(raised).__name__} in {where}: {str(raised)[:200]!a}"
+    seconds, grown = time.process_time() - began, _memory("VmHWM") - before
+    if outcome != "raw" and seconds > SECONDS + PLANNING * _plans(case):
+        outcome, error = "slow", f"{seconds:.1f} s"
+    if outcome != "raw" and grown > MEGABYTES:
+        outcome, error = "memory", f"{grown:.0f} MB"
+    return {"outcome": outcome, "error": error, "seconds": seconds, "grown": grown}
+
+
+def _plans(case: dict[str, Any]) -> bool:
+    name, words = case.get("call", ""), case.get("argv", [])
+    pictures = ("Plan.to_html", "to_html", "show", "animate", "Plan.plot")
+    planning = (*pictures, "plan", "plan_chore", "plan_separately", "Constraint", "Cost", "build", "validate", "random_room")
+    return bool(case.get("plan")) or name in planning or "plan" in words or "view" in words
+
+
+class Worker:
+    """A process that runs cases, and is begun anew when one of them ends it."""
+
+    def __init__(self, hung: float = HUNG) -> None:
+        self.process: subprocess.Popen[bytes] | None = None
+        self.count, self.hung = 0, hung
+
+    def run(self, **asked: Any) -> dict[str, Any]:
+        """Return what came of a case: its outcome, its error if there is one, and what it took."""
+        if self.process is None or self.count >= FRESH:
+            self.close()
+            code = f"import sys; sys.path.insert(0, {str(TESTS)!r}); from fuzz.running import serve; serve()"
+            environment = {**os.environ, "OMP_NUM_THREADS": "1", "VKC_PIN_CACHE": "off", "MPLBACKEND": "agg"}
+            pipe = subprocess.PIPE
+            self.process = subprocess.Popen(
+                [sys.executable, "-c", code], cwd=TESTS.parent, env=environment, stdin=pipe, stdout=pipe
+            )
+            self.count = 0
+        self.count += 1
+        process = self.process
+        assert process.stdin is not None
+        assert process.stdout is not None
+        try:
+            process.stdin.write(json.dumps(asked).encode("ascii") + b"\n")
+            process.stdin.flush()
+            if not select.select([process.stdout], [], [], self.hung + 60.0 * (self.count == 1))[0]:
+                self.close()
+                return {"outcome": "hung", "error": f"no answer in {self.hung:g} s", "seconds": self.hung, "grown": 0.0}
+            line = process.stdout.readline()
+        except BrokenPipeError:
+            line = b""
+        if not line:
+            code_ = process.wait()
+            self.close()
+            return {"outcome": "crashed", "error": f"the interpreter ended with {code_}", "seconds": 0.0, "grown": 0.0}
+        found: dict[str, Any] = json.loads(line)
+        return found
+
+    def close(self) -> None:
+        """End the process."""
+        if self.process is not None:
+            self.process.kill()
+            self.process.communicate()
+            self.process = None

@@ -31,6 +31,8 @@ CORRIDOR = (1.6, 0.0, 0.3), (-7.4, -1.4, 7.2)
 AISLE = (2.35, 2.5, 0.2), (-2.9, -3.0, 6.2)
 HOME = (0.1, -0.3, 0.0), (-1.5, -8.5, 9.0)
 KITCHEN = (-2.1, 2.4, 0.7), (0.1, -1.0, 2.9)
+TRAY = (0.0, -0.5, 0.5), (-3.2, -2.6, 2.6)
+CARRIED = 15.0  # [s] of the motion with the tray
 GAP = (0.1, -0.3, 0.2), (-3.4, -5.0, 5.6)
 OPENED = {"door": ("hinge", 1.0), "drawer": ("slide", 0.22), "dishwasher": ("rack", 0.5), "refrigerator": ("hinge", 1.4)}
 
@@ -92,6 +94,12 @@ def gap_picture(through: vkc.Plan) -> None:
     picture(through, "gap_table", WIDE, float(through.trajectory.times[inside]))
 
 
+def tray_picture() -> None:
+    """Write a picture of a tray on its way."""
+    look(*TRAY)
+    picture(vkc.plan(vkc.load_scene("tray"), [vkc.Place("tray", [-0.3, -1.96, 0.7])]), "tray", SMALL, CARRIED)
+
+
 def main() -> int:
     """Write the pictures; return 1 if there is no motion to show."""
     saved = [vkc.Plan.load(name) for name in sys.argv[1:]]
@@ -120,6 +128,7 @@ def main() -> int:
     room_picture()
     chore_pictures(chore)
     gap_picture(through)
+    tray_picture()
     return 0
 
 

@@ -114,6 +114,11 @@ def test_a_plan_that_fails_returns_1_and_is_written(tmp_path: Path, capsys: pyte
     assert data["violations"]
 
 
+def test_effort_ends_planning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["plan", "drawer", "--set", "drawer.slide=0.3", "--effort", "500", "--quiet"]) == 1
+    assert capsys.readouterr().out.startswith("drawer: FAILED, effort spent")
+
+
 @pytest.mark.parametrize(
     ("arguments", "texts"),
     [
@@ -129,6 +134,7 @@ def test_a_plan_that_fails_returns_1_and_is_written(tmp_path: Path, capsys: pyte
         (["plan", "door"], ["--set"]),
         (["plan", "door", "--set", "door.hinge=1", "--initialization", "stationry"], ["did you mean 'stationary'"]),
         (["plan", "door", "--set", "door.hinge=1", "--time-limit", "-1"], ["time_limit", "more than 0"]),
+        (["plan", "door", "--set", "door.hinge=1", "--effort", "0"], ["effort", "at least 1"]),
         (["plan", "door", "--set", "door.hinge=1", "--time-limit", "soon"], ["--time-limit", "soon"]),
         (["plan", "door", "--set", "door.hinge=1", "--seed", "-1"], ["--seed", "at least 0"]),
         (["check", "none.npz"], ["none.npz", "no such file"]),

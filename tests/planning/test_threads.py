@@ -1,0 +1,45 @@
+"""Threads that plan the same structures at once: in a process of their own, which must come to its end."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+
+PROGRAM = """
+import collections, faulthandler, sys, threading
+faulthandler.enable()
+import vkc_pin as vkc
+
+scene, shared = vkc.load_scene("drawer"), vkc.Planner()
+found, raised = [], []
+
+def work(number):
+    for turn in range(3):
+        options = vkc.Options(reach_waypoints=10 + (number + turn) % 3, move_waypoints=8, turn_waypoints=3)
+        planner = (None, shared, vkc.Planner())[(number + turn) % 3]
+        limit = (None, 300.0)[turn % 2]
+        try:
+            plan = vkc.plan(scene, [vkc.Actuate("drawer", {"slide": 0.3})], options=options, planner=planner, time_limit=limit)
+            found.append((options.reach_waypoints, plan.status, plan.trajectory.positions.tobytes()))
+        except BaseException as error:
+            raised.append(repr(error))
+
+threads = [threading.Thread(target=work, args=(number,)) for number in range(8)]
+for thread in threads:
+    thread.start()
+for thread in threads:
+    thread.join()
+assert not raised, raised
+assert len(found) == 24
+assert len(set(found)) == 3, [item[:2] for item in set(found)]
+print("done")
+"""
+
+
+def test_eight_threads_with_one_planner_and_the_shared_one_and_their_own() -> None:
+    """The same call gives the same bits in each; a crash of the interpreter would show in what the process returns."""
+    done = subprocess.run([sys.executable, "-c", PROGRAM], cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
+    assert (done.returncode, done.stdout) == (0, "done\n"), done.stderr

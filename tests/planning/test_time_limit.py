@@ -1,0 +1,81 @@
+"""Wherever planning is when the budget is at its end, a plan comes back: at every look at the clock, and soon after."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from helpers.drawers import SHORT, drawer_scene
+
+import vkc_pin as vkc
+from vkc_pin.baselines import plan_separately
+from vkc_pin.benchmarks.chores import fetch
+from vkc_pin.budget import Budget
+
+PULL = [vkc.Actuate("drawer", {"slide": 0.3})]
+CALLS: dict[str, Callable[[], vkc.Plan]] = {
+    "plan": lambda: vkc.plan(drawer_scene(), PULL, options=SHORT, planner=vkc.Planner()),
+    "steps": lambda: vkc.plan(drawer_scene(), [*PULL, vkc.GoTo(0.0, 0.0)], options=SHORT, joint=False),
+    "trees": lambda: vkc.plan(drawer_scene(), PULL, initialization="rrt"),
+    "chore": lambda: vkc.plan_chore(drawer_scene(), [*PULL, vkc.GoTo(0.0, 0.0)], options=SHORT),
+    "baseline": lambda: plan_separately(drawer_scene(), PULL, method="B2", retries=1),
+}
+
+
+class Looks:
+    """A clock by which time is up at one of the looks at it."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.count, self.last = 0, np.inf
+        monkeypatch.setattr(Budget, "ended", property(self.ended))
+
+    def ended(self, budget: Budget) -> str:
+        self.count += 1
+        return "time limit" if self.count > self.last else ""
+
+    def upto(self, last: float, call: Callable[[], vkc.Plan]) -> vkc.Plan:
+        self.count, self.last = 0, last
+        return call()
+
+
+@pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
+def test_a_plan_comes_back_wherever_time_is_up(call: Callable[[], vkc.Plan], monkeypatch: pytest.MonkeyPatch) -> None:
+    looks = Looks(monkeypatch)
+    whole = looks.upto(np.inf, call)
+    assert whole.success, whole.report()
+    count = looks.count
+    assert count > 50
+    rounds = []
+    for last in [0, 1, 2, 3, 5, *np.linspace(8, count - 8, 9).astype(int).tolist()]:
+        plan = looks.upto(last, call)
+        assert plan.success or plan.status == "time limit"
+        assert plan.success == plan.validation.ok
+        assert np.isfinite(plan.trajectory.positions).all()
+        assert plan.metrics["effort"] <= whole.metrics["effort"]
+        rounds.append(plan.metrics["rounds"])
+    assert rounds[0] <= rounds[-1] <= whole.metrics["rounds"]
+
+
+def test_what_is_decided_of_a_chore_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    looks, steps = Looks(monkeypatch), [*PULL, vkc.GoTo(0.0, 0.0), vkc.GoTo(0.3, 0.0)]
+    whole = looks.upto(np.inf, lambda: vkc.plan_chore(drawer_scene(), steps, options=SHORT))
+    assert whole.success, whole.report()
+    phases = []
+    for last in np.linspace(1, looks.count - 1, 8).astype(int).tolist():
+        plan = looks.upto(last, lambda: vkc.plan_chore(drawer_scene(), steps, options=SHORT))
+        phases.append(len(plan.trajectory.phases))
+    assert phases == sorted(phases)
+    assert phases[0] == 1 < phases[-1]
+
+
+@pytest.mark.parametrize("limit", [0.05, 0.5, 2.0])
+def test_a_hard_task_takes_no_longer_than_it_may(limit: float) -> None:
+    """It takes a minute and more; on a machine that does something else, too, 0.3 s become more."""
+    scene = vkc.load_scene("fetch")
+    began = time.perf_counter()
+    plan = vkc.plan_chore(scene, fetch(scene), time_limit=limit, planner=vkc.Planner())
+    assert time.perf_counter() - began < limit + 3.0
+    assert plan.status == "time limit"
+    assert plan.validation.violations

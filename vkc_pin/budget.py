@@ -5,11 +5,12 @@ from __future__ import annotations
 import contextlib
 import math
 import signal
-import threading
 import time
 from collections.abc import Iterator
 from contextvars import ContextVar
 from types import FrameType
+
+from vkc_pin.interrupt import handled
 
 __all__ = ["ENDINGS", "Budget", "SpentError", "spend", "unlimited"]
 
@@ -62,21 +63,16 @@ class Budget:
         elsewhere nothing changes.
         """
         token = _RUNNING.set(self)
-        before = signal.getsignal(signal.SIGINT)  # None: whoever embeds Python handles it, and could not be put back
-        handled = before is not None and threading.current_thread() is threading.main_thread()
 
         def note(number: int, frame: FrameType | None) -> None:
             self.pressed = True
             signal.signal(signal.SIGINT, before)
 
         try:
-            if handled:
-                signal.signal(signal.SIGINT, note)
-            yield self
+            with handled(note) as before:
+                yield self
         finally:
             _RUNNING.reset(token)
-            if handled:
-                signal.signal(signal.SIGINT, before)
 
 
 _RUNNING: ContextVar[Budget | None] = ContextVar("running", default=None)  # each thread has its own

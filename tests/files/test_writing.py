@@ -1,20 +1,179 @@
 from __future__ import annotations
 
 import errno
+import os
+import signal
+import socket
+import stat
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from vkc_pin.files.writing import write_atomically
+from vkc_pin.errors import InputError
+from vkc_pin.files.writing import check_outputs, check_writable, write_atomically
 
 
-def test_it_makes_the_folder_and_replaces_what_was_there(tmp_path: Path) -> None:
+def everything(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*")}
+
+
+@pytest.mark.parametrize("umask", [0o022, 0o027, 0o077])
+def test_it_makes_the_folder_and_replaces_what_was_there(tmp_path: Path, umask: int) -> None:
     path = tmp_path / "deep" / "er" / "file.txt"
-    for data in (b"one", b"two"):
-        assert write_atomically(path, data) == path
-        assert path.read_bytes() == data
+    before = os.umask(umask)
+    try:
+        for data in (b"one, and longer", b"two"):
+            assert write_atomically(path, data) == path
+            assert path.read_bytes() == data
+    finally:
+        os.umask(before)
     assert list(path.parent.iterdir()) == [path]
-    assert path.stat().st_mode & 0o777 == 0o644
+    assert path.stat().st_mode & 0o777 == 0o666 & ~umask
+
+
+def test_the_mode_of_a_file_stays(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    for mode in (0o600, 0o640, 0o755):
+        path.write_bytes(b"before")
+        path.chmod(mode)
+        write_atomically(path, b"after")
+        assert (path.read_bytes(), path.stat().st_mode & 0o7777) == (b"after", mode)
+
+
+def test_a_long_name_is_no_problem(tmp_path: Path) -> None:
+    path = tmp_path / ("x" * 255)
+    assert check_writable(path) == path
+    assert write_atomically(path, b"data").read_bytes() == b"data"
+
+
+@pytest.mark.parametrize("there", [True, False], ids=["there", "dangling"])
+def test_links_are_followed(tmp_path: Path, there: bool) -> None:
+    target, link, chain = tmp_path / "elsewhere" / "file", tmp_path / "link", tmp_path / "chain"
+    if there:
+        target.parent.mkdir()
+        target.write_bytes(b"before")
+    link.symlink_to(Path("elsewhere") / "file")
+    chain.symlink_to(link)
+    assert check_writable(chain) == target
+    assert everything(tmp_path) == {"link", "chain", *(("elsewhere", "elsewhere/file") if there else ())}
+    assert write_atomically(chain, b"after") == chain
+    assert (link.is_symlink(), chain.is_symlink(), target.read_bytes()) == (True, True, b"after")
+    assert everything(tmp_path) == {"link", "chain", "elsewhere", "elsewhere/file"}
+
+
+def _folder(path: Path) -> str:
+    path.mkdir()
+    return "got a folder"
+
+
+def _pipe(path: Path) -> str:
+    os.mkfifo(path)
+    return "got a pipe"
+
+
+def _device(path: Path) -> str:
+    if os.getuid():
+        pytest.skip("only root can make a device, and those of the machine are not to be played with")
+    os.mknod(path, stat.S_IFCHR | 0o666, os.makedev(1, 3))
+    return "got a device"
+
+
+def _socket(path: Path) -> str:
+    here = Path.cwd()
+    os.chdir(path.parent)  # the paths of sockets are short
+    with socket.socket(socket.AF_UNIX) as one:
+        one.bind(path.name)
+    os.chdir(here)
+    return "got a socket"
+
+
+def _circle(path: Path) -> str:
+    path.with_name("other").symlink_to(path)
+    path.symlink_to(path.with_name("other"))
+    return "Too many levels of symbolic links"
+
+
+@pytest.mark.parametrize("make", [_folder, _pipe, _device, _socket, _circle])
+def test_what_is_no_file_is_refused(tmp_path: Path, make: object) -> None:
+    path = tmp_path / "output"
+    said = make(path)  # type: ignore[operator]
+    before = everything(tmp_path)
+    for write in (check_writable, lambda path: write_atomically(path, b"data")):
+        with pytest.raises(InputError, match=f"cannot write this.*expected a regular file or a new one.*{said}") as caught:
+            write(path)
+        assert caught.value.file == str(path)
+    assert everything(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    ("path", "said"),
+    [
+        ("file/plan.npz", "Not a directory"),
+        ("new/", "got a folder"),
+        ("new/" + "x" * 256, "File name too long"),
+        ("new/" + "x" * 256 + "/plan.npz", "File name too long"),
+        ("nul\0", "null byte"),
+        ("", "got a folder"),
+        ("/proc/nowhere/plan.npz", "got "),
+    ],
+)
+def test_what_cannot_be_written_is_refused(tmp_path: Path, path: str, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.chdir(tmp_path)
+    for write in (check_writable, lambda path: write_atomically(path, b"data")):
+        with pytest.raises(InputError, match=said):
+            write(path)
+    assert everything(tmp_path) <= {"file", "new"}
+
+
+@pytest.mark.parametrize("what", ["file", "folder"])
+def test_what_may_not_be_written_is_refused(tmp_path: Path, what: str) -> None:
+    """Tried by a user who is nobody: root may write anything."""
+    for above in (tmp_path, *tmp_path.parents[:2]):
+        above.chmod(0o755)
+    (tmp_path / "folder").mkdir()
+    path = tmp_path / "folder" / "file"
+    path.write_text("before")
+    path.chmod(0o444 if what == "file" else 0o666)
+    (tmp_path / "folder").chmod(0o777 if what == "file" else 0o555)
+    code = f"""
+import os
+from vkc_pin.errors import InputError
+from vkc_pin.files.writing import check_writable, write_atomically
+os.getuid() or os.setuid(65534)
+for write in (check_writable, lambda path: write_atomically(path, b"after")):
+    try:
+        write({str(path)!r})
+    except InputError as error:
+        print(error.got)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert len(done.stdout.splitlines()) == 2
+    assert done.stdout.lower().count("permission") == 2
+    assert path.read_text() == "before"
+
+
+def test_checking_leaves_no_trace(tmp_path: Path) -> None:
+    assert check_writable(tmp_path / "a" / "b" / "file") == tmp_path / "a" / "b" / "file"
+    assert everything(tmp_path) == set()
+
+
+def test_outputs_that_get_in_each_others_way(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to("one")
+    one, other = tmp_path / "one", tmp_path / "other"
+    check_outputs({"--a": one, "--b": other, "--c": tmp_path / "new" / "file"}, kept={"PLAN": tmp_path / "plan"})
+    with pytest.raises(InputError, match=r"--b: cannot write this .*got a folder"):
+        check_outputs({"--a": one, "--b": tmp_path})
+    for again in (one, tmp_path / "new" / ".." / "one", tmp_path / "link"):
+        with pytest.raises(InputError, match=r"--b: this file is named twice .*than --a"):
+            check_outputs({"--a": one, "--b": again})
+    with pytest.raises(InputError, match=r"--a: this file is named twice .*than PLAN"):
+        check_outputs({"--a": one}, kept={"PLAN": one})
+    with pytest.raises(InputError, match=r"--b: a file cannot be a folder .*file of --a"):
+        check_outputs({"--a": one, "--b": one / "two" / "three"})
+    assert everything(tmp_path) == {"link"}
 
 
 def test_what_fails_leaves_no_trace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -25,7 +184,28 @@ def test_what_fails_leaves_no_trace(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         raise OSError(errno.ENOSPC, "no space left")
 
     monkeypatch.setattr(Path, "replace", full)
-    with pytest.raises(OSError, match="no space"):
+    with pytest.raises(InputError, match="no space") as caught:
         write_atomically(path, b"after")
+    assert caught.value.file == str(path)
     assert path.read_bytes() == b"before"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_ctrl_c_waits_until_it_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The signal comes between writing and renaming, three times."""
+    path, replace = tmp_path / "file.txt", Path.replace
+
+    def pressed(self: Path, target: Path) -> Path:
+        for _ in range(3):
+            signal.raise_signal(signal.SIGINT)
+        return replace(self, target)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    monkeypatch.setattr(Path, "replace", pressed)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            write_atomically(path, b"whole")
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert path.read_bytes() == b"whole"
     assert list(tmp_path.iterdir()) == [path]

@@ -1,28 +1,121 @@
-"""Writes files whole or not at all."""
+"""Writes files whole or not at all, to where their names lead, and tells beforehand whether that can be done."""
 
 from __future__ import annotations
 
+import contextlib
 import os
-import tempfile
+import secrets
+import stat
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from vkc_pin.arguments import file_path
+from vkc_pin.errors import InputError
+from vkc_pin.interrupt import deferred
 
-__all__ = ["write_atomically"]
+__all__ = ["check_outputs", "check_writable", "write_atomically"]
 
 
 def write_atomically(path: str | Path, data: bytes) -> Path:
-    """Write `data` to `path` whole or not at all, making its folder if need be; return the path."""
-    path = file_path(path, "path")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    temporary = Path(name)
+    """Write `data` to `path` whole or not at all, making its folder if need be; return the path.
+
+    A symbolic link stays, and what it names is written. A file that is there keeps its mode. Ctrl-C waits until it is done.
+
+    Raises:
+        InputError: The path names something else than a file, or it cannot be written.
+    """
+    with _told(path):
+        target, mode = _target(path)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with deferred():
+            temporary = _temporary(target.parent)
+            try:
+                with temporary.open("xb") as stream:
+                    stream.write(data)
+                    if mode is not None:
+                        os.fchmod(stream.fileno(), mode)
+                temporary.replace(target)
+            except BaseException:
+                temporary.unlink(missing_ok=True)
+                raise
+    return Path(path)
+
+
+def check_writable(path: str | Path, *, field: str | None = None) -> Path:
+    """Return where `write_atomically` would write.
+
+    Raises:
+        InputError: It cannot: the path, which `field` names, is that of something else, or nothing can be made there.
+    """
+    with _told(path, field):
+        target, _ = _target(path)
+        place, missing = target.parent, [target.name]
+        while not place.exists():
+            missing.append(place.name)
+            place = place.parent
+        for name in missing:  # no file system takes any name
+            with contextlib.suppress(FileNotFoundError):
+                (place / name).lstat()
+        temporary = _temporary(place)  # only trying tells: of a disk that is read-only, say
+        with deferred():
+            try:
+                temporary.open("xb").close()
+            finally:
+                temporary.unlink(missing_ok=True)
+    return target
+
+
+def check_outputs(files: Mapping[str, str | Path], *, kept: Mapping[str, str | Path] | None = None) -> None:
+    """Check that files can be written, and do not get in each other's way.
+
+    Args:
+        files: Option or argument → the file that it names.
+        kept: Option or argument → a file that is read, and must not be written.
+
+    Raises:
+        InputError: One of them cannot be written, names what another one does, or needs a folder where another one is a file.
+    """
+    taken = {Path(os.path.realpath(path)): field for field, path in (kept or {}).items()}
+    targets: dict[Path, str] = {}
+    for field, path in files.items():
+        target = check_writable(path, field=field)
+        if (other := {**taken, **targets}.get(target)) is not None:
+            raise InputError("this file is named twice", file=path, field=field, expected=f"another file than {other}")
+        targets[target] = field
+    for target, field in targets.items():
+        if (above := next((place for place in target.parents if place in targets), None)) is not None:
+            raise InputError("a file cannot be a folder", file=above, field=field, got=f"the file of {targets[above]}")
+
+
+def _target(path: str | Path) -> tuple[Path, int | None]:
+    """Return what a path leads to, and the mode of what is there; None if nothing is."""
+    target = Path(os.path.realpath(path))
     try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(data)
-        temporary.chmod(0o644)
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    return path
+        found = os.stat(path)  # noqa: PTH116 - as text, which tells a folder by its slash
+    except FileNotFoundError:
+        if not str(path) or str(path).endswith(os.sep):
+            raise IsADirectoryError("a folder") from None
+        return target, None
+    if not stat.S_ISREG(found.st_mode):
+        kinds = {stat.S_ISDIR: "a folder", stat.S_ISFIFO: "a pipe", stat.S_ISSOCK: "a socket"}
+        raise IsADirectoryError(next((name for is_kind, name in kinds.items() if is_kind(found.st_mode)), "a device"))
+    if not os.access(target, os.W_OK):
+        raise PermissionError("no permission to write it")
+    return target, stat.S_IMODE(found.st_mode)
+
+
+def _temporary(folder: Path) -> Path:
+    """Return a new name in a folder, for a file that is renamed when it is whole."""
+    return folder / f".vkc-pin-{secrets.token_hex(8)}"
+
+
+@contextlib.contextmanager
+def _told(path: str | Path, field: str | None = None) -> Iterator[None]:
+    """Say what is wrong with a path."""
+    path = path if isinstance(path, str) else file_path(path, "path")  # text may end with a slash, which paths forget
+    try:
+        yield
+    except (OSError, ValueError) as error:  # the latter: a NUL in the name
+        got = getattr(error, "strerror", None) or str(error)
+        expected = "a regular file or a new one"
+        raise InputError("cannot write this", file=str(path), field=field, expected=expected, got=got) from error

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.files import documents
-from vkc_pin.files.documents import Document, check, field_name, read_text, read_xml, read_yaml
+from vkc_pin.files.documents import Document, check, field_name, parse_json, read_bytes, read_text, read_xml, read_yaml
 from vkc_pin.files.fields import Name, Number, Positive, Schema, Vector3
 
 NAMES = st.text("abcdefgh", min_size=1, max_size=4).filter(lambda name: name not in ("no", "off", "on", "yes"))
@@ -185,3 +185,30 @@ def test_lists_inside_each_other(tmp_path: Path, open_: str, close: str) -> None
 
 def test_many_lists_after_each_other_are_not_deep(tmp_path: Path) -> None:
     assert len(read_yaml(written(tmp_path, "[" + "[1], " * (10 * documents.DEEPEST) + "]")).data) == 10 * documents.DEEPEST
+
+
+def test_json_within_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert parse_json('{"a": [1, {"b": "[["}]}', "file") == {"a": [1, {"b": "[["}]}
+    deepest = "[" * documents.DEEPEST + "]" * documents.DEEPEST
+    assert str(parse_json(deepest, "file")) == deepest
+    for text, said in (
+        (f"[{deepest}]", "too many lists and objects inside each other"),
+        ("[" * 100_000, "not JSON"),
+        ('{"a": ' * 100_000 + "1" + "}" * 100_000, "not JSON"),
+        ("[" + "[]," * documents.MOST_FIELDS + "[]]", "too many lists and objects .expected"),
+        ("1" * 5000, "not JSON"),
+        ("[1,\n2,,]", "file:2: not JSON"),
+    ):
+        with pytest.raises(InputError, match=said) as caught:
+            parse_json(text, "file")
+        assert caught.value.file == "file"
+
+
+def test_bytes_within_bounds(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.write_bytes(b"\xef\xbb\xbfabc")
+    assert (read_bytes(file, "plan"), read_text(file, "plan")) == (b"\xef\xbb\xbfabc", "abc")
+    with pytest.raises(InputError, match=r"the plan is too large .expected at most 5 bytes, got 6"):
+        read_bytes(file, "plan", 5)
+    with pytest.raises(InputError, match=r"cannot read the plan .*null byte"):
+        read_bytes("a\0b", "plan")

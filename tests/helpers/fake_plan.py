@@ -19,7 +19,7 @@ def fake_plan(scene: Scene | None = None) -> Plan:
     """Return a plan of 6 s in two phases, whose report blames the forearm and the sofa at 4 s."""
     scene = load_scene("door") if scene is None else scene
     robot = scene.robot.coordinates.names
-    names = (*robot, "door.hinge", "door.knob", "door.handle")  # the last is the virtual joint of a grasp
+    names = (*robot, "door.hinge", "door.knob", "door.handle_free")  # the last is the virtual joint of a grasp
     times = np.concatenate([np.linspace(0.0, 3.0, 7), 3.0 + np.geomspace(0.1, 3.0, 7)])  # not evenly spaced
     done = np.linspace(0.0, 1.0, len(times))
     start = np.concatenate([scene.start, np.zeros(3)])

@@ -1,8 +1,11 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
+import os
 import re
+import time
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +18,14 @@ from hypothesis import given
 import vkc_pin as vkc
 from vkc_pin import cli
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.planning.outcome import spent
 from vkc_pin.planning.plan import Plan
 from vkc_pin.scene.hold import Hold
 
 
 @pytest.fixture(scope="module")
 def plan() -> Plan:
-    return fake_plan()
+    return dataclasses.replace(fake_plan(), metrics=spent())
 
 
 # There and back
@@ -61,7 +65,7 @@ def test_columns_have_names_and_units(plan: Plan, tmp_path: Path) -> None:
     with plan.to_csv(tmp_path / "door.csv").open(encoding="utf-8", newline="") as file:
         lines = list(csv.reader(file))
     assert lines[0][:4] == ["time [s]", "base_x [m]", "base_y [m]", "base_yaw [rad]"]
-    assert lines[0][-6:] == ["door.hinge [rad]", "door.knob [rad]", "door.handle", "phase", "phase_name", "held"]
+    assert lines[0][-6:] == ["door.hinge [rad]", "door.knob [rad]", "door.handle_free [rad]", "phase", "phase_name", "held"]
     assert len(lines) == 1 + len(plan.trajectory.times)
     assert lines[1][-3:] == ["1", "reach door.handle", "{}"]
     assert lines[8][-3:] == ["2", "move door.hinge", '{"door": "handle"}']
@@ -128,11 +132,56 @@ def test_bad_tables(tmp_path: Path, text: str, message: str) -> None:
 
 def test_files_that_are_not_there_or_no_text(tmp_path: Path) -> None:
     for read in (Trajectory.from_csv, Trajectory.from_json, Trajectory.from_ros):
-        with pytest.raises(vkc.InputError, match=r"none.csv: no such file"):
+        with pytest.raises(vkc.InputError, match=r"none.csv: cannot read the (CSV|JSON) .*No such file"):
             read(tmp_path / "none.csv")
         (tmp_path / "picture").write_bytes(b"\xff\xfe\x00")
-        with pytest.raises(vkc.InputError, match=r"picture: not text .expected UTF-8"):
+        with pytest.raises(vkc.InputError, match=r"picture: cannot read the (CSV|JSON) .*utf-8"):
             read(tmp_path / "picture")
+
+
+HELD = "0,0,0,0,1,a,"
+
+
+@pytest.mark.parametrize(
+    ("read", "text", "message"),
+    [
+        (Trajectory.from_csv, "time," + ",".join(map(str, range(1_000_000))), ":1: too many columns"),
+        (Trajectory.from_csv, "time,x,y,yaw\n" + "0,0,0,0\n" * 300_000, "too many lines"),
+        (Trajectory.from_csv, "time," + "x" * 200_000, ":1: not a table .got field larger"),
+        (Trajectory.from_csv, "time,x,y,yaw\n0,0,0," + "9" * 100_000, ":2: yaw: not a number"),
+        (Trajectory.from_csv, "time,x,y,yaw,phase,phase_name,held\n" + HELD + "[" * 100_000, ":2: held: not what is held"),
+        (Trajectory.from_json, "[" * 1_000_000, "too many lists|not JSON"),
+        (Trajectory.from_json, '{"names": [' + "1," * 5_000_000 + "1]}", "phases: this is missing"),
+        (
+            Trajectory.from_json,
+            '{"names": [' + ",".join(f'"{k}"' for k in range(500_000)) + ',"7"], "times": [0, 1], "positions": [[0]],'
+            ' "robot_size": 3, "phases": []}',
+            "Trajectory.names: a name occurs twice .got 7",
+        ),
+        (
+            Trajectory.from_json,
+            '{"names": ["x"], "times": [0, 1], "positions": ["' + "x" * 5_000_000 + '"], "robot_size": 3, "phases": []}',
+            "Trajectory.positions: not numbers",
+        ),
+        (Trajectory.from_ros, '{"joint_names": ["x"], "points": [' + "[]," * 400_000 + "[]]}", "too many lists and objects"),
+        (Trajectory.from_ros, '{"joint_names": "' + "x" * 19_000_000 + '"}', "joint_names: wrong kind of value"),
+        (Trajectory.from_json, " " * 20_000_001, "the JSON is too large"),
+    ],
+    ids=lambda value: value if isinstance(value, str) and len(value) < 60 else "",
+)
+def test_files_of_any_size_and_depth_are_refused_in_time(read: Any, text: str, message: str, tmp_path: Path) -> None:
+    began = time.process_time()
+    with pytest.raises(vkc.InputError, match=message) as caught:
+        read(broken(tmp_path / "bad", text))
+    assert len(str(caught.value)) < 5000
+    assert time.process_time() - began < 10.0
+
+
+def test_pipes_are_refused(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for read in (Trajectory.from_csv, Trajectory.from_json, Trajectory.from_ros):
+        with pytest.raises(vkc.InputError, match="got a pipe or a device"):
+            read(tmp_path / "pipe")
 
 
 # JSON

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import os
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Iterator
@@ -16,7 +18,7 @@ import yaml
 from vkc_pin.errors import InputError, UnknownNameError, shown
 from vkc_pin.files.xml import parse_xml
 
-__all__ = ["Document", "check", "field_name", "read_text", "read_xml", "read_yaml"]
+__all__ = ["Document", "check", "field_name", "parse_json", "read_bytes", "read_text", "read_xml", "read_yaml"]
 
 LARGEST_FILE = 50_000_000
 """Largest description file [bytes]."""
@@ -31,6 +33,7 @@ T = TypeVar("T", bound=pydantic.BaseModel)
 _EXPECTED = {
     "bool_parsing": "true or false",
     "bool_type": "true or false",
+    "int_type": "a whole number",
     "dict_type": "fields (name: value)",
     "finite_number": "a finite number",
     "float_parsing": "a number",
@@ -92,23 +95,66 @@ class Document:
             raise self.error(path, where + error.problem, expected=error.expected, got=error.got) from error
 
 
-def read_text(file: str | Path, kind: str) -> str:
-    """Return what a text file of a `kind` ("YAML", "URDF", "SRDF") says.
+def read_bytes(file: str | Path, kind: str, largest: int | None = None) -> bytes:
+    """Return what a file of a `kind` ("YAML", "URDF", "plan") holds.
 
     Raises:
-        InputError: It does not exist, is no file (but a folder, a pipe, a device), is larger than `LARGEST_FILE`, cannot be read,
-            or is not encoded in UTF-8.
+        InputError: It does not exist, is no file (but a folder, a pipe, a device), has more than `largest` bytes (None:
+            `LARGEST_FILE`), or cannot be read.
     """
-    path = Path(file)
+    path, expected = Path(file), f"an existing {kind} file"
+    largest = LARGEST_FILE if largest is None else largest
     try:
-        if (size := path.stat().st_size) > LARGEST_FILE:
-            raise InputError(f"the {kind} is too large", file=file, expected=f"at most {LARGEST_FILE:g} bytes", got=size)
-        if not path.is_file() and not path.is_dir():  # reading a pipe would wait for ever
-            raise InputError(f"cannot read the {kind}", file=file, expected=f"an existing {kind} file", got="a pipe or a device")
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"cannot read the {kind}", file=file, expected=f"an existing {kind} file", got=reason) from error
+        if not path.is_file() and not path.is_dir() and path.exists():  # reading a pipe would wait for ever
+            raise InputError(f"cannot read the {kind}", file=file, expected=expected, got="a pipe or a device")
+        with path.open("rb") as stream:
+            data = stream.read(largest + 1)
+            size = max(len(data), os.fstat(stream.fileno()).st_size)
+    except InputError:
+        raise
+    except (OSError, ValueError) as error:  # the latter: a NUL in the name
+        got = getattr(error, "strerror", None) or error
+        raise InputError(f"cannot read the {kind}", file=file, expected=expected, got=got) from error
+    if size > largest:
+        raise InputError(f"the {kind} is too large", file=file, expected=f"at most {largest:g} bytes", got=size)
+    return data
+
+
+def read_text(file: str | Path, kind: str, largest: int | None = None) -> str:
+    """Return what a text file holds, as `read_bytes` does.
+
+    Raises:
+        InputError: It cannot be read, or is not encoded in UTF-8.
+    """
+    try:
+        return read_bytes(file, kind, largest).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        expected = f"an existing {kind} file"
+        raise InputError(f"cannot read the {kind}", file=file, expected=expected, got=error) from error
+
+
+def parse_json(text: str, file: str | Path) -> Any:
+    """Return what JSON says.
+
+    Raises:
+        InputError: It is no JSON, holds more lists and objects than `MOST_FIELDS`, or more inside each other than `DEEPEST`.
+    """
+    many = text.count("[") + text.count("{")  # before they are made: each takes twenty times its text
+    if many > MOST_FIELDS:
+        raise InputError("too many lists and objects", file=file, expected=f"at most {MOST_FIELDS}", got=many)
+    try:
+        data = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise InputError("not JSON", file=file, line=error.lineno, got=error.msg) from None
+    except (RecursionError, ValueError) as error:  # the latter: a number of thousands of digits
+        raise InputError("not JSON", file=file, got=error) from None
+    level, depth = [data], 0
+    while level := [item for item in level if isinstance(item, dict | list)]:
+        depth += 1
+        if depth > DEEPEST:
+            raise InputError("too many lists and objects inside each other", file=file, expected=f"at most {DEEPEST}")
+        level = [inner for item in level for inner in (item.values() if isinstance(item, dict) else item)]
+    return data
 
 
 def read_xml(file: str | Path, kind: str) -> tuple[str, ElementTree.Element]:

@@ -11,17 +11,21 @@ import io
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 from vkc_pin.arguments import file_path, items, mapping, text, whole
 from vkc_pin.errors import InputError, UnknownNameError, shown
+from vkc_pin.files.documents import parse_json, read_text
 from vkc_pin.files.writing import write_atomically
 
 __all__ = [
     "GROUPS",
+    "LARGEST_MOTION",
+    "MOST_COLUMNS",
+    "MOST_LINES",
     "chosen_columns",
     "one_phase",
     "read_csv",
@@ -33,6 +37,10 @@ __all__ = [
 
 GROUPS = ("all", "robot", "base", "arm", "objects")
 """What can be asked for instead of names: everything, base and arm, the base, the arm, or what no motor of the robot moves."""
+LARGEST_MOTION = 20_000_000
+"""Largest file that a motion is read from [bytes]: some 30 000 waypoints of 25 coordinates."""
+MOST_LINES, MOST_COLUMNS = 200_000, 1000
+"""Most lines and columns of a table."""
 _TIME, _PHASES = "time", ("phase", "phase_name", "held")  # the first column of a table, and the last ones
 
 
@@ -84,8 +92,14 @@ def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, An
         InputError: The file is missing, or something in it does not fit; the error names line and column.
     """
     path = file_path(path, "path")
-    reader = csv.reader(io.StringIO(_text(path), newline=""))
-    header = [re.sub(r" \[(s|m|rad)\]$", "", name) for name in next(reader, [])]
+    table = read_text(path, "CSV", LARGEST_MOTION)
+    if (many := table.count("\n")) > MOST_LINES:
+        raise InputError("too many lines", file=path, expected=f"at most {MOST_LINES}", got=many)
+    lines = _lines(table, path)
+    header = next(lines, (0, []))[1]
+    if len(header) > MOST_COLUMNS:
+        raise InputError("too many columns", file=path, line=1, expected=f"at most {MOST_COLUMNS}", got=len(header))
+    header = [re.sub(r" \[(s|m|rad)\]$", "", name) for name in header]
     if not header:
         raise InputError("an empty file", file=path, expected="a table with a line of names")
     if header[0] != _TIME:
@@ -96,8 +110,7 @@ def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, An
     names = header[1 : -3 if told else None]
     rows: list[list[float]] = []
     phases: list[dict[str, Any]] = []
-    for cells in reader:
-        number = reader.line_num
+    for number, cells in lines:
         if not cells:
             continue
         if len(cells) != len(header):
@@ -125,15 +138,10 @@ def read_json(path: str | Path) -> Any:
     """Return what a JSON file holds.
 
     Raises:
-        InputError: The file is missing or is no JSON; the error names the line.
+        InputError: The file is missing, is no JSON, or is larger than a motion can be; the error names the line.
     """
     path = file_path(path, "path")
-    try:
-        return json.loads(_text(path))
-    except json.JSONDecodeError as error:
-        raise InputError("not JSON", file=path, line=error.lineno, got=error.msg) from None
-    except (RecursionError, ValueError) as error:  # too deep, or a number of too many digits
-        raise InputError("not JSON that can be read", file=path, got=str(error)) from None
+    return parse_json(read_text(path, "JSON", LARGEST_MOTION), path)
 
 
 def chosen_columns(motion: Mapping[str, Any], joints: str | Sequence[str]) -> list[int]:
@@ -168,15 +176,14 @@ def one_phase(waypoints: int) -> dict[str, Any]:
     return {"name": "motion", "first": 0, "last": waypoints - 1, "held": {}, "by": {}}
 
 
-def _text(path: Path) -> str:
+def _lines(text: str, path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Yield the cells of every line of a table, with the number of the line."""
+    reader = csv.reader(io.StringIO(text, newline=""))
     try:
-        if not path.is_file():
-            raise InputError("no such file", file=path)
-        return path.read_bytes().decode("utf-8-sig")
-    except OSError as error:
-        raise InputError("cannot read the file", file=path, got=error.strerror) from None
-    except UnicodeDecodeError as error:
-        raise InputError("not text", file=path, expected="UTF-8", got=str(error)) from None
+        for cells in reader:
+            yield reader.line_num, cells
+    except csv.Error as error:
+        raise InputError("not a table", file=path, line=reader.line_num, got=error) from None
 
 
 def _number(cell: str, path: Path, line: int, column: str) -> float:
@@ -202,7 +209,7 @@ def _add_phase(phases: list[dict[str, Any]], cells: Sequence[str], row: int, pat
         found = json.loads(held)
         at = {thing: where if isinstance(where, str) else where[0] for thing, where in found.items()}
         by = {thing: where[1] for thing, where in found.items() if not isinstance(where, str)}
-    except (ValueError, AttributeError, TypeError, LookupError):
+    except (ValueError, AttributeError, TypeError, LookupError, RecursionError):
         wanted = 'JSON such as {"door": "handle"}'
         raise InputError("not what is held", file=path, line=line, field="held", expected=wanted, got=shown(held)) from None
     phases.append({"name": name, "first": max(row - 1, 0), "last": row, "held": at, "by": by})

@@ -96,7 +96,7 @@ class Trajectory:
             phase.first != before or phase.last <= before for phase, before in zip(phases, edges, strict=False)
         ):
             problem = "phases do not follow one another from the first waypoint to the last"
-            got = ", ".join(f"{phase.first} to {phase.last}" for phase in phases) or "none"
+            got = ", ".join(f"{phase.first} to {phase.last}" for phase in phases[:20]) or "none"
             raise InputError(problem, field="Trajectory.phases", expected=f"0 to {len(times) - 1}", got=got)
         for array in (times, positions):
             array.setflags(write=False)

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import io
 import json
-import os
-import zipfile
-import zlib
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
 import numpy as np
 
 from vkc_pin.arguments import file_path
-from vkc_pin.errors import InputError
-from vkc_pin.files.resources import folder
+from vkc_pin.arrays import Floats
+from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.files.writing import write_atomically
+from vkc_pin.motion.archives import folder_from_data, folder_to_data, read_archive, write_archive
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.motion.world import units_of
 from vkc_pin.options import Options
@@ -27,6 +25,7 @@ from vkc_pin.scene.scene import Scene
 from vkc_pin.task.steps import Step, step_from_dict, step_to_dict
 from vkc_pin.task.terms import Term, term_from_dict, term_to_dict
 from vkc_pin.validation.report import Report
+from vkc_pin.validation.validate import check_fits, validate
 from vkc_pin.visualization import viewer as visualization
 
 if TYPE_CHECKING:
@@ -34,22 +33,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Plan"]
 
-FORMAT = 1
-
-
-def _folder_to_data(scene_folder: Path, plan: Path) -> dict[str, str]:
-    """Return where a scene's folder is: in the package, or seen from the plan's file and absolutely."""
-    there = scene_folder.resolve()
-    if there == folder("scenes").resolve():
-        return {"package": "scenes"}
-    return {"relative": os.path.relpath(there, plan.resolve().parent), "absolute": str(there)}
-
-
-def _folder_from_data(data: Mapping[str, str], plan: Path) -> Path:
-    if "package" in data:
-        return folder(data["package"])
-    beside = plan.resolve().parent / data["relative"]
-    return beside if beside.is_dir() else Path(data["absolute"])
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -61,7 +45,7 @@ class Plan:
         steps: What was asked for.
         options: How it was planned.
         trajectory: The motion; if planning failed, the best there was.
-        validation: What the independent check says of it.
+        validation: What the independent check says of it. For a loaded plan it is made when it is first asked for.
         status: "success", or why not: "infeasible", "not converged", "time limit", "effort spent", "interrupted", "rejected";
             plans of the baselines name the stage that failed.
         metrics: planning_time [s], build_time [s], base_effort [m], base_effort_l1 [m], arm_effort [rad], clearance [m],
@@ -71,6 +55,7 @@ class Plan:
         initialization: Which seed trajectory it came from.
         history: One row per round of the solver.
         terms: The user's own constraints and costs, with their expressions as data.
+        claimed: What the file says of the motion that a plan was loaded from, which nothing here relies on; else None.
     """
 
     scene: Scene
@@ -84,11 +69,16 @@ class Plan:
     initialization: str = ""
     history: Sequence[Mapping[str, float]] = field(default_factory=tuple)
     terms: tuple[Term, ...] = ()
+    claimed: Report | None = field(default=None, repr=False, compare=False)
 
     @property
     def success(self) -> bool:
         """Whether the independent validation found nothing wrong with a motion that does what was asked for."""
         return self.validation.ok and self.status == "success"
+
+    def contradictions(self) -> list[str]:
+        """Return what the file that the plan was loaded from says otherwise than the check of its motion, one line each."""
+        return [] if self.claimed is None else self.validation.contradictions(self.claimed)
 
     def report(self) -> str:
         """Return what came out, for people: success or every violated constraint, efforts, clearance, times."""
@@ -167,63 +157,128 @@ class Plan:
         absolutely, so that plan and scene can move together and the plan alone.
         """
         about = {
-            "format": FORMAT,
             "scene": self.scene.document,
-            "folder": _folder_to_data(self.scene.folder, file_path(path, "path")),
+            "folder": folder_to_data(self.scene.folder, file_path(path, "path")),
             "steps": [step_to_dict(step) for step in self.steps],
             "options": asdict(self.options),
             "trajectory": {k: v for k, v in self.trajectory.to_dict().items() if k not in ("times", "positions")},
             "validation": self.validation.to_dict(),
             "status": self.status,
-            "metrics": dict(self.metrics),
+            "metrics": {**self.metrics, **_measured(self.trajectory, self.validation)},
             "seed": self.seed,
             "initialization": self.initialization,
             "history": [dict(row) for row in self.history],
             "terms": [term_to_dict(term) for term in self.terms],
         }
-        buffer = io.BytesIO()
-        np.savez_compressed(
-            buffer, about=np.array(json.dumps(about)), times=self.trajectory.times, positions=self.trajectory.positions
-        )
-        return write_atomically(path, buffer.getvalue())
+        return write_archive(path, about, self.trajectory.times, self.trajectory.positions)
 
     @classmethod
-    def load(cls, path: str | Path) -> Plan:
+    def load(cls, path: str | Path, *, check: bool = False) -> Plan:
         """Return the plan that `save` wrote to `path`.
 
+        What the file says of its motion is kept as `claimed`, and not relied on: `validation`, `success`, `status` and `metrics`
+        are those of a check that is made when they are first asked for, which takes as long as the check after planning. The
+        file's are only what planning took, and what it found out about the task: the notes, and why a task is infeasible.
+
+        Args:
+            path: The file.
+            check: Check the motion at once; then not even that is the file's.
+
         Raises:
-            InputError: The file is missing, damaged, no plan, or of a newer format, or what its scene names is not there.
+            InputError: The file is missing, damaged, no plan, or of another format, something in it does not fit, the motion is
+                none of its scene's robot and objects, or what the scene names is not there.
         """
         path = file_path(path, "path", "a saved plan (.npz)")
-        if not path.is_file():
-            raise InputError("no such file", file=path, expected="a saved plan (.npz)")
+        about, arrays = read_archive(path)
         try:
-            return cls._read(path)
+            plan = cls._made_of(about, arrays, path, _checked if check else _recalled)
+            check_fits(plan.scene, plan.steps, plan.trajectory, plan.terms)
+            if check:
+                plan.validation  # noqa: B018 - makes it
         except InputError as error:
             if error.file is not None:
                 raise
             got, expected = error.got, error.expected
             raise InputError(error.problem, file=path, field=error.field, expected=expected, got=got) from error
-        except (ValueError, LookupError, TypeError, AttributeError, OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        except (ValueError, LookupError, TypeError, AttributeError, OSError, OverflowError, RecursionError) as error:
             raise InputError("not a saved plan", file=path, expected="a file written by Plan.save", got=str(error)) from error
+        return plan
 
     @classmethod
-    def _read(cls, path: Path) -> Plan:
-        with np.load(path, allow_pickle=False) as archive:
-            about = json.loads(str(archive["about"]))
-            if about.get("format") != FORMAT:
-                raise InputError("unknown format", file=path, field="format", expected=FORMAT, got=about.get("format"))
-            trajectory = {**about["trajectory"], "times": archive["times"], "positions": archive["positions"]}
+    def _made_of(
+        cls, about: Mapping[str, Any], arrays: Mapping[str, Floats], path: Path, validation: Callable[[Plan], Report]
+    ) -> Plan:
+        trajectory, status = Trajectory.from_dict({**about["trajectory"], **arrays}), about["status"]
+        claimed, metrics = Report.from_dict(about["validation"]), about["metrics"]
+        for name, value in _measured(trajectory, claimed).items():
+            if metrics[name] != value and not abs(metrics[name] - value) <= 1e-9 * max(1.0, abs(value)):
+                raise InputError("not that of motion and report", field=f"metrics.{name}", expected=value, got=metrics[name])
+        options = {item.name for item in fields(Options)}
+        for name in about["options"]:
+            if name not in options:
+                raise UnknownNameError("option", name, options, field=f"options.{name}")
         return cls(
-            scene=Scene.from_document(about["scene"], _folder_from_data(about["folder"], path)),
+            scene=Scene.from_document(about["scene"], folder_from_data(about["folder"], path)),
             steps=tuple(step_from_dict(step) for step in about["steps"]),
             options=Options(**about["options"]),
-            trajectory=Trajectory.from_dict(trajectory),
-            validation=Report.from_dict(about["validation"]),
-            status=about["status"],
-            metrics=about["metrics"],
+            trajectory=trajectory,
+            validation=cast(Report, validation),
+            status=cast(str, _status) if status == "success" else status,
+            metrics=cast(Mapping[str, float], partial(_metrics, metrics)),
             seed=about["seed"],
             initialization=about["initialization"],
             history=tuple(about["history"]),
-            terms=tuple(term_from_dict(term) for term in about.get("terms", ())),
+            terms=tuple(term_from_dict(term) for term in about["terms"]),
+            claimed=claimed,
         )
+
+
+def _checked(plan: Plan) -> Report:
+    """Return what validation says of a loaded plan."""
+    return validate(plan.scene, plan.steps, plan.trajectory, plan.options, plan.terms)
+
+
+def _recalled(plan: Plan) -> Report:
+    """Return the same with what its file says of the task."""
+    report, claimed = _checked(plan), plan.claimed
+    if claimed is None or report.ok:
+        return report
+    report = replace(report, notes=claimed.notes)
+    return report.with_reasons(claimed.violations or report.violations) if vars(plan)["status"] == "infeasible" else report
+
+
+def _status(plan: Plan) -> str:
+    """Return the status of a loaded plan that is said to be a success."""
+    return "success" if plan.validation.ok else "rejected"
+
+
+def _metrics(taken: Mapping[str, float], plan: Plan) -> Mapping[str, float]:
+    """Return the metrics of a loaded plan, with what its file says of what planning took."""
+    return {**taken, **_measured(plan.trajectory, plan.validation)}
+
+
+def _measured(trajectory: Trajectory, report: Report) -> dict[str, float]:
+    """Return what a motion is measured by."""
+    return {**trajectory.metrics(), "clearance": report.clearance, "closure_error": report.closure_error}
+
+
+class _OnDemand(Generic[T]):
+    """A field that may be given as a function of the plan, which is called when the field is first asked for."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def __get__(self, plan: Plan | None, owner: type[Plan]) -> T:
+        if plan is None:
+            raise AttributeError(self.name)
+        value = vars(plan)[self.name]
+        if callable(value):
+            value = vars(plan)[self.name] = value(plan)
+        return cast(T, value)
+
+    def __set__(self, plan: Plan, value: T | Callable[[Plan], T]) -> None:
+        vars(plan)[self.name] = value
+
+
+for _name in ("validation", "status", "metrics"):
+    setattr(Plan, _name, _OnDemand(_name))

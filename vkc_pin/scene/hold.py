@@ -16,6 +16,9 @@ from vkc_pin.scene.placed import PlacedObject
 
 __all__ = ["Hold", "checked_holds", "holds_of", "in_hand", "in_order"]
 
+MOST_HELD = 50
+"""So many things may be held at once: they are followed one through the other."""
+
 
 @dataclass(frozen=True)
 class Hold:
@@ -66,10 +69,12 @@ def holds_of(
 
     Raises:
         UnknownNameError: `by` or `at` name an object that is not held.
-        InputError: Objects hold each other in a circle, or `by` is not of that form.
+        InputError: Objects hold each other in a circle, `by` is not of that form, or more is held than anybody can.
     """
     held = mapping(held, "held", "object names, each with that of an attachment")
     by, at = mapping({} if by is None else by, "by"), mapping({} if at is None else at, "at")
+    if len(held) > MOST_HELD:
+        raise InputError("too many things are held", field="held", expected=f"at most {MOST_HELD}", got=len(held))
     for field_name, names in (("by", by), ("at", at)):
         for name in names:
             if name not in held:

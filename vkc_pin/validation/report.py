@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Judged", "Report", "Violation"]
 
+SAME = 1e-5  # [m] or [rad] that two checks of the same motion may differ by, on two machines, say
 LISTED = 12  # violations that the text names; `violations` has them all
 
 
@@ -85,6 +86,17 @@ class Report:
     def with_reasons(self, reasons: Sequence[Violation]) -> Report:
         """Return the report of a motion that was never planned: only `reasons` are violated, the rest follows from them."""
         return replace(self, violations=tuple(reasons))
+
+    def contradictions(self, claimed: Report) -> list[str]:
+        """Return what another report of the same motion says otherwise, one line each; distances to 10 µm, angles to 1e-5 rad."""
+        lines = []
+        if claimed.ok != self.ok:
+            lines.append("every constraint holds" if claimed.ok else f"{len(claimed.violations)} constraint(s) violated")
+        for name, unit in (("clearance", "m"), ("closure_error", "m"), ("closure_angle", "rad")):
+            there, here = getattr(claimed, name), getattr(self, name)
+            if there != here and not abs(there - here) <= SAME:
+                lines.append(f"{name} {there:.6g} {unit} instead of {here:.6g} {unit}")
+        return lines
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data of it."""

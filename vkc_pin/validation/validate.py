@@ -27,7 +27,7 @@ from vkc_pin.validation.samples import MOST, Samples
 from vkc_pin.validation.sweep import sweep
 from vkc_pin.validation.touching import windows
 
-__all__ = ["validate"]
+__all__ = ["check_fits", "validate"]
 
 START_TOLERANCE = 1e-9  # [m] or [rad]
 LIMIT_TOLERANCE = 1e-5  # [m] or [rad]
@@ -61,13 +61,20 @@ def validate(
         InputError: The trajectory is none of this scene's robot and objects, or a step or term names what is not there.
     """
     options = Options() if options is None else instance(options, Options, "options")
+    return _Check(*check_fits(scene, steps, trajectory, terms), options).report()
+
+
+def check_fits(
+    scene: Scene, steps: Sequence[Step], trajectory: Trajectory, terms: Sequence[Term] = ()
+) -> tuple[Samples, tuple[Step, ...], tuple[Term, ...]]:
+    """Return what `validate` checks, for its arguments; raise what it raises. That takes a few milliseconds."""
     samples, asked = Samples(instance(scene, Scene, "scene"), instance(trajectory, Trajectory, "trajectory")), as_list(steps)
     check_steps(samples, asked)
-    return _Check(samples, asked, options, traced(scene, terms)).report()
+    return samples, asked, traced(scene, terms)
 
 
 class _Check:
-    def __init__(self, samples: Samples, steps: Sequence[Step], options: Options, terms: Sequence[Term]) -> None:
+    def __init__(self, samples: Samples, steps: Sequence[Step], terms: Sequence[Term], options: Options) -> None:
         self.samples, self.steps, self.options, self.terms = samples, steps, options, terms
         self.scene, self.trajectory = samples.scene, samples.trajectory
         self.found: list[Violation] = []

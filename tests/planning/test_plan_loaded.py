@@ -1,0 +1,115 @@
+"""Plans from files: what they say of themselves is not believed."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import vkc_pin as vkc
+from vkc_pin.validation.report import Report, Violation
+
+
+@pytest.fixture
+def saved(door_plan: vkc.Plan, tmp_path: Path) -> Path:
+    return door_plan.save(tmp_path / "door.npz")
+
+
+def test_a_failed_plan_keeps_its_violations(door_plan: vkc.Plan, tmp_path: Path) -> None:
+    blame = Violation(
+        "penetration", "forearm_link – sofa", waypoint=9, time=4.0, amount=0.03, unit="m", detail="overlap by 30 mm"
+    )
+    report = Report(
+        (blame,), float("inf"), closure_error=1e-4, closure_angle=2e-4, states=77, notes=("the sofa stands in the way",)
+    )
+    positions = door_plan.trajectory.positions.copy()
+    positions[5, 2] += 1.5  # such reports are not of motions that are right
+    bent = dataclasses.replace(door_plan.trajectory, positions=positions)
+    failed = dataclasses.replace(door_plan, trajectory=bent, validation=report, status="infeasible")
+    loaded = vkc.Plan.load(failed.save(tmp_path / "failed.npz"))
+    assert (loaded.success, loaded.status, loaded.claimed) == (False, "infeasible", report)
+    assert (loaded.validation.violations, loaded.validation.notes) == ((blame,), report.notes)
+    late = dataclasses.replace(failed, status="time limit")  # then the violations are those of the motion
+    loaded = vkc.Plan.load(late.save(tmp_path / "late.npz"))
+    assert {v.constraint for v in loaded.validation.violations} == {"velocity", "acceleration"}
+    assert (loaded.success, loaded.status, loaded.validation.notes) == (False, "time limit", report.notes)
+
+
+def spoiled(plan: vkc.Plan) -> vkc.Plan:
+    """The plan of another motion, which says of itself what the right one says."""
+    positions = plan.trajectory.positions.copy()
+    positions[5, 2] += 1.5
+    return dataclasses.replace(plan, trajectory=dataclasses.replace(plan.trajectory, positions=positions))
+
+
+@pytest.mark.parametrize("check", [False, True])
+def test_success_is_not_what_the_file_says(door_plan: vkc.Plan, tmp_path: Path, check: bool) -> None:
+    bad = spoiled(door_plan)
+    assert bad.success
+    loaded = vkc.Plan.load(bad.save(tmp_path / "bad.npz"), check=check)
+    assert (loaded.success, loaded.status) == (False, "rejected")
+    assert loaded.report().startswith("door: FAILED, rejected")
+    assert loaded.to_dict()["status"] == "rejected"
+    assert repr(loaded).startswith("<Plan rejected")
+    assert loaded.claimed is not None
+    assert loaded.claimed.ok
+    assert loaded.contradictions() == ["every constraint holds"]
+    again = vkc.Plan.load(loaded.save(tmp_path / "again.npz"))
+    assert (again.success, again.contradictions()) == (False, [])
+
+
+def test_a_plan_is_checked_when_somebody_asks(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[vkc.Trajectory] = []
+
+    def check(scene: vkc.Scene, steps: Any, trajectory: vkc.Trajectory, *more: Any) -> Report:
+        asked.append(trajectory)
+        return vkc.validate(scene, steps, trajectory, *more)
+
+    monkeypatch.setattr("vkc_pin.planning.plan.validate", check)
+    loaded = vkc.Plan.load(saved)
+    assert not asked
+    alike = copy.copy(loaded)
+    for plan in (loaded, dataclasses.replace(loaded, seed=1)):
+        assert (plan.success, plan.report()[:13], plan.metrics["clearance"] > 0) == (True, "door: success", True)
+    assert len(asked) == 1
+    assert alike.validation == loaded.validation
+    assert len(asked) == 2
+    vkc.Plan.load(saved, check=True)
+    assert len(asked) == 3
+
+
+def test_what_the_file_says_of_the_task_does_not_matter_when_it_is_checked(door_plan: vkc.Plan, tmp_path: Path) -> None:
+    blame = Violation("penetration", "a – b", amount=0.03, unit="m", detail="overlap by 30 mm")
+    said = dataclasses.replace(spoiled(door_plan), status="infeasible", validation=Report((blame,), notes=("so it is",)))
+    path = said.save(tmp_path / "said.npz")
+    assert vkc.Plan.load(path).validation.violations == (blame,)
+    checked = vkc.Plan.load(path, check=True).validation
+    assert {v.constraint for v in checked.violations} == {"velocity", "acceleration"}
+    assert checked.notes == ()
+    right = dataclasses.replace(door_plan, status="infeasible", validation=said.validation)
+    loaded = vkc.Plan.load(right.save(path))
+    assert (loaded.validation.ok, loaded.success) == (True, False)
+    assert "1 constraint(s) violated" in loaded.contradictions()
+
+
+def test_a_motion_of_another_robot(door_plan: vkc.Plan, tmp_path: Path) -> None:
+    names = ("arm", *door_plan.trajectory.names[1:])
+    path = dataclasses.replace(door_plan, trajectory=dataclasses.replace(door_plan.trajectory, names=names)).save(tmp_path / "a")
+    with pytest.raises(vkc.InputError, match=r"trajectory.names: not this robot's coordinates") as caught:
+        vkc.Plan.load(path)
+    assert caught.value.file == path
+
+
+def test_a_motion_without_end(door_plan: vkc.Plan, tmp_path: Path) -> None:
+    for far in (1e6, 1e100):
+        positions = door_plan.trajectory.positions.copy()
+        positions[5, 0] = far
+        path = dataclasses.replace(door_plan, trajectory=dataclasses.replace(door_plan.trajectory, positions=positions)).save(
+            tmp_path / "far"
+        )
+        with pytest.raises(vkc.InputError, match=r"trajectory.positions: too long a motion") as caught:
+            vkc.Plan.load(path)
+        assert caught.value.file == path

@@ -156,7 +156,7 @@ HELD = "0,0,0,0,1,a,"
             Trajectory.from_json,
             '{"names": [' + ",".join(f'"{k}"' for k in range(500_000)) + ',"7"], "times": [0, 1], "positions": [[0]],'
             ' "robot_size": 3, "phases": []}',
-            "Trajectory.names: a name occurs twice .got 7",
+            "Trajectory.names: too many entries",
         ),
         (
             Trajectory.from_json,

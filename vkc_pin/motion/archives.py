@@ -31,13 +31,13 @@ LARGEST_ARCHIVE, LARGEST_MEMBER = 20_000_000, 40_000_000
 ARRAYS = {"about": ("U", 0), "times": ("f", 1), "positions": ("f", 2)}
 """Parts of the file: kind of their items and number of axes."""
 STATUSES = (
-    *("success", "infeasible", "not converged", "time limit", "interrupted", "rejected"),
+    *("success", "infeasible", "not converged", "time limit", "effort spent", "interrupted", "rejected"),
     *("no base pose", "no base path", "arm does not reach", "no inverse kinematics", "collision", "too fast", "closure"),
 )
 """What plans end with; those in the second line are the baselines'."""
 METRICS = (
     *("planning_time", "build_time", "base_effort", "base_effort_l1", "arm_effort", "clearance", "closure_error", "duration"),
-    *("iterations", "rounds", "time_initialization", "time_coal", "time_casadi", "time_ipopt", "time_validation"),
+    *("iterations", "rounds", "effort", "time_initialization", "time_coal", "time_casadi", "time_ipopt", "time_validation"),
 )
 """What every plan is measured by; baselines have more."""
 
@@ -110,7 +110,10 @@ class _Others(BaseModel):
         return self
 
 
-_kinds: dict[str, Any] = {name: (Distance if name == "clearance" else Measured, ...) for name in METRICS}
+_LATER = ("effort",)  # older files do not have it
+_kinds: dict[str, Any] = {
+    name: (Distance if name == "clearance" else Measured, 0.0 if name in _LATER else ...) for name in METRICS
+}
 _Metrics = create_model("_Metrics", __base__=_Others, **_kinds)
 
 

@@ -183,7 +183,7 @@ def _lines(text: str, path: Path) -> Iterator[tuple[int, list[str]]]:
         for cells in reader:
             yield reader.line_num, cells
     except csv.Error as error:
-        raise InputError("not a table", file=path, line=reader.line_num, got=error) from None
+        raise InputError("not a table", file=path, line=reader.line_num, got=str(error)) from None
 
 
 def _number(cell: str, path: Path, line: int, column: str) -> float:

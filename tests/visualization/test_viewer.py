@@ -3,6 +3,7 @@ from __future__ import annotations
 import html
 import json
 import re
+import socket
 import subprocess
 import sys
 import time
@@ -274,6 +275,45 @@ def test_server_listens_on_loopback_only(viewer: Any) -> None:
     for address in visualization._server[1:]:
         port = int(re.findall(r":(\d+)", address)[0])
         assert listening(port) == {"0100007F"}, address
+
+
+def answer(port: int, host: str | None, *more: str, path: str = "/static/", version: str = "1.1") -> int:
+    """Return the status that the server answers a request with."""
+    lines = [f"GET {path} HTTP/{version}", *([] if host is None else [f"Host: {host}"]), "Connection: close", *more, "", ""]
+    if more:
+        lines.remove("Connection: close")
+    with socket.create_connection(("127.0.0.1", port), timeout=20) as connection:
+        connection.sendall("\r\n".join(lines).encode())
+        return int(connection.makefile("rb").readline().split()[1])
+
+
+def test_server_is_for_this_machine_only_by_whatever_name_it_is_asked(viewer: Any) -> None:
+    """A page elsewhere may call this machine by a name of its own."""
+    assert visualization._server is not None
+    port = int(visualization._server[2].split(":")[2].split("/")[0])
+    for host in ("localhost", "LOCALHOST", "127.0.0.1", "[::1]"):
+        assert (answer(port, f"{host}:{port}"), answer(port, host)) == (200, 200), host
+    upgrade = (
+        "Connection: Upgrade",
+        "Upgrade: websocket",
+        "Sec-WebSocket-Version: 13",
+        "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==",
+    )
+    assert answer(port, f"localhost:{port}", *upgrade, path="/") == 101
+    assert answer(port, f"localhost:{port}", *upgrade, f"Origin: http://localhost:{port}", path="/") == 101
+    for origin in ("http://evil.example", f"http://evil.example:{port}", "http://localhost:1", "null"):
+        assert answer(port, f"localhost:{port}", *upgrade, f"Origin: {origin}", path="/") == 403, origin
+    for host in (
+        "evil.example",
+        f"evil.example:{port}",
+        "localhost.evil.example",
+        "127.0.0.1.evil.example",
+        "0.0.0.0",
+        "127.0.0.1@evil",
+    ):
+        assert answer(port, host) in (400, 403), host
+        assert answer(port, host, *upgrade, f"Origin: http://{host}", path="/") in (400, 403), host
+    assert answer(port, None, version="1.0") == 403
 
 
 def test_server_serves_the_motion(viewer: Any, plan: Plan) -> None:

@@ -88,7 +88,7 @@ def test_modules_are_imported_by_their_full_names() -> None:
         if file.name == "__init__.py":
             continue
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ImportFrom) and node.module == "vkc_pin" and name != "vkc_pin.cli":
+            if isinstance(node, ast.ImportFrom) and node.module == "vkc_pin" and name != "vkc_pin.commands":
                 wrong += [f"{name}: from vkc_pin import {a.name}" for a in node.names if f"vkc_pin.{a.name}" not in known]
             if isinstance(node, ast.ImportFrom) and node.module and node.module.removeprefix("vkc_pin.") in wings:
                 wing = node.module.removeprefix("vkc_pin.")

@@ -18,7 +18,7 @@ import pytest
 import yaml
 
 import vkc_pin as vkc
-from vkc_pin.cli import _parser
+from vkc_pin.commands import make_parser
 from vkc_pin.files.documents import Document, check
 from vkc_pin.models.object_file import AttachmentSchema, LatchSchema, ObjectSchema
 from vkc_pin.models.robot_schema import BaseSchema, RobotSchema
@@ -118,7 +118,7 @@ def commands() -> dict[str, argparse.ArgumentParser]:
         if not inner:
             found[prefix] = parser
 
-    collect(_parser(), "")
+    collect(make_parser(), "")
     return found
 
 
@@ -135,7 +135,7 @@ def test_shell_commands_are_understood() -> None:
     assert len(lines) >= 8
     for line in lines:
         words = line.partition("#")[0].split()[1:]
-        assert callable(_parser().parse_args(words).run), line
+        assert callable(make_parser().parse_args(words).run), line
     targets = set(re.findall(r"^(\w+):", read("Makefile"), re.MULTILINE))
     assert set(re.findall(r"^make (\w+)", "\n".join(blocks(ROOT / "README.md", "sh")), re.MULTILINE)) <= targets
 

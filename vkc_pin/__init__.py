@@ -4,17 +4,24 @@ What is public is listed in `__init__.pyi` and loaded when it is first asked for
 that `import vkc_pin` costs little in a process that needs a part of it, and type checkers see everything.
 """
 
-from importlib.metadata import PackageNotFoundError, version
+from typing import Any
 
 import lazy_loader
 
 from vkc_pin import notebook
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_public, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 __all__.append("__version__")
 notebook.cards_from("vkc_pin.plotting.cards")
 
-try:
-    __version__ = version("vkc-pin")
-except PackageNotFoundError:  # a source tree that was never installed
-    __version__ = "0+unknown"
+
+def __getattr__(name: str) -> Any:
+    if name != "__version__":
+        return _public(name)
+    from importlib.metadata import PackageNotFoundError, version  # takes longer than all the rest
+
+    try:
+        found = version("vkc-pin")
+    except PackageNotFoundError:  # a source tree that was never installed
+        found = "0+unknown"
+    return globals().setdefault(name, found)

@@ -259,11 +259,11 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
 
 
 def test_twenty_trials_unless_told_otherwise() -> None:
-    from vkc_pin.cli import _parser
+    from vkc_pin.commands import make_parser
 
-    given = _parser().parse_args(["bench", "household", "--out", "x"])
+    given = make_parser().parse_args(["bench", "household", "--out", "x"])
     assert (given.trials, given.tasks, given.methods) == (20, None, None)
-    assert _parser().parse_args(["bench", "baselines", "--out", "x"]).trials == 50
+    assert make_parser().parse_args(["bench", "baselines", "--out", "x"]).trials == 50
 
 
 @pytest.mark.parametrize(("more", "words"), [(["--tasks", "fridge"], "there is no task 'fridge'"), (["--methods", "B3"], "'B3'")])

@@ -111,6 +111,15 @@ def test_ctrl_c_leaves_a_line_as_well(terminal: Terminal, monkeypatch: pytest.Mo
     assert terminal.lines()[1:] == [""]
 
 
+def test_a_terminal_that_goes_away_is_no_reason_to_stop(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
+    def gone(text: str) -> int:
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr(terminal, "write", gone)
+    plan = vkc.plan(hall(), [vkc.GoTo(0.3, 0.2)], options=vkc.Options(reach_waypoints=8), progress=True)
+    assert plan.success
+
+
 def test_a_pipe_gets_nothing(capfd: pytest.CaptureFixture[str]) -> None:
     with shown(True) as line:
         line.doing("something")

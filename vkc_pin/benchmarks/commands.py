@@ -12,6 +12,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from vkc_pin.interrupt import raising
+
 __all__ = ["EXIT_INTERRUPTED", "EXIT_OK", "add_bench", "natural", "positive"]
 
 EXIT_OK, EXIT_INTERRUPTED = 0, 130
@@ -129,14 +131,16 @@ def _add_choice(parser: argparse.ArgumentParser, names: str, choices: str) -> No
 
 def _bench_door(arguments: argparse.Namespace) -> int:
     from vkc_pin.benchmarks import door
+    from vkc_pin.files.writing import check_outputs, write_atomically
 
-    result = door.run(trials=arguments.trials, seed=arguments.seed, progress=not arguments.quiet)
-    sys.stdout.write(door.table(result) + "\n")
-    if arguments.json:
-        from vkc_pin.files.writing import write_atomically
-
-        write_atomically(arguments.json, (json.dumps(result, indent=1) + "\n").encode())
-        sys.stdout.write(f"wrote {arguments.json}\n")
+    if arguments.json is not None:
+        check_outputs({"--json": arguments.json})
+    with raising():
+        result = door.run(trials=arguments.trials, seed=arguments.seed, progress=not arguments.quiet)
+    said = door.table(result) + "\n"
+    if arguments.json is not None:
+        said += f"wrote {write_atomically(arguments.json, (json.dumps(result, indent=1) + chr(10)).encode())}\n"
+    sys.stdout.write(said)
     return EXIT_OK
 
 
@@ -146,7 +150,8 @@ def _bench_experiment(arguments: argparse.Namespace) -> int:
     others = ("run", "benchmark", "given", "quiet")
     settings = {name: value for name, value in vars(arguments).items() if value is not None and name not in others}
     try:
-        experiment.run(**settings, progress=not arguments.quiet)
+        with raising():
+            experiment.run(**settings, progress=not arguments.quiet)
     except KeyboardInterrupt as stop:
         again = shlex.join(["vkc-pin", *arguments.given])
         sys.stderr.write(f"\nvkc-pin: stopped{f'; {stop}' if str(stop) else ''}. The same command goes on from there:\n{again}\n")

@@ -60,6 +60,9 @@ def run(*, trials: int, seed: int, progress: bool = True) -> dict[str, Any]:
     Returns:
         {"meta": ..., "trials": [...]}, one object a trial; the first trial of a task also pays for the symbolic build,
         which is not part of its planning time.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C was pressed.
     """
     rng = np.random.default_rng(seed)
     scene = load_scene("door")
@@ -68,6 +71,8 @@ def run(*, trials: int, seed: int, progress: bool = True) -> dict[str, Any]:
     for number, start in enumerate(tqdm(starts, desc="door", unit="start", disable=not progress)):
 
         def record(task: str, result: Plan, number: int = number) -> Plan:
+            if result.status == "interrupted":
+                raise KeyboardInterrupt
             records.append(trial(result, method="VKC", seed=seed, task=task, number=number))
             return result
 

@@ -67,12 +67,18 @@ class Progress:
     def _show(self) -> None:
         if not self._ended and self.write is not None:
             passed = f"{time.perf_counter() - self._began:.0f} s"
-            self.write(" · ".join(filter(None, [passed, self._part, self._doing, self._what])), False)
+            self._write(" · ".join(filter(None, [passed, self._part, self._doing, self._what])), False)
 
     def _last(self, text: str) -> None:
         if not self._ended and self.write is not None:
             self._ended = True
-            self.write(text, True)
+            self._write(text, True)
+
+    def _write(self, text: str, last: bool) -> None:
+        """Show a text; a terminal that is gone is no reason to stop."""
+        with contextlib.suppress(OSError, ValueError):
+            if self.write is not None:
+                self.write(text, last)
 
 
 @contextlib.contextmanager

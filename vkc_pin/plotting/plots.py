@@ -22,9 +22,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, FigureBase
 
-__all__ = ["plot", "plot_clearance", "plot_joints", "plot_top_view"]
+__all__ = ["PICTURES", "plot", "plot_clearance", "plot_joints", "plot_top_view"]
 
-_SUFFIXES = (".png", ".svg", ".pdf")
+PICTURES = (".png", ".svg", ".pdf")
+"""Ends of the names of files that get all in one figure."""
 _SAMPLES = 240  # of the clearance
 _SHOWN = 0.30  # [m]: clearance above this is of no interest
 
@@ -45,10 +46,10 @@ def plot(plan: Judged, path: str | Path | None = None) -> Figure | dict[str, Fig
     """
     _check(plan)
     target = None if path is None else file_path(path, "path")
-    if target is None or target.suffix.lower() in _SUFFIXES:
+    if target is None or target.suffix.lower() in PICTURES:
         return save_figure(_combined(plan), target)
     if target.is_file():
-        expected = f"a folder, or a name ending with {', '.join(_SUFFIXES)}"
+        expected = f"a folder, or a name ending with {', '.join(PICTURES)}"
         raise InputError("this is a file", field="path", file=target, expected=expected)
     figures = {"joints": plot_joints(plan), "clearance": plot_clearance(plan), "top_view": plot_top_view(plan)}
     for name, figure in figures.items():

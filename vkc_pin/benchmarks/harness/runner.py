@@ -24,7 +24,7 @@ from vkc_pin.benchmarks.harness.record import meta, peak_memory
 from vkc_pin.benchmarks.harness.tables import to_csv
 from vkc_pin.errors import InputError, UnknownNameError, VkcError
 from vkc_pin.files.resources import folder, package_folder
-from vkc_pin.files.writing import write_atomically
+from vkc_pin.files.writing import check_writable, write_atomically
 
 __all__ = ["Function", "chosen", "run"]
 
@@ -32,7 +32,7 @@ Function = Callable[[dict[str, Any]], Mapping[str, Any] | Sequence[Mapping[str, 
 """What runs one trial: takes its specification, returns its record, or several."""
 
 # What shows results has no part in them: a table may be written anew after a change there.
-_NO_PART = ("cli.py", "benchmarks/")
+_NO_PART = ("cli.py", "commands.py", "benchmarks/")
 _DESCRIPTIONS = (".yaml", ".urdf", ".srdf")
 
 
@@ -80,6 +80,7 @@ def run(
         out.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):
         raise InputError("this is no folder", file=out, field="out") from None
+    check_writable(out / "trials.jsonl")
     about = meta()
     about["versions"]["sources"] = _sources()
     described = json.dumps([todo[key] for key in sorted(todo)], sort_keys=True).encode()

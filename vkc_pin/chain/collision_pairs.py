@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.arrays import Floats
+from vkc_pin.budget import spend
 from vkc_pin.chain.chain import VirtualKinematicChain
 from vkc_pin.chain.easing import eased_pairs
 from vkc_pin.chain.phase_geometry import PhaseGeometry
@@ -93,6 +94,7 @@ class _Pairing:
                 shape.name = f"{name}.{shape.name}"
                 shapes.append(shape)
                 labels.append(label)
+        spend()
         attached = {i for name, indices in mine.items() if scene.objects[name].object.free for i in indices}
         above = [i for i in moving if i in attached or (i in robots and shapes[i].parentJoint > 1)]
         table = np.concatenate([np.array(pairs).reshape(-1, 3), self._with_obstacles(len(shapes), moving, above)])

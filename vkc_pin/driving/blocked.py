@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vkc_pin.arrays import Bools, Floats, Ints
+from vkc_pin.budget import spend
 from vkc_pin.driving.body import FAN, Shape, hull_points
 
 __all__ = ["Lattice", "PlanViews", "stuck"]
@@ -201,11 +202,13 @@ def _fill(
         for known, index, number, which in zip(parts, indices, (i, j), (solid, other), strict=True):
             key = (number, 0.0, 0.0) if which.prism else (number, low, high)
             index.append(known.setdefault(key, (len(known), (which, *key[1:])))[0])
+    spend()
     moving, standing = np.array(indices)
     cosine, sine = np.cos(lattice.yaws)[:, None], np.sin(lattice.yaws)[:, None]
     turned = -np.stack([cosine * FAN[:, 0] + sine * FAN[:, 1], cosine * FAN[:, 1] - sine * FAN[:, 0]], axis=-1)
     support, overshoot = views.of([part for _, part in parts[0].values()], turned)
     other_support, other_overshoot = views.of([part for _, part in parts[1].values()], FAN[None])
+    spend()
     allowed = _SLANT * margin - overshoot[moving] - other_overshoot[standing] - _ROUNDING  # (pairs, H)
     reach = (support[moving] + other_support[standing] + allowed[..., None]).reshape(-1, len(FAN)).astype(np.float32)
     return _rows(reach, np.tile(np.arange(count), len(moving)), lattice)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vkc_pin.arrays import Bools, Floats, Ints
+from vkc_pin.budget import spend
 from vkc_pin.cache import Cache
 from vkc_pin.compiled import compiled_module
 from vkc_pin.driving.blocked import Lattice, PlanViews, stuck
@@ -207,6 +208,7 @@ class BaseGrid:
         bodies = (self.base, self.carried)
         rooms = (np.full((self.cells, self.cells), _ROOM), np.full((self.cells, self.cells), _ROOM))
         for s, support in enumerate(self.base.world.support):
+            spend()
             reach = max(float(body.span[s]) for body in bodies) + _ROOM
             if reach < 0.0:  # nothing can hit it
                 continue

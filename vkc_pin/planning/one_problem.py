@@ -139,6 +139,7 @@ class OneProblem:
                 notes = explain(problem, self.settings.random_seed)
             elif notes:  # two seeds failed, and random configurations find no free one at a goal either
                 break
+        spend()
         best = self._best
         if best is None:
             best, notes = self._stationary(problem), notes + self.blocked

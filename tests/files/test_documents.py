@@ -212,3 +212,13 @@ def test_bytes_within_bounds(tmp_path: Path) -> None:
         read_bytes(file, "plan", 5)
     with pytest.raises(InputError, match=r"cannot read the plan .*null byte"):
         read_bytes("a\0b", "plan")
+
+
+def test_text_can_be_written() -> None:
+    for document in (Document({"name": "x", "parts": ["a\ud800"]}), Document({"x\udfff": [1]}), Document(["\ud800"])):
+        with pytest.raises(InputError, match="not text"):
+            check(document, Thing)
+    around: dict[str, object] = {}
+    around["inside"] = around
+    with pytest.raises(InputError, match="inside: too many lists inside each other"):
+        check(Document(around), Thing)

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
+import pytest
+
+from vkc_pin.errors import InputError
 from vkc_pin.validation.report import Report, Violation
 
 ONE = Violation("limit", "elbow_joint", waypoint=4, time=1.0, amount=0.05, unit="rad", detail="3.2 rad is outside")
@@ -26,3 +30,32 @@ def test_round_trip() -> None:
     ):
         assert Report.from_dict(json.loads(json.dumps(report.to_dict()))) == report
     assert not Report((ONE,)).ok
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "field"),
+    [
+        (("violations", 0, "time"), "soon", "violations[0].time"),
+        (("violations", 0, "amount"), None, "violations[0].amount"),
+        (("violations", 1, "subject"), 3, "violations[1].subject"),
+        (("violations", 1, "waypoint"), -1, "violations[1].waypoint"),
+        (("violations", 1, "more"), 1, "violations[1]"),
+        (("violations",), 3, "violations"),
+        (("violations",), [3], "violations[0]"),
+        (("notes",), [3], "notes[0]"),
+        (("clearance",), "near", "clearance"),
+        (("closure_error",), 10**500, "closure_error"),
+        (("states",), 1.5, "states"),
+        (("more",), 1.5, None),
+    ],
+)
+def test_what_is_no_report(path: tuple[str | int, ...], value: object, field: str | None) -> None:
+    data: Any = Report((ONE, TWO), states=12).to_dict()
+    data["violations"] = list(data["violations"])
+    place = data
+    for key in path[:-1]:
+        place = place[key]
+    place[path[-1]] = value
+    with pytest.raises(InputError) as caught:
+        Report.from_dict(data)
+    assert caught.value.field == field

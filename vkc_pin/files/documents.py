@@ -207,16 +207,33 @@ def check(document: Document, schema: type[T]) -> T:
         InputError: It does not fit; the error is about the first wrong field in the file.
         UnknownNameError: The same, where a name resembles one that would fit.
     """
+    _check_text(document)
     try:
         return schema.model_validate(document.data)
     except pydantic.ValidationError as problem:
-        try:
-            errors = problem.errors(include_url=False)
-        except UnicodeEncodeError as unwritten:  # the name of a field is half of a surrogate pair
-            raise InputError("not text", file=document.file, expected="names in UTF-8", got=str(unwritten)) from None
+        errors = problem.errors(include_url=False)
     located = [(_path(document.data, error), error) for error in errors]
     path, first = min(located, key=lambda item: document.line(item[0]) or 0)
     raise _translate(document, path, first)
+
+
+def _check_text(document: Document) -> None:
+    """Raise InputError if a text, or the name of a field, is none that could be written: half of a surrogate pair is in it."""
+    left: list[tuple[tuple[Key, ...], Any]] = [((), document.data)]
+    while left:
+        path, value = left.pop()
+        if len(path) > DEEPEST:  # data that contain themselves have no end
+            raise document.error(path[:1], "too many lists inside each other", expected=f"at most {DEEPEST}")
+        if isinstance(value, dict):
+            left += [(path, name) for name in value if isinstance(name, str)]
+            left += [((*path, name if isinstance(name, int | str) else shown(name)), entry) for name, entry in value.items()]
+        elif isinstance(value, list | tuple):
+            left += [((*path, place), entry) for place, entry in enumerate(value)]
+        elif isinstance(value, str):
+            try:
+                value.encode("utf-8")
+            except UnicodeEncodeError:
+                raise document.error(path, "not text", expected="text in UTF-8", got=ascii(value)) from None
 
 
 def _check_depth(events: Iterable[yaml.Event], file: Path) -> None:

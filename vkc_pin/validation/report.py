@@ -6,6 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
+from vkc_pin.arguments import items, mapping, number, text, whole
+from vkc_pin.errors import InputError
+
 if TYPE_CHECKING:
     from vkc_pin.motion.trajectory import Trajectory
     from vkc_pin.options import Options
@@ -104,11 +107,43 @@ class Report:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Report:
-        """Return the report that `to_dict` made `data` of."""
-        fields = dict(data)
-        fields["violations"] = tuple(Violation(**v) for v in fields["violations"])
-        fields["notes"] = tuple(fields["notes"])
-        return cls(**fields)
+        """Return the report that `to_dict` made `data` of.
+
+        Raises:
+            InputError: Something is missing from it, or of another kind.
+        """
+        fields = dict(mapping(data, "report"))
+        for name in ("clearance", "closure_error", "closure_angle"):  # infinite where nothing can collide
+            if name in fields:
+                fields[name] = _real(fields[name], name)
+        fields["states"] = whole(fields.get("states", 0), "states", low=0)
+        listed: tuple[Any, ...] = items(fields.get("violations"), "violations", "a list of violations")
+        fields["violations"] = tuple(_violation(one, f"violations[{k}]") for k, one in enumerate(listed))
+        notes: tuple[Any, ...] = items(fields.get("notes"), "notes", "a list of texts")
+        fields["notes"] = tuple(text(note, f"notes[{k}]") for k, note in enumerate(notes))
+        try:
+            return cls(**fields)
+        except TypeError as error:  # a field that there is not
+            raise InputError("not a report", expected="what Report.to_dict returns", got=str(error)) from None
+
+
+def _real(value: Any, field: str) -> float:
+    """Return a number, which may be infinite. Raises `InputError` if it is none."""
+    return value if isinstance(value, float) else number(value, field)
+
+
+def _violation(data: Any, field: str) -> Violation:
+    """Return the violation that plain data describe. Raises `InputError` if something is missing or of another kind."""
+    given = mapping(data, field)
+    for name in ("constraint", "subject", "unit", "detail"):
+        given[name] = text(given.get(name), f"{field}.{name}")
+    for name in ("time", "amount"):
+        given[name] = _real(given.get(name), f"{field}.{name}")
+    given["waypoint"] = whole(given.get("waypoint"), f"{field}.waypoint", low=0)
+    try:
+        return Violation(**given)
+    except TypeError as error:
+        raise InputError("not a violation", field=field, expected="what Report.to_dict returns", got=str(error)) from None
 
 
 @runtime_checkable

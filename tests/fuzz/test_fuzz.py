@@ -14,7 +14,7 @@ import pytest
 from fuzz.running import BAD, KINDS, Worker
 
 CORPUS = sorted((Path(__file__).parent / "corpus").glob("*.json"))
-CASES = 150  # of all kinds, with each of the two seeds
+CASES = 300  # of all kinds, with each of the two seeds
 FIXED, FRESH = 1, int(os.environ.get("FUZZ_SEED", random.SystemRandom().randrange(10**6)))
 
 

@@ -15,6 +15,7 @@ import coal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vkc_pin.arguments import file_path
 from vkc_pin.arrays import Floats, Ints
 from vkc_pin.errors import InputError
 from vkc_pin.files.hulls import outer_hull
@@ -60,7 +61,7 @@ def load_mesh(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0)) -> trimesh.T
     """
     import trimesh
 
-    file = Path(path)
+    file = file_path(path, "path", "a mesh file")
     factors = _factors(file, scale)
     if not file.is_file():
         raise InputError("there is no such mesh", file=file, expected="a mesh file")

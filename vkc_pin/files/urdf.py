@@ -13,6 +13,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 
+from vkc_pin.arguments import file_path
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
 from vkc_pin.files import resources
@@ -138,7 +139,7 @@ class UrdfFile:
             plain = Path(address.removeprefix("file://"))
             candidates = [plain if plain.is_absolute() else self.path.parent / plain]
         for candidate in candidates:
-            if candidate.is_file():
+            if file_path(candidate, "filename", "a mesh file").is_file():
                 return candidate
         tried = f"nothing at {candidates[0]}"
         raise InputError("there is no such mesh", file=self.path, field=address, expected="a mesh file", got=tried)

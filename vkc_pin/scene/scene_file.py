@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from vkc_pin.arguments import file_path
 from vkc_pin.arrays import Floats
 from vkc_pin.files.documents import Document, check
 from vkc_pin.models.grafting import clean
@@ -171,7 +172,8 @@ def _pose(item: schema.PoseSchema) -> pin.SE3:
 
 
 def _file(document: Document, path: tuple[str | int, ...], folder: Path, name: str) -> Path:
-    file = folder / name
+    with document.at(path):
+        file = file_path(folder / name, "file", "the name of a file")
     if not file.is_file():
         raise document.error(path, "there is no such file", expected=f"a file in {folder}", got=name)
     return file

@@ -10,6 +10,7 @@ from vkc_pin.cli import main
 
 from .calls import files, folder
 from .mutate import spoiled
+from .odd import pipe
 
 __all__ = ["case", "run"]
 
@@ -53,14 +54,14 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, tuple[str, ...]]]] = {
             "--json": ("OUT/a.json",),
             "--save": ("OUT/a.npz", "OUT"),
             "--csv": ("OUT/a.csv", "/proc/x"),
-            "--ros": ("OUT/a.ros", "/dev/full"),
+            "--ros": ("OUT/a.ros", "OUT/pipe"),
             "--initialization": ("auto", "interpolated", "astr"),
             "--seed": ("0", "3", "-3"),
             "--quiet": (),
         },
     ),
     "check": (("NPZ", "nowhere.npz", "CSV"), {}),
-    "view": (("NPZ", "drawer"), {"--html": ("OUT/a.html", "/dev/full", "/")}),
+    "view": (("NPZ", "drawer"), {"--html": ("OUT/a.html", "OUT/pipe", "/")}),
     "export": (
         ("NPZ", "CSV", "nowhere"),
         {
@@ -113,7 +114,7 @@ def run(given: dict[str, Any]) -> str:
     """Run the command, in a folder of its own."""
     out = folder() / "out"
     out.mkdir(exist_ok=True)
-    known = {"NPZ": str(files()["npz"]), "CSV": str(files()["csv"])}
+    known = {"NPZ": str(files()["npz"]), "CSV": str(files()["csv"]), "OUT/pipe": str(pipe())}
     words = [known.get(word, word.replace("OUT", str(out))) for word in given["argv"]]
     code: Any = None
     with contextlib.chdir(out):
@@ -121,5 +122,5 @@ def run(given: dict[str, Any]) -> str:
             code = main(words)
         except SystemExit as end:
             code = end.code
-    assert code in (0, 1, 2), f"ended with {code!r}"
-    return ("done", "failed", "refused")[code]
+    assert code in (0, 1, 2, 3), f"ended with {code!r}"
+    return ("done", "failed", "refused", "infeasible")[code]

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import atexit
+import functools
 import math
+import os
+import shutil
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,7 +15,16 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-__all__ = ["JSON_VALUES", "RAISING", "USUAL", "VALUES", "value", "within"]
+__all__ = ["JSON_VALUES", "RAISING", "USUAL", "VALUES", "pipe", "value", "within"]
+
+
+@functools.cache
+def pipe() -> Path:
+    """Return a pipe that nobody reads or writes; devices are not played with: a fault would break the machine's own."""
+    made = Path(tempfile.mkdtemp())
+    atexit.register(shutil.rmtree, made, ignore_errors=True)
+    os.mkfifo(made / "pipe")
+    return made / "pipe"
 
 
 class _Hostile:
@@ -135,7 +149,7 @@ _OTHERS: dict[str, Callable[[], Any]] = {
     "exception": lambda: ValueError("x"),
     "path": lambda: Path("nowhere/x.yaml"),
     "folder": lambda: Path("/"),
-    "device": lambda: Path("/dev/null"),
+    "pipe": pipe,
     "long path": lambda: Path("x" * 10000),
     "null path": lambda: Path("\x00"),
     "surrogate path": lambda: Path("a\ud800b.yaml"),

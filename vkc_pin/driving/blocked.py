@@ -20,7 +20,7 @@ from vkc_pin.arrays import Bools, Floats, Ints
 from vkc_pin.budget import spend
 from vkc_pin.driving.body import FAN, Shape, hull_points
 
-__all__ = ["Lattice", "PlanViews", "stuck"]
+__all__ = ["Lattice", "PlanViews", "Solid", "slice_of", "solids_of", "stuck"]
 
 _FLAT = 1e-6  # [m]: shapes, and what two have in common in height, that are no higher are left out
 _ROUNDING = 1e-5  # [m] of numbers of single precision
@@ -38,7 +38,7 @@ class Lattice(NamedTuple):
     yaws: Floats
 
 
-class _Solid(NamedTuple):
+class Solid(NamedTuple):
     """Points whose hull a shape contains, shape (n, 3), its lowest and highest z [m], if it is a prism, and a name for it."""
 
     points: Floats
@@ -48,7 +48,7 @@ class _Solid(NamedTuple):
     key: bytes
 
 
-_Part = tuple[_Solid, float, float]
+_Part = tuple[Solid, float, float]
 """Of a solid, what is between two heights [m]."""
 _Reach = tuple[Floats, Floats]
 """Support functions, and how far beyond their hulls the polygons reach that they bound."""
@@ -77,7 +77,7 @@ def stuck(
         For base and carried, shape (cells, cells, H). What rides within the outline of the base is looked at only for obstacles
         that the base passes under.
     """
-    obstacles, below, above = _solids(standing), _solids(base), _solids(carried)
+    obstacles, below, above = solids_of(standing), solids_of(base), solids_of(carried)
     pairs, over = _meeting(below, obstacles), _meeting(above, obstacles)
     points = np.concatenate([solid.points for solid in below] or [np.zeros((1, 3))])
     low, high = points.min(axis=0), points.max(axis=0)
@@ -88,25 +88,26 @@ def stuck(
     return _fill(below, obstacles, pairs, lattice, margin, views=views), carrying
 
 
-def _solids(shapes: Sequence[Shape]) -> list[_Solid]:
+def solids_of(shapes: Sequence[Shape]) -> list[Solid]:
+    """Return what hulls placed shapes contain, without those that are flat."""
     solids = []
     for shape, placement in shapes:
         points, _ = hull_points(shape, placement, outer=False)
         if len(points) and np.ptp(points[:, 2]) > _FLAT:
             prism = isinstance(shape, coal.Box | coal.Cylinder) and bool(abs(placement.rotation[2, 2]) > 1.0 - 1e-9)
             key = points.tobytes() + bytes([prism])
-            solids.append(_Solid(points, float(points[:, 2].min()), float(points[:, 2].max()), prism, key))
+            solids.append(Solid(points, float(points[:, 2].min()), float(points[:, 2].max()), prism, key))
     return solids
 
 
-def _meeting(first: Sequence[_Solid], second: Sequence[_Solid]) -> Ints:
+def _meeting(first: Sequence[Solid], second: Sequence[Solid]) -> Ints:
     """Return which solids share heights with which, in the order of the first, shape (P, 2)."""
     one, other = (np.array([(solid.bottom, solid.top) for solid in solids]).reshape(-1, 2) for solids in (first, second))
     common = np.minimum(one[:, None, 1], other[:, 1]) - np.maximum(one[:, None, 0], other[:, 0])
     return np.argwhere(common > _FLAT)
 
 
-def _slice(solid: _Solid, low: float, high: float) -> Floats:
+def slice_of(solid: Solid, low: float, high: float) -> Floats:
     """Return those points in the plan view of a solid between two heights that `FAN` touches, shape (n, 2) [m], n at most 32."""
     points = solid.points
     if solid.prism or (low <= solid.bottom and high >= solid.top):
@@ -146,7 +147,7 @@ class PlanViews:
         """
         turned = directions.tobytes() if len(directions) > 1 else b""
         keys = [(solid.key, low, high, turned) for solid, low, high in parts]
-        new = {key: _slice(*part) for key, part in zip(keys, parts, strict=True) if key not in self._known}
+        new = {key: slice_of(*part) for key, part in zip(keys, parts, strict=True) if key not in self._known}
         order = sorted(new, key=lambda key: len(new[key]))
         for first in range(0, len(order), _AT_ONCE):  # few at once stay in the processor's cache
             some = order[first : first + _AT_ONCE]
@@ -186,7 +187,7 @@ def _support_of(outlines: list[Floats], directions: Floats) -> tuple[Floats, Flo
 
 
 def _fill(
-    first: Sequence[_Solid], second: Sequence[_Solid], pairs: Ints, lattice: Lattice, margin: float, *, views: PlanViews
+    first: Sequence[Solid], second: Sequence[Solid], pairs: Ints, lattice: Lattice, margin: float, *, views: PlanViews
 ) -> Bools:
     """Return where any of pairs of solids, shape (P, 2), surely come too close, shape (cells, cells, H)."""
     count, cells = len(lattice.yaws), lattice.cells

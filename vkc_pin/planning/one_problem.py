@@ -14,9 +14,10 @@ import numpy as np
 from vkc_pin.arrays import Floats
 from vkc_pin.budget import ENDINGS, SpentError, spend, unlimited
 from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.planning.diagnosis import explain, impossible
 from vkc_pin.planning.outcome import TIMES, outcome, spent, still
 from vkc_pin.planning.plan import Plan
+from vkc_pin.planning.reasons.diagnosis import explain, impossible
+from vkc_pin.planning.reasons.proofs import proofs
 from vkc_pin.planning.settings import Settings
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.scene.scene import Scene
@@ -112,6 +113,10 @@ class OneProblem:
         if reasons:
             best = self._stationary(problem)
             return dataclasses.replace(best, report=best.report.with_reasons(reasons)), "infeasible"
+        certain = proofs(problem)
+        if certain:
+            best = self._stationary(problem)
+            return dataclasses.replace(best, report=dataclasses.replace(best.report, notes=tuple(certain))), "infeasible"
         seeds = self._seeds(problem) if seed is None else iter([seed(problem)])
         return self._try_seeds(problem, seeds, searched=seed is None)
 

@@ -6,7 +6,7 @@ from helpers.drives import hall
 from helpers.small_problems import SHORT, door_scene, program_of
 
 import vkc_pin as vkc
-from vkc_pin.planning.diagnosis import explain, impossible
+from vkc_pin.planning.reasons.diagnosis import explain, impossible
 
 CRATE = {"name": "crate", "type": "box", "size": [0.6, 0.6, 0.4], "position": [1.5, 0.0, 0.2]}
 

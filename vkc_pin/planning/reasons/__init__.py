@@ -1,0 +1,1 @@
+"""Why a task cannot be done, as far as that is known."""

@@ -89,6 +89,10 @@ def _add_problems(benches: Any) -> None:
     shown, what = "problems drawn at random, whose plans are kept", "problems"
     drawn = _add_experiment(benches, "random", shown, about, "--problems", default=100, jobs=1, what=what)
     drawn.set_defaults(benchmark="problems.random_problems")
+    about = "Plan problems that cannot be done, each for one known reason: how long that takes, and whether the report says why."
+    shown = "problems that cannot be done: how soon that is said, and why"
+    own = _add_experiment(benches, "impossible", shown, about, "--problems", default=50, jobs=1, what="problems")
+    own.set_defaults(benchmark="problems.impossible")
     _add_choice(first, "tasks", "door drawer init_1 init_2 init_3 corridor_door aisle_drawer household_cup ... (default: all)")
 
 

@@ -1,6 +1,6 @@
 """Where the base cannot get to at any heading: a disc inside it does not pass, so that nothing around the disc passes either.
 
-Whatever the heading, the base covers a disc around its origin. Obstacles grown by its radius are where the origin cannot be. A
+Whatever the heading, the base covers a disc around a point of it. Obstacles grown by its radius are where the point cannot be. A
 cell counts as taken only if all of it is: what a flood over the other cells, corners included, does not touch, no motion gets to.
 """
 

@@ -20,7 +20,7 @@ from vkc_pin.motion.tables import chosen_columns, one_phase, read_json, size_of_
 
 __all__ = ["along", "from_ros", "rates", "to_ros"]
 
-_POINTS = 1_000_000  # in a message, at most: a gigabyte
+_MOST = 1_000_000  # positions in a message: some 300 MB
 _NANO = 1_000_000_000
 
 
@@ -68,8 +68,9 @@ def to_ros(
     velocities, accelerations = rates(times, positions)
     if rate is not None:
         rate = number(rate, "rate", "points a second, more than 0", low=0.0, above=True)
-        if times[-1] * rate > _POINTS:
-            expected = f"at most {_POINTS} points, {_POINTS / times[-1]:.4g} a second for this motion of {times[-1]:.4g} s"
+        most = _MOST // len(columns)
+        if times[-1] * rate > most:
+            expected = f"at most {most} points, {most / times[-1]:.4g} a second for this motion of {times[-1]:.4g} s"
             raise InputError("too many points", field="rate", expected=expected, got=rate)
         moments = np.append(np.arange(math.ceil(times[-1] * rate - 1e-6)) / rate, times[-1])
         if smooth:

@@ -16,8 +16,9 @@ from vkc_pin.budget import ENDINGS, SpentError, spend, unlimited
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.planning.outcome import TIMES, outcome, spent, still
 from vkc_pin.planning.plan import Plan
-from vkc_pin.planning.reasons.diagnosis import explain, impossible
+from vkc_pin.planning.reasons.diagnosis import Blocked, explain, impossible
 from vkc_pin.planning.reasons.proofs import proofs
+from vkc_pin.planning.reasons.ways import ways
 from vkc_pin.planning.settings import Settings
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.scene.scene import Scene
@@ -83,6 +84,7 @@ class OneProblem:
         self.history: list[dict[str, float]] = []
         self.blocked: list[str] = []  # phases in which there is no way for the base
         self._best: _Try | None = None
+        self._explained: list[Blocked] | None = None
 
     def run(self, seed: Callable[[TrajectoryProblem], Seed] | None = None) -> Plan:
         """Try seeds until validation accepts a motion, there are no more, or the budget is at its end.
@@ -129,7 +131,7 @@ class OneProblem:
 
     def _try_seeds(self, problem: TrajectoryProblem, seeds: Iterator[Seed], *, searched: bool) -> tuple[_Try, str]:
         """Return the best try, with what is in the way of the task if it is no success, and the plan's status."""
-        notes: list[str] = []
+        notes: list[Blocked] = []
         for number, seed in enumerate(seeds, start=1):
             solution = self._solve(problem, seed)
             found = self._judge(problem, solution, seed.name)
@@ -141,15 +143,26 @@ class OneProblem:
                 return self._best, solution.status
             spend()
             if number == 1 and searched and not _ends_free(problem, seed):
-                notes = explain(problem, self.settings.random_seed)
+                notes = self._goals(problem)
             elif notes:  # two seeds failed, and random configurations find no free one at a goal either
                 break
+            if any(goal.deep for goal in notes):
+                break
         spend()
-        best = self._best
-        if best is None:
-            best, notes = self._stationary(problem), notes + self.blocked
-        report = dataclasses.replace(best.report, notes=tuple(notes))
-        return dataclasses.replace(best, report=report), "infeasible" if notes else best.status
+        best = self._best or self._stationary(problem)
+        lines = [goal.text for goal in notes]
+        status = "infeasible" if lines or (self._best is None and self.blocked) else best.status
+        if self._best is None:
+            lines += self.blocked
+        elif searched and not lines:
+            lines += ways(problem, best.z, best.report, self.blocked)
+        return dataclasses.replace(best, report=dataclasses.replace(best.report, notes=tuple(lines))), status
+
+    def _goals(self, problem: TrajectoryProblem) -> list[Blocked]:
+        """Return the goals for which no free configuration is found, looked for once."""
+        if self._explained is None:
+            self._explained = explain(problem, self.settings.random_seed)
+        return self._explained
 
     def _seeds(self, problem: TrajectoryProblem) -> Iterator[Seed]:
         s = self.settings
@@ -160,6 +173,7 @@ class OneProblem:
             count=s.options.max_restarts,
             perturbation=s.perturbation,
             notes=self.blocked,
+            hopeless=lambda: any(goal.deep for goal in self._goals(problem)),
         )
         while True:
             began, built = time.perf_counter(), s.cache.building

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -36,6 +36,7 @@ def initialize(
     count: int = 1,
     perturbation: float = 0.0,
     notes: list[str] | None = None,
+    hopeless: Callable[[], bool] = lambda: False,
 ) -> Iterator[Seed]:
     """Yield up to `count` seeds of each kind, best first; each is looked for when it is asked for.
 
@@ -51,6 +52,7 @@ def initialize(
         count: How many different seeds to return.
         perturbation: Standard deviation of what is added to the robot's coordinates, smoothly over time, [m] and [rad].
         notes: Gets a line for every phase in which there is no way for the base.
+        hopeless: Asked by "auto" before trees grow: whether no way helps, since a goal is blocked; then none grow.
     """
     said: list[str] = [] if notes is None else notes
     if method == "stationary":
@@ -58,15 +60,19 @@ def initialize(
     else:
         shared = _Shared(problem, random_seed, said, Routes(problem), Known())
         kinds = ("interpolated", "astar", "rrt") if method == "auto" else (method,)
-        seeds = _in_turn(*(_kind(kind, shared, count) for kind in kinds))
+        asked = hopeless if method == "auto" else lambda: False
+        seeds = _in_turn(*(_kind(kind, shared, count, asked) for kind in kinds))
     rng = np.random.default_rng([random_seed, 1])
     for item in seeds:
         yield replace(item, z=_perturbed(problem, item.z, perturbation, rng)) if perturbation else item
 
 
-def _kind(method: str, shared: _Shared, count: int) -> Iterator[Seed | None]:
+def _kind(method: str, shared: _Shared, count: int, hopeless: Callable[[], bool]) -> Iterator[Seed | None]:
     """Yield the seeds of one kind; nothing is made before the first is asked for."""
-    yield from (_Rrt(shared) if method == "rrt" else _SeedSearch(shared, method)).seeds(count)
+    if method != "rrt":
+        yield from _SeedSearch(shared, method).seeds(count)
+    elif not hopeless():  # trees take their time
+        yield from _Rrt(shared).seeds(count)
 
 
 def _in_turn(*kinds: Iterator[Seed | None]) -> Iterator[Seed]:

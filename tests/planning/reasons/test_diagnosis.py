@@ -47,15 +47,17 @@ def test_a_start_that_touches() -> None:
 
 
 def test_how_far_a_target_stays_out_of_reach() -> None:
-    (line,) = explain(problem(hall(), vkc.Reach((1.0, 0.0, 4.0, 0.0, 0.0, 0.0))), 0)
+    ((line, short_by),) = explain(problem(hall(), vkc.Reach((1.0, 0.0, 4.0, 0.0, 0.0, 0.0))), 0)
     assert line.startswith("reach with tool: out of reach")
     short = float(line.split("the nearest stays ")[1].split()[0])
+    assert short_by == pytest.approx(short, abs=1e-3)
     assert 1.5 < short < 3.0
 
 
 def test_what_blocks_every_goal_configuration() -> None:
-    (line,) = explain(problem(hall(obstacles=[CRATE]), vkc.GoTo(1.5, 0.0, 0.0)), 0)
+    ((line, short_by),) = explain(problem(hall(obstacles=[CRATE]), vkc.GoTo(1.5, 0.0, 0.0)), 0)
     assert line.endswith("base_link – crate overlap by 270.0 mm")
+    assert short_by == pytest.approx(0.27 + SHORT.dist_safe)
 
 
 def test_a_goal_that_leaves_the_base_free_is_not_judged() -> None:

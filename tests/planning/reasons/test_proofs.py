@@ -75,6 +75,15 @@ def test_a_wall_that_the_base_passes_under() -> None:
     assert proofs(problem([box("beam", (0.1, 12.0, 0.3), (1.2, 0.0, 1.5))], vkc.GoTo(3.0, 0.0))) == []
 
 
+@pytest.mark.parametrize("height", [0.42, 0.47])
+def test_a_wall_that_the_base_passes_under_but_not_the_foot_of_the_arm(height: float) -> None:
+    beam = box("beam", (0.1, 13.0, 1.0), (1.2, 0.0, 0.5 + height))
+    (line,) = proofs(problem([beam], vkc.GoTo(3.0, 0.0)))
+    assert line.endswith("cut off by beam")
+    shorter = {**beam, "size": [0.1, 12.0, 1.0]}  # the base passes under it at the arena's edge, the foot beside it
+    assert proofs(problem([shorter], vkc.GoTo(3.0, 0.0))) == []
+
+
 def test_the_goal_is_taken() -> None:
     (line,) = proofs(problem([box("crate", (0.6, 0.6, 0.4), (1.5, 0.0, 0.2))], vkc.GoTo(1.5, 0.0)))
     assert line.startswith("go to: no place for the base, " + PROVEN)
@@ -120,7 +129,7 @@ def test_where_a_path_was_found_nothing_is_proven(seed: int) -> None:
     z = own.start.copy()
     z[:3] = 0.0
     moving, standing = grid_shapes(own, 0, z)
-    grid = BaseGrid([shape for joint, shape in moving if joint == 1], [], standing, own.scene.arena, 0.0)
+    grid = BaseGrid([shape for joint, shape in moving if joint <= 1], [], standing, own.scene.arena, 0.0)
     goals = np.array([(x, y, yaw) for yaw in np.linspace(0.0, 2 * np.pi, 16, endpoint=False)])
     if shortest_path(grid, own.start[:3].tolist(), goals) is not None:
         assert proofs(own) == []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from vkc_pin.arrays import Floats
@@ -10,9 +12,27 @@ from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.knots import depth, scatter
 from vkc_pin.validation.report import Violation
 
-__all__ = ["explain", "impossible"]
+__all__ = ["Blocked", "explain", "impossible"]
 
 _DRAWS = 4  # batches of `SCATTER` random configurations before a goal counts as blocked
+_DEEP = 0.05  # [m] or [rad]
+
+
+class Blocked(NamedTuple):
+    """A goal for which no free configuration was found.
+
+    Attributes:
+        text: One line for people.
+        short: By how much the best one misses the goal [m] or [rad], or its margins [m].
+    """
+
+    text: str
+    short: float
+
+    @property
+    def deep(self) -> bool:
+        """Whether it is so far from good that no solver pushes it free."""
+        return self.short > _DEEP
 
 
 def impossible(problem: TrajectoryProblem) -> list[Violation]:
@@ -47,14 +67,14 @@ def impossible(problem: TrajectoryProblem) -> list[Violation]:
     return found
 
 
-def explain(problem: TrajectoryProblem, random_seed: int) -> list[str]:
+def explain(problem: TrajectoryProblem, random_seed: int) -> list[Blocked]:
     """Return, for every goal that no free configuration was found for, the nearest miss or what collides with what.
 
     Args:
         problem: What could not be solved.
         random_seed: Of the random configurations tried.
     """
-    lines = []
+    found = []
     for phase, end in zip(problem.task.phases, problem.ends, strict=True):
         tried = _try(problem, int(end), np.random.default_rng(random_seed))
         if tried is None:
@@ -62,10 +82,11 @@ def explain(problem: TrajectoryProblem, random_seed: int) -> list[str]:
         z, residual = tried
         if residual.min() > TOLERANCE:
             nearest = int(np.argmin(residual))
-            lines.append(
+            text = (
                 f"{phase.name}: out of reach, none of {len(z)} configurations tried gets there; "
                 f"the nearest stays {residual[nearest]:.3f} m or rad short"
             )
+            found.append(Blocked(text, float(residual[nearest])))
             continue
         reached = z[residual < TOLERANCE]
         contacts = problem.contacts.evaluate(reached, np.full(len(reached), int(end)), reach=problem.options.dist_safe)
@@ -75,11 +96,12 @@ def explain(problem: TrajectoryProblem, random_seed: int) -> list[str]:
             worst = int(np.flatnonzero(contacts.waypoint == best)[0])
             labels = problem.contacts.phases[problem.contacts.phase_of(int(end))].labels
             first, second = contacts.pair[worst]
-            lines.append(
+            text = (
                 f"{phase.name}: all {len(reached)} configurations found there are blocked; in the least blocked one "
                 f"{labels[first]} – {labels[second]} {_gap(contacts.distance[worst])}"
             )
-    return lines
+            found.append(Blocked(text, float(shortfall[best])))
+    return found
 
 
 def _try(problem: TrajectoryProblem, waypoint: int, rng: np.random.Generator) -> tuple[Floats, Floats] | None:

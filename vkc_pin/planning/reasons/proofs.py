@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pinocchio as pin
 
 from vkc_pin.arrays import Bools, Floats
 from vkc_pin.driving.blocked import solids_of
@@ -34,7 +35,7 @@ _Window = tuple[tuple[slice, slice], Bools]
 
 @dataclass(frozen=True, eq=False)
 class _Goal:
-    """Where the base must be at the end of a phase: within `radius` [m] of `at`, shape (2,) [m]; nan: anywhere along an axis."""
+    """Where a point of the base must be at the end of a phase: within `radius` [m] of `at`, shape (2,) [m]; nan: anywhere."""
 
     at: Floats
     radius: float
@@ -62,17 +63,39 @@ def proofs(problem: TrajectoryProblem) -> list[str]:
     """
     if problem.chain.robot.base == "fixed":
         return []
-    parts = []
+    goals = []
     for number, phase in enumerate(problem.task.phases):
-        goals, beyond = _goals(problem, number)
+        found, beyond = _goals(problem, number)
         if beyond:
             return [f"{phase.name}: out of reach, {PROVEN}{text}" for text in beyond]
-        parts.append(_Part(phase, goals, *_standing(problem, number)))
+        goals.append(found)
     low, high = (np.array(side) for side in zip(*(problem.limits(name) for name in problem.chain.names[:2]), strict=True))
-    low, high = low - _LEEWAY, high + _LEEWAY
-    if not any(part.goals and part.walls for part in parts) or _passes(problem, parts, Cells.over(low, high, _COARSE)):
+    x, y, yaw = problem.start[:3].tolist()
+    for point in _points(problem):
+        away = float(np.hypot(*point))
+        start = np.array([x, y]) + np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]) @ point
+        parts = []
+        for number, phase in enumerate(problem.task.phases):
+            own = [_Goal(goal.at, goal.radius + away) for goal in goals[number]]
+            parts.append(_Part(phase, own, *_standing(problem, number, point)))
+        begin, end = low - _LEEWAY - away, high + _LEEWAY + away
+        step = max(_FINE, float(np.sqrt(np.prod(end - begin) / _MOST)))
+        if not any(part.goals and part.walls for part in parts) or _passes(start, parts, Cells.over(begin, end, _COARSE)):
+            continue
+        missed = _missed(problem, start, parts, Cells.over(begin, end, step))
+        if missed:
+            return missed
+    return []
+
+
+def _points(problem: TrajectoryProblem) -> list[Floats]:
+    """Return points fixed in the base, shape (2,) [m], whose ways are looked for: its origin, and where it is highest."""
+    robot = problem.chain.robot.collision.geometryObjects
+    solids = solids_of([(shape.geometry, shape.placement) for shape in robot if shape.parentJoint == _BASE])
+    if not solids:
         return []
-    return _missed(problem, parts, Cells.over(low, high, max(_FINE, float(np.sqrt(np.prod(high - low) / _MOST)))))
+    corners = max(solids, key=lambda solid: solid.top).points[:, :2]
+    return [np.zeros(2), (corners.min(axis=0) + corners.max(axis=0)) / 2.0]
 
 
 def _goals(problem: TrajectoryProblem, number: int) -> tuple[list[_Goal], list[str]]:
@@ -111,8 +134,8 @@ def _arm(problem: TrajectoryProblem, joint: int, local: Floats) -> tuple[Floats,
     return np.asarray(model.jointPlacements[along[0]].translation), length
 
 
-def _standing(problem: TrajectoryProblem, number: int) -> tuple[list[Wall], list[str]]:
-    """Return what surely keeps the base away in a phase, and the names of what stands there."""
+def _standing(problem: TrajectoryProblem, number: int, point: Floats) -> tuple[list[Wall], list[str]]:
+    """Return what surely keeps a point of the base away in a phase, and the names of what stands there."""
     part = problem.contacts.phases[number]
     robot = part.shapes[: len(problem.chain.robot.collision.geometryObjects)]
     base = [i for i, shape in enumerate(robot) if shape.parentJoint == _BASE]
@@ -125,16 +148,17 @@ def _standing(problem: TrajectoryProblem, number: int) -> tuple[list[Wall], list
         if shape.parentJoint == 0 and label != FLOOR and hits[i] == len(base) and i not in left | eased
     ]
     below, shapes = ([(part.shapes[i].geometry, part.shapes[i].placement) for i in which] for which in (base, solid))
+    below = [(shape, pin.SE3(np.eye(3), -np.array([*point, 0.0])) * where) for shape, where in below]
     key = ("discs", *(solid.key for solid in solids_of(below)))
     discs = problem.cache.get(key, lambda: Discs(below))
     return discs.walls(shapes), [part.labels[i] for i in solid]
 
 
-def _passes(problem: TrajectoryProblem, parts: Sequence[_Part], cells: Cells) -> bool:
+def _passes(start: Floats, parts: Sequence[_Part], cells: Cells) -> bool:
     """Return whether the disc surely finds a way from goal to goal: it keeps to cells all of which are free."""
     half = cells.step * float(np.sqrt(0.5))
     here = np.zeros(cells.shape, bool)
-    here[cells.at(problem.start[:2])] = True
+    here[cells.at(start)] = True
     known: dict[tuple[bytes, float], _Window] = {}  # most stands where it is from phase to phase
     for part in parts:
         free = np.ones(cells.shape, bool)
@@ -152,11 +176,11 @@ def _passes(problem: TrajectoryProblem, parts: Sequence[_Part], cells: Cells) ->
     return True
 
 
-def _missed(problem: TrajectoryProblem, parts: Sequence[_Part], cells: Cells) -> list[str]:
+def _missed(problem: TrajectoryProblem, start: Floats, parts: Sequence[_Part], cells: Cells) -> list[str]:
     """Return a line about the first phase whose goals the base surely cannot get to, if any."""
     half = cells.step * float(np.sqrt(0.5))
     here = np.zeros(cells.shape, bool)
-    here[cells.at(problem.start[:2])] = True
+    here[cells.at(start)] = True
     for part in parts:
         taking: dict[int, list[_Window]] = {}
         for wall in part.walls:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import atexit
 import functools
 import random
+import shutil
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -67,7 +69,9 @@ def saved() -> vkc.Plan:
 @functools.cache
 def folder() -> Path:
     """Where files may be written: nothing else is, since a name that is not in it is no valid one."""
-    return Path(tempfile.mkdtemp(prefix="vkc_fuzz_"))
+    root = Path(tempfile.mkdtemp(prefix="vkc_fuzz_"))
+    atexit.register(shutil.rmtree, root, ignore_errors=True)
+    return root
 
 
 @functools.cache

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import functools
 import random
 import shutil
@@ -29,6 +30,7 @@ PLANNED = 0.02  # the share of what loads that is planned in
 def pool() -> Path:
     """A copy of robots and scenes, with a mesh of each kind and a scene that has them."""
     root = Path(tempfile.mkdtemp(prefix="vkc_fuzz_files_"))
+    atexit.register(shutil.rmtree, root, ignore_errors=True)
     for kind in ("robots", "scenes"):
         shutil.copytree(folder(kind), root / kind)
     for name in MESHES.values():

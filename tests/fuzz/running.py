@@ -9,6 +9,7 @@ import resource
 import select
 import subprocess
 import sys
+import tempfile
 import time
 import traceback
 import warnings
@@ -148,8 +149,15 @@ class Worker:
         """Return what came of a case: its outcome, its error if there is one, and what it took."""
         if self.process is None or self.count >= FRESH:
             self.close()
+            self.folder = tempfile.TemporaryDirectory(prefix="vkc_fuzz_")
             code = f"import sys; sys.path.insert(0, {str(TESTS)!r}); from fuzz.running import serve; serve()"
-            environment = {**os.environ, "OMP_NUM_THREADS": "1", "VKC_PIN_CACHE": "off", "MPLBACKEND": "agg"}
+            environment = {
+                **os.environ,
+                "OMP_NUM_THREADS": "1",
+                "VKC_PIN_CACHE": "off",
+                "MPLBACKEND": "agg",
+                "TMPDIR": self.folder.name,
+            }
             pipe = subprocess.PIPE
             self.process = subprocess.Popen(
                 [sys.executable, "-c", code], cwd=TESTS.parent, env=environment, stdin=pipe, stdout=pipe
@@ -181,3 +189,4 @@ class Worker:
             self.process.kill()
             self.process.communicate()
             self.process = None
+            self.folder.cleanup()

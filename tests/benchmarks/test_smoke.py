@@ -209,3 +209,16 @@ def test_household(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("success", "base_effort", "arm_effort", "planning_time", "cup_joints", "cabinet_joints"):
         assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
         assert f"]({name}.png)" in table
+
+
+def test_impossible(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "impossible", "--problems", "4", "--quiet", "--out", str(tmp_path)]) == 0
+    table = (tmp_path / "table.md").read_text(encoding="utf-8")
+    assert table in capsys.readouterr().out
+    trials = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))["trials"]
+    assert [t["kind"] for t in trials] == ["closed wall", "fence round the start", "fence round the goal", "gap too narrow"]
+    for t in trials:
+        assert (t["success"], t["explained"], t["proven"]) == (False, True, True)
+        assert "proven: " in t["notes"][0]
+        assert t["notes"][0] in table
+        assert t["wall_time"] > 0.0

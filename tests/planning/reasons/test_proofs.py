@@ -95,6 +95,12 @@ def test_too_high() -> None:
     assert line.startswith("reach with tool: out of reach, " + PROVEN)
 
 
+@pytest.mark.parametrize("obstacles", [[], [box("crate", (0.4, 0.4, 0.4), (0.0, 2.0, 0.2))]], ids=["empty", "crate"])
+def test_outside_the_arena(obstacles: list[dict[str, Any]]) -> None:
+    (line,) = proofs(problem(obstacles, vkc.Reach((8.0, 0.0, 0.8, np.pi / 2, 0.0, 0.0))))
+    assert line.endswith("proven: the goal is in reach from outside the arena alone")
+
+
 def test_the_phase_that_fails_is_named() -> None:
     steps = [vkc.GoTo(-1.0, 0.0), vkc.GoTo(3.0, 0.0)]
     lines = proofs(problem([box("fence", (0.1, 12.0, 1.0), (1.2, 0.0, 0.5))], *steps))

@@ -160,6 +160,18 @@ def _narrow(rng: np.random.Generator) -> _Problem:
     return _hall(*walls), (_beyond(rng),)
 
 
+def _bend(rng: np.random.Generator) -> _Problem:
+    """Return a passage as wide as the base, round a corner that is too tight to turn in."""
+    x, width = float(rng.uniform(1.2, 1.4)), _WIDTH + 0.08
+    walls = [_box("wall_low", (2.0 + width, 0.1, 1.0), (x + 1.0 + width / 2, -width / 2 - 0.05))]
+    walls += [_box("wall_high", (2.0, 0.1, 1.0), (x + 1.0, width / 2 + 0.05))]
+    walls += [_box("wall_east", (0.1, 3.0 + width, 1.0), (x + 2.05 + width, 1.5))]
+    walls += [_box("wall_west", (0.1, 3.0, 1.0), (x + 1.95, width / 2 + 1.5))]
+    ends = {"wall_left": (width / 2, _HALL), "wall_right": (-_HALL, -width / 2)}
+    walls += [_box(name, (0.1, high - low, 1.0), (x, (low + high) / 2)) for name, (low, high) in ends.items()]
+    return _hall(*walls), (GoTo(x + 2.4, float(rng.uniform(4.3, 4.8))),)
+
+
 def _low_beam(rng: np.random.Generator) -> _Problem:
     """Return a wall under which the base fits, but not the lowest link of the arm."""
     return _hall(_box("beam", (0.2, 2 * _HALL + 1.0, 1.5), (float(rng.uniform(1.2, 1.6)), 0.0), bottom=0.42)), (_beyond(rng),)
@@ -189,7 +201,7 @@ def _high(rng: np.random.Generator) -> _Problem:
 
 
 def _outside(rng: np.random.Generator) -> _Problem:
-    return _hall(), (Reach((_HALL + float(rng.uniform(1.2, 3.0)), 0.0, 0.8, np.pi / 2, 0.0, np.pi / 2)),)
+    return _hall(), (Reach((_HALL + float(rng.uniform(1.6, 3.0)), 0.0, 0.8, np.pi / 2, 0.0, np.pi / 2)),)
 
 
 def _boxed(rng: np.random.Generator) -> _Problem:
@@ -239,6 +251,7 @@ KINDS: Mapping[str, Callable[[np.random.Generator], _Problem]] = {
     "fence round the start": _fenced_in,
     "fence round the goal": _fenced_out,
     "gap too narrow": _narrow,
+    "bend too tight": _bend,
     "beam too low": _low_beam,
     "place taken": _taken,
     "no room for the heading": _turned,

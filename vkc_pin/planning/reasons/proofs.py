@@ -80,7 +80,7 @@ def proofs(problem: TrajectoryProblem) -> list[str]:
             parts.append(_Part(phase, own, *_standing(problem, number, point)))
         begin, end = low - _LEEWAY - away, high + _LEEWAY + away
         step = max(_FINE, float(np.sqrt(np.prod(end - begin) / _MOST)))
-        if not any(part.goals and part.walls for part in parts) or _passes(start, parts, Cells.over(begin, end, _COARSE)):
+        if not any(part.goals for part in parts) or _passes(start, parts, Cells.over(begin, end, _COARSE)):
             continue
         missed = _missed(problem, start, parts, Cells.over(begin, end, step))
         if missed:
@@ -193,6 +193,8 @@ def _missed(problem: TrajectoryProblem, start: Floats, parts: Sequence[_Part], c
         cut = _Cut(here, goal, taking)
         here = cut.reached & goal
         if not here.any():
+            if not goal.any():
+                return [f"{part.phase.name}: no place for the base, {PROVEN}the goal is in reach from outside the arena alone"]
             names = [part.names[number] for number in cut.obstacles()]
             return [f"{part.phase.name}: {cut.what}{_listed(problem, part.phase, names)}"]
     return []

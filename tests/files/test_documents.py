@@ -16,8 +16,9 @@ from hypothesis import strategies as st
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.files import documents
-from vkc_pin.files.documents import Document, check, field_name, parse_json, read_bytes, read_text, read_xml, read_yaml
+from vkc_pin.files.documents import Document, check, field_name, parse_json, read_bytes, read_text, read_yaml
 from vkc_pin.files.fields import Name, Number, Positive, Schema, Vector3
+from vkc_pin.files.xml import read_xml
 
 NAMES = st.text("abcdefgh", min_size=1, max_size=4).filter(lambda name: name not in ("no", "off", "on", "yes"))
 LEAVES = st.integers(-9, 9) | st.floats(-1e3, 1e3) | st.booleans() | NAMES

@@ -39,7 +39,6 @@ from vkc_pin.validation.distances import Placed, Solids, travelled
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.sweep import _Sweep, sweep
-from vkc_pin.validation.touching import may_touch
 
 SEEDS = st.integers(0, 2**32 - 1)
 POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array([0.4, 0.2, 0.9]))
@@ -107,7 +106,7 @@ def test_pictures_of_clearance_ask_for_few(plans: dict[int, tuple[Plan, int]]) -
     for result, _ in plans.values():
         counter, times = Counter(), result.trajectory.times
         with counter.counting(pytest.MonkeyPatch()):
-            found.append(clearance_curves(result.scene, result.trajectory, times, dist_safe=0.02))
+            found.append(clearance_curves(result.scene, result.trajectory, times))
         counts.append(counter.asked / len(times))
     assert [curve.name for curve in found[0]] == [curve.name for curve in found[1]]
     assert max(counts) < 200  # at every moment, of 26,000 pairs
@@ -218,17 +217,17 @@ def test_validation_sees_what_brute_force_sees_of_what_is_carried(seed: int, cou
 def check_sweep(scene: Scene, motion: Trajectory) -> None:
     """The smallest distance of all, whatever overlaps at a sample, and whatever falls short of its margin at a waypoint."""
     samples = Samples(scene, motion)
-    touching = may_touch(scene, Solids(samples.world), motion, (), 0.02)
-    table = PairTable(scene, Solids(samples.world), motion, 0.02, touching=touching)
+    table = PairTable(scene, Solids(samples.world), motion, 0.02)
     hits = list(sweep(table, samples.z, samples.waypoint_rows))
-    distances = brute_force(table, samples.z)
+    moves = table._moves[table._phase[np.searchsorted(samples.waypoint_rows, np.arange(len(samples.z)))]]
+    distances = np.where(moves[:, table.pairs].any(axis=2), brute_force(table, samples.z), np.inf)
     at_samples = min(hit.distance for hit in hits)
     assert at_samples <= distances.min() + COAL
     assert at_samples >= distances.min() - 2e-3 or min(distances.min(), 0.0) > at_samples  # it looks between samples, too
     found = {(hit.row, hit.first, hit.second) for hit in hits}
     for row, k in np.argwhere(distances < -COAL):
         assert (row, *pair_names(table, k)) in found
-    for t, k in np.argwhere(distances[samples.waypoint_rows] < table.margins - COAL):
+    for t, k in np.argwhere(distances[samples.waypoint_rows] < 0.02 - COAL):
         assert (samples.waypoint_rows[t], *pair_names(table, k)) in found
     for row in samples.waypoint_rows.tolist():  # and the closest pair of every waypoint
         closest = min(hit.distance for hit in hits if hit.at_waypoint and hit.row == row)
@@ -243,6 +242,7 @@ def test_bounds_are_bounds(seed: int, count: int, size: float) -> None:
     table = PairTable(scene, Solids(samples.world), samples.trajectory, 0.02)
     z = samples.z[samples.waypoint_rows]
     distances = brute_force(table, z)
+    moves = table._moves[table._phase][:, table.pairs].any(axis=2)
     placed, count = table.solids.at(samples.world.coordinates.q(z)), len(table.pairs)
     at, pairs = np.repeat(np.arange(len(z)), count), np.tile(table.pairs, (len(z), 1))
     bounds = placed.bounds(at, pairs).reshape(-1, count)
@@ -250,7 +250,7 @@ def test_bounds_are_bounds(seed: int, count: int, size: float) -> None:
     assert (bounds[np.isfinite(bounds)] >= 0.0).all()
     for reach in (0.02, 0.5):
         close = table.close(placed, np.arange(len(z)), np.full((len(z), len(table.group)), reach))
-        assert set(map(tuple, np.argwhere(distances < reach - COAL).tolist())) <= set(
+        assert set(map(tuple, np.argwhere((distances < reach - COAL) & moves).tolist())) <= set(
             zip(*map(np.ndarray.tolist, close), strict=True)
         )
     np.testing.assert_allclose(placed.distances(at, pairs).reshape(-1, count), distances, rtol=0.0, atol=COAL)

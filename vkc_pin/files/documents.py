@@ -1,11 +1,10 @@
-"""Description files: YAML read safely and checked against a schema, with errors that name file, line and field; and XML."""
+"""Description files: YAML read safely and checked against a schema, with errors that name file, line and field."""
 
 from __future__ import annotations
 
 import json
 import os
 import re
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -16,9 +15,8 @@ import pydantic
 import yaml
 
 from vkc_pin.errors import InputError, UnknownNameError, shown
-from vkc_pin.files.xml import parse_xml
 
-__all__ = ["Document", "check", "field_name", "parse_json", "read_bytes", "read_text", "read_xml", "read_yaml"]
+__all__ = ["Document", "check", "field_name", "parse_json", "read_bytes", "read_text", "read_yaml"]
 
 LARGEST_FILE = 50_000_000
 """Largest description file [bytes]."""
@@ -155,19 +153,6 @@ def parse_json(text: str, file: str | Path) -> Any:
             raise InputError("too many lists and objects inside each other", file=file, expected=f"at most {DEEPEST}")
         level = [inner for item in level for inner in (item.values() if isinstance(item, dict) else item)]
     return data
-
-
-def read_xml(file: str | Path, kind: str) -> tuple[str, ElementTree.Element]:
-    """Return what a URDF or SRDF file (`kind`) says, as text and as its element <robot>.
-
-    Raises:
-        InputError: It cannot be read, is no XML, or is about something else than a robot.
-    """
-    text = read_text(file, kind)
-    root = parse_xml(text, Path(file))
-    if root.tag != "robot":
-        raise InputError(f"this is no {kind}", file=file, expected="an element <robot>", got=f"<{root.tag}>")
-    return text, root
 
 
 def read_yaml(file: str | Path) -> Document:

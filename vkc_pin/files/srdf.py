@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vkc_pin.errors import UnknownNameError
-from vkc_pin.files.documents import read_xml
+from vkc_pin.files.xml import read_xml
 
 __all__ = ["Srdf", "read_srdf"]
 

@@ -8,8 +8,9 @@ from typing import Any
 from xml.parsers import expat
 
 from vkc_pin.errors import InputError, shown
+from vkc_pin.files.documents import read_text
 
-__all__ = ["check_indices", "line_of", "parse_xml"]
+__all__ = ["check_indices", "line_of", "parse_xml", "read_xml"]
 
 _INDICES = ("h", "p", "v", "vcount")
 
@@ -23,6 +24,19 @@ class _Element(ElementTree.Element):
 def line_of(element: ElementTree.Element) -> int | None:
     """Return the line in which an element begins, counted from 1; None if that is not known."""
     return getattr(element, "line", None)
+
+
+def read_xml(file: str | Path, kind: str) -> tuple[str, ElementTree.Element]:
+    """Return what a URDF or SRDF file (`kind`) says, as text and as its element <robot>.
+
+    Raises:
+        InputError: It cannot be read, is no XML, or is about something else than a robot.
+    """
+    text = read_text(file, kind)
+    root = parse_xml(text, Path(file))
+    if root.tag != "robot":
+        raise InputError(f"this is no {kind}", file=file, expected="an element <robot>", got=f"<{root.tag}>")
+    return text, root
 
 
 def parse_xml(text: str, file: Path) -> ElementTree.Element:

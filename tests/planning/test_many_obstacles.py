@@ -280,9 +280,10 @@ def cull_nothing(patch: pytest.MonkeyPatch) -> None:
     def nowhere(placed: Placed, states: np.ndarray, pairs: np.ndarray) -> np.ndarray:
         return np.full(len(pairs), -np.inf)
 
-    def all_of(table: PairTable, _: Placed, states: np.ndarray, *__: Any) -> tuple[np.ndarray, ...]:
-        count = len(table.pairs)
-        return np.repeat(np.arange(len(states)), count), np.tile(np.arange(count), len(states))
+    def all_of(
+        table: PairTable, _: Placed, states: np.ndarray, __: np.ndarray, also: np.ndarray | None = None
+    ) -> tuple[np.ndarray, ...]:
+        return np.nonzero(table._moves[table._phase[states if also is None else also]][:, table.pairs].any(axis=2))
 
     def everywhere(shape: coal.CollisionGeometry, placement: pin.SE3) -> tuple[np.ndarray, np.ndarray]:
         return np.full(3, -1e3), np.full(3, 1e3)

@@ -85,6 +85,7 @@ class OneProblem:
         self.blocked: list[str] = []  # phases in which there is no way for the base
         self._best: _Try | None = None
         self._explained: list[Blocked] | None = None
+        self._proven: list[str] | None = None
 
     def run(self, seed: Callable[[TrajectoryProblem], Seed] | None = None) -> Plan:
         """Try seeds until validation accepts a motion, there are no more, or the budget is at its end.
@@ -115,10 +116,6 @@ class OneProblem:
         if reasons:
             best = self._stationary(problem)
             return dataclasses.replace(best, report=best.report.with_reasons(reasons)), "infeasible"
-        certain = proofs(problem)
-        if certain:
-            best = self._stationary(problem)
-            return dataclasses.replace(best, report=dataclasses.replace(best.report, notes=tuple(certain))), "infeasible"
         seeds = self._seeds(problem) if seed is None else iter([seed(problem)])
         return self._try_seeds(problem, seeds, searched=seed is None)
 
@@ -142,6 +139,8 @@ class OneProblem:
             if solution.status in ENDINGS:
                 return self._best, solution.status
             spend()
+            if searched and self._proofs(problem):
+                break
             if number == 1 and searched and not _ends_free(problem, seed):
                 notes = self._goals(problem)
             elif notes:  # two seeds failed, and random configurations find no free one at a goal either
@@ -149,6 +148,9 @@ class OneProblem:
             if any(goal.deep for goal in notes):
                 break
         spend()
+        if searched and self._proofs(problem):
+            best, certain = self._stationary(problem), tuple(self._proofs(problem))
+            return dataclasses.replace(best, report=dataclasses.replace(best.report, notes=certain)), "infeasible"
         best = self._best or self._stationary(problem)
         lines = [goal.text for goal in notes]
         status = "infeasible" if lines or (self._best is None and self.blocked) else best.status
@@ -157,6 +159,12 @@ class OneProblem:
         elif searched and not lines:
             lines += ways(problem, best.z, best.report, self.blocked)
         return dataclasses.replace(best, report=dataclasses.replace(best.report, notes=tuple(lines))), status
+
+    def _proofs(self, problem: TrajectoryProblem) -> list[str]:
+        """Return what is certain, looked for once, and only when something has failed: most tasks can be done."""
+        if self._proven is None:
+            self._proven = proofs(problem)
+        return self._proven
 
     def _goals(self, problem: TrajectoryProblem) -> list[Blocked]:
         """Return the goals for which no free configuration is found, looked for once."""
@@ -173,7 +181,7 @@ class OneProblem:
             count=s.options.max_restarts,
             perturbation=s.perturbation,
             notes=self.blocked,
-            hopeless=lambda: any(goal.deep for goal in self._goals(problem)),
+            hopeless=lambda: bool(self._proofs(problem)) or any(goal.deep for goal in self._goals(problem)),
         )
         while True:
             began, built = time.perf_counter(), s.cache.building
@@ -182,7 +190,7 @@ class OneProblem:
                 seed = next(seeds, None)
             finally:
                 self.times["initialization"] += time.perf_counter() - began - (s.cache.building - built)
-            if seed is None:
+            if seed is None or self._proven:
                 return
             yield seed
 

@@ -316,7 +316,7 @@ def test_where_there_is_no_way_trees_make_no_seed() -> None:
     assert len(notes) == 1
     plan = vkc.plan(gated(0.0).scene, [vkc.GoTo(*GOAL)], initialization="rrt")
     assert plan.status == "infeasible"
-    assert "found no way" in plan.report()
+    assert "no way for the base, proven" in plan.report()
 
 
 def test_a_motion_through_the_narrow_gate() -> None:

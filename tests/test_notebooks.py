@@ -339,17 +339,17 @@ def test_when_planning_fails(tmp_path: Path) -> None:
 
     occupied = text(cells["occupied-report"])
     assert occupied.startswith("drawer: FAILED, infeasible — go to")
-    assert re.search(r"because go to: all \d+ configurations found there are blocked; .* base_link – chair overlap by", occupied)
+    assert "because go to: no place for the base, proven: wherever it would have to be, at any heading, it hits chair" in occupied
     page = result(cells["show"])["text/html"]
-    assert "penetration: base_link \\u2013 chair" in page or "penetration: base_link – chair" in page  # marked on the time bar
+    assert "clearance: base_link \\u2013 chair" in page or "clearance: base_link – chair" in page  # marked on the time bar
     data = re.findall(r"^(\w+) (.*) ([\d.]+) m at ([\d.]+) s$", text(cells["data"]), re.MULTILINE)
-    assert ("penetration", "base_link – chair") in [row[:2] for row in data]
+    assert ("clearance", "base_link – chair") in [row[:2] for row in data]
 
     assert text(cells["wide"]).startswith("drawer: FAILED, infeasible — go to")
     assert re.search(r"base_link – chair are only 4\d\.\d mm apart", text(cells["wide"]))
     assert text(cells["narrow"]).startswith("drawer: success — go to")
 
-    assert "because reach drawer.handle: found no way for the base from (-0.80, 0.50) to" in text(cells["fenced"])
+    assert re.search(r"because reach drawer.handle: (found )?no way for the base", text(cells["fenced"]))
     assert text(cells["gap-report"]).startswith("drawer: success — reach drawer.handle, move drawer.slide")
 
     assert text(cells["time-limit"]).startswith("door: FAILED, time limit")

@@ -12,6 +12,7 @@ import pytest
 
 from vkc_pin import arguments as check
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.files.resources import file_path
 
 
 class Hostile:
@@ -35,7 +36,7 @@ CHECKS: dict[str, Callable[[Any], Any]] = {
     "instance": lambda value: check.instance(value, Path, "it"),
     "mapping": lambda value: check.mapping(value, "it"),
     "items": lambda value: check.items(value, "it", "a list of texts", str),
-    "file_path": lambda value: check.file_path(value, "it"),
+    "file_path": lambda value: file_path(value, "it"),
 }
 WRONG = [
     None,
@@ -111,7 +112,7 @@ def test_names_are_those_that_there_are() -> None:
 
 
 def test_paths_can_be_those_of_files(tmp_path: Path) -> None:
-    assert check.file_path(str(tmp_path), "it") == check.file_path(tmp_path, "it") == tmp_path
+    assert file_path(str(tmp_path), "it") == file_path(tmp_path, "it") == tmp_path
     for value in ("", "a\0b", "a\ud800", "x" * 256, "x/" * 2048, b"x", 3):
         with pytest.raises(InputError, match=r"^it: (no file can be called that|not a path)"):
-            check.file_path(value, "it")
+            file_path(value, "it")

@@ -18,7 +18,7 @@ import pytest
 import yaml
 
 import vkc_pin as vkc
-from vkc_pin.commands import make_parser
+from vkc_pin.cli.commands import make_parser
 from vkc_pin.files.documents import Document, check
 from vkc_pin.models.object_file import AttachmentSchema, LatchSchema, ObjectSchema
 from vkc_pin.models.robot_schema import BaseSchema, RobotSchema

@@ -8,19 +8,15 @@ from __future__ import annotations
 
 import itertools
 import math
-import os
 from collections.abc import Collection, Iterator, KeysView, Mapping, Sequence, ValuesView
-from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
-from vkc_pin.arrays import Floats
+from vkc_pin.arrays import LARGEST, Floats
 from vkc_pin.errors import InputError, UnknownNameError, shown
 
 __all__ = [
-    "LARGEST",
-    "file_path",
     "flag",
     "instance",
     "is_number",
@@ -37,8 +33,6 @@ __all__ = [
 T = TypeVar("T")
 MOST = 100_000
 """Most entries of a list that an argument may be."""
-LARGEST = 1e4
-"""Largest length [m] or angle [rad] that a file or an argument may name."""
 
 
 def is_number(value: object) -> bool:
@@ -194,21 +188,3 @@ def items(value: Any, field: str, expected: str, kind: type[T] | tuple[type[T], 
         if kind is not None and not isinstance(entry, kind):
             raise InputError("wrong kind of entry", field=f"{field}[{place}]", expected=expected, got=shown(entry))
     return found
-
-
-def file_path(value: Any, field: str, expected: str = "a path") -> Path:
-    """Return the path of a file, whether it exists or not.
-
-    Raises:
-        InputError: It is neither text nor a path, or no file can be called that.
-    """
-    if not isinstance(value, str | Path):
-        raise InputError("not a path", field=field, expected=expected, got=shown(value))
-    name = str(value)
-    try:
-        coded = os.fsencode(name)
-    except UnicodeEncodeError:
-        coded = b""
-    if not coded or b"\0" in coded or len(coded) >= 4096 or max(map(len, coded.split(b"/"))) > 255:
-        raise InputError("no file can be called that", field=field, expected=expected, got=shown(name))
-    return Path(value)

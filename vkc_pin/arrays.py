@@ -1,11 +1,14 @@
-"""Names for the arrays that functions take and return; their shapes and units are in docstrings."""
+"""Names for the arrays that functions take and return, and how large numbers may be; shapes and units are in docstrings."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Bools", "Floats", "Ints"]
+__all__ = ["LARGEST", "Bools", "Floats", "Ints"]
+
+LARGEST = 1e4
+"""Largest length [m] or angle [rad] that a file or an argument may name."""
 
 Floats = NDArray[np.float64]
 """Numbers of double precision."""

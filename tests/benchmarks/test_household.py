@@ -259,7 +259,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
 
 
 def test_twenty_trials_unless_told_otherwise() -> None:
-    from vkc_pin.commands import make_parser
+    from vkc_pin.cli.commands import make_parser
 
     given = make_parser().parse_args(["bench", "household", "--out", "x"])
     assert (given.trials, given.tasks, given.methods) == (20, None, None)

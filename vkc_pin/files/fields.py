@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from vkc_pin.arguments import LARGEST
+from vkc_pin.arrays import LARGEST
 
 __all__ = [
     "JointSchema",

@@ -11,7 +11,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from vkc_pin.arguments import LARGEST
+from vkc_pin.arrays import LARGEST
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.files.xml import line_of
 

@@ -15,10 +15,10 @@ import coal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vkc_pin.arguments import file_path
 from vkc_pin.arrays import Floats, Ints
 from vkc_pin.errors import InputError
 from vkc_pin.files.hulls import outer_hull
+from vkc_pin.files.resources import file_path
 from vkc_pin.files.xml import check_indices
 
 if TYPE_CHECKING:

@@ -1,16 +1,17 @@
-"""Finds the robots and scenes that travel with the package, installed or in a source tree."""
+"""Paths of files: of those that users name, and of the robots and scenes that travel with the package."""
 
 from __future__ import annotations
 
 import importlib.util
+import os
 from pathlib import Path
+from typing import Any
 
 import pinocchio as pin
 
-from vkc_pin.arguments import file_path
-from vkc_pin.errors import UnknownNameError
+from vkc_pin.errors import InputError, UnknownNameError, shown
 
-__all__ = ["available", "example_robot_data", "find", "folder", "located", "package_folder"]
+__all__ = ["available", "example_robot_data", "file_path", "find", "folder", "located", "package_folder"]
 
 
 def package_folder() -> Path:
@@ -40,6 +41,24 @@ def find(kind: str, pattern: str, name: str, *, what: str) -> Path:
     if name not in found:
         raise UnknownNameError(what, name, found)
     return found[name]
+
+
+def file_path(value: Any, field: str, expected: str = "a path") -> Path:
+    """Return the path of a file, whether it exists or not.
+
+    Raises:
+        InputError: It is neither text nor a path, or no file can be called that.
+    """
+    if not isinstance(value, str | Path):
+        raise InputError("not a path", field=field, expected=expected, got=shown(value))
+    name = str(value)
+    try:
+        coded = os.fsencode(name)
+    except UnicodeEncodeError:
+        coded = b""
+    if not coded or b"\0" in coded or len(coded) >= 4096 or max(map(len, coded.split(b"/"))) > 255:
+        raise InputError("no file can be called that", field=field, expected=expected, got=shown(name))
+    return Path(value)
 
 
 def located(name_or_path: str | Path, kind: str, pattern: str, *, what: str) -> Path:

@@ -13,12 +13,12 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.arguments import file_path
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
 from vkc_pin.files import resources
 from vkc_pin.files.kinematic_tree import check_tree, numbers_of
 from vkc_pin.files.meshes import load_convex, load_mesh, to_bvh
+from vkc_pin.files.resources import file_path
 from vkc_pin.files.xml import line_of, read_xml
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ import stat
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from vkc_pin.arguments import file_path
 from vkc_pin.errors import InputError
+from vkc_pin.files.resources import file_path
 from vkc_pin.interrupt import deferred
 
 __all__ = ["check_outputs", "check_writable", "write_atomically"]

@@ -10,11 +10,12 @@ from typing import Literal
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.arguments import file_path, mapping, quantity, text
+from vkc_pin.arguments import mapping, quantity, text
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError, UnknownNameError, shown
 from vkc_pin.files import resources
 from vkc_pin.files.documents import Document
+from vkc_pin.files.resources import file_path
 from vkc_pin.files.srdf import Srdf, read_srdf
 from vkc_pin.files.urdf import UrdfFile, read_urdf
 from vkc_pin.models.coordinates import Coordinates

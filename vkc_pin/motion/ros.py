@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.arguments import file_path, flag, is_number, number, text, whole
+from vkc_pin.arguments import flag, is_number, number, text, whole
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError, shown
+from vkc_pin.files.resources import file_path
 from vkc_pin.motion.tables import chosen_columns, one_phase, read_json, size_of_robot
 
 __all__ = ["along", "from_ros", "rates", "to_ros"]

@@ -16,9 +16,10 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from vkc_pin.arguments import file_path, items, mapping, text, whole
+from vkc_pin.arguments import items, mapping, text, whole
 from vkc_pin.errors import InputError, UnknownNameError, shown
 from vkc_pin.files.documents import parse_json, read_text
+from vkc_pin.files.resources import file_path
 from vkc_pin.files.writing import write_atomically
 
 __all__ = [

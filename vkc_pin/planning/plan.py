@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
 import numpy as np
 
-from vkc_pin.arguments import file_path
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.files.resources import file_path
 from vkc_pin.files.writing import write_atomically
 from vkc_pin.motion.archives import folder_from_data, folder_to_data, read_archive, write_archive
 from vkc_pin.motion.trajectory import Trajectory

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vkc_pin.arguments import file_path
 from vkc_pin.errors import InputError
+from vkc_pin.files.resources import file_path
 from vkc_pin.motion.world import World
 from vkc_pin.plotting.style import COLOURS, new_figure, save_figure, shade_phases, styled
 from vkc_pin.plotting.top_view import draw_top_view

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.arguments import LARGEST, numbers
+from vkc_pin.arguments import numbers
+from vkc_pin.arrays import LARGEST
 from vkc_pin.errors import InputError, shown
 
 __all__ = ["as_placement", "as_target"]

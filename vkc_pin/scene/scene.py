@@ -14,10 +14,10 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from vkc_pin.arguments import file_path, instance, is_number, known, mapping, numbers
+from vkc_pin.arguments import instance, is_number, known, mapping, numbers
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError, shown
-from vkc_pin.files.resources import located
+from vkc_pin.files.resources import file_path, located
 from vkc_pin.models.shapes import clearance, placed_shapes, within_limits
 from vkc_pin.notebook import show
 from vkc_pin.scene.hold import Hold, checked_holds, holds_of, in_hand

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.arguments import file_path
 from vkc_pin.arrays import Floats
 from vkc_pin.files.documents import Document, check
+from vkc_pin.files.resources import file_path
 from vkc_pin.models.grafting import clean
 from vkc_pin.models.object_file import load_object
 from vkc_pin.models.robot import Robot

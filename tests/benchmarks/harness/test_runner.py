@@ -252,14 +252,14 @@ def test_progress(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
 def test_sources_are_those_that_planning_depends_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from vkc_pin.files.resources import folder
 
-    for name in ("__init__.py", "planner.py", "cli.py", "benchmarks/tables.py", "scenes/a.yaml", "scenes/notes.txt"):
+    for name in ("__init__.py", "planner.py", "cli/commands.py", "benchmarks/tables.py", "scenes/a.yaml", "scenes/notes.txt"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text("1\n")
     monkeypatch.setattr(runner, "package_folder", lambda: tmp_path)
     monkeypatch.setattr(runner, "folder", lambda kind: tmp_path / "scenes" if kind == "scenes" else folder(kind))
     first = runner._sources()
     for name, counts in (
-        ("cli.py", False),
+        ("cli/commands.py", False),
         ("benchmarks/tables.py", False),
         ("scenes/notes.txt", False),
         ("planner.py", True),

@@ -32,7 +32,7 @@ Function = Callable[[dict[str, Any]], Mapping[str, Any] | Sequence[Mapping[str, 
 """What runs one trial: takes its specification, returns its record, or several."""
 
 # What shows results has no part in them: a table may be written anew after a change there.
-_NO_PART = ("cli.py", "commands.py", "benchmarks/")
+_NO_PART = ("cli/", "benchmarks/")
 _DESCRIPTIONS = (".yaml", ".urdf", ".srdf")
 
 

@@ -27,7 +27,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             what cannot be printed is no reason not to go on.
     """
     if argv is not None:
-        from vkc_pin.commands import run
+        from vkc_pin.cli.commands import run
 
         return run(argv)
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else it is ignored, as behind "&" in scripts
@@ -35,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     _open_all()
     sys.stdout, printed = _forgiving(sys.stdout, 1)
     sys.stderr, _ = _forgiving(sys.stderr, 2)
-    from vkc_pin.commands import EXIT_MISUSE, run
+    from vkc_pin.cli.commands import EXIT_MISUSE, run
 
     try:
         code = run(sys.argv[1:])
@@ -88,7 +88,3 @@ def _forgiving(stream: TextIO | None, number: int) -> tuple[TextIO, _Forgiving]:
     like = stream if isinstance(stream, io.TextIOWrapper) else io.TextIOWrapper(io.BytesIO(), encoding="utf-8")
     how: dict[str, Any] = {name: getattr(like, name) for name in ("encoding", "line_buffering", "write_through")}
     return io.TextIOWrapper(io.BufferedWriter(raw), errors="backslashreplace", **how), raw
-
-
-if __name__ == "__main__":
-    sys.exit(main())

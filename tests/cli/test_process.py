@@ -16,7 +16,7 @@ import pytest
 
 import vkc_pin as vkc
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 COMMAND = [sys.executable, "-m", "vkc_pin.cli"]
 UNFINISHED = ["plan", "drawer", "--set", "drawer.slide=0.3", "--time-limit", "0.001", "--initialization", "stationary"]
 INFEASIBLE = ["plan", "drawer", "--set", "drawer.slide=9"]

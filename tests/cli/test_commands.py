@@ -14,13 +14,14 @@ import numpy as np
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin import cli, commands
+from vkc_pin import cli
 from vkc_pin.benchmarks import door, initialization
 from vkc_pin.benchmarks.harness import record, runner
+from vkc_pin.cli import commands
 from vkc_pin.planning import planner
 from vkc_pin.planning.stepwise import all_at_once
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 UNFINISHED = ["plan", "drawer", "--set", "drawer.slide=0.3", "--quiet", "--time-limit", "0.001", "--initialization", "stationary"]
 
 

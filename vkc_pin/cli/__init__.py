@@ -1,0 +1,5 @@
+"""The command line `vkc-pin`."""
+
+from vkc_pin.cli.process import main
+
+__all__ = ["main"]

@@ -14,7 +14,6 @@ from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.limits import LIMITS
 from vkc_pin.benchmarks.harness.record import Solve, distribution, trial
 from vkc_pin.benchmarks.harness.tables import decimal, failures, foot, markdown
-from vkc_pin.files.writing import write_atomically
 from vkc_pin.planning.chore import plan_chore
 from vkc_pin.planning.plan import Plan
 from vkc_pin.scene.scene import Scene, load_scene
@@ -122,9 +121,9 @@ def run(
             specs.append({"key": f"{chore}/{number:04d}", "chore": chore, "number": number, "base": base, "seed": seed})
     settings = {"benchmark": "chores", "seed": seed, "starts": trials, "chores": chores}
     settings |= {"window": WINDOW, **_LIMITS, "steps": {name: _steps(name) for name in chores}}
-    result = runner.run(specs, functools.partial(_record, solve=solve), out, settings=settings, jobs=jobs, progress=progress)
-    write_atomically(Path(out) / "table.md", report(result).encode())
-    return result
+    return runner.run(
+        specs, functools.partial(_record, solve=solve), out, settings=settings, report=report, jobs=jobs, progress=progress
+    )
 
 
 def report(result: Mapping[str, Any]) -> str:

@@ -15,7 +15,6 @@ from vkc_pin.benchmarks.problems.ablation import SUMMARY, every_trial, summary
 from vkc_pin.benchmarks.problems.poses import random_start
 from vkc_pin.benchmarks.problems.trials import tried
 from vkc_pin.errors import InputError
-from vkc_pin.files.writing import write_atomically
 from vkc_pin.scene.scene import Scene, load_scene
 from vkc_pin.task.steps import Reach
 
@@ -57,9 +56,7 @@ def run(*, out: str | Path, trials: int = 50, seed: int = 0, jobs: int = 1, prog
         raise InputError("out of range", field="trials", expected="at least 1", got=trials)
     settings = {"benchmark": "gap", "seed": seed, "starts": trials, "pose": POSE, **LIMITS}
     specs = [{"key": f"{number:04d}", "number": number, "seed": seed} for number in range(trials)]
-    result = runner.run(specs, _record, out, settings=settings, jobs=jobs, progress=progress)
-    write_atomically(Path(out) / "table.md", report(result).encode())
-    return result
+    return runner.run(specs, _record, out, settings=settings, report=report, jobs=jobs, progress=progress)
 
 
 def report(result: Mapping[str, Any]) -> str:

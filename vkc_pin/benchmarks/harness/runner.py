@@ -42,6 +42,7 @@ def run(
     out: str | Path,
     *,
     settings: Mapping[str, Any],
+    report: Callable[[dict[str, Any]], str] | None = None,
     jobs: int = 1,
     progress: bool = True,
 ) -> dict[str, Any]:
@@ -59,6 +60,7 @@ def run(
             Ctrl-C.
         out: The folder, made if need be.
         settings: Everything that the results depend on, as plain data; goes into the results' "meta".
+        report: What makes of a result the text of `out`/table.md.
         jobs: Number of processes, each with one thread of BLAS; 1 runs all trials in this process.
         progress: Whether to show a progress bar.
 
@@ -100,6 +102,8 @@ def run(
     result = {"meta": {**about, **json.loads(json.dumps(dict(settings))), **measured}, "trials": records}
     write_atomically(out / "results.csv", to_csv(records).encode())
     write_atomically(out / "results.json", (json.dumps(result, indent=1, allow_nan=False) + "\n").encode())
+    if report is not None:
+        write_atomically(out / "table.md", report(result).encode())
     return result
 
 

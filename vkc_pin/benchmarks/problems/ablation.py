@@ -16,7 +16,6 @@ from vkc_pin.benchmarks.harness.tables import decimal, failures, foot, markdown,
 from vkc_pin.benchmarks.problems import trials
 from vkc_pin.benchmarks.problems.changes import UNCHANGED, Change, parsed
 from vkc_pin.benchmarks.problems.problem_set import KINDS, NUMBER, Problem, kind_of, problem
-from vkc_pin.files.writing import write_atomically
 
 __all__ = ["SUMMARY", "every_trial", "report", "run", "specify", "summary"]
 
@@ -70,9 +69,7 @@ def run(
     settings = {"benchmark": "ablation", "seed": seed, "problems": numbers, "changes": [str(change) for change in chosen_changes]}
     settings |= LIMITS
     specs = specify(problems=numbers, changes=chosen_changes, seed=seed)
-    result = runner.run(specs, _record, out, settings=settings, jobs=jobs, progress=progress)
-    write_atomically(Path(out) / "table.md", report(result).encode())
-    return result
+    return runner.run(specs, _record, out, settings=settings, report=report, jobs=jobs, progress=progress)
 
 
 def chosen(problems: Sequence[int] | None) -> list[int]:

@@ -14,7 +14,6 @@ from vkc_pin.benchmarks.problems.ablation import every_trial
 from vkc_pin.benchmarks.problems.problem_set import TASKS, started
 from vkc_pin.benchmarks.problems.trials import tried
 from vkc_pin.errors import InputError
-from vkc_pin.files.writing import write_atomically
 
 __all__ = ["report", "run"]
 
@@ -55,9 +54,7 @@ def run(
         for name in names
         for number in range(trials)
     ]
-    result = runner.run(specs, _record, out, settings=settings, jobs=jobs, progress=progress)
-    write_atomically(Path(out) / "table.md", report(result).encode())
-    return result
+    return runner.run(specs, _record, out, settings=settings, report=report, jobs=jobs, progress=progress)
 
 
 def report(result: Mapping[str, Any]) -> str:

@@ -10,20 +10,19 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.benchmarks.harness import runner
+from vkc_pin.benchmarks.harness.limits import LIMITS, allowed
 from vkc_pin.benchmarks.harness.record import distribution, trial
 from vkc_pin.benchmarks.harness.tables import decimal, foot, markdown
 from vkc_pin.benchmarks.problems.ablation import every_trial
 from vkc_pin.errors import InputError
-from vkc_pin.files.writing import write_atomically
 from vkc_pin.planning.planner import plan
 from vkc_pin.planning.reasons.proofs import PROVEN
 from vkc_pin.scene.rooms.random_room import random_layout
 from vkc_pin.scene.scene import Scene, load_scene
 from vkc_pin.task.steps import Actuate, GoTo, Grasp, Place, Reach, Step
 
-__all__ = ["KINDS", "TIME_LIMIT", "impossible", "report", "run"]
+__all__ = ["KINDS", "impossible", "report", "run"]
 
-TIME_LIMIT = 60.0  # [s] of planning
 _WIDTH = 0.67  # [m] of the robot's base
 _HALL = 6.0  # [m] from the middle of the hall to its edges
 
@@ -50,11 +49,9 @@ def run(*, out: str | Path, problems: int = 50, seed: int = 0, jobs: int = 1, pr
     """
     if problems < 1:
         raise InputError("out of range", field="problems", expected="at least 1", got=problems)
-    settings = {"benchmark": "impossible", "seed": seed, "problems": problems, "time_limit": TIME_LIMIT}
+    settings = {"benchmark": "impossible", "seed": seed, "problems": problems, **LIMITS}
     specs = [{"key": f"{number:05d}", "number": number, "seed": seed} for number in range(problems)]
-    result = runner.run(specs, _record, out, settings=settings, jobs=jobs, progress=progress)
-    write_atomically(Path(out) / "table.md", report(result).encode())
-    return result
+    return runner.run(specs, _record, out, settings=settings, report=report, jobs=jobs, progress=progress)
 
 
 def report(result: Mapping[str, Any]) -> str:
@@ -67,7 +64,7 @@ def report(result: Mapping[str, Any]) -> str:
     said = [(f"{r['kind']}, problem {r['number']}", r["notes"] or r["violations"][:1]) for r in records if "notes" in r]
     parts = [
         "# Impossible problems",
-        f"{about['problems']} problems that cannot be done, seed {about['seed']}, at most {about['time_limit']:g} s each. "
+        f"{about['problems']} problems that cannot be done, seed {about['seed']}, {allowed(about)} each. "
         "Explained: the report names a cause. Proven: it does so for certain.",
         markdown(["kind", "problems", "success", "explained", "proven", "time, median [s]", "95th percentile [s]"], rows),
         "## What the reports say",
@@ -94,7 +91,7 @@ def _record(spec: dict[str, Any]) -> dict[str, Any]:
     kind = list(KINDS)[number % len(KINDS)]
     scene, steps = impossible(seed, number)
     began = time.perf_counter()
-    found = plan(scene, steps, seed=seed, time_limit=TIME_LIMIT)
+    found = plan(scene, steps, seed=seed, **LIMITS)
     took = time.perf_counter() - began - found.metrics["build_time"]
     notes = found.validation.notes
     reasons = [violation for violation in found.validation.violations if violation.constraint == "goal"]

@@ -17,7 +17,6 @@ from vkc_pin.benchmarks.problems import trials
 from vkc_pin.benchmarks.problems.ablation import chosen, every_trial
 from vkc_pin.benchmarks.problems.problem_set import problem
 from vkc_pin.errors import InputError
-from vkc_pin.files.writing import write_atomically
 
 __all__ = ["report", "run", "spread_of"]
 
@@ -61,9 +60,7 @@ def run(
         for number in numbers
         for own in range(seed, seed + seeds)
     ]
-    result = runner.run(specs, _record, out, settings=settings, jobs=jobs, progress=progress)
-    write_atomically(Path(out) / "table.md", report(result).encode())
-    return result
+    return runner.run(specs, _record, out, settings=settings, report=report, jobs=jobs, progress=progress)
 
 
 def spread_of(records: Sequence[Record], field: str) -> float | None:

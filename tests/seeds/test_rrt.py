@@ -205,6 +205,21 @@ def search(seed: int = 0) -> trees._Search:
     return trees._Search(problem, 0, problem.start, guide, arms, np.random.default_rng(seed), trees._STEPS[0])
 
 
+def test_a_line_is_free_up_to_the_last_place_before_the_first_that_is_blocked() -> None:
+    problem, guide, arms = gate()
+    finder, rng, shares = search(), np.random.default_rng(5), []
+    for _ in range(60):
+        a, b = (np.concatenate([guide[rng.integers(len(guide)), :3], arms[rng.integers(len(arms))]]) for _ in range(2))
+        b = b + 0.3 * rng.normal(size=SIZE)
+        count = max(1, int(np.ceil(np.abs((b - a) * finder.weights).max() / finder.step)))
+        rows = a + np.arange(1, count + 1)[:, None] / count * (b - a)
+        blocked = np.flatnonzero(missing(problem, rows) > finder.allowed)
+        shares.append(blocked[0] / count if len(blocked) else 1.0)
+        assert finder._along(a, b) == shares[-1]
+    assert (min(shares), max(shares)) == (0.0, 1.0)
+    assert len(set(shares)) > 5
+
+
 def test_runs_are_the_free_parts_of_the_way_with_each_arm() -> None:
     """Each as long as can be, and free half-way between its configurations, too."""
     problem, guide, arms = gate()

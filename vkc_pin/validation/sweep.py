@@ -60,8 +60,7 @@ class _Sweep:
         apart = np.flatnonzero(margins > -np.inf)  # what moves as one is as close as it was
         closest = apart[_least(at[apart], distances[apart])]
         chosen = np.union1d(closest, np.flatnonzero(distances < np.maximum(margins, 0.0)))
-        for row, k, distance in zip(waypoints[at[chosen]], pairs[chosen], distances[chosen], strict=True):
-            yield self._hit(row, k, distance, at_waypoint=True)
+        yield from self._hits(waypoints[at[chosen]], pairs[chosen], distances[chosen], at_waypoint=True)
         smallest = max(
             RESOLUTION, float(distances[closest].min(initial=np.inf))
         )  # what cannot come closer than that changes nothing
@@ -92,8 +91,8 @@ class _Sweep:
             middle = (todo.low + todo.high) // 2
             rows, at = np.unique(middle, return_inverse=True)
             distances = self._solids.at(self._solids.world.coordinates.q(z[rows])).distances(at, self._table.pairs[todo.pair])
-            for c in np.union1d(_least(at, distances), np.flatnonzero(distances < 0)).tolist():
-                yield self._hit(middle[c], todo.pair[c], distances[c])
+            told = np.union1d(_least(at, distances), np.flatnonzero(distances < 0))
+            yield from self._hits(middle[told], todo.pair[told], distances[told])
             todo = Stretches(
                 np.append(todo.low, middle),
                 np.append(middle, todo.high),
@@ -128,8 +127,9 @@ class _Sweep:
                     continue
                 middle = (low + high) / 2
                 state = self._solids.at(self._solids.world.coordinates.q((1 - middle) * z[[row]] + middle * z[[row + 1]]))
-                (between,) = state.distances(np.zeros(1, int), self._table.pairs[[k]])
-                yield self._hit(row, k, between)
+                found = state.distances(np.zeros(1, int), self._table.pairs[[k]])
+                yield from self._hits(np.array([row]), np.array([k]), found)
+                between = float(found[0])
                 if between < -overlap[c]:
                     break
                 stack += [(low, middle, before, between), (middle, high, between, after)]
@@ -180,12 +180,15 @@ class _Sweep:
         """Return the waypoints from which the stretches begin in which samples are, shape (n,)."""
         return np.searchsorted(self._waypoints, rows, side="right") - 1
 
-    def _hit(self, row: int, k: int, distance: float, *, at_waypoint: bool = False) -> Hit:
-        first, second = (self._solids.world.collision_labels[i] for i in self._table.pairs[k])
-        pair, at = np.array([k]), self._stretch(np.array([row]))
-        margin = float(self._table.margins_at(pair, at)[0])
-        contact = float(self._table.contact_at(pair, at, at if at_waypoint else at + 1)[0])
-        return Hit(int(row), first, second, float(distance), margin, contact, at_waypoint=at_waypoint)
+    def _hits(self, rows: Ints, pairs: Ints, distances: Floats, *, at_waypoint: bool = False) -> Iterator[Hit]:
+        """Yield the distances of pairs at samples, or between these and the next, all of shape (n,)."""
+        at = self._stretch(rows)
+        margins = self._table.margins_at(pairs, at)
+        contacts = self._table.contact_at(pairs, at, at if at_waypoint else at + 1)
+        labels = self._solids.world.collision_labels
+        columns = (column.tolist() for column in (rows, self._table.pairs[pairs], distances, margins, contacts))
+        for row, (i, j), distance, margin, contact in zip(*columns, strict=True):
+            yield Hit(row, labels[i], labels[j], distance, margin, contact, at_waypoint)
 
 
 def _in_parts(count: int) -> list[Ints]:

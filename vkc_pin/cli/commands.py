@@ -20,6 +20,7 @@ from vkc_pin.motion.tables import GROUPS
 __all__ = ["EXIT_MISUSE", "make_parser", "parse_settings", "run"]
 
 EXIT_FAILED, EXIT_MISUSE, EXIT_INFEASIBLE = 1, 2, 3
+_FAILURES = {"infeasible": EXIT_INFEASIBLE, "interrupted": EXIT_INTERRUPTED}  # by a plan's status; others have failed
 _CODES = """exit codes:
   0    success: a motion that the validation finds nothing wrong with, and all that was asked for is written and printed
   1    failed: no valid motion came out, or a saved one is none or not what its file says
@@ -91,14 +92,9 @@ def _plan(arguments: argparse.Namespace) -> int:
         "html": plan.to_html,
         "plots": plan.plot,
     }
-    whole = _write(_chosen(arguments, (*_FILES, "plots")), writers, plan.report() + "\n")
-    if not whole:
+    if not _write(_chosen(arguments, (*_FILES, "plots")), writers, plan.report() + "\n"):
         return EXIT_MISUSE
-    return (
-        EXIT_OK
-        if plan.success
-        else {"infeasible": EXIT_INFEASIBLE, "interrupted": EXIT_INTERRUPTED}.get(plan.status, EXIT_FAILED)
-    )
+    return EXIT_OK if plan.success else _FAILURES.get(plan.status, EXIT_FAILED)
 
 
 def _chosen(arguments: argparse.Namespace, options: Sequence[str]) -> dict[str, str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -62,6 +62,10 @@ class _Try:
     def better(self, other: _Try) -> bool:
         """Return whether it is a success, or violates less."""
         return self.report.ok or self.amount < other.amount
+
+    def noted(self, notes: Iterable[str]) -> _Try:
+        """Return the same with notes in its report."""
+        return dataclasses.replace(self, report=dataclasses.replace(self.report, notes=tuple(notes)))
 
 
 class OneProblem:
@@ -149,8 +153,7 @@ class OneProblem:
                 break
         spend()
         if searched and self._proofs(problem):
-            best, certain = self._stationary(problem), tuple(self._proofs(problem))
-            return dataclasses.replace(best, report=dataclasses.replace(best.report, notes=certain)), "infeasible"
+            return self._stationary(problem).noted(self._proofs(problem)), "infeasible"
         best = self._best or self._stationary(problem)
         lines = [goal.text for goal in notes]
         status = "infeasible" if lines or (self._best is None and self.blocked) else best.status
@@ -158,7 +161,7 @@ class OneProblem:
             lines += self.blocked
         elif searched and not lines:
             lines += ways(problem, best.z, best.report, self.blocked)
-        return dataclasses.replace(best, report=dataclasses.replace(best.report, notes=tuple(lines))), status
+        return best.noted(lines), status
 
     def _proofs(self, problem: TrajectoryProblem) -> list[str]:
         """Return what is certain, looked for once, and only when something has failed: most tasks can be done."""

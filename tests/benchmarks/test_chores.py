@@ -18,14 +18,20 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.task.actions import actions_of, foresee
 
 
-@pytest.mark.parametrize(("name", "number", "actions"), [("home", 18, 10), ("fetch", 10, 6)])
+@pytest.mark.parametrize(("name", "number", "actions"), [("home", 18, 10), ("fetch", 10, 6), ("cluttered", 18, 10)])
 def test_chores_have_the_papers_steps(name: str, number: int, actions: int) -> None:
-    scene, steps = chores.CHORES[name]
-    loaded = vkc.load_scene(scene)
-    listed = steps(loaded)
+    chore = chores.CHORES[name]
+    scene, listed = chore.scene(), chore.planned()
     assert len(listed) == number
     assert len(actions_of(listed)) == actions
-    foresee(loaded, listed, vkc.Options())  # none of them is impossible at its place
+    foresee(scene, listed, chore.options)  # none of them is impossible at its place
+
+
+def test_the_cluttered_home_is_the_home_and_more() -> None:
+    home, full = vkc.load_scene("household"), chores.cluttered_home()
+    assert full.document["obstacles"][: len(home.document["obstacles"])] == list(home.document["obstacles"])
+    shapes = [len(placed.object.collision.geometryObjects) for placed in full.objects.values()]
+    assert len(full.obstacles) + sum(shapes) > 500
 
 
 def test_one_step_less_is_noticed() -> None:

@@ -1,10 +1,11 @@
-"""Two chores of many steps: eighteen in a home, ten in an arena, each planned in one call from random starts."""
+"""Chores of many steps, each planned in one call from random starts: eighteen in a home, also cluttered, and ten in an arena."""
 
 from __future__ import annotations
 
 import functools
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +15,18 @@ from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.limits import LIMITS
 from vkc_pin.benchmarks.harness.record import Solve, distribution, trial
 from vkc_pin.benchmarks.harness.tables import decimal, failures, foot, markdown
+from vkc_pin.options import Options
 from vkc_pin.planning.chore import plan_chore
 from vkc_pin.planning.plan import Plan
+from vkc_pin.scene.rooms.clutter import cluttered
 from vkc_pin.scene.scene import Scene, load_scene
 from vkc_pin.task.steps import Actuate, Grasp, Place, Step
 
-__all__ = ["CHORES", "fetch", "home", "plan_trial", "report", "run"]
+__all__ = ["CHORES", "Chore", "cluttered_home", "fetch", "home", "plan_trial", "report", "run"]
 
 WINDOW = 2
+THINGS = 300  # in the cluttered home
+_AROUND = 0.2  # [m] around what the chore is about that stays free there
 _LIMITS = {**LIMITS, "effort": 4 * LIMITS["effort"]}  # eighteen steps take half a million units and more
 
 BAR_TABLE = (-3.0, 1.3, 1.051)  # [m], where the cup stands in between
@@ -72,14 +77,44 @@ def fetch(scene: Scene) -> list[Step]:
     ]
 
 
-CHORES: dict[str, tuple[str, Callable[[Scene], list[Step]]]] = {"home": ("household", home), "fetch": ("fetch", fetch)}
-"""Name → scene, and what makes the steps in it."""
+@functools.cache
+def cluttered_home() -> Scene:
+    """Return the scene `household` as full as homes are: with 300 things more there are 553 convex shapes."""
+    places = (BAR_TABLE, DESK, CLEAR, BIN)
+    return cluttered(load_scene("household"), THINGS, clear=[(place, _AROUND) for place in places])
+
+
+@dataclass(frozen=True)
+class Chore:
+    """A chore.
+
+    Attributes:
+        scene: Returns where it is done.
+        steps: Returns what is to be done in that scene.
+        options: How it is planned.
+    """
+
+    scene: Callable[[], Scene]
+    steps: Callable[[Scene], list[Step]]
+    options: Options = field(default_factory=Options)
+
+    def planned(self) -> list[Step]:
+        """Return its steps."""
+        return self.steps(self.scene())
+
+
+CHORES = {
+    "home": Chore(functools.partial(load_scene, "household"), home),
+    "fetch": Chore(functools.partial(load_scene, "fetch"), fetch),
+    "cluttered": Chore(cluttered_home, home, Options(dist_safe=0.005)),
+}
+"""By name."""
 
 
 def plan_trial(scene: Scene, spec: Mapping[str, Any]) -> Plan:
     """Plan the chore of one trial."""
-    _, steps = CHORES[spec["chore"]]
-    return plan_chore(scene, steps(scene), window=WINDOW, seed=spec["seed"], **_LIMITS)
+    chore = CHORES[spec["chore"]]
+    return plan_chore(scene, chore.steps(scene), window=WINDOW, options=chore.options, seed=spec["seed"], **_LIMITS)
 
 
 def run(
@@ -114,13 +149,14 @@ def run(
     chores = runner.chosen("chore", chores, CHORES)
     specs = []
     for chore in chores:
-        scene = load_scene(CHORES[chore][0])
+        scene = CHORES[chore].scene()
         rng = np.random.default_rng([seed, list(CHORES).index(chore)])
         for number in range(trials):
             base = (scene.sample_start(rng) if number else scene).start[:3].tolist()
             specs.append({"key": f"{chore}/{number:04d}", "chore": chore, "number": number, "base": base, "seed": seed})
     settings = {"benchmark": "chores", "seed": seed, "starts": trials, "chores": chores}
-    settings |= {"window": WINDOW, **_LIMITS, "steps": {name: _steps(name) for name in chores}}
+    settings |= {"window": WINDOW, **_LIMITS, "steps": {name: list(map(str, CHORES[name].planned())) for name in chores}}
+    settings |= {"dist_safe": {name: CHORES[name].options.dist_safe for name in chores}}
     return runner.run(
         specs, functools.partial(_record, solve=solve), out, settings=settings, report=report, jobs=jobs, progress=progress
     )
@@ -158,13 +194,8 @@ def report(result: Mapping[str, Any]) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _steps(chore: str) -> list[str]:
-    scene, steps = CHORES[chore]
-    return [str(step) for step in steps(load_scene(scene))]
-
-
 def _record(spec: dict[str, Any], solve: Solve) -> dict[str, Any]:
-    scene = load_scene(CHORES[spec["chore"]][0]).with_start(base=spec["base"])
+    scene = CHORES[spec["chore"]].scene().with_start(base=spec["base"])
     began = time.perf_counter()
     plan = solve(scene, spec)
     spent = time.perf_counter() - began

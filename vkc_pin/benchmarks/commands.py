@@ -51,7 +51,7 @@ def add_bench(commands: Any) -> None:
 
     about = "Plan two chores, of eighteen and of ten steps, each in one call, from random starts."
     shown = "chores of many steps, in a home and in an arena"
-    _add_choice(_add_experiment(benches, "chores", shown, about, default=5, jobs=1), "chores", "home fetch (default: both)")
+    _add_choice(_add_experiment(benches, "chores", shown, about, default=5, jobs=1), "chores", "home fetch cluttered (default: all)")
 
     shown = "planning time against the number of obstacles or segments"
     about = "Measure planning time against the number of obstacles, or of segments, at the door from random starts."

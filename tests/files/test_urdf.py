@@ -51,6 +51,13 @@ def test_triangles_enclose_the_solid(tmp_path: Path, shape: str, volume: float) 
     assert (found.link, found.name, found.kind) == ("a", "a_0", shape[1:].partition(" ")[0])
 
 
+def test_a_flat_mesh_is_named_by_link_and_file(tmp_path: Path) -> None:
+    (tmp_path / "sheet.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 2 0\nv 0 2 0\nf 1 2 3\nf 1 3 4\n")
+    (found,) = read_urdf(urdf(tmp_path, collision('<mesh filename="sheet.obj"/>'))).shapes("collision")
+    with pytest.warns(UserWarning, match=rf"{found.link} of .*sheet\.obj is flat"):
+        assert found.solid().computeVolume() == pytest.approx(2e-3)
+
+
 def test_the_hull_of_a_mesh_is_its_solid(tmp_path: Path) -> None:
     ring = trimesh.creation.annulus(0.3, 0.5, 1.0)
     ring.export(tmp_path / "ring.stl")

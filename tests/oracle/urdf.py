@@ -62,13 +62,23 @@ def mesh_hull(file: Path, scale: np.ndarray) -> coal.Convex:
         points = np.array(loaded.vertices())
     else:
         points = np.asarray(trimesh.load(file, force="mesh", skip_materials=True).vertices)
-    hull = trimesh.convex.convex_hull(points * scale)
+    hull = trimesh.convex.convex_hull(_solid(points * scale))
     if np.bincount(hull.faces.ravel()).max() > 255:
         raise NotJudged(f"{file.name}: a corner with more neighbours than coal can hold")
     corners, faces = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
     corners.extend(np.asarray(hull.vertices, float))
     faces.extend(coal.Triangle(*face) for face in hull.faces.tolist())
     return coal.Convex(corners, faces)
+
+
+def _solid(points: np.ndarray) -> np.ndarray:
+    """Return points of a sheet as those of a plate 1 mm thick, all others as they are."""
+    axes = np.linalg.svd(np.cov(points.T))[2]
+    widths = [np.ptp(points @ axis) for axis in axes]
+    for axis, width in zip(axes, widths, strict=True):
+        if width <= 1e-5 * max(widths):
+            points = np.vstack([points + half * axis for half in (-5e-4, 5e-4)])
+    return points
 
 
 def solid(kind: str, about: dict[str, Any]) -> Any:

@@ -12,14 +12,36 @@ from vkc_pin.arrays import Floats
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["outer_hull"]
+__all__ = ["FLAT", "outer_hull", "thickened"]
 
+FLAT = 1e-3
+"""What a part gets as thickness that has none [m]: a picture on a wall, a rug, a pane."""
+_THIN = 1e-5  # of the largest extent: thinner than 10 µm in a metre is drawn as a sheet, not as a solid
 _GAP = 5e-4  # [m]: no cut takes away less
 _DIRECTIONS = 400  # of cuts, spread over the sphere
 
 
+def thickened(points: ArrayLike) -> tuple[Floats, bool]:
+    """Return points that span a volume, and whether they did not before: then `FLAT` is added across what they lie in.
+
+    A sheet becomes a plate with the sheet in its middle, a line a square bar, a point a cube.
+
+    Args:
+        points: Shape (n, 3), [m].
+    """
+    given = np.asarray(points, float)
+    around = given - given.mean(axis=0)
+    axes = np.linalg.eigh(around.T @ around)[1].T
+    extents = np.ptp(around @ axes.T, axis=0)
+    (flat,) = np.nonzero(extents <= _THIN * extents.max())
+    found = given
+    for axis in axes[flat]:
+        found = np.concatenate([found - FLAT / 2.0 * axis, found + FLAT / 2.0 * axis])
+    return found, bool(len(flat))
+
+
 def outer_hull(points: ArrayLike, *, vertices: int = 40) -> trimesh.Trimesh:
-    """Return a convex polytope of few vertices that contains `points`.
+    """Return a convex polytope of few vertices that contains `points`; what is flat is thickened first.
 
     It starts as the box along the principal axes of the hull and is cut, again and again, by the plane that touches
     the hull and lies deepest below one of the polytope's corners.
@@ -33,7 +55,7 @@ def outer_hull(points: ArrayLike, *, vertices: int = 40) -> trimesh.Trimesh:
     """
     import trimesh
 
-    hull = trimesh.convex.convex_hull(np.asarray(points, float))
+    hull = trimesh.convex.convex_hull(thickened(points)[0])
     corners = np.asarray(hull.vertices)
     normals = _directions(hull)
     offsets = (corners @ normals.T).max(axis=0)

@@ -7,6 +7,7 @@ another package, are read by coal.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vkc_pin.arrays import Floats, Ints
 from vkc_pin.errors import InputError
-from vkc_pin.files.hulls import outer_hull
+from vkc_pin.files.hulls import FLAT, outer_hull, thickened
 from vkc_pin.files.resources import file_path
 from vkc_pin.files.xml import check_indices
 
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 __all__ = ["MeshPart", "coarser", "convex_hull", "indices", "load_convex", "load_mesh", "load_parts", "to_bvh"]
 
 _NEIGHBOURS = 255  # coal's corners have no more
-_FLAT = 1e-9  # of the extent of points that is too thin for a hull
 _TOLERANCE = 1e-6  # how far, relatively, coal's volume and area may be from trimesh's
 
 
@@ -87,36 +87,43 @@ def load_mesh(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0)) -> trimesh.T
     return mesh
 
 
-def load_convex(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0)) -> coal.Convex:
+def load_convex(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0), *, about: str | None = None) -> coal.Convex:
     """Return the convex hull of a mesh file as a coal shape, in the file's frame, [m].
 
     Args:
         path: The mesh file, see `load_mesh`.
         scale: One factor per axis, or one for all, from the file's unit to [m].
+        about: The link or obstacle that it is a part of, for warnings and errors.
 
     Raises:
-        InputError: The mesh cannot be read, is empty or flat, or coal does not hold what the file holds.
+        InputError: The mesh cannot be read or is empty, or coal does not hold what the file holds.
     """
-    return convex_hull(load_mesh(path, scale).vertices, file=path)
+    return convex_hull(load_mesh(path, scale).vertices, file=path, about=about)
 
 
-def convex_hull(points: ArrayLike, *, file: str | Path | None = None) -> coal.Convex:
-    """Return the convex hull of `points`, shape (n, 3), [m], as a coal shape; errors name the file that they are of.
+def convex_hull(points: ArrayLike, *, file: str | Path | None = None, about: str | None = None) -> coal.Convex:
+    """Return the convex hull of `points`, shape (n, 3), [m], as a coal shape.
+
+    Points in one plane, as of a picture on a wall, become a plate of 1 mm around that plane, with a warning.
+
+    Args:
+        points: The points.
+        file: The file that they are of, for warnings and errors.
+        about: The link or obstacle that they are a part of, for the same.
 
     Raises:
-        InputError: The points lie in one plane, or coal's volume or area is not that of the hull.
+        InputError: There are no points, or coal's volume or area is not that of the hull.
     """
     import trimesh
-    from scipy.spatial import QhullError
 
     given = np.asarray(points, float)
-    flat = InputError("the mesh has no convex hull: it is flat", file=file, expected="points that span a volume")
-    if _thickness(given) < _FLAT:  # Qhull may shake such points into a volume, of which trimesh makes what it can
-        raise flat
-    try:
-        hull = trimesh.convex.convex_hull(given)
-    except (QhullError, ValueError, IndexError) as error:
-        raise flat from error
+    if not len(given):
+        raise InputError("a hull of nothing", file=file, field=about, expected="at least one point")
+    given, was_flat = thickened(given)
+    if was_flat:
+        named = " of ".join(str(part) for part in (about, file) if part is not None) or "a mesh"
+        warnings.warn(f"{named} is flat: it collides as a plate, {1e3 * FLAT:g} mm thick", stacklevel=2)
+    hull = trimesh.convex.convex_hull(given)
     if np.bincount(np.asarray(hull.faces).ravel()).max() > _NEIGHBOURS:  # the tip of a finely meshed cone, a fine disc
         hull = outer_hull(hull.vertices, vertices=60)
     vertices, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
@@ -127,17 +134,10 @@ def convex_hull(points: ArrayLike, *, file: str | Path | None = None) -> coal.Co
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2.0
     for what, held, wanted in (("volume", shape.computeVolume(), hull.volume), ("area", area, hull.area)):
         if not abs(held - wanted) <= _TOLERANCE * abs(wanted) or wanted <= 0.0:
-            raise InputError(f"coal does not hold this hull: wrong {what}", file=file, expected=wanted, got=held)
+            problem = f"coal does not hold this hull: wrong {what}"
+            raise InputError(problem, file=file, field=about, expected=wanted, got=held)
     shape.computeLocalAABB()
     return shape
-
-
-def _thickness(points: Floats) -> float:
-    """Return how thin points, shape (n, 3), are: their least spread relative to their largest; 0 for points in one plane."""
-    if len(points) < 4:
-        return 0.0
-    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return float(spread[-1] / spread[0]) if spread[0] > 0.0 else 0.0
 
 
 def load_parts(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0), *, detail: float = 0.0) -> list[MeshPart]:

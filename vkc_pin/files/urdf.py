@@ -58,10 +58,10 @@ class UrdfShape:
         """Return it as a coal shape in its own frame, a mesh as its convex hull.
 
         Raises:
-            InputError: Its mesh cannot be read or is flat.
+            InputError: Its mesh cannot be read.
         """
         if self.file is not None:
-            return load_convex(self.file, self.size)
+            return load_convex(self.file, self.size, about=self.link)
         kinds = {"box": coal.Box, "sphere": coal.Sphere, "cylinder": coal.Cylinder, "capsule": coal.Capsule}
         return kinds[self.kind](*self.size)
 

@@ -54,7 +54,7 @@ def obstacle_shapes(
             from vkc_pin.files.meshes import load_convex
 
             drawn_as, scale = str(folder / item.file), np.array(item.scale)
-            solid = load_convex(drawn_as, scale)
+            solid = load_convex(drawn_as, scale, about=item.name)
     drawn = _shape(item.name, pose, solid, item.colour)
     drawn.meshPath, drawn.meshScale = drawn_as, scale
     return [drawn], [_shape(item.name, pose, solid, item.colour)]

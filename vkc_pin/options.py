@@ -35,7 +35,7 @@ class Options:
         turn_waypoints: Segments of a phase in which a latch is released.
         move_waypoints: Segments of a phase in which a held object is moved.
         dist_safe: Clearance to keep at the waypoints [m].
-        grasp_clearance: Clearance of the gripper's touch links to the link that is grasped, before the grasp [m].
+        grasp_clearance: Clearance of the gripper's touch links to an object near its grasp, where the attachment states none [m].
         effort: What is minimised: "length", of the way, or "squares", eq. 1.
         velocity_weight_base: W_vel of eq. 1 for the base's place, and for every joint that slides [1/m²].
         velocity_weight_heading: W_vel for its heading [1/rad²].

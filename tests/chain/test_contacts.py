@@ -10,7 +10,17 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.small_problems import SHORT, all_pairs, cabinet, door_scene, full_scene, program_of, random_configurations
+from helpers.small_problems import (
+    SHORT,
+    all_pairs,
+    cabinet,
+    door_scene,
+    full_scene,
+    program_of,
+    random_configurations,
+    with_attachment,
+    with_objects,
+)
 
 from vkc_pin.chain.contacts import Contacts
 from vkc_pin.errors import InputError
@@ -137,7 +147,8 @@ def test_the_hand_may_hold_what_it_grasps_and_nothing_else_may_touch_it() -> Non
         found = pairs(problem, phase)
         assert {first for first, second in found if second == "door.lever"} == set(problem.scene.robot.links) - hand
         assert {first for first, second in found if second == "door.panel"} == set(problem.scene.robot.links)
-        assert {margin for margins in found.values() for margin in margins} == {MARGIN}
+        for (first, second), margins in found.items():
+            assert set(margins) == {CLOSE if first in hand and second.startswith("door.") else MARGIN}
 
 
 def test_the_hand_comes_closer_to_what_it_will_grasp_or_has_let_go_of() -> None:
@@ -148,7 +159,21 @@ def test_the_hand_comes_closer_to_what_it_will_grasp_or_has_let_go_of() -> None:
     for phase, at, away in ((0, begins[1], -1), (3, begins[3], 1)):
         for steps, close in ((0, CLOSE), (near, CLOSE), (near + 1, MARGIN)):
             for (first, second), margins in pairs(problem, phase, waypoint=int(at + away * steps)).items():
-                assert set(margins) == {close if first in hand and second == "door.lever" else MARGIN}
+                assert set(margins) == {close if first in hand and second.startswith("door.") else MARGIN}
+
+
+@pytest.mark.parametrize(("own", "expected"), [(None, CLOSE), (0.002, 0.002), (0.0, 0.0), (0.1, MARGIN)])
+def test_an_attachment_says_how_close_the_hand_may_come_to_its_object(own: float | None, expected: float) -> None:
+    """Never further than everything else keeps, and not closer to what is no part of the object."""
+    scene = door_scene()
+    placed = scene.objects["door"]
+    handle = dataclasses.replace(placed.object.attachments["handle"], name="near", clearance=own)
+    steps = [Actuate("door", {"hinge": 1.2}, "near"), GoTo(0.0, 0.0)]
+    problem = program_of(with_objects(scene, {"door": with_attachment(placed, handle)}), steps, options=SHORT)
+    hand, begins = set(scene.robot.touch_links), problem.contacts.first_waypoint
+    for phase, at in ((0, begins[1]), (1, begins[2]), (3, begins[3])):
+        for (first, second), margins in pairs(problem, phase, waypoint=int(at)).items():
+            assert set(margins) == {expected if first in hand and second.startswith("door.") else MARGIN}
 
 
 def test_a_held_object_is_not_paired_with_itself_but_with_the_room() -> None:
@@ -286,7 +311,7 @@ def test_all_pairs_within_reach_are_found_with_their_distances(phase: int) -> No
     np.testing.assert_array_equal(found[sure], (distances < reach)[sure])
     assert np.all(contacts.distance < reach)
     np.testing.assert_allclose(contacts.distance, distances[contacts.waypoint, which], rtol=0.0, atol=COAL)
-    np.testing.assert_array_equal(contacts.margin, part.margins[which])
+    np.testing.assert_array_equal(contacts.margin, part.margins_at(which, waypoints[contacts.waypoint]))
     # d = n·(b − a), and n is a unit vector.
     np.testing.assert_allclose(np.linalg.norm(contacts.normal, axis=1), 1.0, atol=1e-9)
     along = np.einsum("ci,ci->c", contacts.normal, contacts.second - contacts.first)

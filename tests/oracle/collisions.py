@@ -15,12 +15,11 @@ from .plan import Violation
 from .poses import Poses, turn_between
 from .riding import distance
 from .stage import FLOOR, Solid, Stage, World
-from .touching import Licence
+from .touching import SHORT, Licence
 
 __all__ = ["CONTACT", "check_collisions"]
 
 CONTACT = 1e-4  # [m] of overlap that is rounding
-SHORT = 1e-3  # [m] that clearance at a waypoint may fall short
 BLOCK = 32  # samples
 
 
@@ -105,7 +104,7 @@ def check_collisions(world: World, stage: Stage, allowed: list[Licence]) -> Iter
             for k in waypoints[near]:
                 apart = distance(one.shape.solid, one.at, other.shape.solid, other.at, k)
                 time = float(stage.times[k])
-                if apart < safe and not any(own.covers(one.label, other.label, time) for own in allowed):
+                if apart < safe and not any(own.covers(one.label, other.label, time, apart) for own in allowed):
                     yield Violation("clearance", names, time, safe - apart, f"{1e3 * apart:.2f} mm apart at a waypoint")
             depth, row = _deepest(one, other, arc, blocks)
             if depth > CONTACT:

@@ -80,6 +80,7 @@ class Grasp:
     freedoms: tuple[tuple[str, bool, np.ndarray, float, float], ...]
     standoff: float
     firm: bool
+    clearance: float | None
 
     def tool(self, values: Mapping[str, np.ndarray]) -> Poses:
         """Return the tool in the link's frame at values of the freedoms, shape (S,) each."""
@@ -190,7 +191,8 @@ def _grasp(entry: Mapping[str, Any], free: bool) -> Grasp:
     elif joint != "fixed":
         freedoms = [(name, joint == "prismatic", axis, *entry["limits"])]
     place = pose(entry.get("position", (0.0, 0.0, 0.0)), turn)
-    return Grasp(name, entry["link"], place, tuple(freedoms), float(entry.get("standoff", 0.0)), bool(entry.get("firm", free)))
+    standoff, firm = float(entry.get("standoff", 0.0)), bool(entry.get("firm", free))
+    return Grasp(name, entry["link"], place, tuple(freedoms), standoff, firm, entry.get("clearance"))
 
 
 def load_robot(item: Mapping[str, Any] | str, folder: Path, arm: list[str]) -> Robot:

@@ -1,6 +1,7 @@
 """What may touch what, and when: the least that is right.
 
-- The hand's touch links and the link that is grasped, from shortly before the grasp until shortly after letting go.
+- The hand's touch links and the link that is grasped, from shortly before the grasp until shortly after letting go. From the
+  object's other links they keep the attachment's clearance then.
 - What is held through something, and the link that holds it, for as long.
 - A free object and what it stands on, where it is lifted and put down.
 - The link that a `Touch` brings somewhere and what is there, around the moment when it is.
@@ -21,25 +22,27 @@ from .plan import Hold
 from .riding import distance
 from .stage import Solid, Stage, World
 
-__all__ = ["Licence", "licences"]
+__all__ = ["SHORT", "Licence", "licences"]
 
 SHORTLY, WAYPOINTS = 1.0, 4  # [s], and at least as many waypoints
+SHORT = 1e-3  # [m] that clearance at a waypoint may fall short
 
 
 @dataclass(frozen=True)
 class Licence:
-    """Two groups of links, by label, that may touch from one time to another [s]."""
+    """Two groups of links, by label, that may touch from one time to another [s], or come as close as `least` [m]."""
 
     ones: frozenset[str]
     others: frozenset[str]
     begin: float
     end: float
+    least: float = -np.inf
 
     def names(self, one: str, other: str) -> bool:
         return (one in self.ones and other in self.others) or (other in self.ones and one in self.others)
 
-    def covers(self, one: str, other: str, time: float) -> bool:
-        return self.names(one, other) and self.begin - 1e-9 <= time <= self.end + 1e-9
+    def covers(self, one: str, other: str, time: float, apart: float) -> bool:
+        return self.names(one, other) and self.begin - 1e-9 <= time <= self.end + 1e-9 and apart >= self.least - SHORT
 
 
 class _Clock:
@@ -84,8 +87,13 @@ def _held(world: World, clock: _Clock) -> Iterator[Licence]:
             grasp = world.things[step["object"]].grasp(step["attachment"])
             spans.append((Hold(step["object"], grasp.name, step["by"]), clock.before(last), np.inf))
     for hold, begin, end in spans:
-        grasped = frozenset({f"{hold.object}.{world.things[hold.object].grasps[hold.attachment].link}"})
-        yield Licence(frozenset({hold.by}) if hold.by else frozenset(world.robot.touch), grasped, begin, end)
+        thing = world.things[hold.object]
+        grasp = thing.grasps[hold.attachment]
+        ours = frozenset({hold.by}) if hold.by else frozenset(world.robot.touch)
+        yield Licence(ours, frozenset({f"{hold.object}.{grasp.link}"}), begin, end)
+        others = frozenset(f"{hold.object}.{link}" for link in thing.tree.urdf.links if link != grasp.link)
+        least = plan.options["grasp_clearance"] if grasp.clearance is None else grasp.clearance
+        yield Licence(ours, others, begin, end, least)
 
 
 def _lifted(world: World, stages: list[Stage], clock: _Clock) -> Iterator[Licence]:

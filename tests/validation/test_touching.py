@@ -53,7 +53,7 @@ def near(
         for first, second in named:
             by_hand = first in HANDS
             held = window.together and window.margin == 0.0
-            assert held or window.margin == (-np.inf if window.together else 0.005 if by_hand else 0.0)
+            assert held or window.margin == (-np.inf if window.together else min(0.005, dist_safe) if by_hand else 0.0)
             assert window.contact == (0.0 if by_hand and not window.together else CONTACT)
             at = found.setdefault((first, second), [])
             at += [(window.first, window.last)] * ((window.first, window.last) not in at)
@@ -64,22 +64,31 @@ def still(scene: Scene) -> Trajectory:
     return of_rows(scene, np.tile(scene.start, (11, 1)))
 
 
-def hand_on(label: str, *spans: tuple[int, int]) -> dict[tuple[str, str], list[tuple[int, int]]]:
-    return {(link, label): list(spans) for link in HANDS}
+DOOR, TIP = ("door.frame", "door.panel"), ("stick.tip",)
+
+
+def hand_on(
+    label: str, near: tuple[int, int], held: tuple[int, int] | None = None, others: Sequence[str] = ()
+) -> dict[tuple[str, str], list[tuple[int, int]]]:
+    """Return what the hand may be close to: the link it holds for a while, and around that time the object's others, too."""
+    found = {(link, other): [near] for link in HANDS for other in (label, *others)}
+    return found | {(link, label): sorted({near, held or near}) for link in HANDS}
 
 
 def test_a_hand_and_what_it_holds_around_that_time() -> None:
     door = door_scene()
     assert near(door, still(door)) == {}
     assert near(door, still(door), [Actuate("door", {"hinge": 1.0})]) == {}  # the motion says where it is held
-    assert near(door.with_held({"door": "handle"}), still(door)) == hand_on("door.lever", (0, 0), (0, 10))  # let go of at once
+    assert near(door.with_held({"door": "handle"}), still(door)) == hand_on(
+        "door.lever", (0, 10), (0, 0), DOOR
+    )  # let go of at once
     motion, hold = (
         through(door, door.start, moved_base(door.start, y=0.3)),
         (Hold("door", "handle"),),
     )
     spans = (PhaseSpan("reach", 0, 15), PhaseSpan("hold", 15, 30, hold), PhaseSpan("leave", 30, 40))
     held = dataclasses.replace(motion, phases=spans)
-    assert near(door, held) == hand_on("door.lever", (15 - STEPS, 15), (15, 30), (30, 30 + STEPS))
+    assert near(door, held) == hand_on("door.lever", (15 - STEPS, 30 + STEPS), (15, 30), DOOR)
 
 
 def test_a_hand_that_is_where_it_is_asked_to_grasp() -> None:
@@ -87,7 +96,7 @@ def test_a_hand_that_is_where_it_is_asked_to_grasp() -> None:
     scene = room(table())
     there = Script(scene).go(reaching(tool_at(STICK), above(STICK))).go(np.array(scene.start))
     assert near(scene, there.motion()) == {}
-    assert near(scene, there.motion(), [Grasp("stick")]) == hand_on("stick.stick", (20 - STEPS, 20 + STEPS))
+    assert near(scene, there.motion(), [Grasp("stick")]) == hand_on("stick.stick", (20 - STEPS, 20 + STEPS), others=TIP)
 
 
 @pytest.mark.parametrize(("attachment", "rigid"), [("handle", True), ("handle_free", False)])
@@ -97,8 +106,9 @@ def test_only_a_grasp_without_freedom_moves_as_one(attachment: str, rigid: bool)
     names = (*scene.robot.coordinates.names, *(f"door.{name}" for name in freedoms))
     rows = np.column_stack([np.tile(scene.start, (2, 1)), np.zeros((2, len(names) - 9))])
     samples = Samples(scene, Trajectory(names, np.arange(2.0), rows, (PhaseSpan("hold", 0, 1, scene.holds),), 9))
-    (window,) = windows(samples, Solids(samples.world), [], Options())
-    assert (window.together, window.margin, window.contact) == ((True, 0.0, CONTACT) if rigid else (False, 0.005, CONTACT))
+    near, lever = windows(samples, Solids(samples.world), [], Options())
+    assert (near.together, near.margin, near.contact) == (False, 0.005, 0.0)
+    assert (lever.together, lever.margin, lever.contact) == ((True, 0.0, CONTACT) if rigid else (False, 0.005, CONTACT))
 
 
 def carried(scene: Scene, *, aside: float = 0.5) -> Script:
@@ -117,7 +127,7 @@ def test_what_a_carried_thing_rests_on_where_it_is_taken_and_left() -> None:
     scene = room(short, other, between, beside, far)
     taken, left = (20, 20 + STEPS), (80 - STEPS, 80)
     assert near(scene, carried(scene, aside=1.0).motion(), dist_safe=0.055) == {
-        **hand_on("stick.stick", (20 - STEPS, 20), (20, 80), (80, 80 + STEPS)),
+        **hand_on("stick.stick", (20 - STEPS, 80 + STEPS), (20, 80), TIP),
         ("stick.stick", "board"): [taken],
         ("stick.tip", "board"): [taken],
         ("stick.stick", "near"): [taken],
@@ -125,19 +135,19 @@ def test_what_a_carried_thing_rests_on_where_it_is_taken_and_left() -> None:
         ("stick.tip", "other"): [left],
     }
     wide = near(scene, carried(scene, aside=1.0).motion(), dist_safe=0.15)  # the wrist is that close when the hand closes
-    assert {pair for pair in wide if pair[0] in set(scene.robot.links)} == set(hand_on("stick.stick"))
+    assert {pair for pair in wide if pair[0] in set(scene.robot.links)} == set(hand_on("stick.stick", (0, 0), others=TIP))
     tight = near(scene, carried(scene, aside=1.0).motion(), dist_safe=1e-3 / 2)
-    assert tight.keys() == hand_on("stick.stick").keys()  # everything is 1 mm away at least
+    assert tight.keys() == hand_on("stick.stick", (0, 0), others=TIP).keys()  # everything is 1 mm away at least
 
 
 def test_what_is_in_the_hand_at_the_start_and_stays_there_rests_nowhere() -> None:
     scene = room(table()).with_held({"stick": "grip"})
     low = scene.with_start(arm=reaching(tool_at(STICK), above(STICK))[3:])
     drive = Script(low).go(moved_base(low.start, y=0.3)).motion()
-    assert near(low, drive) == hand_on("stick.stick", (0, 20))
+    assert near(low, drive) == hand_on("stick.stick", (0, 20), others=TIP)
     left = Script(low).go(moved_base(low.start, y=0.3)).let_go().go(moved_base(low.start, y=0.3, x=-0.1)).motion()
     assert near(low, left) == {
-        **hand_on("stick.stick", (0, 20), (20, 20 + STEPS)),
+        **hand_on("stick.stick", (0, 20 + STEPS), (0, 20), TIP),
         ("stick.stick", "table"): [(20 - STEPS, 20)],
     }
 
@@ -147,7 +157,7 @@ def test_what_lies_on_the_floor() -> None:
     scene = with_object(room(objects=("stick", "ball")), "ball", on_floor)
     taken = Script(scene).take("ball", "grip", (0.0, 0.0, 0.0)).go(moved_base(scene.start, x=-0.2)).motion()
     found = near(scene, taken)
-    assert found == {**hand_on("ball.ball", (0, 0), (0, 20)), ("ball.ball", FLOOR): [(0, STEPS)]}
+    assert found == {**hand_on("ball.ball", (0, 20)), ("ball.ball", FLOOR): [(0, STEPS)]}
 
 
 def test_things_that_lie_side_by_side() -> None:
@@ -155,7 +165,7 @@ def test_things_that_lie_side_by_side() -> None:
     beside = pin.SE3(np.eye(3), np.array([0.8 + 0.05 + 0.035 + 0.01, 0.1275, TOP + 0.036]))
     scene = with_object(room(table(), objects=("stick", "ball")), "ball", beside)
     assert near(scene, carried(scene).motion()) == {
-        **hand_on("stick.stick", (20 - STEPS, 20), (20, 80), (80, 80 + STEPS)),
+        **hand_on("stick.stick", (20 - STEPS, 80 + STEPS), (20, 80), TIP),
         ("stick.stick", "table"): [(20, 20 + STEPS), (80 - STEPS, 80)],
         ("stick.stick", "ball.ball"): [(20, 20 + STEPS)],
     }
@@ -166,8 +176,8 @@ def test_a_tip_and_what_it_holds() -> None:
     script = Script(scene).take("ball", "pull", (0.0, 0.0, 0.0), by="stick.tip").go(moved_base(scene.start, y=0.5))
     found = near(scene, script.motion())
     assert found == {
-        **hand_on("stick.stick", (0, 20)),
-        ("stick.tip", "ball.ball"): [(0, 0), (0, 20)],
+        **hand_on("stick.stick", (0, 20), others=TIP),
+        ("stick.tip", "ball.ball"): [(0, 20)],
         ("ball.ball", "stand"): [(0, STEPS)],
     }
 
@@ -184,7 +194,7 @@ def test_a_frame_and_what_is_at_its_target_when_it_is_there() -> None:
         for goal in (tuple(target), pin.SE3(np.eye(3), target)):
             found = near(there.scene, there.motion(), [Touch("stick.tip", goal)])
             wanted = {("stick.tip", "wall"): [(20 - STEPS, 20 + STEPS)]} if touches else {}
-            assert found == {**hand_on("stick.stick", (0, 40)), **wanted}
+            assert found == {**hand_on("stick.stick", (0, 40), others=TIP), **wanted}
         assert ("stick.tip", "wall") not in near(there.scene, there.motion(), [Touch("stick.tip", tuple(target + 0.05))])
 
 
@@ -208,4 +218,4 @@ def test_what_can_be_carried_itself_may_be_touched_where_it_is_then() -> None:
         found = near(there, Script(there).wait().motion(), [Touch("stick.tip", tuple(tip))])
         assert (("stick.tip", "ball.ball") in found) == touched
     inside = [Touch("ball.ball", tuple(tip + np.array([0.0, 0.035, 0.0])))]
-    assert near(beside, Script(beside).wait().motion(), inside) == hand_on("stick.stick", (0, 2))
+    assert near(beside, Script(beside).wait().motion(), inside) == hand_on("stick.stick", (0, 2), others=TIP)

@@ -17,7 +17,7 @@ from vkc_pin.chain.phase_geometry import PhaseGeometry
 from vkc_pin.errors import InputError
 from vkc_pin.models.shapes import bounding_box, link_name, own_name
 from vkc_pin.options import Options
-from vkc_pin.scene.contact import CONTACT, grasped, moves_as_one, touching
+from vkc_pin.scene.contact import CONTACT, grasped, hand_clearance, moves_as_one, touching
 from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.placed import standing_geometry
@@ -57,13 +57,14 @@ class _Pairing:
 
     def phase(self, number: int) -> PhaseGeometry:
         phase, scene, chain = self.task.phases[number], self.scene, self.chain
+        holds = {hold.object: hold for hold in phase.held}
         shapes, labels = list(chain.collision.geometryObjects), list(self._labels)
         robots, own, margin = range(len(scene.robot.collision.geometryObjects)), len(shapes), self.options.dist_safe
         pairs = [(pair.first, pair.second, margin) for pair in scene.robot.collision.collisionPairs]
         moving, mine = list(robots), dict[str, tuple[int, ...]]()
         for hold in phase.held:
             mine[hold.object] = chain.held_geometries[hold]
-            pairs += [(i, j, self._held_margin(hold, i, j)) for i in moving for j in mine[hold.object]]
+            pairs += [(i, j, self._held_margin(hold, labels[i], labels[j])) for i in moving for j in mine[hold.object]]
             pairs += [
                 (i, j, margin) for i, j in combinations(mine[hold.object], 2) if self._own_pair(hold.object, labels[i], labels[j])
             ]
@@ -90,7 +91,8 @@ class _Pairing:
             for shape in standing:
                 label = f"{name}.{link_name(shape.name)}"
                 others = [i for i in moving if i not in mine.get(name, ()) or self._own_pair(name, labels[i], label)]
-                pairs += [(i, len(shapes), margin) for i in others]
+                held = holds.get(name)  # and it moves only some of its joints
+                pairs += [(i, len(shapes), self._held_margin(held, labels[i], label) if held else margin) for i in others]
                 shape.name = f"{name}.{shape.name}"
                 shapes.append(shape)
                 labels.append(label)
@@ -118,16 +120,18 @@ class _Pairing:
         )
         return dataclasses.replace(part, eased=eased_pairs(self.scene, self.chain, self.task, number, part, self.options))
 
-    def _held_margin(self, hold: Hold, i: int, j: int) -> float:
-        """Return the clearance [m] of geometry `i` from geometry `j` of what is held.
+    def _held_margin(self, hold: Hold, one: str, link: str) -> float:
+        """Return the clearance [m] of what has the label `one` from a link, by its label, of what is held.
 
         The hand and what it grasps move together, so that there is nothing to plan, unless the grasp leaves a freedom.
         """
-        if self._labels[i] not in touching(self.scene, hold) or self._labels[j] != grasped(self.scene, hold):
+        if one not in touching(self.scene, hold):
             return self.options.dist_safe
+        if link != grasped(self.scene, hold):
+            return hand_clearance(self.scene, hold, link, self.options)
         if moves_as_one(self.scene, hold):
             return -np.inf
-        return -CONTACT if hold.by else self.options.grasp_clearance
+        return hand_clearance(self.scene, hold, link, self.options) or -CONTACT
 
     def _own_pair(self, name: str, first: str, second: str) -> bool:
         """Return whether two links of an object, by their labels, can meet."""

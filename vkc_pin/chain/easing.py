@@ -13,7 +13,7 @@ from vkc_pin.chain.chain import VirtualKinematicChain
 from vkc_pin.chain.phase_geometry import PhaseGeometry
 from vkc_pin.models.shapes import own_name, shape_distance, world_box
 from vkc_pin.options import Options
-from vkc_pin.scene.contact import EASED_TIME, grasped, touching
+from vkc_pin.scene.contact import EASED_TIME, hand_clearance, touching
 from vkc_pin.scene.placed import PlacedObject, standing_geometry
 from vkc_pin.scene.resting import Ride
 from vkc_pin.scene.scene import Scene
@@ -31,9 +31,9 @@ def eased_pairs(
 ) -> Eased:
     """Return pair → (first waypoint, last waypoint, margin [m]) for what may be close for a while; see `scene.contact`.
 
-    A hand keeps `Options.grasp_clearance` from the link that it takes or lets go of. A free object rests on something where it is
-    lifted from and where it is put down, with what rides on it; a frame that touches a target may come close to what the target
-    is on: there the margin is half the distance at the contact.
+    A hand keeps the attachment's clearance from the object that it takes or lets go of. A free object rests on something where it
+    is lifted from and where it is put down, with what rides on it; a frame that touches a target may come close to what the
+    target is on: there the margin is half the distance at the contact.
 
     Args:
         scene: Where it happens.
@@ -59,9 +59,10 @@ def eased_pairs(
 
     for holds, begin, end in ((phase.leaves, first, first + steps), (phase.grasps, last - steps, last)):
         for hold in holds:
-            margin, links, link = 0.0 if hold.by else options.grasp_clearance, touching(scene, hold), grasped(scene, hold)
+            links, owner = touching(scene, hold), f"{hold.object}."
             for k, (i, j) in enumerate(part.pairs.tolist()):
-                if part.labels[i] in links and part.labels[j] == link:
+                if part.labels[i] in links and part.labels[j].startswith(owner):
+                    margin = hand_clearance(scene, hold, part.labels[j], options)
                     eased.setdefault(k, []).append((begin, end, margin))
     for geometries, placed, begins in _moments(scene, chain, phase):
         stands = {shape.name: shape.placement for shape in standing_geometry(placed)}

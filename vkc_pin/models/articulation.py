@@ -73,6 +73,7 @@ class Attachment:
         freedoms: The virtual joint's coordinates, J(v) being the product of their motions in this order.
         standoff: How far before the joint's centre the tool stops, along its approach [m].
         firm: Whether the hand clamps: v is chosen when grasping, and stays while the object is held.
+        clearance: What the hand keeps from the object's links near the grasp [m]; None: `Options.grasp_clearance`.
     """
 
     name: str
@@ -82,6 +83,7 @@ class Attachment:
     freedoms: tuple[Freedom, ...] = ()
     standoff: float = 0.0
     firm: bool = False
+    clearance: float | None = None
 
     @property
     def coordinates(self) -> tuple[str, ...]:

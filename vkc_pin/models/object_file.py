@@ -46,6 +46,7 @@ class AttachmentSchema(Schema):
     turn: Limits | None = None
     standoff: NotNegative = 0.0
     firm: bool | None = None  # not stated: as the object is free or not
+    clearance: NotNegative | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> AttachmentSchema:
@@ -164,6 +165,7 @@ def _attachment(item: AttachmentSchema, *, firm: bool) -> Attachment:
         freedoms=_freedoms(item),
         standoff=item.standoff,
         firm=firm if item.firm is None else item.firm,
+        clearance=item.clearance,
     )
 
 

@@ -1,8 +1,9 @@
 """What may be close to what, and for how long: the rules that the program and its independent check keep, each in its own way.
 
-- A hand and the link it takes hold of keep `Options.grasp_clearance` for `EASED_TIME` before it is held and after. What is held
-  through another link, and that link, need no clearance then.
-- While it is held they move as one, unless the grasp leaves a freedom: then they keep the same.
+- A hand keeps the attachment's clearance from the whole object that it takes hold of, for `EASED_TIME` before it is held, as long
+  as it is held, and for `EASED_TIME` after. Without a clearance of its own that is `Options.grasp_clearance`. What is held
+  through another link, and that link, need none.
+- The hand and the link that it holds move as one, unless the grasp leaves a freedom.
 - What is lifted, put down, or begins or ends a ride, and what is next to it there, may be as near as they are there for
   `EASED_TIME`. So may a link that touches something, and what is at that place.
 - What rides and what it stands on move as one.
@@ -12,10 +13,11 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
+from vkc_pin.options import Options
 from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.scene import Scene
 
-__all__ = ["CONTACT", "EASED_TIME", "grasped", "moves_as_one", "touching"]
+__all__ = ["CONTACT", "EASED_TIME", "grasped", "hand_clearance", "moves_as_one", "touching"]
 
 CONTACT = 1e-4
 """Overlap that is contact: what stands on a table overlaps it by rounding [m]."""
@@ -31,6 +33,21 @@ def grasped(scene: Scene, hold: Hold) -> str:
 def touching(scene: Scene, hold: Hold) -> Collection[str]:
     """Return the labels of the links that take hold: the robot's touch links, or the link that something is held through."""
     return scene.robot.touch_links if hold.frame is None else (hold.frame,)
+
+
+def hand_clearance(scene: Scene, hold: Hold, link: str, options: Options) -> float:
+    """Return what the links that take hold keep from a link of what they take hold of, near the grasp and while it lasts [m].
+
+    Args:
+        scene: Whose objects they are.
+        hold: The hold.
+        link: The link of its object, "<object>.<link>".
+        options: Clearances where the attachment has none of its own.
+    """
+    if hold.by and link == grasped(scene, hold):
+        return 0.0
+    own = scene.objects[hold.object].object.attachments[hold.attachment].clearance
+    return min(options.grasp_clearance if own is None else own, options.dist_safe)
 
 
 def moves_as_one(scene: Scene, hold: Hold) -> bool:

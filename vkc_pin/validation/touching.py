@@ -11,7 +11,7 @@ import pinocchio as pin
 from vkc_pin.arrays import Ints
 from vkc_pin.motion.carrying import FreeObjects
 from vkc_pin.options import Options
-from vkc_pin.scene.contact import CONTACT, EASED_TIME, grasped, moves_as_one, touching
+from vkc_pin.scene.contact import CONTACT, EASED_TIME, grasped, hand_clearance, moves_as_one, touching
 from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.steps import Grasp, Step, Touch
@@ -82,17 +82,22 @@ class _Windows:
 
     def _hand(self, hold: Hold, first: int | None, last: int | None) -> Iterator[Window]:
         """Yield what a hold that lasts between two waypoints, or from the start or up to the end, means for what holds."""
-        pairs = self._gripping(hold)
-        clearance, contact = (0.0, CONTACT) if hold.by else (self.options.grasp_clearance, 0.0)
         begin, end = 0 if first is None else first, len(self.steps) if last is None else last
+        since, until = begin if first is None else self._since(begin), end if last is None else self._until(end)
+        yield from self._near(hold, since, until)
+        gripped = self._between(touching(self.scene, hold), {grasped(self.scene, hold)})
         if moves_as_one(self.scene, hold):
-            yield Window(pairs, begin, end, 0.0, together=True)
+            yield Window(gripped, begin, end, 0.0, together=True)
         else:
-            yield Window(pairs, begin, end, clearance, CONTACT)
-        if first is not None:
-            yield Window(pairs, self._since(first), first, clearance, contact)
-        if last is not None:
-            yield Window(pairs, last, self._until(last), clearance, contact)
+            yield Window(gripped, begin, end, hand_clearance(self.scene, hold, grasped(self.scene, hold), self.options))
+
+    def _near(self, hold: Hold, first: int, last: int) -> Iterator[Window]:
+        """Yield what links that take hold, or have it, keep from all of the object meanwhile."""
+        by_clearance: dict[float, set[str]] = {}
+        for link in (label for label in self.labels.tolist() if label.startswith(f"{hold.object}.")):
+            by_clearance.setdefault(hand_clearance(self.scene, hold, link, self.options), set()).add(link)
+        for least, links in by_clearance.items():
+            yield Window(self._between(touching(self.scene, hold), links), first, last, least, 0.0 if least else CONTACT)
 
     def _grasps(self, steps: Sequence[Grasp]) -> Iterator[Window]:
         """Yield what it means that the hand is at a grasp at the end of a phase, whether it holds on or not."""
@@ -102,12 +107,13 @@ class _Windows:
             for name in [step.attachment] if step.attachment is not None else list(thing.attachments):
                 errors = self.samples.grasp_errors(step.object, name, self.samples.waypoint_rows[ends], step.by)
                 for at in ends[(errors <= (self.options.goal_position, self.options.goal_angle)).all(axis=1)].tolist():
-                    pairs = self._between(
-                        {step.by} if step.by else set(self.scene.robot.touch_links),
-                        {f"{step.object}.{thing.attachment(name).link}"},
-                    )
-                    least = 0.0 if step.by else self.options.grasp_clearance
-                    yield Window(pairs, self._since(at), self._until(at), least, CONTACT if step.by else 0.0)
+                    yield from self._near(self._grasped(step, name), self._since(at), self._until(at))
+
+    def _grasped(self, step: Grasp, attachment: str) -> Hold:
+        """Return the hold that a step brings about; how what it is held through is held itself does not matter here."""
+        owner, _, link = (step.by or "").partition(".")
+        through = Hold(owner, self.scene.objects[owner].object.attachment().name) if step.by else None
+        return Hold(step.object, attachment, through, link or None)
 
     def _beside(self, owner: str, at: int, other: int, *, begin: bool = True) -> Window:
         """Return what a free object is next to where it begins or ends to be carried, at waypoint `at`."""
@@ -152,9 +158,6 @@ class _Windows:
             for item in now:
                 begun.setdefault(item, at)
         yield from ((item, first, None) for item, first in begun.items())
-
-    def _gripping(self, hold: Hold) -> Ints:
-        return self._between(touching(self.scene, hold), {grasped(self.scene, hold)})
 
     def _between(self, ones: Collection[str], others: Collection[str]) -> Ints:
         """Return the pairs of shapes of some links with those of others, by their labels."""

@@ -70,6 +70,17 @@ def links(*names: str) -> list[str]:
             4,
             "j: limit upper: wrong numbers .*1 finite number, got inf",
         ),
+        (
+            [*links("a", "b"), joint("j", "a", "b", kind="continuous", inside='<mimic joint="k"/>')],
+            4,
+            "j: mimic: there is no joint 'k'",
+        ),
+        (
+            [*links("a", "b"), joint("j", "a", "b", kind="continuous", inside='<mimic joint="j" multiplier="twice"/>')],
+            4,
+            "j: mimic multiplier: wrong numbers .*got twice",
+        ),
+        ([*links("a"), '<xacro:wheel side="left"/>'], 3, "xacro has not been run .*xacro FILE .*got <xacro:wheel>"),
     ],
 )
 def test_what_is_no_tree_is_refused(tmp_path: Path, lines: list[str], line: int | None, message: str) -> None:
@@ -110,3 +121,65 @@ def test_the_nearest_link_is_named(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError) as caught:
         read_urdf(written(tmp_path, *links("upper_arm", "forearm"), joint("j", "uper_arm", "forearm")))
     assert caught.value.nearest == "upper_arm"
+
+
+def test_what_planning_does_not_need_may_be_left_out(tmp_path: Path) -> None:
+    """A limit without effort or velocity: the joint has none, and only what is missing differs."""
+    lines = [*links("a", "b", "c"), joint("k", "b", "c", kind="prismatic", inside='<limit upper="2" velocity="3"/>')]
+    model, _, _ = load_urdf(
+        written(tmp_path, *lines, joint("j", "a", "b", kind="revolute", inside='<limit lower="-1" upper="0.5"/>'))
+    )
+    assert list(model.names)[1:] == ["j", "k"]
+    np.testing.assert_array_equal(model.velocityLimit, [np.inf, 3.0])
+    np.testing.assert_array_equal(model.lowerPositionLimit, [-1.0, 0.0])
+    np.testing.assert_array_equal(model.upperPositionLimit, [0.5, 2.0])
+
+
+def test_extensions_say_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Elements of simulators and of nobody known, with prefixes that nothing declares; no parser complains behind our back."""
+    lines = [*links("a", "b"), joint("j", "a", "b", kind="continuous", inside='<axis xyz="0 0 1"/><limit effort="3"/>')]
+    plain, _, _ = load_urdf(written(tmp_path, *lines))
+    more = [
+        '<gazebo reference="a"><material>Gazebo/Red</material></gazebo>',
+        '<transmission name="t"><type>SimpleTransmission</type><joint name="nowhere"/></transmission>',
+        '<drake:joint name="j" type="universal"/>',
+        '<xacro:property name="width" value="3"/>',
+        "<velocity>fast</velocity>",
+    ]
+    inside = lines[-1].replace("</joint>", '<drake:gear ratio="x"/><safety_controller/><calibration rising="x"/></joint>')
+    shape = lines[0].replace("</link>", '<drake:proximity/><sensor name="s"/></link>')
+    model, collision, _ = load_urdf(written(tmp_path, shape, lines[1], inside, *more))
+    assert model == plain
+    assert [shape.name for shape in collision.geometryObjects] == ["a_0", "b_0"]
+    assert not capfd.readouterr().err
+
+
+def test_a_robot_without_a_name_is_called_like_its_file(tmp_path: Path) -> None:
+    file = written(tmp_path, *links("a"))
+    file.write_text(file.read_text().replace(' name="r"', ""))
+    assert load_urdf(file)[0].name == "thing"
+
+
+@pytest.mark.parametrize(
+    ("inertial", "message"),
+    [
+        ("<inertial/>", "2: a: an <inertial> without <mass> counts as none"),
+        ('<inertial><mass value="1"/></inertial>', "2: a: an <inertial> without <inertia> counts as none"),
+        (
+            '<inertial><mass value="heavy"/><inertia ixx="1"/></inertial>',
+            "a: mass value: wrong numbers .*got heavy.*counts as none",
+        ),
+    ],
+)
+def test_masses_that_are_none(tmp_path: Path, inertial: str, message: str) -> None:
+    lines = [*links("r", "a"), joint("j", "r", "a", kind="continuous")]
+    lines[:2] = [lines[1].replace("</link>", f"{inertial}</link>"), lines[0]]
+    with pytest.warns(UserWarning, match=message):
+        model, _, _ = load_urdf(written(tmp_path, *lines))
+    assert model.inertias[1].mass == 0.0
+
+
+def test_a_limit_without_numbers_is_warned_of(tmp_path: Path) -> None:
+    lines = [*links("a", "b"), joint("j", "a", "b", kind="revolute", inside='<limit effort="1" velocity="1"/>')]
+    with pytest.warns(UserWarning, match="thing.urdf:4: j: a limit without lower and upper: it cannot move"):
+        load_urdf(written(tmp_path, *lines))

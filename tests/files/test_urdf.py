@@ -108,6 +108,22 @@ def test_addresses_of_meshes(tmp_path: Path) -> None:
         assert (caught.value.file, caught.value.field) == (path, address)
 
 
+def test_packages_are_looked_for_in_all_folders_above(tmp_path: Path) -> None:
+    """For objects as for robots: by the package's name or not, and above a link to the file as above the file itself."""
+    deep, other = tmp_path / "repository" / "robots" / "arm" / "urdf", tmp_path / "mine"
+    meshes = tmp_path / "repository" / "meshes"
+    for folder in (deep, other, meshes):
+        folder.mkdir(parents=True)
+    trimesh.creation.box((1.0, 2.0, 3.0)).export(meshes / "box.stl")
+    path = urdf(deep, collision('<mesh filename="package://some_name/meshes/box.stl"/>'))
+    (other / "thing.urdf").symlink_to(path)
+    for file in (path, other / "thing.urdf"):
+        assert read_urdf(file).resolve("package://some_name/meshes/box.stl") == meshes / "box.stl"
+        _, found, _ = load_urdf(file)
+        found.geometryObjects[0].geometry.computeLocalAABB()
+        assert found.geometryObjects[0].geometry.aabb_local.height() == pytest.approx(2.0)
+
+
 def test_a_tree_is_as_pinocchio_reads_it(tmp_path: Path) -> None:
     text = """<robot name="r"><link name="a"/><link name="b"><collision><origin xyz="0.1 0 0" rpy="0 0 1"/><geometry>
     <box size="1 2 3"/></geometry></collision></link><link name="c"><collision><geometry><sphere radius="0.5"/></geometry>

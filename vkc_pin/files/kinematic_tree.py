@@ -1,25 +1,29 @@
 """Checks of the links and joints of a URDF: they make one tree, of numbers that mean something.
 
 Parsers take that for granted: a circle of links never ends, a link with two parents gets one of them without a word, and an
-origin that is no number becomes none.
+origin that is no number becomes none. They also refuse whole files, and do not say where, for want of a number that nobody
+needs, or for what programs of all kinds write into a URDF for themselves. So they get what was checked here, and nothing else.
 """
 
 from __future__ import annotations
 
 import math
+import warnings
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 
 from vkc_pin.arrays import LARGEST
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.files.xml import line_of
 
-__all__ = ["check_tree", "numbers_of"]
+__all__ = ["check_tree", "numbers_of", "plain_tree"]
 
 _KINDS = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 _LIMITED = ("revolute", "prismatic")
 _WITHOUT_AXIS = ("fixed", "floating")
+_INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+_SILENT = ("xacro:arg", "xacro:property")  # of xacro's elements those that put nothing in their place
 
 
 def check_tree(file: Path, root: ElementTree.Element) -> None:
@@ -27,21 +31,93 @@ def check_tree(file: Path, root: ElementTree.Element) -> None:
 
     Raises:
         InputError: A name is missing or given twice, a link has two parents or goes in a circle, there are several roots or
-            none, a joint's type, origin, axis or limit is wrong.
-        UnknownNameError: A joint names a link that does not exist.
+            none, a joint's type, origin, axis, limit or mimic is wrong, or macros of xacro are still to be put in.
+        UnknownNameError: A joint names a link or joint that does not exist.
     """
+    for element in root.iter():
+        if element.tag.startswith("xacro:") and element.tag not in _SILENT:
+            expected, line = "a plain URDF: xacro FILE > robot.urdf", line_of(element)
+            raise InputError("xacro has not been run", file=file, line=line, expected=expected, got=f"<{element.tag}>")
     links = _named(file, root, "link")
     if not links:
         raise InputError("there are no links", file=file, expected="<link> elements")
     above: dict[str, tuple[str, str]] = {}  # link → its parent, and the joint between
-    for name, joint in _named(file, root, "joint").items():
-        _check_joint(file, name, joint)
+    joints = _named(file, root, "joint")
+    for name, joint in joints.items():
+        _check_joint(file, name, joint, joints)
         parent, child = (_link(file, name, joint, key, links) for key in ("parent", "child"))
         if child in above:
             got, line = f"joints '{above[child][1]}' and '{name}'", line_of(joint)
             raise InputError("a link with two parents", file=file, line=line, field=child, expected="one joint", got=got)
         above[child] = parent, name
     _check_roots(file, links, above)
+
+
+def plain_tree(file: Path, root: ElementTree.Element) -> tuple[str, frozenset[str]]:
+    """Return links and joints of a URDF that was checked, as one that parsers understand, without shapes and extensions.
+
+    What a limit does not say is 0; joints that say nothing about velocity are named. Mimicking is left to the caller. An
+    <inertial> that is not whole counts as none, with a warning: nothing here is planned with masses.
+
+    Args:
+        file: The URDF.
+        root: What it says.
+
+    Returns:
+        The text, and the joints without velocity.
+    """
+    plain = ElementTree.Element("robot", name=root.get("name") or file.stem)
+    silent = set[str]()
+    for link in root.findall("link"):
+        added = ElementTree.SubElement(plain, "link", name=link.get("name", ""))
+        if (inertial := link.find("inertial")) is not None:
+            _add_inertial(file, added, inertial)
+    for joint in root.findall("joint"):
+        name, kind = joint.get("name", ""), joint.get("type", "")
+        added = ElementTree.SubElement(plain, "joint", name=name, type=kind)
+        _add_origin(file, added, joint.find("origin"), name)
+        for key in ("parent", "child"):
+            if (end := joint.find(key)) is not None:
+                ElementTree.SubElement(added, key, link=end.get("link", ""))
+        if kind not in _WITHOUT_AXIS and (axis := joint.find("axis")) is not None:
+            ElementTree.SubElement(added, "axis", xyz=_written(numbers_of(file, axis, "xyz", 3, default="1 0 0", where=name)))
+        if (limit := joint.find("limit")) is not None and kind not in _WITHOUT_AXIS:
+            silent.update([name] if limit.get("velocity") is None else [])
+            if kind in _LIMITED and limit.get("lower") is None and limit.get("upper") is None:
+                warnings.warn(f"{file}:{line_of(limit)}: {name}: a limit without lower and upper: it cannot move", stacklevel=2)
+            said = {key: _written(_limit(file, name, limit, key)) for key in ("lower", "upper", "velocity", "effort")}
+            ElementTree.SubElement(added, "limit", said)
+    return ElementTree.tostring(plain, encoding="unicode"), frozenset(silent)
+
+
+def _add_origin(file: Path, parent: ElementTree.Element, origin: ElementTree.Element | None, where: str) -> None:
+    if origin is not None:
+        said = {key: _written(numbers_of(file, origin, key, 3, default="0 0 0", where=where)) for key in ("xyz", "rpy")}
+        ElementTree.SubElement(parent, "origin", said)
+
+
+def _add_inertial(file: Path, link: ElementTree.Element, inertial: ElementTree.Element) -> None:
+    """Add mass and inertia to a link, or warn."""
+    name, mass, inertia = link.get("name", ""), inertial.find("mass"), inertial.find("inertia")
+    if mass is None or inertia is None:
+        lacks = f"an <inertial> without <{'mass' if mass is None else 'inertia'}>"
+        warnings.warn(f"{file}:{line_of(inertial)}: {name}: {lacks} counts as none", stacklevel=2)
+        return
+    try:
+        weight = _written(numbers_of(file, mass, "value", 1, default=None, where=name))
+        moments = {key: _written(numbers_of(file, inertia, key, 1, default="0", where=name)) for key in _INERTIA}
+        added = ElementTree.Element("inertial")
+        _add_origin(file, added, inertial.find("origin"), name)
+    except InputError as error:
+        warnings.warn(f"{error}; this <inertial> counts as none", stacklevel=2)
+        return
+    ElementTree.SubElement(added, "mass", value=weight)
+    ElementTree.SubElement(added, "inertia", moments)
+    link.append(added)
+
+
+def _written(values: tuple[float, ...]) -> str:
+    return " ".join(map(repr, values))
 
 
 def numbers_of(
@@ -108,7 +184,11 @@ def _link(file: Path, name: str, joint: ElementTree.Element, key: str, links: Ma
     return link
 
 
-def _check_joint(file: Path, name: str, joint: ElementTree.Element) -> None:
+def _limit(file: Path, name: str, limit: ElementTree.Element, key: str) -> tuple[float, ...]:
+    return numbers_of(file, limit, key, 1, default="0", where=name, largest=math.inf)
+
+
+def _check_joint(file: Path, name: str, joint: ElementTree.Element, joints: Collection[str]) -> None:
     kind, line = joint.get("type"), line_of(joint)
     if kind not in _KINDS:
         expected = ", ".join(_KINDS)
@@ -124,12 +204,17 @@ def _check_joint(file: Path, name: str, joint: ElementTree.Element) -> None:
     if kind in _LIMITED and not limits:
         raise InputError(f"a {kind} joint without limits", file=file, line=line, field=name, expected="<limit>")
     for limit in limits:
-        keys = ("lower", "upper", "velocity", "effort")
-        lower, upper, _, _ = (numbers_of(file, limit, key, 1, default="0", where=name, largest=math.inf)[0] for key in keys)
+        lower, upper, _, _ = (_limit(file, name, limit, key)[0] for key in ("lower", "upper", "velocity", "effort"))
         if kind in _LIMITED and lower > upper:
             field, got, line = f"{name}: limit", f"{lower:g} and {upper:g}", line_of(limit)
             problem = "limits in the wrong order"
             raise InputError(problem, file=file, line=line, field=field, expected="lower ≤ upper", got=got)
+    for mimic in joint.findall("mimic"):
+        followed, line = mimic.get("joint", ""), line_of(mimic)
+        if followed not in joints:
+            raise UnknownNameError("joint", followed, joints, file=file, line=line, field=f"{name}: mimic")
+        for key, default in (("multiplier", "1"), ("offset", "0")):
+            numbers_of(file, mimic, key, 1, default=default, where=name)
 
 
 def _check_roots(file: Path, links: Mapping[str, ElementTree.Element], above: Mapping[str, tuple[str, str]]) -> None:

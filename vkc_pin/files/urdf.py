@@ -16,7 +16,7 @@ import pinocchio as pin
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
 from vkc_pin.files import resources
-from vkc_pin.files.kinematic_tree import check_tree, numbers_of
+from vkc_pin.files.kinematic_tree import check_tree, numbers_of, plain_tree
 from vkc_pin.files.meshes import load_convex, load_mesh, to_bvh
 from vkc_pin.files.resources import file_path
 from vkc_pin.files.xml import line_of, read_xml
@@ -24,7 +24,7 @@ from vkc_pin.files.xml import line_of, read_xml
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["UrdfFile", "UrdfShape", "load_urdf", "read_urdf"]
+__all__ = ["UrdfFile", "UrdfShape", "load_urdf", "read_urdf", "tree_model"]
 
 Colour = tuple[float, float, float, float]
 _LIGHT_GREY: Colour = (0.9, 0.9, 0.9, 1.0)
@@ -130,13 +130,14 @@ class UrdfFile:
         if address.startswith("package://"):
             package, _, inside = address.removeprefix("package://").partition("/")
             folders = [self.packages[package]] if package in self.packages else []
-            folders += [folder / package for folder in self.path.parents] + [self.path.parent, self.path.parent.parent]
+            around = dict.fromkeys([*self.path.parents, *self.path.resolve().parents])  # of a link to it, and of the file itself
+            folders += [folder / package for folder in around] + list(around)
             if package == "example-robot-data" and (data := resources.example_robot_data()) is not None:
                 folders.append(data)  # for copies of its URDFs, wherever they are
             candidates = [folder / inside for folder in folders]
         else:
             plain = Path(address.removeprefix("file://"))
-            candidates = [plain if plain.is_absolute() else self.path.parent / plain]
+            candidates = [folder / plain for folder in (self.path.parent, self.path.resolve().parent)]  # plain, if absolute
         for candidate in candidates:
             if file_path(candidate, "filename", "a mesh file").is_file():
                 return candidate
@@ -206,7 +207,32 @@ def read_urdf(path: str | Path, packages: Mapping[str, Path] | None = None) -> U
     file = Path(path)
     text, root = read_xml(file, "URDF")
     check_tree(file, root)
-    return UrdfFile(file.resolve(), text, root, dict(packages or {}))
+    return UrdfFile(file.absolute(), text, root, dict(packages or {}))
+
+
+def tree_model(file: UrdfFile, *root: pin.JointModelPlanar | str) -> pin.Model:
+    """Return the Pinocchio model of all links and joints of a URDF.
+
+    A joint whose limit says nothing about velocity has none, as one without a limit; efforts play no part here.
+
+    Args:
+        file: The file.
+        *root: A joint that carries all of it, and its name; without one its root stands still.
+
+    Raises:
+        InputError: It is no valid URDF.
+    """
+    text, silent = plain_tree(file.path, file.root)
+    try:
+        model = pin.buildModelFromXML(text, *root)
+    except (ValueError, RuntimeError) as error:
+        raise InputError(f"not a valid URDF: {error}", file=file.path) from error
+    velocity = model.velocityLimit
+    for j in range(1, model.njoints):
+        if model.names[j] in silent:
+            velocity[model.joints[j].idx_v : model.joints[j].idx_v + model.joints[j].nv] = np.inf
+    model.velocityLimit = velocity
+    return model
 
 
 def load_urdf(path: str | Path) -> tuple[pin.Model, pin.GeometryModel, pin.GeometryModel]:
@@ -227,10 +253,7 @@ def load_urdf(path: str | Path) -> tuple[pin.Model, pin.GeometryModel, pin.Geome
         if joint.find("mimic") is not None:  # Pinocchio's parser would let it move on its own
             problem = "joints that mimic others are not supported"
             raise InputError(problem, file=path, line=line, field=name, expected="no <mimic>")
-    try:
-        model = pin.buildModelFromXML(file.text)
-    except (ValueError, RuntimeError) as error:
-        raise InputError(f"not a valid URDF: {error}", file=path) from error
+    model = tree_model(file)
     collision, visual = _geometry(model, file, "collision"), _geometry(model, file, "visual")
     if len(visual.geometryObjects) > 0 and len(collision.geometryObjects) == 0:
         raise InputError("nothing in this URDF can collide", file=path, expected="<collision> elements", got="only <visual> ones")

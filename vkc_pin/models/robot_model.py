@@ -12,7 +12,7 @@ import pinocchio as pin
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
 from vkc_pin.files.meshes import load_parts, to_bvh
-from vkc_pin.files.urdf import UrdfFile, UrdfShape
+from vkc_pin.files.urdf import UrdfFile, UrdfShape, tree_model
 from vkc_pin.models.grafting import add_joint, clean
 
 __all__ = [
@@ -39,10 +39,7 @@ def full_model(file: UrdfFile) -> pin.Model:
     Raises:
         InputError: It is no valid URDF.
     """
-    try:
-        return pin.buildModelFromXML(file.text, pin.JointModelPlanar(), ROOT)
-    except (ValueError, RuntimeError) as error:
-        raise InputError(f"not a valid URDF: {error}", file=file.path) from error
+    return tree_model(file, pin.JointModelPlanar(), ROOT)
 
 
 def planned_model(

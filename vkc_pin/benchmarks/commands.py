@@ -49,9 +49,10 @@ def add_bench(commands: Any) -> None:
         _add_choice(comparison, "methods", "B1 B2 VKC (default: all)")
         comparison.add_argument("--save-failures", action="store_true", help="save the plans of failures, to be viewed")
 
-    about = "Plan two chores, of eighteen and of ten steps, each in one call, from random starts."
+    about = "Plan chores of many steps, each in one call, from random starts."
     shown = "chores of many steps, in a home and in an arena"
-    _add_choice(_add_experiment(benches, "chores", shown, about, default=5, jobs=1), "chores", "home fetch cluttered (default: all)")
+    chores = _add_experiment(benches, "chores", shown, about, default=5, jobs=1)
+    _add_choice(chores, "chores", "home fetch cluttered (default: all)")
 
     shown = "planning time against the number of obstacles or segments"
     about = "Measure planning time against the number of obstacles, or of segments, at the door from random starts."

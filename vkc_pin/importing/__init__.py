@@ -1,0 +1,1 @@
+"""Descriptions of robots, objects and homes, made from files that were made for other programs."""

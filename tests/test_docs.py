@@ -68,9 +68,11 @@ def test_readme_is_brief() -> None:
 
 
 def test_yaml_examples_fit_their_schemas(tmp_path: Path) -> None:
-    (scene,) = blocks(ROOT / "docs/scenes.md", "yaml")
-    (tmp_path / "room.yaml").write_text(scene, encoding="utf-8")
-    assert list(vkc.load_scene(tmp_path / "room.yaml").objects) == ["drawer"]
+    room, home = blocks(ROOT / "docs/scenes.md", "yaml")
+    for scene, objects, allowed in ((room, ["drawer"], 0), (home, ["door"], 4)):
+        (tmp_path / "room.yaml").write_text(scene, encoding="utf-8")
+        loaded = vkc.load_scene(tmp_path / "room.yaml")
+        assert (list(loaded.objects), len(loaded.allowed)) == (objects, allowed)
     (described,) = blocks(ROOT / "docs/objects.md", "yaml")
     assert check(Document(yaml.safe_load(described)), ObjectSchema).urdf == "door.urdf"
     (robot,) = blocks(ROOT / "docs/robots.md", "yaml")

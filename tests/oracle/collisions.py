@@ -11,6 +11,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from .neighbours import Neighbours
 from .plan import Violation
 from .poses import Poses, turn_between
 from .riding import distance
@@ -81,7 +82,7 @@ class Pairs:
         return np.asarray(apart - self.moving[i].shape.radius - self.moving[j].shape.radius)
 
 
-def check_collisions(world: World, stage: Stage, allowed: list[Licence]) -> Iterator[Violation]:
+def check_collisions(world: World, stage: Stage, allowed: list[Licence], built: Neighbours) -> Iterator[Violation]:
     """Yield what overlaps ("overlap"), and what is too close at waypoints: "clearance"."""
     pairs = Pairs(world, stage)
     begins = np.arange(0, pairs.length, BLOCK)
@@ -101,24 +102,33 @@ def check_collisions(world: World, stage: Stage, allowed: list[Licence]) -> Iter
             if not pairs.counts(one, other):
                 continue
             names = f"{one.label} - {other.label}"
+            close, inside = built.during(stage, one, other)
+            asked = built.margin(one, other)
             for k in waypoints[near]:
                 apart = distance(one.shape.solid, one.at, other.shape.solid, other.at, k)
                 time = float(stage.times[k])
-                if apart < safe and not any(own.covers(one.label, other.label, time, apart) for own in allowed):
-                    yield Violation("clearance", names, time, safe - apart, f"{1e3 * apart:.2f} mm apart at a waypoint")
-            depth, row = _deepest(one, other, arc, blocks)
-            if depth > CONTACT:
+                least = min(safe, asked - SHORT)
+                licensed = any(own.covers(one.label, other.label, time, apart) for own in allowed)
+                if apart < least and not close[k] and not licensed:
+                    yield Violation("clearance", names, time, least - apart, f"{1e3 * apart:.2f} mm apart at a waypoint")
+            slack = np.where(inside, np.inf, CONTACT + max(0.0, -asked))
+            for own in allowed:
+                if own.depth and own.names(one.label, other.label):
+                    slack[(own.begin <= stage.times) & (stage.times <= own.end)] += own.depth
+            depth, row = _deepest(one, other, arc, blocks, slack)
+            if depth > 0.0:
                 yield Violation("overlap", names, float(stage.times[row]), depth, f"overlap by {1e3 * depth:.2f} mm")
 
 
-def _deepest(one: Solid, other: Solid, arc: np.ndarray, active: np.ndarray) -> tuple[float, int]:
-    """Return by how much two shapes overlap at most [m], negative if they never do as far as is known, and where.
+def _deepest(one: Solid, other: Solid, arc: np.ndarray, active: np.ndarray, slack: np.ndarray) -> tuple[float, int]:
+    """Return by how much two shapes overlap more than they may [m], negative if they never do as far as is known, and where.
 
     Args:
         one: A shape.
         other: The other.
         arc: How far they have moved against each other, from the first sample on, shape (S,) [m].
         active: For every block of samples, whether they could overlap there.
+        slack: By how much they may overlap, shape (S,) [m].
     """
     worst, row, k = -np.inf, 0, 0
     while k < len(arc):
@@ -128,7 +138,7 @@ def _deepest(one: Solid, other: Solid, arc: np.ndarray, active: np.ndarray) -> t
                 break
             k = int(k // BLOCK + later[0]) * BLOCK
         apart = distance(one.shape.solid, one.at, other.shape.solid, other.at, k)
-        if -apart > worst:
-            worst, row = -apart, k
+        if -apart - slack[k] > worst:
+            worst, row = -apart - slack[k], k
         k = max(k + 1, int(np.searchsorted(arc, arc[k] + abs(apart))))
     return worst, row

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from .collisions import check_collisions
 from .goals import check_goals
+from .neighbours import Neighbours
 from .plan import NotJudged, SavedPlan, Violation, read_plan
 from .rules import check_motion, check_stage
 from .stage import World
@@ -56,10 +57,10 @@ def violations(plan: SavedPlan) -> list[Violation]:
     world = World(plan)
     stages = list(world.stages())
     found = [*check_motion(world), *check_goals(world, stages)]
-    allowed = licences(world, stages)
+    allowed, built = licences(world, stages), Neighbours(world)
     for stage in stages:
         found += check_stage(world, stage)
-        found += check_collisions(world, stage, allowed)
+        found += check_collisions(world, stage, allowed, built)
     worst: dict[tuple[str, str], Violation] = {}
     for one in found:
         key = (one.rule, one.subject)

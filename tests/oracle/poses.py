@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 
-__all__ = ["IDENTITY", "Poses", "axis_turn", "pose", "rpy", "turn_between"]
+__all__ = ["IDENTITY", "Poses", "axis_turn", "orientation", "pose", "rpy", "turn_between"]
 
 
 class Poses(NamedTuple):
@@ -49,6 +50,15 @@ def rpy(roll: float, pitch: float, yaw: float) -> np.ndarray:
     about_y = np.array([[b, 0, v], [0, 1, 0], [-v, 0, b]])
     about_z = np.array([[c, -w, 0], [w, c, 0], [0, 0, 1]])
     return about_z @ about_y @ about_x
+
+
+def orientation(about: Mapping[str, Any]) -> np.ndarray:
+    """Return the rotation that `rpy`, `yaw` or `quaternion` of a description says, shape (3, 3)."""
+    if about.get("quaternion"):
+        x, y, z, w = np.array(about["quaternion"], float) / np.linalg.norm(about["quaternion"])
+        across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        return np.eye(3) + 2.0 * w * across + 2.0 * across @ across
+    return rpy(*(about.get("rpy") or (0.0, 0.0, about.get("yaw") or 0.0)))
 
 
 def pose(position: object = (0.0, 0.0, 0.0), turn: np.ndarray | None = None) -> Poses:

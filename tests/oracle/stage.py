@@ -11,7 +11,7 @@ import coal
 import numpy as np
 
 from .plan import Hold, Phase, SavedPlan
-from .poses import IDENTITY, Poses, pose, rpy
+from .poses import IDENTITY, Poses, orientation, pose
 from .riding import riders
 from .things import Thing, Tree, load_robot, load_thing
 from .urdf import Shape, mesh_hull, read_urdf, solid
@@ -89,8 +89,7 @@ class World:
         self.held.sort(key=lambda hold: hold.by is not None and hold.by.partition(".")[0] in {h.object for h in self.held})
 
     def _obstacle(self, item: dict[str, Any]) -> list[Solid]:
-        angles = item.get("rpy") or (0.0, 0.0, item.get("yaw") or 0.0)
-        here, name = pose(item["position"], rpy(*angles)), item["name"]
+        here, name = pose(item["position"], orientation(item)), item["name"]
         if item["type"] == "urdf":
             urdf = read_urdf(self.plan.folder / item["file"])
             links = Tree(urdf, drives=False).links({}, None, sorted({shape.link for shape in urdf.shapes}))

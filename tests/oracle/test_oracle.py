@@ -124,7 +124,8 @@ def _out_of_turn(c: Content) -> None:
 
 def _blocked(c: Content) -> None:
     drawer = c["scene"]["objects"][0]
-    spot = [*drawer["position"][:2], 0.0]
+    x, y, _ = drawer["position"]
+    spot = [x - 0.28, y, 0.0]  # before its handle; what stood in it from the start would be built so
     c["scene"]["obstacles"].append({"name": "box", "type": "box", "size": [0.05, 0.05, 3.0], "position": spot})
 
 

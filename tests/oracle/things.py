@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,7 +14,7 @@ import pinocchio as pin
 import yaml
 
 from .plan import ROOT, NotJudged
-from .poses import Poses, axis_turn, pose, rpy
+from .poses import Poses, axis_turn, orientation, pose
 from .urdf import Urdf, read_urdf
 
 __all__ = ["Grasp", "Robot", "Thing", "Tree", "load_robot", "load_thing"]
@@ -160,13 +160,12 @@ def load_thing(item: Mapping[str, Any], folder: Path) -> Thing:
         limits[joint] = (low, high, float(fastest), float(own.get("acceleration", 2.0)))
         rest[joint] = float(np.clip(0.0, low, high))
     free = bool(about.get("free", False))
-    grasps = {entry["name"]: _grasp(entry, free) for entry in about["attachments"]}
-    angles = item.get("rpy") or (0.0, 0.0, item.get("yaw") or 0.0)
+    grasps = {entry["name"]: _grasp(entry, free, item.get("reversed") or ()) for entry in about["attachments"]}
     return Thing(
         name=item["name"],
         tree=Tree(urdf, drives=False),
         free=free,
-        at=pose(item["position"], rpy(*angles)),
+        at=pose(item["position"], orientation(item)),
         state={**rest, **(item.get("state") or {})},
         limits=limits,
         grasps=grasps,
@@ -174,12 +173,12 @@ def load_thing(item: Mapping[str, Any], folder: Path) -> Thing:
     )
 
 
-def _grasp(entry: Mapping[str, Any], free: bool) -> Grasp:
+def _grasp(entry: Mapping[str, Any], free: bool, reversed_ones: Sequence[str]) -> Grasp:
     if "approach" in entry:
         z, x = (np.array(entry[key], float) / np.linalg.norm(entry[key]) for key in ("approach", "closing"))
         turn = np.column_stack([x, np.cross(z, x), z])
     else:
-        turn = rpy(*entry.get("rpy", (0.0, 0.0, 0.0)))
+        turn = orientation(entry)
     name, joint = entry["name"], entry.get("joint", "fixed")
     axis = np.array(entry["axis"], float) / np.linalg.norm(entry["axis"]) if "axis" in entry else np.zeros(3)
     freedoms: list[tuple[str, bool, np.ndarray, float, float]] = []
@@ -190,6 +189,9 @@ def _grasp(entry: Mapping[str, Any], free: bool) -> Grasp:
         freedoms = [(f"{name}_slide", True, axis, *entry["limits"]), (f"{name}_turn", False, axis, *entry["turn"])]
     elif joint != "fixed":
         freedoms = [(name, joint == "prismatic", axis, *entry["limits"])]
+    if name in reversed_ones:  # the fingers close along the same line, the hand comes from the other side
+        turn = np.column_stack([turn[:, 0], -turn[:, 1], -turn[:, 2]])
+        freedoms = [(*freedom[:2], np.array([1.0, -1.0, -1.0]) * freedom[2], *freedom[3:]) for freedom in freedoms]
     place = pose(entry.get("position", (0.0, 0.0, 0.0)), turn)
     standoff, firm = float(entry.get("standoff", 0.0)), bool(entry.get("firm", free))
     return Grasp(name, entry["link"], place, tuple(freedoms), standoff, firm, entry.get("clearance"))

@@ -6,6 +6,8 @@
 - A free object and what it stands on, where it is lifted and put down.
 - The link that a `Touch` brings somewhere and what is there, around the moment when it is.
 - What rides on something, and that.
+- What is built close to something; see `neighbours`.
+- A free object and what it stands in at the start, while it is lifted for the first time.
 
 Shortly is a second, or four waypoints where these take longer: the program's margins are eased over four waypoints.
 """
@@ -30,13 +32,21 @@ SHORT = 1e-3  # [m] that clearance at a waypoint may fall short
 
 @dataclass(frozen=True)
 class Licence:
-    """Two groups of links, by label, that may touch from one time to another [s], or come as close as `least` [m]."""
+    """Two groups of links, by label, that may be close from one time to another [s].
+
+    Attributes:
+        ones, others: The groups.
+        begin, end: The times.
+        least: How close at waypoints [m].
+        depth: By how much they may overlap [m].
+    """
 
     ones: frozenset[str]
     others: frozenset[str]
     begin: float
     end: float
     least: float = -np.inf
+    depth: float = 0.0
 
     def names(self, one: str, other: str) -> bool:
         return (one in self.ones and other in self.others) or (other in self.ones and one in self.others)
@@ -97,6 +107,7 @@ def _held(world: World, clock: _Clock) -> Iterator[Licence]:
 
 
 def _lifted(world: World, stages: list[Stage], clock: _Clock) -> Iterator[Licence]:
+    carried = {hold.object for hold in world.held}
     for number, stage in enumerate(stages):
         before = {hold.object for hold in (world.held if number == 0 else stages[number - 1].phase.holds)}
         now = {hold.object for hold in stage.phase.holds}
@@ -111,6 +122,14 @@ def _lifted(world: World, stages: list[Stage], clock: _Clock) -> Iterator[Licenc
                     near = frozenset(other.label for other in others for part in ours if _close(world, part, other, row))
                     labels = frozenset(part.label for part in ours)
                     yield Licence(labels, near, clock.before(waypoint), clock.after(waypoint))
+                    if row == 0 and name not in carried:
+                        for part in ours:
+                            for other in others:
+                                apart = distance(part.shape.solid, part.at, other.shape.solid, other.at, 0)
+                                if apart < 0.0:
+                                    pair = frozenset({part.label}), frozenset({other.label})
+                                    yield Licence(*pair, clock.before(waypoint), clock.after(waypoint), -apart)
+        carried |= now
 
 
 def _close(world: World, one: Solid, other: Solid, row: int) -> bool:

@@ -145,14 +145,16 @@ def check_contacts(
     contacts = model.evaluate(z, waypoints, reach=reach, nearest=nearest)
     number = {tuple(pair): k for k, pair in enumerate(part.pairs.tolist())}
     which = np.array([number[tuple(pair)] for pair in contacts.pair.tolist()], int)
-    margins = part.margins_at(np.arange(len(part.pairs)), np.full(len(part.pairs), problem.ends[phase]))
+    every, same = np.arange(len(part.pairs)), np.full(len(part.pairs), problem.ends[phase])
+    margins = np.array([part.margins_at(every, same, z, np.full(len(every), row)) for row in range(len(z))])
     assert len(set(zip(contacts.waypoint.tolist(), which.tolist(), strict=True))) == len(which)
     np.testing.assert_allclose(contacts.distance, distances[contacts.waypoint, which], rtol=0.0, atol=COAL)
-    np.testing.assert_array_equal(contacts.margin, margins[which])
+    np.testing.assert_array_equal(contacts.margin, margins[contacts.waypoint, which])
     for row in range(len(z)):
         mine = contacts.distance[contacts.waypoint == row] - contacts.margin[contacts.waypoint == row]
         assert np.all(np.diff(mine) >= 0.0)
-        lack = np.sort((distances[row] - margins)[distances[row] < reach])[:nearest]
+        asked = (distances[row] < reach) & (margins[row] > -np.inf)
+        lack = np.sort((distances[row] - margins[row])[asked])[:nearest]
         sure = (np.abs(distances[row] - reach) > COAL).all()  # a pair just at the reach may count or not
         assert not sure or len(mine) == len(lack)
         np.testing.assert_allclose(mine[: len(lack)], lack[: len(mine)], rtol=0.0, atol=COAL)

@@ -78,6 +78,39 @@ def test_thousands_of_obstacles(tmp_path: Path) -> None:
     assert len(str(caught.value)) < 300
 
 
+def test_orientations_may_be_quaternions(tmp_path: Path) -> None:
+    half = np.sqrt(0.5)
+    extra = f"""\
+  - {{name: turned, type: box, size: [1, 2, 3], position: [0, 3, 2], yaw: {np.pi / 2}}}
+  - {{name: same, type: box, size: [1, 2, 3], position: [0, -3, 2], quaternion: [0, 0, 0.7071, 0.7071]}}
+"""
+    scene = load(tmp_path, TINY + extra)
+    drawer = {"name": "drawer", "type": "drawer", "position": [2, 0, 0], "quaternion": [0, 0, -half, half]}
+    scene = Scene.from_document({**scene.document, "objects": [drawer]}, tmp_path)
+    turns = {shape.name: shape.placement.rotation for shape in scene.obstacles}
+    np.testing.assert_allclose(turns["turned"], turns["same"], atol=1e-12)
+    np.testing.assert_allclose(pin.rpy.matrixToRpy(scene.objects["drawer"].placement.rotation), [0, 0, -np.pi / 2], atol=1e-12)
+    same(scene, Scene.from_document(scene.document, tmp_path))
+    moved = scene.with_placement("drawer", pin.SE3(pin.rpy.rpyToMatrix(0.1, 0.2, 0.3), np.ones(3)))
+    again = Scene.from_document(moved.document, tmp_path).objects["drawer"].placement
+    np.testing.assert_allclose(again.homogeneous, moved.objects["drawer"].placement.homogeneous, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("orientation", "said"),
+    [
+        ("quaternion: [0, 0, 1, 1]", "not a rotation .*length 1, not 1.414"),
+        ("quaternion: [0, 0, 1]", "4 values"),
+        ("quaternion: [0, 0, 0, 1], yaw: 0", "two orientations .*one of rpy, yaw and quaternion"),
+        ("quaternion: [0, 0, 0, 1], rpy: [0, 0, 0]", "two orientations"),
+    ],
+)
+def test_wrong_quaternions_are_located(tmp_path: Path, orientation: str, said: str) -> None:
+    with pytest.raises(InputError, match=said) as caught:
+        load(tmp_path, TINY + f"  - {{name: box, type: box, size: [1, 2, 3], position: [0, 3, 2], {orientation}}}\n")
+    assert caught.value.line == len(TINY.splitlines()) + 1
+
+
 def test_a_scene_without_a_floor(tmp_path: Path) -> None:
     assert FLOOR not in load(tmp_path, TINY + "floor: false\n").obstacle_labels
 
@@ -161,7 +194,7 @@ def test_unknown_names_are_located_and_the_nearest_is_offered(
         ("size: [0.5, 0.4, 0.3]", "size: [0.5, -0.4, 0.3]", 13, "obstacles[0].size[1]", "expected a number > 0, got -0.4"),
         ("size: [0.5, 0.4, 0.3]", "size: 0.5", 13, "obstacles[0].size", "expected a list of 3 values, got 0.5"),
         ("size: [0.5, 0.4, 0.3]", "size: [1, 2, 3, 4]", 13, "obstacles[0].size", "wrong number of values"),
-        ("yaw: 0.2, ", "yaw: 0.2, rpy: [0, 0, 0], ", 13, "obstacles[0]", "expected either rpy or yaw"),
+        ("yaw: 0.2, ", "yaw: 0.2, rpy: [0, 0, 0], ", 13, "obstacles[0]", "expected one of rpy, yaw and quaternion"),
         ("colour: [1, 0, 0]", "colour: rd", 13, "obstacles[0].colour", "unknown colour 'rd'"),
         ("colour: [1, 0, 0]", "colour: [255, 0, 0]", 13, "obstacles[0].colour[0]", "expected a number <= 1, got 255"),
         ("    radius: 0.1", "    radius: 0", 16, "obstacles[1].radius", "expected a number > 0, got 0"),

@@ -3,26 +3,27 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.arrays import Floats
+from vkc_pin.arrays import Floats, Ints
 from vkc_pin.budget import spend
 from vkc_pin.chain.chain import VirtualKinematicChain
-from vkc_pin.chain.easing import eased_pairs
-from vkc_pin.chain.phase_geometry import PhaseGeometry
+from vkc_pin.chain.easing import EASED_SHARE, eased_pairs
+from vkc_pin.chain.phase_geometry import Neighbours, PhaseGeometry
 from vkc_pin.errors import InputError
 from vkc_pin.models.shapes import bounding_box, link_name, own_name
 from vkc_pin.options import Options
 from vkc_pin.scene.contact import CONTACT, grasped, hand_clearance, moves_as_one, touching
 from vkc_pin.scene.hold import Hold
+from vkc_pin.scene.neighbours import allowances
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.placed import standing_geometry
 from vkc_pin.scene.scene import Scene
-from vkc_pin.task.phases import Task
+from vkc_pin.task.phases import Phase, Task
 
 __all__ = ["phase_geometries"]
 
@@ -52,6 +53,7 @@ class _Pairing:
         riding = [(ride.object, indices) for ride, indices in chain.ride_geometries.items()]
         for name, indices in (*held, *riding):
             self._labels += [f"{name}.{link_name(own_name(chain.collision.geometryObjects[i].name))}" for i in indices]
+        self._allowances = allowances(scene, options.dist_safe)
         self._obstacles = scene.obstacles
         self._boxes = _boxes([*chain.collision.geometryObjects]), _boxes(self._obstacles)
 
@@ -100,6 +102,8 @@ class _Pairing:
         attached = {i for name, indices in mine.items() if scene.objects[name].object.free for i in indices}
         above = [i for i in moving if i in attached or (i in robots and shapes[i].parentJoint > 1)]
         table = np.concatenate([np.array(pairs).reshape(-1, 3), self._with_obstacles(len(shapes), moving, above)])
+        labels += scene.obstacle_labels
+        table, near = self._allowed(phase, table, labels)
         if not len(table):
             expected = "collision geometry in robot or scene"
             raise InputError("no pair of geometries can collide", field=phase.name, expected=expected)
@@ -108,7 +112,7 @@ class _Pairing:
         shapes += self._obstacles
         part = PhaseGeometry(
             shapes=tuple(shapes),
-            labels=(*labels, *scene.obstacle_labels),
+            labels=tuple(labels),
             pairs=table[:, :2].astype(int),
             margins=table[:, 2],
             joint=np.array([shape.parentJoint for shape in shapes]),
@@ -116,6 +120,7 @@ class _Pairing:
             half=half,
             rotation=rotation,
             translation=translation,
+            neighbours=near,
             left=left,
         )
         return dataclasses.replace(part, eased=eased_pairs(self.scene, self.chain, self.task, number, part, self.options))
@@ -132,6 +137,45 @@ class _Pairing:
         if moves_as_one(self.scene, hold):
             return -np.inf
         return hand_clearance(self.scene, hold, link, self.options) or -CONTACT
+
+    def _allowed(self, phase: Phase, table: Floats, labels: Sequence[str]) -> tuple[Floats, list[Neighbours]]:
+        """Return pairs with their margins, shape (P, 3), as the scene allows them, and those that may be close for a while."""
+        if not self._allowances:
+            return table, []
+        numbers = {label: k for k, label in enumerate(dict.fromkeys(labels))}
+        own = np.array([numbers[label] for label in labels])[table[:, :2].astype(int)]
+        known = [one for one in self._allowances if one.first in numbers and one.second in numbers]
+        named = [numbers[label] for one in known for label in (one.first, one.second)]
+        some = np.flatnonzero(np.all(np.isin(own, named), axis=1))
+        own = np.sort(own[some], axis=1)
+        rows = {one: some[(own == np.sort([numbers[one.first], numbers[one.second]])).all(axis=1)] for one in known}
+        for one in known:
+            if not one.ranges:
+                table[rows[one], 2] = np.minimum(table[rows[one], 2], one.margin)
+        kept = np.isfinite(table[:, 2])
+        place, near = np.where(kept, np.cumsum(kept) - 1, -1), []
+        for one in known:
+            pairs, within = place[rows[one]][kept[rows[one]]], self._within(phase, one.ranges)
+            if one.ranges and len(pairs) and within is not None:
+                margin = EASED_SHARE * max(one.distance, 0.0) if np.isfinite(one.margin) else -np.inf
+                near.append(Neighbours(pairs, margin, *within))
+        return table[kept], near
+
+    def _within(self, phase: Phase, ranges: Mapping[str, tuple[float, float]]) -> tuple[Ints, Floats, Floats] | None:
+        """Return coordinates of the chain and limits, shape (m,) each; None if one that stands still is outside its own."""
+        columns, limits = list[int](), list[tuple[float, float]]()
+        for name, (lower, upper) in ranges.items():
+            if name in self.chain.names:
+                columns.append(self.chain.index(name))
+                limits.append((lower, upper))
+                continue
+            owner, _, joint = name.partition(".")
+            placed = self.scene.objects[owner]
+            value = phase.before.get(name, float(placed.state[placed.object.coordinates.index(joint)]))
+            if not lower <= value <= upper:
+                return None
+        low, high = np.array(limits).reshape(-1, 2).T
+        return np.array(columns, int), low, high
 
     def _own_pair(self, name: str, first: str, second: str) -> bool:
         """Return whether two links of an object, by their labels, can meet."""

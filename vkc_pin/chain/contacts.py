@@ -168,9 +168,12 @@ class ContactModel:
         for number in set(phase_of.tolist()):
             part, inside = self.phases[number], np.flatnonzero(phase_of == number)
             at, pairs, bounds = part.maybe_within(reach, rotations[inside], translations[inside], standing=standing)
+            margins = part.margins_at(pairs, waypoints[inside[at]], z, inside[at])
+            if part.neighbours:
+                asked = margins > -np.inf
+                at, pairs, bounds, margins = at[asked], pairs[asked], bounds[asked], margins[asked]
             if not len(at):
                 continue
-            margins = part.margins_at(pairs, waypoints[inside[at]])
             least = bounds - margins
             order = np.lexsort((pairs, least, at))
             at, pairs, margins, least = at[order], pairs[order], margins[order], least[order]

@@ -13,7 +13,7 @@ from vkc_pin.chain.chain import VirtualKinematicChain
 from vkc_pin.chain.phase_geometry import PhaseGeometry
 from vkc_pin.models.shapes import own_name, shape_distance, world_box
 from vkc_pin.options import Options
-from vkc_pin.scene.contact import EASED_TIME, hand_clearance, touching
+from vkc_pin.scene.contact import CONTACT, EASED_TIME, hand_clearance, touching
 from vkc_pin.scene.placed import PlacedObject, standing_geometry
 from vkc_pin.scene.resting import Ride
 from vkc_pin.scene.scene import Scene
@@ -33,7 +33,8 @@ def eased_pairs(
 
     A hand keeps the attachment's clearance from the object that it takes or lets go of. A free object rests on something where it
     is lifted from and where it is put down, with what rides on it; a frame that touches a target may come close to what the
-    target is on: there the margin is half the distance at the contact.
+    target is on: there the margin is half the distance at the contact. What a free object stands in at the start it may stand in
+    then.
 
     Args:
         scene: Where it happens.
@@ -48,14 +49,15 @@ def eased_pairs(
     last, steps = first + phase.segments, options.steps(EASED_TIME)
     shapes, eased = part.shapes, Eased()
 
-    def ease(moving: int, shape: coal.CollisionGeometry, where: pin.SE3, begin: int, end: int) -> None:
-        """Ease the pairs of a geometry that moves with what stands next to a shape."""
+    def ease(moving: int, shape: coal.CollisionGeometry, where: pin.SE3, begin: int, end: int, *, inside: bool = False) -> None:
+        """Ease the pairs of a geometry that moves with what stands next to a shape, or in it."""
         beside = part.within(float(part.margins.max()), *world_box(shape, where))
         for k in part.pairs_of(moving, beside).tolist():
             other = shapes[int(part.pairs[k, 1])]
             distance = shape_distance(shape, where, other.geometry, other.placement)
+            share = EASED_SHARE * max(distance, 0.0)
             if distance < part.margins[k]:
-                eased.setdefault(k, []).append((begin, end, EASED_SHARE * max(distance, 0.0)))
+                eased.setdefault(k, []).append((begin, end, distance if inside and distance < -CONTACT else share))
 
     for holds, begin, end in ((phase.leaves, first, first + steps), (phase.grasps, last - steps, last)):
         for hold in holds:
@@ -68,7 +70,8 @@ def eased_pairs(
         stands = {shape.name: shape.placement for shape in standing_geometry(placed)}
         for i in geometries:
             begin, end = (first, first + steps) if begins else (last - steps, last)
-            ease(i, shapes[i].geometry, stands[own_name(shapes[i].name)], begin, end)
+            new = begins and placed.name not in {hold.object for earlier in task.phases[:number] for hold in earlier.held}
+            ease(i, shapes[i].geometry, stands[own_name(shapes[i].name)], begin, end, inside=new)
     touches = [(goal, last - steps, last) for goal in phase.frames]
     touches += [(goal, first, first + steps) for goal in (before.frames if before else ())]
     for goal, begin, end in touches:

@@ -5,14 +5,32 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.arrays import Floats, Ints
+from vkc_pin.arrays import Bools, Floats, Ints
 from vkc_pin.distances.boxes import Boxes
 
-__all__ = ["PhaseGeometry"]
+__all__ = ["Neighbours", "PhaseGeometry"]
+
+
+class Neighbours(NamedTuple):
+    """Pairs that may be closer than others as long as some coordinates are within limits; see `scene.neighbours`.
+
+    Attributes:
+        pairs: Which, shape (k,).
+        margin: What they keep there [m]; -inf: nothing.
+        columns: The coordinates in z, shape (m,).
+        lower, upper: Their limits, shape (m,) each.
+    """
+
+    pairs: Ints
+    margin: float
+    columns: Ints
+    lower: Floats
+    upper: Floats
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -28,6 +46,7 @@ class PhaseGeometry:
         center, half: Bounding box per geometry, in the geometry's own frame: centre and half extents, shape (G, 3) [m].
         rotation, translation: Placement of each geometry in its joint's frame, shapes (G, 3, 3) and (G, 3).
         eased: Pair → (first waypoint, last waypoint, margin) [m]: between these it may come closer than `margins` says, so close.
+        neighbours: Pairs that may come closer than `margins` says where some coordinates have some values.
         left: Object → its geometries, for what the motion leaves behind at a place that it chooses.
     """
 
@@ -41,16 +60,31 @@ class PhaseGeometry:
     rotation: Floats
     translation: Floats
     eased: Mapping[int, Sequence[tuple[int, int, float]]] = field(default_factory=dict)
+    neighbours: Sequence[Neighbours] = ()
     left: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
-    def margins_at(self, pairs: Ints, waypoints: Ints) -> Floats:
-        """Return the clearances that pairs must keep at waypoints, both of shape (n,), shape (n,) [m]."""
+    def margins_at(self, pairs: Ints, waypoints: Ints, z: Floats | None = None, rows: Ints | None = None) -> Floats:
+        """Return the clearances that pairs must keep at waypoints, shape (n,) [m]; -inf: none.
+
+        Args:
+            pairs: Shape (n,).
+            waypoints: Shape (n,).
+            z: Configurations, shape (W, m); None: anywhere but where pairs are neighbours.
+            rows: Which of these each pair is looked at in, shape (n,).
+        """
         margins = self.margins[pairs]
         for pair, moments in self.eased.items():
             (which,) = np.nonzero(pairs == pair)
             for first, last, margin in moments:
                 inside = which[(first <= waypoints[which]) & (waypoints[which] <= last)]
                 margins[inside] = np.minimum(margins[inside], margin)
+        if z is None:
+            return margins
+        for near in self.neighbours:
+            values = z[:, near.columns]
+            holds: Bools = np.all((near.lower <= values) & (values <= near.upper), axis=1)
+            which = np.flatnonzero(np.isin(pairs, near.pairs) & holds[rows])
+            margins[which] = np.minimum(margins[which], near.margin)
         return margins
 
     def placed(self, where: Mapping[int, pin.SE3]) -> PhaseGeometry:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 from typing import Annotated, Any
@@ -17,6 +18,7 @@ __all__ = [
     "NotNegative",
     "Number",
     "Positive",
+    "Quaternion",
     "Schema",
     "Vector3",
     "count",
@@ -73,6 +75,18 @@ NotNegative = Annotated[Number, Field(ge=0.0)]
 Vector3 = Annotated[tuple[Number, Number, Number], count(3)]
 _is_name = re.compile(r"[^\s./]([^./]*[^\s./])?").fullmatch
 Name = Annotated[str, require(_is_name, "not a name", "text without '.', '/' or spaces around it")]
+
+
+def _normalised(value: tuple[float, ...]) -> tuple[float, ...]:
+    norm = math.hypot(*value)
+    if abs(norm - 1.0) > _UNIT:
+        raise fail("not a rotation", f"a quaternion [x, y, z, w] of length 1, not {norm:.4g}")
+    return tuple(number / norm for number in value)
+
+
+_UNIT = 1e-3  # by which a quaternion may miss length 1: files have three decimals
+Quaternion = Annotated[tuple[Number, Number, Number, Number], count(4), AfterValidator(_normalised)]
+"""A rotation as a unit quaternion, the scalar last: [x, y, z, w]; normalised."""
 
 
 class Schema(BaseModel):

@@ -13,7 +13,19 @@ from pydantic import Field, model_validator
 
 from vkc_pin.errors import InputError
 from vkc_pin.files.documents import Document, check, read_yaml
-from vkc_pin.files.fields import JointSchema, Name, NotNegative, Number, Positive, Schema, Vector3, count, fail, require
+from vkc_pin.files.fields import (
+    JointSchema,
+    Name,
+    NotNegative,
+    Number,
+    Positive,
+    Quaternion,
+    Schema,
+    Vector3,
+    count,
+    fail,
+    require,
+)
 from vkc_pin.files.resources import located
 from vkc_pin.files.urdf import load_urdf
 from vkc_pin.models.articulation import DEFAULT_ACCELERATION, DEFAULT_VELOCITY, ArticulatedObject, Attachment, Freedom, Latch
@@ -38,6 +50,7 @@ class AttachmentSchema(Schema):
     link: str
     position: Vector3 = (0.0, 0.0, 0.0)
     rpy: Vector3 | None = None
+    quaternion: Quaternion | None = None
     approach: Direction | None = None
     closing: Direction | None = None
     joint: Literal["fixed", "revolute", "prismatic", "cylindrical", "spherical"] = "fixed"
@@ -50,12 +63,13 @@ class AttachmentSchema(Schema):
 
     @model_validator(mode="after")
     def _consistent(self) -> AttachmentSchema:
-        unclear = (self.approach is None) != (self.closing is None) or (self.rpy is not None and self.approach is not None)
+        given = sum(way is not None for way in (self.rpy, self.quaternion, self.approach))
+        unclear = (self.approach is None) != (self.closing is None) or given > 1
         slanted = self.approach is not None and self.closing is not None and abs(np.dot(self.approach, self.closing)) > 1e-9
         has_axis, axis = self.joint in ("revolute", "prismatic", "cylindrical"), "joint revolute, prismatic or cylindrical"
         turns = self.joint == "cylindrical"
         for wrong, problem, expected in (
-            (unclear, "the tool's direction is not clear", "either rpy, or approach and closing"),
+            (unclear, "the tool's direction is not clear", "rpy, quaternion, or approach and closing"),
             (slanted, "approach and closing are not perpendicular", "two perpendicular directions"),
             (has_axis != (self.axis is not None), "axis and joint do not fit", f"an axis with {axis}, and only there"),
             (has_axis and self.limits is None, "limits missing", "limits [lower, upper] of the grasp's joint"),
@@ -155,6 +169,8 @@ def _attachment(item: AttachmentSchema, *, firm: bool) -> Attachment:
     if item.approach is not None and item.closing is not None:
         z, x = (np.array(v) / np.linalg.norm(v) for v in (item.approach, item.closing))
         rotation = np.column_stack([x, np.cross(z, x), z])
+    elif item.quaternion is not None:
+        rotation = pin.Quaternion(np.array(item.quaternion)).matrix()
     else:
         rotation = pin.rpy.rpyToMatrix(*(item.rpy or (0.0, 0.0, 0.0)))
     return Attachment(

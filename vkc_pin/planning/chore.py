@@ -78,6 +78,7 @@ def plan_chore(
     def run(settings: Settings) -> Plan:
         tasks = foresee(scene, asked, settings.options)
         check_active(settings.terms, [stretch for task in tasks for stretch in stretches(task)])
-        return SlidingWindow(scene, asked, window, settings).run()
+        through = dict.fromkeys(hold for task in tasks for hold in task.holds if hold.by is not None)
+        return SlidingWindow(scene.with_approaches(through, stacklevel=5), asked, window, settings).run()
 
     return guarded(run, settings, progress, planner)

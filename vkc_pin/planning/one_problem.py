@@ -18,6 +18,7 @@ from vkc_pin.planning.outcome import TIMES, outcome, spent, still
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.reasons.diagnosis import Blocked, explain, impossible
 from vkc_pin.planning.reasons.proofs import proofs
+from vkc_pin.planning.reasons.swept import swept
 from vkc_pin.planning.reasons.ways import ways
 from vkc_pin.planning.settings import Settings
 from vkc_pin.program.problem import TrajectoryProblem
@@ -166,7 +167,7 @@ class OneProblem:
     def _proofs(self, problem: TrajectoryProblem) -> list[str]:
         """Return what is certain, looked for once, and only when something has failed: most tasks can be done."""
         if self._proven is None:
-            self._proven = proofs(problem)
+            self._proven = swept(problem) or proofs(problem)
         return self._proven
 
     def _goals(self, problem: TrajectoryProblem) -> list[Blocked]:

@@ -147,8 +147,10 @@ def plan(
 
     def run(settings: Settings) -> Plan:
         task = compile_task(scene, steps, settings.options)
+        ready = scene.with_approaches((hold for hold in task.holds if hold.by is not None), stacklevel=5)
+        task = task if ready is scene else compile_task(ready, steps, settings.options)
         check_active(settings.terms, stretches(task))
-        return all_at_once(scene, task, settings) if joint else step_by_step(scene, task, settings)
+        return all_at_once(ready, task, settings) if joint else step_by_step(ready, task, settings)
 
     return guarded(run, settings, progress, planner)
 

@@ -7,6 +7,10 @@
 - What is lifted, put down, or begins or ends a ride, and what is next to it there, may be as near as they are there for
   `EASED_TIME`. So may a link that touches something, and what is at that place.
 - What rides and what it stands on move as one.
+- Links of objects that are closer than `Options.dist_safe` to what else stands there, at the start or with all joints at zero,
+  keep no clearance until their joints have taken them so far apart, and overlap only if they did there; see `neighbours`.
+- What a free object stands in where it is lifted for the first time, it may leave within `EASED_TIME`.
+- What the scene allows keeps the margin that the scene says, or none; see `Scene.allowed`.
 """
 
 from __future__ import annotations
@@ -15,12 +19,11 @@ from collections.abc import Collection
 
 from vkc_pin.options import Options
 from vkc_pin.scene.hold import Hold
+from vkc_pin.scene.neighbours import CONTACT
 from vkc_pin.scene.scene import Scene
 
 __all__ = ["CONTACT", "EASED_TIME", "grasped", "hand_clearance", "moves_as_one", "touching"]
 
-CONTACT = 1e-4
-"""Overlap that is contact: what stands on a table overlaps it by rounding [m]."""
 EASED_TIME = 1.0
 """For how long before and after a contact shapes may be close; at `Options.dt` a waypoint [s]."""
 

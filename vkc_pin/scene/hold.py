@@ -1,21 +1,30 @@
-"""Holds: what is held, where and through what, whether that fits the objects, and where it puts them."""
+"""Holds: what is held, where and through what, whether that fits the objects, from which side, and where it puts them."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from types import MappingProxyType
 
+import coal
+import numpy as np
 import pinocchio as pin
 
 from vkc_pin.arguments import instance, items, mapping, numbers, text
 from vkc_pin.errors import InputError, UnknownNameError, shown
-from vkc_pin.models.shapes import within_limits
-from vkc_pin.scene.placed import PlacedObject
+from vkc_pin.models.robot import Robot
+from vkc_pin.models.shapes import clearance, placed_shapes, within_limits
+from vkc_pin.scene.placed import PlacedObject, standing_geometry
 
-__all__ = ["Hold", "checked_holds", "holds_of", "in_hand", "in_order"]
+__all__ = ["Hold", "Solids", "checked_holds", "holds_of", "in_hand", "in_order", "misdirected"]
 
+Solids = Sequence[tuple[coal.CollisionGeometry, pin.SE3]]
+"""Shapes, each with where it is."""
+
+_DEEP = 0.01  # [m] of a hand in an object, or in the floor, that is no matter of how far it is open
+_WAY = (0.0, 0.04, 0.08)  # [m] before the grasp where a hand is looked at
 MOST_HELD = 50
 """So many things may be held at once: they are followed one through the other."""
 
@@ -156,3 +165,50 @@ def in_hand(
             holder = placed[hold.by.object].link_placement(str(hold.link)) if hold.by else tool()
             placed[hold.object] = dataclasses.replace(one, placement=holder * in_object.inverse())
     return MappingProxyType(placed)
+
+
+def misdirected(objects: Mapping[str, PlacedObject], holds: Iterable[Hold], robot: Robot, floor: Solids) -> list[Hold]:
+    """Return those of some holds whose hand comes out of the object or from below the floor, and would not from the other side.
+
+    Args:
+        objects: All, where they stand.
+        holds: What is to be held, where and through what.
+        robot: Whose hand it is, open as at home.
+        floor: The floor, if there is one.
+    """
+    found, own = list[Hold](), _hand(robot)
+    for hold in holds:
+        placed, hand = objects[hold.object], own
+        if hold.by is not None and hold.link is not None:
+            holder = objects[hold.by.object]
+            back = holder.link_placement(hold.link).inverse()
+            hand = [(shape, back * where) for shape, where in placed_shapes(standing_geometry(holder))]
+        solids = [*placed_shapes(standing_geometry(placed)), *floor]
+        if hold.attachment in placed.reversed or _free(placed, hold.attachment, hand, solids):
+            continue
+        if _free(placed.with_reversed(hold.attachment), hold.attachment, hand, solids):
+            found.append(hold)
+    return found
+
+
+def _free(placed: PlacedObject, attachment: str, hand: Solids, solids: Solids) -> bool:
+    """Return whether a hand, given in its tool frame, is nowhere deep in solids when it comes to an attachment."""
+    grasp = placed.object.attachment(attachment)
+    where = placed.link_placement(grasp.link)
+    for values in product(*({freedom.lower, 0.0, freedom.upper} for freedom in grasp.freedoms)):
+        tool = where * grasp.tool(values)
+        way = [tool * pin.SE3(np.eye(3), np.array([0.0, 0.0, -back])) for back in _WAY]
+        if clearance([(shape, at * local) for at in way for shape, local in hand], solids, reach=-_DEEP) >= -_DEEP:
+            return True
+    return False
+
+
+def _hand(robot: Robot) -> Solids:
+    """Return the shapes of a robot's touch links in its tool frame, with all joints at home."""
+    data, shapes = robot.model.createData(), robot.collision.createData()
+    q = robot.coordinates.q(np.concatenate([np.zeros(3), robot.home]))
+    pin.updateGeometryPlacements(robot.model, data, robot.collision, shapes, q)
+    pin.updateFramePlacements(robot.model, data)
+    back = data.oMf[robot.model.getFrameId(robot.tool_frame)].inverse()
+    own = [i for i in range(len(shapes.oMg)) if robot.link_of(i) in robot.touch_links]
+    return [(robot.collision.geometryObjects[i].geometry, back * shapes.oMg[i]) for i in own]

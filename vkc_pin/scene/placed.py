@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
+import numpy as np
 import pinocchio as pin
 
 from vkc_pin.arguments import mapping, number
@@ -15,6 +17,8 @@ from vkc_pin.models.articulation import ArticulatedObject
 from vkc_pin.models.shapes import copy_shape, within_limits
 
 __all__ = ["PlacedObject", "standing_geometry"]
+
+_OTHER_SIDE = pin.SE3(np.diag([1.0, -1.0, -1.0]), np.zeros(3))  # half a turn about the line on which fingers close
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,12 +30,14 @@ class PlacedObject:
         object: What it is.
         placement: Its base link in the world frame.
         state: Its joint values, shape (n,), [rad] or [m], in the order of `object.coordinates.names`.
+        reversed: The attachments that are approached from the other side than its description says.
     """
 
     name: str
     object: ArticulatedObject
     placement: pin.SE3
     state: Floats
+    reversed: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         state = ", ".join(f"{n}={v:.4g}" for n, v in zip(self.object.coordinates.names, self.state, strict=True))
@@ -51,6 +57,19 @@ class PlacedObject:
             index, value = coordinates.index(joint), number(given, f"{self.name}.{joint}")
             state[index] = within_limits(value, self.object.lower[index], self.object.upper[index], f"{self.name}.{joint}")
         return dataclasses.replace(self, state=state)
+
+    def with_reversed(self, attachment: str) -> PlacedObject:
+        """Return the object with an attachment approached from the other side, the fingers closing along the same line.
+
+        Raises:
+            UnknownNameError: It has no such attachment.
+        """
+        given = self.object.attachment(attachment)
+        turned = [dataclasses.replace(freedom, axis=_OTHER_SIDE.rotation @ freedom.axis) for freedom in given.freedoms]
+        changed = dataclasses.replace(given, placement=given.placement * _OTHER_SIDE, freedoms=tuple(turned))
+        attachments = MappingProxyType({**self.object.attachments, attachment: changed})
+        listed = tuple(sorted({*self.reversed} ^ {attachment}))
+        return dataclasses.replace(self, object=dataclasses.replace(self.object, attachments=attachments), reversed=listed)
 
     def link_placement(self, link: str) -> pin.SE3:
         """Return the placement of `link` in the world frame. Raises `UnknownNameError` if there is none."""

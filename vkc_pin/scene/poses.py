@@ -13,21 +13,23 @@ from vkc_pin.errors import InputError, shown
 
 __all__ = ["as_placement", "as_target"]
 
-_POSE = "a pinocchio.SE3, a 4 x 4 matrix or (x, y, z, roll, pitch, yaw)"
+_POSE = "a pinocchio.SE3, a 4 x 4 matrix, (x, y, z, roll, pitch, yaw) or (x, y, z, qx, qy, qz, qw)"
+_UNIT = 1e-3  # by which a quaternion may miss length 1
 
 
 def as_placement(pose: Any, *, name: str = "pose") -> pin.SE3:
     """Return `pose` as a `pinocchio.SE3`.
 
     Args:
-        pose: An SE3, a 4 × 4 homogeneous matrix, or (x, y, z, roll, pitch, yaw) in [m] and [rad].
+        pose: An SE3, a 4 × 4 homogeneous matrix, (x, y, z, roll, pitch, yaw) in [m] and [rad], or (x, y, z, qx, qy, qz, qw) with
+            a unit quaternion, the scalar last.
         name: The argument's name, for the message.
 
     Raises:
         InputError: It is none of these, not finite, further away than `LARGEST`, or its rotation is no rotation.
     """
     array = numbers(pose.homogeneous if isinstance(pose, pin.SE3) else pose, name, _POSE, problem="not a pose")
-    if array.shape not in ((6,), (4, 4)):
+    if array.shape not in ((6,), (7,), (4, 4)):
         got = f"an array of shape {array.shape}" if array.ndim else shown(pose)
         raise InputError("not a pose", field=name, expected=_POSE, got=got)
     if not np.all(np.isfinite(array)):
@@ -37,6 +39,11 @@ def as_placement(pose: Any, *, name: str = "pose") -> pin.SE3:
         raise InputError("out of range", field=name, expected=expected, got=array.tolist())
     if array.shape == (6,):
         return pin.SE3(pin.rpy.rpyToMatrix(*array[3:]), array[:3])
+    if array.shape == (7,):
+        norm = float(np.linalg.norm(array[3:]))
+        if abs(norm - 1.0) > _UNIT:
+            raise InputError("not a rotation", field=name, expected="a unit quaternion (x, y, z, w)", got=array[3:].tolist())
+        return pin.SE3(pin.Quaternion(array[3:] / norm).matrix(), array[:3])
     rotation = array[:3, :3]
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-6 or np.linalg.det(rotation) < 0:
         raise InputError("its upper left 3 x 3 block is not a rotation", field=name, got=rotation.tolist())
@@ -54,7 +61,7 @@ def as_target(target: Any, *, name: str) -> pin.SE3 | tuple[float, float, float]
     if isinstance(target, pin.SE3):
         return as_placement(target, name=name)
     point = numbers(target, name, f"a point (x, y, z), or a pose: {_POSE}", problem="not a pose or a point")
-    if point.ndim < 2 and point.shape not in ((3,), (6,)):
+    if point.ndim < 2 and point.shape not in ((3,), (6,), (7,)):
         expected = f"a point (x, y, z), or a pose: {_POSE}"
         raise InputError("not a pose or a point", field=name, expected=expected, got=shown(target))
     if point.shape != (3,):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,8 @@ from vkc_pin.errors import InputError, shown
 from vkc_pin.files.resources import file_path, located
 from vkc_pin.models.shapes import clearance, placed_shapes, within_limits
 from vkc_pin.notebook import show
-from vkc_pin.scene.hold import Hold, checked_holds, holds_of, in_hand
+from vkc_pin.scene.hold import Hold, checked_holds, holds_of, in_hand, misdirected
+from vkc_pin.scene.neighbours import warn_of_overlaps
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.placed import PlacedObject, standing_geometry
 from vkc_pin.scene.poses import as_placement
@@ -56,7 +58,9 @@ class Scene:
         arena: The floor that belongs to the scene: (x_min, x_max, y_min, y_max) [m].
         start_region: Where `sample_start` draws from, if the scene says so.
         holds: What the robot holds at the start, each hold after the one it depends on.
+        allowed: Pairs of links, by label, that may be close, and what they must keep: a margin [m], or -inf if nothing.
         described: What it was made of; `document` takes from it what cannot be told from the rest: robot, obstacles, files.
+        memory: What was found out about it and can serve changed copies; makes no difference to anything but time.
     """
 
     name: str
@@ -73,7 +77,9 @@ class Scene:
     arena: tuple[float, float, float, float]
     start_region: RegionSchema | None
     holds: tuple[Hold, ...]
+    allowed: Mapping[frozenset[str], float]
     described: SceneSchema
+    memory: dict[Any, Any] = dataclasses.field(default_factory=dict, repr=False)
 
     def __repr__(self) -> str:
         return (
@@ -111,7 +117,7 @@ class Scene:
         from vkc_pin.scene.scene_file import scene_fields
 
         fields = scene_fields(Document(mapping(document, "document")), file_path(folder, "folder"))
-        return Scene(**fields)._with()
+        return _checked(Scene(**fields)._with())
 
     def with_start(self, base: ArrayLike | None = None, arm: ArrayLike | None = None) -> Scene:
         """Return the scene with another start.
@@ -180,6 +186,25 @@ class Scene:
         """
         holds = holds_of(held, by, at) if isinstance(held, Mapping) else held
         return self._with(holds=checked_holds(self.objects, holds))
+
+    def with_approaches(self, holds: Iterable[Hold], *, stacklevel: int = 2) -> Scene:
+        """Return the scene with attachments reversed to which the hand would come out of the object or from below the floor.
+
+        Each of them gives a warning. Those from whose other side it would be no better stay as they are.
+
+        Args:
+            holds: What is to be held, where and through what.
+            stacklevel: Whose line the warnings name, as for `warnings.warn`.
+        """
+        floor = [shape for shape, label in zip(self.obstacles, self.obstacle_labels, strict=True) if label == FLOOR]
+        objects = dict(self.objects)
+        for hold in misdirected(self.objects, holds, self.robot, placed_shapes(floor)):
+            objects[hold.object] = objects[hold.object].with_reversed(hold.attachment)
+            what = f"{hold.frame or 'the hand'} would come to {hold.object}.{hold.attachment}"
+            text = f"{what} out of the object or from below the floor"
+            hint = f"turn its approach, the frame, or say `reversed: [{hold.attachment}]` of the object"
+            warnings.warn(f"{self.file or self.name}: {text}: it comes from the other side; {hint}", stacklevel=stacklevel)
+        return self._with(objects=MappingProxyType(objects)) if objects != dict(self.objects) else self
 
     def _placed(self, name: str) -> PlacedObject:
         return self.objects[known(name, self.objects, "object")]
@@ -250,6 +275,8 @@ class Scene:
 def load_scene(name_or_path: str | Path) -> Scene:
     """Load a scene: by the name of a file in `scenes`, or by the path of a scene file (.yaml).
 
+    What can move and stands in something else gives a warning.
+
     Raises:
         UnknownNameError: There is no such scene, or it names something that does not exist.
         InputError: Something in the file is wrong; the error says what, in which file, line and field.
@@ -258,4 +285,11 @@ def load_scene(name_or_path: str | Path) -> Scene:
     from vkc_pin.scene.scene_file import scene_fields
 
     file = located(name_or_path, "scenes", "*.yaml", what="scene")
-    return Scene(**scene_fields(read_yaml(file), file.parent))._with()
+    return _checked(Scene(**scene_fields(read_yaml(file), file.parent))._with())
+
+
+def _checked(scene: Scene) -> Scene:
+    """Return a scene that was made of a description; warn of what that may not have meant."""
+    warn_of_overlaps(scene, str(scene.file or scene.name))
+    loose = ((name, placed.object.attachments) for name, placed in scene.objects.items() if name not in scene.held)
+    return scene.with_approaches((Hold(name, one) for name, attachments in loose for one in attachments), stacklevel=4)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -13,6 +14,7 @@ import pinocchio as pin
 from vkc_pin.arrays import Floats
 from vkc_pin.files.documents import Document, check
 from vkc_pin.files.resources import file_path
+from vkc_pin.files.srdf import read_srdf
 from vkc_pin.models.grafting import clean
 from vkc_pin.models.object_file import load_object
 from vkc_pin.models.robot import Robot
@@ -66,6 +68,7 @@ def scene_fields(document: Document, folder: Path) -> dict[str, Any]:
         "arena": arena,
         "start_region": description.start_region,
         "holds": _holds(document, description.start.held, objects),
+        "allowed": MappingProxyType(_allowed(document, description, folder, robot, objects)),
         "described": description,
     }
 
@@ -79,7 +82,7 @@ def document_of(fields: Mapping[str, Any]) -> dict[str, Any]:
         fields: The attributes of a `Scene`, by name.
     """
     described, start, objects, region = (fields[key] for key in ("described", "start", "objects", "start_region"))
-    plain = described.model_dump(mode="json", include={"robot", "obstacles", "objects"}, exclude_none=True)
+    plain = described.model_dump(mode="json", include={"robot", "obstacles", "objects", "allow"}, exclude_none=True)
     held = {}
     for hold in fields["holds"]:
         said = {"attachment": hold.attachment, "by": hold.frame, "at": list(hold.at) if any(hold.at) else None}
@@ -87,9 +90,13 @@ def document_of(fields: Mapping[str, Any]) -> dict[str, Any]:
     for item, entry in zip(described.objects, plain["objects"], strict=True):
         placed = objects[item.name]
         entry["state"] = dict(zip(placed.object.coordinates.names, placed.state.tolist(), strict=True))
+        entry.pop("reversed", None)
+        if placed.reversed:
+            entry["reversed"] = list(placed.reversed)
         in_hand = placed.object.free and item.name in held
         if not in_hand and not np.array_equal(placed.placement.homogeneous, _pose(item).homogeneous):
-            entry.pop("yaw", None)
+            for orientation in ("yaw", "quaternion"):
+                entry.pop(orientation, None)
             entry["position"] = placed.placement.translation.tolist()
             entry["rpy"] = pin.rpy.matrixToRpy(placed.placement.rotation).tolist()
     at_home = described.start.arm is None and np.array_equal(start[3:], fields["robot"].home)
@@ -102,6 +109,7 @@ def document_of(fields: Mapping[str, Any]) -> dict[str, Any]:
         "floor": fields["floor"],
         "obstacles": plain["obstacles"],
         "objects": plain["objects"],
+        **({"allow": plain["allow"]} if plain["allow"] else {}),
     }
 
 
@@ -166,9 +174,41 @@ def _holds(document: Document, held: Mapping[str, schema.HeldSchema], objects: M
         return checked_holds(objects, holds_of(attachments, by, at))
 
 
+def _allowed(
+    document: Document, description: schema.SceneSchema, folder: Path, robot: Robot, objects: Mapping[str, PlacedObject]
+) -> dict[frozenset[str], float]:
+    """Return pairs of labels of links that may be close, and their margin [m]; of those named twice the least."""
+    labels = {link: [link] for link in robot.links}
+    for name, placed in objects.items():
+        own = [f"{name}.{link}" for link in placed.object.links]
+        labels |= {label: [label] for label in own} | {name: own}
+    labels |= {item.name: [item.name] for item in description.obstacles} | ({FLOOR: [FLOOR]} if description.floor else {})
+    found: dict[frozenset[str], float] = {}
+    for number, item in enumerate(description.allow):
+        pairs: Iterable[tuple[str, ...]] = [item.pair] if item.pair is not None else []
+        if item.srdf is not None:
+            short = isinstance(document.data["allow"][number], str)
+            file = _file(document, ("allow", number, *(() if short else ("srdf",))), folder, item.srdf)
+            pairs = read_srdf(file, links=labels).allowed
+        for pair in pairs:
+            for place, name in enumerate(pair):
+                if name not in labels:
+                    short = isinstance(document.data["allow"][number], list | tuple)
+                    raise document.unknown(
+                        ("allow", number, *(() if short else ("pair",)), place), "link, object or obstacle", name, labels
+                    )
+            margin = -np.inf if item.margin is None else item.margin
+            for both in itertools.product(*(labels[name] for name in pair)):
+                found[frozenset(both)] = min(margin, found.get(frozenset(both), np.inf))
+    return found
+
+
 def _pose(item: schema.PoseSchema) -> pin.SE3:
     roll, pitch, yaw = item.rpy or (0.0, 0.0, item.yaw or 0.0)
-    return clean(pin.SE3(pin.rpy.rpyToMatrix(roll, pitch, yaw), np.array(item.position)))
+    rotation = pin.rpy.rpyToMatrix(roll, pitch, yaw)
+    if item.quaternion is not None:
+        rotation = pin.Quaternion(np.array(item.quaternion)).matrix()
+    return clean(pin.SE3(rotation, np.array(item.position)))
 
 
 def _file(document: Document, path: tuple[str | int, ...], folder: Path, name: str) -> Path:
@@ -188,6 +228,9 @@ def _object(document: Document, path: tuple[str | int, ...], item: schema.Placed
     for joint, value in item.state.items():
         with document.at((*path, "state", joint)):
             placed = placed.with_state({joint: value})
+    for number, attachment in enumerate(item.reversed):
+        with document.at((*path, "reversed", number)):
+            placed = placed.with_reversed(attachment)
     return placed
 
 

@@ -9,10 +9,11 @@ import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
 from vkc_pin.arrays import Floats
-from vkc_pin.files.fields import Name, Number, Positive, Schema, Vector3, count, fail, require, text_for
+from vkc_pin.files.fields import Name, Number, Positive, Quaternion, Schema, Vector3, count, fail, require, text_for
 
 __all__ = [
     "COLOURS",
+    "AllowSchema",
     "BoxSchema",
     "CapsuleSchema",
     "CylinderSchema",
@@ -89,16 +90,17 @@ Scale = Annotated[Size, BeforeValidator(_triple)]
 
 
 class PoseSchema(Schema):
-    """Where something stands: position [m], and orientation as roll, pitch, yaw [rad] or as yaw alone."""
+    """Where something stands: position [m], and orientation as roll, pitch, yaw [rad], yaw alone, or quaternion [x, y, z, w]."""
 
     position: Vector3
     rpy: Vector3 | None = None
     yaw: Number | None = None
+    quaternion: Quaternion | None = None
 
     @model_validator(mode="after")
     def _one_orientation(self) -> PoseSchema:
-        if self.rpy is not None and self.yaw is not None:
-            raise fail("two orientations", "either rpy or yaw")
+        if sum(given is not None for given in (self.rpy, self.yaw, self.quaternion)) > 1:
+            raise fail("two orientations", "one of rpy, yaw and quaternion")
         return self
 
 
@@ -162,11 +164,15 @@ ObstacleSchema = Annotated[
 
 
 class PlacedObjectSchema(PoseSchema):
-    """An articulated object: `type` names its description or its file, `state` its joint values (others are 0)."""
+    """An articulated object: `type` names its description or its file, `state` its joint values (others are 0).
+
+    Attachments that are `reversed` are approached from the other side than the object's description says.
+    """
 
     name: Name
     type: str
     state: Mapping[str, Number] = Field(default_factory=dict)
+    reversed: tuple[str, ...] = ()
 
 
 class SceneRobotSchema(Schema):
@@ -214,6 +220,26 @@ class RegionSchema(Schema):
             yield rng.uniform(low, high)
 
 
+def _allow(value: Any) -> Any:
+    if isinstance(value, str):
+        return {"srdf": value}
+    return {"pair": value} if isinstance(value, list | tuple) else value
+
+
+class AllowSchema(Schema):
+    """A pair of links, objects or obstacles that may be close, and the margin that it keeps (None: none), or an SRDF."""
+
+    pair: Annotated[tuple[str, str], count(2)] | None = None
+    srdf: str | None = None
+    margin: Number | None = None
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> AllowSchema:
+        if (self.pair is None) == (self.srdf is None) or (self.srdf is not None and self.margin is not None):
+            raise fail("not what may be close", "[one, other], {pair: [one, other], margin: 0.005}, or the name of an SRDF file")
+        return self
+
+
 class SceneSchema(Schema):
     """A scene file."""
 
@@ -225,3 +251,4 @@ class SceneSchema(Schema):
     floor: bool = True
     obstacles: Annotated[tuple[ObstacleSchema, ...], Field(max_length=_MOST)] = ()
     objects: tuple[PlacedObjectSchema, ...] = ()
+    allow: tuple[Annotated[AllowSchema, BeforeValidator(_allow)], ...] = ()

@@ -120,7 +120,8 @@ def grid_shapes(problem: TrajectoryProblem, phase: int, z: Floats) -> tuple[list
         z: Its configuration with the base at the origin, shape (n,).
 
     Returns:
-        Shapes in the base's frame, those of the robot first, each after the joint that carries it; shapes in the world.
+        Shapes in the base's frame, those of the robot first, each after the joint that carries it; shapes in the world that the
+        base may not touch.
     """
     chain, part = problem.chain, problem.contacts.phases[phase]
     rotations, translations = chain.joint_placements(z[None])
@@ -131,9 +132,11 @@ def grid_shapes(problem: TrajectoryProblem, phase: int, z: Floats) -> tuple[list
         joint = shape.parentJoint
         carrier = pin.SE3(rotations[0, joint], translations[0, joint])
         moving.append((joint, (shape.geometry, carrier * shape.placement)))
+    base = [i for i in robot if part.shapes[i].parentJoint < _ARM_BASE]
+    hits = set(part.pairs[np.isin(part.pairs[:, 0], base), 1].tolist())  # but for what it may touch
     standing: list[Shape] = [
         (shape.geometry, shape.placement)
-        for shape, label in zip(part.shapes, part.labels, strict=True)
-        if shape.parentJoint == 0 and label != FLOOR
+        for i, (shape, label) in enumerate(zip(part.shapes, part.labels, strict=True))
+        if shape.parentJoint == 0 and label != FLOOR and (i in hits or not base)
     ]
     return moving, standing

@@ -13,6 +13,7 @@ from vkc_pin.motion.carrying import FreeObjects
 from vkc_pin.options import Options
 from vkc_pin.scene.contact import CONTACT, EASED_TIME, grasped, hand_clearance, moves_as_one, touching
 from vkc_pin.scene.hold import Hold
+from vkc_pin.scene.neighbours import Allowance, allowances
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.steps import Grasp, Step, Touch
 from vkc_pin.validation.distances import Solids
@@ -66,19 +67,35 @@ class _Windows:
         self.rides = FreeObjects(self.scene, self.trajectory).rides
 
     def of(self, steps: Sequence[Step]) -> Iterator[Window]:
+        for one in allowances(self.scene, self.options.dist_safe):
+            yield from self._allowed(one)
         holds = [set(phase.holds) for phase in self.trajectory.phases]
         for hold, first, last in self._runs([set(self.scene.holds), *holds]):
             yield from self._hand(hold, first, last)
         yield from self._grasps([step for step in steps if isinstance(step, Grasp)])
-        for owner, first, last in self._runs(self._carried()):
-            yield from (self._beside(owner, at, self._until(at)) for at in ([first] if first is not None else []))
-            yield from (self._beside(owner, at, self._since(at), begin=False) for at in ([last] if last is not None else []))
+        moved = {name for name in self.scene.held if self.scene.objects[name].object.free}
+        for owner, first, last in sorted(self._runs(self._carried()), key=lambda run: -1 if run[1] is None else run[1]):
+            for at in [first] if first is not None else []:
+                yield from self._beside(owner, at, self._until(at), new=owner not in moved)
+            for at in [last] if last is not None else []:
+                yield from self._beside(owner, at, self._since(at), begin=False)
+            moved.add(owner)
         for phase, riding in zip(self.trajectory.phases, self.rides, strict=True):
             for owner, label in riding.items():
                 as_one = {other for other, on in riding.items() if on == label and other != owner}
                 mates = [k for k, one in enumerate(self.labels) if one == label or one.partition(".")[0] in as_one]
                 yield Window(self._pairs(self._shapes(owner), mates), phase.first, phase.last, -np.inf, together=True)
         yield from self._touches([step for step in steps if isinstance(step, Touch)])
+
+    def _allowed(self, one: Allowance) -> Iterator[Window]:
+        """Yield when two links may be closer than others: always, or while joints are where that holds."""
+        pairs, count = self._between({one.first}, {one.second}), len(self.steps) + 1
+        rows = self.samples.z[self.samples.waypoint_rows]
+        holds = one.holds(self.samples.world.coordinates.names, rows)
+        contact, together = max(CONTACT, -one.margin), one.margin == -np.inf
+        for begin, end in np.flatnonzero(np.diff(holds, prepend=False, append=False)).reshape(-1, 2).tolist():
+            if len(pairs):
+                yield Window(pairs, begin, min(end, count) - 1, one.margin, contact, together)
 
     def _hand(self, hold: Hold, first: int | None, last: int | None) -> Iterator[Window]:
         """Yield what a hold that lasts between two waypoints, or from the start or up to the end, means for what holds."""
@@ -115,14 +132,20 @@ class _Windows:
         through = Hold(owner, self.scene.objects[owner].object.attachment().name) if step.by else None
         return Hold(step.object, attachment, through, link or None)
 
-    def _beside(self, owner: str, at: int, other: int, *, begin: bool = True) -> Window:
-        """Return what a free object is next to where it begins or ends to be carried, at waypoint `at`."""
+    def _beside(self, owner: str, at: int, other: int, *, begin: bool = True, new: bool = False) -> Iterator[Window]:
+        """Yield what a free object is next to where it begins or ends to be carried, at waypoint `at`.
+
+        Where it is lifted for the first time (`new`), it may be as deep in something as it stood there.
+        """
         mine = self._shapes(owner)
         pairs = self._pairs(mine, [k for k in range(self.robots, len(self.labels)) if k not in mine])
         placed, here = self.solids.at(self.q[[at]]), np.zeros(len(pairs), int)
         pairs = pairs[placed.bounds(here, pairs) < self.options.dist_safe]
-        pairs = pairs[placed.distances(here[: len(pairs)], pairs) < self.options.dist_safe]
-        return Window(pairs, at if begin else other, other if begin else at, 0.0)
+        distances = placed.distances(here[: len(pairs)], pairs)
+        first, last = (at, other) if begin else (other, at)
+        yield Window(pairs[distances < self.options.dist_safe], first, last, 0.0)
+        for k in np.flatnonzero(distances < -CONTACT).tolist() if new else ():
+            yield Window(pairs[[k]], first, last, float(distances[k]), CONTACT - float(distances[k]))
 
     def _touches(self, steps: Sequence[Touch]) -> Iterator[Window]:
         """Yield what is at the target of a touch, wherever a phase ends with that."""

@@ -14,6 +14,7 @@ from vkc_pin.arguments import instance
 from vkc_pin.motion.carrying import FreeObjects
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.options import Options
+from vkc_pin.scene.neighbours import allowances
 from vkc_pin.scene.resting import LEVEL, tilt
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.steps import Step, as_list
@@ -282,7 +283,11 @@ class _Check:
         solids = Solids(samples.world)
         near = windows(samples, solids, self.steps, self.options)
         pairs = PairTable(self.scene, solids, self.trajectory, self.options.dist_safe, windows=near)
+        neighbours = [one for one in allowances(self.scene, self.options.dist_safe) if one.margin == -np.inf]
         for hit in sweep(pairs, samples.z, samples.waypoint_rows):
+            named = [one for one in neighbours if one.between(hit.first, hit.second)]
+            if any(one.holds(samples.world.coordinates.names, samples.z[[hit.row]])[0] for one in named):
+                continue  # on the way to the waypoint at which they are neighbours no more, or first are
             smallest = min(smallest, hit.distance) if hit.margin > -np.inf else smallest
             subject, millimetres = f"{hit.first} – {hit.second}", 1e3 * abs(hit.distance)
             if hit.distance < -hit.contact:

@@ -39,7 +39,9 @@ def impossible(problem: TrajectoryProblem) -> list[Violation]:
     """Return what is wrong before anything moves: a start in collision, a hand off what it holds, goals beyond limits."""
     found = []
     contacts = problem.contacts.evaluate(problem.start[None], np.array([0]), reach=0.0)
-    for (first, second), distance in zip(contacts.pair, contacts.distance, strict=True):
+    for (first, second), distance, margin in zip(contacts.pair, contacts.distance, contacts.margin, strict=True):
+        if distance >= margin:  # as the scene allows
+            continue
         labels = problem.contacts.phases[0].labels
         subject = f"{labels[first]} – {labels[second]}"
         detail = f"overlap by {-1e3 * distance:.1f} mm at the start"

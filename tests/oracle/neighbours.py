@@ -1,0 +1,152 @@
+"""Pairs that may be close for longer than a moment: those that a scene allows, and what is built as close as that.
+
+A link of an object that no hand can carry away, and something else that stands there, are neighbours if they are closer than the
+clearance at the start or with every joint at zero: for as long as each of their joints is between the values at which it alone
+would take them that far apart. Neighbours need no clearance, and those that overlap where they stand may do so.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .riding import distance
+
+if TYPE_CHECKING:
+    from .stage import Solid, Stage, World
+    from .urdf import Shape
+
+__all__ = ["Neighbours"]
+
+NEARLY = 1e-3  # [m] short of the clearance that is as good as having it
+RESTS = 1e-4  # [m] of overlap that is none
+VALUES = 150  # of a joint on its way to a limit
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two links, by label; whether they may overlap; and joint, as "<object>.<joint>" → between which values."""
+
+    links: frozenset[str]
+    inside: bool
+    joints: Mapping[str, tuple[float, float]]
+
+
+class Neighbours:
+    """All of a world."""
+
+    def __init__(self, world: World) -> None:
+        self.world, self.safe = world, float(world.plan.options["dist_safe"])
+        self.listed = list(self._listed())
+        self.fixed = {name: thing for name, thing in world.things.items() if not thing.free}
+        zero = {
+            name: {joint: float(np.clip(0.0, *thing.limits[joint][:2])) for joint in thing.state}
+            for name, thing in self.fixed.items()
+        }
+        self.pairs = [*self._found({name: thing.state for name, thing in self.fixed.items()}), *self._found(zero)]
+
+    def _listed(self) -> list[tuple[str, str, float]]:
+        found = []
+        for item in self.world.plan.scene.get("allow") or ():
+            if item.get("srdf"):
+                root = ElementTree.parse(self.world.plan.folder / item["srdf"]).getroot()
+                found += [(each.get("link1"), each.get("link2"), -np.inf) for each in root.iter("disable_collisions")]
+            else:
+                margin = item.get("margin")
+                found.append((*item["pair"], -np.inf if margin is None else float(margin)))
+        return found
+
+    def margin(self, one: Solid, other: Solid) -> float:
+        """Return the clearance that a scene asks of two shapes; infinite if it says nothing."""
+
+        def means(name: str, part: Solid) -> bool:
+            return part.label == name or (part.owner == name and name in self.world.things)
+
+        return min(
+            (m for a, b, m in self.listed if (means(a, one) and means(b, other)) or (means(a, other) and means(b, one))),
+            default=np.inf,
+        )
+
+    def during(self, stage: Stage, one: Solid, other: Solid) -> tuple[np.ndarray, np.ndarray]:
+        """Return at which samples two shapes need no clearance, and at which they may overlap as well."""
+        close, inside = np.zeros((2, len(stage.times)), bool)
+        for pair in self.pairs:
+            if pair.links == {one.label, other.label}:
+                holds = np.ones(len(stage.times), bool)
+                for name, (low, high) in pair.joints.items():
+                    index, (owner, _, joint) = self.world.plan.index(name), name.partition(".")
+                    values = stage.columns[:, index] if index is not None else np.array([self.fixed[owner].state[joint]])
+                    holds &= (low <= values) & (values <= high)
+                close |= holds
+                inside |= holds & pair.inside
+        return close, inside
+
+    def _found(self, state: dict[str, dict[str, float]]) -> list[Pair]:
+        """Return what is close where all objects that stand fixed are in some state."""
+        links = {name: thing.tree.links(state[name], None, thing.tree.urdf.links) for name, thing in self.fixed.items()}
+        parts = {}
+        for name, thing in self.fixed.items():
+            for shape in thing.tree.urdf.shapes:
+                place = thing.at @ links[name][shape.link] @ shape.place
+                parts.setdefault(f"{name}.{shape.link}", []).append((shape, place))
+        for solid in self.world.obstacles:
+            if solid.owner != "floor":
+                parts.setdefault(solid.label, []).append((solid.shape, solid.at))
+        found, done = [], set()
+        for label in parts:
+            for other in parts:
+                owners = {label.partition(".")[0], other.partition(".")[0]}
+                if not self._joints(label) or len(owners) == 1 or frozenset((label, other)) in done:
+                    continue
+                apart = min(self._apart(a, b) for a in parts[label] for b in parts[other])
+                if apart < self.safe - NEARLY:
+                    done.add(frozenset((label, other)))
+                    ranges = {}
+                    for mine, theirs in ((label, other), (other, label)):
+                        owner = mine.partition(".")[0]
+                        for joint in self._joints(mine):
+                            ranges[f"{owner}.{joint}"] = self._range(mine, joint, state[owner], parts[theirs])
+                    found.append(Pair(frozenset((label, other)), apart <= -RESTS, ranges))
+        return found
+
+    def _apart(self, one: tuple[Shape, object], other: tuple[Shape, object], k: int = 0) -> float:
+        (a, here), (b, there) = one, other
+        i, j = (0 if len(place.turn) == 1 else k for place in (here, there))
+        centres = here.turn[i] @ a.centre + here.at[i], there.turn[j] @ b.centre + there.at[j]
+        least = float(np.linalg.norm(centres[0] - centres[1])) - a.radius - b.radius
+        return least if least > self.safe else distance(a.solid, here, b.solid, there, k)
+
+    def _joints(self, label: str) -> list[str]:
+        owner, _, link = label.partition(".")
+        if owner not in self.fixed:
+            return []
+        urdf = self.fixed[owner].tree.urdf
+        return [joint for joint in urdf.path_to(link) if urdf.moves(joint)]
+
+    def _range(self, label: str, joint: str, state: dict[str, float], others: list[tuple[Shape, object]]) -> tuple[float, float]:
+        """Return between which values of a joint a link stays closer to others than the clearance."""
+        owner, _, link = label.partition(".")
+        thing = self.fixed[owner]
+
+        def apart(values: np.ndarray) -> np.ndarray:
+            place = thing.tree.links({**state, joint: values}, None, [link])[link]
+            own = [(shape, thing.at @ place @ shape.place) for shape in thing.tree.urdf.shapes if shape.link == link]
+            return np.array([min(self._apart(a, b, k) for a in own for b in others) for k in range(len(values))])
+
+        ends = []
+        for limit, sign in zip(thing.limits[joint][:2], (-1.0, 1.0), strict=True):
+            values = np.linspace(state[joint], limit if np.isfinite(limit) else state[joint] + sign * np.pi, VALUES)
+            beyond = np.flatnonzero(apart(values) >= self.safe)
+            if not len(beyond):
+                ends.append(sign * np.inf)
+                continue
+            near, far = values[max(beyond[0] - 1, 0)], values[beyond[0]]
+            for _ in range(30):
+                middle = (near + far) / 2
+                near, far = (near, middle) if apart(np.array([middle]))[0] >= self.safe else (middle, far)
+            ends.append(float(far))
+        return ends[0], ends[1]

@@ -1,0 +1,57 @@
+"""What a joint of an object takes its links into on the way to where it is to go, whoever moves it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vkc_pin.planning.reasons.proofs import PROVEN
+from vkc_pin.program.problem import TrajectoryProblem
+from vkc_pin.scene.neighbours import Standing, allowances
+from vkc_pin.scene.obstacles import FLOOR
+from vkc_pin.task.phases import Phase
+
+__all__ = ["swept"]
+
+_SURE = 1e-3  # [m] of overlap: more than validation lets pass
+_VALUES = 200  # of a joint between begin and goal
+
+
+def swept(problem: TrajectoryProblem) -> list[str]:
+    """Return why joints of objects cannot get to where a task wants them, for certain; no line at all proves nothing.
+
+    A link that one joint alone moves is, on any motion, in all places between begin and goal, and so in what stands there.
+    """
+    for phase in problem.task.phases:
+        for coordinate in phase.values:
+            text = _hit(problem, phase, coordinate)
+            if text:
+                return [f"{phase.name}: no way for {coordinate}, {PROVEN}{text}"]
+    return []
+
+
+def _hit(problem: TrajectoryProblem, phase: Phase, coordinate: str) -> str:
+    """Return what a joint takes a link into in a phase; empty if nothing is certain."""
+    scene, (name, _, joint) = problem.scene, coordinate.partition(".")
+    placed = scene.objects[name]
+    if placed.object.free:
+        return ""
+    begin, end = phase.before[coordinate], float(np.clip(phase.values[coordinate], *problem.limits(coordinate)))
+    values = np.linspace(begin, end, _VALUES)
+    fixed = {owner: one for owner, one in scene.objects.items() if not one.object.free}
+    standing, known = Standing(scene, fixed), allowances(scene, problem.options.dist_safe)
+    links = [label for label in (f"{name}.{link}" for link in placed.object.links) if standing.joints(label) == [joint]]
+    others = {f"{owner}.{link}" for owner, one in fixed.items() if owner != name for link in one.object.links}
+    others = {label for label in others if not standing.joints(label)} | set(scene.obstacle_labels) - {FLOOR}
+    deepest, text = -_SURE, ""
+    for label in links:
+        for other in sorted(others & standing.labels):
+            distance = standing.distance(label, other, placed.object.coordinates.index(joint), 0.0)(values)
+            for one in known:
+                if one.between(label, other):
+                    distance[one.holds([coordinate], values[:, None])] += max(0.0, -one.margin)
+            worst = int(np.argmin(distance))
+            if distance[worst] < deepest:
+                deepest = float(distance[worst])
+                where = f"between {begin:.3g} and {end:.3g}, at {values[worst]:.3g}"
+                text = f"{where}, {label} – {other} overlap by {-1e3 * deepest:.1f} mm"
+    return text

@@ -51,6 +51,11 @@ def picture(shown: vkc.Plan | vkc.Scene, name: str, size: tuple[int, int], time:
         screenshot(visualization.to_html(shown, Path(folder) / "page.html"), IMAGES / f"{name}.png", time=time, size=size)
 
 
+def attachments() -> None:
+    """Write the picture of proposed attachments."""
+    vkc.plotting.plot_attachments(vkc.propose_attachments(vkc.load_object("dishwasher"), most=2), IMAGES / "attachments.png")
+
+
 def plots(plan: vkc.Plan, prefix: str, *names: str) -> None:
     """Write some of a plan's plots."""
     with tempfile.TemporaryDirectory() as folder:
@@ -113,6 +118,7 @@ def main() -> int:
         sys.stdout.write(plan.report() + "\n")
         if not plan.success:
             return 1
+    attachments()
     picture(door, "door", WIDE, HALF_OPEN)
     plots(door, "door", "joints", "clearance", "top_view")
     plots(stick, "stick", "top_view")

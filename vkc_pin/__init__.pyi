@@ -4,6 +4,8 @@ from .chain.inversion import invert
 from .errors import BuildError, InputError, UnknownNameError, VkcError
 from .models.articulation import ArticulatedObject, Attachment, Freedom, Latch
 from .models.object_file import load_object
+from .models.proposals.proposal import Proposal, Proposals
+from .models.proposals.propose import propose_attachments
 from .models.robot import Robot
 from .models.robot_file import load_robot
 from .motion.trajectory import PhaseSpan, Trajectory
@@ -47,6 +49,8 @@ __all__ = [
     "PlacedObject",
     "Plan",
     "Planner",
+    "Proposal",
+    "Proposals",
     "Reach",
     "Release",
     "Report",
@@ -74,6 +78,7 @@ __all__ = [
     "plan",
     "plan_chore",
     "plotting",
+    "propose_attachments",
     "random_room",
     "validate",
     "validation",

@@ -30,6 +30,15 @@ latches:
 """
 
 
+def test_an_object_may_say_that_it_has_no_attachment_but_not_forget_it() -> None:
+    item = load_text(URDF, "urdf: thing.urdf\nattachments: []")
+    assert dict(item.attachments) == {}
+    with pytest.raises(InputError, match="no attachment"):
+        item.attachment()
+    with pytest.raises(InputError, match="attachments"):
+        load_text(URDF, "urdf: thing.urdf")
+
+
 def test_limits_that_are_not_stated_have_documented_defaults() -> None:
     thing = load_text(URDF, BASE)
     np.testing.assert_array_equal(thing.velocity, [1.0, DEFAULT_VELOCITY])

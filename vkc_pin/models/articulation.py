@@ -189,8 +189,15 @@ class ArticulatedObject:
         return {str(frame.name) for frame in bodies if not joints.isdisjoint(above[frame.parentJoint])}
 
     def attachment(self, name: str | None = None) -> Attachment:
-        """Return the attachment `name`, or the default one. Raises `UnknownNameError` if there is none."""
+        """Return the attachment `name`, or the default one.
+
+        Raises:
+            UnknownNameError: There is none of that name.
+            InputError: There is none at all.
+        """
         if name is None:
+            if not self.attachments:
+                raise InputError(f"object '{self.name}' has no attachment, so it cannot be grasped", field="attachment")
             return next(iter(self.attachments.values()))
         return self.attachments[known(name, self.attachments, f"attachment of {self.name}")]
 

@@ -101,7 +101,7 @@ class ObjectSchema(Schema):
     urdf: str
     free: bool = False
     joints: Mapping[str, JointSchema] = Field(default_factory=dict)
-    attachments: Annotated[tuple[AttachmentSchema, ...], require(bool, "nothing in the list", "at least one")]
+    attachments: tuple[AttachmentSchema, ...]  # none, if it is said so: what no hand can open still stands in rooms
     latches: tuple[LatchSchema, ...] = ()
     own_collisions: tuple[Annotated[tuple[str, ...], count(2)], ...] = ()
 

@@ -1,0 +1,95 @@
+"""The hand of a robot as grasps see it: its open gripper's shapes in the tool frame, and how much fits between the fingers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import coal
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.errors import InputError
+from vkc_pin.models.robot import Robot
+from vkc_pin.models.shapes import placed_shapes, world_box
+
+__all__ = ["Hand", "hand_of"]
+
+Placed = tuple[coal.CollisionGeometry, pin.SE3]
+_THIN = 2e-3  # [m]: how thick what is put between the fingers is, across the direction that is measured
+_WIDEST = 0.5  # [m]: no hand opens wider
+_EXACT = 1e-4  # [m]: of what is measured
+
+
+@dataclass(frozen=True, eq=False)
+class Hand:
+    """An open hand.
+
+    Attributes:
+        robot: The robot's name.
+        touch: Shapes of the links that may touch what is grasped, with their placements in the tool frame.
+        others: Those of the other links behind them that move with the tool.
+        opening: How wide a bar between the fingers may be, at the tool's origin along its x axis [m].
+        tip: How far the fingers reach beyond the tool's origin, along its z axis [m].
+        width: How wide the fingers are, along the tool's y axis [m].
+    """
+
+    robot: str
+    touch: tuple[Placed, ...]
+    others: tuple[Placed, ...]
+    opening: float
+    tip: float
+    width: float
+
+
+def hand_of(robot: Robot) -> Hand:
+    """Return the hand of a robot, open as the robot's description has it.
+
+    Raises:
+        InputError: The description names no touch links, or they leave no room around the tool frame's origin.
+    """
+    if not robot.touch_links:
+        problem, expected = f"the hand of '{robot.name}' is not known", "touch_links in its robot.yaml"
+        raise InputError(problem, field="touch_links", expected=expected, got="none")
+    data, frame = robot.model.createData(), robot.model.frames[robot.model.getFrameId(robot.tool_frame)]
+    pin.framesForwardKinematics(robot.model, data, robot.coordinates.q(np.concatenate([np.zeros(3), robot.home])))
+    tool = data.oMi[frame.parentJoint] * frame.placement
+    touch, others = list[pin.GeometryObject](), list[pin.GeometryObject]()
+    for number, shape in enumerate(robot.collision.geometryObjects):
+        placed = pin.GeometryObject(shape)
+        placed.placement = tool.inverse() * data.oMi[shape.parentJoint] * shape.placement
+        if robot.link_of(number) in robot.touch_links:
+            touch.append(placed)
+        elif frame.parentJoint in robot.model.supports[shape.parentJoint]:
+            others.append(placed)
+    fingers, rest = tuple(placed_shapes(touch)), tuple(placed_shapes(others))
+    opening = _largest(lambda width: _is_free(np.array([width, _THIN, _THIN]), np.zeros(3), fingers))
+    if opening < 2.0 * _THIN:
+        problem = f"there is no room between the fingers of '{robot.name}' at its tool frame '{robot.tool_frame}'"
+        raise InputError(problem, field="tool_frame", expected="an open hand around its origin, x the direction of closing")
+    beside = [
+        box for geometry, where in fingers if (box := world_box(geometry, where))[1][2] > 0.0
+    ]  # what reaches past the origin
+    ends = beside or [world_box(geometry, where) for geometry, where in fingers]
+    width = max(high[1] for _, high in ends) - min(low[1] for low, _ in ends)
+    return Hand(robot.name, fingers, rest, opening, max(0.0, float(max(high[2] for _, high in ends))), float(width))
+
+
+def _is_free(size: np.ndarray, centre: np.ndarray, shapes: Iterable[Placed]) -> bool:
+    """Return whether a box, in the tool frame, hits none of some shapes."""
+    box, where = coal.Box(*size), coal.Transform3s(np.eye(3), centre)
+    request, result = coal.CollisionRequest(), coal.CollisionResult()
+    for geometry, placement in shapes:
+        result.clear()
+        if coal.collide(box, where, geometry, coal.Transform3s(placement.rotation, placement.translation), request, result):
+            return False
+    return True
+
+
+def _largest(fits: Callable[[float], bool]) -> float:
+    """Return the largest size [m] that fits, 0 if none does: all below one that fits do."""
+    low, high = 0.0, _WIDEST
+    while high - low > _EXACT:
+        middle = (low + high) / 2.0
+        low, high = (middle, high) if fits(middle) else (low, middle)
+    return low

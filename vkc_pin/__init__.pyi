@@ -2,6 +2,7 @@ from . import baselines, benchmarks, cpin, plotting, validation, visualization
 from .chain.chain import VirtualKinematicChain, consolidate
 from .chain.inversion import invert
 from .errors import BuildError, InputError, UnknownNameError, VkcError
+from .importing.objects.object_import import ImportedObject, import_object
 from .models.articulation import ArticulatedObject, Attachment, Freedom, Latch
 from .models.object_file import load_object
 from .models.proposals.proposal import Proposal, Proposals
@@ -40,6 +41,7 @@ __all__ = [
     "GoTo",
     "Grasp",
     "Hold",
+    "ImportedObject",
     "InputError",
     "Iteration",
     "Latch",
@@ -71,6 +73,7 @@ __all__ = [
     "build",
     "consolidate",
     "cpin",
+    "import_object",
     "invert",
     "load_object",
     "load_robot",

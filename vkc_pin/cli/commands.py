@@ -1,4 +1,4 @@
-"""The commands of `vkc-pin`: plan, check, view, export, bench, srdf. Files are written before anything is printed."""
+"""The commands of `vkc-pin`: plan, check, view, export, srdf, and those of other modules. Files are written before reports."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from vkc_pin.benchmarks.commands import EXIT_INTERRUPTED, EXIT_OK, add_bench, natural, positive
+from vkc_pin.cli.importing import add_importing
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.files.writing import check_outputs, write_atomically
 from vkc_pin.motion.tables import GROUPS
@@ -231,6 +232,7 @@ def make_parser() -> argparse.ArgumentParser:
     export.set_defaults(run=_export)
 
     add_bench(commands)
+    add_importing(commands)
 
     about = "Sample which links of a robot can never collide."
     srdf = commands.add_parser("srdf", help="regenerate allowed collisions", description=about)

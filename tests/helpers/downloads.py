@@ -1,0 +1,103 @@
+"""Files of objects as others make them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import trimesh
+
+
+def partnet(folder: Path) -> Path:
+    """Write a cabinet as PartNet-Mobility has them, and return its `mobility.urdf`.
+
+    About one unit high, y up, set upright by a fixed joint below a link `base` without shapes; many small meshes, which are
+    seen and collide; names on what is seen; a drawer with a flat decoration, a door without limits, a wheel without shape, and
+    no effort or velocity anywhere.
+    """
+    meshes = folder / "textured_objs"
+    meshes.mkdir(parents=True)
+
+    def box(name: str, size: tuple[float, ...], at: tuple[float, ...]) -> str:
+        trimesh.creation.box(size).apply_translation(at).export(meshes / f"{name}.obj")
+        return name
+
+    def elements(parts: dict[str, str], xyz: str = "0 0 0") -> str:
+        shapes = {
+            file: f'<origin xyz="{xyz}"/><geometry><mesh filename="textured_objs/{file}.obj"/></geometry>' for file in parts
+        }
+        seen = "".join(f'<visual name="{name}">{shapes[file]}</visual>' for file, name in parts.items())
+        return seen + "".join(f"<collision>{shape}</collision>" for shape in shapes.values())
+
+    # x to the right, y up, z out of the front
+    case = {
+        box("original-1", (0.04, 1.0, 0.6), (-0.38, 0.0, 0.0)): "frame-1",
+        box("original-2", (0.04, 1.0, 0.6), (0.38, 0.0, 0.0)): "frame-2",
+        box("original-3", (0.8, 1.0, 0.04), (0.0, 0.0, -0.28)): "frame-3",
+        box("original-4", (0.8, 0.04, 0.6), (0.0, 0.48, 0.0)): "frame-4",
+    }
+    drawer = {
+        box("original-5", (0.7, 0.3, 0.02), (0.0, 0.25, 0.35)): "board-5",
+        box("original-7", (0.2, 0.02, 0.02), (0.0, 0.25, 0.45)): "handle-7",
+        box("original-8", (0.02, 0.02, 0.08), (-0.1, 0.25, 0.4)): "handle-8",
+        box("original-9", (0.02, 0.02, 0.08), (0.1, 0.25, 0.4)): "handle-9",
+    }
+    front = trimesh.Trimesh(
+        [[-0.3, 0.12, 0.361], [0.3, 0.12, 0.361], [0.3, 0.38, 0.361], [-0.3, 0.38, 0.361]], [[0, 1, 2], [0, 2, 3]]
+    )
+    front.export(meshes / "original-6.obj")
+    drawer["original-6"] = "decoration-6"
+    door = {
+        box("original-10", (0.7, 0.4, 0.02), (0.0, -0.2, 0.35)): "board-10",
+        box("original-11", (0.02, 0.2, 0.02), (0.3, -0.2, 0.45)): "bar-11",
+    }
+    text = f"""<?xml version="1.0" ?>
+<robot name="partnet_cabinet">
+  <link name="base"/>
+  <link name="link_2">{elements(case)}</link>
+  <joint name="joint_2" type="fixed"><origin rpy="1.570796326794897 0 -1.570796326794897"/>
+    <child link="link_2"/><parent link="base"/></joint>
+  <link name="link_0">{elements(drawer)}</link>
+  <joint name="joint_0" type="prismatic"><origin xyz="0 0 0"/><axis xyz="0 0 1"/><child link="link_0"/><parent link="link_2"/>
+    <limit lower="0" upper="0.36"/></joint>
+  <link name="link_1">{elements(door, "0.38 0 -0.3")}</link>
+  <joint name="joint_1" type="revolute"><origin xyz="-0.38 0 0.3"/><axis xyz="0 -1 0"/>
+    <child link="link_1"/><parent link="link_2"/></joint>
+  <link name="link_3"/>
+  <joint name="joint_3" type="continuous"><axis xyz="0 1 0"/>
+    <child link="link_3"/><parent link="link_2"/></joint>
+</robot>"""
+    (folder / "mobility.urdf").write_text(text)
+    return folder / "mobility.urdf"
+
+
+MJCF = """<mujoco>
+  <compiler angle="radian"/>
+  <asset><mesh name="wedge" vertex="0 0 0  0.1 0 0  0 0.1 0  0 0 0.1"/></asset>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 0.1"/>
+    <body name="case" pos="1 0 0.4">
+      <geom type="box" size="0.2 0.3 0.4"/>
+      <body name="door" pos="-0.25 -0.3 0">
+        <joint name="hinge" axis="0 0 -1" range="-1.5 0" pos="0 0 0"/>
+        <geom name="leaf" type="box" size="0.01 0.3 0.4" pos="0 0.3 0"/>
+        <geom name="handle" type="capsule" fromto="-0.08 0.5 -0.15 -0.08 0.5 0.15" size="0.01"/>
+        <geom name="looks" type="mesh" mesh="wedge" pos="-0.02 0.1 0" contype="0" conaffinity="0"/>
+      </body>
+    </body>
+    <body name="cup" pos="2 0 0"><freejoint/><geom type="sphere" size="0.04"/></body>
+  </worldbody>
+</mujoco>"""
+
+SDF = """<?xml version="1.0"?>
+<sdf version="1.7">
+  <model name="box">
+    <link name="case"><pose>1 0 0.4 0 0 0</pose>
+      <collision name="body"><geometry><box><size>0.4 0.6 0.8</size></box></geometry></collision></link>
+    <link name="door"><pose relative_to="case">-0.25 0 0 0 0 0</pose>
+      <collision name="leaf"><geometry><box><size>0.02 0.6 0.8</size></box></geometry></collision>
+      <collision name="handle"><pose>-0.08 0.2 0 0 0 0</pose>
+        <geometry><cylinder><radius>0.01</radius><length>0.3</length></cylinder></geometry></collision></link>
+    <joint name="hinge" type="revolute"><pose>0 -0.3 0 0 0 1.0</pose><parent>case</parent><child>door</child>
+      <axis><xyz>0 0 -1</xyz><limit><lower>-1.5</lower><upper>0</upper></limit></axis></joint>
+  </model>
+</sdf>"""

@@ -1,0 +1,42 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.downloads import partnet
+
+from vkc_pin.importing.objects.description import Description, Joint, Link, Part
+from vkc_pin.importing.objects.urdf import read_object_urdf
+
+
+def test_volumes_of_parts_are_those_of_their_shapes() -> None:
+    where = pin.SE3(np.eye(3), np.array([1.0, 2.0, 3.0]))
+    for kind, size, volume in (
+        ("box", (0.1, 0.2, 0.3), 0.006),
+        ("sphere", (0.1,), 4.0 / 3.0 * np.pi * 1e-3),
+        ("cylinder", (0.1, 0.2), np.pi * 2e-3),
+        ("capsule", (0.1, 0.2), np.pi * 2e-3 + 4.0 / 3.0 * np.pi * 1e-3),
+    ):
+        mesh = Part(name="", placement=where, kind=kind, size=size).mesh()
+        assert mesh.volume == pytest.approx(volume, rel=0.02)
+        assert np.allclose(mesh.bounds.mean(axis=0), [1.0, 2.0, 3.0], atol=1e-6)
+
+
+def test_placements_follow_the_joints() -> None:
+    place, axis = pin.SE3(np.eye(3), np.array([1.0, 0.0, 0.0])), np.array([0.0, 0.0, 1.0])
+    joints = {
+        "c": Joint(name="slide", kind="prismatic", parent="b", child="c", placement=place, axis=axis),
+        "b": Joint(name="turn", kind="revolute", parent="a", child="b", placement=place, axis=axis),
+    }
+    found = Description(Path("f"), {name: Link(name) for name in "abc"}, joints)
+    assert found.root == "a"
+    assert np.allclose(found.placements({"turn": np.pi / 2, "slide": 0.3})["c"].translation, [1.0, 1.0, 0.3])
+    assert found.below("b") == {"b", "c"}
+
+
+def test_what_is_seen_is_solid_where_nothing_else_is(tmp_path: Path) -> None:
+    case = read_object_urdf(partnet(tmp_path)).links["link_2"]
+    assert case.solid == case.collision
+    assert Link("", case.visual).solid == case.visual

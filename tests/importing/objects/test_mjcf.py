@@ -1,0 +1,42 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.downloads import MJCF
+
+from vkc_pin.errors import InputError
+from vkc_pin.importing.objects.mjcf import read_object_mjcf
+
+pytest.importorskip("mujoco")
+
+
+def test_bodies_joints_and_shapes(tmp_path: Path) -> None:
+    (tmp_path / "t.xml").write_text(MJCF)
+    found = read_object_mjcf(tmp_path / "t.xml")
+    assert list(found.links) == ["world", "case", "door"]
+    hinge = found.joints["door"]
+    assert (hinge.name, hinge.kind, hinge.limits) == ("hinge", "revolute", (-1.5, 0.0))
+    assert np.allclose(hinge.axis, [0.0, 0.0, -1.0])
+    place = found.placements()["door"]
+    assert np.allclose(place.translation, [0.75, -0.3, 0.4])
+    assert [(part.name, part.kind) for part in found.links["door"].collision] == [("leaf", "box"), ("handle", "capsule")]
+    assert found.links["door"].collision[1].size == pytest.approx((0.01, 0.3))
+    assert [part.name for part in found.links["door"].visual] == ["leaf", "handle", "looks"]
+    notes = " ".join(found.notes)
+    assert "'cup' moves freely" in notes
+    assert "'floor'" in notes
+
+
+def test_meshes_are_where_the_file_has_them(tmp_path: Path) -> None:
+    """MuJoCo moves meshes into their principal axes."""
+    (tmp_path / "t.xml").write_text(MJCF)
+    looks = read_object_mjcf(tmp_path / "t.xml").links["door"].visual[2].mesh()
+    assert np.allclose(looks.bounds, [[-0.02, 0.1, 0.0], [0.08, 0.2, 0.1]], atol=1e-6)
+
+
+def test_what_mujoco_does_not_understand(tmp_path: Path) -> None:
+    (tmp_path / "t.xml").write_text('<mujoco><worldbody><geom type="bx" size="1 1 1"/></worldbody></mujoco>')
+    with pytest.raises(InputError, match=r"t\.xml"):
+        read_object_mjcf(tmp_path / "t.xml")

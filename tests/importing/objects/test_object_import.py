@@ -1,0 +1,109 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from helpers.downloads import MJCF, SDF, partnet
+
+import vkc_pin as vkc
+from vkc_pin.importing.objects.object_import import read_description
+
+
+@pytest.fixture(scope="module")
+def cabinet(tmp_path_factory: pytest.TempPathFactory) -> vkc.ImportedObject:
+    folder = tmp_path_factory.mktemp("partnet")
+    return vkc.import_object(partnet(folder / "45427"), folder / "out", height=0.8)
+
+
+def test_a_cabinet_of_partnet_stands_on_the_floor_in_its_height(cabinet: vkc.ImportedObject) -> None:
+    assert cabinet.file.name == "object_45427.yaml"
+    assert cabinet.size[2] == pytest.approx(0.8)
+    item, data = cabinet.object, cabinet.object.model.createData()
+    import pinocchio as pin
+
+    pin.forwardKinematics(item.model, data, item.coordinates.q(np.zeros(2)))
+    corners = [
+        (data.oMi[shape.parentJoint] * shape.placement).act(np.asarray(point))
+        for shape in item.collision.geometryObjects
+        for point in np.asarray(shape.geometry.points())
+    ]
+    low, high = np.min(corners, axis=0), np.max(corners, axis=0)
+    assert low[2] == pytest.approx(0.0, abs=1e-3)
+    assert high[2] == pytest.approx(0.8, abs=1e-3)
+    assert np.allclose((low + high)[:2], 0.0, atol=2e-3)
+    assert item.upper[item.coordinates.index("joint_0")] == pytest.approx(0.8 * 0.36)
+
+
+def test_handles_are_found_named_or_not(cabinet: vkc.ImportedObject) -> None:
+    drawer, door = (cabinet.proposals.opening(joint)[0] for joint in ("joint_0", "joint_1"))
+    assert drawer.named
+    assert not door.named
+    assert {drawer.kind, door.kind} == {"bar"}
+    assert drawer.thickness == pytest.approx(0.8 * 0.02, rel=0.01)
+    assert cabinet.object.attachment(drawer.attachment.name).joint == drawer.attachment.joint
+    assert list(cabinet.object.attachments) == [proposal.attachment.name for proposal in cabinet.proposals.found]
+
+
+def test_the_report_says_what_was_changed(cabinet: vkc.ImportedObject) -> None:
+    report = cabinet.report()
+    for text in ("joint_1' states no limits", "joint_3", "decoration-6", "2 joints", "0.80 m", "husky_ur5e"):
+        assert text in report, text
+    assert cabinet.picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_scene_with_it_can_be_planned(cabinet: vkc.ImportedObject, tmp_path: Path) -> None:
+    best = cabinet.proposals.opening("joint_0")[0].attachment
+    tool = cabinet.object.link_placement(best.link, np.zeros(2)) * best.placement
+    back = -tool.rotation[:2, 2]
+    start = [*(tool.translation[:2] + 1.5 * back).tolist(), float(np.arctan2(-back[1], -back[0]))]
+    scene = {
+        "name": "alone",
+        "robot": {"name": "husky_ur5e", "base": "omni"},
+        "start": {"base": start, "arm": "home"},
+        "arena": {"x": [-4, 4], "y": [-4, 4]},
+        "floor": True,
+        "objects": [{"name": "it", "type": str(cabinet.file), "position": [0, 0, 0]}],
+    }
+    (tmp_path / "alone.yaml").write_text(yaml.safe_dump(scene))
+    plan = vkc.plan(vkc.load_scene(tmp_path / "alone.yaml"), [vkc.Actuate("it", {"joint_0": 0.2}, best.name)])
+    assert plan.success, plan.report()
+    assert plan.trajectory.column("it.joint_0")[-1] == pytest.approx(0.2, abs=1e-3)
+
+
+@pytest.mark.parametrize(("name", "text"), [("box.sdf", SDF), ("box.xml", MJCF)])
+def test_the_same_box_in_other_formats(name: str, text: str, tmp_path: Path) -> None:
+    if name.endswith("xml"):
+        pytest.importorskip("mujoco")
+    (tmp_path / name).write_text(text)
+    done = vkc.import_object(tmp_path / name, tmp_path / "out")
+    best = done.proposals.opening("hinge")[0]
+    assert best.kind == "bar"
+    assert best.thickness == pytest.approx(0.02, rel=0.02)
+    assert best.opens["hinge"] == pytest.approx(-1.5)
+    assert done.size == pytest.approx([0.54, 0.6, 0.8], abs=0.01)
+
+
+def test_a_link_alone(tmp_path: Path) -> None:
+    done = vkc.import_object(partnet(tmp_path / "in"), tmp_path / "out", link="link_2", up="y")
+    assert done.file.name == "link_2.yaml"
+    assert set(done.object.coordinates.names) == {"joint_0", "joint_1"}
+    assert done.size[2] == pytest.approx(1.0)
+
+
+def test_what_is_no_object_and_wrong_arguments(tmp_path: Path) -> None:
+    (tmp_path / "page.xml").write_text("<html/>")
+    with pytest.raises(vkc.InputError, match=r"page\.xml.*<html>"):
+        read_description(tmp_path / "page.xml")
+    file = partnet(tmp_path / "in")
+    for wrong, word in (
+        ({"height": 0.0}, "height"),
+        ({"height": 1.0, "scale": 2.0}, "scale"),
+        ({"up": "x"}, "up"),
+        ({"link": "link_9"}, "link_2"),
+        ({"folder": tmp_path / "in"}, "something already"),
+    ):
+        with pytest.raises(vkc.InputError, match=word):
+            vkc.import_object(file, **{"folder": tmp_path / "out", **wrong})  # type: ignore[arg-type]
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,66 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import trimesh
+from helpers.downloads import partnet
+
+from vkc_pin.importing.objects.description import Description, Joint, Link, Part
+from vkc_pin.importing.objects.pieces import with_pieces
+from vkc_pin.importing.objects.tidying import surfaces, tidied
+from vkc_pin.importing.objects.urdf import read_object_urdf
+
+HERE = pin.SE3.Identity()
+
+
+def alone(*meshes: trimesh.Trimesh) -> Description:
+    parts = tuple(Part(name="p", placement=HERE, kind="mesh", size=(1, 1, 1), triangles=mesh) for mesh in meshes)
+    joint = Joint(name="j", kind="prismatic", parent="a", child="b", placement=HERE, limits=(0.0, 1.0))
+    return Description(Path("f"), {"a": Link("a"), "b": Link("b", parts, parts)}, {"b": joint})
+
+
+def pieces(description: Description) -> tuple[tuple[Part, ...], tuple[str, ...]]:
+    found = with_pieces(description, surfaces(description))
+    return found.links["b"].collision, found.notes
+
+
+def test_a_bracket_leaves_room_for_fingers() -> None:
+    pytest.importorskip("coacd")
+    outline = np.array([[0, -15], [7, -15], [7, 15], [0, 15], [0, 13], [5, 13], [5, -13], [0, -13]]) / 100.0
+    above = np.array([[0, 1, 6], [0, 6, 7], [1, 2, 5], [1, 5, 6], [2, 3, 4], [2, 4, 5]])
+    around = [[k, (k + 1) % 8, side] for k in range(8) for side in ((k + 1) % 8 + 8, -1)]
+    sides = [[k, j, top] if top > 0 else [k, j + 8, k + 8] for k, j, top in around]
+    corners = np.vstack([np.column_stack([outline, np.full(8, z)]) for z in (0.0, 0.02)])
+    bracket = trimesh.Trimesh(corners, np.vstack([above[:, ::-1], above + 8, sides]))
+    assert bracket.is_volume
+    found, notes = pieces(alone(bracket))
+    assert len(found) == 3
+    between = np.array([[0.02, 0.0, 0.01]])
+    assert not any(part.mesh().contains(between).any() for part in found)
+    assert sum(part.mesh().volume for part in found) == pytest.approx(bracket.volume, rel=0.3)
+    assert notes == ()
+
+
+def test_flat_shapes_get_thick_and_are_named(tmp_path: Path) -> None:
+    found = tidied(read_object_urdf(partnet(tmp_path)))
+    done = with_pieces(found, surfaces(found))
+    decoration = next(part for part in done.links["link_0"].collision if part.name == "decoration-6")
+    assert decoration.mesh().volume > 0.0
+    assert any("decoration-6" in note and "link_0" in note for note in done.notes)
+
+
+def test_what_lies_inside_of_another_piece_goes() -> None:
+    large, small = trimesh.creation.box((0.3, 0.3, 0.3)), trimesh.creation.box((0.1, 0.1, 0.1))
+    beside = small.copy().apply_translation((0.15, 0.0, 0.0))
+    found, _ = pieces(alone(small, large, beside))
+    assert sorted(round(part.mesh().volume, 6) for part in found) == [0.001, 0.027]
+
+
+def test_boxes_stay_boxes_and_what_is_seen_collides_where_nothing_else_does() -> None:
+    box = Part(name="", placement=HERE, kind="box", size=(0.1, 0.1, 0.1))
+    found = with_pieces(Description(Path("f"), {"a": Link("a", (box,))}, {}), {id(box): box.mesh()})
+    assert found.links["a"].collision == (box,)
+    assert any("collides as what it looks like" in note for note in found.notes)

@@ -1,0 +1,52 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.downloads import partnet
+
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.importing.objects.urdf import read_object_urdf
+
+
+def test_what_partnet_leaves_out_is_none(tmp_path: Path) -> None:
+    found = read_object_urdf(partnet(tmp_path))
+    assert found.root == "base"
+    joints = {joint.name: joint for joint in found.joints.values()}
+    assert joints["joint_0"].limits == (0.0, 0.36)
+    assert joints["joint_1"].limits is None
+    assert joints["joint_3"].kind == "continuous"
+    assert {joint.velocity for joint in joints.values()} == {None}
+
+
+def test_what_collides_is_called_as_what_is_seen(tmp_path: Path) -> None:
+    drawer = read_object_urdf(partnet(tmp_path)).links["link_0"]
+    assert [part.name for part in drawer.collision] == [part.name for part in drawer.visual]
+    assert "handle-7" in [part.name for part in drawer.collision]
+
+
+def test_limits_the_wrong_way_round_and_unknown_joints_are_noted(tmp_path: Path) -> None:
+    text = """<robot name="t"><link name="a"/><link name="b"/><link name="c"/>
+    <joint name="j" type="revolute"><parent link="a"/><child link="b"/><limit lower="1" upper="-0.5"/>
+      <mimic joint="k"/></joint>
+    <joint name="k" type="floating"><parent link="a"/><child link="c"/></joint></robot>"""
+    (tmp_path / "t.urdf").write_text(text)
+    found = read_object_urdf(tmp_path / "t.urdf")
+    assert found.joints["b"].limits == (-0.5, 1.0)
+    assert np.allclose(found.joints["b"].axis, [1.0, 0.0, 0.0])
+    assert found.joints["c"].kind == "fixed"
+    assert [word in " ".join(found.notes) for word in ("wrong way round", "floating", "mimics")] == [True] * 3
+
+
+def test_errors_name_file_and_element(tmp_path: Path) -> None:
+    file = tmp_path / "t.urdf"
+    file.write_text(
+        '<robot name="t"><link name="a"/><joint name="j" type="fixed"><parent link="a"/><child link="d"/></joint></robot>'
+    )
+    with pytest.raises(UnknownNameError, match=r"t\.urdf"):
+        read_object_urdf(file)
+    geometry = '<geometry><mesh filename="gone.obj"/></geometry>'
+    file.write_text(f'<robot name="t"><link name="a"><collision>{geometry}</collision></link></robot>')
+    with pytest.raises(InputError, match=r"gone\.obj"):
+        read_object_urdf(file)

@@ -1,0 +1,149 @@
+"""Reads the MJCF of an object with MuJoCo, which knows best what its defaults, includes and meshes mean."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.errors import InputError
+from vkc_pin.importing.extras import extra
+from vkc_pin.importing.objects.description import Description, Joint, Link, Part
+
+__all__ = ["read_object_mjcf"]
+
+_HIDDEN = 3  # MuJoCo's viewer hides groups from here on: by custom, what collides and is not to be seen
+
+
+def read_object_mjcf(file: Path) -> Description:
+    """Return what an MJCF file says about an object; what stands in the world is one link, `world`.
+
+    Raises:
+        InputError: MuJoCo is not installed, or cannot read the file.
+    """
+    mujoco = extra("mujoco", what="reading MJCF", file=file)
+    try:
+        model = mujoco.MjModel.from_xml_path(str(file))
+    except ValueError as error:
+        raise InputError(f"MuJoCo cannot read this: {error}", file=file, expected="an MJCF file") from error
+    data = mujoco.MjData(model)
+    data.qpos[:] = model.qpos0
+    mujoco.mj_kinematics(model, data)
+    return _Reader(mujoco, model, data, file).description()
+
+
+class _Reader:
+    def __init__(self, mujoco: Any, model: Any, data: Any, file: Path) -> None:
+        self.mujoco, self.model, self.data, self.file = mujoco, model, data, file
+        self.notes = list[str]()
+
+    def description(self) -> Description:
+        model = self.model
+        frames, links, joints = dict[str, pin.SE3](), dict[str, Link](), dict[str, Joint]()
+        left_out: set[int] = set()
+        for body in range(model.nbody):
+            name, parent = self._name("body", body), int(model.body_parentid[body])
+            above = self._name("body", parent)
+            moving = range(int(model.body_jntadr[body]), int(model.body_jntadr[body]) + int(model.body_jntnum[body]))
+            if parent in left_out and body:
+                left_out.add(body)
+                continue
+            if any(int(model.jnt_type[j]) == 0 for j in moving):
+                self.notes.append(f"body '{name}' moves freely, it is an object of its own: left out")
+                left_out.add(body)
+                continue
+            here = _placement(self.data.xpos[body], self.data.xmat[body])
+            last = above
+            for count, j in enumerate(moving):  # several joints of one body: links without shapes between them
+                link = name if count == len(moving) - 1 else f"{name}_{count}"
+                frames[link] = pin.SE3(here.rotation, np.array(self.data.xanchor[j]))
+                joints[link] = self._joint(j, last, link, frames)
+                links[link] = Link(link)
+                last = link
+            if not len(moving):
+                frames[name] = here
+                if body:
+                    joints[name] = Joint(
+                        name=f"{name}_fixed", kind="fixed", parent=above, child=name, placement=frames[above].inverse() * here
+                    )
+            links[name] = Link(name, *self._parts(body, frames[name]))
+        return Description(self.file, links, joints, tuple(self.notes))
+
+    def _joint(self, number: int, parent: str, child: str, frames: dict[str, pin.SE3]) -> Joint:
+        model = self.model
+        kind = {2: "prismatic", 3: "revolute"}.get(int(model.jnt_type[number]), "fixed")
+        name = self._name("joint", number)
+        if kind == "fixed":
+            self.notes.append(f"joint '{name}' is a ball: taken as fixed")
+        limits = None
+        if model.jnt_limited[number]:
+            zero = float(model.qpos0[model.jnt_qposadr[number]])
+            limits = (float(model.jnt_range[number][0]) - zero, float(model.jnt_range[number][1]) - zero)
+        return Joint(
+            name=name,
+            kind="continuous" if kind == "revolute" and limits is None else kind,
+            parent=parent,
+            child=child,
+            placement=frames[parent].inverse() * frames[child],
+            axis=np.asarray(frames[child].rotation.T @ self.data.xaxis[number]),
+            limits=limits,
+        )
+
+    def _parts(self, body: int, frame: pin.SE3) -> tuple[tuple[Part, ...], tuple[Part, ...]]:
+        """Return what a body looks like, and what collides."""
+        model, kinds = self.model, self.mujoco.mjtGeom
+        visual, collision = list[Part](), list[Part]()
+        for geom in range(int(model.body_geomadr[body]), int(model.body_geomadr[body]) + int(model.body_geomnum[body])):
+            kind, size = int(model.geom_type[geom]), model.geom_size[geom]
+            rgba = model.geom_rgba[geom] if model.geom_matid[geom] < 0 else model.mat_rgba[model.geom_matid[geom]]
+            shape: tuple[str, tuple[float, ...]] | None = {
+                int(kinds.mjGEOM_BOX): ("box", tuple(2.0 * float(s) for s in size)),
+                int(kinds.mjGEOM_SPHERE): ("sphere", (float(size[0]),)),
+                int(kinds.mjGEOM_CYLINDER): ("cylinder", (float(size[0]), 2.0 * float(size[1]))),
+                int(kinds.mjGEOM_CAPSULE): ("capsule", (float(size[0]), 2.0 * float(size[1]))),
+                int(kinds.mjGEOM_ELLIPSOID): ("mesh", tuple(map(float, size))),
+                int(kinds.mjGEOM_MESH): ("mesh", (1.0, 1.0, 1.0)),
+            }.get(kind)
+            name = self._name("geom", geom, otherwise=self._mesh_name(geom))
+            if shape is None:
+                self.notes.append(f"geom '{name}' of body '{self._name('body', body)}' has no volume (a plane): left out")
+                continue
+            part = Part(
+                name=name,
+                placement=frame.inverse() * _placement(self.data.geom_xpos[geom], self.data.geom_xmat[geom]),
+                kind=shape[0],
+                size=shape[1],
+                triangles=self._triangles(geom) if shape[0] == "mesh" else None,
+                colour=(float(rgba[0]), float(rgba[1]), float(rgba[2]), float(rgba[3])),
+            )
+            collides = bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
+            if collides:
+                collision.append(part)
+            if int(model.geom_group[geom]) < _HIDDEN or not collides:
+                visual.append(part)
+        return tuple(visual), tuple(collision)
+
+    def _triangles(self, geom: int) -> Any:
+        import trimesh
+
+        number = int(self.model.geom_dataid[geom])
+        if number < 0:  # an ellipsoid: its half axes are the scale
+            return trimesh.creation.icosphere(subdivisions=3)
+        first, count = int(self.model.mesh_vertadr[number]), int(self.model.mesh_vertnum[number])
+        start, faces = int(self.model.mesh_faceadr[number]), int(self.model.mesh_facenum[number])
+        corners = np.array(self.model.mesh_vert[first : first + count], float)
+        return trimesh.Trimesh(corners, np.array(self.model.mesh_face[start : start + faces]))
+
+    def _mesh_name(self, geom: int) -> str:
+        number = int(self.model.geom_dataid[geom])
+        return self._name("mesh", number) if number >= 0 else ""
+
+    def _name(self, kind: str, number: int, otherwise: str | None = None) -> str:
+        name = getattr(self.model, kind)(number).name
+        return str(name) or (f"{kind}_{number}" if otherwise is None else otherwise)
+
+
+def _placement(position: Any, matrix: Any) -> pin.SE3:
+    return pin.SE3(np.array(matrix, float).reshape(3, 3), np.array(position, float))

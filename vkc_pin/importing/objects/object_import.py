@@ -1,0 +1,181 @@
+"""Imports an object: from a file that somebody else made to a folder that `load_object` and scenes take."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.arguments import instance, quantity
+from vkc_pin.arrays import Floats
+from vkc_pin.errors import InputError, shown
+from vkc_pin.files.documents import read_text
+from vkc_pin.files.resources import file_path
+from vkc_pin.files.xml import parse_xml
+from vkc_pin.importing.objects.description import Description
+from vkc_pin.importing.objects.mjcf import read_object_mjcf
+from vkc_pin.importing.objects.pieces import with_pieces
+from vkc_pin.importing.objects.sdf import read_object_sdf
+from vkc_pin.importing.objects.tidying import bounds, only, renamed, rooted, scaled, surfaces, tidied, upright, with_limits
+from vkc_pin.importing.objects.urdf import read_object_urdf
+from vkc_pin.importing.objects.writing import write_description, write_urdf
+from vkc_pin.models.articulation import ArticulatedObject
+from vkc_pin.models.object_file import load_object
+from vkc_pin.models.proposals.proposal import Proposals
+from vkc_pin.models.proposals.propose import propose_attachments
+from vkc_pin.models.robot import Robot
+from vkc_pin.models.robot_file import load_robot
+from vkc_pin.options import Options
+from vkc_pin.plotting.attachments import plot_attachments
+
+__all__ = ["ImportedObject", "import_object", "read_description"]
+
+_GENERAL = ("mobility", "model", "object", "scene", "index", "main")  # names of files that say nothing
+_SMALL, _LARGE = 0.02, 3.5  # [m]: heights of what is opened by hand
+
+
+@dataclass(frozen=True, eq=False)
+class ImportedObject:
+    """An object that was imported.
+
+    Attributes:
+        file: Its description, which `load_object` and scenes take.
+        object: The object, with the attachments that were proposed.
+        proposals: How good these are, and which joints have none.
+        size: Length, width, height of the closed object [m], shape (3,).
+        notes: What the file left out, and what was changed.
+        picture: A picture of its attachments.
+    """
+
+    file: Path
+    object: ArticulatedObject
+    proposals: Proposals
+    size: Floats
+    notes: tuple[str, ...]
+    picture: Path
+
+    def report(self) -> str:
+        """Return what came out, as text."""
+        pieces, joints = len(self.object.collision.geometryObjects), len(self.object.coordinates.names)
+        size = " × ".join(f"{length:.2f}" for length in self.size)
+        head = f"{self.object.name}: {size} m, {joints} joint{'s' * (joints != 1)}, {pieces} convex pieces"
+        notes = [f"  {note}" for note in self.notes]
+        lines = [head, *notes, f"attachments for the hand of {self.proposals.hand.robot}, best first:", self.proposals.report()]
+        return "\n".join(lines)
+
+
+def read_description(file: str | Path) -> Description:
+    """Return what a URDF, MJCF or SDF file says; which it is, its first element tells.
+
+    Raises:
+        InputError: It is none of them, or cannot be read.
+        UnknownNameError: It names something that does not exist.
+    """
+    path = file_path(file, "file", "a URDF, MJCF or SDF file")
+    root = parse_xml(read_text(path, "URDF, MJCF or SDF"), path).tag
+    readers = {"robot": read_object_urdf, "mujoco": read_object_mjcf, "sdf": read_object_sdf}
+    if root not in readers:
+        expected = "a URDF (<robot>), MJCF (<mujoco>) or SDF (<sdf>) file"
+        raise InputError("this is no object", file=path, expected=expected, got=f"<{root}>")
+    return readers[root](path)
+
+
+def import_object(
+    file: str | Path,
+    folder: str | Path | None = None,
+    *,
+    height: float | None = None,
+    scale: float | None = None,
+    up: str = "z",
+    link: str | None = None,
+    robot: str | Robot = "husky_ur5e",
+    options: Options | None = None,
+    most: int = 3,
+) -> ImportedObject:
+    """Make an object that can be planned with of a URDF, MJCF or SDF file.
+
+    Its shapes become convex pieces, fixed links part of what they are fixed to; links without shapes go, limits that nobody
+    states are chosen. Its lowest point is at z = 0, the origin below its middle. Attachments are proposed for every joint.
+
+    Args:
+        file: The file.
+        folder: Where to write it, a new or empty folder; named like the file if it is not given.
+        height: How high the object is [m]: objects of PartNet-Mobility have no size of their own.
+        scale: By what to multiply the file's lengths instead.
+        up: Which of the file's axes points up, "z" or "y".
+        link: Import this link and what hangs on it alone.
+        robot: Whose hand the attachments are for.
+        options: Which clearances they must have.
+        most: How many attachments one joint gets at most.
+
+    Raises:
+        InputError: The file cannot be read or is no object, the folder holds something, or an argument is wrong.
+        UnknownNameError: There is no such link or robot, or the file names something that does not exist.
+    """
+    path = file_path(file, "file", "a URDF, MJCF or SDF file")
+    if up not in ("y", "z"):
+        raise InputError("not an axis that can point up", field="up", expected='"y" or "z"', got=shown(up))
+    for name, value in (("height", height), ("scale", scale)):
+        if value is not None and quantity(value, name) <= 0.0:
+            raise InputError("not a size", field=name, expected="a number above 0", got=value)
+    if height is not None and scale is not None:
+        raise InputError("both a height and a scale", field="height, scale", expected="one of them")
+    options = Options() if options is None else instance(options, Options, "options")
+    clearances = {"dist_safe": options.dist_safe, "grasp_clearance": options.grasp_clearance}
+    robot = robot if isinstance(robot, Robot) else load_robot(robot)
+    name = _name(path, link)
+    target = Path(name) if folder is None else file_path(folder, "folder", "a folder")
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise InputError("there is something already", file=target, field="folder", expected="a new or an empty folder")
+    description = read_description(path)
+    description = upright(tidied(renamed(only(description, link) if link else description)), up)
+    description, size = _sized(description, height, scale)
+    meshes = surfaces(description)
+    description = _settled(with_limits(description, meshes))
+    description = with_pieces(description, surfaces(description))
+    yaml, urdf = target / f"{name}.yaml", target / f"{name}.urdf"
+    write_urdf(description, urdf)
+    about = [f"Made of {path.name} by vkc-pin import-object."]
+    write_description(yaml, urdf.name, (), about=about)
+    proposals = propose_attachments(load_object(yaml), robot, most=most, **clearances)
+    about.append(f"Attachments as proposed for the hand of {proposals.hand.robot}, best first.")
+    about += [f"No hand can open {joint}: {reason}." for joint, reason in proposals.because.items()]
+    write_description(yaml, urdf.name, [item.description() for item in proposals.found], about=about)
+    picture = target / "attachments.png"
+    plot_attachments(proposals, picture)
+    return ImportedObject(yaml, load_object(yaml), proposals, size, description.notes, picture)
+
+
+def _name(path: Path, link: str | None) -> str:
+    """Return what to call an object: by its link, its file, or the folder of a file whose name says nothing."""
+    stem = link or (path.resolve().parent.name if path.stem.lower() in _GENERAL else path.stem)
+    name = re.sub(r"[^A-Za-z0-9_]+", "_", stem).strip("_") or "object"
+    return name if name[0].isalpha() else f"object_{name}"
+
+
+def _sized(description: Description, height: float | None, scale: float | None) -> tuple[Description, Floats]:
+    """Return the object in its size, and that [m]; what is not plausible is noted."""
+    low, high = bounds(description, surfaces(description))
+    if not (high > low).all():
+        raise InputError("the object is flat", file=description.file, expected="shapes around a volume")
+    factor = height / float(high[2] - low[2]) if height is not None else scale or 1.0
+    size = factor * (high - low)
+    if height is None and not _SMALL <= size[2] <= _LARGE:
+        note = f"it is {size[2]:.3g} m high: if it is not, say how high it is (height) or in which unit the file is (scale)"
+        description = dataclasses.replace(description, notes=(*description.notes, note))
+    return scaled(description, factor), size
+
+
+def _settled(description: Description) -> Description:
+    """Return the object with its root's frame on the floor, below its middle, joints closed."""
+    low, high = bounds(description, surfaces(description), closed(description))
+    return rooted(description, pin.SE3(np.eye(3), -np.array([(low[0] + high[0]) / 2.0, (low[1] + high[1]) / 2.0, low[2]])))
+
+
+def closed(description: Description) -> dict[str, float]:
+    """Return the values at which joints are closed, zero or the limit next to it, [rad] or [m]."""
+    return {joint.name: min(max(0.0, joint.limits[0]), joint.limits[1]) for joint in description.joints.values() if joint.limits}

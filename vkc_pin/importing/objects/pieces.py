@@ -1,0 +1,96 @@
+"""Convex pieces of the links of an object, few enough to plan with and close enough for fingers to get around a handle."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.arrays import Floats
+from vkc_pin.importing.convex import ERROR, concavity, decompose
+from vkc_pin.importing.objects.description import Description, Link, Part
+from vkc_pin.importing.objects.tidying import Surfaces
+from vkc_pin.importing.slicing import THICKNESS, flat, thickened
+
+if TYPE_CHECKING:
+    import trimesh
+
+__all__ = ["with_pieces"]
+
+_FINE = 0.006  # [m]: how far pieces of what moves may stand out; a finger keeps about as much from a handle
+_INSIDE = 1e-3  # [m]: what stands out of another piece by less is part of it
+
+
+def with_pieces(description: Description, meshes: Surfaces) -> Description:
+    """Return the object with convex shapes alone to collide with, what is flat or lies inside of others noted.
+
+    Args:
+        description: The object.
+        meshes: Its surfaces.
+
+    Raises:
+        InputError: A mesh is concave, and CoACD is not installed.
+    """
+    notes, links = list(description.notes), dict[str, Link]()
+    for name, link in description.links.items():
+        error, solids, thick = _FINE if name in description.joints else ERROR, list[Part](), list[str]()
+        for part in link.solid:
+            mesh = meshes[id(part)]
+            if part.kind != "mesh":
+                solids.append(part)
+                continue
+            if flat(mesh.vertices):
+                thick.append(part.name or "a mesh")
+            found = _convex(mesh, error)
+            solids += [
+                Part(
+                    name=part.name,
+                    placement=pin.SE3.Identity(),
+                    kind="mesh",
+                    size=(1.0, 1.0, 1.0),
+                    triangles=piece,
+                    colour=part.colour,
+                )
+                for piece in found
+            ]
+        kept = _without_inner(solids)
+        if thick:
+            notes.append(f"link '{name}': flat shapes are {1e3 * THICKNESS:g} mm thick now: {', '.join(dict.fromkeys(thick))}")
+        if link.visual and not link.collision:
+            notes.append(f"link '{name}' has nothing to collide with: it collides as what it looks like")
+        links[name] = Link(name, link.visual or link.collision, tuple(kept))
+    return dataclasses.replace(description, links=links, notes=tuple(notes))
+
+
+def _convex(mesh: trimesh.Trimesh, error: float) -> Sequence[trimesh.Trimesh]:
+    """Return convex pieces that contain a mesh."""
+    import trimesh
+
+    if flat(mesh.vertices):
+        return [trimesh.convex.convex_hull(thickened(np.asarray(mesh.vertices)))]
+    if concavity(mesh) <= error:  # quicker to tell than all that `decompose` says
+        return [trimesh.convex.convex_hull(mesh.vertices)]
+    return decompose(mesh, error=error).meshes
+
+
+def _without_inner(parts: list[Part]) -> list[Part]:
+    """Return parts without the meshes that lie inside one of the others."""
+    planes: Mapping[int, tuple[Floats, Floats]] = {
+        k: (np.asarray(part.triangles.face_normals), np.asarray(part.triangles.triangles)[:, 0])
+        for k, part in enumerate(parts)
+        if part.triangles is not None and part.kind == "mesh"
+    }
+    order = sorted(planes, key=lambda k: -parts[k].triangles.volume)  # type: ignore[union-attr]
+    gone: set[int] = set()
+    for number, k in enumerate(order):
+        corners = np.asarray(parts[k].triangles.vertices)  # type: ignore[union-attr]
+        for other in order[:number]:
+            if other not in gone:
+                normals, points = planes[other]
+                if (corners @ normals.T - np.einsum("ij,ij->i", normals, points)).max() < _INSIDE:
+                    gone.add(k)
+                    break
+    return [part for k, part in enumerate(parts) if k not in gone]

@@ -1,0 +1,204 @@
+"""Makes what a planner needs of what a file says: joints that move something, between limits, in metres, upright."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.arrays import Floats
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.importing.objects.description import Description, Link, Part
+
+if TYPE_CHECKING:
+    import trimesh
+
+__all__ = ["Surfaces", "bounds", "only", "renamed", "rooted", "scaled", "surfaces", "tidied", "upright", "with_limits"]
+
+Surfaces = Mapping[int, "trimesh.Trimesh"]
+"""The surfaces of parts in the frame of their link, by `id` of the part."""
+_OPEN = np.pi / 2.0  # [rad]: how far a hinge opens whose limits nobody states
+_HARDLY = 0.05  # [rad]: who meant degrees and wrote radians has hinges that turn by less
+_PULLED = 0.8  # of the depth of a drawer: how far it slides then
+_UP = {"z": np.eye(3), "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])}
+
+
+def only(description: Description, link: str) -> Description:
+    """Return a link and all that hangs on it as an object of its own.
+
+    Raises:
+        UnknownNameError: There is no such link.
+    """
+    if link not in description.links:
+        raise UnknownNameError("link", link, description.links, file=description.file, field="link")
+    kept = description.below(link)
+    links = {name: found for name, found in description.links.items() if name in kept}
+    joints = {child: joint for child, joint in description.joints.items() if child in kept and child != link}
+    return dataclasses.replace(description, links=links, joints=joints)
+
+
+def renamed(description: Description) -> Description:
+    """Return the object with names of links and joints that attachments and steps can have: without '.', '/' and spaces."""
+    taken: set[str] = set()
+
+    def plain(name: str) -> str:
+        stem, number = re.sub(r"[\s./]+", "_", name).strip("_") or "part", 1
+        while (new := stem if number == 1 else f"{stem}_{number}") in taken:
+            number += 1
+        taken.add(new)
+        return new
+
+    names = {name: plain(name) for name in description.links}
+    taken.clear()
+    links = {names[name]: dataclasses.replace(link, name=names[name]) for name, link in description.links.items()}
+    joints = {
+        names[child]: dataclasses.replace(joint, name=plain(joint.name), parent=names[joint.parent], child=names[child])
+        for child, joint in description.joints.items()
+    }
+    return dataclasses.replace(description, links=links, joints=joints)
+
+
+def tidied(description: Description) -> Description:
+    """Return the same object with every link a body that moves: fixed links become part of what they are fixed to.
+
+    Links without any shape that nothing with a shape hangs on are left out, and noted. A joint with nowhere to go becomes fixed.
+    """
+    links, joints, notes = dict(description.links), dict(description.joints), list(description.notes)
+    for child in list(joints):
+        below = description.below(child)
+        if not any(links[name].solid for name in below if name in links):
+            notes.append(f"joint '{joints[child].name}' moves nothing that has a shape: left out with link '{child}'")
+            for name in below:
+                links.pop(name, None)
+                joints.pop(name, None)
+    for child, joint in joints.items():
+        if joint.kind != "fixed" and joint.limits is not None and joint.limits[0] == joint.limits[1] != 0.0:
+            placement = joint.placement * joint.motion(joint.limits[0])
+            joints[child] = dataclasses.replace(joint, placement=placement, limits=(0.0, 0.0))
+    for child in list(joints):
+        joint = joints[child]
+        stuck = joint.kind != "fixed" and joint.limits == (0.0, 0.0)
+        if stuck:
+            notes.append(f"joint '{joint.name}' has one value only: fixed")
+        if joint.kind == "fixed" or stuck:
+            above, gone = links[joint.parent], links.pop(child)
+            moved = (_moved(gone, parts, joint.placement) for parts in (gone.visual, gone.collision))
+            visual, collision = moved
+            if bool(above.collision) != bool(gone.collision):  # one of them collides as what it looks like
+                above, collision = Link(above.name, above.visual, above.solid), collision or visual
+            links[joint.parent] = Link(above.name, (*above.visual, *visual), (*above.collision, *collision))
+            del joints[child]
+            for name, other in joints.items():
+                if other.parent == child:
+                    placement = joint.placement * other.placement
+                    joints[name] = dataclasses.replace(other, parent=joint.parent, placement=placement)
+    return dataclasses.replace(description, links=links, joints=joints, notes=tuple(notes))
+
+
+def _moved(link: Link, parts: tuple[Part, ...], placement: pin.SE3) -> tuple[Part, ...]:
+    return tuple(
+        dataclasses.replace(part, name=f"{link.name}_{part.name}".rstrip("_"), placement=placement * part.placement)
+        for part in parts
+    )
+
+
+def surfaces(description: Description) -> Surfaces:
+    """Return the surfaces of all shapes, those that are seen and those that collide."""
+    parts = [part for link in description.links.values() for part in (*link.visual, *link.collision)]
+    return {id(part): part.mesh() for part in parts}
+
+
+def bounds(description: Description, meshes: Surfaces, values: Mapping[str, float] | None = None) -> tuple[Floats, Floats]:
+    """Return the box around what collides, in the root's frame, [m], joints at `values` or at zero.
+
+    Raises:
+        InputError: Nothing has a shape.
+    """
+    places = description.placements(values)
+    points = [
+        np.asarray(meshes[id(part)].vertices) @ places[name].rotation.T + places[name].translation
+        for name, link in description.links.items()
+        for part in link.solid
+    ]
+    if not points:
+        raise InputError("nothing in this file has a shape", file=description.file, expected="<collision> or <visual> elements")
+    joined = np.vstack(points)
+    return joined.min(axis=0), joined.max(axis=0)
+
+
+def scaled(description: Description, factor: float) -> Description:
+    """Return the object made larger by a factor: shapes, places of joints, and how far they slide."""
+    links = {
+        name: Link(name, tuple(_scaled(p, factor) for p in link.visual), tuple(_scaled(p, factor) for p in link.collision))
+        for name, link in description.links.items()
+    }
+    joints = {}
+    for child, joint in description.joints.items():
+        limits = joint.limits
+        if joint.kind == "prismatic" and limits is not None:
+            limits = (factor * limits[0], factor * limits[1])
+        placement = pin.SE3(joint.placement.rotation, factor * joint.placement.translation)
+        joints[child] = dataclasses.replace(joint, placement=placement, limits=limits)
+    return dataclasses.replace(description, links=links, joints=joints)
+
+
+def _scaled(part: Part, factor: float) -> Part:
+    placement = pin.SE3(part.placement.rotation, factor * part.placement.translation)
+    return dataclasses.replace(part, placement=placement, size=tuple(factor * size for size in part.size))
+
+
+def upright(description: Description, up: str) -> Description:
+    """Return the object turned so that its axis `up`, "y" or "z", points upwards."""
+    return rooted(description, pin.SE3(_UP[up], np.zeros(3)))
+
+
+def rooted(description: Description, placement: pin.SE3) -> Description:
+    """Return the object with its root's frame where the old one is at `placement`."""
+    links, root = dict(description.links), description.root
+    parts = (
+        tuple(dataclasses.replace(part, placement=placement * part.placement) for part in kind)
+        for kind in (links[root].visual, links[root].collision)
+    )
+    links[root] = Link(root, *parts)
+    joints = {
+        child: dataclasses.replace(joint, placement=placement * joint.placement) if joint.parent == root else joint
+        for child, joint in description.joints.items()
+    }
+    return dataclasses.replace(description, links=links, joints=joints)
+
+
+def with_limits(description: Description, meshes: Surfaces) -> Description:
+    """Return the object with limits for hinges and slides that have none, each noted.
+
+    A hinge opens by a right angle, a drawer by most of its depth, in the direction that brings what moves away from the middle of
+    the object.
+    """
+    joints, notes = dict(description.joints), list(description.notes)
+    places, (low, high) = description.placements(), bounds(description, meshes)
+    for child, joint in description.joints.items():
+        if joint.kind == "revolute" and joint.limits is not None and np.ptp(joint.limits) < _HARDLY:
+            degrees = float(np.degrees(np.ptp(joint.limits)))
+            notes.append(f"joint '{joint.name}' turns by {degrees:.1g}° only: are its limits in another unit?")
+        if joint.kind not in ("revolute", "prismatic") or joint.limits is not None:
+            continue
+        below = description.below(child)
+        points = np.vstack(
+            [
+                np.asarray(meshes[id(part)].vertices) @ places[name].rotation.T + places[name].translation
+                for name in below
+                for part in description.links[name].solid
+            ]
+        )
+        centre, axis = (points.min(axis=0) + points.max(axis=0)) / 2.0, places[child].rotation @ joint.axis
+        way = axis if joint.kind == "prismatic" else np.cross(axis, centre - places[child].translation)
+        sign = 1.0 if way @ (centre - (low + high) / 2.0) >= 0.0 else -1.0
+        far = _OPEN if joint.kind == "revolute" else _PULLED * float(np.ptp(points @ axis))
+        limits = (0.0, far) if sign > 0.0 else (-far, 0.0)
+        joints[child] = dataclasses.replace(joint, limits=limits)
+        unit = "rad" if joint.kind == "revolute" else "m"
+        notes.append(f"joint '{joint.name}' states no limits: {limits[0]:.3g} to {limits[1]:.3g} {unit}, away from the middle")
+    return dataclasses.replace(description, joints=joints, notes=tuple(notes))

@@ -1,0 +1,104 @@
+"""Reads the URDF of an object as it was downloaded, with what it leaves out."""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.files.kinematic_tree import check_tree, numbers_of
+from vkc_pin.files.urdf import UrdfFile
+from vkc_pin.files.xml import read_xml
+from vkc_pin.importing.objects.description import Description, Joint, Link, Part
+
+__all__ = ["read_object_urdf"]
+
+_KINDS = ("fixed", "revolute", "continuous", "prismatic")
+
+
+def read_object_urdf(file: Path) -> Description:
+    """Return what a URDF says about an object.
+
+    Raises:
+        InputError: It cannot be read, its links are no tree, or a mesh file is missing.
+        UnknownNameError: A joint names a link that does not exist.
+    """
+    _, root = read_xml(file, "URDF")
+    notes = list[str]()
+    stated = {joint.get("name", ""): _stated(file, joint, notes) for joint in root.findall("joint")}
+    for joint in root.findall("joint"):
+        if joint.get("type") not in _KINDS:
+            notes.append(f"joint '{joint.get('name')}' is {joint.get('type')}: taken as fixed")
+            joint.set("type", "fixed")
+        if (mimic := joint.find("mimic")) is not None:
+            notes.append(f"joint '{joint.get('name')}' mimics '{mimic.get('joint')}': it moves on its own now")
+            joint.remove(mimic)
+    check_tree(file, root)
+    urdf = UrdfFile(file.resolve(), "", root)
+    names = _names(root)
+    parts: dict[str, dict[str, list[Part]]] = {kind: {link: [] for link in urdf.links} for kind in ("visual", "collision")}
+    for kind, of_links in parts.items():
+        for shape in urdf.shapes(kind):
+            name = names.get((kind, shape.name)) or names.get(("mesh", str(shape.file))) or ""
+            of_links[shape.link].append(
+                Part(name=name, placement=shape.placement, kind=shape.kind, size=shape.size, file=shape.file, colour=shape.colour)
+            )
+            if name and shape.file is not None:  # PartNet-Mobility names what is seen; what collides are the same files
+                names["mesh", str(shape.file)] = name
+    links = {name: Link(name, tuple(parts["visual"][name]), tuple(parts["collision"][name])) for name in urdf.links}
+    joints = [_joint(file, joint, stated[joint.get("name", "")]) for joint in root.findall("joint")]
+    return Description(file, links, {joint.child: joint for joint in joints}, tuple(notes))
+
+
+def _names(root: ElementTree.Element) -> dict[tuple[str, str], str]:
+    """Return what elements are called: (kind, `<link>_<k>`) → name."""
+    return {
+        (kind, f"{link.get('name')}_{number}"): element.get("name", "")
+        for link in root.findall("link")
+        for kind in ("visual", "collision")
+        for number, element in enumerate(link.findall(kind))
+    }
+
+
+def _stated(file: Path, joint: ElementTree.Element, notes: list[str]) -> tuple[float, float] | None:
+    """Return the limits that a joint states, and write some that any reader takes; None if it states none."""
+    limit, name = joint.find("limit"), joint.get("name", "")
+    if limit is None:
+        joint.append(ElementTree.Element("limit", {"lower": "0", "upper": "0"}))
+        return None
+    if limit.get("lower") is None and limit.get("upper") is None:
+        return None
+    low, high = (numbers_of(file, limit, key, 1, default="0", where=name, largest=math.inf)[0] for key in ("lower", "upper"))
+    if low > high:
+        notes.append(f"joint '{name}' has its limits the wrong way round, {low:g} and {high:g}: exchanged")
+        low, high = high, low
+        limit.set("lower", str(low))
+        limit.set("upper", str(high))
+    return low, high
+
+
+def _joint(file: Path, element: ElementTree.Element, limits: tuple[float, float] | None) -> Joint:
+    name, kind = element.get("name", ""), element.get("type", "")
+    origin, axis, limit = element.find("origin"), element.find("axis"), element.find("limit")
+    placement = pin.SE3.Identity()
+    if origin is not None:
+        xyz, rpy = (numbers_of(file, origin, key, 3, default="0 0 0", where=name) for key in ("xyz", "rpy"))
+        placement = pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array(xyz))
+    direction = np.array([1.0, 0.0, 0.0])
+    if axis is not None and kind != "fixed":
+        direction = np.array(numbers_of(file, axis, "xyz", 3, default="1 0 0", where=name))
+    velocity = numbers_of(file, limit, "velocity", 1, default="0", where=name)[0] if limit is not None else 0.0
+    ends = [(found.get("link", "") if (found := element.find(key)) is not None else "") for key in ("parent", "child")]
+    return Joint(
+        name=name,
+        kind=kind,
+        parent=ends[0],
+        child=ends[1],
+        placement=placement,
+        axis=direction / np.linalg.norm(direction),
+        limits=None if kind == "continuous" else limits,
+        velocity=velocity if velocity > 0.0 else None,
+    )

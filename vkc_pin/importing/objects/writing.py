@@ -1,0 +1,142 @@
+"""Writes an object as a folder: a URDF with convex pieces, meshes to look at, and the description that scenes name."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+import pinocchio as pin
+import yaml
+
+from vkc_pin.files.meshes import load_parts
+from vkc_pin.files.writing import write_atomically
+from vkc_pin.importing.objects.description import Colour, Description, Joint, Link, Part
+from vkc_pin.models.articulation import DEFAULT_VELOCITY
+
+if TYPE_CHECKING:
+    import trimesh
+
+__all__ = ["write_description", "write_urdf"]
+
+_EFFORT = 100.0  # [N], [N m]: nothing here reads it, but other programs want one
+_GREY: Colour = (0.75, 0.75, 0.75, 1.0)
+
+
+def write_urdf(description: Description, file: Path) -> None:
+    """Write a URDF, and beside it the folders `collision` and `visual` with its meshes.
+
+    Args:
+        description: The object; what collides is convex.
+        file: The URDF to write.
+    """
+    lines = ['<?xml version="1.0"?>', f"<robot name={quoteattr(file.stem)}>"]
+    for link in description.links.values():
+        lines.append(f"  <link name={quoteattr(link.name)}>")
+        for number, (part, mesh, colour) in enumerate(_looks(link)):
+            address = None if mesh is None else _mesh(file, f"visual/{_plain(link.name)}_{number}.stl", mesh)
+            lines += _element("visual", "", part, address, colour)
+        for number, part in enumerate(_plain_shapes(link.collision)):
+            piece = None if part.kind != "mesh" else _mesh(file, f"collision/{_plain(link.name)}_{number}.stl", part.mesh())
+            lines += _element("collision", part.name, part, piece, None)
+        lines.append("  </link>")
+    for joint in description.joints.values():
+        lines += _joint(joint)
+    write_atomically(file, ("\n".join([*lines, "</robot>"]) + "\n").encode())
+
+
+def write_description(file: Path, urdf: str, attachments: Sequence[Mapping[str, Any]], *, about: Sequence[str]) -> None:
+    """Write the description of an object.
+
+    Args:
+        file: The .yaml to write.
+        urdf: Its URDF, from the folder of `file`.
+        attachments: As data, best first.
+        about: Lines for its head.
+    """
+    head = "".join(f"# {line}\n" for line in about)
+    body = yaml.safe_dump({"urdf": urdf, "attachments": [dict(item) for item in attachments]}, sort_keys=False, width=130)
+    write_atomically(file, (head + body).encode())
+
+
+def _looks(link: Link) -> list[tuple[Part | None, trimesh.Trimesh | None, Colour]]:
+    """Return what a link looks like: shapes as they are, and meshes in its frame, those of one colour together."""
+    import trimesh
+
+    found: list[tuple[Part | None, trimesh.Trimesh | None, Colour]] = []
+    meshes: dict[Colour, list[trimesh.Trimesh]] = {}
+    for part in _plain_shapes(link.visual):
+        if part.kind != "mesh":
+            found.append((part, None, part.colour or _GREY))
+        elif part.file is not None and part.colour is None:
+            for coloured in load_parts(part.file, part.size):
+                mesh = trimesh.Trimesh(coloured.vertices, coloured.faces, process=False)
+                mesh.apply_transform(part.placement.homogeneous)
+                meshes.setdefault(coloured.colour or _GREY, []).append(mesh)
+        else:
+            meshes.setdefault(part.colour or _GREY, []).append(part.mesh())
+    return found + [(None, trimesh.util.concatenate(same), colour) for colour, same in meshes.items()]
+
+
+def _plain_shapes(parts: Sequence[Part]) -> list[Part]:
+    """Return parts with a cylinder and two balls for each capsule, which URDF has not: many readers then drop the whole link."""
+    found = list[Part]()
+    for part in parts:
+        if part.kind != "capsule":
+            found.append(part)
+            continue
+        radius, length = part.size
+        found.append(dataclasses.replace(part, kind="cylinder"))
+        for end in (-length / 2.0, length / 2.0):
+            ball = part.placement * pin.SE3(np.eye(3), np.array([0.0, 0.0, end]))
+            found.append(dataclasses.replace(part, kind="sphere", size=(radius,), placement=ball))
+    return found
+
+
+def _mesh(urdf: Path, address: str, mesh: trimesh.Trimesh) -> str:
+    write_atomically(urdf.parent / address, mesh.export(file_type="stl"))
+    return address
+
+
+def _element(kind: str, name: str, part: Part | None, address: str | None, colour: Colour | None) -> list[str]:
+    lines = [f"    <{kind}{f' name={quoteattr(name)}' if name else ''}>"]
+    if part is not None and address is None:
+        lines.append(f"      {_origin(part.placement)}")
+        keys = {"box": f'size="{_numbers(part.size)}"', "sphere": f'radius="{_numbers(part.size)}"'}
+        size = keys.get(part.kind) or f'radius="{_numbers(part.size[:1])}" length="{_numbers(part.size[1:])}"'
+        lines.append(f"      <geometry><{part.kind} {size}/></geometry>")
+    else:
+        lines.append(f"      <geometry><mesh filename={quoteattr(address or '')}/></geometry>")
+    if colour is not None:
+        name = "_".join(f"{round(255 * c):02x}" for c in colour)
+        lines.append(f'      <material name="{name}"><color rgba="{_numbers(colour)}"/></material>')
+    return [*lines, f"    </{kind}>"]
+
+
+def _joint(joint: Joint) -> list[str]:
+    lines = [
+        f"  <joint name={quoteattr(joint.name)} type={quoteattr(joint.kind)}>",
+        f"    <parent link={quoteattr(joint.parent)}/><child link={quoteattr(joint.child)}/>",
+        f"    {_origin(joint.placement)}",
+        f'    <axis xyz="{_numbers(joint.axis)}"/>',
+    ]
+    velocity = joint.velocity or DEFAULT_VELOCITY
+    ends = "" if joint.limits is None else f'lower="{_numbers(joint.limits[:1])}" upper="{_numbers(joint.limits[1:])}" '
+    return [*lines, f'    <limit {ends}velocity="{_numbers([velocity])}" effort="{_numbers([_EFFORT])}"/>', "  </joint>"]
+
+
+def _origin(placement: pin.SE3) -> str:
+    return f'<origin xyz="{_numbers(placement.translation)}" rpy="{_numbers(pin.rpy.matrixToRpy(placement.rotation))}"/>'
+
+
+def _numbers(values: Any) -> str:
+    return " ".join(f"{value + 0.0:.9g}" for value in np.asarray(values, float).round(9).tolist())
+
+
+def _plain(name: str) -> str:
+    """Return a name that any file can have."""
+    return re.sub(r"[^A-Za-z0-9_-]", "_", name)

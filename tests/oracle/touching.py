@@ -103,7 +103,7 @@ def _held(world: World, clock: _Clock) -> Iterator[Licence]:
         yield Licence(ours, frozenset({f"{hold.object}.{grasp.link}"}), begin, end)
         others = frozenset(f"{hold.object}.{link}" for link in thing.tree.urdf.links if link != grasp.link)
         least = plan.options["grasp_clearance"] if grasp.clearance is None else grasp.clearance
-        yield Licence(ours, others, begin, end, least)
+        yield Licence(ours, others, begin, end, least=least)
 
 
 def _lifted(world: World, stages: list[Stage], clock: _Clock) -> Iterator[Licence]:
@@ -128,7 +128,7 @@ def _lifted(world: World, stages: list[Stage], clock: _Clock) -> Iterator[Licenc
                                 apart = distance(part.shape.solid, part.at, other.shape.solid, other.at, 0)
                                 if apart < 0.0:
                                     pair = frozenset({part.label}), frozenset({other.label})
-                                    yield Licence(*pair, clock.before(waypoint), clock.after(waypoint), -apart)
+                                    yield Licence(*pair, clock.before(waypoint), clock.after(waypoint), depth=-apart)
         carried |= now
 
 

@@ -32,6 +32,8 @@ AISLE = (2.35, 2.5, 0.2), (-2.9, -3.0, 6.2)
 HOME = (0.1, -0.3, 0.0), (-1.5, -8.5, 9.0)
 KITCHEN = (-2.1, 2.4, 0.7), (0.1, -1.0, 2.9)
 TRAY = (0.0, -0.5, 0.5), (-3.2, -2.6, 2.6)
+PUSHED = (2.3, -0.2, 0.8), (-0.5, -2.6, 2.9)
+PUSHING = 14.0  # [s] of the motion at the door that stands open
 CARRIED = 15.0  # [s] of the motion with the tray
 GAP = (0.1, -0.3, 0.2), (-3.4, -5.0, 5.6)
 OPENED = {"door": ("hinge", 1.0), "drawer": ("slide", 0.22), "dishwasher": ("rack", 0.5), "refrigerator": ("hinge", 1.4)}
@@ -105,6 +107,13 @@ def tray_picture() -> None:
     picture(vkc.plan(vkc.load_scene("tray"), [vkc.Place("tray", [-0.3, -1.96, 0.7])]), "tray", SMALL, CARRIED)
 
 
+def push_picture() -> None:
+    """Write a picture of a door that is pushed shut."""
+    look(*PUSHED)
+    scene = vkc.load_scene("door").with_state("door", {"hinge": -1.2})
+    picture(vkc.plan(scene, [vkc.Actuate("door", {"hinge": 0.0}, "push")]), "pushing", SMALL, PUSHING)
+
+
 def main() -> int:
     """Write the pictures; return 1 if there is no motion to show."""
     saved = [vkc.Plan.load(name) for name in sys.argv[1:]]
@@ -135,6 +144,7 @@ def main() -> int:
     chore_pictures(chore)
     gap_picture(through)
     tray_picture()
+    push_picture()
     return 0
 
 

@@ -30,6 +30,8 @@ GRASPS = [
     {"cabinet": "sleeve"},
     {"cabinet": "socket"},
     {"cabinet": "spike"},
+    {"cabinet": "wheel"},
+    {"cabinet": "face"},
     {"door": "handle", "drawer": "handle_free", "cabinet": "ball"},
 ]
 IDS = [" ".join(f"{name}.{grasp}" for name, grasp in grasps.items()) for grasps in GRASPS]
@@ -59,6 +61,15 @@ def virtual_motion(chain: VirtualKinematicChain, scene: Scene, name: str, grasp:
         return float(z[chain.index(f"{name}.{grasp}{suffix}")])
 
     turn, shift = np.eye(3), np.zeros(3)
+    if attachment.joint == "listed":
+        moved = pin.SE3.Identity()
+        for freedom in attachment.freedoms:
+            if freedom.kind == "prismatic":
+                moved = moved * pin.SE3(np.eye(3), freedom.axis * value(freedom.suffix))
+            else:
+                there, spin = pin.SE3(np.eye(3), freedom.through), pin.AngleAxis(value(freedom.suffix), freedom.axis)
+                moved = moved * there * pin.SE3(spin.matrix(), np.zeros(3)) * there.inverse()
+        turn, shift = moved.rotation, moved.translation
     if attachment.joint == "spherical":
         turn = pin.utils.rotate("x", value("_x")) @ pin.utils.rotate("y", value("_y")) @ pin.utils.rotate("z", value("_z"))
     elif attachment.joint == "revolute":

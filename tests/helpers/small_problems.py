@@ -91,6 +91,11 @@ def full_scene() -> Scene:
     axis = np.array([2.0, -1.0, 2.0]) / 3.0
     turns = tuple(Freedom(f"_{name}", "revolute", unit, -0.7, 0.6) for name, unit in zip("xyz", np.eye(3), strict=True))
     sleeve = (Freedom("_slide", "prismatic", axis, -0.05, 0.08), Freedom("_turn", "revolute", axis, -0.5, 0.9))
+    wheel = (
+        Freedom("_around", "revolute", axis, -2.0, 2.0, np.array([0.1, -0.2, 0.05])),
+        Freedom("_tilt", "revolute", turns[1].axis, -0.5, 0.5),
+    )
+    face = (*(Freedom(f"_{name}", "prismatic", unit, -0.1, 0.1) for name, unit in zip("xy", np.eye(3), strict=False)), turns[2])
     for freer in (
         dataclasses.replace(grip, name="rail", joint="prismatic", freedoms=(Freedom("", "prismatic", axis, -0.05, 0.08),)),
         dataclasses.replace(grip, name="bar", joint="revolute", freedoms=(Freedom("", "revolute", axis, -0.5, 0.9),)),
@@ -98,6 +103,8 @@ def full_scene() -> Scene:
         dataclasses.replace(grip, name="sleeve", joint="cylindrical", freedoms=sleeve, standoff=0.02),
         dataclasses.replace(grip, name="socket", joint="spherical", freedoms=turns, standoff=0.04),
         dataclasses.replace(grip, name="spike", standoff=0.03),
+        dataclasses.replace(grip, name="wheel", joint="listed", freedoms=wheel, standoff=0.02),
+        dataclasses.replace(grip, name="face", joint="listed", freedoms=face, standoff=0.01),
     ):
         case = with_attachment(case, freer)
     return with_objects(scene, {"drawer": drawer, "cabinet": case})

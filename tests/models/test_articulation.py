@@ -34,7 +34,7 @@ def test_door() -> None:
         0.5,
         0.05,
     )
-    assert list(door.attachments) == ["handle", "handle_free"]
+    assert list(door.attachments) == ["handle", "handle_free", "push", "push_back"]
     assert door.attachment() is door.attachment("handle")
     free = door.attachment("handle_free")
     (tilt,) = free.freedoms
@@ -69,7 +69,7 @@ def test_drawer() -> None:
     assert drawer.coordinates.names == ("slide",)
     assert (drawer.lower[0], drawer.upper[0], drawer.velocity[0], drawer.acceleration[0]) == (0.0, 0.4, 0.5, 1.0)
     assert drawer.latches == ()
-    assert list(drawer.attachments) == ["handle", "handle_free"]
+    assert list(drawer.attachments) == ["handle", "handle_free", "push"]
     moved = drawer.link_placement("tray", [0.4]).translation - drawer.link_placement("tray", [0.0]).translation
     np.testing.assert_allclose(moved, [-0.4, 0.0, 0.0], atol=1e-12)  # out of the cabinet, towards whoever pulls
 
@@ -123,3 +123,33 @@ def test_an_attachment_moves_as_its_joint_does(joint: str, fields: str, suffixes
     np.testing.assert_allclose(grip.tool(v).homogeneous, placement.homogeneous @ moved.homogeneous, atol=1e-12)
     with pytest.raises(InputError, match="one a freedom"):
         grip.motion([*v, 0.0])
+
+
+def test_the_freedoms_of_a_region_follow_each_other() -> None:
+    """A rim of radius 0.3, along which the hand goes, then tilts, then slides: against rotations about points by SciPy."""
+    entry = """
+  - name: rim
+    link: panel
+    position: [0.3, 0, 0.1]
+    approach: [0, 0, -1]
+    closing: [1, 0, 0]
+    freedoms:
+      - {name: around, turn: [0, 0, 2], through: [-0.3, 0, 0], limits: [-3, 3]}
+      - {name: tilt, turn: [0, 1, 0], limits: [-0.5, 0.5]}
+      - {name: slide, slide: [3, 0, 4], limits: [0, 0.02]}"""
+    rim = load_text(URDF, f"urdf: thing.urdf\nattachments: {entry}").attachment()
+    assert (rim.joint, rim.coordinates) == ("listed", ("rim_around", "rim_tilt", "rim_slide"))
+    assert [(own.kind, own.unit, own.lower, own.upper) for own in rim.freedoms] == [
+        ("revolute", "rad", -3.0, 3.0),
+        ("revolute", "rad", -0.5, 0.5),
+        ("prismatic", "m", 0.0, 0.02),
+    ]
+    rng = np.random.default_rng(3)
+    down = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
+    for around, tilt, slide in rng.uniform([-3, -0.5, 0], [3, 0.5, 0.02], (20, 3)):
+        tool = rim.tool([around, tilt, slide])
+        spin = Rotation.from_euler("z", -around).as_matrix()  # seen from above the hand goes the other way
+        turn = spin @ down @ Rotation.from_euler("y", tilt).as_matrix()
+        np.testing.assert_allclose(tool.rotation, turn, rtol=0.0, atol=1e-12)
+        at = spin @ [0.3, 0.0, 0.0] + [0.0, 0.0, 0.1] + turn @ [0.6 * slide, 0.0, 0.8 * slide]
+        np.testing.assert_allclose(tool.translation, at, rtol=0.0, atol=1e-12)

@@ -16,6 +16,7 @@ from vkc_pin.files.urdf import load_urdf
 from vkc_pin.models.articulation import DEFAULT_ACCELERATION, DEFAULT_VELOCITY
 from vkc_pin.models.object_file import load_object
 
+ALONG = "name: along, slide: [1, 0, 0], limits: [0, 0.1]"
 SLIDE = "    axis: [0, 1, 0]\n    limits: [-0.1, 0.2]"
 
 
@@ -49,6 +50,12 @@ def test_limits_that_are_not_stated_have_documented_defaults() -> None:
 def test_a_hand_clamps_what_is_free_unless_told_otherwise(free: int, stated: str, firm: int) -> None:
     text = f"urdf: thing.urdf\nfree: {bool(free)}\nattachments: [{{name: grip, link: panel, {stated}}}]"
     assert load_text(URDF, text).attachment().firm is bool(firm)
+
+
+def test_what_stands_free_cannot_be_pushed() -> None:
+    with pytest.raises(InputError, match="nothing that leads it") as caught:
+        load_text(URDF, "urdf: thing.urdf\nfree: true\nattachments: [{name: grip, link: panel, contact: push}]")
+    assert (caught.value.line, caught.value.field) == (3, "attachments[0].contact")
 
 
 def test_two_grasps_cannot_share_a_coordinate() -> None:
@@ -105,6 +112,20 @@ def test_unknown_names_in_a_description(old: str, new: str, line: int, field: st
         ("link: panel", "link: panel\n    turn: [-1, 1]", 5, "attachments[0]"),
         ("link: panel", "link: panel\n    standoff: -0.01", 7, "attachments[0].standoff"),
         ("link: panel", "link: panel\n    firm: 2", 7, "attachments[0].firm"),
+        ("link: panel", "link: panel\n    clearance: -0.001", 7, "attachments[0].clearance"),
+        ("link: panel", "link: panel\n    contact: pull", 7, "attachments[0].contact"),
+        ("link: panel", "link: panel\n    contact: push\n    firm: true", 5, "attachments[0]"),
+        ("link: panel", f"link: panel\n    freedoms: [{{{ALONG}}}, {{{ALONG}}}]", 5, "attachments[0]"),
+        ("link: panel", f"link: panel\n    joint: spherical\n    freedoms: [{{{ALONG}}}]", 5, "attachments[0]"),
+        ("link: panel", f"link: panel\n    freedoms: [{{{ALONG}, turn: [0, 0, 1]}}]", 7, "attachments[0].freedoms[0]"),
+        ("link: panel", f"link: panel\n    freedoms: [{{{ALONG}, through: [0, 0, 1]}}]", 7, "attachments[0].freedoms[0]"),
+        ("link: panel", "link: panel\n    freedoms: [{name: up, limits: [0, 1]}]", 7, "attachments[0].freedoms[0]"),
+        (
+            "link: panel",
+            "link: panel\n    freedoms: [{name: up, slide: [0, 0, 0], limits: [0, 1]}]",
+            7,
+            "attachments[0].freedoms[0].slide",
+        ),
         ("link: panel", "link: panel\n    approach: [1, 0, 0]", 5, "attachments[0]"),
         ("link: panel", "link: panel\n    approach: [1, 0, 0]\n    closing: [1, 0, 1]", 5, "attachments[0]"),
         ("link: panel", "link: panel\n  - name: grip\n    link: panel", 7, "attachments[1].name"),

@@ -161,6 +161,16 @@ def test_the_lever_is_how_far_a_radian_moves_the_hand(husky: Robot) -> None:
     assert robot.lever == load_robot("husky_ur5e").lever
 
 
+def test_the_front_is_as_far_ahead_as_the_hand_reaches(husky: Robot) -> None:
+    """Of all corners of the touch links, in the tool frame; without such a link it is the tool frame itself."""
+    frame = husky.model.frames[husky.model.getFrameId(husky.tool_frame)]
+    hand = [s for k, s in enumerate(husky.collision.geometryObjects) if husky.link_of(k) in husky.touch_links]
+    ahead = [frame.placement.actInv(s.placement).act(point)[2] for s in hand for point in s.geometry.points()]
+    np.testing.assert_allclose(husky.front.translation, [0.0, 0.0, max(ahead)], rtol=0.0, atol=1e-6)
+    np.testing.assert_array_equal(husky.front.rotation, np.eye(3))
+    np.testing.assert_array_equal(dataclasses.replace(husky, touch_links=()).front.homogeneous, np.eye(4))
+
+
 def test_an_arm_that_does_not_turn_has_the_least_lever(husky: Robot) -> None:
     units = tuple("m" for _ in husky.coordinates.units)
     straight = dataclasses.replace(husky, coordinates=SimpleNamespace(units=units))  # type: ignore[arg-type]

@@ -7,12 +7,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from .plan import Hold, Violation
-from .poses import turn_between
+from .poses import pose, turn_between
 from .stage import Stage, World
 
 __all__ = ["check_motion", "check_stage"]
 
 TIP = 0.1  # [rad] by which what something stands on may tilt
+BACK = 1e-4  # [m] by which what is pushed may come back
 STILL = 1e-5  # [m] or [rad]
 
 
@@ -89,6 +90,7 @@ def check_stage(world: World, stage: Stage) -> Iterator[Violation]:
     yield from _latches(world, stage)
     for hold in stage.phase.holds:
         yield from _closure(world, stage, hold)
+        yield from _push(world, stage, hold)
         grasp = world.things[hold.object].grasps[hold.attachment]
         for name, *_ in grasp.freedoms if grasp.firm else ():
             column = stage.columns[:, world.plan.names.index(f"{hold.object}.{name}")]
@@ -129,10 +131,27 @@ def _latches(world: World, stage: Stage) -> Iterator[Violation]:
             yield from _worst("latch", f"{owner}.{latch['joint']}", short, stage.times, f"needs {latch['released_by']}")
 
 
+def _push(world: World, stage: Stage, hold: Hold) -> Iterator[Violation]:
+    """What is pushed goes ahead of the hand: where they touch, the link does not come back by more than rounding."""
+    grasp = world.things[hold.object].grasps[hold.attachment]
+    if not grasp.pushed:
+        return
+    size, link = len(stage.times), stage.links[hold.object, grasp.link]
+    turns, middles = np.broadcast_to(link.turn, (size, 3, 3)), np.broadcast_to(link.at, (size, 3))
+    touched = (stage.tool @ world.front @ pose((0.0, 0.0, grasp.standoff))).at  # in the world
+    in_link = np.einsum("kji,kj->ki", turns, touched - middles)
+    later = np.einsum("kij,kj->ki", turns[1:], in_link[:-1]) + middles[1:]
+    into = (turns @ grasp.place.turn[0])[:-1, :, 2]
+    ahead = np.concatenate([[0.0], np.cumsum(np.einsum("ki,ki->k", into, later - touched[:-1]))])
+    yield from _worst(
+        "push", f"{hold.object}.{hold.attachment}", np.maximum.accumulate(ahead) - ahead - BACK, stage.times, "pulls"
+    )
+
+
 def _closure(world: World, stage: Stage, hold: Hold) -> Iterator[Violation]:
     """The tool, or what takes its place, is where the attachment has it."""
     grasp = world.things[hold.object].grasps[hold.attachment]
-    holder = stage.tool
+    holder = stage.tool @ world.front if grasp.pushed else stage.tool
     if hold.by is not None:
         owner, _, link = hold.by.partition(".")
         holder = stage.links[owner, link]

@@ -11,8 +11,8 @@ import coal
 import numpy as np
 
 from .plan import Hold, Phase, SavedPlan
-from .poses import IDENTITY, Poses, orientation, pose
-from .riding import riders
+from .poses import IDENTITY, Poses, orientation, pose, rpy
+from .riding import distance, riders
 from .things import Thing, Tree, load_robot, load_thing
 from .urdf import Shape, mesh_hull, read_urdf, solid
 
@@ -110,6 +110,16 @@ class World:
         if own in thing.limits:
             return thing.slides(own)
         return next(f[1] for grasp in thing.grasps.values() for f in grasp.freedoms if f[0] == own)
+
+    @cached_property
+    def front(self) -> Poses:
+        """The hand's foremost point, in the tool's frame: as far ahead as any of its touch links reaches."""
+        robot, wall = self.robot, coal.Halfspace(np.array([0.0, 0.0, -1.0]), -1.0)  # all that is a metre ahead, and beyond
+        frames = robot.tree.links(robot.locked, None, sorted({robot.tool, *robot.touch}))
+        tool = frames[robot.tool].inverse()
+        hand = [shape for shape in robot.tree.urdf.shapes if shape.link in robot.touch]
+        gaps = [distance(shape.solid, tool @ frames[shape.link] @ shape.place, wall, IDENTITY) for shape in hand]
+        return pose((0.0, 0.0, 1.0 - min(gaps)))
 
     @cached_property
     def resting(self) -> np.ndarray:

@@ -71,26 +71,30 @@ class Tree:
 class Grasp:
     """An attachment: the tool in a link's frame is place · J(v) · standoff back along the tool's z axis.
 
-    `freedoms` are (name of the coordinate in the object, slides or not, axis, lower, upper).
+    `freedoms` are (name of the coordinate in the object, slides or not, axis, lower, upper); those that turn do so about an axis
+    through a point of `through`. Of a grasp that is `pushed`, the hand's foremost point is where the tool would be.
     """
 
     name: str
     link: str
     place: Poses
     freedoms: tuple[tuple[str, bool, np.ndarray, float, float], ...]
+    through: tuple[np.ndarray, ...]
     standoff: float
     firm: bool
     clearance: float | None
+    pushed: bool
 
     def tool(self, values: Mapping[str, np.ndarray]) -> Poses:
         """Return the tool in the link's frame at values of the freedoms, shape (S,) each."""
         found = self.place
-        for name, slides, axis, _, _ in self.freedoms:
+        for (name, slides, axis, _, _), point in zip(self.freedoms, self.through, strict=True):
             value = np.atleast_1d(values[name])
             if slides:
                 found = found @ Poses(np.tile(np.eye(3), (len(value), 1, 1)), value[:, None] * axis)
             else:
-                found = found @ Poses(axis_turn(axis, value), np.zeros((len(value), 3)))
+                turn = axis_turn(axis, value)
+                found = found @ Poses(turn, point - turn @ point)
         return found @ pose((0.0, 0.0, -self.standoff))
 
 
@@ -182,6 +186,10 @@ def _grasp(entry: Mapping[str, Any], free: bool, reversed_ones: Sequence[str]) -
     name, joint = entry["name"], entry.get("joint", "fixed")
     axis = np.array(entry["axis"], float) / np.linalg.norm(entry["axis"]) if "axis" in entry else np.zeros(3)
     freedoms: list[tuple[str, bool, np.ndarray, float, float]] = []
+    through = [np.array(own.get("through", (0.0, 0.0, 0.0)), float) for own in entry.get("freedoms", ())]
+    for own in entry.get("freedoms", ()):
+        direction = np.array(own["slide"] if "slide" in own else own["turn"], float)
+        freedoms.append((f"{name}_{own['name']}", "slide" in own, direction / np.linalg.norm(direction), *own["limits"]))
     if joint == "spherical":
         low, high = entry.get("limits", (-np.pi, np.pi))
         freedoms = [(f"{name}_{letter}", False, np.eye(3)[i], low, high) for i, letter in enumerate("xyz")]
@@ -194,7 +202,9 @@ def _grasp(entry: Mapping[str, Any], free: bool, reversed_ones: Sequence[str]) -
         freedoms = [(*freedom[:2], np.array([1.0, -1.0, -1.0]) * freedom[2], *freedom[3:]) for freedom in freedoms]
     place = pose(entry.get("position", (0.0, 0.0, 0.0)), turn)
     standoff, firm = float(entry.get("standoff", 0.0)), bool(entry.get("firm", free))
-    return Grasp(name, entry["link"], place, tuple(freedoms), standoff, firm, entry.get("clearance"))
+    through = through or [np.zeros(3) for _ in freedoms]
+    pushed = entry.get("contact") == "push"
+    return Grasp(name, entry["link"], place, tuple(freedoms), tuple(through), standoff, firm, entry.get("clearance"), pushed)
 
 
 def load_robot(item: Mapping[str, Any] | str, folder: Path, arm: list[str]) -> Robot:

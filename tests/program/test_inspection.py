@@ -34,7 +34,9 @@ def test_sizes_add_up(problem: TrajectoryProblem) -> None:
     shares = [size for kind, size in found.items() if kind.startswith("variables: shares")]
     assert shares == [problem.segments]
     assert found["rows: closure door"] % 7 == 0
-    assert found["rows: rolling"] == found["rows: clamped freedoms"] == found["rows: own constraints"] == 0
+    assert (
+        found["rows: rolling"] == found["rows: clamped freedoms"] == found["rows: own constraints"] == found["rows: pushes"] == 0
+    )
 
 
 def test_rows_of_own_constraints_are_told_from_clamped_freedoms() -> None:

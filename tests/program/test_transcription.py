@@ -50,12 +50,15 @@ def problem(name: str) -> TrajectoryProblem:
         scene = room(stand(), objects=("stick", "ball")).with_held({"stick": "grip"}, at={"stick": (0.02, -0.1)})
         steps = [Grasp("ball", "pull", "stick.tip"), Place("ball", pose), Release("stick"), GoTo(0.0, 0.0)]
         return program_of(scene, steps, options=OPTIONS)
+    if name == "push":  # from the start on, and then at another face
+        scene = door_scene().with_state("door", {"hinge": -1.0}).with_held({"door": "push"})
+        return program_of(scene, [Actuate("door", {"hinge": -0.5}), GoTo(0.0, 0.0)], options=OPTIONS)
     assert name == "two grasps"  # the second ends nothing: there is a pose to reach after it
     steps = [Grasp("cabinet", "ball"), Actuate("drawer", {"slide": 0.2}, attachment="handle_free"), Reach(pose)]
     return program_of(full_scene(), steps, options=OPTIONS)
 
 
-NAMES = ["reach", "door", "differential", "two grasps", "stick", "fetch"]
+NAMES = ["reach", "door", "differential", "two grasps", "stick", "fetch", "push"]
 
 
 @dataclass
@@ -177,9 +180,9 @@ def clamped(p: TrajectoryProblem) -> list[tuple[int, int, int]]:
 
 
 def clamp_rows(p: TrajectoryProblem) -> np.ndarray:
-    """Return the last rows: one for every coordinate that is clamped and every step of time."""
+    """Return the last rows but for those of pushes: one for every coordinate that is clamped and every step of time."""
     count = sum(last - first for _, first, last in clamped(p))
-    return p.transcription.rows - count + np.arange(count)
+    return p.transcription.rows - len(p.transcription.pushed_rows) - count + np.arange(count)
 
 
 def stretches(p: TrajectoryProblem) -> list[np.ndarray]:
@@ -211,7 +214,7 @@ def test_the_objective_is_of_weighted_squares_of_steps_and_their_changes(name: s
 
 
 def test_there_are_rests_where_a_hand_closes_or_opens() -> None:
-    assert [len(stretches(problem(name))) for name in NAMES] == [1, 2, 1, 4, 2, 3]
+    assert [len(stretches(problem(name))) for name in NAMES] == [1, 2, 1, 4, 2, 3, 2]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -275,6 +278,28 @@ def test_clamped_coordinates_keep_their_values(name: str) -> None:
     assert len(expected) == {"stick": 2 * 8, "fetch": 3 * 5}.get(name, 0)
 
 
+def test_what_is_pushed_goes_one_way() -> None:
+    """A row for every step of the phase, the first from the start: how far the hinge goes in it, which is 0 at least."""
+    p = problem("push")
+    point, column, t = random_point(p), p.chain.index("door.hinge"), p.transcription
+    path, phase = p.waypoints(point.z)[:, column], p.task.phases[0]
+    assert (phase.name, phase.pushed) == ("move door.hinge", {"door.hinge": 1})
+    expected = np.diff(path)[: phase.segments]
+    expected -= taken_away(point, list(range(1, phase.segments + 1)), excess_at(point, t.pushed_rows))
+    np.testing.assert_allclose(rows(point)[t.pushed_rows], expected, rtol=0.0, atol=1e-12)
+    np.testing.assert_array_equal(t.pushed_rows, t.rows - phase.segments + np.arange(phase.segments))
+    lower, upper = p.row_bounds(None)
+    assert set(lower[t.pushed_rows]) == {0.0}
+    assert set(upper[t.pushed_rows]) == {np.inf}
+    shut = door_scene().with_state("door", {"hinge": 1.0}).with_held({"door": "push_back"})
+    other = program_of(shut, [Actuate("door", {"hinge": 0.5}), GoTo(0.0, 0.0)], options=OPTIONS)
+    back, there = other.task.phases[0].pushed, random_point(other)
+    assert back == {"door.hinge": -1}
+    moved = -np.diff(other.waypoints(there.z)[:, column])[: phase.segments]
+    moved -= taken_away(there, list(range(1, phase.segments + 1)), excess_at(there, other.transcription.pushed_rows))
+    np.testing.assert_allclose(rows(there)[other.transcription.pushed_rows], moved, rtol=0.0, atol=1e-12)
+
+
 def test_slip_rows_are_the_sideways_motion_at_the_middle_heading() -> None:
     p = problem("differential")
     point = random_point(p)
@@ -313,7 +338,7 @@ def test_rate_rows_are_steps_and_their_changes(name: str) -> None:
 def test_every_row_has_one_meaning(name: str) -> None:
     t = problem(name).transcription
     parts = [t.slot_rows.ravel(), t.base_rows, *(which for at in t.pose_rows for which in at.values())]
-    parts.append(clamp_rows(problem(name)))
+    parts += [clamp_rows(problem(name)), t.pushed_rows]
     np.testing.assert_array_equal(np.sort(np.concatenate(parts)), np.arange(t.rows))
     assert t.width == t.n + t.slots + 1
     assert t.size == t.segments * t.width
@@ -378,7 +403,7 @@ def test_patterns_hold_everywhere(name: str) -> None:
     # Waypoints hang together by rates, and what is clamped, alone: all other rows of one touch no other's variables.
     if p.transcription.base_rows.size == 0:
         row, column = (np.array(part) for part in jacobian.sparsity().get_triplet())
-        alone = ~np.isin(row, clamp_rows(p))
+        alone = ~np.isin(row, [*clamp_rows(p), *p.transcription.pushed_rows])
         row, column = row[alone], column[alone]
         owner = np.empty(p.transcription.rows, int)
         owner[p.transcription.slot_rows] = np.arange(p.segments)[:, None]
@@ -412,7 +437,7 @@ def test_wherever_it_is_set_up_it_is_feasible_there_with_shares_of_one(name: str
             missing[kind] = max(missing.get(kind, 0.0), amount)
     there = {kind for kind, amount in missing.items() if amount > 0.1}
     expected = {"poses", "clearance", "rates"}
-    expected |= {"differential": {"rolling"}, "stick": {"clamped"}, "fetch": {"clamped"}}.get(name, set())
+    expected |= {"differential": {"rolling"}, "stick": {"clamped"}, "fetch": {"clamped"}, "push": {"clamped"}}.get(name, set())
     assert there == expected, "a test in which nothing is missing says nothing"
 
 

@@ -158,6 +158,8 @@ def test_programs_are_shared_by_structures_that_are_equal(chain: VirtualKinemati
         {"stops": (2,)},
         {"differential": True},
         {"clamped": ((3, 1, 4),)},
+        {"pushed": ((3, 1, 4, 1),)},
+        {"pushed": ((3, 1, 4, -1),)},
     ):
         assert dataclasses.replace(one, **change).key != one.key  # type: ignore[arg-type]
     assert not one.timed

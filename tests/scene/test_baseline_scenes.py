@@ -90,7 +90,8 @@ def test_goal_is_within_limits_and_joints_have_rates(name: str) -> None:
     np.testing.assert_allclose([placed.object.lower, placed.object.upper], limits, atol=1e-6)
     rates = {"corridor_door": ([1.0, 2.0], [1.0, 4.0]), "aisle_drawer": ([0.5], [1.0])}[name]
     np.testing.assert_array_equal([placed.object.velocity, placed.object.acceleration], rates)
-    assert list(placed.object.attachments) == ["handle", "handle_free"]
+    pushes = {"corridor_door": ["push", "push_back"], "aisle_drawer": ["push"]}[name]
+    assert list(placed.object.attachments) == ["handle", "handle_free", *pushes]
     fixed, free = (placed.object.attachment(each) for each in ("handle", "handle_free"))
     assert (fixed.joint, free.joint, fixed.firm, free.firm) == ("fixed", "revolute", False, False)
     assert fixed.placement == free.placement

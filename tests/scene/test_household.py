@@ -33,11 +33,11 @@ JOINTS = {  # joint → upper limit, velocity and acceleration; all start at 0
 }
 CARRIED = {"cup": ("side", "oblique", "top"), "broom": ("grip", "end"), "litter": ("grip", "pull")}
 ATTACHMENTS = {
-    "narrow_door": ("handle", "handle_free", "inside", "inside_free"),
+    "narrow_door": ("handle", "handle_free", "inside", "inside_free", "push", "push_back"),
     "low_drawer": ("handle", "handle_free"),
-    "dishwasher": ("handle", "handle_free", "side", "other_side", "door_handle"),
-    "refrigerator": ("handle", "handle_free"),
-    "cabinet": ("handle", "handle_free"),
+    "dishwasher": ("handle", "handle_free", "side", "other_side", "door_handle", "door_push"),
+    "refrigerator": ("handle", "handle_free", "push"),
+    "cabinet": ("handle", "handle_free", "push"),
     **CARRIED,
 }
 PINNED = {frozenset({"panel", "lever"})}  # the spindle goes through the panel
@@ -123,8 +123,10 @@ def test_attachments_are_where_hands_can_be(name: str) -> None:
         tool = (
             placed.link_placement(attachment.link) * attachment.placement * attachment.motion(np.zeros(len(attachment.freedoms)))
         )
-        hand = moved_hand(tool)
-        assert clearance(hand, parts(placed, attachment.link)) > GRASP_CLEARANCE, attachment.name
+        pushes = attachment.contact == "push"
+        hand = moved_hand(tool * scene().robot.front.inverse() if pushes else tool)
+        gap = clearance(hand, parts(placed, attachment.link))
+        assert gap > GRASP_CLEARANCE or (pushes and gap == pytest.approx(attachment.standoff, abs=1e-5)), attachment.name
         others = [link for link in obj.links if link != attachment.link]
         assert not others or clearance(hand, parts(placed, *others)) > DIST_SAFE, attachment.name
 

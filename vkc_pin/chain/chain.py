@@ -19,6 +19,7 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.models.coordinates import Coordinates
 from vkc_pin.models.grafting import clean, graft, graft_geometry
 from vkc_pin.models.robot import Robot
+from vkc_pin.scene.contact import hand_frame
 from vkc_pin.scene.hold import Hold, checked_holds, holds_of
 from vkc_pin.scene.placed import standing_geometry
 from vkc_pin.scene.resting import Ride
@@ -211,15 +212,16 @@ def consolidate(
         prefix = prefixes[hold] = name + "'" * sum(other.object == name for other in prefixes) + "."
         holder = robot.tool_frame if hold.by is None else f"{prefixes[hold.by]}{hold.link}"
         tool = model.frames[model.getFrameId(holder)]
-        parent, placement = tool.parentJoint, tool.placement * attachment.offset.inverse()
+        parent, placement = tool.parentJoint, tool.placement * hand_frame(robot, attachment) * attachment.offset.inverse()
         added = []
         # J(v)⁻¹, tool to object: each joint's axis is negated, and their order reversed.
         for suffix, freedom in reversed([*zip(attachment.coordinates, attachment.freedoms, strict=True)]):
             kind = pin.JointModelRevoluteUnaligned if freedom.kind == "revolute" else pin.JointModelPrismaticUnaligned
             joint_name, joint, low, high = f"{name}.{suffix}", kind(-freedom.axis), freedom.lower, freedom.upper
             own = [np.array([value]) for value in (np.inf, VIRTUAL_VELOCITY, low, high)]
-            parent = model.addJoint(parent, joint, clean(placement), joint_name, *own)
-            placement = pin.SE3.Identity()
+            through = pin.SE3(np.eye(3), freedom.through)
+            parent = model.addJoint(parent, joint, clean(placement * through), joint_name, *own)
+            placement = through.inverse()
             added.append(joint_name)
             for row, value in zip(limits, (low, high, VIRTUAL_VELOCITY, VIRTUAL_ACCELERATION), strict=True):
                 row.append(value)

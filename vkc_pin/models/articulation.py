@@ -6,7 +6,7 @@ An object is a URDF tree plus named attachments (where a tool takes hold of it, 
 from __future__ import annotations
 
 from collections.abc import Mapping, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +35,7 @@ class Freedom:
         kind: "revolute" or "prismatic".
         axis: Unit axis in the tool frame (after the freedoms before this one), shape (3,).
         lower, upper: Limits, [rad] or [m].
+        through: A point of the axis of one that turns, in the same frame, shape (3,) [m]: the middle of a rim, say.
     """
 
     suffix: str
@@ -42,6 +43,7 @@ class Freedom:
     axis: Floats
     lower: float
     upper: float
+    through: Floats = field(default_factory=lambda: np.zeros(3))
 
     @property
     def unit(self) -> str:
@@ -52,7 +54,8 @@ class Freedom:
         """Return the motion at `value`, [rad] or [m]. Raises `InputError` if that is no finite number."""
         value = number(value, "value")
         if self.kind == "revolute":
-            return pin.SE3(pin.exp3(self.axis * value), np.zeros(3))
+            turn = pin.exp3(self.axis * value)
+            return pin.SE3(turn, self.through - turn @ self.through)
         return pin.SE3(np.eye(3), self.axis * value)
 
 
@@ -68,12 +71,14 @@ class Attachment:
         name: Its name in the object.
         link: The link that is held.
         placement: The tool frame in the link's frame at v = 0, were there no standoff: the virtual joint's centre.
-        joint: "fixed" (no freedom), "revolute", "prismatic", "cylindrical" (slides along an axis and turns about it)
-            or "spherical" (turns about x, then y, then z).
+        joint: "fixed" (no freedom), "revolute", "prismatic", "cylindrical" (slides along an axis and turns about it),
+            "spherical" (turns about x, then y, then z) or "listed" (what its description lists).
         freedoms: The virtual joint's coordinates, J(v) being the product of their motions in this order.
         standoff: How far before the joint's centre the tool stops, along its approach [m].
         firm: Whether the hand clamps: v is chosen when grasping, and stays while the object is held.
         clearance: What the hand keeps from the object's links near the grasp [m]; None: `Options.grasp_clearance`.
+        contact: "grasp": the hand closes on it, and moves it any way. "push": the hand's foremost point is where the tool frame
+            would be, against a face whose inward normal is `placement`'s z axis, and moves it that way only.
     """
 
     name: str
@@ -84,6 +89,7 @@ class Attachment:
     standoff: float = 0.0
     firm: bool = False
     clearance: float | None = None
+    contact: str = "grasp"
 
     @property
     def coordinates(self) -> tuple[str, ...]:

@@ -32,7 +32,7 @@ from vkc_pin.models.articulation import DEFAULT_ACCELERATION, DEFAULT_VELOCITY, 
 from vkc_pin.models.coordinates import Coordinates
 from vkc_pin.models.grafting import clean
 
-__all__ = ["AttachmentSchema", "LatchSchema", "ObjectSchema", "load_object"]
+__all__ = ["AttachmentSchema", "FreedomSchema", "LatchSchema", "ObjectSchema", "load_object"]
 
 
 _around_zero = require(
@@ -41,6 +41,24 @@ _around_zero = require(
 _some_length = require(lambda value: np.linalg.norm(value) >= 1e-6, "a direction cannot be zero", "a vector of some length")
 Limits = Annotated[tuple[Number, Number], count(2), _around_zero]
 Direction = Annotated[Vector3, _some_length]
+
+
+class FreedomSchema(Schema):
+    """One way in which the hand may move in a grasp; see `vkc_pin.models.articulation.Freedom`."""
+
+    name: Name
+    slide: Direction | None = None
+    turn: Direction | None = None
+    through: Vector3 | None = None
+    limits: Limits
+
+    @model_validator(mode="after")
+    def _consistent(self) -> FreedomSchema:
+        if (self.slide is None) == (self.turn is None):
+            raise fail("it is not clear how the hand may move", "either slide or turn, an axis")
+        if self.slide is not None and self.through is not None:
+            raise fail("where a slide is does not matter", "through with turn only")
+        return self
 
 
 class AttachmentSchema(Schema):
@@ -58,8 +76,10 @@ class AttachmentSchema(Schema):
     limits: Limits | None = None
     turn: Limits | None = None
     standoff: NotNegative = 0.0
+    freedoms: tuple[FreedomSchema, ...] = ()
     firm: bool | None = None  # not stated: as the object is free or not
     clearance: NotNegative | None = None
+    contact: Literal["grasp", "push"] = "grasp"
 
     @model_validator(mode="after")
     def _consistent(self) -> AttachmentSchema:
@@ -68,6 +88,7 @@ class AttachmentSchema(Schema):
         slanted = self.approach is not None and self.closing is not None and abs(np.dot(self.approach, self.closing)) > 1e-9
         has_axis, axis = self.joint in ("revolute", "prismatic", "cylindrical"), "joint revolute, prismatic or cylindrical"
         turns = self.joint == "cylindrical"
+        names = [freedom.name for freedom in self.freedoms]
         for wrong, problem, expected in (
             (unclear, "the tool's direction is not clear", "rpy, quaternion, or approach and closing"),
             (slanted, "approach and closing are not perpendicular", "two perpendicular directions"),
@@ -79,6 +100,10 @@ class AttachmentSchema(Schema):
                 "turn and joint do not fit",
                 "turn [lower, upper] with joint cylindrical, and only there",
             ),
+            (names and self.joint != "fixed", "freedoms and joint both say how the hand may move", "one of them"),
+            (self.contact == "push" and self.firm, "a hand that pushes does not clamp", "firm: false, or contact: grasp"),
+            (len(names) > 6, "more freedoms than a body has", "at most 6"),
+            (len(set(names)) < len(names), "two freedoms share a name", "different names"),
         ):
             if wrong:
                 raise fail(problem, expected)
@@ -139,6 +164,9 @@ def load_object(name_or_path: str | Path) -> ArticulatedObject:
             raise document.unknown(("attachments", index, "link"), "link", item.link, links)
         if item.name in attachments:
             raise document.error(("attachments", index, "name"), "this name is taken", expected="a new name", got=item.name)
+        if schema.free and item.contact == "push":
+            problem = "what stands free has nothing that leads it where it is pushed"
+            raise document.error(("attachments", index, "contact"), problem, expected="grasp", got=item.contact)
         attachment = _attachment(item, firm=schema.free)
         taken = {name for other in attachments.values() for name in other.coordinates}.intersection(attachment.coordinates)
         if taken:  # "grip_slide" beside a "grip" that slides
@@ -177,15 +205,18 @@ def _attachment(item: AttachmentSchema, *, firm: bool) -> Attachment:
         name=item.name,
         link=item.link,
         placement=clean(pin.SE3(rotation, np.array(item.position))),
-        joint=item.joint,
+        joint="listed" if item.freedoms else item.joint,
         freedoms=_freedoms(item),
         standoff=item.standoff,
         firm=firm if item.firm is None else item.firm,
         clearance=item.clearance,
+        contact=item.contact,
     )
 
 
 def _freedoms(item: AttachmentSchema) -> tuple[Freedom, ...]:
+    if item.freedoms:
+        return tuple(_freedom(own) for own in item.freedoms)
     if item.joint == "spherical":
         limits = item.limits or (-np.pi, np.pi)
         return tuple(Freedom(f"_{name}", "revolute", axis, *limits) for name, axis in zip("xyz", np.eye(3), strict=True))
@@ -195,6 +226,12 @@ def _freedoms(item: AttachmentSchema) -> tuple[Freedom, ...]:
     if item.turn is not None:
         return Freedom("_slide", "prismatic", axis, *item.limits), Freedom("_turn", "revolute", axis, *item.turn)
     return (Freedom("", item.joint, axis, *item.limits),)
+
+
+def _freedom(item: FreedomSchema) -> Freedom:
+    kind, given = ("revolute", item.turn) if item.slide is None else ("prismatic", item.slide)
+    axis = np.array(given, float)
+    return Freedom(f"_{item.name}", kind, axis / np.linalg.norm(axis), *item.limits, np.array(item.through or (0.0, 0.0, 0.0)))
 
 
 def _own_pairs(document: Document, schema: ObjectSchema, links: Sequence[str]) -> frozenset[frozenset[str]]:

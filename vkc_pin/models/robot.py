@@ -7,6 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
+import coal
 import numpy as np
 import pinocchio as pin
 
@@ -15,11 +16,12 @@ from vkc_pin.arrays import Floats
 from vkc_pin.files.urdf import UrdfFile
 from vkc_pin.models.coordinates import Coordinates
 from vkc_pin.models.robot_model import visual_geometry
-from vkc_pin.models.shapes import link_name
+from vkc_pin.models.shapes import link_name, shape_distance
 
 __all__ = ["Base", "Robot"]
 
 _LEAST_LEVER = 0.1  # [m/rad] about the size of a hand
+_AHEAD = 10.0  # [m] further than any hand reaches
 _POSTURES = 200  # random ones over which the lever is averaged
 
 Base = Literal["omni", "differential", "fixed"]
@@ -86,6 +88,16 @@ class Robot:
             jacobian = pin.computeFrameJacobian(self.model, data, self.coordinates.q(z), frame, pin.LOCAL_WORLD_ALIGNED)
             squares += (jacobian[:3, turns] ** 2).sum(axis=0)
         return max(float(np.sqrt(squares / _POSTURES).mean()), _LEAST_LEVER)
+
+    @cached_property
+    def front(self) -> pin.SE3:
+        """The foremost point of the hand in the tool frame, with its axes: as far along the approach as a touch link reaches."""
+        frame = self.model.frames[self.model.getFrameId(self.tool_frame)]
+        ahead = coal.Halfspace(np.array([0.0, 0.0, -1.0]), -_AHEAD)  # all that is so far before the tool
+        carried = [s for s in self.collision.geometryObjects if s.parentJoint == frame.parentJoint]
+        hand = [(s.geometry, frame.placement.actInv(s.placement)) for s in carried if link_name(s.name) in self.touch_links]
+        gaps = [shape_distance(geometry, where, ahead, pin.SE3.Identity()) for geometry, where in hand]
+        return pin.SE3(np.eye(3), np.array([0.0, 0.0, _AHEAD - min(gaps, default=_AHEAD)]))
 
     @property
     def start_limits(self) -> tuple[Floats, Floats]:

@@ -123,6 +123,7 @@ def sizes(problem: TrajectoryProblem) -> dict[str, int]:
     found["rows: witness planes"] = t.slot_rows.size
     found["rows: rolling"] = len(t.base_rows)
     found["rows: clamped freedoms"] = sum(last - first for _, first, last in t.structure.clamped)
+    found["rows: pushes"] = len(t.pushed_rows)
     found["rows: own constraints"] = len(problem.term_numbers.rows)
     found["only if needed: velocities"] = first.size
     found["only if needed: accelerations"] = second.size

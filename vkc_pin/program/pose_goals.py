@@ -93,6 +93,13 @@ def approach_at(first: int, last: int, options: Options) -> int:
     return max(first + 1, last - options.steps(options.approach_time))
 
 
+def pushed_steps(chain: VirtualKinematicChain, task: Task) -> tuple[tuple[int, int, int, int], ...]:
+    """Return column, first and last waypoint, and way (1 or -1), for every coordinate that a phase pushes."""
+    ends = np.cumsum([phase.segments for phase in task.phases]).tolist()
+    phases = zip(task.phases, [0, *ends[:-1]], ends, strict=True)
+    return tuple((chain.index(name), first, last, way) for phase, first, last in phases for name, way in phase.pushed.items())
+
+
 def chosen_freedoms(scene: Scene, chain: VirtualKinematicChain, task: Task) -> tuple[tuple[int, int, int], ...]:
     """Return column, waypoint of the grasp and last waypoint of the hold, for every freedom that is chosen when a hand clamps.
 

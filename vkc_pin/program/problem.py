@@ -17,7 +17,7 @@ from vkc_pin.models.coordinates import wrapped
 from vkc_pin.motion.effort import Effort
 from vkc_pin.motion.timing import Timing, runs_between, time_for
 from vkc_pin.options import Options
-from vkc_pin.program.pose_goals import approach_at, chosen_freedoms, pose_goals
+from vkc_pin.program.pose_goals import approach_at, chosen_freedoms, pose_goals, pushed_steps
 from vkc_pin.program.term_places import TermNumbers, term_goals
 from vkc_pin.program.term_rows import TermRow
 from vkc_pin.program.transcription import transcribe
@@ -104,6 +104,7 @@ class TrajectoryProblem:
             stops=stops,
             differential=self.chain.robot.base == "differential",
             clamped=clamped,
+            pushed=pushed_steps(self.chain, self.task),
             terms=terms,
         )
 
@@ -265,7 +266,7 @@ class TrajectoryProblem:
         """Return the bounds of the program's rows, and with a timing those of its rates; shapes (rows,) and (rows,)."""
         t, terms = self.transcription, self.term_numbers
         lower, upper = np.zeros(t.rows), np.zeros(t.rows)
-        upper[t.slot_rows] = np.inf
+        upper[t.slot_rows] = upper[t.pushed_rows] = np.inf
         for pose, at in zip(t.structure.poses, t.pose_rows, strict=True):
             for rows in at.values():
                 lower[rows], upper[rows] = ROW_BOUNDS[pose.kind]

@@ -213,15 +213,18 @@ class Transcription:
         self.hessian = self.hessian + curvature
 
     def _clamp(self) -> None:
-        """Append z_t − z_{t−1} = 0 for what a clamping hand does not let slide."""
-        pairs = [(c, t) for c, first, last in self.structure.clamped for t in range(first + 1, last + 1)]
-        if not pairs:
+        """Append z_t − z_{t−1} = 0 for what a clamping hand does not let slide, and ±(z_t − z_{t−1}) ≥ 0 for what is pushed."""
+        steps = [(c, t, 1) for c, first, last in self.structure.clamped for t in range(first + 1, last + 1)]
+        pushes = [(c, t, way) for c, first, last, way in self.structure.pushed for t in range(first + 1, last + 1)]
+        self.pushed_rows = self.rows + len(steps) + np.arange(len(pushes))
+        if not (steps := steps + pushes):
             return
-        difference = ca.DM(len(pairs), self.size)
-        for row, (column, waypoint) in enumerate(pairs):
-            difference[row, (waypoint - 1) * self.width + column] = 1.0
-            difference[row, (waypoint - 2) * self.width + column] = -1.0
-        self._append(difference @ self.x, difference, np.array([t - 1 for _, t in pairs]))
+        difference = ca.DM(len(steps), self.n + self.size)  # the start comes first
+        for row, (column, t, way) in enumerate(steps):
+            difference[row, self.n + (t - 1) * self.width + column] = way
+            difference[row, self.n + (t - 2) * self.width + column if t > 1 else column] = -way
+        start, own = difference[:, : self.n], difference[:, self.n :]
+        self._append(start @ self.start + own @ self.x, own, np.array([t - 1 for _, t, _ in steps]))
 
     def _terms(self) -> None:
         """Append the user's own constraints, and add their costs to the objective."""

@@ -36,6 +36,7 @@ class Structure:
         differential: Whether the base must not slip sideways.
         clamped: (column, first, last): coordinates that keep their value from waypoint `first` to `last`, as a hand does
             that clamps.
+        pushed: (column, first, last, way): coordinates that only go up (way 1) or down (-1) from waypoint `first` to `last`.
         terms: The user's own constraints and costs.
     """
 
@@ -46,6 +47,7 @@ class Structure:
     stops: tuple[int, ...] = ()
     differential: bool = False
     clamped: tuple[tuple[int, int, int], ...] = ()
+    pushed: tuple[tuple[int, int, int, int], ...] = ()
     terms: tuple[TermRow, ...] = ()
 
     @property
@@ -57,7 +59,7 @@ class Structure:
     def key(self) -> tuple[Any, ...]:
         """Equal for structures that share one program."""
         poses = tuple((*_key(pose), pose.waypoints) for pose in self.poses)
-        others = (self.stops, self.differential, self.clamped, self.terms)
+        others = (self.stops, self.differential, self.clamped, self.pushed, self.terms)
         return (self.model.saveToString(), self.segments, poses, self.slots, *others)
 
 

@@ -4,6 +4,8 @@
   as it is held, and for `EASED_TIME` after. Without a clearance of its own that is `Options.grasp_clearance`. What is held
   through another link, and that link, need none.
 - The hand and the link that it holds move as one, unless the grasp leaves a freedom.
+- A hand that pushes touches the link with its foremost point. It needs no clearance from that link, overlaps it nowhere, and
+  moves it ahead of it only.
 - What is lifted, put down, or begins or ends a ride, and what is next to it there, may be as near as they are there for
   `EASED_TIME`. So may a link that touches something, and what is at that place.
 - What rides and what it stands on move as one.
@@ -17,12 +19,16 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
+import pinocchio as pin
+
+from vkc_pin.models.articulation import Attachment
+from vkc_pin.models.robot import Robot
 from vkc_pin.options import Options
 from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.neighbours import CONTACT
 from vkc_pin.scene.scene import Scene
 
-__all__ = ["CONTACT", "EASED_TIME", "grasped", "hand_clearance", "moves_as_one", "touching"]
+__all__ = ["CONTACT", "EASED_TIME", "grasped", "hand_clearance", "hand_frame", "moves_as_one", "touching"]
 
 EASED_TIME = 1.0
 """For how long before and after a contact shapes may be close; at `Options.dt` a waypoint [s]."""
@@ -47,13 +53,18 @@ def hand_clearance(scene: Scene, hold: Hold, link: str, options: Options) -> flo
         link: The link of its object, "<object>.<link>".
         options: Clearances where the attachment has none of its own.
     """
-    if hold.by and link == grasped(scene, hold):
+    attachment = scene.objects[hold.object].object.attachments[hold.attachment]
+    if (hold.by or attachment.contact == "push") and link == grasped(scene, hold):
         return 0.0
-    own = scene.objects[hold.object].object.attachments[hold.attachment].clearance
-    return min(options.grasp_clearance if own is None else own, options.dist_safe)
+    return min(options.grasp_clearance if attachment.clearance is None else attachment.clearance, options.dist_safe)
+
+
+def hand_frame(robot: Robot, attachment: Attachment) -> pin.SE3:
+    """Return what of the hand is brought to an attachment, in the tool frame: that itself, or the foremost point that pushes."""
+    return robot.front if attachment.contact == "push" else pin.SE3.Identity()
 
 
 def moves_as_one(scene: Scene, hold: Hold) -> bool:
     """Return whether what holds does not move relative to what is grasped while it is held."""
     attachment = scene.objects[hold.object].object.attachments[hold.attachment]
-    return attachment.firm or not attachment.freedoms
+    return attachment.contact != "push" and (attachment.firm or not attachment.freedoms)

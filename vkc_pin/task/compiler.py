@@ -16,6 +16,7 @@ from vkc_pin.scene.placed import PlacedObject
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.lookup import attachment_of, check_link, joint_limits, path_joints, placed_object, robot_frame
 from vkc_pin.task.phases import FrameGoal, Mark, Phase, PhaseKind, Task
+from vkc_pin.task.pushing import pushed_ways
 from vkc_pin.task.rides import Riders
 from vkc_pin.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch, as_list
 
@@ -52,7 +53,9 @@ class _Compiler:
         """Add a phase in which joints move of what stands fixed and is held, with all that stands on it."""
         self.riders.begin(hold, {coordinate.partition(".")[2] for coordinate in ranges}, self.state, where)
         segments = self.options.move_waypoints if kind == "move" else self.options.turn_waypoints
-        self._append(kind, tuple(values), segments, ranges=ranges, values=values)
+        placed = self.scene.objects[hold.object]
+        ways = pushed_ways(placed, placed.object.attachments[hold.attachment], self.state, values, f"{where}.joints")
+        self._append(kind, tuple(values), segments, ranges=ranges, values=values, pushed=ways)
         self.riders.end(self.state, where)
 
     def _append(self, kind: PhaseKind, about: tuple[str, ...], segments: int, **details: Any) -> None:

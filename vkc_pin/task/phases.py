@@ -63,6 +63,7 @@ class Phase:
         held: What is held, each after the hold it depends on.
         ranges: Object coordinate → (lower, upper) for every waypoint after the first; all others stand still.
         values: Object coordinate → value at the last waypoint.
+        pushed: Object coordinate → 1 or -1, for those that may only go up or down, because the hand pushes.
         frames: Frame goals at the last waypoint.
         base: (x, y, yaw or None) at the last waypoint, in the world.
         grasps: What is grasped at the last waypoint.
@@ -82,6 +83,7 @@ class Phase:
     held: tuple[Hold, ...] = ()
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     values: Mapping[str, float] = field(default_factory=dict)
+    pushed: Mapping[str, int] = field(default_factory=dict)
     frames: tuple[FrameGoal, ...] = ()
     base: tuple[float, float, float | None] | None = None
     grasps: tuple[Hold, ...] = ()

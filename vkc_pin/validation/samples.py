@@ -13,6 +13,7 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.models.articulation import Freedom
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.motion.world import World
+from vkc_pin.scene.contact import hand_frame
 from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.scene import Scene
 
@@ -174,7 +175,7 @@ class Samples:
             by: The frame that takes the tool's place, "<object>.<link>".
         """
         attachment = self.scene.objects[owner].object.attachments[name]
-        tools = self.placements(rows, by or self.scene.robot.tool_frame)
+        tools, hand = self.placements(rows, by or self.scene.robot.tool_frame), hand_frame(self.scene.robot, attachment)
         links = self.placements(rows, f"{owner}.{attachment.link}")
         positions, own = self.trajectory.at(self.times[rows]), [f"{owner}.{suffix}" for suffix in attachment.coordinates]
         values = np.zeros((len(rows), len(own)))
@@ -183,6 +184,6 @@ class Samples:
                 values[:, column] = positions[:, self.trajectory.names.index(coordinate)]
         errors = np.empty((len(rows), 2))
         for k, (tool, link) in enumerate(zip(tools, links, strict=True)):
-            offset = (link * attachment.tool(values[k])).actInv(tool)
+            offset = (link * attachment.tool(values[k])).actInv(tool * hand)
             errors[k] = np.linalg.norm(offset.translation), np.linalg.norm(pin.log3(offset.rotation))
         return errors

@@ -11,15 +11,16 @@ import pinocchio as pin
 from vkc_pin.arrays import Ints
 from vkc_pin.motion.carrying import FreeObjects
 from vkc_pin.options import Options
-from vkc_pin.scene.contact import CONTACT, EASED_TIME, grasped, hand_clearance, moves_as_one, touching
+from vkc_pin.scene.contact import CONTACT, EASED_TIME, grasped, hand_clearance, hand_frame, moves_as_one, touching
 from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.neighbours import Allowance, allowances
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.steps import Grasp, Step, Touch
 from vkc_pin.validation.distances import Solids
+from vkc_pin.validation.report import Violation
 from vkc_pin.validation.samples import Samples
 
-__all__ = ["Window", "windows"]
+__all__ = ["Window", "check_pushes", "windows"]
 
 _STILL = 1e-9  # [m] or [rad]
 _T = TypeVar("_T")
@@ -54,6 +55,34 @@ def windows(samples: Samples, solids: Solids, steps: Sequence[Step], options: Op
         options: Clearances, and the time between waypoints that counts as one.
     """
     return list(_Windows(samples, solids, options).of(steps))
+
+
+def check_pushes(samples: Samples) -> Iterator[Violation]:
+    """Yield where a hand that pushes goes back with what it pushes, which would stay where it is.
+
+    What counts is where the hand is, and how the link moves there: the link's point at the contact goes into the face, or stays.
+    """
+    scene, tool = samples.scene, samples.scene.robot.tool_frame
+    for phase in samples.trajectory.phases:
+        for hold in phase.holds:
+            attachment = scene.objects[hold.object].object.attachments[hold.attachment]
+            if attachment.contact != "push":
+                continue
+            rows = samples.rows(phase)
+            hands, links = samples.placements(rows, tool), samples.placements(rows, f"{hold.object}.{attachment.link}")
+            foremost = hand_frame(scene.robot, attachment) * attachment.offset.inverse()
+            gone = [0.0]
+            for hand, link, after in zip(hands, links, links[1:], strict=False):
+                contact = (hand * foremost).translation
+                into = (link * attachment.placement).rotation[:, 2]
+                gone.append(gone[-1] + float(into @ (after.act(link.actInv(contact)) - contact)))
+            back = np.maximum.accumulate(gone) - gone
+            worst = int(np.argmax(back))
+            if not back[worst] <= CONTACT:
+                row, amount = int(rows[worst]), float(back[worst] - CONTACT)
+                at, time = samples.waypoint(row), float(samples.times[row])
+                detail = f"goes back by {1e3 * back[worst]:.2f} mm where the hand only pushes"
+                yield Violation("push", str(hold), waypoint=at, time=time, amount=amount, unit="m", detail=detail)
 
 
 class _Windows:

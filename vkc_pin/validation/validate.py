@@ -26,7 +26,7 @@ from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.report import Report, Violation
 from vkc_pin.validation.samples import MOST, Samples
 from vkc_pin.validation.sweep import sweep
-from vkc_pin.validation.touching import windows
+from vkc_pin.validation.touching import check_pushes, windows
 
 __all__ = ["check_fits", "validate"]
 
@@ -55,8 +55,8 @@ def validate(
     Returns:
         Every violated constraint: start, limits, velocity, acceleration, slip of a differential base, closure, latches,
         rests in which the gripper closes or opens, joints of objects that nobody holds, what tips on what it stands on, hands
-        that slide on what they clamp, goals and their order, clearance at waypoints and penetration anywhere, and own
-        constraints; or that it is longer than can be looked at.
+        that slide on what they clamp, pushes that would pull, goals and their order, clearance at waypoints and penetration
+        anywhere, and own constraints; or that it is longer than can be looked at.
 
     Raises:
         InputError: The trajectory is none of this scene's robot and objects, or a step or term names what is not there.
@@ -86,6 +86,7 @@ class _Check:
             check()
         self.found += check_goals(self.samples, self.steps, self.options)
         self.found += check_terms(self.samples, self.terms)
+        self.found += check_pushes(self.samples)
         error, angle = self._closure()
         self._slides()
         clearance = self._clearance() if self._within_reason() else np.inf

@@ -1,0 +1,102 @@
+"""Doors and drawers shut by pushing, and a bowl taken at its rim, planned for real."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from oracle.changes import changed
+from oracle.judge import judge
+
+import vkc_pin as vkc
+
+CASES = [  # scene, object, joint, where it is at the start, the face
+    ("door", "door", "hinge", -1.2, "push"),
+    ("door", "door", "hinge", 1.2, "push_back"),
+    ("drawer", "drawer", "slide", 0.3, "push"),
+    ("household", "dishwasher", "door", 0.6, "door_push"),
+    ("household", "refrigerator", "hinge", 1.0, "push"),
+    ("household", "cabinet", "hinge", 1.0, "push"),
+]
+
+
+@cache
+def shut(scene: str, thing: str, joint: str, begin: float, face: str) -> vkc.Plan:
+    return vkc.plan(vkc.load_scene(scene).with_state(thing, {joint: begin}), [vkc.Actuate(thing, {joint: 0.0}, face)])
+
+
+def gaps(plan: vkc.Plan, thing: str, face: str) -> np.ndarray:
+    """Return how far the hand's foremost point is from the plane of the face, wherever it pushes, by numeric Pinocchio [m]."""
+    scene, motion = plan.scene, plan.trajectory
+    (phase,), robot, placed, found = [one for one in motion.phases if one.holds], scene.robot, scene.objects[thing], []
+    attachment, model, data = placed.object.attachments[face], robot.model, robot.model.createData()
+    frame, shapes = model.getFrameId(robot.tool_frame), robot.collision.createData()
+    hand = [i for i in range(len(robot.collision.geometryObjects)) if robot.link_of(i) in robot.touch_links]
+    for row in motion.positions[phase.first : phase.last + 1]:
+        pin.updateGeometryPlacements(model, data, robot.collision, shapes, robot.coordinates.q(row[: motion.robot_size]))
+        tool = pin.updateFramePlacement(model, data, frame)
+        corners = [shapes.oMg[i].act(point) for i in hand for point in robot.collision.geometryObjects[i].geometry.points()]
+        foremost = tool.act(np.array([0.0, 0.0, max(float(tool.actInv(corner)[2]) for corner in corners)]))
+        named = dict(zip(motion.names, row.tolist(), strict=True))
+        state = {name: named[f"{thing}.{name}"] for name in placed.object.coordinates.names if f"{thing}.{name}" in named}
+        found.append(-(placed.with_state(state).link_placement(attachment.link) * attachment.placement).actInv(foremost)[2])
+    return np.array(found)
+
+
+@pytest.mark.parametrize("case", CASES, ids=[f"{thing}.{face}" for _, thing, _, _, face in CASES])
+def test_what_stands_open_is_pushed_shut(case: tuple[str, str, str, float, str]) -> None:
+    """The hand's foremost point stays within what its tilt takes of the face, and the joint never goes back."""
+    plan, (_, thing, joint, begin, face) = shut(*case), case
+    assert plan.success, plan.report()
+    column = plan.trajectory.positions[:, plan.trajectory.names.index(f"{thing}.{joint}")]
+    assert (column[0], abs(column[-1]) < 1e-3) == (begin, True)
+    assert (np.diff(column) * np.sign(begin)).max() < 1e-6
+    distance = gaps(plan, thing, face)
+    standoff = plan.scene.objects[thing].object.attachments[face].standoff
+    assert standoff > 0.0
+    assert distance.min() > standoff * np.cos(0.4) - 1.1e-3
+    assert distance.max() < standoff + 1.1e-3
+
+
+def test_a_push_that_goes_back_is_found_by_the_validation_and_by_the_oracle(tmp_path: Path) -> None:
+    plan = shut(*CASES[0])
+    motion, (phase,) = plan.trajectory, [one for one in plan.trajectory.phases if one.holds]
+    middle = (phase.first + phase.last) // 2
+
+    def back(rows: np.ndarray) -> None:
+        rows[middle + 1] = rows[middle - 1]  # robot and door together: it would hold if the hand did
+
+    rows = motion.positions.copy()
+    back(rows)
+    said = vkc.validate(plan.scene, plan.steps, dataclasses.replace(motion, positions=rows)).violations
+    (push,) = [one for one in said if one.constraint == "push"]
+    assert (push.subject, push.unit) == ("door.push", "m")
+    hinge = motion.positions[:, motion.names.index("door.hinge")]
+    lever = push.amount / (hinge[middle] - hinge[middle - 1])
+    assert 0.3 < lever < 0.8  # [m] from the hinge: the region's
+    other = changed(plan.save(tmp_path / "plan.npz"), tmp_path / "back.npz", lambda content: back(content["positions"]))
+    assert {one.subject for one in judge(other).found if one.rule == "push"} == {"door.push"}
+
+
+@pytest.mark.parametrize("yaw", [0.0, 2.0])
+def test_a_bowl_is_taken_at_its_rim(yaw: float) -> None:
+    """Wherever on it: the wall is between the fingers then, and the hand level with the rim to what the tilt allows."""
+    scene = vkc.load_scene("tray").document
+    scene["objects"] = [{"name": "bowl", "type": "bowl", "position": [0.9, 0.5, 0.701], "yaw": yaw}]
+    plan = vkc.plan(vkc.Scene.from_document(scene), [vkc.Place("bowl", (-0.3, -1.95, 0.701))])
+    assert plan.success, plan.report()
+    motion, (phase,) = plan.trajectory, [one for one in plan.trajectory.phases if one.holds]
+    row = motion.positions[phase.first]
+    robot = plan.scene.robot
+    data = robot.model.createData()
+    pin.framesForwardKinematics(robot.model, data, robot.coordinates.q(row[: motion.robot_size]))
+    tool = plan.scene.objects["bowl"].placement.actInv(data.oMf[robot.model.getFrameId(robot.tool_frame)])
+    assert np.hypot(*tool.translation[:2]) == pytest.approx(0.107, abs=2e-3)
+    assert tool.translation[2] == pytest.approx(0.055, abs=2e-3)
+    outwards = tool.translation[:2] / np.hypot(*tool.translation[:2])
+    assert abs(tool.rotation[:2, 0] @ outwards) > np.cos(0.4) - 1e-2  # the fingers close across the wall
+    assert tool.rotation[2, 2] < -np.cos(0.4) + 1e-2

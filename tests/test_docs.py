@@ -73,7 +73,9 @@ def test_yaml_examples_fit_their_schemas(tmp_path: Path) -> None:
         (tmp_path / "room.yaml").write_text(scene, encoding="utf-8")
         loaded = vkc.load_scene(tmp_path / "room.yaml")
         assert (list(loaded.objects), len(loaded.allowed)) == (objects, allowed)
-    (described,) = blocks(ROOT / "docs/objects.md", "yaml")
+    described, whole = blocks(ROOT / "docs/objects.md", "yaml")
+    (tmp_path / "hatch.yaml").write_text(whole, encoding="utf-8")
+    assert vkc.load_scene(tmp_path / "hatch.yaml").objects["hatch"].object.name == "hatch"
     assert check(Document(yaml.safe_load(described)), ObjectSchema).urdf == "door.urdf"
     (robot,) = blocks(ROOT / "docs/robots.md", "yaml")
     assert check(Document(yaml.safe_load(robot)), RobotSchema).tool_frame == "tool"

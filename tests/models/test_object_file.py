@@ -246,3 +246,19 @@ def test_unknown_objects_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError) as lost:
         load_object(tmp_path / "thing.yaml")
     assert lost.value.file == tmp_path / "none.urdf"
+
+
+def test_a_description_that_is_handed_over(tmp_path: Path) -> None:
+    (tmp_path / "wedge.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n")
+    mesh = '<collision><geometry><mesh filename="wedge.obj"/></geometry></collision>'
+    urdf = f'<robot name="wedge"><link name="base">{mesh}</link></robot>'
+    description = {"urdf": urdf, "free": True, "attachments": [{"name": "grip", "link": "base"}]}
+    thing = load_object(description, folder=tmp_path)
+    assert (thing.name, thing.urdf, thing.free) == ("wedge", None, True)
+    assert thing.collision.geometryObjects[0].geometry.num_points == 4
+    with pytest.raises(InputError, match=r"wedge\.obj"):
+        load_object(description, folder=tmp_path / "elsewhere")
+    with pytest.raises(InputError, match="expected text"):
+        load_object({1: urdf})  # type: ignore[dict-item]
+    (tmp_path / "wedge.urdf").write_text(urdf)
+    assert load_object({**description, "urdf": "wedge.urdf"}, folder=tmp_path).urdf == tmp_path / "wedge.urdf"

@@ -11,7 +11,7 @@ import coal
 import numpy as np
 
 from .plan import Hold, Phase, SavedPlan
-from .poses import IDENTITY, Poses, orientation, pose, rpy
+from .poses import IDENTITY, Poses, orientation, pose
 from .riding import distance, riders
 from .things import Thing, Tree, load_robot, load_thing
 from .urdf import Shape, mesh_hull, read_urdf, solid

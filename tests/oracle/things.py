@@ -150,11 +150,16 @@ class Robot:
 
 def load_thing(item: Mapping[str, Any], folder: Path) -> Thing:
     """Return the object of an entry in a scene's `objects`."""
-    kind = str(item["type"])
-    by_path = kind.endswith((".yaml", ".yml")) or "/" in kind
-    file = folder / kind if by_path else ROOT / "scenes" / "objects" / f"{kind}.yaml"
-    about = yaml.safe_load(file.read_text(encoding="utf-8"))
-    urdf = read_urdf(file.parent / about["urdf"])
+    kind = item["type"]
+    if isinstance(kind, str):
+        by_path = kind.endswith((".yaml", ".yml")) or "/" in kind
+        file = folder / kind if by_path else ROOT / "scenes" / "objects" / f"{kind}.yaml"
+        about = yaml.safe_load(file.read_text(encoding="utf-8"))
+        folder = file.parent
+    else:
+        about = kind
+    inside = about["urdf"].lstrip().startswith("<")
+    urdf = Urdf(folder / "urdf", about["urdf"]) if inside else read_urdf(folder / about["urdf"])
     joints = [joint for joint in urdf.joints if urdf.moves(joint)]
     limits, rest = {}, {}
     for joint in joints:

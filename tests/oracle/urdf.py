@@ -108,9 +108,9 @@ def _read(path: Path, _: int) -> Urdf:
 class Urdf:
     """A URDF file."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, text: str | None = None) -> None:
         self.path = path
-        self.text = path.read_text(encoding="utf-8")
+        self.text = path.read_text(encoding="utf-8") if text is None else text
         self.root = ElementTree.fromstring(self.text)
 
     @cached_property

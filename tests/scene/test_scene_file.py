@@ -240,6 +240,72 @@ def test_errors_in_files_that_a_scene_names_point_into_these(tmp_path: Path) -> 
     assert broken.value.file == tmp_path / "bad.urdf"
 
 
+DESCRIBED = """\
+robot: husky_ur5e
+start: {base: [0, 0, 0]}
+objects:
+  - name: trap
+    position: [2, 0, 0]
+    state: {hinge: 0.3}
+    type:
+      joints:
+        hinge: {acceleration: 3}
+      attachments:
+        - {name: ring, link: leaf, position: [-0.4, 0, 0], approach: [0, 0, -1], closing: [1, 0, 0]}
+      urdf: |
+        <robot name="trap_door">
+          <link name="frame"/>
+          <link name="leaf">
+            <collision><origin xyz="-0.25 0 0"/><geometry><box size="0.5 0.5 0.02"/></geometry></collision>
+          </link>
+          <joint name="hinge" type="revolute">
+            <parent link="frame"/><child link="leaf"/><axis xyz="0 1 0"/>
+            <limit lower="0" upper="1.5" velocity="1" effort="1"/>
+          </joint>
+        </robot>
+"""
+
+
+def test_objects_that_a_scene_describes_itself(tmp_path: Path) -> None:
+    file = tmp_path / "room.yaml"
+    file.write_text(DESCRIBED)
+    scene = load_scene(file)
+    placed = scene.objects["trap"]
+    assert (placed.object.name, placed.object.urdf, placed.object.acceleration[0]) == ("trap_door", None, 3.0)
+    assert placed.state[0] == 0.3
+    elsewhere = Scene.from_document(json.loads(json.dumps(scene.document)), "/")
+    assert elsewhere.document == scene.document
+    assert elsewhere.objects["trap"].object.model == placed.object.model
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "field"),
+    [
+        ("link: leaf,", "link: leav,", 11, "attachments[0].link"),
+        ("acceleration: 3", "acceleration: -3", 9, "joints.hinge.acceleration"),
+        ("      joints:", "      jonts:", 8, "jonts"),
+        ('size="0.5 0.5 0.02"', 'size="0.5 0.5"', 4, "leaf_0: box size"),
+        ('<child link="leaf"/>', '<child link="leav"/>', 7, "hinge: child"),
+    ],
+)
+def test_what_is_wrong_in_such_a_description_is_located(tmp_path: Path, old: str, new: str, line: int, field: str) -> None:
+    """In the scene's file, or in the text of the URDF in it."""
+    assert old in DESCRIBED
+    (tmp_path / "room.yaml").write_text(DESCRIBED.replace(old, new))
+    with pytest.raises(InputError) as caught:
+        load_scene(tmp_path / "room.yaml")
+    assert str(caught.value.file) == str(tmp_path / "room.yaml") + (": urdf" if "link=" in old or "size" in old else "")
+    assert (caught.value.line, caught.value.field) == (line, field)
+
+
+def test_objects_of_no_kind(tmp_path: Path) -> None:
+    plain = {"robot": "husky_ur5e", "start": {"base": [0, 0, 0]}}
+    for kind, field, said in ((5, "objects[0].type", "the name or file"), ({}, "objects[0].type", "urdf: missing")):
+        with pytest.raises(InputError, match=said) as caught:
+            Scene.from_document({**plain, "objects": [{"name": "it", "type": kind, "position": [0, 0, 0]}]})
+        assert caught.value.field == field
+
+
 def test_unknown_scenes_and_missing_files(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError) as caught:
         load_scene("dor")

@@ -193,19 +193,20 @@ class UrdfFile:
         return numbers_of(self.path, element, key, count, default=default, where=where)
 
 
-def read_urdf(path: str | Path, packages: Mapping[str, Path] | None = None) -> UrdfFile:
+def read_urdf(path: str | Path, packages: Mapping[str, Path] | None = None, *, text: str | None = None) -> UrdfFile:
     """Read a URDF file.
 
     Args:
         path: The file.
         packages: Package name → folder. Other packages are looked for in the folders around the file.
+        text: What it says, where that stands elsewhere: no file is read then, but meshes are looked for as if `path` were one.
 
     Raises:
         InputError: The file does not exist, is no XML, no URDF, or its links and joints are no tree; see `check_tree`.
         UnknownNameError: A joint names a link that does not exist.
     """
     file = Path(path)
-    text, root = read_xml(file, "URDF")
+    text, root = read_xml(file, "URDF", text)
     check_tree(file, root)
     return UrdfFile(file.absolute(), text, root, dict(packages or {}))
 
@@ -235,16 +236,20 @@ def tree_model(file: UrdfFile, *root: pin.JointModelPlanar | str) -> pin.Model:
     return model
 
 
-def load_urdf(path: str | Path) -> tuple[pin.Model, pin.GeometryModel, pin.GeometryModel]:
+def load_urdf(path: str | Path, *, text: str | None = None) -> tuple[pin.Model, pin.GeometryModel, pin.GeometryModel]:
     """Return model, collision and visual geometry of a URDF without a root joint; its root link's frame is the universe frame.
 
     Collision meshes become their convex hulls.
+
+    Args:
+        path: The file.
+        text: What it says, where that stands elsewhere; see `read_urdf`.
 
     Raises:
         InputError: There is no such file, it is no valid URDF, a shape is not understood, a mesh cannot be read, a joint type
             is not supported, or a link is drawn while nothing in the whole file can collide.
     """
-    file = read_urdf(path)
+    file = read_urdf(path, text=text)
     for joint in file.root.findall("joint"):  # what Pinocchio would accept with another meaning, or refuse without saying why
         name, kind, line = joint.get("name"), joint.get("type"), line_of(joint)
         if kind not in _JOINTS:

@@ -26,13 +26,18 @@ def line_of(element: ElementTree.Element) -> int | None:
     return getattr(element, "line", None)
 
 
-def read_xml(file: str | Path, kind: str) -> tuple[str, ElementTree.Element]:
+def read_xml(file: str | Path, kind: str, text: str | None = None) -> tuple[str, ElementTree.Element]:
     """Return what a URDF or SRDF file (`kind`) says, as text and as its element <robot>.
+
+    Args:
+        file: The file.
+        kind: "URDF" or "SRDF".
+        text: What it says, where that stands elsewhere: nothing is read then, and `file` is for messages alone.
 
     Raises:
         InputError: It cannot be read, is no XML, or is about something else than a robot.
     """
-    text = read_text(file, kind)
+    text = read_text(file, kind) if text is None else text
     root = parse_xml(text, Path(file))
     if root.tag != "robot":
         raise InputError(f"this is no {kind}", file=file, expected="an element <robot>", got=f"<{root.tag}>")

@@ -149,7 +149,7 @@ class ArticulatedObject:
 
     Attributes:
         name: Its name.
-        urdf: The URDF it came from.
+        urdf: The URDF it came from; None if that is part of its description.
         model: Its kinematics, without a root joint.
         collision: Its collision geometry, convex shapes only, no collision pairs.
         visual: What to draw.
@@ -165,7 +165,7 @@ class ArticulatedObject:
     """
 
     name: str
-    urdf: Path
+    urdf: Path | None
     model: pin.Model
     collision: pin.GeometryModel
     visual: pin.GeometryModel

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import pinocchio as pin
 from pydantic import Field, model_validator
 
+from vkc_pin.arguments import mapping
 from vkc_pin.errors import InputError
 from vkc_pin.files.documents import Document, check, read_yaml
 from vkc_pin.files.fields import (
@@ -26,13 +27,13 @@ from vkc_pin.files.fields import (
     fail,
     require,
 )
-from vkc_pin.files.resources import located
+from vkc_pin.files.resources import file_path, located
 from vkc_pin.files.urdf import load_urdf
 from vkc_pin.models.articulation import DEFAULT_ACCELERATION, DEFAULT_VELOCITY, ArticulatedObject, Attachment, Freedom, Latch
 from vkc_pin.models.coordinates import Coordinates
 from vkc_pin.models.grafting import clean
 
-__all__ = ["AttachmentSchema", "FreedomSchema", "LatchSchema", "ObjectSchema", "load_object"]
+__all__ = ["AttachmentSchema", "FreedomSchema", "LatchSchema", "ObjectSchema", "described_object", "load_object"]
 
 
 _around_zero = require(
@@ -121,7 +122,7 @@ class LatchSchema(Schema):
 
 
 class ObjectSchema(Schema):
-    """A description file of an articulated object."""
+    """The description of an articulated object; `urdf` is the path of a file, or what it says."""
 
     urdf: str
     free: bool = False
@@ -131,19 +132,40 @@ class ObjectSchema(Schema):
     own_collisions: tuple[Annotated[tuple[str, ...], count(2)], ...] = ()
 
 
-def load_object(name_or_path: str | Path) -> ArticulatedObject:
-    """Load an articulated object: by the name of a description in `scenes/objects`, or by the path of one (.yaml).
+def load_object(name_or_path: str | Path | Mapping[str, Any], *, folder: str | Path = ".") -> ArticulatedObject:
+    """Load an articulated object.
+
+    Args:
+        name_or_path: The name of a description in `scenes/objects`, the path of one (.yaml), or a description itself.
+        folder: Where paths in a description that is handed over start from.
 
     Raises:
         UnknownNameError: There is no such object, or its description names a field, link or joint that does not exist.
         InputError: The description or its URDF is wrong.
     """
+    if isinstance(name_or_path, Mapping):
+        return described_object(Document(mapping(name_or_path, "description")), file_path(folder, "folder"))
     file = located(name_or_path, "scenes", "objects/*.yaml", what="object")
-    document = read_yaml(file)
+    return described_object(read_yaml(file), file.parent, file.stem)
+
+
+def described_object(document: Document, folder: Path, name: str | None = None) -> ArticulatedObject:
+    """Return the object of a description.
+
+    Args:
+        document: The description.
+        folder: Where paths in it start from.
+        name: Of the object; None: that of the URDF's robot.
+
+    Raises:
+        UnknownNameError: It names a field, link or joint that does not exist.
+        InputError: The description or its URDF is wrong.
+    """
     schema = check(document, ObjectSchema)
-    urdf = file.parent / schema.urdf
+    text = schema.urdf if schema.urdf.lstrip().startswith("<") else None
+    urdf = folder / schema.urdf if text is None else Path(f"{document.file or folder / 'description'}: urdf")
     with document.at(("urdf",)):
-        model, collision, visual = load_urdf(urdf)
+        model, collision, visual = load_urdf(urdf, text=text)
         coordinates = Coordinates(model)
     names, links = coordinates.names, [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
     velocity, acceleration = coordinates.velocity.copy(), np.full(coordinates.size, DEFAULT_ACCELERATION)
@@ -174,8 +196,8 @@ def load_object(name_or_path: str | Path) -> ArticulatedObject:
             raise document.error(("attachments", index, "name"), problem, expected="a new name", got=got)
         attachments[item.name] = attachment
     return ArticulatedObject(
-        name=file.stem,
-        urdf=urdf,
+        name=name or str(model.name),
+        urdf=urdf if text is None else None,
         model=model,
         collision=collision,
         visual=visual,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -16,7 +17,7 @@ from vkc_pin.files.documents import Document, check
 from vkc_pin.files.resources import file_path
 from vkc_pin.files.srdf import read_srdf
 from vkc_pin.models.grafting import clean
-from vkc_pin.models.object_file import load_object
+from vkc_pin.models.object_file import described_object, load_object
 from vkc_pin.models.robot import Robot
 from vkc_pin.models.robot_file import load_robot
 from vkc_pin.models.shapes import within_limits
@@ -220,9 +221,13 @@ def _file(document: Document, path: tuple[str | int, ...], folder: Path, name: s
 
 
 def _object(document: Document, path: tuple[str | int, ...], item: schema.PlacedObjectSchema, folder: Path) -> PlacedObject:
-    by_path = item.type.endswith((".yaml", ".yml")) or "/" in item.type
-    with document.at((*path, "type")):
-        loaded = load_object(_file(document, (*path, "type"), folder, item.type) if by_path else item.type)
+    at, kind = (*path, "type"), item.type
+    with document.at(at):
+        if isinstance(kind, dict):
+            loaded = described_object(_part(document, at), folder)
+        else:
+            by_path = kind.endswith((".yaml", ".yml")) or "/" in kind
+            loaded = load_object(_file(document, at, folder, kind) if by_path else kind)
     neutral = np.clip(0.0, loaded.lower, loaded.upper)
     placed = PlacedObject(item.name, loaded, _pose(item), neutral)
     for joint, value in item.state.items():
@@ -232,6 +237,13 @@ def _object(document: Document, path: tuple[str | int, ...], item: schema.Placed
         with document.at((*path, "reversed", number)):
             placed = placed.with_reversed(attachment)
     return placed
+
+
+def _part(document: Document, path: tuple[str | int, ...]) -> Document:
+    """Return the data at `path` as a document of its own, which knows file and lines; its fields are named from there."""
+    inside, data = len(path), functools.reduce(lambda data, key: data[key], path, document.data)
+    lines = {place[inside:]: line for place, line in document.lines.items() if place[:inside] == path}
+    return Document(data, document.file, lines)
 
 
 def _obstacle(

@@ -86,6 +86,10 @@ Colour = Annotated[tuple[Fraction, Fraction, Fraction, Fraction], count(4), Befo
 Interval = Annotated[
     tuple[Number, Number], count(2), require(lambda value: value[0] <= value[1], "the interval is empty", "[lowest, highest]")
 ]
+Description = Annotated[
+    Any,
+    require(lambda value: isinstance(value, str | dict), "wrong value", "the name or file of an object, or its description"),
+]
 Scale = Annotated[Size, BeforeValidator(_triple)]
 
 
@@ -164,13 +168,13 @@ ObstacleSchema = Annotated[
 
 
 class PlacedObjectSchema(PoseSchema):
-    """An articulated object: `type` names its description or its file, `state` its joint values (others are 0).
+    """An articulated object: `type` names its description or its file, or is one; `state` its joint values (others are 0).
 
     Attachments that are `reversed` are approached from the other side than the object's description says.
     """
 
     name: Name
-    type: str
+    type: Description
     state: Mapping[str, Number] = Field(default_factory=dict)
     reversed: tuple[str, ...] = ()
 

@@ -10,12 +10,15 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks import chores, gap
+from vkc_pin.models.shapes import triangles
 from vkc_pin.motion.world import World
 from vkc_pin.plotting.style import new_figure, save_figure, styled
 from vkc_pin.plotting.top_view import draw_top_view
+from vkc_pin.scene.placed import standing_geometry
 from vkc_pin.visualization import drawing
 from vkc_pin.visualization import viewer as visualization
 
@@ -36,6 +39,11 @@ PUSHED = (2.3, -0.2, 0.8), (-0.5, -2.6, 2.9)
 PUSHING = 14.0  # [s] of the motion at the door that stands open
 CARRIED = 15.0  # [s] of the motion with the tray
 GAP = (0.1, -0.3, 0.2), (-3.4, -5.0, 5.6)
+FURNITURE = {  # kinds, and the seeds of those that are shown
+    **{"door": 1, "drawers": 2, "cabinet": 1, "refrigerator": 2, "dishwasher": 0},
+    **{"oven": 1, "microwave": 0, "chest": 0, "faucet": 1, "valve": 2},
+}
+TASKS = (5, 49, 40, 54)  # a door, a refrigerator, a chest, an oven
 OPENED = {"door": ("hinge", 1.0), "drawer": ("slide", 0.22), "dishwasher": ("rack", 0.5), "refrigerator": ("hinge", 1.4)}
 
 sys.path.insert(0, str(ROOT / "tests"))
@@ -85,6 +93,65 @@ def room_picture() -> None:
         for own, room in zip(figure.subfigures(1, len(rooms)), rooms, strict=True):
             draw_top_view(own, World(room), None)
         save_figure(figure, IMAGES / "random_rooms.png")
+
+
+def furniture_picture() -> None:
+    """Write one of every kind of furniture that is made at random, with its joints half open."""
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    light = np.array([-0.6, -0.35, 0.72])
+    with styled():
+        figure = new_figure(12.0, 5.6)
+        for place, (kind, seed) in enumerate(FURNITURE.items(), start=1):
+            thing = vkc.load_object(vkc.random_object(kind, seed))
+            state = np.array(
+                [0.0 if name == "knob" else 0.5 * high for name, high in zip(thing.coordinates.names, thing.upper, strict=True)]
+            )
+            shapes = standing_geometry(vkc.PlacedObject(kind, thing, pin.SE3.Identity(), state), visual=True)
+            faces, colours = list[np.ndarray](), list[np.ndarray]()
+            for shape in shapes:
+                points, corners = triangles(shape.geometry)
+                points = points @ shape.placement.rotation.T + shape.placement.translation
+                for face in points[corners]:
+                    normal = np.cross(face[1] - face[0], face[2] - face[0])
+                    size = np.linalg.norm(normal)
+                    shade = 0.55 + 0.45 * abs(float(normal @ light)) / size if size > 0.0 else 1.0
+                    faces += finer(face)
+                    colours += [np.append(shade * shape.meshColor[:3], 1.0)] * (len(faces) - len(colours))
+            axes = figure.add_subplot(2, 5, place, projection="3d", computed_zorder=False)
+            axes.add_collection3d(Poly3DCollection(np.array(faces), facecolors=colours, edgecolors=colours, linewidths=0.2))
+            corners = np.array(faces).reshape(-1, 3)
+            middle, half = (corners.max(axis=0) + corners.min(axis=0)) / 2, np.ptp(corners, axis=0).max() / 2
+            for axis, value in zip("xyz", middle, strict=True):
+                getattr(axes, f"set_{axis}lim")(value - half, value + half)
+            axes.view_init(elev=22, azim=-145)
+            axes.set_box_aspect((1, 1, 1), zoom=1.25)
+            axes.set_axis_off()
+            axes.set_title(kind, y=-0.05)
+        save_figure(figure, IMAGES / "furniture.png")
+
+
+def finer(face: np.ndarray, longest: float = 0.06) -> list[np.ndarray]:
+    """Return a triangle as triangles whose edges are not longer than that [m]: the picture is sorted by their middles."""
+    edges = [np.linalg.norm(face[k] - face[k - 1]) for k in range(3)]
+    k = int(np.argmax(edges))
+    if edges[k] <= longest:
+        return [face]
+    a, b, c = face[k - 1], face[k], face[k - 2]
+    middle = (a + b) / 2
+    return [*finer(np.array([a, middle, c]), longest), *finer(np.array([middle, b, c]), longest)]
+
+
+def task_picture() -> None:
+    """Write tasks in random rooms from above, with the motions that were planned for them."""
+    with styled():
+        figure = new_figure(12.0, 8.4)
+        for own, seed in zip(figure.subfigures(2, 2).ravel(), TASKS, strict=True):
+            room, steps = vkc.random_task(seed)
+            plan = vkc.plan(room, steps)
+            sys.stdout.write(plan.report() + "\n")
+            draw_top_view(own, World(room), plan.trajectory)
+        save_figure(figure, IMAGES / "random_tasks.png")
 
 
 def chore_pictures(chore: vkc.Plan) -> None:
@@ -141,6 +208,8 @@ def main() -> int:
         picture(vkc.load_scene(name), name, SMALL)
     home_pictures()
     room_picture()
+    furniture_picture()
+    task_picture()
     chore_pictures(chore)
     gap_picture(through)
     tray_picture()

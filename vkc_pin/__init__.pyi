@@ -4,6 +4,7 @@ from .chain.inversion import invert
 from .errors import BuildError, InputError, UnknownNameError, VkcError
 from .importing.objects.object_import import ImportedObject, import_object
 from .models.articulation import ArticulatedObject, Attachment, Freedom, Latch
+from .models.furniture.catalogue import random_object, write_object
 from .models.object_file import load_object
 from .models.proposals.proposal import Proposal, Proposals
 from .models.proposals.propose import propose_attachments
@@ -23,6 +24,7 @@ from .scene.rooms.settings import RoomSettings
 from .scene.scene import Scene, load_scene
 from .solver.solution import Iteration
 from .task.formula import State
+from .task.goals import goals, random_task
 from .task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Touch
 from .task.terms import Constraint, Cost
 from .validation.report import Report, Violation
@@ -73,6 +75,7 @@ __all__ = [
     "build",
     "consolidate",
     "cpin",
+    "goals",
     "import_object",
     "invert",
     "load_object",
@@ -82,8 +85,11 @@ __all__ = [
     "plan_chore",
     "plotting",
     "propose_attachments",
+    "random_object",
     "random_room",
+    "random_task",
     "validate",
     "validation",
     "visualization",
+    "write_object",
 ]

@@ -174,6 +174,16 @@ CALLS: dict[str, Call] = {
     "random_room": Call(
         vkc.random_room, lambda: {"number": 0, "settings": None, "clutter": 0.0, "tables": 0, "objects": ()}, 0.3
     ),
+    "random_task": Call(
+        vkc.random_task, lambda: {"seed": 0, "settings": None, "clutter": 0.0, "tables": 0, "objects": ("random_oven",)}, 0.3
+    ),
+    "random_object": Call(vkc.random_object, lambda: {"kind": "oven", "seed": 0}),
+    "write_object": Call(
+        _written(lambda path, **k: vkc.write_object(path=path, **k)),
+        lambda: {"path": "oven.yaml", "description": vkc.random_object("oven")},
+    ),
+    "load_object described": Call(vkc.load_object, lambda: {"name_or_path": vkc.random_object("door"), "folder": "."}),
+    "goals": Call(vkc.goals, lambda: {"scene": scene(), "share": 0.5}),
     "RoomSettings": Call(
         vkc.RoomSettings,
         lambda: {

@@ -134,7 +134,18 @@ def _run(does: Callable[[dict[str, Any]], str], case: dict[str, Any]) -> dict[st
 def _plans(case: dict[str, Any]) -> bool:
     name, words = case.get("call", ""), case.get("argv", [])
     pictures = ("Plan.to_html", "to_html", "show", "animate", "Plan.plot")
-    planning = (*pictures, "plan", "plan_chore", "plan_separately", "Constraint", "Cost", "build", "validate", "random_room")
+    planning = (
+        *pictures,
+        "plan",
+        "plan_chore",
+        "plan_separately",
+        "Constraint",
+        "Cost",
+        "build",
+        "validate",
+        "random_room",
+        "random_task",
+    )
     return bool(case.get("plan")) or name in planning or "plan" in words or "view" in words
 
 

@@ -9,6 +9,7 @@ import vkc_pin as vkc
 from vkc_pin.models.shapes import clearance, placed_shapes, world_box
 from vkc_pin.scene.placed import standing_geometry
 from vkc_pin.scene.rooms import parts
+from vkc_pin.scene.rooms.fixtures import OPENED, fixture
 from vkc_pin.scene.rooms.footprints import Floor, Frame
 
 FLOOR = Floor(6.0, 5.0)
@@ -56,10 +57,10 @@ def test_a_box() -> None:
     assert [*low, *high] == pytest.approx([0.7, 1.8, 0.0, 1.3, 2.2, 0.8], abs=1e-3)
 
 
-@pytest.mark.parametrize("kind", parts.OPENED)
+@pytest.mark.parametrize("kind", [*OPENED, "random_oven", "random_door", "random_chest"])
 @pytest.mark.parametrize("side", range(4))
 def test_what_opens_stands_at_its_wall_and_has_room_to(kind: str, side: int) -> None:
-    part = parts.opened(kind, kind, FLOOR, side, 0.5, 1.8)
+    part = parts.opened(kind, fixture(kind, side), FLOOR, side, 0.5, 1.8)
     room = scene(part, walls=True)
     placed = room.objects[kind]
     walls = placed_shapes(room.obstacles)
@@ -77,8 +78,26 @@ def test_what_opens_stands_at_its_wall_and_has_room_to(kind: str, side: int) -> 
     assert FLOOR.half_length(side + 1) - abs(np.array(part.spot)[side % 2]) > 0.8
 
 
+@pytest.mark.parametrize("kind", ["random_microwave", "random_faucet"])
+@pytest.mark.parametrize("seed", range(4))
+def test_small_things_stand_on_a_counter(kind: str, seed: int) -> None:
+    part = parts.opened("it", fixture(kind, seed), FLOOR, 2, 0.3, 1.8)
+    low, high = extent(scene(part))
+    room = scene(part)
+    boxes = np.array([world_box(shape.geometry, shape.placement) for shape in standing_geometry(room.objects["it"])])
+    assert boxes[:, 0].min(axis=0)[2] == pytest.approx(high[2] + 0.001, abs=1e-4)
+    assert (boxes[:, 0].min(axis=0)[:2] >= low[:2]).all()
+    assert (boxes[:, 1].max(axis=0)[:2] <= high[:2]).all()
+    assert [*low[:2], *high[:2]] == pytest.approx(
+        [*part.footprint.corners.min(axis=0), *part.footprint.corners.max(axis=0)], abs=2e-3
+    )
+    assert 0.7 < high[2] < 0.92
+    assert part.before is not None
+    assert part.before.gap(part.footprint) == pytest.approx(0.0, abs=2e-3)
+
+
 def test_walls_close_the_room_but_for_doors() -> None:
-    door = parts.opened("door", "door", FLOOR, 1, -1.0, 1.8)
+    door = parts.opened("door", fixture("door"), FLOOR, 1, -1.0, 1.8)
     closed, open_ = (parts.walls(FLOOR, 2.4, standing) for standing in ((), (door,)))
     assert [item["name"] for item in closed] == ["wall_east", "wall_north", "wall_west", "wall_south"]
     assert [item["name"] for item in open_ if "north" in item["name"]] == [
@@ -99,8 +118,3 @@ def test_what_is_carried_stands_on_its_table(kind: str) -> None:
     gap = clearance(placed_shapes(standing_geometry(placed)), placed_shapes(room.obstacles))
     assert gap == pytest.approx(1e-3, abs=1e-4)
     assert placed.placement.translation[:2] == pytest.approx([1.2, -0.8])
-
-
-def test_an_unknown_object() -> None:
-    with pytest.raises(vkc.UnknownNameError, match="cabinet"):
-        parts.opened("it", "cabinett", FLOOR, 0, 0.0, 1.8)

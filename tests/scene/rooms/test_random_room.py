@@ -14,23 +14,28 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 import vkc_pin as vkc
-from vkc_pin.models.shapes import clearance, placed_shapes, shape_distance
+from vkc_pin.models.furniture.catalogue import KINDS
+from vkc_pin.models.shapes import clearance, placed_shapes, shape_distance, world_box
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.placed import standing_geometry
-from vkc_pin.scene.rooms.parts import OPENED
+from vkc_pin.scene.rooms.fixtures import OPENED
 from vkc_pin.scene.rooms.random_room import Layout, random_layout
 from vkc_pin.scene.scene import START_CLEARANCE
 
 NUMBERS = st.integers(0, 10_000)
-OBJECTS = st.one_of(st.none(), st.lists(st.sampled_from(sorted(OPENED)), max_size=2).map(tuple))
+KNOWN = sorted([*OPENED, *(f"random_{kind}" for kind in KINDS)])
+OBJECTS = st.one_of(st.none(), st.lists(st.sampled_from(KNOWN), max_size=2).map(tuple))
 
 
 def groups(layout: Layout, scene: vkc.Scene) -> dict[str, list]:
     """Return the collision shapes of every part and of the walls."""
     found: dict[str, list] = {part.name: [] for part in layout.parts}
-    owners = {entry["name"]: part.name for part in layout.parts for entry in part.obstacles}
+    owners = {entry["name"]: part.name for part in layout.parts for entry in part.obstacles if not part.objects}
+    counters = {entry["name"] for part in layout.parts for entry in part.obstacles if part.objects}
     for shape, label in zip(scene.obstacles, scene.obstacle_labels, strict=True):
-        if label != FLOOR:
+        if label in counters:
+            found.setdefault("counters", []).append(shape)
+        elif label != FLOOR:
             found.setdefault(owners.get(label, "walls"), []).append(shape)
     for name, placed in scene.objects.items():
         found[name] = standing_geometry(placed)
@@ -47,7 +52,7 @@ def test_a_room_is_sound(number: int, clutter: float, objects: tuple[str, ...] |
     shapes = groups(layout, scene)
     for one, other in itertools.combinations(shapes, 2):
         distance = clearance(placed_shapes(shapes[one]), placed_shapes(shapes[other]), reach=0.05)
-        carried = "cup" in (one, other)
+        carried = "cup" in (one, other) or ("counters" in (one, other) and "walls" not in (one, other))
         door = "walls" in (one, other) and any("door" in name for name in (one, other))
         least = -2e-3 if door else 5e-4 if carried else 0.0 if "walls" in (one, other) else 0.05
         assert distance >= least - 1e-9, (one, other, distance)
@@ -100,6 +105,34 @@ def test_a_room_can_be_saved(tmp_path: Path) -> None:
     for one, other in zip(room.obstacles, again.obstacles, strict=True):
         assert one.placement.isApprox(other.placement)
         assert shape_distance(one.geometry, one.placement, other.geometry, other.placement) < 0.0
+
+
+def test_objects_made_at_random_differ_from_room_to_room_and_are_kept_with_it(tmp_path: Path) -> None:
+    asked = ("random_drawers", "random_drawers", "random_microwave", "refrigerator")
+    rooms = [vkc.random_room(number, objects=asked, clutter=0.1) for number in (4, 5)]
+    assert list(rooms[0].objects) == ["drawers_1", "drawers_2", "microwave", "refrigerator"]
+    sizes = {tuple(placed.object.upper) for room in rooms for name, placed in room.objects.items() if "drawers" in name}
+    assert len(sizes) == 4
+    assert {"microwave_counter", "microwave_worktop"} <= set(rooms[0].obstacle_names)
+    file = tmp_path / "room.yaml"
+    file.write_text(yaml.safe_dump(rooms[0].document), encoding="utf-8")
+    again = vkc.load_scene(file)
+    assert again.document == rooms[0].document
+    assert again.objects["drawers_1"].object.model == rooms[0].objects["drawers_1"].object.model
+
+
+def test_objects_by_path_and_by_description(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    description = vkc.random_object("chest", 3)
+    vkc.write_object(description, tmp_path / "my.chest.yaml")
+    monkeypatch.chdir(tmp_path)
+    room = vkc.random_room(1, objects=["./my.chest.yaml", tmp_path / "my.chest.yaml", description, "dishwasher"], clutter=0.0)
+    assert list(room.objects) == ["my_chest_1", "my_chest_2", "chest", "dishwasher"]
+    monkeypatch.chdir("/")
+    again = vkc.Scene.from_document(room.document, room.folder)  # paths are whole
+    assert again.document == room.document
+    for name in room.objects:
+        low = min(world_box(shape.geometry, shape.placement)[0][2] for shape in standing_geometry(room.objects[name]))
+        assert low == pytest.approx(0.0, abs=1e-4)
 
 
 def test_what_was_asked_for_is_there() -> None:

@@ -23,6 +23,7 @@ import vkc_pin as vkc
         ({"front": 0.2}, "front", "a number from 1.5"),
         ({"gap": 0.0}, "gap", "a number from 0.02"),
         ({"objects": "door"}, "objects", "a list of types"),
+        ({"objects": (3,)}, "objects", "the name of a"),
         ({"carried": ("cup",) * 5}, "carried", "at most 4"),
         ({"carried": ("cup",), "tables": 0}, "carried", "at least 1"),
     ],
@@ -35,7 +36,10 @@ def test_wrong_settings(changes: dict[str, Any], field: str, expected: str) -> N
     assert found.value.got is not None
 
 
-@pytest.mark.parametrize(("field", "name", "nearest"), [("objects", "dor", "door"), ("carried", "cub", "cup")])
+@pytest.mark.parametrize(
+    ("field", "name", "nearest"),
+    [("objects", "dor", "door"), ("objects", "random_ovn", "random_oven"), ("carried", "cub", "cup")],
+)
 def test_unknown_types(field: str, name: str, nearest: str) -> None:
     with pytest.raises(vkc.UnknownNameError) as found:
         vkc.RoomSettings(**{field: (name,)})  # type: ignore[arg-type]

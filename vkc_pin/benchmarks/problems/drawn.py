@@ -20,7 +20,7 @@ from vkc_pin.models.shapes import world_box
 from vkc_pin.options import Options
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.placed import standing_geometry
-from vkc_pin.scene.rooms.parts import OPENED
+from vkc_pin.scene.rooms.fixtures import OPENED
 from vkc_pin.scene.rooms.random_room import random_room
 from vkc_pin.scene.scene import Scene, load_scene
 from vkc_pin.task.compiler import compile_task

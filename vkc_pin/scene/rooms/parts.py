@@ -2,44 +2,26 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 
-from vkc_pin.arrays import Floats
-from vkc_pin.errors import UnknownNameError
-from vkc_pin.models.object_file import load_object
-from vkc_pin.models.shapes import world_box
-from vkc_pin.scene.placed import PlacedObject, standing_geometry
+from vkc_pin.scene.rooms.fixtures import Fixture
 from vkc_pin.scene.rooms.footprints import Floor, Frame, Rectangle
 
-__all__ = ["CARRIED", "OPENED", "Part", "box", "carried", "opened", "shelf", "table", "walls"]
+__all__ = ["CARRIED", "Part", "box", "carried", "opened", "shelf", "table", "walls"]
 
 WALL = 0.1  # [m] thickness
 AIR = 0.02  # [m] between a wall and what stands against it
 PLATE, LEG, BOARD = 0.03, 0.06, 0.02  # [m] thicknesses
 BEFORE_TABLE = 1.5  # [m] depth of the floor that stays free on one side of a table
 _LEAST = 0.75  # [m] to either side of the middle of what is stood before: room for a robot to turn
-_SLIT = 0.03  # [m] of air above a door's panel, where its frame has no lintel
 _ON = 0.001  # [m] of air below what is carried
 
-OPENED = {
-    "door": 0.4,
-    "narrow_door": 0.4,
-    "wide_door": 0.4,
-    "drawer": 0.5,
-    "low_drawer": 0.5,
-    "refrigerator": 0.7,
-    "cabinet": 0.7,
-}
-"""Objects that open: type → how far to either side of it the floor before it stays free, for the robot and for a door [m]."""
 CARRIED = {"cup": 0.0, "ball": 0.035}
 """Free objects that stand on tables: type → how high their frame is above what they stand on [m]."""
-_IN_WALL = ("door", "narrow_door", "wide_door")
 
 
 @dataclass(frozen=True)
@@ -117,28 +99,40 @@ def shelf(name: str, frame: Frame, size: tuple[float, float, float], boards: int
     return Part(name, frame, footprint, tuple(items), size=size)
 
 
-def opened(name: str, kind: str, floor: Floor, side: int, along: float, front: float) -> Part:
-    """Return an object that opens, against a wall or, if it is a door, in it; the floor before it stays free.
+def opened(name: str, own: Fixture, floor: Floor, side: int, along: float, front: float) -> Part:
+    """Return an object that opens, in a wall, against it, or on a counter against it; the floor before it stays free.
 
     Args:
         name: Its name in the scene.
-        kind: Its type, one of `OPENED`.
+        own: What it is.
         floor: Of the room.
         side: Of the wall.
         along: Where on the wall its middle is; see `Floor.at_wall` [m].
         front: How deep the floor before it is that stays free [m].
     """
-    low, high = _extent(kind)
-    in_wall = kind in _IN_WALL
-    frame = floor.at_wall(side, along - (low[1] + high[1]) / 2.0)
-    frame = Frame(*frame.point(WALL / 2.0 if in_wall else -AIR - high[0], 0.0), frame.yaw)
-    footprint = frame.rectangle((low[0], high[0]), (low[1], high[1]))
-    face = -WALL / 2.0 if in_wall else 0.0
-    before = frame.rectangle((face - front, face), (low[1] - OPENED[kind], high[1] + OPENED[kind]))
-    entry = {"name": name, "type": kind, "position": [frame.x, frame.y, 0.0], "yaw": frame.yaw}
-    spot = frame.point(face - front / 2.0, (low[1] + high[1]) / 2.0)
+    low, high, counter = own.low, own.high, own.counter
+    middle = (low[1] + high[1]) / 2.0
+    wall = floor.at_wall(side, along - middle)
+    edge = -AIR - counter.size[0] if counter else 0.0  # of the counter, along the wall's frame
+    inwards = WALL / 2.0 if own.in_wall else edge + counter.setback if counter else -AIR - high[0]
+    frame = Frame(*wall.point(inwards, 0.0), wall.yaw)
+    sides, face = (low[1], high[1]), -WALL / 2.0 if own.in_wall else 0.0
+    footprint, items, up = frame.rectangle((low[0], high[0]), sides), [], own.lift
+    if counter:
+        depth, width, height = counter.size
+        sides, face, up = (middle - width / 2.0, middle + width / 2.0), -counter.setback, height + own.lift
+        footprint = frame.rectangle((face, face + depth), sides)
+        centre = (face + depth / 2.0, middle)
+        items = [
+            _box(f"{name}_counter", frame, centre, (0.0, height - PLATE), (depth, width), "cream"),
+            _box(f"{name}_worktop", frame, centre, (height - PLATE, height), (depth, width), "oak"),
+        ]
+    beside = (low[1] - own.beside, high[1] + own.beside)
+    before = frame.rectangle((face - front, face), beside)
+    entry = {"name": name, "type": own.type, "position": [frame.x, frame.y, round(up, 4)], "yaw": frame.yaw}
+    spot = frame.point(face - front / 2.0, middle)
     size = (float(high[0] - low[0]), float(high[1] - low[1]), float(high[2]))
-    return Part(name, frame, footprint, (), (entry,), before, spot, size, side if in_wall else None)
+    return Part(name, frame, footprint, tuple(items), (entry,), before, spot, size, side if own.in_wall else None)
 
 
 def carried(name: str, kind: str, on: Part, x: float, y: float) -> Part:
@@ -192,23 +186,3 @@ def _box(
     edges = [round(float(edge), 3) for edge in (*size, z[1] - z[0])]
     position = [*frame.point(*at), round((z[0] + z[1]) / 2.0, 4)]
     return {"name": name, "type": "box", "size": edges, "position": position, "yaw": frame.yaw, "colour": colour}
-
-
-@functools.cache
-def _extent(kind: str) -> tuple[Floats, Floats]:
-    """Return lowest and highest corner, shape (3,) each [m], of an object's base link and what is shut, in its own frame.
-
-    Of a door in a wall it is the frame alone, as handles stick out of the wall, and as high as the panel needs it.
-    """
-    if kind not in OPENED:
-        raise UnknownNameError("object that opens", kind, OPENED, field="objects")
-    loaded = load_object(kind)
-    placed = PlacedObject(kind, loaded, pin.SE3.Identity(), np.clip(0.0, loaded.lower, loaded.upper))
-    boxes = np.array([world_box(shape.geometry, shape.placement) for shape in standing_geometry(placed)])
-    low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
-    if kind in _IN_WALL:
-        fixed = [shape.parentJoint == 0 for shape in loaded.collision.geometryObjects]
-        top = max(boxes[fixed, 1].max(axis=0)[2], high[2] + _SLIT)
-        low, high = boxes[fixed, 0].min(axis=0), boxes[fixed, 1].max(axis=0)
-        high[2] = top
-    return low.round(4), high.round(4)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,8 +18,9 @@ from vkc_pin.models.robot import Robot
 from vkc_pin.models.robot_file import load_robot
 from vkc_pin.models.shapes import world_box
 from vkc_pin.scene.rooms import parts
+from vkc_pin.scene.rooms.fixtures import OPENED, Fixture, fixture, own_name
 from vkc_pin.scene.rooms.footprints import Floor, Frame
-from vkc_pin.scene.rooms.parts import OPENED, Part
+from vkc_pin.scene.rooms.parts import Part
 from vkc_pin.scene.rooms.settings import RoomSettings
 from vkc_pin.scene.scene import START_CLEARANCE, Scene
 
@@ -110,13 +111,21 @@ def random_layout(number: int, settings: RoomSettings | None = None, **changes: 
             raise UnknownNameError("field of RoomSettings", name, known, field=name)
     chosen = dataclasses.replace(RoomSettings() if settings is None else instance(settings, RoomSettings, "settings"), **changes)
     rng, radius = np.random.default_rng([1, number]), _turning_radius(load_robot(chosen.robot))
+    named = None if chosen.objects is None else _named(chosen.objects, number)
     for _ in range(_ROOMS):
-        found = _Room(chosen, rng, radius).furnished()
+        found = _Room(chosen, rng, radius).furnished(named)
         if found is not None:
             floor, standing, start = found
             return Layout(number, chosen, floor, standing, start, radius)
     expected = "less clutter, fewer objects or tables, or wider rooms"
     raise InputError(f"no room in {_ROOMS} had a place for everything", field="clutter", expected=expected, got=chosen.clutter)
+
+
+def _named(kinds: Sequence[str | Mapping[str, Any]], number: int) -> list[tuple[str, Fixture]]:
+    """Return the things to open, each with its name in the room of a number."""
+    names = [own_name(kind) for kind in kinds]
+    names = [name if names.count(name) == 1 else f"{name}_{names[: k + 1].count(name)}" for k, name in enumerate(names)]
+    return [(name, fixture(kind, 100 * number + k)) for k, (name, kind) in enumerate(zip(names, kinds, strict=True))]
 
 
 class _Room:
@@ -129,14 +138,18 @@ class _Room:
         self.parts: list[Part] = []
         self.start: tuple[float, float, float] | None = None
 
-    def furnished(self) -> tuple[Floor, tuple[Part, ...], tuple[float, float, float]] | None:
-        """Return floor, parts and start, or None if something finds no place."""
-        kinds = self.settings.objects
-        if kinds is None:
+    def furnished(
+        self, named: Sequence[tuple[str, Fixture]] | None
+    ) -> tuple[Floor, tuple[Part, ...], tuple[float, float, float]] | None:
+        """Return floor, parts and start, or None if something finds no place.
+
+        Args:
+            named: What can be opened, by name; None: one or two of `OPENED`.
+        """
+        if named is None:
             count = int(self.rng.integers(1, 3))
-            kinds = tuple(str(kind) for kind in self.rng.choice(list(OPENED), count, replace=False))
-        names = [kind if kinds.count(kind) == 1 else f"{kind}_{kinds[: k + 1].count(kind)}" for k, kind in enumerate(kinds)]
-        fixed = [self._opened(name, kind) for name, kind in zip(names, kinds, strict=True)]
+            named = _named([str(kind) for kind in self.rng.choice(list(OPENED), count, replace=False)], 0)
+        fixed = [self._opened(name, own) for name, own in named]
         fixed += [self._table(f"table_{k + 1}") for k in range(self.settings.tables)]
         if not all(self._put(draws) for draws in fixed):
             return None
@@ -206,10 +219,10 @@ class _Room:
         """Return random lengths [m], to the centimetre."""
         return tuple(round(float(self.rng.uniform(*interval)), 2) for interval in intervals)
 
-    def _opened(self, name: str, kind: str) -> Iterator[Part]:
+    def _opened(self, name: str, own: Fixture) -> Iterator[Part]:
         while True:
             side, along = self._wall(1.0)
-            yield parts.opened(name, kind, self.floor, side, along, self.settings.front)
+            yield parts.opened(name, own, self.floor, side, along, self.settings.front)
 
     def _table(self, name: str) -> Iterator[Part]:
         while True:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from vkc_pin.arguments import is_number, items, known, text, whole
+from vkc_pin.arguments import is_number, items, known, mapping, text, whole
 from vkc_pin.errors import InputError, shown
-from vkc_pin.scene.rooms.parts import CARRIED, OPENED
+from vkc_pin.files.resources import file_path
+from vkc_pin.scene.rooms.fixtures import known_objects
+from vkc_pin.scene.rooms.parts import CARRIED
 
 __all__ = ["RoomSettings"]
 
@@ -20,8 +24,10 @@ class RoomSettings:
 
     Attributes:
         clutter: How much furniture there is, from 0, nothing but `tables`, to 1.
-        objects: Types of the things to open, from `door`, `narrow_door`, `wide_door`, `drawer`, `low_drawer`, `refrigerator`,
-            `cabinet`; None: one or two of these at random.
+        objects: What can be opened; None: one or two, at random, of `door`, `narrow_door`, `wide_door`, `drawer`, `low_drawer`,
+            `refrigerator` and `cabinet`, which are always the same. `random_door`, `random_oven` and others have sizes of their
+            own in every room, see `random_object`. Objects can also be given by path, or as what `random_object` returns: they
+            stand on the floor with their face, -x, towards the room.
         tables: How many tables there are at least, each with a side at which a robot can stand.
         carried: Types of free objects, up to four of `cup` and `ball`, which stand on the first table.
         width: Lowest and highest inner length of a wall [m].
@@ -32,7 +38,7 @@ class RoomSettings:
     """
 
     clutter: float = 0.5
-    objects: tuple[str, ...] | None = None
+    objects: tuple[str | Mapping[str, Any], ...] | None = None
     tables: int = 1
     carried: tuple[str, ...] = ()
     width: tuple[float, float] = (4.0, 7.0)
@@ -54,11 +60,10 @@ class RoomSettings:
             raise InputError("the interval is empty", field="width", expected=expected, got=shown(self.width))
         object.__setattr__(self, "width", tuple(map(float, self.width)))
         object.__setattr__(self, "tables", whole(self.tables, "tables", low=0, high=10))
-        for name, what, choices in (("objects", "object that opens", OPENED), ("carried", "object that is carried", CARRIED)):
-            given = getattr(self, name)
-            if given is not None or name == "carried":
-                kinds: tuple[Any, ...] = items(given, name, "a list of types")
-                object.__setattr__(self, name, tuple(known(kind, choices, what, name) for kind in kinds))
+        if self.objects is not None:
+            object.__setattr__(self, "objects", tuple(map(_opened, items(self.objects, "objects", "a list of types"))))
+        kinds: tuple[Any, ...] = items(self.carried, "carried", "a list of types")
+        object.__setattr__(self, "carried", tuple(known(kind, CARRIED, "object that is carried", "carried") for kind in kinds))
         text(self.robot, "robot", "a robot's name")
         if len(self.carried) > _CARRIED:
             raise InputError("too many", field="carried", expected=f"at most {_CARRIED}", got=len(self.carried))
@@ -66,6 +71,14 @@ class RoomSettings:
             raise InputError(
                 "there is nothing for it to stand on", field="carried", expected="tables of at least 1", got=self.tables
             )
+
+
+def _opened(kind: Any) -> str | dict[str, Any]:
+    """Return what a thing that opens is given by. Raises an error if nothing is called that."""
+    if isinstance(kind, Mapping):
+        return mapping(kind, "objects")
+    path = isinstance(kind, Path) or (isinstance(kind, str) and (kind.endswith((".yaml", ".yml")) or "/" in kind))
+    return str(file_path(kind, "objects")) if path else known(kind, known_objects(), "object that opens", "objects")
 
 
 def _within(name: str, value: Any, low: float, high: float) -> None:

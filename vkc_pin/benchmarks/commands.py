@@ -90,6 +90,8 @@ def _add_problems(benches: Any) -> None:
     shown, what = "problems drawn at random, whose plans are kept", "problems"
     drawn = _add_experiment(benches, "random", shown, about, "--problems", default=100, jobs=1, what=what)
     drawn.set_defaults(benchmark="problems.random_problems")
+    shown = "anything (default): steps at random, possible or not; rooms: something to open in each of as many random rooms"
+    drawn.add_argument("--of", choices=("anything", "rooms"), default="anything", help=shown)
     about = "Plan problems that cannot be done, each for one known reason: how long that takes, and whether the report says why."
     shown = "problems that cannot be done: how soon that is said, and why"
     own = _add_experiment(benches, "impossible", shown, about, "--problems", default=50, jobs=1, what="problems")

@@ -12,9 +12,10 @@ from oracle.plan import read_plan
 from vkc_pin.benchmarks.problems import random_problems
 from vkc_pin.benchmarks.problems.drawn import drawn
 from vkc_pin.cli import main
-from vkc_pin.errors import InputError
+from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.files.resources import available
 from vkc_pin.planning.plan import Plan
+from vkc_pin.task.goals import random_task
 from vkc_pin.task.steps import step_to_dict
 
 
@@ -68,3 +69,22 @@ def test_plans_are_kept_and_judged(tmp_path: Path, capsys: pytest.CaptureFixture
     assert (out / "trials.jsonl").read_bytes() == before
     with pytest.raises(InputError, match="problems"):
         random_problems.run(problems=0, out=tmp_path / "none")
+
+
+def test_one_task_in_each_of_some_rooms(tmp_path: Path) -> None:
+    out = tmp_path / "rooms"
+    assert main(["bench", "random", "--of", "rooms", "--problems", "3", "--quiet", "--out", str(out)]) == 0
+    trials = json.loads((out / "results.json").read_text(encoding="utf-8"))["trials"]
+    assert [trial["success"] for trial in trials] == [True, True, True]
+    for trial in trials:
+        room, steps = random_task(trial["number"])
+        kept = Plan.load(out / "plans" / f"{trial['key']}.npz")
+        assert (kept.scene.document, tuple(kept.steps)) == (room.document, steps)
+        assert trial["kind"] in {placed.object.name for placed in room.objects.values()}
+    verdicts = judged(sorted((out / "plans").iterdir()))
+    assert [verdict.found for verdict in verdicts] == [[], [], []]
+    assert "# Random rooms, one task each" in (out / "table.md").read_text(encoding="utf-8")
+    with pytest.raises(InputError, match="run otherwise"):  # the folder is of other problems
+        random_problems.run(problems=3, out=out)
+    with pytest.raises(UnknownNameError, match="rooms"):
+        random_problems.run(of="room", out=tmp_path / "none")

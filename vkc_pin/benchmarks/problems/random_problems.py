@@ -10,28 +10,36 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from vkc_pin.arguments import known
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.limits import LIMITS, allowed
 from vkc_pin.benchmarks.harness.record import Record, distribution, trial
 from vkc_pin.benchmarks.harness.tables import decimal, foot, markdown
 from vkc_pin.benchmarks.problems.ablation import every_trial
 from vkc_pin.benchmarks.problems.drawn import drawn
+from vkc_pin.benchmarks.problems.problem_set import Problem
 from vkc_pin.errors import InputError
 from vkc_pin.planning.planner import plan
+from vkc_pin.task.goals import random_task
+from vkc_pin.task.steps import Actuate, Grasp
 
 __all__ = ["report", "run"]
 
+_ROOMS = 100_000  # of one seed
 _LIMITS = {**LIMITS, "effort": LIMITS["effort"] // 10}  # many of them cannot be done; those that can take up to 60 000
-KINDS = ("room", "scene")
+OF = ("anything", "rooms")
 
 
-def run(*, out: str | Path, problems: int = 100, seed: int = 0, jobs: int = 1, progress: bool = True) -> dict[str, Any]:
+def run(
+    *, out: str | Path, problems: int = 100, seed: int = 0, of: str = "anything", jobs: int = 1, progress: bool = True
+) -> dict[str, Any]:
     """Run the experiment, or what is left of it, and write results.json, results.csv, table.md and plans/*.npz to `out`.
 
     Args:
         out: The folder; if it has trials of the same settings already, they are not run again.
         problems: How many, at least 1.
         seed: Of the problems and of planning.
+        of: "anything" for steps at random, possible or not; "rooms" for `random_task`: something to open in a random room.
         jobs: Number of processes.
         progress: Whether to show a progress bar.
 
@@ -39,13 +47,14 @@ def run(*, out: str | Path, problems: int = 100, seed: int = 0, jobs: int = 1, p
         {"meta": ..., "trials": [...]}; see `runner.run`.
 
     Raises:
-        InputError: No problems, or `out` has trials of other settings.
+        InputError: No problems, nothing that they can be of, or `out` has trials of other settings.
         KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
     """
     if problems < 1:
         raise InputError("out of range", field="problems", expected="at least 1", got=problems)
-    settings = {"benchmark": "random", "seed": seed, "problems": problems, **_LIMITS}
-    specs = [{"key": f"{number:05d}", "number": number, "seed": seed} for number in range(problems)]
+    known(of, OF, "set of problems", "of")
+    settings = {"benchmark": "random" if of == OF[0] else of, "seed": seed, "problems": problems, **_LIMITS}
+    specs = [{"key": f"{number:05d}", "number": number, "seed": seed, "of": of} for number in range(problems)]
     function = functools.partial(_record, folder=str(Path(out) / "plans"))
     return runner.run(specs, function, out, settings=settings, report=report, jobs=jobs, progress=progress)
 
@@ -55,20 +64,31 @@ def report(result: Mapping[str, Any]) -> str:
     about, records = result["meta"], result["trials"]
     statuses = sorted({record["status"] for record in records} - {"success"})
     rows = []
-    for kind in (*KINDS, "all"):
+    for kind in (*sorted({record["kind"] for record in records if "kind" in record}), "all"):
         own = [record for record in records if kind in (record.get("kind"), "all")]
         counts = [str(_count(own, status)) for status in statuses]
         times = map(decimal, distribution(own, "planning_time"))
         rows.append([kind, str(len(own)), str(_count(own, "success")), *counts, *times])
+    title, possible = "# Random problems", "Not all of them can be done. "
+    if about["benchmark"] == "rooms":
+        title, possible = "# Random rooms, one task each", ""
     parts = [
-        "# Random problems",
-        f"{about['problems']} problems, seed {about['seed']}, {allowed(about)} each. Not all of them can "
-        "be done. Success is the word of the independent validation.",
+        title,
+        f"{about['problems']} problems, seed {about['seed']}, {allowed(about)} each. {possible}"
+        "Success is the word of the independent validation.",
         markdown(["kind", "problems", "success", *statuses, "time, median [s]", "95th percentile [s]"], rows),
         "## Every trial",
         every_trial(records),
     ]
     return "\n\n".join([*parts, foot(about)]) + "\n"
+
+
+def _in_a_room(seed: int, number: int) -> Problem:
+    """Return a task in a random room; with seed 0 the room has the problem's number. It is of the kind of what is moved."""
+    scene, steps = random_task(seed * _ROOMS + number)
+    name = steps[0].object if isinstance(steps[0], Actuate | Grasp) else ""
+    kind = scene.objects[name].object.name
+    return Problem(number, f"{scene.name}: {type(steps[0]).__name__} {name}", kind, scene, steps)
 
 
 def _count(records: list[Record], status: str) -> int:
@@ -77,7 +97,7 @@ def _count(records: list[Record], status: str) -> int:
 
 def _record(spec: dict[str, Any], *, folder: str) -> dict[str, Any]:
     number, seed = spec["number"], spec["seed"]
-    own = drawn(seed, number)
+    own = drawn(seed, number) if spec["of"] == OF[0] else _in_a_room(seed, number)
     found = plan(own.scene, own.steps, seed=seed, **_LIMITS)
     if found.status != "interrupted":
         Path(folder).mkdir(parents=True, exist_ok=True)

@@ -15,7 +15,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "vkc_pin"
 FILE = ROOT / "docs" / "images" / "architecture.svg"
-OPEN_TO_ALL = {"arrays", "budget", "cache", "compiled", "errors", "notebook", "options"}
+OPEN_TO_ALL = {"arrays", "budget", "cache", "compiled", "errors", "kept", "notebook", "options"}
 CHECKING = {"validation"}
 # Where wings stand, from the left: so that arrows find their way between them. Others share their row.
 COLUMNS = {

@@ -7,15 +7,14 @@ import hashlib
 import os
 import shutil
 import stat
-import tempfile
 import time
 from pathlib import Path
 
+from vkc_pin.kept import VARIABLE, folder, only_mine, write_whole
+
 __all__ = ["VARIABLE", "Libraries"]
 
-VARIABLE = "VKC_PIN_CACHE"  # names the folder; empty or "off": there is none
-
-_FILES, _BYTES = 256, 512 * 2**20  # libraries that are kept at most; one of a waypoint's functions takes 0.1 MB
+_FILES, _BYTES = 256, 512 * 2**20  # libraries that are kept at most, and records; a waypoint's functions take 0.1 MB
 _JOBS = 64  # that wait at most
 _RETRY = 86400.0  # [s] after which what could not be compiled is tried again, and what a dead process left is removed
 _DIGEST = hashlib.sha256().digest_size  # bytes after the end of a library: loaders do not look at them
@@ -37,20 +36,8 @@ class Libraries:
     @classmethod
     def here(cls) -> Libraries | None:
         """Return this user's folder, made if need be; None if there is none, or if others might have written in it."""
-        named = os.environ.get(VARIABLE)
-        if os.name != "posix" or (named is not None and named.strip().lower() in ("", "off")):
-            return None
-        try:
-            if named is not None:
-                path = Path(named).expanduser().absolute()
-            else:
-                caches = Path(os.environ.get("XDG_CACHE_HOME", ""))
-                path = (caches if caches.is_absolute() else Path.home() / ".cache") / "vkc_pin"
-            path.mkdir(mode=0o700, parents=True, exist_ok=True)
-            status = path.lstat()
-        except (OSError, RuntimeError):  # RuntimeError: nobody knows where the user's home is
-            return None
-        return cls(path) if stat.S_ISDIR(status.st_mode) and _own(status) else None
+        path = folder()
+        return None if path is None else cls(path)
 
     def exists(self, key: str) -> bool:
         """Whether there seems to be a library."""
@@ -62,7 +49,7 @@ class Libraries:
         try:
             with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb") as stream:
                 status = os.fstat(stream.fileno())
-                if not stat.S_ISREG(status.st_mode) or not _own(status):
+                if not stat.S_ISREG(status.st_mode) or not only_mine(status):
                     return None
                 data = stream.read()
         except OSError:
@@ -92,7 +79,7 @@ class Libraries:
         """Return what was asked for."""
         path = self.path / f"{key}.job"
         with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb") as stream:
-            if not _own(os.fstat(stream.fileno())):
+            if not only_mine(os.fstat(stream.fileno())):
                 raise PermissionError(f"others may have written {path}")
             return stream.read()
 
@@ -117,12 +104,12 @@ class Libraries:
             (self.path / name).unlink()
 
     def tidy(self) -> None:
-        """Remove the libraries that were used longest ago where there are too many, and what dead processes left."""
+        """Remove what was used longest ago where there is too much, and what dead processes left."""
         libraries, now = [], time.time()
         for path in self.path.iterdir():
             with contextlib.suppress(OSError):
                 status = path.lstat()
-                if path.suffix == ".so" and not path.name.startswith("."):
+                if path.suffix in (".so", ".json") and not path.name.startswith("."):
                     libraries.append((status.st_mtime, status.st_size, path))
                 elif path.name != "lock" and now - status.st_mtime > _RETRY:
                     shutil.rmtree(path) if stat.S_ISDIR(status.st_mode) else path.unlink()
@@ -164,17 +151,4 @@ class Libraries:
         fcntl.flock(handle, fcntl.LOCK_UN)
 
     def _write(self, name: str, data: bytes) -> None:
-        """Write a file whole or not at all, for the owner's eyes only."""
-        handle, temporary = tempfile.mkstemp(dir=self.path, prefix=".")
-        try:
-            with os.fdopen(handle, "wb") as stream:
-                stream.write(data)
-            Path(temporary).replace(self.path / name)
-        except BaseException:
-            self.remove(Path(temporary).name)
-            raise
-
-
-def _own(status: os.stat_result) -> bool:
-    """Whether a file is this user's, and nobody else may write it."""
-    return status.st_uid == os.geteuid() and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+        write_whole(self.path / name, data)

@@ -35,6 +35,7 @@ class Options:
         turn_waypoints: Segments of a phase in which a latch is released.
         move_waypoints: Segments of a phase in which a held object is moved.
         dist_safe: Clearance to keep at the waypoints [m].
+        self_distance: The same between links of the robot; those that cannot get so far apart keep half of what they can [m].
         grasp_clearance: Clearance of the gripper's touch links to an object near its grasp, where the attachment states none [m].
         effort: What is minimised: "length", of the way, or "squares", eq. 1.
         velocity_weight_base: W_vel of eq. 1 for the base's place, and for every joint that slides [1/m²].
@@ -62,6 +63,7 @@ class Options:
     turn_waypoints: int = 6
     move_waypoints: int = 30
     dist_safe: float = 0.02
+    self_distance: float = 0.02
     grasp_clearance: float = 0.005
     effort: str = "length"
     velocity_weight_base: float = 1.0
@@ -107,6 +109,11 @@ class Options:
         """
         weights = dict.fromkeys((item.name for item in fields(cls) if item.name.startswith("velocity_weight")), 1.0)
         return cls(**{"effort": "squares", **weights, **changes})
+
+    @property
+    def largest_margin(self) -> float:
+        """The largest clearance that any pair keeps [m]."""
+        return max(self.dist_safe, self.self_distance)
 
     def steps(self, seconds: float) -> int:
         """Return how many steps of `dt` a time [s] takes, at least 1."""

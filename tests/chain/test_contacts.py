@@ -493,6 +493,7 @@ def test_more_contacts_than_slots_keep_the_worst() -> None:
     "steps", [[Reach(pin.SE3.Identity())], [GoTo(0.0, 0.0)], [Grasp("door", "handle_free")]], ids=["reach", "go", "grasp"]
 )
 def test_margins_follow_the_options(steps: list[Step]) -> None:
-    problem = program_of(door_scene(), steps, options=Options(dist_safe=0.05, grasp_clearance=0.01, reach_waypoints=2))
+    options = Options(dist_safe=0.05, self_distance=0.03, grasp_clearance=0.01, reach_waypoints=2)
+    problem = program_of(door_scene(), steps, options=options)
     margins = {margin for found in pairs(problem, 0, waypoint=2).values() for margin in found}
-    assert margins == ({0.05, 0.01} if isinstance(steps[0], Grasp) else {0.05})
+    assert margins == ({0.05, 0.03, 0.01} if isinstance(steps[0], Grasp) else {0.05, 0.03})

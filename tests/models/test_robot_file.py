@@ -171,3 +171,80 @@ def test_a_copy_of_the_robot_works_elsewhere(husky: Robot, tmp_path: Path) -> No
     assert (twin.name, twin.tool_frame, len(twin.collision.collisionPairs)) == (husky.name, "tool", 95)
     with pytest.raises(dataclasses.FrozenInstanceError):
         twin.name = "other"  # type: ignore[misc]
+
+
+@pytest.mark.parametrize("field", ["locked_joints", "home"])
+@pytest.mark.parametrize("by_file", [True, False])
+def test_joints_outside_their_limits_are_refused(tmp_path: Path, field: str, by_file: bool) -> None:
+    """Planned or locked, in robot.yaml or as an argument."""
+    small_urdf(tmp_path)
+    for joint in ("j1", "j2"):
+        about = ["urdf: small.urdf", "tool_frame: l2", *([f"{field}: {{{joint}: 2.5}}"] if by_file else [])]
+        (tmp_path / "robot.yaml").write_text("\n".join(about) + "\n")
+        with pytest.raises(InputError, match=r"rests outside its limits .expected between -2 and 2, got 2.5") as caught:
+            load_robot(tmp_path / "robot.yaml", **({} if by_file else {field: {joint: 2.5}}))  # type: ignore[arg-type]
+        assert caught.value.field == f"{field}.{joint}"
+        assert (caught.value.file, caught.value.line) == (
+            (tmp_path / "robot.yaml", 3) if by_file else (tmp_path / "small.urdf", None)
+        )
+        load_robot(tmp_path / "small.urdf", **{field: {joint: 2.0 + 1e-7}})  # type: ignore[arg-type]
+
+
+def driving_urdf(folder: Path, *, order: str = "xyt", shape: bool = False, tilted: bool = False) -> Path:
+    """The small robot on joints of its own that drive it about, as simulators have them; with links of nothing between."""
+    file = small_urdf(folder)
+    names, joints, solid = (
+        ["world", *(f"m{k}" for k in range(2)), "l0"],
+        "",
+        "<collision><geometry><sphere radius='1'/></geometry>",
+    )
+    axes = {"x": "1 0 0", "y": "0 1 0", "t": "0 0 1"}
+    for k, letter in enumerate(order):
+        kind = "continuous" if letter == "t" else "prismatic"
+        axis, origin = axes[letter], '<origin rpy="0.3 0 0"/>' if tilted and not k else ""
+        joints += f'<joint name="drive_{k}" type="{kind}"><parent link="{names[k]}"/><child link="{names[k + 1]}"/>{origin}'
+        joints += f'<axis xyz="{axis}"/><limit lower="-9" upper="9"/></joint>'
+    links = "".join(f'<link name="{name}"/>' for name in names[:3])
+    text = file.read_text().replace("</robot>", f"{links}{joints}</robot>")
+    file.write_text(text.replace('<link name="m1"/>', f'<link name="m1">{solid}</collision></link>') if shape else text)
+    return file
+
+
+@pytest.mark.parametrize("order", ["xyt", "yxt", "txy", "xty"])
+def test_a_base_of_its_own_is_noticed(tmp_path: Path, order: str) -> None:
+    file = driving_urdf(tmp_path, order=order)
+    with pytest.warns(UserWarning, match=r"small.urdf: the virtual base .* are locked: drive_0, drive_1, drive_2$"):
+        robot = load_robot(file)
+    assert robot.coordinates.names == ("base_x", "base_y", "base_yaw", "j0", "j1", "j2")
+    (tmp_path / "plain").mkdir()
+    plain = load_robot(small_urdf(tmp_path / "plain"))
+    z = np.array([0.3, -0.2, 1.0, 0.5, -0.4, 0.3])
+    assert placement(robot, "l3", z).isApprox(placement(plain, "l3", z), 1e-12)
+
+
+def test_a_base_that_stands_still_leaves_it_alone(tmp_path: Path) -> None:
+    robot = load_robot(driving_urdf(tmp_path), base="fixed")
+    assert robot.coordinates.names[3:] == ("drive_0", "drive_1", "drive_2", "j0", "j1", "j2")
+
+
+@pytest.mark.parametrize("change", [{"shape": True}, {"tilted": True}, {"order": "xxt"}, {"order": "xyx"}, {"order": "ttx"}])
+def test_what_is_no_base_of_its_own(tmp_path: Path, change: dict[str, object]) -> None:
+    """Something on it that could collide, slides that climb, too few directions."""
+    assert len(load_robot(driving_urdf(tmp_path, **change)).coordinates.names) == 9  # type: ignore[arg-type]
+
+
+def test_height_of_the_root(tmp_path: Path) -> None:
+    """All of the robot is that much higher, wherever it drives and turns; the argument counts before the file."""
+    file = small_urdf(tmp_path)
+    low, z = load_robot(file), np.array([0.3, -0.2, 1.0, 0.5, -0.4, 0.3])
+    (tmp_path / "robot.yaml").write_text("urdf: small.urdf\nbase: {height: 0.25}\n")
+    for robot, height in ((load_robot(file), 0.25), (load_robot(file, height=0.7), 0.7), (load_robot(file, height=0.0), 0.0)):
+        assert robot.height == height
+        for frame in ("l0", "l3"):
+            raised = placement(low, frame, z)
+            raised.translation += np.array([0.0, 0.0, height])
+            assert placement(robot, frame, z).isApprox(raised, 1e-12)
+        for shape, other in zip(robot.collision.geometryObjects[:1], low.collision.geometryObjects[:1], strict=True):
+            np.testing.assert_allclose(shape.placement.translation - other.placement.translation, [0.0, 0.0, height], atol=1e-12)
+    with pytest.raises(InputError, match="height"):
+        load_robot(file, height=float("nan"))

@@ -88,7 +88,7 @@ def check_collisions(world: World, stage: Stage, allowed: list[Licence], built: 
     begins = np.arange(0, pairs.length, BLOCK)
     ends = np.append(begins[1:], pairs.length) - 1
     middles, waypoints = (begins + ends) // 2, stage.rows[1:]
-    safe = float(world.plan.options["dist_safe"]) - SHORT
+    safe, own_safe = (float(world.plan.options[key]) - SHORT for key in ("dist_safe", "self_distance"))
     for i, one in enumerate(pairs.moving):
         arcs = pairs.arcs(i)
         reach = np.maximum(arcs[:, ends] - arcs[:, middles], arcs[:, middles] - arcs[:, begins])
@@ -97,17 +97,17 @@ def check_collisions(world: World, stage: Stage, allowed: list[Licence], built: 
         todo = [(pairs.standing[k], arcs[0], active[:, k], close[:, k]) for k in some]
         for j, other in enumerate(pairs.moving[:i]):
             bounds = pairs.ball_bounds(i, j, middles), pairs.ball_bounds(i, j, waypoints)
-            todo.append((other, arcs[1 + j], bounds[0] < reach[1 + j], bounds[1] < safe))
+            todo.append((other, arcs[1 + j], bounds[0] < reach[1 + j], bounds[1] < max(safe, own_safe)))
         for other, arc, blocks, near in todo:
             if not pairs.counts(one, other):
                 continue
             names = f"{one.label} - {other.label}"
             close, inside = built.during(stage, one, other)
             asked = built.margin(one, other)
+            least = min(own_safe if one.owner == other.owner == "robot" else safe, asked - SHORT)
             for k in waypoints[near]:
                 apart = distance(one.shape.solid, one.at, other.shape.solid, other.at, k)
                 time = float(stage.times[k])
-                least = min(safe, asked - SHORT)
                 licensed = any(own.covers(one.label, other.label, time, apart) for own in allowed)
                 if apart < least and not close[k] and not licensed:
                     yield Violation("clearance", names, time, least - apart, f"{1e3 * apart:.2f} mm apart at a waypoint")

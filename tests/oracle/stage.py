@@ -10,7 +10,7 @@ from typing import Any
 import coal
 import numpy as np
 
-from .plan import Hold, Phase, SavedPlan
+from .plan import Hold, NotJudged, Phase, SavedPlan
 from .poses import IDENTITY, Poses, orientation, pose
 from .riding import distance, riders
 from .things import Thing, Tree, load_robot, load_thing
@@ -64,6 +64,8 @@ class World:
     def __init__(self, plan: SavedPlan) -> None:
         self.plan = plan
         scene = plan.scene
+        if scene["start"].get("z"):
+            raise NotJudged("the robot's root is not on the floor")
         self.robot = load_robot(scene["robot"], plan.folder, plan.names[3 : plan.robot_size])
         self.things = {item["name"]: load_thing(item, plan.folder) for item in scene.get("objects") or ()}
         arena = scene.get("arena") or {}

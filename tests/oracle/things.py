@@ -232,6 +232,8 @@ def load_robot(item: Mapping[str, Any] | str, folder: Path, arm: list[str]) -> R
     if semantics is None:
         raise NotJudged("no SRDF says which links of the robot may touch")
     base, joints = own.get("base") or {}, own.get("joints") or {}
+    if base.get("height"):
+        raise NotJudged("the robot's root is not on the floor")
     speeds, strengths = base.get("velocity", (1.0, 1.0, 2.0)), base.get("acceleration", (3.0, 3.0, 6.0))
     (x, y) = base.get("position", ((-20.0, 20.0), (-20.0, 20.0)))
     spans = (x, y, (-np.inf, np.inf))

@@ -235,6 +235,12 @@ def test_a_plan_with_something_wrong_in_it(saved: Path, change: Callable[[dict[s
     assert caught.value.file == saved
 
 
+def test_a_plan_from_before_links_of_the_robot_had_a_clearance_of_their_own(saved: Path) -> None:
+    rewritten(saved, lambda about: (about["options"].pop("self_distance"), about["options"].update(dist_safe=0.013)))
+    options = vkc.Plan.load(saved).options
+    assert (options.dist_safe, options.self_distance) == (0.013, 0.013)
+
+
 def test_no_file(tmp_path: Path) -> None:
     for path in (tmp_path / "none.npz", tmp_path):
         with pytest.raises(vkc.InputError, match="cannot read the plan") as caught:

@@ -21,6 +21,7 @@ from helpers.drives import hall
 import vkc_pin as vkc
 from vkc_pin.files.resources import folder
 from vkc_pin.motion.world import World
+from vkc_pin.validation.validate import validate
 
 ROOT = Path(__file__).resolve().parents[2]
 HINGE = 1.2
@@ -448,3 +449,18 @@ def test_steps_may_come_from_anywhere() -> None:
     plan = vkc.plan(hall(), (step for step in [vkc.GoTo(0.5, 0.0)]), options=SEEN)  # type: ignore[arg-type]
     confirm(plan)
     assert plan.steps == (vkc.GoTo(0.5, 0.0),)
+
+
+@pytest.mark.filterwarnings("ignore:.*links overlap where the arm would rest")
+def test_a_robot_that_nobody_prepared_reaches() -> None:
+    """Tiago, from a URDF alone: free at its home, and where links always are as close as 18.8 mm it keeps half of that."""
+    scene = vkc.Scene.from_document({"robot": "tiago", "start": {"base": [0.0, 0.0, 0.0]}})
+    assert scene.robot.tight["arm_2_link", "torso_lift_link"] == pytest.approx(0.0188, abs=1e-4)
+    target = pin.SE3(np.eye(3), np.array([1.5, 0.4, 0.9]))
+    plan = vkc.plan(scene, [vkc.Reach(target)], options=SEEN)
+    assert plan.success, plan.report()
+    assert tool(scene, plan.trajectory.positions[-1]).isApprox(target, 2e-3)
+    motion, steps = plan.trajectory, plan.steps
+    assert validate(plan.scene, steps, motion, SEEN).ok
+    held_back = validate(plan.scene, steps, motion, dataclasses.replace(SEEN, self_distance=0.2))
+    assert {violation.constraint for violation in held_back.violations} == {"clearance"}

@@ -326,3 +326,19 @@ def test_the_packaged_scenes_all_load() -> None:
     assert {file.stem for file in files} >= {"door", "drawer"}
     for file in files:
         assert load_scene(file).name == file.stem
+
+
+def test_a_start_may_have_a_height(tmp_path: Path) -> None:
+    """The robot keeps it wherever it goes; the document has it, and two scenes of one robot may differ."""
+    low, high = load(tmp_path, TINY), load(tmp_path, TINY.replace("arm: home", "arm: home\n  z: 0.4"))
+    assert (low.robot.height, high.robot.height) == (0.0, 0.4)
+    assert "z" not in low.document["start"]
+    again = Scene.from_document(high.with_start(base=[1.0, 0.0, 0.0]).document, tmp_path)
+    assert again.document["start"]["z"] == again.robot.height == 0.4
+    at = [scene.robot.model.frames[scene.robot.model.getFrameId("tool")].placement.translation for scene in (low, high)]
+    np.testing.assert_array_equal(*at)  # above the wrist
+    rise = [scene.robot.model.jointPlacements[2].translation for scene in (high, low)]
+    np.testing.assert_allclose(rise[0] - rise[1], [0.0, 0.0, 0.4], atol=1e-12)
+    with pytest.raises(InputError, match=r"start\.z") as caught:
+        load(tmp_path, TINY.replace("arm: home", "z: high"))
+    assert caught.value.line == 4

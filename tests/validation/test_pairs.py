@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from helpers.carrying import Script, moved_base, room, stand, table
 from helpers.motions import pair_names, wander
-from helpers.small_problems import door_scene, full_scene
+from helpers.small_problems import door_scene, full_scene, program_of
 
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.motion.world import World
+from vkc_pin.options import Options
 from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.scene import Scene, load_scene
+from vkc_pin.task.steps import GoTo
 from vkc_pin.validation.distances import Solids
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.samples import Samples
@@ -130,3 +134,25 @@ def test_links_of_an_object_that_can_meet() -> None:
         pair for pair in (pair_names(table, k) for k in range(len(table.pairs))) if all("dishwasher." in name for name in pair)
     }
     assert own == {("dishwasher.door", "dishwasher.rack")}
+
+
+def test_links_of_the_robot_have_a_clearance_of_their_own(door: Scene) -> None:
+    """As the program has it, also where links are always close."""
+    first, second = next(iter(door.robot.own_margins(0.02)))
+    one, other = sorted((door.robot.link_of(first), door.robot.link_of(second)))
+    scene = dataclasses.replace(door, robot=dataclasses.replace(door.robot, tight={(one, other): 0.006}))
+    motion = wander(scene, 0, size=0.1)
+    table = PairTable(scene, Solids(World(scene)), motion, 0.02, 0.01)
+    margins = table.margins_at(np.arange(len(table.pairs)), np.zeros(len(table.pairs), int))
+    by_pair = {frozenset(pair): float(margin) for pair, margin in zip(table.pairs.tolist(), margins, strict=True)}
+    problem = program_of(scene, [GoTo(1.0, 0.0)], options=Options(self_distance=0.01))
+    robots = len(scene.robot.collision.geometryObjects)
+    part, own = problem.contacts.phases[0], 0
+    for pair, margin in zip(part.pairs.tolist(), part.margins.tolist(), strict=True):
+        if max(pair) < robots:
+            assert by_pair[frozenset(pair)] == margin
+            tight = {scene.robot.link_of(i) for i in pair} == {one, other}
+            assert margin == (0.003 if tight else 0.01)
+            own += 1
+    assert own == len(scene.robot.collision.collisionPairs)
+    assert {margin for pair, margin in by_pair.items() if max(pair) >= robots} == {0.02}

@@ -50,7 +50,7 @@ def refined(
     weights = np.where(np.isin(free, columns), 1.0, _OBJECT)
     for _ in range(_ROUNDS):
         residual, jacobian = (part[0] for part in solver.evaluate(z[None], target))
-        reach = problem.options.dist_safe + _REACH
+        reach = problem.options.largest_margin + _REACH
         contacts = problem.contacts.evaluate(z[None], np.array([waypoint]), reach=reach, nearest=None)
         if np.abs(residual).max() < _TOLERANCE and contacts.violation() <= CLEAR:
             return z, True

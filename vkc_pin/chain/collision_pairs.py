@@ -62,7 +62,7 @@ class _Pairing:
         holds = {hold.object: hold for hold in phase.held}
         shapes, labels = list(chain.collision.geometryObjects), list(self._labels)
         robots, own, margin = range(len(scene.robot.collision.geometryObjects)), len(shapes), self.options.dist_safe
-        pairs = [(pair.first, pair.second, margin) for pair in scene.robot.collision.collisionPairs]
+        pairs = [(*pair, own_margin) for pair, own_margin in scene.robot.own_margins(self.options.self_distance).items()]
         moving, mine = list(robots), dict[str, tuple[int, ...]]()
         for hold in phase.held:
             mine[hold.object] = chain.held_geometries[hold]

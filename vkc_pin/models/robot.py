@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -16,13 +18,14 @@ from vkc_pin.arrays import Floats
 from vkc_pin.files.urdf import UrdfFile
 from vkc_pin.models.coordinates import Coordinates
 from vkc_pin.models.robot_model import visual_geometry
-from vkc_pin.models.shapes import link_name, shape_distance
+from vkc_pin.models.shapes import link_name, shape_distance, triangles
 
 __all__ = ["Base", "Robot"]
 
 _LEAST_LEVER = 0.1  # [m/rad] about the size of a hand
 _AHEAD = 10.0  # [m] further than any hand reaches
 _POSTURES = 200  # random ones over which the lever is averaged
+_TIGHT_SHARE = 0.5  # margin of links that are always close, as a share of what they can have
 
 Base = Literal["omni", "differential", "fixed"]
 
@@ -45,6 +48,8 @@ class Robot:
         tool_frame: The frame of `model` that grasps: z is the approach direction, x the one in which fingers close.
         base: How the base moves: "omni" in any direction, "differential" forwards and round, "fixed" not at all.
         touch_links: The links that may touch what is grasped.
+        height: Of its root link above the floor [m].
+        tight: Pairs of links, each sorted, that are never, or not at home, 50 mm apart: how far they are at most, or there [m].
     """
 
     name: str
@@ -60,6 +65,8 @@ class Robot:
     tool_frame: str
     base: Base
     touch_links: tuple[str, ...] = ()
+    height: float = 0.0
+    tight: Mapping[tuple[str, str], float] = field(default_factory=dict, repr=False)
     file: UrdfFile = field(repr=False)
 
     @cached_property
@@ -99,6 +106,25 @@ class Robot:
         gaps = [shape_distance(geometry, where, ahead, pin.SE3.Identity()) for geometry, where in hand]
         return pin.SE3(np.eye(3), np.array([0.0, 0.0, _AHEAD - min(gaps, default=_AHEAD)]))
 
+    @cached_property
+    def fingerprint(self) -> str:
+        """A digest of all that distances between its links depend on: shapes, where they are, limits, home, links and joints."""
+        digest, data = hashlib.sha256(), self.model.createData()
+        for joint in self.file.root.findall("joint"):
+            ends = [element.get("link") for key in ("parent", "child") if (element := joint.find(key)) is not None]
+            digest.update(repr((joint.get("name"), joint.get("type"), ends)).encode())
+        digest.update(repr((self.coordinates.names, list(self.model.parents))).encode())
+        for values in (self.lower, self.upper, self.home):
+            digest.update(np.asarray(values, float).tobytes())
+        for z in np.random.default_rng(0).uniform(-3.0, 3.0, (3, len(self.lower))):  # axes and placements, by what they do
+            pin.forwardKinematics(self.model, data, self.coordinates.q(z))
+            digest.update(np.array([place.homogeneous for place in data.oMi]).tobytes())
+        for shape in self.collision.geometryObjects:
+            points, faces = triangles(shape.geometry)
+            digest.update(repr((shape.name, shape.parentJoint, points.shape, faces.shape)).encode())
+            digest.update(points.tobytes() + shape.placement.homogeneous.tobytes())
+        return digest.hexdigest()
+
     @property
     def start_limits(self) -> tuple[Floats, Floats]:
         """Limits of a start, shape (n,), [m] and [rad]: the robot's own; a base that cannot move may stand anywhere."""
@@ -118,6 +144,24 @@ class Robot:
         """
         geometry = whole(geometry, "geometry", low=0, high=len(self.collision.geometryObjects) - 1)
         return link_name(self.collision.geometryObjects[geometry].name)
+
+    def own_margin(self, links: tuple[str, str], margin: float) -> float:
+        """Return the clearance [m] that two of its links, sorted, can keep: `margin`, or half of what they have at most."""
+        return min(margin, _TIGHT_SHARE * self.tight.get(links, np.inf))
+
+    def own_margins(self, margin: float) -> dict[tuple[int, int], float]:
+        """Return for each of its collision pairs, by the numbers of its shapes, the clearance to keep [m].
+
+        Program and validation ask for it alike.
+
+        Args:
+            margin: What pairs keep that can: `Options.self_distance` [m].
+        """
+        found = {}
+        for pair in self.collision.collisionPairs:
+            one, other = sorted((self.link_of(pair.first), self.link_of(pair.second)))
+            found[pair.first, pair.second] = self.own_margin((one, other), margin)
+        return found
 
     @property
     def links(self) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,11 +26,13 @@ from vkc_pin.models.robot_model import (
     default_tool_frame,
     full_model,
     nearest_position,
+    own_base,
     planned_model,
     rest_positions,
 )
 from vkc_pin.models.robot_schema import RobotSchema, python_packages, read_robot
-from vkc_pin.models.self_collisions import sample_allowed_pairs, with_collision_pairs
+from vkc_pin.models.self_collisions import surveyed, with_collision_pairs
+from vkc_pin.models.shapes import LIMIT_SLACK
 
 __all__ = ["find_robot", "known_robots", "load_robot"]
 
@@ -88,6 +91,7 @@ def load_robot(
     srdf: str | Path | None = None,
     pairs: Literal["srdf", "sampled", "all"] = "srdf",
     packages: Mapping[str, str | Path] | None = None,
+    height: float | None = None,
 ) -> Robot:
     """Load a robot and put it on a planar virtual base.
 
@@ -97,8 +101,12 @@ def load_robot(
     Limits come from the URDF and from a `robot.yaml` beside it. Where neither names a velocity or an acceleration they
     are π rad/s (m/s) and 1.4 rad/s² (m/s²) for joints, 1 m/s, 2 rad/s, 3 m/s² and 6 rad/s² for the base, ±20 m.
 
+    Where the URDF begins with joints that drive the robot about, the virtual base takes their place: they are locked at 0, with a
+    warning, unless `base` is "fixed".
+
     Pairs of links that may touch come from the SRDF. Without one they are adjacent links and those that sampling
-    finds always, or never, in collision (`vkc_pin.models.self_collisions`).
+    finds always, or never, in collision. In any case neighbours may that are always close, links that always overlap, and those
+    that overlap at home; see `vkc_pin.models.self_collisions`. There is a warning where these are not neighbours.
 
     Args:
         name: A robot in robots/, one of example-robot-data ("panda", "tiago", "ur5"), or the path of a URDF.
@@ -106,11 +114,13 @@ def load_robot(
         tool_frame: The frame that grasps; by default that of robot.yaml, else the last frame of the longest chain.
         locked_joints: More joints to lock, and where, [m] or [rad]; joints locked anyway rest at 0 or the nearest limit.
         home: Where joints rest, [m] or [rad]; by default what robot.yaml says, else a group state of the SRDF that
-            covers all planned joints (one called home if there is one), else 0, or the middle if 0 is outside the limits.
+            covers all planned joints (one called home if there is one), else 0, or the middle if 0 is outside the limits. Where
+            links overlap there, joints of which nobody says where they rest are moved, with a warning.
         srdf: File of allowed collisions; by default the one robot.yaml names, or the one beside the URDF.
         pairs: Where the allowed pairs come from: "srdf"; "sampled" whether there is an SRDF or not; "all" makes every pair
             of links that move against each other a collision pair, even adjacent ones, to look at the geometry itself.
         packages: Folders for `package://` addresses; others are looked for around the file.
+        height: Of the root link above the floor [m]; by default what robot.yaml says, else 0.
 
     Raises:
         UnknownNameError: There is no such robot, frame, joint or link; the error names the nearest one.
@@ -126,6 +136,7 @@ def load_robot(
         named = mapping({} if values is None else values, field, "joints, each with its position")
         positions[field] = {joint: quantity(value, f"{field}.{joint}") for joint, value in named.items()}
     home, locked_joints = positions["home"], positions["locked_joints"]
+    raised = None if height is None else quantity(height, "height")
     files = _read(name, mapping({} if packages is None else packages, "packages", "packages, each with its folder"))
     urdf, settings = files.urdf, files.settings
     beside = file_path(srdf, "srdf") if srdf is not None else files.srdf()
@@ -135,16 +146,27 @@ def load_robot(
     tool = tool_frame if tool_frame is not None else settings.tool_frame or default_tool_frame(full, urdf)
     if tool not in (frames := dict.fromkeys(frame.name for frame in full.frames)):
         raise UnknownNameError("frame", tool, frames, file=urdf.path, field="tool_frame")
-    locked = {**settings.locked_joints, **locked_joints}
+    replaced = own_base(full, urdf) if base != "fixed" else ()
+    said = {**settings.locked_joints, **locked_joints}
+    locked = {**dict.fromkeys(replaced, 0.0), **said}
     given = {**settings.home, **home, **locked}
     rest = rest_positions(full, urdf, given)
     files.check_names(rest)
     for joint in given:
+        field = "home" if joint in home else "locked_joints"
         if joint not in rest:
-            field = "home" if joint in home else "locked_joints"
             raise UnknownNameError("joint", joint, rest, file=urdf.path, field=field)
-    model = planned_model(full, urdf, tool, rest, locked)
+        if joint not in replaced or joint in said:
+            files.check_limits(full, joint, given[joint], field)
+    if replaced:
+        text_of = ", ".join(replaced)
+        warnings.warn(
+            f"{urdf.path}: the virtual base moves the robot; joints of its own that do are locked: {text_of}", stacklevel=2
+        )
+    raised = settings.base.height if raised is None else raised
+    model = planned_model(full, urdf, tool, rest, locked, height=raised)
     coordinates, lower, upper, velocity, acceleration = _limits(model, settings, base)
+    state = _state(model, semantics, given)
     robot = Robot(
         name=files.name,
         urdf=urdf.path,
@@ -155,16 +177,19 @@ def load_robot(
         upper=upper,
         velocity=velocity,
         acceleration=acceleration,
-        home=_home(files, model, {**rest, **_state(model, semantics, given)}, lower[3:], upper[3:]),
+        home=np.clip([{**rest, **state}[joint] for joint in coordinates.names[3:]], lower[3:], upper[3:]),  # rounding
         tool_frame=tool,
         base=base,
         touch_links=settings.touch_links,
+        height=raised,
         file=urdf,
     )
-    if pairs != "all" and semantics is None:
-        return with_collision_pairs(robot, sample_allowed_pairs(robot, samples=_SAMPLES))
-    robot = with_collision_pairs(robot, () if pairs == "all" or semantics is None else semantics.allowed)
-    if len(robot.collision.collisionPairs) == 0:
+    if pairs == "all":
+        robot = with_collision_pairs(robot, ())
+    else:
+        loose = [joint for joint in coordinates.names[3:] if joint not in given and joint not in state]
+        robot = surveyed(robot, semantics, loose, samples=_SAMPLES)
+    if len(robot.collision.collisionPairs) == 0 and (pairs == "all" or semantics is not None):
         expected = "<collision> elements, and an SRDF that fits"
         raise InputError("no pair of links is left that could collide", file=robot.urdf, expected=expected)
     return robot
@@ -204,6 +229,18 @@ class _Files:
             if link not in self.urdf.links:
                 raise self.document.unknown(("touch_links",), "link", link, self.urdf.links)
 
+    def check_limits(self, full: pin.Model, joint: str, position: float, field: str) -> None:
+        """Check that a joint can be where it is said to rest, or to be locked. Raises `InputError` if it cannot."""
+        moving = full.joints[full.getJointId(joint)]
+        if moving.nq == 1:
+            low, high = full.lowerPositionLimit[moving.idx_q], full.upperPositionLimit[moving.idx_q]
+            if not low - LIMIT_SLACK <= position <= high + LIMIT_SLACK:
+                problem, expected = "rests outside its limits", f"between {low:g} and {high:g}"
+                for key, said in (("locked_joints", self.settings.locked_joints), ("home", self.settings.home)):
+                    if said.get(joint) == position:
+                        raise self.document.error((key, joint), problem, expected=expected, got=position)
+                raise InputError(problem, file=self.urdf.path, field=f"{field}.{joint}", expected=expected, got=position)
+
 
 def _read(name: str | Path, packages: Mapping[str, str | Path]) -> _Files:
     """Find and read a robot's URDF, and the robot.yaml that belongs to it if there is one."""
@@ -225,17 +262,6 @@ def _state(model: pin.Model, semantics: Srdf | None, given: Collection[str]) -> 
     arm = list(model.names)[2:]
     state = {} if semantics is None else semantics.state(arm)
     return {joint: nearest_position(model, joint, state[joint]) for joint in arm if joint in state and joint not in given}
-
-
-def _home(files: _Files, model: pin.Model, rest: Mapping[str, float], lower: Floats, upper: Floats) -> Floats:
-    """Return where the planned joints rest, shape (n − 3,). Raises `InputError` if one rests outside its limits."""
-    arm = list(model.names)[2:]
-    home = np.array([rest[joint] for joint in arm])
-    if (outside := np.flatnonzero((home < lower - 1e-9) | (home > upper + 1e-9))).size:
-        k = int(outside[0])
-        file, expected = files.document.file or files.urdf.path, f"between {lower[k]:g} and {upper[k]:g}"
-        raise InputError("rests outside its limits", file=file, field=f"home.{arm[k]}", expected=expected, got=home[k])
-    return home
 
 
 def _limits(model: pin.Model, settings: RobotSchema, base: Base) -> tuple[Coordinates, Floats, Floats, Floats, Floats]:

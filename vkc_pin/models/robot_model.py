@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Set
 
 import coal
 import numpy as np
@@ -20,6 +20,8 @@ __all__ = [
     "default_tool_frame",
     "full_model",
     "nearest_position",
+    "neighbours",
+    "own_base",
     "planned_model",
     "rest_positions",
     "visual_geometry",
@@ -27,6 +29,7 @@ __all__ = [
 
 ROOT = "base"  # the name of the planar joint
 _ROUNDING = 1e-9  # [m] and of a rotation: URDFs write quarter turns with nine digits; exact ones make lean expressions
+_LEVEL = 1e-3  # sine of the angle up to which axes count as level or upright
 _FINGER = 7  # joints in the longest finger of a hand
 _ARM = 4  # joints, at least, that carry a hand
 _DETAIL = 0.0015  # of displayed meshes, [m]
@@ -43,7 +46,13 @@ def full_model(file: UrdfFile) -> pin.Model:
 
 
 def planned_model(
-    full: pin.Model, file: UrdfFile, tool_frame: str, rest: Mapping[str, float], locked: Mapping[str, float]
+    full: pin.Model,
+    file: UrdfFile,
+    tool_frame: str,
+    rest: Mapping[str, float],
+    locked: Mapping[str, float],
+    *,
+    height: float = 0.0,
 ) -> pin.Model:
     """Return `full` with all joints locked but those between the base and `tool_frame`.
 
@@ -53,6 +62,7 @@ def planned_model(
         tool_frame: A frame of it.
         rest: Where each joint is locked, [m] or [rad]; see `rest_positions`.
         locked: Joints to lock though they are among these, and where.
+        height: Of the root link above the base's joint, which moves on the floor [m].
 
     Raises:
         InputError: No joint is left.
@@ -65,7 +75,7 @@ def planned_model(
     if not planned:
         expected = "a frame at the end of an arm"
         raise InputError("no joint moves this frame", file=file.path, field="tool_frame", expected=expected, got=tool_frame)
-    return _reduced(full, {1, *planned}, configuration(full, {**rest, **locked}))
+    return _reduced(full, {1, *planned}, configuration(full, {**rest, **locked}), height)
 
 
 def rest_positions(full: pin.Model, file: UrdfFile, given: Mapping[str, float]) -> dict[str, float]:
@@ -97,6 +107,61 @@ def nearest_position(model: pin.Model, joint: str, position: float) -> float:
         if low <= position + turn <= high:
             return float(position + turn)
     return float(np.clip(position, low, high))
+
+
+def neighbours(file: UrdfFile, links: Collection[str]) -> tuple[Set[tuple[str, str]], Set[tuple[str, str]]]:
+    """Return two sets of pairs of `links`, each sorted.
+
+    The first has those that one joint connects, or only links that are not among them; the second those that one joint connects
+    that moves, and links that are fixed to either.
+    """
+    parents = dict[str, tuple[str, str]]()
+    for joint in file.root.findall("joint"):
+        parent, child = joint.find("parent"), joint.find("child")
+        if parent is not None and child is not None:
+            parents[child.get("link", "")] = (parent.get("link", ""), joint.get("type", ""))
+    joined, body, above = set[tuple[str, str]](), dict[str, str](), dict[str, str]()
+    for link in links:
+        up, _ = parents.get(link, ("", ""))
+        while up and up not in links:
+            up, _ = parents.get(up, ("", ""))
+        if up:
+            joined.add((min(link, up), max(link, up)))
+        body[link] = _rigid(link, parents)
+        above[link] = _rigid(parents[body[link]][0], parents) if body[link] in parents else ""
+    return joined, {(min(a, b), max(a, b)) for a in links for b in links if above[a] == body[b]}
+
+
+def _rigid(link: str, parents: Mapping[str, tuple[str, str]]) -> str:
+    """Return the uppermost of the links that a link is fixed to."""
+    while link in parents and parents[link][1] == "fixed":
+        link, _ = parents[link]
+    return link
+
+
+def own_base(full: pin.Model, file: UrdfFile) -> tuple[str, ...]:
+    """Return the joints that move a robot in the plane on their own, or none: then its URDF has a base that drives, too.
+
+    They are the first three, one after the other: two that slide along the floor, in different directions, and one that turns
+    about the vertical, in any order. Nothing that could collide is in front of the last.
+    """
+    data, slides, found, joint = full.createData(), list[Floats](), list[str](), 1
+    pin.computeJointJacobians(full, data, pin.neutral(full))
+    solid = {shape.link for shape in file.shapes("collision")}
+    carries = {frame.parentJoint for frame in full.frames if frame.type == pin.FrameType.BODY and frame.name in solid}
+    while len(found) < 3:
+        after = [j for j in range(2, full.njoints) if full.parents[j] == joint]
+        if joint in carries or len(after) != 1 or full.joints[after[0]].nv != 1:
+            return ()
+        (joint,) = after
+        twist = pin.getJointJacobian(full, data, joint, pin.LOCAL_WORLD_ALIGNED)[:, full.joints[joint].idx_v]
+        if np.abs(twist[3:]).max() < _LEVEL and abs(twist[2]) < _LEVEL:
+            slides.append(twist[:2])
+        elif abs(twist[5]) < 1.0 - _LEVEL:
+            return ()
+        found.append(full.names[joint])
+    crossing = len(slides) == 2 and abs(slides[0][0] * slides[1][1] - slides[0][1] * slides[1][0]) > _LEVEL
+    return tuple(found) if crossing else ()
 
 
 def configuration(model: pin.Model, positions: Mapping[str, float]) -> Floats:
@@ -163,8 +228,8 @@ def visual_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
     return geometry
 
 
-def _reduced(full: pin.Model, planned: Collection[int], q: Floats) -> pin.Model:
-    """Return `full` with the joints that are not `planned` locked at `q`.
+def _reduced(full: pin.Model, planned: Collection[int], q: Floats, height: float) -> pin.Model:
+    """Return `full` with the joints that are not `planned` locked at `q`, and all on joint 1 higher by `height`.
 
     `pinocchio.buildReducedModel` refuses models in which a link is called like a joint, as many are. Here, the frame of
     such a joint is left out, so that every frame's name is the only one.
@@ -178,7 +243,7 @@ def _reduced(full: pin.Model, planned: Collection[int], q: Floats) -> pin.Model:
         joint, (parent, placement) = full.joints[j], placed[full.parents[j]]
         if j in planned:
             index = add_joint(model, parent, joint, clean(placement * full.jointPlacements[j], _ROUNDING), like=(full, j))
-            placed[j] = (index, pin.SE3.Identity())
+            placed[j] = (index, pin.SE3(np.eye(3), np.array([0.0, 0.0, height if j == 1 else 0.0])))
         else:
             placed[j] = (parent, placement * data.liMi[j])
         model.appendBodyToJoint(placed[j][0], full.inertias[j], placed[j][1])

@@ -21,11 +21,12 @@ Limits = Annotated[
 
 
 class BaseSchema(Schema):
-    """The planar base: x and y in [m], yaw in [rad]; velocities and accelerations per x, y, yaw."""
+    """The planar base: x and y in [m], yaw in [rad]; velocities and accelerations per x, y, yaw; height of the root link [m]."""
 
     position: tuple[Limits, Limits] = ((-20.0, 20.0), (-20.0, 20.0))
     velocity: tuple[Positive, Positive, Positive] = (1.0, 1.0, 2.0)
     acceleration: tuple[Positive, Positive, Positive] = (3.0, 3.0, 6.0)
+    height: Number = 0.0
 
 
 class RobotSchema(Schema):

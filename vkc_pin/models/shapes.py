@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 import coal
 import numpy as np
@@ -16,6 +16,7 @@ from vkc_pin.models.grafting import clean
 
 __all__ = [
     "LIMIT_SLACK",
+    "ShapeDistances",
     "bounding_box",
     "clearance",
     "copy_shape",
@@ -144,3 +145,51 @@ def world_box(shape: coal.CollisionGeometry, placement: pin.SE3) -> tuple[Floats
     centre = placement.act(np.asarray(box.center(), float))
     extent = np.abs(placement.rotation) @ np.array([box.width(), box.height(), box.depth()]) / 2
     return centre - extent, centre + extent
+
+
+class ShapeDistances:
+    """Distances of shapes on a model at one configuration after the other, by coal.
+
+    Args:
+        model: What moves them.
+        configuration: Minimal coordinates, shape (n,) → Pinocchio's configuration, shape (nq,).
+        shapes: The shapes.
+    """
+
+    def __init__(self, model: pin.Model, configuration: Callable[[Floats], Floats], shapes: Sequence[pin.GeometryObject]) -> None:
+        self._model, self._configuration, self._data = model, configuration, model.createData()
+        self._solids = [shape.geometry for shape in shapes]
+        self._joints = np.array([shape.parentJoint for shape in shapes])
+        self._locals = [shape.placement for shape in shapes]
+        for solid in self._solids:
+            solid.computeLocalAABB()
+        self._radii = np.array([solid.aabb_radius for solid in self._solids])
+        self._middles = np.array([place.act(solid.aabb_center) for place, solid in zip(self._locals, self._solids, strict=True)])
+        self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
+
+    def place(self, z: Floats) -> None:
+        """Put the model at coordinates `z`, shape (n,)."""
+        pin.forwardKinematics(self._model, self._data, self._configuration(z))
+        rotations = np.array([place.rotation for place in self._data.oMi])[self._joints]
+        positions = np.array([place.translation for place in self._data.oMi])[self._joints]
+        self._centres = np.einsum("kij,kj->ki", rotations, self._middles) + positions
+        self._places: dict[int, coal.Transform3s] = {}
+
+    def between(self, parts: Iterable[tuple[int, int]], worth: float = np.inf) -> float:
+        """Return the smallest distance [m] of pairs of shapes; a lower bound of it where it is larger than `worth`."""
+        smallest = np.inf
+        for first, second in parts:
+            gap = self._centres[first] - self._centres[second]
+            bound = float(np.sqrt(gap @ gap) - self._radii[first] - self._radii[second])
+            if bound <= min(smallest, worth):
+                self._result.clear()
+                one, other = ((self._solids[shape], self._place(shape)) for shape in (first, second))
+                bound = coal.distance(*one, *other, self._request, self._result)
+            smallest = min(smallest, float(bound))
+        return smallest
+
+    def _place(self, shape: int) -> coal.Transform3s:
+        if shape not in self._places:
+            place = self._data.oMi[int(self._joints[shape])] * self._locals[shape]
+            self._places[shape] = coal.Transform3s(place.rotation, place.translation)
+        return self._places[shape]

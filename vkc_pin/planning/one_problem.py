@@ -262,5 +262,5 @@ class OneProblem:
 def _ends_free(problem: TrajectoryProblem, seed: Seed) -> bool:
     """Return whether a seed's configurations at the ends of the phases are free and what they should be."""
     ends = problem.ends - 1
-    free = problem.evaluate_contacts(seed.z, reach=problem.options.dist_safe).shortfall(problem.segments)[ends] <= 0.0
+    free = problem.evaluate_contacts(seed.z, reach=problem.options.largest_margin).shortfall(problem.segments)[ends] <= 0.0
     return bool(free.all()) and problem.pose_error(seed.z) < 1e-2

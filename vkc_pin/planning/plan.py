@@ -220,7 +220,7 @@ class Plan:
         return cls(
             scene=Scene.from_document(about["scene"], folder_from_data(about["folder"], path)),
             steps=tuple(step_from_dict(step) for step in about["steps"]),
-            options=Options(**about["options"]),
+            options=Options(**_with_own_distance(about["options"])),
             trajectory=trajectory,
             validation=cast(Report, validation),
             status=cast(str, _status) if status == "success" else status,
@@ -282,3 +282,8 @@ class _OnDemand(Generic[T]):
 
 for _name in ("validation", "status", "metrics"):
     setattr(Plan, _name, _OnDemand(_name))
+
+
+def _with_own_distance(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return options that were saved: those without a clearance between the robot's links had one for all pairs."""
+    return {**({"self_distance": options["dist_safe"]} if "dist_safe" in options else {}), **options}

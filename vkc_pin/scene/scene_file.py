@@ -40,7 +40,7 @@ def scene_fields(document: Document, folder: Path) -> dict[str, Any]:
         InputError: The description is wrong; `UnknownNameError` where it names something that does not exist.
     """
     description = check(document, schema.SceneSchema)
-    robot = _robot(document, description.robot, folder)
+    robot = _robot(document, description, folder)
     _unique_names(document, description)
     objects = {item.name: _object(document, ("objects", index), item, folder) for index, item in enumerate(description.objects)}
     arena = (*description.arena.x, *description.arena.y)
@@ -104,7 +104,12 @@ def document_of(fields: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "name": fields["name"],
         "robot": plain["robot"],
-        "start": {"base": start[:3].tolist(), **({} if at_home else {"arm": start[3:].tolist()}), "held": held},
+        "start": {
+            "base": start[:3].tolist(),
+            **({} if described.start.z is None else {"z": described.start.z}),
+            **({} if at_home else {"arm": start[3:].tolist()}),
+            "held": held,
+        },
         "arena": {"x": list(fields["arena"][:2]), "y": list(fields["arena"][2:])},
         **({"start_region": {key: list(value) for key, value in vars(region).items() if value}} if region else {}),
         "floor": fields["floor"],
@@ -114,11 +119,13 @@ def document_of(fields: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _robot(document: Document, item: schema.SceneRobotSchema, folder: Path) -> Robot:
+def _robot(document: Document, description: schema.SceneSchema, folder: Path) -> Robot:
+    item, height = description.robot, description.start.z
     by_path = item.name.endswith((".urdf", ".yaml", ".yml")) or "/" in item.name
     short = isinstance(document.data["robot"], str)  # robot: husky_ur5e
     with document.at(("robot",) if short else ("robot", "name")):
-        return load_robot(folder / item.name if by_path else item.name, base=item.base, tool_frame=item.tool_frame)
+        name = folder / item.name if by_path else item.name
+        return load_robot(name, base=item.base, tool_frame=item.tool_frame, height=height)
 
 
 def _unique_names(document: Document, description: schema.SceneSchema) -> None:

@@ -196,9 +196,13 @@ class HeldSchema(Schema):
 
 
 class StartSchema(Schema):
-    """Where the robot starts: base [x, y, yaw], arm joints [rad], and object → attachment (or more) of what it holds."""
+    """Where the robot starts: base [x, y, yaw], arm joints [rad], and object → attachment (or more) of what it holds.
+
+    `z` is the height of the robot's root link [m], all the time; the robot's own if it is left out.
+    """
 
     base: Vector3
+    z: Number | None = None
     arm: Annotated[tuple[Number, ...] | None, BeforeValidator(_arm)] = None
     held: Mapping[str, Annotated[HeldSchema, text_for("attachment")]] = Field(default_factory=dict)
 

@@ -51,7 +51,9 @@ def clear_out(
         at = np.flatnonzero(~done)
         if not len(at):
             break
-        contacts = problem.contacts.evaluate(z[at], np.full(len(at), waypoint), reach=options.dist_safe + extra, nearest=slots)
+        contacts = problem.contacts.evaluate(
+            z[at], np.full(len(at), waypoint), reach=options.largest_margin + extra, nearest=slots
+        )
         short = contacts.shortfall(len(at))
         residual, pose_rows = solver.evaluate(z[at], target)
         done[at] = (short <= 0.0) & (np.abs(residual).max(axis=1) < TOLERANCE)

@@ -134,7 +134,7 @@ def _place(problem: TrajectoryProblem, waypoint: int, columns: Ints, rng: np.ran
 def _merit(problem: TrajectoryProblem, z: Floats, waypoint: int) -> float:
     """Return the merit of z_1..z_N, shape (N, n), from which what is missing after a waypoint is left out."""
     timing, options = problem.timing_for(z), problem.options
-    contacts = problem.evaluate_contacts(z, reach=options.dist_safe, nearest=options.contact_slots)
+    contacts = problem.evaluate_contacts(z, reach=options.largest_margin, nearest=options.contact_slots)
     missing = Merit(options.penalty).price(infeasibility(problem, z, timing, contacts, rates=False), clearance=True)
     return problem.objective(z, timing.dt) + float(missing[:waypoint].sum())
 
@@ -254,7 +254,7 @@ class _SeedSearch:
             self.notes += [line for line in self.joiner.blocked if line not in self.notes]
             if z is None:
                 continue
-            contacts = self.problem.evaluate_contacts(z, reach=self.problem.options.dist_safe, nearest=1)
+            contacts = self.problem.evaluate_contacts(z, reach=self.problem.options.largest_margin, nearest=1)
             short = contacts.shortfall(len(z))
             overlap = float(np.maximum(short - self.problem.options.dist_safe, 0.0).sum())
             merit = self.problem.objective(z, self.problem.timing_for(z).dt) + self.problem.options.penalty * float(short.sum())

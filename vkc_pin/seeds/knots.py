@@ -199,7 +199,7 @@ def depth(problem: TrajectoryProblem, z: Floats, waypoint: int, *, standing: boo
         standing: Whether what stands in the world counts, too; otherwise only the robot itself and what it carries.
         reach: Pairs further apart do not count [m]; None: all that may fall short.
     """
-    waypoints, reach = np.full(len(z), waypoint), problem.options.dist_safe if reach is None else reach
+    waypoints, reach = np.full(len(z), waypoint), problem.options.largest_margin if reach is None else reach
     contacts = problem.contacts.evaluate(z, waypoints, reach=reach, nearest=1, standing=standing)
     return contacts.shortfall(len(z))
 

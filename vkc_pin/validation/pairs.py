@@ -26,21 +26,29 @@ class PairTable:
     Attributes:
         pairs: Indices of `world.shapes`, shape (P, 2).
         solids: The shapes, to ask for distances.
-        dist_safe: Clearance to keep at the waypoints [m].
+        margins: Clearance to keep at the waypoints, of each pair, shape (P,) [m].
 
     Args:
         scene: Where it happens.
         solids: The shapes of the scene as one plain tree.
         trajectory: The motion.
         dist_safe: Clearance to keep at the waypoints [m].
+        self_distance: The same between links of the robot that can [m]; `dist_safe` if left out.
         windows: Which pairs may be closer than that, and when.
     """
 
     def __init__(
-        self, scene: Scene, solids: Solids, trajectory: Trajectory, dist_safe: float, *, windows: Sequence[Window] = ()
+        self,
+        scene: Scene,
+        solids: Solids,
+        trajectory: Trajectory,
+        dist_safe: float,
+        self_distance: float | None = None,
+        *,
+        windows: Sequence[Window] = (),
     ) -> None:
-        self.scene, self.world, self.solids, self.dist_safe = scene, solids.world, solids, float(dist_safe)
-        world = self.world
+        self.scene, self.world, self.solids = scene, solids.world, solids
+        world, own_margin = self.world, dist_safe if self_distance is None else self_distance
         rows = world.positions(trajectory)
         self._moves = np.array([self._moved(rows[phase.first : phase.last + 1]) for phase in trajectory.phases])
         self._phase = np.searchsorted([phase.last for phase in trajectory.phases], np.arange(len(rows)))  # the earlier of two
@@ -48,12 +56,14 @@ class PairTable:
         owners = [label.partition(".")[0] if "." in label else "" for label in labels]
         robots = len(scene.robot.collision.geometryObjects)
         self.group = ["robot" if i < robots else name if name in scene.objects else "" for i, name in enumerate(owners)]
-        self._robot_pairs = {frozenset((p.first, p.second)) for p in scene.robot.collision.collisionPairs}
+        self._robot_pairs = {frozenset(pair): own for pair, own in scene.robot.own_margins(own_margin).items()}
         self._moving_once: Bools = np.asarray(self._moves.any(axis=0))
         own = np.array([(i, j) for j in bodies for i in range(j) if self._counts(i, j)], int).reshape(-1, 2)
         self.pairs = np.concatenate([own, self._with_obstacles()])
         if not len(self.pairs):
             raise InputError("no pair of geometries can collide", field="scene", expected="collision geometry")
+        self.margins = np.full(len(self.pairs), float(dist_safe))
+        self.margins[: len(own)] = [self._robot_pairs.get(frozenset(pair), dist_safe) for pair in own.tolist()]
         self._windows = self._by_pair(windows)
         self._special = np.zeros(len(self.pairs), bool)
         self._special[list(self._windows)] = True
@@ -81,7 +91,7 @@ class PairTable:
 
     def margins_at(self, pairs: Ints, waypoints: Ints) -> Floats:
         """Return the clearances that pairs must keep at waypoints, both of shape (n,), shape (n,) [m]; -inf: none."""
-        margins = np.full(len(pairs), self.dist_safe)
+        margins = self.margins[pairs]
         for k, window in self._at(pairs, waypoints, waypoints):
             margins[k] = min(margins[k], window.margin)
         return margins

@@ -143,7 +143,7 @@ class _Sweep:
 
     def _nearest_at(self, placed: Placed, todo: Ints) -> Iterator[tuple[Ints, Ints, Floats]]:
         """Yield those of some states, in no order."""
-        reach = max(self._table.dist_safe, RESOLUTION)
+        reach = max(self._table.margins.max(), RESOLUTION)
         while len(todo):
             at, pairs = self._table.close(placed, todo, np.full((len(todo), len(self._table.group)), reach))
             near = placed.bounds(todo[at], self._table.pairs[pairs]) < reach

@@ -283,7 +283,7 @@ class _Check:
         samples, smallest = self.samples, np.inf
         solids = Solids(samples.world)
         near = windows(samples, solids, self.steps, self.options)
-        pairs = PairTable(self.scene, solids, self.trajectory, self.options.dist_safe, windows=near)
+        pairs = PairTable(self.scene, solids, self.trajectory, self.options.dist_safe, self.options.self_distance, windows=near)
         neighbours = [one for one in allowances(self.scene, self.options.dist_safe) if one.margin == -np.inf]
         for hit in sweep(pairs, samples.z, samples.waypoint_rows):
             named = [one for one in neighbours if one.between(hit.first, hit.second)]

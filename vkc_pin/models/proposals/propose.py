@@ -101,7 +101,7 @@ class _Search:
         self.fitting = Fitting(item, hand, dist_safe, grasp_clearance)
         self.closed = self.fitting.state.copy()
         self.tallies: dict[int, _Tally] = {}
-        self._handles = names_of_pieces(read_urdf(item.urdf).root)
+        self._handles = {} if item.urdf is None else names_of_pieces(read_urdf(item.urdf).root)
 
     def body(self, number: int) -> list[Proposal]:
         """Return the proposals for what joint `number` moves itself, best first.

@@ -91,7 +91,7 @@ def explain(problem: TrajectoryProblem, random_seed: int) -> list[Blocked]:
             found.append(Blocked(text, float(residual[nearest])))
             continue
         reached = z[residual < TOLERANCE]
-        contacts = problem.contacts.evaluate(reached, np.full(len(reached), int(end)), reach=problem.options.dist_safe)
+        contacts = problem.contacts.evaluate(reached, np.full(len(reached), int(end)), reach=problem.options.largest_margin)
         shortfall = contacts.shortfall(len(reached))
         if shortfall.min() > 0.0:
             best = int(np.argmin(shortfall))

@@ -32,7 +32,7 @@ def check_tree(file: Path, root: ElementTree.Element) -> None:
     Raises:
         InputError: A name is missing or given twice, a link has two parents or goes in a circle, there are several roots or
             none, a joint's type, origin, axis, limit or mimic is wrong, or macros of xacro are still to be put in.
-        UnknownNameError: A joint names a link or joint that does not exist.
+        UnknownNameError: A joint names a link that does not exist.
     """
     for element in root.iter():
         if element.tag.startswith("xacro:") and element.tag not in _SILENT:
@@ -210,9 +210,8 @@ def _check_joint(file: Path, name: str, joint: ElementTree.Element, joints: Coll
             problem = "limits in the wrong order"
             raise InputError(problem, file=file, line=line, field=field, expected="lower ≤ upper", got=got)
     for mimic in joint.findall("mimic"):
-        followed, line = mimic.get("joint", ""), line_of(mimic)
-        if followed not in joints:
-            raise UnknownNameError("joint", followed, joints, file=file, line=line, field=f"{name}: mimic")
+        if (followed := mimic.get("joint", "")) not in joints:  # published robots have that
+            warnings.warn(f"{file}:{line_of(mimic)}: {name}: there is no joint '{followed}' to follow", stacklevel=2)
         for key, default in (("multiplier", "1"), ("offset", "0")):
             numbers_of(file, mimic, key, 1, default=default, where=name)
 

@@ -154,6 +154,11 @@ def task_picture() -> None:
         save_figure(figure, IMAGES / "random_tasks.png")
 
 
+def check_picture() -> None:
+    """The home with the approaches to all that can be taken hold of."""
+    vkc.check_scene(vkc.load_scene("household")).plot(IMAGES / "scene_check.png")
+
+
 def chore_pictures(chore: vkc.Plan) -> None:
     """Write a picture of the chore in the home, and the page that shows all of it."""
     look(*HOME)
@@ -210,6 +215,7 @@ def main() -> int:
     room_picture()
     furniture_picture()
     task_picture()
+    check_picture()
     chore_pictures(chore)
     gap_picture(through)
     tray_picture()

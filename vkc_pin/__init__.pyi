@@ -15,6 +15,7 @@ from .options import Options
 from .planning.chore import plan_chore
 from .planning.plan import Plan
 from .planning.planner import Planner, plan
+from .planning.scene_check import ReachableAttachment, SceneCheck, check_scene
 from .program.inspection import build
 from .program.problem import TrajectoryProblem
 from .scene.hold import Hold
@@ -56,11 +57,13 @@ __all__ = [
     "Proposal",
     "Proposals",
     "Reach",
+    "ReachableAttachment",
     "Release",
     "Report",
     "Robot",
     "RoomSettings",
     "Scene",
+    "SceneCheck",
     "State",
     "Touch",
     "Trajectory",
@@ -73,6 +76,7 @@ __all__ = [
     "baselines",
     "benchmarks",
     "build",
+    "check_scene",
     "consolidate",
     "cpin",
     "goals",

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 import vkc_pin as vkc
 from vkc_pin import cli
@@ -85,6 +86,24 @@ def test_what_it_writes(planned: Run) -> None:
 def test_check(planned: Run, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["check", str(planned.folder / "door.npz")]) == 0
     assert "every constraint holds" in capsys.readouterr().out
+
+
+def test_check_of_a_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["check", "drawer", "--plot", str(tmp_path / "drawer.png")]) == 0
+    out = capsys.readouterr().out
+    assert "drawer.handle, approach (1.00, 0.00, 0.00): reached from (" in out
+    assert f"wrote {tmp_path / 'drawer.png'}" in out
+    assert (tmp_path / "drawer.png").stat().st_size > 10_000
+    document = vkc.load_scene("drawer").document
+    box = {"name": "box", "type": "box", "size": [0.2, 0.5, 0.5], "position": [1.66, 0.0, 0.75]}
+    (tmp_path / "blocked.yaml").write_text(yaml.safe_dump({**document, "obstacles": [box]}))
+    assert cli.main(["check", str(tmp_path / "blocked.yaml")]) == 1
+    assert "not reached" in capsys.readouterr().out
+
+
+def test_a_plan_has_no_picture_of_its_scene(planned: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["check", str(planned.folder / "door.npz"), "--plot", "door.png"]) == 2
+    assert "--plot" in capsys.readouterr().err
 
 
 def test_check_finds_what_is_wrong(planned: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from vkc_pin.benchmarks.commands import EXIT_INTERRUPTED, EXIT_OK, add_bench, natural, positive
+from vkc_pin.cli.checking import add_check
 from vkc_pin.cli.importing import add_importing
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.files.writing import check_outputs, write_atomically
@@ -24,7 +25,7 @@ EXIT_FAILED, EXIT_MISUSE, EXIT_INFEASIBLE = 1, 2, 3
 _FAILURES = {"infeasible": EXIT_INFEASIBLE, "interrupted": EXIT_INTERRUPTED}  # by a plan's status; others have failed
 _CODES = """exit codes:
   0    success: a motion that the validation finds nothing wrong with, and all that was asked for is written and printed
-  1    failed: no valid motion came out, or a saved one is none or not what its file says
+  1    failed: no valid motion came out, a saved one is none or not what its file says, or a scene has a fault
   2    wrong input, or something that cannot be read, written or printed
   3    infeasible: the task cannot be done, and the report says why
   130  Ctrl-C"""
@@ -143,15 +144,6 @@ def _export(arguments: argparse.Namespace) -> int:
     return EXIT_OK if whole else EXIT_MISUSE
 
 
-def _check(arguments: argparse.Namespace) -> int:
-    import vkc_pin as vkc
-
-    plan = vkc.Plan.load(arguments.plan, check=True)
-    otherwise = plan.contradictions()
-    sys.stdout.write("\n".join([*plan.validation.lines(), *(f"  the file says otherwise: {line}" for line in otherwise)]) + "\n")
-    return EXIT_OK if plan.validation.ok and not otherwise else EXIT_FAILED
-
-
 def _view(arguments: argparse.Namespace) -> int:
     import vkc_pin as vkc
     from vkc_pin.visualization import viewer as visualization
@@ -210,10 +202,7 @@ def make_parser() -> argparse.ArgumentParser:
     plan.add_argument("--quiet", action="store_true", help="no progress")
     plan.set_defaults(run=_plan)
 
-    about = "Run the independent validation on a saved plan, and say what its file says otherwise."
-    check = commands.add_parser("check", help="validate a saved plan", description=about)
-    check.add_argument("plan", metavar="PLAN", help="a plan saved with --save or Plan.save")
-    check.set_defaults(run=_check)
+    add_check(commands)
 
     view = commands.add_parser("view", help="look at a scene or plan", description="Show a scene or a saved plan in the browser.")
     view.add_argument("what", metavar="SCENE|PLAN")

@@ -17,11 +17,12 @@ from vkc_pin.files.resources import file_path
 from vkc_pin.files.writing import write_atomically
 from vkc_pin.motion.archives import folder_from_data, folder_to_data, read_archive, write_archive
 from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.motion.world import units_of
+from vkc_pin.motion.world import scene_after, units_of
 from vkc_pin.options import Options
 from vkc_pin.plotting import plots as plotting
 from vkc_pin.plotting.cards import motion_html
 from vkc_pin.scene.scene import Scene
+from vkc_pin.task.actions import foresee
 from vkc_pin.task.steps import Step, step_from_dict, step_to_dict
 from vkc_pin.task.terms import Term, term_from_dict, term_to_dict
 from vkc_pin.validation.report import Report
@@ -75,6 +76,17 @@ class Plan:
     def success(self) -> bool:
         """Whether the independent validation found nothing wrong with a motion that does what was asked for."""
         return self.validation.ok and self.status == "success"
+
+    def end_scene(self) -> Scene:
+        """Return the scene at the end of the motion, to plan on from: robot, objects and what is held as it leaves them.
+
+        Raises:
+            InputError: It is no success, so that nothing ends.
+        """
+        if not self.success:
+            raise InputError("this plan is no success", field="end_scene", expected="a motion that is valid", got=self.status)
+        after = foresee(self.scene, self.steps, self.options)[-1].after
+        return scene_after(self.scene, self.trajectory, after)
 
     def contradictions(self) -> list[str]:
         """Return what the file that the plan was loaded from says otherwise than the check of its motion, one line each."""

@@ -1,0 +1,105 @@
+"""What a check of a scene says: what is close, what is reached, and how frames point."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.drawers import changed, drawer_scene, with_boxes
+
+import vkc_pin as vkc
+from vkc_pin.errors import InputError
+from vkc_pin.planning.scene_check import SceneCheck, check_scene
+from vkc_pin.scene.scene import Scene
+from vkc_pin.validation.validate import validate
+
+
+@pytest.fixture(scope="module")
+def found() -> SceneCheck:
+    return check_scene(drawer_scene())
+
+
+def test_a_free_scene_has_nothing_to_say_but_where_handles_are(found: SceneCheck) -> None:
+    assert found.ok
+    assert (found.robot, found.close, found.allowed, found.problems) == ((), (), (), ())
+    assert [one.attachment for one in found.attachments] == list(drawer_scene().objects["drawer"].object.attachments)
+    for one in found.attachments:
+        np.testing.assert_allclose(one.approach, [1.0, 0.0, 0.0], atol=1e-9)
+        np.testing.assert_allclose(one.closing, [0.0, 0.0, 1.0], atol=1e-9)
+
+
+def test_what_is_reached_is_a_grasp_that_validation_agrees_with(found: SceneCheck) -> None:
+    scene = drawer_scene()
+    for one in found.attachments:
+        assert one.configuration is not None
+        there = scene.with_start(base=one.configuration[:3], arm=one.configuration[3:])
+        still = vkc.Trajectory(
+            tuple(scene.robot.coordinates.names)
+            + ("drawer.slide", f"drawer.{one.attachment}")[: 1 + (one.attachment != "handle")],
+            np.array([0.0, 1.0]),
+            np.tile([*one.configuration, *([0.0] if one.attachment == "handle" else [0.0, 0.0])], (2, 1)),
+            (vkc.PhaseSpan("stand", 0, 1, ()),),
+            len(one.configuration),
+        )
+        report = validate(there, [vkc.Reach(there.tool_placement())], still)
+        assert report.ok, report.lines()
+        assert report.clearance >= 0.005 - 1e-6  # of the hand at the handle
+        assert one.clearance >= 0.02
+
+
+def test_what_stands_before_a_handle_is_named() -> None:
+    blocked = check_scene(with_boxes(drawer_scene(), box=((0.2, 0.5, 0.5), (1.66, 0.0, 0.75))))
+    assert not blocked.ok
+    assert all(one.configuration is None and "box" in one.because for one in blocked.attachments)
+    assert any("not reached" in line for line in blocked.lines())
+
+
+def test_a_robot_in_something_and_what_is_close_are_told(tmp_path: Path) -> None:
+    scene = with_boxes(drawer_scene(), side=((0.6, 0.1, 0.9), (2.0, 0.295 + 0.05 + 0.004, 0.45)))
+    x, y, _ = scene.start[:3]
+    post = {"name": "post", "type": "box", "size": [0.1, 0.1, 1.0], "position": [x, y, 0.5]}
+    found = check_scene(changed(scene, obstacles=[*scene.document["obstacles"], post]))
+    assert not found.ok
+    assert found.problems
+    assert all("post" in line and "overlap" in line for line in found.problems)
+    assert {pair.second for pair in found.robot if pair.distance < 0.0} == {"post"}
+    assert [pair[:2] for pair in found.close] == [("drawer.tray", "side")]
+    assert [(one.first, one.second) for one in found.allowed] == [("drawer.tray", "side")]
+    text = str(found)
+    assert "drawer.tray – side are 4.0 mm apart" in text
+    assert "nothing can be planned, because" in text
+    found.plot(tmp_path / "scene.png")
+    assert (tmp_path / "scene.png").read_bytes()[:4] == b"\x89PNG"
+    with pytest.raises(InputError, match="not the name of a picture"):
+        found.plot(tmp_path / "scene.txt")
+
+
+def test_the_picture_has_an_arrow_for_each_attachment(found: SceneCheck) -> None:
+    texts = [text.get_text() for text in found.plot().axes[0].texts]
+    assert "drawer.handle, handle_free" in texts
+
+
+def test_wrong_arguments_are_named() -> None:
+    with pytest.raises(InputError, match="scene"):
+        check_scene("drawer")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="seed"):
+        check_scene(drawer_scene(), seed=-1)
+
+
+def test_one_plans_on_from_the_end_scene() -> None:
+    scene: Scene = drawer_scene()
+    grasp = vkc.plan(scene, [vkc.Grasp("drawer")])
+    held = grasp.end_scene()
+    assert held.held == {"drawer": "handle"}
+    np.testing.assert_allclose(held.start, grasp.trajectory.positions[-1, : len(held.start)], atol=1e-9)
+    pulled = vkc.plan(held, [vkc.Actuate("drawer", {"slide": 0.3})])
+    assert pulled.success, pulled.report()
+    after = pulled.end_scene()
+    assert after.objects["drawer"].state[0] == pytest.approx(0.3, abs=1e-3)
+    gone = vkc.plan(after, [vkc.Release(), vkc.GoTo(0.0, 0.0)])
+    assert gone.success, gone.report()
+    assert gone.end_scene().held == {}
+    refused = vkc.plan(scene, [vkc.Actuate("drawer", {"slide": 9.0})])
+    with pytest.raises(InputError, match="no success"):
+        refused.end_scene()

@@ -1,0 +1,214 @@
+"""What is to be said of a scene before anything is planned: what is close, what can be taken hold of, which way frames point."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vkc_pin.arguments import instance, whole
+from vkc_pin.arrays import Floats
+from vkc_pin.cache import Cache
+from vkc_pin.errors import InputError
+from vkc_pin.options import Options
+from vkc_pin.planning.reasons.diagnosis import explain, impossible
+from vkc_pin.plotting.scene_view import Approach, plot_scene
+from vkc_pin.program.merit import TOLERANCE
+from vkc_pin.program.problem import TrajectoryProblem
+from vkc_pin.scene.neighbours import Allowance, Close, allowances, close_pairs
+from vkc_pin.scene.scene import Scene
+from vkc_pin.seeds.knots import scatter
+from vkc_pin.task.compiler import compile_task
+from vkc_pin.task.steps import Grasp, Reach
+
+__all__ = ["ReachableAttachment", "SceneCheck", "check_scene"]
+
+_FAR = 0.25  # [m] beyond which clearances are not told
+
+
+@dataclass(frozen=True, eq=False)
+class ReachableAttachment:
+    """Whether the hand can take hold somewhere.
+
+    Attributes:
+        object, attachment: Where.
+        approach: The direction in which the hand comes, in the world frame, shape (3,); at zero of the grasp's freedoms.
+        closing: The line along which its fingers close, shape (3,).
+        configuration: The robot's coordinates of the clearest grasp that was found, shape (n,); None: none was found.
+        clearance: The smallest distance there of what must keep `dist_safe`, at most 0.25 [m].
+        because: Why none was found.
+    """
+
+    object: str
+    attachment: str
+    approach: Floats
+    closing: Floats
+    configuration: Floats | None = None
+    clearance: float = 0.0
+    because: str = ""
+
+    def __str__(self) -> str:
+        where = ", ".join(f"{value:.2f}" for value in self.approach + 0.0)
+        head = f"{self.object}.{self.attachment}, approach ({where})"
+        if self.configuration is None:
+            return f"{head}: not reached, {self.because}"
+        x, y, yaw = self.configuration[:3]
+        least = f"{1e3 * self.clearance:.0f} mm" if self.clearance < _FAR else f"more than {1e3 * _FAR:.0f} mm"
+        return f"{head}: reached from ({x:.2f}, {y:.2f}) at {yaw:.2f} rad, with {least} of air"
+
+
+@dataclass(frozen=True, eq=False)
+class SceneCheck:
+    """What a check found.
+
+    Attributes:
+        scene: The scene.
+        dist_safe: What counts as close [m].
+        robot: What the robot, with what it holds, is close to at the start: itself, objects and obstacles.
+        close: What else can move and is close to something.
+        allowed: Which pairs of links may be close, as the scene says or as they are built.
+        attachments: Of all objects that are not in the hand.
+        problems: What prevents every plan: the robot's start, and what it is said to hold.
+    """
+
+    scene: Scene
+    dist_safe: float
+    robot: tuple[Close, ...]
+    close: tuple[Close, ...]
+    allowed: tuple[Allowance, ...]
+    attachments: tuple[ReachableAttachment, ...]
+    problems: tuple[str, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Whether plans can begin, and every object that has attachments can be taken hold of at one at least."""
+        reached = {one.object for one in self.attachments if one.configuration is not None}
+        return not self.problems and reached == {one.object for one in self.attachments}
+
+    def lines(self) -> list[str]:
+        """Return it as lines of text."""
+        scene = self.scene
+        found = [f"{scene.name}: {scene.robot.name}, {len(scene.objects)} objects, {len(scene.obstacle_names)} obstacles"]
+        near, stuck = ([pair for pair in self.close if (pair.distance < 0.0) == inside] for inside in (False, True))
+        for title, entries in (
+            ("nothing can be planned, because", self.problems),
+            (f"the robot is closer than {1e3 * self.dist_safe:g} mm to", self.robot),
+            (
+                f"closer than {1e3 * self.dist_safe:g} mm to each other",
+                near,
+            ),
+            ("one in the other", stuck),
+            ("may be close", [_said(one) for one in self.allowed]),
+            ("attachments", self.attachments),
+        ):
+            if entries:
+                found += [f"  {title}", *(f"    {entry}" for entry in entries)]
+        return found
+
+    def __str__(self) -> str:
+        return "\n".join(self.lines())
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Draw the scene from above, with what is close and from where attachments are reached; see `plot_scene`.
+
+        Args:
+            path: Where to write the picture; None: nowhere.
+
+        Returns:
+            The matplotlib figure.
+
+        Raises:
+            InputError: The name's end is none of a picture.
+        """
+        arrows = []
+        for one in self.attachments:
+            placed = self.scene.objects[one.object]
+            grasp = placed.object.attachments[one.attachment]
+            tool = placed.link_placement(grasp.link) * grasp.tool(np.zeros(len(grasp.freedoms)))
+            base = None if one.configuration is None else one.configuration[:3]
+            arrows.append(Approach(f"{one.object}.{one.attachment}", tool.translation, one.approach, base))
+        stuck = [label for pair in (*self.robot, *self.close) if pair.distance < 0.0 for label in (pair.first, pair.second)]
+        return plot_scene(self.scene, arrows, stuck, path)
+
+
+def check_scene(scene: Scene, *, options: Options | None = None, seed: int = 0) -> SceneCheck:
+    """Look at a scene as a plan would: what is close or overlaps, what can be reached, and which way frames point.
+
+    Args:
+        scene: The scene.
+        options: Clearances; `Options()` if left out.
+        seed: Of the random configurations with which attachments are tried, as for `plan`.
+
+    Returns:
+        What was found. It promises nothing: what is reached need not be on any path, and what is not may be all the same.
+
+    Raises:
+        InputError: An argument is wrong.
+    """
+    instance(scene, Scene, "scene")
+    options = Options() if options is None else instance(options, Options, "options")
+    seed, cache = whole(seed, "seed", low=0), Cache()
+    reach = [Reach(scene.tool_placement())]
+    problem = TrajectoryProblem(scene, compile_task(scene, reach, options, nothing=True), options, (), cache=cache)
+    contacts = problem.contacts.evaluate(problem.start[None], np.array([0]), reach=options.dist_safe)
+    labels = problem.contacts.phases[0].labels
+    pairs: dict[tuple[str, str], float] = {}
+    for (i, j), distance in zip(contacts.pair.tolist(), contacts.distance.tolist(), strict=True):
+        key = (labels[i], labels[j])
+        pairs[key] = min(distance, pairs.get(key, np.inf))
+    return SceneCheck(
+        scene=scene,
+        dist_safe=options.dist_safe,
+        robot=tuple(sorted((Close(*key, distance) for key, distance in pairs.items()), key=lambda pair: pair.distance)),
+        close=tuple(close_pairs(scene, options.dist_safe)),
+        allowed=allowances(scene, options.dist_safe),
+        attachments=tuple(_attachments(scene, options, seed, cache)),
+        problems=tuple(f"{one.subject}: {one.detail}" for one in impossible(problem)),
+    )
+
+
+def _attachments(scene: Scene, options: Options, seed: int, cache: Cache) -> Iterator[ReachableAttachment]:
+    """Yield what can be said of all attachments."""
+    empty = scene.with_held({})
+    for name, placed in scene.objects.items():
+        for attachment, grasp in placed.object.attachments.items() if name not in scene.held else ():
+            turned = (placed.link_placement(grasp.link) * grasp.placement).rotation
+            about: dict[str, Any] = {"approach": turned[:, 2].copy(), "closing": turned[:, 0].copy()}
+            try:
+                task = compile_task(empty, [Grasp(name, attachment)], options, nothing=True)
+            except InputError as error:
+                yield ReachableAttachment(name, attachment, **about, because=str(error))
+                continue
+            problem = TrajectoryProblem(empty, task, options, (), cache=cache)
+            yield ReachableAttachment(name, attachment, **about, **_reached(problem, seed))
+
+
+def _reached(problem: TrajectoryProblem, seed: int) -> dict[str, Any]:
+    """Return the clearest grasp among random ones, and its clearance, or why there is none."""
+    end, safe = int(problem.ends[-1]), problem.options.dist_safe
+    for draw in range(3):
+        tried = scatter(problem, end, np.random.default_rng((seed, draw)))
+        z = np.zeros((0, problem.chain.size)) if tried is None else tried[0][tried[1] < TOLERANCE]
+        if not len(z):
+            continue
+        contacts = problem.contacts.evaluate(z, np.full(len(z), end), reach=_FAR)
+        clearance = np.full(len(z), _FAR)
+        full = contacts.margin >= safe
+        np.minimum.at(clearance, contacts.waypoint[full], contacts.distance[full])
+        clearance[contacts.shortfall(len(z)) > 0.0] = -np.inf
+        best = int(np.argmax(clearance))
+        if clearance[best] > -np.inf:
+            robot = problem.chain.robot.coordinates.size
+            return {"configuration": z[best, :robot].copy(), "clearance": float(clearance[best])}
+    blocked = explain(problem, seed)
+    return {"because": blocked[0].text if blocked else "no free configuration was found"}
+
+
+def _said(one: Allowance) -> str:
+    kept = "at any distance" if one.margin == -np.inf else f"down to {1e3 * one.margin:g} mm"
+    ends = {name: [f"{end:.3g}" if np.isfinite(end) else "its limit" for end in both] for name, both in one.ranges.items()}
+    while_ = ", ".join(f"{name} from {low} to {high}" for name, (low, high) in ends.items())
+    return f"{one.first} – {one.second} {kept}, " + (f"with {while_}" if while_ else "as the scene says")

@@ -15,7 +15,7 @@ def wings() -> dict[str, dict[str, Path]]:
     for file in sorted(PACKAGE.rglob("*.py"), key=lambda file: (file.parent, file.name != "__init__.py", file.name)):
         parts = file.relative_to(ROOT).with_suffix("").parts
         name = ".".join(part for part in parts if part != "__init__")
-        if name != "vkc_pin":
+        if name != "vkc_pin" and file.name != "__main__.py":  # importing that is running it
             found.setdefault(parts[1] if len(parts) > 2 else "package", {})[name] = file
     return found
 

@@ -225,14 +225,13 @@ class Plan:
         for name, value in _measured(trajectory, claimed).items():
             if metrics[name] != value and not abs(metrics[name] - value) <= 1e-9 * max(1.0, abs(value)):
                 raise InputError("not that of motion and report", field=f"metrics.{name}", expected=value, got=metrics[name])
-        options = {item.name for item in fields(Options)}
         for name in about["options"]:
-            if name not in options:
+            if name not in (options := [item.name for item in fields(Options)]):
                 raise UnknownNameError("option", name, options, field=f"options.{name}")
         return cls(
             scene=Scene.from_document(about["scene"], folder_from_data(about["folder"], path)),
             steps=tuple(step_from_dict(step) for step in about["steps"]),
-            options=Options(**_with_own_distance(about["options"])),
+            options=_saved(about["options"]),
             trajectory=trajectory,
             validation=cast(Report, validation),
             status=cast(str, _status) if status == "success" else status,
@@ -296,6 +295,6 @@ for _name in ("validation", "status", "metrics"):
     setattr(Plan, _name, _OnDemand(_name))
 
 
-def _with_own_distance(options: Mapping[str, Any]) -> dict[str, Any]:
+def _saved(options: Mapping[str, Any]) -> Options:
     """Return options that were saved: those without a clearance between the robot's links had one for all pairs."""
-    return {**({"self_distance": options["dist_safe"]} if "dist_safe" in options else {}), **options}
+    return Options(**{**({"self_distance": options["dist_safe"]} if "dist_safe" in options else {}), **options})

@@ -22,7 +22,10 @@ include_patterns = ["docs/**", "notebooks/*.ipynb", "CHANGELOG.md", "robots/husk
 exclude_patterns = ["docs/_*", "**/.ipynb_checkpoints", ".*", "out", "build", "dist", "tests", "vkc_pin", "scenes"]
 nitpicky = True
 # Names of other packages have no pages here; single backticks in docstrings are code first, and links where they happen to lead.
-nitpick_ignore_regex = [("py:.*", r"(?!vkc_pin\.).*|.*<locals>.*"), ("py:class", r"vkc_pin\.[\w.]+\.(_\w+|[A-Z]|\w+Schema|Annotated)")]
+nitpick_ignore_regex = [
+    ("py:.*", r"(?!vkc_pin\.).*|.*<locals>.*"),
+    ("py:class", r"vkc_pin\.[\w.]+\.(_\w+|[A-Z]|\w+Schema|Annotated)"),
+]
 suppress_warnings = ["ref.python"]  # attributes of the same name in several classes
 
 # Markdown as GitHub reads it.

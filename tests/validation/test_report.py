@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+import re
 from typing import Any
 
+import numpy as np
 import pytest
 
+import vkc_pin as vkc
 from vkc_pin.errors import InputError
+from vkc_pin.validation.clearance import clearance_curves
 from vkc_pin.validation.report import Report, Violation
 
 ONE = Violation("limit", "elbow_joint", waypoint=4, time=1.0, amount=0.05, unit="rad", detail="3.2 rad is outside")
@@ -59,3 +63,28 @@ def test_what_is_no_report(path: tuple[str | int, ...], value: object, field: st
     with pytest.raises(InputError) as caught:
         Report.from_dict(data)
     assert caught.value.field == field
+
+
+def test_a_line_for_each_phase_says_when_how_far_and_how_close(door_plan: vkc.Plan) -> None:
+    report, motion = door_plan.validation, door_plan.trajectory
+    assert min(report.clearances) == report.clearance
+    assert len(report.clearances) == len(motion.phases)
+    parts = motion.parts()
+    assert sum(part.base_effort() for part in parts) == pytest.approx(motion.base_effort())
+    assert sum(part.arm_effort() for part in parts) == pytest.approx(motion.arm_effort())
+    for line, part, phase, close in zip(report.by_phase(motion), parts, motion.phases, report.clearances, strict=True):
+        numbers = [float(number) for number in re.findall(r"-?[\d.]+(?= (?:to|s|m|rad|mm)\b)", line)]
+        first, last = motion.times[[phase.first, phase.last]]
+        np.testing.assert_allclose(numbers, [first, last, part.base_effort(), part.arm_effort(), 1e3 * close], atol=0.06)
+        assert line.endswith(phase.name)
+    assert Report.from_dict(json.loads(json.dumps(report.to_dict()))) == report
+
+
+def test_each_phase_has_the_clearance_of_its_own_motion(door_plan: vkc.Plan) -> None:
+    """The curves that are plotted are asked of coal in another way."""
+    fine = door_plan.trajectory
+    for phase, close in zip(fine.phases, door_plan.validation.clearances, strict=True):
+        times = fine.times[phase.first + 1 : phase.last + 1]
+        curves = clearance_curves(door_plan.scene, fine, times)
+        least = min(float(curve.distances.min()) for curve in curves if not curve.name.startswith("gripper"))
+        assert close <= least + 1e-6

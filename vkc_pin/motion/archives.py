@@ -122,6 +122,7 @@ class _Report(Schema):
     clearance: Distance
     closure_error: Measured
     closure_angle: Measured
+    clearances: Annotated[tuple[Distance, ...], FailFast()] = ()  # older files do not have it
     states: Count
     notes: Annotated[list[Text], FailFast()]
 

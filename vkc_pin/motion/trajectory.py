@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -152,6 +152,13 @@ class Trajectory:
     def arm_effort(self) -> float:
         """Return the sum of the arm joints' absolute displacements, Σ |δq_arm| [rad]."""
         return float(np.abs(np.diff(self.positions[:, 3 : self.robot_size], axis=0)).sum())
+
+    def parts(self) -> list[Trajectory]:
+        """Return the motion of each phase, with its own times."""
+        spans = [slice(phase.first, phase.last + 1) for phase in self.phases]
+        alone = [replace(phase, first=0, last=phase.last - phase.first) for phase in self.phases]
+        own = [(self.times[span], self.positions[span], (phase,)) for span, phase in zip(spans, alone, strict=True)]
+        return [replace(self, times=times, positions=positions, phases=phases) for times, positions, phases in own]
 
     def metrics(self) -> dict[str, float]:
         """Return duration [s], base_effort and base_effort_l1 [m], and arm_effort [rad]."""

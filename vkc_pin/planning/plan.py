@@ -106,19 +106,19 @@ class Plan:
             f"Ipopt {m['time_ipopt']:.3f}, validation {m['time_validation']:.3f}; "
             f"{int(m['rounds'])} rounds, {int(m['iterations'])} Ipopt iterations, "
             f"effort {int(m.get('effort', 0))}, seed {self.initialization}",
+            *(f"  {line}" for line in self.validation.by_phase(self.trajectory) if len(self.steps) > 1),
             *(f"  {line}" for line in self.validation.lines()),
         ]
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
         """Return trajectory, metrics and report as plain data, e.g. for JSON; distances that do not exist are None."""
-        finite = {key: value if np.isfinite(value) else None for key, value in self.metrics.items()}
         return {
             "scene": self.scene.name,
             "steps": [step_to_dict(step) for step in self.steps],
             "success": self.success,
             "status": self.status,
-            "metrics": finite,
+            "metrics": {key: value if np.isfinite(value) else None for key, value in self.metrics.items()},
             "seed": self.seed,
             "initialization": self.initialization,
             "violations": [asdict(violation) for violation in self.validation.violations],

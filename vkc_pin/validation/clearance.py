@@ -11,7 +11,9 @@ from numpy.typing import ArrayLike
 from vkc_pin.arrays import Floats, Ints
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.motion.world import World
+from vkc_pin.options import Options
 from vkc_pin.scene.contact import grasped, touching
+from vkc_pin.scene.neighbours import allowances
 from vkc_pin.scene.scene import Scene
 from vkc_pin.validation.distances import Solids
 from vkc_pin.validation.pairs import PairTable
@@ -55,11 +57,13 @@ def clearance_curves(scene: Scene, trajectory: Trajectory, times: ArrayLike) -> 
     world = World(scene)
     solids = Solids(world)
     table = PairTable(scene, solids, trajectory, 0.0)
+    silent = {frozenset((one.first, one.second)) for one in allowances(scene, Options().dist_safe) if one.margin == -np.inf}
     moments = np.atleast_1d(np.asarray(times, float))
     holds = {hold for phase in trajectory.phases for hold in phase.holds} | set(scene.holds)
     gripped = {(link, grasped(scene, hold)) for hold in holds for link in touching(scene, hold)}
     kinds = np.array([_kind(table, pair, gripped) for pair in table.pairs])
-    groups = {kind: table.pairs[kinds == kind] for kind in _KINDS if (kinds == kind).any()}
+    asked = np.array([frozenset(world.collision_labels[i] for i in pair) not in silent for pair in table.pairs.tolist()], bool)
+    groups = {kind: table.pairs[(kinds == kind) & asked] for kind in _KINDS if ((kinds == kind) & asked).any()}
     placed, curves = table.solids.at(world.coordinates.q(world.positions(trajectory, moments))), []
     for kind, pairs in groups.items():
         which, distances = placed.nearest(pairs)

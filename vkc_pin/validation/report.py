@@ -57,6 +57,7 @@ class Report:
         clearance: Smallest distance of any pair anywhere along the motion [m].
         closure_error: Largest drift of a held object's base or of the grasp [m].
         closure_angle: The same for orientation [rad].
+        clearances: The smallest distance at the waypoints of each phase, and anywhere in the phase of the smallest of all [m].
         states: How many configurations were looked at.
         notes: What prevents the task as a whole, if planning failed; one line each.
     """
@@ -66,6 +67,7 @@ class Report:
     _: KW_ONLY
     closure_error: float = 0.0
     closure_angle: float = 0.0
+    clearances: tuple[float, ...] = ()
     states: int = 0
     notes: tuple[str, ...] = ()
 
@@ -85,6 +87,15 @@ class Report:
             *([f"  ... and {len(self.violations) - LISTED} more"] if len(self.violations) > LISTED else []),
             *(f"  because {note}" for note in self.notes),
         ]
+
+    def by_phase(self, trajectory: Trajectory) -> list[str]:
+        """Return a line of text for each phase of the motion it is about: when, how much effort, and how close."""
+        lines, nearest = [], self.clearances or (float("inf"),) * len(trajectory.phases)
+        for part, close in zip(trajectory.parts(), nearest, strict=True):
+            first, last, effort = part.times[0], part.times[-1], (part.base_effort(), part.arm_effort())
+            gone = f"base {effort[0]:5.2f} m, arm {effort[1]:5.2f} rad, {1e3 * close:6.1f} mm"
+            lines.append(f"{first:6.1f} to {last:6.1f} s: {gone}, {part.phases[0].name}")
+        return lines
 
     def with_reasons(self, reasons: Sequence[Violation]) -> Report:
         """Return the report of a motion that was never planned: only `reasons` are violated, the rest follows from them."""
@@ -116,6 +127,8 @@ class Report:
         for name in ("clearance", "closure_error", "closure_angle"):  # infinite where nothing can collide
             if name in fields:
                 fields[name] = _real(fields[name], name)
+        nearest: tuple[Any, ...] = items(fields.get("clearances", ()), "clearances", "a list of distances")
+        fields["clearances"] = tuple(_real(one, f"clearances[{k}]") for k, one in enumerate(nearest))
         fields["states"] = whole(fields.get("states", 0), "states", low=0)
         listed: tuple[Any, ...] = items(fields.get("violations"), "violations", "a list of violations")
         fields["violations"] = tuple(_violation(one, f"violations[{k}]") for k, one in enumerate(listed))

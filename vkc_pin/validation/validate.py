@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from vkc_pin.arguments import instance
+from vkc_pin.arrays import Floats
 from vkc_pin.motion.carrying import FreeObjects
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.options import Options
@@ -36,8 +37,7 @@ START_LIMIT_TOLERANCE = 1e-2  # [m] or [rad]: a start slightly outside its limit
 ACCEPTED_RATE_TOLERANCE = 1e-3  # excess over a limit, relative to it
 LATCH_TOLERANCE = 1e-4
 WAYPOINT_TOLERANCE = 1e-3  # [m] that clearance at a waypoint may fall short of dist_safe
-SLIP_TOLERANCE = 1e-4  # [m] per step
-DWELL_TOLERANCE = 1e-6  # [s]
+SLIP_TOLERANCE, DWELL_TOLERANCE = 1e-4, 1e-6  # [m] per step, [s]
 
 
 def validate(
@@ -89,7 +89,7 @@ class _Check:
         self.found += check_pushes(self.samples)
         error, angle = self._closure()
         self._slides()
-        clearance = self._clearance() if self._within_reason() else np.inf
+        nearest = self._clearance() if self._within_reason() else np.full(len(self.trajectory.phases), np.inf)
         worst: dict[tuple[str, str, str], Violation] = {}
         for violation in self.found:
             key = (violation.constraint, violation.subject, violation.unit)
@@ -99,7 +99,8 @@ class _Check:
             if violation.constraint == "penetration":
                 worst.pop(("clearance", violation.subject, violation.unit), None)
         ordered = tuple(sorted(worst.values(), key=lambda v: (v.time, v.constraint, v.subject, v.unit)))
-        return Report(ordered, clearance, closure_error=error, closure_angle=angle, states=len(self.samples.times))
+        close, states = tuple(nearest.tolist()), len(self.samples.times)
+        return Report(ordered, min(close), closure_error=error, closure_angle=angle, clearances=close, states=states)
 
     def _add(
         self, constraint: str, subject: str, amount: float, unit: str, detail: str, *, waypoint: int = 0, row: int | None = None
@@ -274,27 +275,26 @@ class _Check:
             detail = f"{before}{moved[worst]:.4f} {unit}{after}"
             self._add(constraint, name, moved[worst], unit, detail, waypoint=phase.first + worst)
 
-    def _clearance(self) -> float:
-        """Nothing comes too close at a waypoint (eqs. 6 and 7) or penetrates anywhere; return the smallest distance [m].
+    def _clearance(self) -> Floats:
+        """Nothing comes too close at a waypoint (eqs. 6 and 7) or penetrates anywhere; return each phase's smallest distance [m].
 
-        What moves as one does not count for that.
-        The start is where the robot is: it may be close to something, but not inside.
+        What moves as one does not count. The start is where the robot is: it may be close to something, but not inside.
         """
-        samples, smallest = self.samples, np.inf
-        solids = Solids(samples.world)
-        near = windows(samples, solids, self.steps, self.options)
-        pairs = PairTable(self.scene, solids, self.trajectory, self.options.dist_safe, self.options.self_distance, windows=near)
-        neighbours = [one for one in allowances(self.scene, self.options.dist_safe) if one.margin == -np.inf]
+        samples, solids, lasts = self.samples, Solids(self.samples.world), [phase.last for phase in self.trajectory.phases]
+        nearest = np.full(len(lasts), np.inf)
+        near, safe = windows(samples, solids, self.steps, self.options), self.options.dist_safe
+        pairs = PairTable(self.scene, solids, self.trajectory, safe, self.options.self_distance, windows=near)
+        neighbours = [one for one in allowances(self.scene, safe) if one.margin == -np.inf]
         for hit in sweep(pairs, samples.z, samples.waypoint_rows):
-            named = [one for one in neighbours if one.between(hit.first, hit.second)]
-            if any(one.holds(samples.world.coordinates.names, samples.z[[hit.row]])[0] for one in named):
+            named, state = (one for one in neighbours if one.between(hit.first, hit.second)), samples.z[[hit.row]]
+            if any(one.holds(samples.world.coordinates.names, state)[0] for one in named):
                 continue  # on the way to the waypoint at which they are neighbours no more, or first are
-            smallest = min(smallest, hit.distance) if hit.margin > -np.inf else smallest
+            if hit.margin > -np.inf:
+                np.minimum.at(nearest, np.searchsorted(lasts, samples.waypoint(hit.row)), hit.distance)
             subject, millimetres = f"{hit.first} – {hit.second}", 1e3 * abs(hit.distance)
             if hit.distance < -hit.contact:
                 self._add("penetration", subject, -hit.distance, "m", f"overlap by {millimetres:.1f} mm", row=hit.row)
-            elif hit.at_waypoint and hit.row > 0 and hit.distance < hit.margin - WAYPOINT_TOLERANCE:
+            elif hit.at_waypoint and hit.row > 0 and (short := hit.margin - WAYPOINT_TOLERANCE - hit.distance) > 0.0:
                 detail = f"are only {millimetres:.1f} mm apart, {1e3 * hit.margin:.0f} mm are asked for"
-                short = hit.margin - WAYPOINT_TOLERANCE - hit.distance
                 self._add("clearance", subject, short, "m", detail, row=hit.row)
-        return float(smallest)
+        return nearest

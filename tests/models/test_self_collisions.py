@@ -12,6 +12,7 @@ from vkc_pin.models import self_collisions
 from vkc_pin.models.robot import Robot
 from vkc_pin.models.robot_file import load_robot
 from vkc_pin.models.self_collisions import sample_allowed_pairs, survey, write_srdf
+from vkc_pin.options import Options
 
 SRDF = resources.folder("robots") / "husky_ur5e" / "husky_ur5e.srdf"
 
@@ -23,6 +24,10 @@ def husky() -> Robot:
 
 def test_committed_list_is_what_sampling_finds(husky: Robot) -> None:
     assert sample_allowed_pairs(husky, samples=3000, seed=7) == read_srdf(SRDF, links=husky.file.links).allowed
+
+
+def test_a_free_home_is_one_from_which_plans_can_begin() -> None:
+    assert Options().self_distance == self_collisions.HOME_DISTANCE
 
 
 def test_same_seed_same_pairs(husky: Robot) -> None:

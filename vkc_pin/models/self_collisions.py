@@ -24,16 +24,16 @@ from vkc_pin.kept import record
 from vkc_pin.models.robot import Robot
 from vkc_pin.models.robot_model import neighbours
 from vkc_pin.models.shapes import ShapeDistances
-from vkc_pin.options import Options
 
 Pair = tuple[str, str]
 Parts = list[tuple[int, int]]
 
-__all__ = ["Survey", "sample_allowed_pairs", "survey", "surveyed", "with_collision_pairs", "write_srdf"]
+__all__ = ["HOME_DISTANCE", "Survey", "sample_allowed_pairs", "survey", "surveyed", "with_collision_pairs", "write_srdf"]
 
 _VERSION = 1  # of what is kept on disk: another one whenever the same robot would get other pairs
 _SAMPLES = 20_000
 _FAR = 0.05  # [m]: links that come no closer in any sample are not driven together; neighbours that are always closer are exempt
+HOME_DISTANCE = 0.02  # [m] as `Options.self_distance`: links that are that far apart do not count against a home
 _STARTS, _STEPS = 4, 200  # how often and in how many steps the others are
 _TOUCHING = 1e-3  # [m]: links that never get further apart touch; validation sees no less
 _SEARCH, _TRIES = (0.05, 0.1, 0.2, 0.4, 0.7, 1.0), 100  # a free home: shares of the joints' ranges, and postures in each
@@ -204,7 +204,7 @@ def _free_home(robot: Robot, groups: Mapping[Pair, Parts], loose: Collection[str
     for share in _SEARCH:
         tries = rest + np.where(moves, share * (rng.uniform(low, high, (_TRIES, len(rest))) - rest), 0.0)
         for z in tries[np.argsort((np.abs(tries - rest) / np.maximum(high - low, 1e-9)).max(axis=1), kind="stable")]:
-            if (count := short(z, Options.self_distance, fewest - 1)) < fewest:
+            if (count := short(z, HOME_DISTANCE, fewest - 1)) < fewest:
                 best, fewest = z, count
             if not fewest:
                 return tuple(best[3:].tolist())

@@ -148,7 +148,7 @@ class World:
         free = {name: thing.at for name, thing in self.things.items() if thing.free}
         upright: dict[str, np.ndarray] = {}
         robot, plan = self.robot, self.plan
-        wanted = sorted({shape.link for shape in robot.tree.urdf.shapes} | {robot.tool} | self._asked())
+        wanted = sorted({shape.link for shape in robot.tree.urdf.shapes} | {robot.tool, robot.tree.urdf.base} | self._asked())
         for number, phase in enumerate(plan.phases):
             times, columns, rows = self.samples(phase)
             arm = {name: columns[:, 3 + k] for k, name in enumerate(robot.arm)}

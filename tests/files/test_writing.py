@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from vkc_pin.errors import InputError
-from vkc_pin.files.writing import check_outputs, check_writable, write_atomically
+from vkc_pin.files.writing import check_outputs, check_writable, folder_at_once, write_atomically
 
 
 def everything(folder: Path) -> set[str]:
@@ -209,3 +209,23 @@ def test_ctrl_c_waits_until_it_is_whole(tmp_path: Path, monkeypatch: pytest.Monk
         signal.signal(signal.SIGINT, before)
     assert path.read_bytes() == b"whole"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_folder_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
+    target = tmp_path / "new" / "folder"
+    with folder_at_once(target) as staging:
+        (staging / "a").write_text("1", encoding="utf-8")
+        assert not target.exists()
+    assert [path.name for path in target.iterdir()] == ["a"]
+    with pytest.raises(FileNotFoundError), folder_at_once(target, force=True) as staging:
+        (staging / "none" / "b").write_text("2", encoding="utf-8")
+    assert [path.name for path in target.iterdir()] == ["a"]
+    with pytest.raises(InputError, match="there already"), folder_at_once(target):
+        pass
+    with folder_at_once(target, force=True) as staging:
+        (staging / "b").write_text("2", encoding="utf-8")
+    assert [path.name for path in target.iterdir()] == ["b"]
+    assert [path.name for path in target.parent.iterdir()] == ["folder"]
+    (tmp_path / "file").write_text("3", encoding="utf-8")
+    with pytest.raises(InputError, match="no folder"), folder_at_once(tmp_path / "file", force=True):
+        pass

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import secrets
+import shutil
 import stat
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -13,7 +14,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.files.resources import file_path
 from vkc_pin.interrupt import deferred
 
-__all__ = ["check_outputs", "check_writable", "write_atomically"]
+__all__ = ["check_outputs", "check_writable", "folder_at_once", "write_atomically"]
 
 
 def write_atomically(path: str | Path, data: bytes) -> Path:
@@ -85,6 +86,39 @@ def check_outputs(files: Mapping[str, str | Path], *, kept: Mapping[str, str | P
     for target, field in targets.items():
         if (above := next((place for place in target.parents if place in targets), None)) is not None:
             raise InputError("a file cannot be a folder", file=above, field=field, got=f"the file of {targets[above]}")
+
+
+@contextlib.contextmanager
+def folder_at_once(path: str | Path, *, force: bool = False) -> Iterator[Path]:
+    """Lend a new folder to write into, which becomes `path` if nothing was raised, and is gone otherwise.
+
+    Args:
+        path: The folder to make; what leads to it is made if need be.
+        force: Replace a folder that is there, with all that is in it.
+
+    Raises:
+        InputError: It is there and may not be replaced, is something else than a folder, or cannot be made.
+    """
+    target = Path(os.path.realpath(file_path(path, "path", "a folder")))
+    if target.exists() and not (force and target.is_dir()):
+        if not target.is_dir():
+            raise InputError("this is no folder", file=path, expected="a new folder", got="a file")
+        expected = "a new folder, or force=True (--force) to replace it"
+        raise InputError("this folder is there already", file=path, expected=expected)
+    with _told(path):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        staging = _temporary(target.parent)
+        staging.mkdir()
+    try:
+        yield staging
+        with _told(path), deferred():
+            old = _temporary(target.parent)
+            if target.exists():
+                target.rename(old)
+            staging.rename(target)
+            shutil.rmtree(old, ignore_errors=True)
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
 
 
 def _target(path: str | Path) -> tuple[Path, int | None]:

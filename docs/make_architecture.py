@@ -23,7 +23,7 @@ COLUMNS = {
     **{"seeds": 0, "driving": 0, "program": 1, "chain": 1, "task": 1, "cpin": 1},
     **{"visualization": 3, "validation": 3, "plotting": 4, "options": 3, "distances": 2, "importing": 4},
 }
-WIDTH, COLUMN, ROW, MARGIN = 1060, 200, 88, 46  # [pixels], as are all lengths here
+WIDTH, COLUMN, ROW, MARGIN = 1100, 200, 88, 46  # [pixels], as are all lengths here
 BOX_WIDTH, BOX_HEIGHT, CHARACTERS = 186, 60, 30
 ROOM = 12  # between an arrow and boxes that it passes
 

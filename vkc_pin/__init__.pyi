@@ -3,6 +3,8 @@ from .chain.chain import VirtualKinematicChain, consolidate
 from .chain.inversion import invert
 from .errors import BuildError, InputError, UnknownNameError, VkcError
 from .importing.objects.object_import import ImportedObject, import_object
+from .importing.robots.doctor import Diagnosis, doctor
+from .importing.robots.robot_import import ImportedRobot, import_robot
 from .models.articulation import ArticulatedObject, Attachment, Freedom, Latch
 from .models.furniture.catalogue import random_object, write_object
 from .models.object_file import load_object
@@ -40,11 +42,13 @@ __all__ = [
     "BuildError",
     "Constraint",
     "Cost",
+    "Diagnosis",
     "Freedom",
     "GoTo",
     "Grasp",
     "Hold",
     "ImportedObject",
+    "ImportedRobot",
     "InputError",
     "Iteration",
     "Latch",
@@ -79,8 +83,10 @@ __all__ = [
     "check_scene",
     "consolidate",
     "cpin",
+    "doctor",
     "goals",
     "import_object",
+    "import_robot",
     "invert",
     "load_object",
     "load_robot",

@@ -3,15 +3,49 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from helpers.arm_urdf import write_arms
 from helpers.downloads import SDF
 
-from vkc_pin.cli.commands import EXIT_MISUSE, run
+import vkc_pin as vkc
+from vkc_pin.cli import commands
+from vkc_pin.cli.importing import EXIT_SICK
+
+
+def test_a_robot_is_imported_and_examined(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file, folder = write_arms(tmp_path / "given", sides=("left_", "right_")), tmp_path / "mine"
+    assert commands.run(["import-robot", str(file), "--output", str(folder), "--arm", "left", "--samples", "100"]) == 0
+    said = capsys.readouterr()
+    assert "arm: left, 5 joints, 2 fingers" in said.out
+    assert f"wrote {folder}" in said.out
+    assert vkc.load_robot(folder).coordinates.names[3] == "left_arm_1_joint"
+    assert commands.run(["doctor", str(folder)]) == 0
+    assert "mine: 0 faults" in capsys.readouterr().out
+    assert commands.run(["doctor", str(folder), "--margin", "0.6"]) == EXIT_SICK
+    assert "the margin is 600 mm" in capsys.readouterr().out
+
+
+def test_what_is_wrong_is_said_on_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = write_arms(tmp_path / "given")
+    for arguments, part in (
+        (["import-robot", str(tmp_path / "none.urdf")], "cannot read the robot"),
+        (["import-robot", str(file), "--output", str(tmp_path / "given")], "--force"),
+        (["import-robot", str(file), "--output", str(tmp_path / "new"), "--package", "meshes"], "NAME=FOLDER"),
+        (["doctor", "husky_ur5"], "did you mean 'husky_ur5e'?"),
+    ):
+        assert commands.run(arguments) == commands.EXIT_MISUSE
+        said = capsys.readouterr()
+        assert part in said.err
+        assert said.out == ""
+        assert len(said.err.splitlines()) == 1
+    assert not (tmp_path / "new").exists()
 
 
 def test_import_object_writes_and_reports(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "box.sdf").write_text(SDF)
     assert (
-        run(["import-object", str(tmp_path / "box.sdf"), "--output", str(tmp_path / "out"), "--height", "0.7", "--most", "1"])
+        commands.run(
+            ["import-object", str(tmp_path / "box.sdf"), "--output", str(tmp_path / "out"), "--height", "0.7", "--most", "1"]
+        )
         == 0
     )
     said = capsys.readouterr().out
@@ -19,5 +53,5 @@ def test_import_object_writes_and_reports(tmp_path: Path, capsys: pytest.Capture
     assert "door_bar (bar, called a handle)" in said
     assert said.count("wrote") == 2
     assert sorted(file.name for file in (tmp_path / "out").iterdir()) == ["attachments.png", "box.urdf", "box.yaml"]
-    assert run(["import-object", str(tmp_path / "box.sdf"), "--output", str(tmp_path / "out")]) == EXIT_MISUSE
+    assert commands.run(["import-object", str(tmp_path / "box.sdf"), "--output", str(tmp_path / "out")]) == commands.EXIT_MISUSE
     assert "something already" in capsys.readouterr().err

@@ -230,6 +230,8 @@ def make_parser() -> argparse.ArgumentParser:
     srdf.add_argument("--samples", type=positive, default=20000)
     srdf.add_argument("--seed", type=natural, default=0)
     srdf.set_defaults(run=_srdf)
+
+    add_importing(commands)
     return parser
 
 

@@ -1,18 +1,37 @@
-"""The commands that make descriptions of files from elsewhere: import-object."""
+"""The commands that bring descriptions from elsewhere: import-robot, import-object, and doctor, which examines robots."""
 
 from __future__ import annotations
 
 import argparse
 import sys
+from pathlib import Path
 from typing import Any
 
-from vkc_pin.benchmarks.commands import EXIT_OK, positive
+from vkc_pin.benchmarks.commands import EXIT_OK, natural, positive
+from vkc_pin.errors import InputError
 
-__all__ = ["add_importing"]
+__all__ = ["EXIT_SICK", "add_importing"]
+
+EXIT_SICK = 1
 
 
 def add_importing(commands: Any) -> None:
-    """Add the commands to those of the command line."""
+    """Add the commands to the parser's."""
+    about = "Make a robot's folder of a URDF, xacro or MJCF file, and say what was guessed."
+    robot = commands.add_parser("import-robot", help="make a robot's folder of a file", description=about)
+    robot.add_argument("file", metavar="FILE", help="URDF, xacro or MJCF")
+    robot.add_argument("--output", metavar="FOLDER", help="where to write (default: a folder of the file's name here)")
+    robot.add_argument("--arm", metavar="NAME", help="which arm to plan, or a part of its name, e.g. left")
+    robot.add_argument("--tool-frame", metavar="FRAME", help="the frame that grasps, if it is not to be guessed")
+    robot.add_argument("--srdf", metavar="FILE", help="an SRDF (default: the one beside the file)")
+    robot.add_argument("--package", action="append", default=[], metavar="NAME=FOLDER", help="for package:// and $(find NAME)")
+    robot.add_argument("--argument", action="append", default=[], metavar="NAME=VALUE", help="of a xacro file")
+    robot.add_argument("--most-pieces", type=positive, metavar="N", help="convex pieces of a mesh, at most; 1 keeps hulls")
+    robot.add_argument("--samples", type=positive, metavar="N", help="configurations to look at for pairs that need no check")
+    robot.add_argument("--seed", type=natural, default=0, help="of the random numbers (default 0)")
+    robot.add_argument("--force", action="store_true", help="replace a folder that is there")
+    robot.set_defaults(run=_import_robot)
+
     about = """Make an object that can be planned with of a URDF, MJCF or SDF file: convex pieces, limits, attachments that are
     proposed from its shapes, and a picture of these. The report says what was changed, and which joints no hand can open."""
     item = commands.add_parser("import-object", help="make an object of a downloaded file", description=about)
@@ -28,6 +47,32 @@ def add_importing(commands: Any) -> None:
     item.add_argument("--robot", default="husky_ur5e", help="whose hand shall open it: name or file (default husky_ur5e)")
     item.add_argument("--most", type=positive, default=3, metavar="N", help="attachments for one joint, at most (default 3)")
     item.set_defaults(run=_import_object)
+
+    about = "Examine a robot's description: home, pairs, limits, hand, shapes. Exit code 1 if plans would fail for it."
+    doctor = commands.add_parser("doctor", help="examine a robot's description", description=about)
+    doctor.add_argument("robot", metavar="ROBOT", help="a robot's name, or the path of a URDF, a robot.yaml or a folder")
+    doctor.add_argument("--margin", type=float, metavar="METRES", help="clearance that motions keep (default: that of plans)")
+    doctor.set_defaults(run=_doctor)
+
+
+def _import_robot(arguments: argparse.Namespace) -> int:
+    from vkc_pin.importing.robots.robot_import import import_robot
+
+    chosen = {name: value for name in ("most_pieces", "samples") if (value := getattr(arguments, name)) is not None}
+    made = import_robot(
+        arguments.file,
+        arguments.output,
+        arm=arguments.arm,
+        tool_frame=arguments.tool_frame,
+        srdf=arguments.srdf,
+        packages=_pairs(arguments.package, "--package", "NAME=FOLDER"),
+        arguments=_pairs(arguments.argument, "--argument", "NAME=VALUE"),
+        seed=arguments.seed,
+        force=arguments.force,
+        **chosen,
+    )
+    sys.stdout.write(f"{made}\n")
+    return EXIT_OK if made.diagnosis.healthy else EXIT_SICK
 
 
 def _import_object(arguments: argparse.Namespace) -> int:
@@ -45,3 +90,22 @@ def _import_object(arguments: argparse.Namespace) -> int:
     )
     sys.stdout.write(f"{done.report()}\nwrote {done.file}\nwrote {done.picture}\n")
     return EXIT_OK
+
+
+def _doctor(arguments: argparse.Namespace) -> int:
+    from vkc_pin.importing.robots.doctor import doctor
+
+    name = arguments.robot
+    found = doctor(Path(name) if Path(name).exists() else name, margin=arguments.margin)
+    sys.stdout.write(f"{found}\n")
+    return EXIT_OK if found.healthy else EXIT_SICK
+
+
+def _pairs(texts: list[str], field: str, form: str) -> dict[str, str]:
+    found = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not (name and equals and value):
+            raise InputError("not a name with a value", field=field, expected=form, got=repr(text))
+        found[name] = value
+    return found

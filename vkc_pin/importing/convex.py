@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import coal
 import numpy as np
 
-from vkc_pin.arguments import quantity, whole
+from vkc_pin.arguments import number, quantity, whole
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
 from vkc_pin.files.hulls import outer_hull
@@ -71,6 +71,7 @@ def decompose(
     *,
     most_pieces: int = PIECES,
     error: float = ERROR,
+    overhead: float = 0.0,
     corners: int = _CORNERS,
     seed: int = 0,
 ) -> Pieces:
@@ -83,6 +84,7 @@ def decompose(
         mesh: A mesh file in [m], or a mesh; it need not be closed.
         most_pieces: The largest number of pieces.
         error: How far the pieces may stand out over the mesh's surface [m]; unless that takes more pieces.
+        overhead: A hull that fills no more than this share more than the mesh is left whole, wherever it stands out.
         corners: A piece with half as many again, or more, becomes a polytope around it that has no more than these.
         seed: Of the random numbers.
 
@@ -93,7 +95,7 @@ def decompose(
 
     whole(most_pieces, "most_pieces", low=1)
     whole(corners, "corners", low=8)
-    error = quantity(error, "error")
+    error, overhead = quantity(error, "error"), number(overhead, "overhead", low=0.0)
     if error <= 0.0:
         raise InputError("not a distance", field="error", expected="a number above 0 [m]", got=error)
     if isinstance(mesh, trimesh.Trimesh):
@@ -102,15 +104,16 @@ def decompose(
         file = file_path(mesh, "mesh", "a mesh or a mesh file")
         given = load_mesh(file)
     hull = _hull(given.vertices, file)
-    found = [hull]
-    if most_pieces > 1 and _standing_out(found, given) > error:
+    found, solid = [hull], min(solid_volume(given), float(hull.volume))
+    if most_pieces > 1 and hull.volume > (1.0 + overhead) * solid and _standing_out(found, given) > error:
         found = _bodies(given, most_pieces)
         if not found or _standing_out(found, given) > error:
             found = _containing(_cut(given, most_pieces, error, seed, file) or [np.asarray(hull.vertices)], _surface(given))
     pieces = tuple(
         outer_hull(piece.vertices, vertices=corners) if len(piece.vertices) > _SPARE * corners else piece for piece in found
     )
-    return Pieces(pieces, solid_volume(given), _standing_out(pieces, given))
+    solid = min(solid, float(sum(piece.volume for piece in pieces)))  # which contain it: of open meshes, it is but measured
+    return Pieces(pieces, solid, _standing_out(pieces, given))
 
 
 def concavity(mesh: trimesh.Trimesh) -> float:

@@ -1,0 +1,87 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from helpers.arm_urdf import write_arms
+
+import vkc_pin as vkc
+from vkc_pin.files import resources
+from vkc_pin.files.urdf import UrdfFile, read_urdf
+from vkc_pin.importing.robots.arms import Arm, base_kind, bodies, choose, find_arms, own_base
+
+
+def arms_of(file: UrdfFile) -> list[Arm]:
+    return find_arms(file, bodies(file), {}, {shape.link for shape in file.shapes("collision")})
+
+
+def test_both_arms_are_found_by_their_hands(tmp_path: Path) -> None:
+    file = read_urdf(write_arms(tmp_path, sides=("left_", "right_")))
+    arms = arms_of(file)
+    assert sorted(arm.name for arm in arms) == ["left", "right"]
+    left = choose(arms, "Left", file)
+    assert left.joints == tuple(f"left_arm_{k}_joint" for k in range(1, 6))
+    assert [finger.name for finger in left.fingers] == ["left_finger_a_joint", "left_finger_b_joint"]
+    assert left.palm.links == ["left_arm_5", "left_hand"]
+    assert left.sure == "sure"
+    with pytest.raises(vkc.UnknownNameError) as caught:
+        choose(arms, "midle", file)
+    assert set(caught.value.choices) == {"left", "right"}
+
+
+def test_groups_of_an_srdf_name_arms(tmp_path: Path) -> None:
+    file = read_urdf(write_arms(tmp_path, sides=("left_", "right_")))
+    groups = {
+        "port": [f"left_arm_{k}_joint" for k in range(1, 6)],
+        "all": [joint for arm in arms_of(file) for joint in arm.joints],
+    }
+    named = find_arms(file, bodies(file), groups, {"body"})
+    assert [arm.name for arm in named if arm.joints[0].startswith("left")] == ["port"]
+
+
+def test_a_base_of_its_own_is_no_part_of_the_arm(tmp_path: Path) -> None:
+    file = read_urdf(write_arms(tmp_path, own_base=True))
+    solid = {shape.link for shape in file.shapes("collision")}
+    assert own_base(bodies(file), solid) == ("drive_x", "drive_y", "drive_yaw")
+    assert arms_of(file)[0].joints[0] == "arm_1_joint"
+    plain = read_urdf(write_arms(tmp_path))
+    assert own_base(bodies(plain), solid) == ()
+
+
+def robots(pattern: str) -> Path:
+    folder = resources.example_robot_data()
+    assert folder is not None
+    return next(iter(sorted((folder / "robots").glob(pattern))))
+
+
+@pytest.mark.parametrize(
+    ("pattern", "joints", "fingers"),
+    [
+        ("**/panda.urdf", 7, 2),
+        ("**/tiago_no_hand.urdf", 8, 0),
+        ("**/ur5_robot.urdf", 6, 0),
+        ("**/pr2.urdf", 8, 2),
+        ("**/baxter.urdf", 7, 2),
+        ("**/talos_reduced.urdf", 9, 1),
+        ("**/z1.urdf", 6, 1),
+    ],
+)
+def test_arms_of_robots_that_others_described(pattern: str, joints: int, fingers: int) -> None:
+    best = arms_of(read_urdf(robots(pattern)))[0]
+    assert (len(best.joints), len(best.fingers)) == (joints, fingers)
+
+
+@pytest.mark.parametrize(
+    "pattern", ["**/solo12.urdf", "**/go1.urdf", "**/anymal_b*/**/anymal.urdf", "**/allegro_right_hand.urdf"]
+)
+def test_legs_and_hands_alone_are_no_arms(pattern: str) -> None:
+    file = read_urdf(robots(pattern))
+    assert arms_of(file) == []
+    with pytest.raises(vkc.InputError, match="no arm was found"):
+        choose([], None, file)
+
+
+def test_wheels_say_how_the_base_moves(tmp_path: Path) -> None:
+    assert base_kind(read_urdf(robots("**/tiago.urdf")).root)[0] == "differential"
+    assert base_kind(read_urdf(robots("**/pr2.urdf")).root)[0] == "omni"
+    assert base_kind(read_urdf(write_arms(tmp_path)).root)[0] == "omni"

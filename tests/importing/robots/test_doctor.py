@@ -1,0 +1,73 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from helpers.arm_urdf import write_arms
+
+import vkc_pin as vkc
+from vkc_pin.importing.robots.doctor import Diagnosis
+
+
+def said(diagnosis: Diagnosis, level: str, topic: str) -> list[str]:
+    return [finding.text for finding in diagnosis.findings if (finding.level, finding.topic) == (level, topic)]
+
+
+def test_the_robot_that_comes_along_is_healthy() -> None:
+    found = vkc.doctor("husky_ur5e", samples=40)
+    assert found.healthy
+    assert said(found, "note", "home")[0].startswith("free")
+
+
+def test_home_in_collision_and_below_the_floor(tmp_path: Path) -> None:
+    robot = vkc.load_robot(write_arms(tmp_path), home={"arm_2_joint": 1.9, "arm_3_joint": 1.9})
+    found = vkc.doctor(robot, samples=20)
+    assert not found.healthy
+    texts = " ".join(said(found, "fault", "home"))
+    assert "collide at home" in texts
+    assert "below the floor" in texts
+    assert str(found).startswith("robot: ")
+    assert "fault" in str(found).splitlines()[1]
+
+
+def test_pairs_that_nothing_brings_apart(tmp_path: Path) -> None:
+    """The first link turns about the vertical, 30 mm above the body."""
+    robot = vkc.load_robot(write_arms(tmp_path), pairs="all")
+    found = vkc.doctor(robot, samples=60, margin=0.035)
+    assert any("body and arm_1 were never more than 30.0 mm" in text for text in said(found, "fault", "pairs"))
+    fewer = vkc.doctor(robot, samples=60, margin=1e-3)
+    assert len(said(fewer, "fault", "pairs")) < len(said(found, "fault", "pairs"))
+
+
+def test_numbers_that_no_file_names(tmp_path: Path) -> None:
+    path = write_arms(tmp_path)
+    text = path.read_text(encoding="utf-8").replace('effort="10" velocity="1.5"', 'effort="0" velocity="0"', 3)
+    path.write_text(text, encoding="utf-8")
+    found = vkc.doctor(path, samples=5)
+    assert "arm_1_joint, arm_2_joint, arm_3_joint (taken: 3.14, 3.14, 3.14)" in said(found, "warning", "limits")[0]
+    assert "arm_1_joint" in said(found, "note", "effort")[0]
+    assert "arm_4_joint" not in said(found, "note", "effort")[0]
+    assert "body" in said(found, "note", "mass")[0]
+
+
+def test_hands_that_look_the_wrong_way(tmp_path: Path) -> None:
+    path = write_arms(tmp_path)
+    assert said(vkc.doctor(path, samples=5), "warning", "hand") == ["no link may touch what is grasped"]
+    text = path.read_text(encoding="utf-8").replace(
+        "</robot>",
+        '<link name="back"/><joint name="back_joint" type="fixed"><origin xyz="0 0 -0.1"/><parent link="hand"/>'
+        '<child link="back"/></joint></robot>',
+    )
+    path.write_text(text, encoding="utf-8")
+    settings = "urdf: robot.urdf\ntool_frame: back\ntouch_links: [hand, finger_a, finger_b]\n"
+    (tmp_path / "robot.yaml").write_text(settings, encoding="utf-8")
+    assert "in front of its tool frame back" in said(vkc.doctor(tmp_path, samples=5), "fault", "hand")[0]
+
+
+def test_wrong_arguments_are_named() -> None:
+    for wrong in ({"samples": 0}, {"margin": -1.0}):
+        with pytest.raises(vkc.InputError):
+            vkc.doctor("husky_ur5e", **wrong)  # type: ignore[arg-type]
+    with pytest.raises(vkc.UnknownNameError) as caught:
+        vkc.doctor("husky_ur5")
+    assert caught.value.nearest == "husky_ur5e"

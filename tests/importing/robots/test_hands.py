@@ -1,0 +1,55 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.arm_urdf import write_arms
+
+from vkc_pin.files.urdf import read_urdf
+from vkc_pin.importing.robots.arms import Arm, bodies, find_arms
+from vkc_pin.importing.robots.hands import look_at
+from vkc_pin.models.robot_model import full_model
+
+
+def found(path: Path) -> tuple[Arm, object]:
+    file = read_urdf(path)
+    arm = find_arms(file, bodies(file), {}, {shape.link for shape in file.shapes("collision")})[0]
+    return arm, look_at(file, full_model(file), arm)
+
+
+def test_the_frame_lies_between_the_fingertips(tmp_path: Path) -> None:
+    _, hand = found(write_arms(tmp_path))
+    assert hand.link == "arm_5"
+    np.testing.assert_allclose(hand.tool.rotation[:, 2], [0, 0, 1], atol=1e-9)  # approach: where fingers point
+    np.testing.assert_allclose(np.abs(hand.tool.rotation[:, 0]), [0, 1, 0], atol=1e-9)  # closing
+    assert np.linalg.det(hand.tool.rotation) == pytest.approx(1.0)
+    np.testing.assert_allclose(hand.tool.translation[:2], 0.0, atol=2e-3)
+    assert 0.2 + 0.06 + 0.05 < hand.tool.translation[2] < 0.2 + 0.06 + 0.08
+    assert hand.open == {"finger_a_joint": 0.04, "finger_b_joint": 0.04}
+    assert hand.opening == pytest.approx(0.08, abs=0.01)
+    assert set(hand.touch_links) == {"arm_5", "hand", "finger_a", "finger_b"}
+    assert hand.sure == "sure"
+
+
+def test_one_jaw_opens_from_the_hand(tmp_path: Path) -> None:
+    path = write_arms(tmp_path)
+    text = path.read_text(encoding="utf-8")
+    still = text.replace('<joint name="finger_b_joint" type="prismatic">', '<joint name="finger_b_joint" type="fixed">')
+    path.write_text(still, encoding="utf-8")
+    arm, hand = found(path)
+    assert [finger.name for finger in arm.fingers] == ["finger_a_joint"]
+    assert hand.open == {"finger_a_joint": 0.04}
+    np.testing.assert_allclose(hand.tool.rotation[:, 2], [0, 0, 1], atol=0.3)
+    assert np.abs(hand.tool.rotation[1, 0]) > 0.9
+
+
+def test_a_flange_points_along_its_last_axis(tmp_path: Path) -> None:
+    path = write_arms(tmp_path)
+    text = path.read_text(encoding="utf-8")
+    path.write_text(text.replace('type="prismatic"', 'type="fixed"'), encoding="utf-8")
+    arm, hand = found(path)
+    assert arm.fingers == ()
+    assert hand.open == {}
+    np.testing.assert_allclose(hand.tool.rotation[:, 2], [0, 0, 1], atol=0.2)
+    assert hand.tool.translation[2] == pytest.approx(0.2 + 0.14, abs=0.01)  # in front of all that is there

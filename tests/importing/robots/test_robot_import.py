@@ -1,0 +1,117 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import trimesh
+from helpers.arm_urdf import HEIGHT, write_arms
+
+import vkc_pin as vkc
+from vkc_pin.files.writing import write_atomically
+from vkc_pin.importing.robots.homes import HOME_ROOM, Clearances
+
+SAMPLES = 150
+
+
+@pytest.fixture(scope="module")
+def imported(tmp_path_factory: pytest.TempPathFactory) -> vkc.ImportedRobot:
+    """Two arms on a base of their own, 0.35 m up, the base an open bin; imported without anything written by hand."""
+    folder = tmp_path_factory.mktemp("imported")
+    walls = [trimesh.creation.box((0.5, 0.4, 0.05)).apply_translation((0, 0, -0.325))]
+    walls += [trimesh.creation.box((0.02, 0.4, 0.4)).apply_translation((x, 0, -0.099)) for x in (-0.24, 0.24)]
+    write_atomically(folder / "given" / "bin.stl", trimesh.util.concatenate(walls).export(file_type="stl"))
+    file = write_arms(folder / "given", sides=("left_", "right_"), own_base=True, mesh="bin.stl")
+    return vkc.import_robot(file, folder / "mine", arm="right", samples=SAMPLES)
+
+
+def test_the_folder_is_whole(imported: vkc.ImportedRobot) -> None:
+    names = {path.name for path in imported.folder.iterdir()}
+    assert names == {"robot.yaml", "mine.urdf", "mine.srdf", "collision"}
+    again = vkc.load_robot(imported.folder)
+    assert again.name == "mine"
+    assert again.coordinates.names[3:] == tuple(f"right_arm_{k}_joint" for k in range(1, 6))
+    assert again.tool_frame == "tool"
+    assert set(again.touch_links) == {"right_arm_5", "right_hand", "right_finger_a", "right_finger_b"}
+    np.testing.assert_array_equal(again.home, imported.robot.home)
+
+
+def test_what_was_guessed_is_told(imported: vkc.ImportedRobot) -> None:
+    assert imported.arms == ("right", "left")
+    said = str(imported)
+    for part in ("drive_x, drive_y, drive_yaw are locked", "arm: right, 5 joints", "open from 0 to 80 mm", "bin.stl in 3 pieces"):
+        assert part in said, said
+    assert imported.diagnosis.healthy
+
+
+def test_the_base_is_hollow_and_stands_on_the_floor(imported: vkc.ImportedRobot) -> None:
+    (piece,) = imported.pieces
+    assert piece.count == 3
+    assert piece.overhead < 0.05
+    assert piece.hull > 1.0
+    assert len(list((imported.folder / "collision").iterdir())) == 3
+    look = Clearances(imported.robot)
+    look.place(imported.robot.home)
+    assert look.floor(moved=False)[0][1] == pytest.approx(0.0, abs=1e-5)
+    robot = imported.robot.model
+    assert robot.frames[robot.getFrameId("body")].placement.translation[2] == pytest.approx(HEIGHT, abs=1e-5)
+
+
+def test_home_has_room(imported: vkc.ImportedRobot) -> None:
+    look = Clearances(imported.robot)
+    look.place(imported.robot.home)
+    assert look.least() >= HOME_ROOM
+    assert len(look.pairs) > 0
+
+
+def test_reachable_poses_are_planned(imported: vkc.ImportedRobot, tmp_path: Path) -> None:
+    scene = tmp_path / "scene.yaml"
+    scene.write_text(f"robot: {imported.folder / 'robot.yaml'}\nstart: {{base: [0, 0, 0]}}\n", encoding="utf-8")
+    loaded = vkc.load_scene(scene)
+    robot, rng = loaded.robot, np.random.default_rng(4)
+    look, data, frame = Clearances(robot), robot.model.createData(), robot.model.getFrameId(robot.tool_frame)
+    goals = []
+    while len(goals) < 2:
+        arm = rng.uniform(robot.lower[3:], robot.upper[3:])
+        look.place(arm)
+        if look.least() > HOME_ROOM:
+            pin.framesForwardKinematics(robot.model, data, robot.coordinates.q(np.concatenate([[1.0, 0.5, 2.0], arm])))
+            goals.append(data.oMf[frame].copy())
+    for goal in goals:
+        plan = vkc.plan(loaded, [vkc.Reach(goal)])
+        assert plan.success, plan.report()
+
+
+def test_a_folder_is_replaced_only_if_asked_and_left_alone_if_importing_fails(tmp_path: Path) -> None:
+    file = write_arms(tmp_path / "given")
+    target = tmp_path / "mine"
+    target.mkdir()
+    (target / "notes.txt").write_text("dear", encoding="utf-8")
+    with pytest.raises(vkc.InputError, match="there already") as caught:
+        vkc.import_robot(file, target)
+    assert "--force" in str(caught.value)
+    with pytest.raises(vkc.UnknownNameError):
+        vkc.import_robot(file, target, arm="third", force=True)
+    assert [path.name for path in target.iterdir()] == ["notes.txt"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["given", "mine"]  # nothing half written
+    vkc.import_robot(file, target, samples=SAMPLES, force=True)
+    assert not (target / "notes.txt").exists()
+    assert (target / "robot.yaml").is_file()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["given", "mine"]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("<sdf/>", r"expected <robot> \(URDF or xacro\) or <mujoco> \(MJCF\), got <sdf>"),
+        ("<robot name='x'><link name='a'/></robot>", "this robot has no shapes"),
+        ("not xml", "not valid XML"),
+    ],
+)
+def test_what_is_no_robot_is_named(tmp_path: Path, text: str, said: str) -> None:
+    file = tmp_path / "wrong.urdf"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(vkc.InputError, match=said):
+        vkc.import_robot(file, tmp_path / "out")
+    assert not (tmp_path / "out").exists()

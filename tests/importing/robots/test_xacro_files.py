@@ -1,0 +1,66 @@
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+import vkc_pin as vkc
+from vkc_pin.files.xml import parse_xml
+from vkc_pin.importing.robots.xacro_files import expand
+
+TEXT = """<?xml version="1.0"?>
+<robot name="two" xmlns:xacro="http://www.ros.org/wiki/xacro">
+  <xacro:include filename="$(find my_parts)/links.xacro"/>
+  <xacro:arg name="length" default="0.3"/>
+  <xacro:stick name="upper" length="$(arg length)"/>
+</robot>
+"""
+PART = """<?xml version="1.0"?>
+<robot xmlns:xacro="http://www.ros.org/wiki/xacro">
+  <xacro:macro name="stick" params="name length">
+    <link name="${name}"><collision><geometry><box size="${2*length} 0.1 0.1"/></geometry></collision></link>
+  </xacro:macro>
+</robot>
+"""
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "work" / "my_robot" / "urdf" / "two.xacro"
+    part = tmp_path / "work" / "my_parts" / "links.xacro"
+    for where, text in ((path, TEXT), (part, PART)):
+        where.parent.mkdir(parents=True)
+        where.write_text(text, encoding="utf-8")
+    return path
+
+
+def size(text: str, file: Path) -> str | None:
+    box = parse_xml(text, file).find("link/collision/geometry/box")
+    assert box is not None
+    return box.get("size")
+
+
+def test_packages_are_found_around_the_file(file: Path) -> None:
+    assert size(expand(file, {}, {}), file) == "0.6 0.1 0.1"
+    assert size(expand(file, {}, {"length": "0.5"}), file) == "1.0 0.1 0.1"
+
+
+def test_a_package_that_is_given_goes_first(file: Path, tmp_path: Path) -> None:
+    other = tmp_path / "elsewhere"
+    other.mkdir()
+    (other / "links.xacro").write_text(PART.replace("2*length", "4*length"), encoding="utf-8")
+    assert size(expand(file, {"my_parts": other}, {}), file).startswith("1.2")  # type: ignore[union-attr]
+
+
+def test_what_is_wrong_is_said(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file.write_text(TEXT.replace("my_parts", "my_prats"), encoding="utf-8")
+    with pytest.raises(vkc.InputError, match="my_prats") as caught:
+        expand(file, {}, {})
+    assert caught.value.file == file
+    file.write_text(TEXT.replace("$(arg length)", "${1/0}"), encoding="utf-8")
+    with pytest.raises(vkc.InputError, match="xacro does not understand this"):
+        expand(file, {}, {})
+    monkeypatch.setitem(sys.modules, "xacro", None)
+    with pytest.raises(vkc.InputError, match=r"vkc-pin\[import\]"):
+        expand(file, {}, {})

@@ -1,0 +1,248 @@
+"""Finds the arms of a robot in the tree of its joints, by its shape and by names."""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Collection, Mapping, Sequence, Set
+from dataclasses import dataclass, field
+
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.files.urdf import UrdfFile
+
+__all__ = ["Arm", "Body", "base_kind", "bodies", "choose", "find_arms", "own_base"]
+
+_MOVING = ("revolute", "continuous", "prismatic")
+_FINGER = 7  # joints in the longest finger of a hand
+_ARM = 3  # joints, at least, that carry a hand; one more without a hand
+_HAND_WORDS = re.compile(r"finger|thumb|gripper|jaw|knuckle|claw|fngr|grip", re.IGNORECASE)
+_ARM_WORDS = re.compile(r"arm|shoulder|elbow|wrist|hand|gripper|ur\d|panda|lift|flange", re.IGNORECASE)
+_TRUNK_WORDS = re.compile(r"shoulder|elbow|arm(?!ature)|neck|head|hip", re.IGNORECASE)
+_WRIST_WORDS = re.compile(r"wrist|yaw|roll|pitch", re.IGNORECASE)
+_OTHER_WORDS = re.compile(
+    r"leg(?!o)|hip|knee|ankle|foot|feet|thigh|calf|shank|haa|hfe|kfe|toe|wheel|caster|head|neck|eye|camera|antenna|tail|propell|rotor"
+    r"|_h[xy]_|_kn_|laser|tilt_mount|ear",
+    re.IGNORECASE,
+)
+_SIDES = {
+    "left": re.compile(r"left|(^|[_\W])l([_\W]|$)|^l[_A-Z]|^L[A-Z]", 0),
+    "right": re.compile(r"right|(^|[_\W])r([_\W]|$)|^r[_A-Z]|^R[A-Z]", 0),
+}
+
+
+@dataclass(eq=False)
+class Body:
+    """Links that fixed joints make one.
+
+    Attributes:
+        links: Their names, the first one nearest to the root.
+        joint: The joint above, None for the root.
+        parent: The body above.
+        children: Those below.
+    """
+
+    links: list[str]
+    joint: ElementTree.Element | None = None
+    parent: Body | None = None
+    children: list[Body] = field(default_factory=list)
+
+    @property
+    def name(self) -> str:
+        """The name of the joint above, "" for the root."""
+        return "" if self.joint is None else self.joint.get("name", "")
+
+    @property
+    def plans(self) -> bool:
+        """Whether the joint above can be planned: it moves by one coordinate, of its own."""
+        return self.joint is not None and self.joint.get("type") in _MOVING and self.joint.find("mimic") is None
+
+    def path(self) -> list[Body]:
+        """Return the bodies from below the root to this one."""
+        return [] if self.parent is None else [*self.parent.path(), self]
+
+    def below(self) -> list[Body]:
+        """Return this body and all that hang on it."""
+        return [self, *(body for child in self.children for body in child.below())]
+
+    def depth(self) -> int:
+        """Return the largest number of joints one after the other below it that can be planned."""
+        return max((child.plans + child.depth() for child in self.children), default=0)
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """An arm.
+
+    Attributes:
+        name: "left", "right", the group's name in an SRDF, or that of the body that carries the hand.
+        joints: The joints that are planned, from the root on; not those of an own planar base.
+        palm: The body at its end, which fingers hang on.
+        fingers: The first body of each finger.
+        sure: "sure", "likely" or "guess".
+        why: What speaks for it.
+    """
+
+    name: str
+    joints: tuple[str, ...]
+    palm: Body
+    fingers: tuple[Body, ...]
+    sure: str
+    why: str
+    score: float
+
+
+def bodies(file: UrdfFile) -> Body:
+    """Return the root of a robot's tree of bodies."""
+    below: dict[str, list[ElementTree.Element]] = {}
+    children = set()
+    for joint in file.root.findall("joint"):
+        below.setdefault(_link(joint, "parent"), []).append(joint)
+        children.add(_link(joint, "child"))
+    root = Body([next(link for link in file.links if link not in children)])
+    waiting = [root]
+    while waiting:
+        body = waiting.pop(0)
+        for link in body.links:  # grows
+            for joint in below.get(link, ()):
+                if joint.get("type") == "fixed":
+                    body.links.append(_link(joint, "child"))
+                else:
+                    body.children.append(Body([_link(joint, "child")], joint, body))
+        waiting += body.children
+    return root
+
+
+def own_base(root: Body, solid: Set[str]) -> tuple[str, ...]:
+    """Return the joints by which a robot drives in its own file: the first ones below the root, of links without shapes.
+
+    They slide, or turn about the vertical, and there are at least two of them.
+
+    Args:
+        root: See `bodies`.
+        solid: The links that have shapes.
+    """
+    found, body = [], root
+    while len(body.children) == 1 and not solid & set(body.links):
+        body = body.children[0]
+        axis = None if body.joint is None else body.joint.find("axis")
+        z = abs(float((axis.get("xyz", "1 0 0") if axis is not None else "1 0 0").split()[2]))
+        kind = None if body.joint is None else body.joint.get("type")
+        if not (kind == "prismatic" or (kind in ("revolute", "continuous") and z > 0.99)):
+            break
+        found.append(body.name)
+    return tuple(found) if len(found) > 1 else ()
+
+
+def base_kind(root: ElementTree.Element) -> tuple[str, str]:
+    """Return how a base moves, by its wheels, and what speaks for it."""
+    turning = [joint.get("name", "").lower() for joint in root.findall("joint") if joint.get("type") == "continuous"]
+    wheels = [name for name in turning if "wheel" in name]
+    names = " ".join(link.get("name", "").lower() for link in root.findall("link"))
+    casters = "caster" in names
+    if any(word in names for word in ("mecanum", "omni", "swerve", "suspension_steer")):
+        return "omni", "wheels that are named so"
+    if wheels and casters and len(wheels) > 4:
+        return "omni", "wheels on casters that turn"
+    if wheels:
+        return "differential", f"{len(wheels)} wheels"
+    return "omni", "no wheels: a base that can go anywhere is put under it; `fixed` for an arm on a table"
+
+
+def find_arms(file: UrdfFile, root: Body, groups: Mapping[str, Sequence[str]], solid: Set[str]) -> list[Arm]:
+    """Return the arms of a robot, the best first.
+
+    A hand is a body below at least three joints from which fingers branch: at least two of at most seven joints each, or
+    one whose name says that it is a jaw. Chains without a hand are arms if they have four joints and their names are not those of
+    legs, heads and wheels.
+
+    Args:
+        file: The robot.
+        root: See `bodies`.
+        groups: Groups of an SRDF, which name arms.
+        solid: The links that have shapes.
+    """
+    base = own_base(root, solid)
+    everything, found = root.below(), []
+    palms: list[Body] = []
+    for body in everything:
+        if any(above in palms for above in body.path()[:-1]) or len(_planned(body, base)) < _ARM:
+            continue
+        if _is_palm(body):
+            palms.append(body)
+    inside = {id(below) for palm in palms for below in palm.below()}
+    carrying = {id(above) for palm in palms for above in palm.path()}
+    tips = [body for body in everything if not body.children and id(body) not in inside | carrying]
+    for body in palms + tips:
+        fingers = tuple(child for child in body.children if any(solid & set(below.links) for below in child.below()))
+        joints = _planned(body, base)
+        own = [*joints[-5:], *body.links[:2]]
+        other = sum(bool(_OTHER_WORDS.search(name)) for name in own)
+        words = sum(bool(_ARM_WORDS.search(name)) for name in own)
+        if not joints or other > words or (body in tips and (len(joints) <= _ARM or other)):
+            continue
+        score = 3.0 * bool(fingers) + 2.0 * bool(words) + min(len(joints), 7) / 7.0
+        sure = "sure" if fingers and words and len(joints) > _ARM else "likely" if fingers or words else "guess"
+        why = f"{len(joints)} joints, " + (f"{len(fingers)} fingers" if fingers else "no fingers")
+        why += ", named like an arm" if words else ""
+        found.append(Arm(_named(joints, body, groups), joints, body, fingers, sure, why, score))
+    if sum(arm.sure == "guess" for arm in found) > 2:  # fingers of a hand, legs
+        found = [arm for arm in found if arm.sure != "guess"]
+    found.sort(key=lambda arm: -arm.score)
+    names = [arm.name for arm in found]
+    return [arm if names.count(arm.name) == 1 else Arm(arm.palm.links[0], *_rest(arm)) for arm in found]
+
+
+def choose(arms: Sequence[Arm], name: str | None, file: UrdfFile) -> Arm:
+    """Return the arm of a name, or that contains it, or the best one.
+
+    Raises:
+        InputError: There is no arm.
+        UnknownNameError: There is none of that name.
+    """
+    if not arms:
+        expected = "at least four joints one after the other, or a hand on three; or tool_frame, its name"
+        raise InputError("no arm was found", file=file.path, expected=expected)
+    if name is None:
+        return arms[0]
+    fitting = [arm for arm in arms if arm.name == name] or [arm for arm in arms if name.lower() in arm.name.lower()]
+    if not fitting:
+        raise UnknownNameError("arm", name, [arm.name for arm in arms], file=file.path, field="arm")
+    return fitting[0]
+
+
+def _rest(arm: Arm) -> tuple[tuple[str, ...], Body, tuple[Body, ...], str, str, float]:
+    return arm.joints, arm.palm, arm.fingers, arm.sure, arm.why, arm.score
+
+
+def _is_palm(body: Body) -> bool:
+    """Return whether fingers hang on a body: two or more, or one jaw that is called so."""
+    if not body.children or body.depth() > _FINGER or not any(below.plans for below in body.below()[1:]):
+        return False
+    if any(_TRUNK_WORDS.search(f"{child.name} {child.links[0]}") for child in body.children):
+        return False
+    if len(body.children) == 1:
+        jaw = body.children[0]
+        return bool(_HAND_WORDS.search(jaw.name)) and not _WRIST_WORDS.search(jaw.name) and not jaw.children
+    named = [bool(_HAND_WORDS.search(f"{child.name} {child.links[0]}")) for child in body.children]
+    other = [bool(_OTHER_WORDS.search(f"{child.name} {child.links[0]}")) for child in body.children]
+    return any(named) or not any(other)
+
+
+def _planned(body: Body, base: Collection[str]) -> tuple[str, ...]:
+    return tuple(above.name for above in body.path() if above.plans and above.name not in base)
+
+
+def _named(joints: Sequence[str], palm: Body, groups: Mapping[str, Sequence[str]]) -> str:
+    """Return what an arm is called: by the smallest group that has its last joints, by its side, or by its end."""
+    last = set(joints[-4:])
+    if fitting := [name for name, members in groups.items() if last <= set(members)]:
+        return min(fitting, key=lambda name: (len(groups[name]), name))
+    for side, pattern in _SIDES.items():
+        if sum(bool(pattern.search(name)) for name in [*joints[-3:], palm.links[0]]) >= 2:
+            return side
+    return palm.links[0]
+
+
+def _link(joint: ElementTree.Element, key: str) -> str:
+    element = joint.find(key)
+    return "" if element is None else element.get("link", "")

@@ -1,0 +1,188 @@
+"""Finds where an arm rests: free of collision, in the middle of its joints' ranges, the hand not far from the base."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import coal
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.arrays import Floats
+from vkc_pin.models.robot import Robot
+from vkc_pin.models.shapes import world_box
+
+__all__ = ["HOME_ROOM", "Clearances", "Home", "find_home", "never_apart", "standing"]
+
+HOME_ROOM = 0.03
+"""Between links at home, and to the floor, if there can be so much [m]: more than the usual margin."""
+
+_SAMPLES = 600
+_STEPS = 150  # of the search around the best sample
+
+
+@dataclass(frozen=True, eq=False)
+class Home:
+    """Where an arm rests.
+
+    Attributes:
+        positions: Of the planned joints, shape (n − 3,), [m] and [rad].
+        clearance: The least distance there between links that are kept apart, and to the floor [m].
+        how: Where it is from.
+    """
+
+    positions: Floats
+    clearance: float
+    how: str
+
+
+class Clearances:
+    """Distances between the links of a robot, and of those that the arm moves to the floor.
+
+    Args:
+        robot: The robot, with its collision pairs.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
+        self._data, self._shapes = robot.model.createData(), robot.collision.geometryObjects
+        self.request, self.result = coal.DistanceRequest(), coal.DistanceResult()
+        self.pairs = [(pair.first, pair.second) for pair in robot.collision.collisionPairs]
+        for shape in self._shapes:
+            shape.geometry.computeLocalAABB()
+
+    def place(self, arm: Floats) -> None:
+        """Put the arm at `arm`, shape (n − 3,), the base at the origin."""
+        q = self.robot.coordinates.q(np.concatenate([np.zeros(3), arm]))
+        pin.forwardKinematics(self.robot.model, self._data, q)
+        self._places = [self._data.oMi[shape.parentJoint] * shape.placement for shape in self._shapes]
+
+    def between(self, pair: tuple[int, int], worth: float = np.inf) -> float:
+        """Return the distance of two shapes [m]; a lower bound of it where it is larger than `worth`."""
+        one, other = (self._shapes[k].geometry for k in pair)
+        here, there = (self._places[k] for k in pair)
+        gap = here.act(one.aabb_center) - there.act(other.aabb_center)
+        bound = float(np.linalg.norm(gap)) - one.aabb_radius - other.aabb_radius
+        if bound > worth:
+            return bound
+        self.result.clear()
+        places = (coal.Transform3s(place.rotation, place.translation) for place in (here, there))
+        first, second = places
+        return float(coal.distance(one, first, other, second, self.request, self.result))
+
+    def floor(self, *, moved: bool = True) -> list[tuple[str, float]]:
+        """Return link → how far above the floor it is [m], of those that the arm moves or of the others, the lowest first."""
+        heights: dict[str, float] = {}
+        for k in (k for k, shape in enumerate(self._shapes) if (shape.parentJoint > 1) == moved):
+            low = float(world_box(self._shapes[k].geometry, self._places[k])[0][2])
+            link = self.robot.link_of(k)
+            heights[link] = min(low, heights.get(link, np.inf))
+        return sorted(heights.items(), key=lambda item: item[1])
+
+    def least(self, worth: float = np.inf) -> float:
+        """Return the least distance between links and to the floor [m], looked at up to `worth`."""
+        floor = self.floor()
+        nearest = min(worth, floor[0][1]) if floor else worth
+        for pair in self.pairs:
+            nearest = min(nearest, self.between(pair, nearest))
+        return nearest
+
+    def links(self, below: float) -> list[tuple[str, str, float]]:
+        """Return pairs of links closer than `below` [m], the closest first."""
+        found: dict[tuple[str, str], float] = {}
+        for pair in self.pairs:
+            distance = self.between(pair, below)
+            if distance < below:
+                names = (self.robot.link_of(pair[0]), self.robot.link_of(pair[1]))
+                found[names] = min(distance, found.get(names, np.inf))
+        return sorted(((*names, distance) for names, distance in found.items()), key=lambda item: item[2])
+
+
+def find_home(robot: Robot, named: Iterable[tuple[str, Floats]], *, seed: int = 0) -> Home:
+    """Return where the arm rests.
+
+    That is the first of the `named` configurations with room around it, else the best one of random ones: with room first, then
+    near the middle of the joints' ranges, with the hand above the base rather than far out.
+
+    Args:
+        robot: The robot, with its collision pairs.
+        named: Configurations to look at first, shape (n − 3,) each, with what to call them.
+        seed: Of the random numbers.
+    """
+    look = Clearances(robot)
+    best = None
+    for how, positions in named:
+        look.place(positions)
+        clearance = look.least()
+        if clearance >= HOME_ROOM:
+            return Home(positions, clearance, how)
+        if best is None or clearance > best.clearance:
+            best = Home(positions, clearance, how)
+    rng = np.random.default_rng(seed)
+    low, high = np.maximum(robot.lower[3:], -np.pi), np.minimum(robot.upper[3:], np.pi)
+    middle, span = 0.5 * (low + high), np.maximum(high - low, 1e-9)
+    frame, data = robot.model.getFrameId(robot.tool_frame), robot.model.createData()
+
+    def cost(arm: Floats) -> tuple[float, float]:
+        look.place(arm)
+        clearance = look.least(HOME_ROOM)
+        pin.framesForwardKinematics(robot.model, data, robot.coordinates.q(np.concatenate([np.zeros(3), arm])))
+        out = float(np.hypot(*data.oMf[frame].translation[:2]))
+        return 100.0 * max(0.0, HOME_ROOM - clearance) + float((((arm - middle) / span) ** 2).mean()) + 0.3 * out, clearance
+
+    trials = [middle, *rng.uniform(low, high, (_SAMPLES, len(low)))]
+    value, clearance, chosen = min(((*cost(arm), k) for k, arm in enumerate(trials)), key=lambda item: item[0])
+    arm = trials[chosen]
+    for width in np.geomspace(0.2, 0.01, _STEPS):
+        trial = np.clip(arm + width * span * rng.standard_normal(len(arm)), low, high)
+        new, gap = cost(trial)
+        if new < value:
+            arm, value, clearance = trial, new, gap
+    if best is not None and best.clearance >= clearance:
+        return best
+    look.place(arm)
+    return Home(arm, look.least(), "searched for")
+
+
+def never_apart(robot: Robot, margin: float, *, samples: int, seed: int = 0) -> dict[tuple[str, str], float]:
+    """Return the pairs of links that no random configuration brings apart by `margin` [m], with the furthest that one does.
+
+    Args:
+        robot: The robot, with its collision pairs and its home, which is looked at as well.
+        margin: A distance [m].
+        samples: How many configurations to look at.
+        seed: Of the random numbers.
+    """
+    look, rng = Clearances(robot), np.random.default_rng(seed)
+    low, high = np.maximum(robot.lower[3:], -np.pi), np.minimum(robot.upper[3:], np.pi)
+    left: dict[tuple[str, str], list[tuple[int, int]]] = {}
+    for pair in look.pairs:
+        left.setdefault((robot.link_of(pair[0]), robot.link_of(pair[1])), []).append(pair)
+    furthest = dict.fromkeys(left, -np.inf)
+    for arm in (robot.home, *rng.uniform(low, high, (samples, len(low)))):
+        look.place(arm)
+        for links, pairs in list(left.items()):
+            furthest[links] = max(furthest[links], min(look.between(pair, margin) for pair in pairs))
+            if furthest[links] >= margin:
+                del left[links]
+        if not left:
+            break
+    return {links: furthest[links] for links in left}
+
+
+def standing(robot: Robot, *, samples: int = 200, seed: int = 0) -> tuple[float, float]:
+    """Return how high above the floor [m] the lowest of what drives along is, and how high the arm's links can be.
+
+    The latter is that of the link that can be least high: a shoulder at the floor never leaves it.
+    """
+    look, rng = Clearances(robot), np.random.default_rng(seed)
+    look.place(robot.home)
+    still = [height for link, height in look.floor(moved=False)]
+    low, high = np.maximum(robot.lower[3:], -np.pi), np.minimum(robot.upper[3:], np.pi)
+    best: dict[str, float] = {}
+    for arm in rng.uniform(low, high, (samples, len(low))):
+        look.place(arm)
+        for link, height in look.floor():
+            best[link] = max(height, best.get(link, -np.inf))
+    return min(still, default=0.0), min(best.values(), default=np.inf)

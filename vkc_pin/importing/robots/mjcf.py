@@ -1,0 +1,243 @@
+"""Writes what MuJoCo makes of an MJCF file as a URDF.
+
+MuJoCo's compiler resolves includes, defaults, classes and units; what it makes is read here, not the file.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.arrays import Floats
+from vkc_pin.errors import InputError
+from vkc_pin.importing.extras import extra
+
+__all__ = ["Converted", "convert"]
+
+_FAR = 20.0  # [m] limits of a joint that slides without any
+
+
+@dataclass
+class Converted:
+    """A URDF made of an MJCF file.
+
+    Attributes:
+        root: The URDF.
+        states: Name of a key frame → joint → position, [m] or [rad].
+        notes: What could not be kept as it was.
+    """
+
+    root: ElementTree.Element
+    states: dict[str, dict[str, float]] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+
+def convert(file: Path, folder: Path) -> Converted:
+    """Return the largest tree of joints in an MJCF file as a URDF, with its meshes as STL files in `folder`.
+
+    Bodies become links, several joints of a body a chain of links. What cannot be said in a URDF is named in the notes: balls
+    and free joints below the root are locked, planes left out. What else stands in the world is left out.
+
+    Raises:
+        InputError: MuJoCo is not installed, or does not understand the file; the error says what it says.
+    """
+    mujoco = extra("mujoco", what="an MJCF file", file=file)
+    try:
+        model = mujoco.MjModel.from_xml_path(str(file.resolve()))
+    except (ValueError, RuntimeError) as error:
+        raise InputError(f"MuJoCo does not understand this: {' '.join(str(error).split())}", file=file) from error
+    return _Converter(mujoco, model, file, folder).convert()
+
+
+class _Converter:
+    def __init__(self, mujoco: Any, model: Any, file: Path, folder: Path) -> None:
+        self._mujoco, self._model, self._folder, self._file = mujoco, model, folder, file
+        self._result = Converted(ElementTree.Element("robot", name=file.stem))
+        self._names: dict[tuple[str, str], str] = {}
+        self._meshes: dict[int, Path] = {}
+
+    def convert(self) -> Converted:
+        """Return the largest tree as a URDF."""
+        model = self._model
+        bodies = range(1, model.nbody)
+        sizes: dict[int, int] = {}
+        for body in bodies:
+            root = int(model.body_rootid[body])
+            sizes[root] = sizes.get(root, 0) + int(model.body_jntnum[body])
+        if not sizes or max(sizes.values()) == 0:
+            raise InputError("nothing moves here", file=self._file, expected="a body with joints")
+        chosen = max(sizes, key=lambda root: sizes[root])
+        if others := [self._name("body", root) for root in sizes if root != chosen]:
+            listed = ", ".join(others[:8]) + (", ..." if len(others) > 8 else "")
+            self._result.notes.append(f"left out what else stands in the world: {listed}")
+        for body in bodies:
+            if model.body_rootid[body] == chosen:
+                self._body(body, root=body == chosen)
+        self._couplings()
+        for key in range(model.nkey):
+            self._result.states[self._name("key", key)] = {
+                self._name("joint", j): float(model.key_qpos[key, address] - model.qpos0[address])
+                for j in self._scalars()
+                if (address := model.jnt_qposadr[j]) >= 0
+            }
+        return self._result
+
+    def _name(self, kind: str, index: int) -> str:
+        """Return the name of something, without what is no name of a URDF's frames, and given only once."""
+        code = getattr(self._mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
+        given = self._mujoco.mj_id2name(self._model, code, index) or f"{kind}_{index}"
+        plain = "".join(letter if letter.isalnum() or letter in "_-" else "_" for letter in given)
+        return self._names.setdefault((kind, f"{index}"), plain if plain not in self._names.values() else f"{plain}_{kind}")
+
+    def _scalars(self) -> list[int]:
+        """Return the joints that turn or slide, and belong to the robot."""
+        named = {joint.get("name") for joint in self._result.root.findall("joint")}
+        return [j for j in range(self._model.njnt) if self._name("joint", j) in named]
+
+    def _body(self, body: int, *, root: bool) -> None:
+        model, kinds, name = self._model, self._mujoco.mjtJoint, self._name("body", body)
+        placement = pin.SE3(_rotation(model.body_quat[body]), model.body_pos[body].copy())
+        above = f"{name}_root" if root else self._name("body", int(model.body_parentid[body]))
+        if root:
+            ElementTree.SubElement(self._result.root, "link", name=above)
+        for joint in range(int(model.body_jntadr[body]), int(model.body_jntadr[body] + model.body_jntnum[body])):
+            kind = int(model.jnt_type[joint])
+            if kind not in (kinds.mjJNT_HINGE, kinds.mjJNT_SLIDE):
+                if not root:
+                    self._result.notes.append(f"joint {self._name('joint', joint)} is locked: a URDF has no such joint")
+                elif kind == kinds.mjJNT_FREE:
+                    placement = pin.SE3.Identity()  # it drives: where it stands is not part of it
+                continue
+            anchor = pin.SE3(np.eye(3), model.jnt_pos[joint].copy())
+            below = f"{self._name('joint', joint)}_link"
+            ElementTree.SubElement(self._result.root, "link", name=below)
+            self._joint(joint, above, below, placement * anchor)
+            above, placement = below, anchor.inverse()
+        link = ElementTree.SubElement(self._result.root, "link", name=name)
+        fixed = ElementTree.SubElement(self._result.root, "joint", name=f"{name}_fixed", type="fixed")
+        _connect(fixed, above, name, placement)
+        self._inertia(link, body)
+        self._shapes(link, body)
+
+    def _joint(self, joint: int, above: str, below: str, placement: pin.SE3) -> None:
+        model, name = self._model, self._name("joint", joint)
+        turns = model.jnt_type[joint] == self._mujoco.mjtJoint.mjJNT_HINGE
+        limited = bool(model.jnt_limited[joint])
+        kind = ("revolute" if limited else "continuous") if turns else "prismatic"
+        element = ElementTree.SubElement(self._result.root, "joint", name=name, type=kind)
+        _connect(element, above, below, placement)
+        ElementTree.SubElement(element, "axis", xyz=_text(model.jnt_axis[joint]))
+        low, high = model.jnt_range[joint] - model.qpos0[model.jnt_qposadr[joint]]
+        if not limited and not turns:
+            low, high = -_FAR, _FAR
+        limit = {"lower": f"{low:.9g}", "upper": f"{high:.9g}"} if kind != "continuous" else {}
+        effort = {"effort": f"{value:.9g}"} if (value := self._effort(joint)) > 0.0 else {}
+        ElementTree.SubElement(element, "limit", {**limit, **effort})
+
+    def _effort(self, joint: int) -> float:
+        """Return the largest force [N] or torque [N m] of a joint; 0 if none is named."""
+        model = self._model
+        if model.jnt_actfrclimited[joint]:
+            return float(np.abs(model.jnt_actfrcrange[joint]).max())
+        by_joint = model.actuator_trntype == int(self._mujoco.mjtTrn.mjTRN_JOINT)
+        for actuator in np.flatnonzero(by_joint & (model.actuator_trnid[:, 0] == joint)):
+            if model.actuator_forcelimited[actuator]:
+                return float(np.abs(model.actuator_forcerange[actuator]).max() * abs(model.actuator_gear[actuator, 0]))
+        return 0.0
+
+    def _inertia(self, link: ElementTree.Element, body: int) -> None:
+        model = self._model
+        if model.body_mass[body] <= 0.0:
+            return
+        inertial = ElementTree.SubElement(link, "inertial")
+        _origin(inertial, pin.SE3(_rotation(model.body_iquat[body]), model.body_ipos[body].copy()))
+        ElementTree.SubElement(inertial, "mass", value=f"{model.body_mass[body]:.9g}")
+        moments = dict(zip(("ixx", "iyy", "izz"), (f"{moment:.9g}" for moment in model.body_inertia[body]), strict=True))
+        ElementTree.SubElement(inertial, "inertia", {**moments, "ixy": "0", "ixz": "0", "iyz": "0"})
+
+    def _shapes(self, link: ElementTree.Element, body: int) -> None:
+        model = self._model
+        geoms = range(int(model.body_geomadr[body]), int(model.body_geomadr[body] + model.body_geomnum[body]))
+        solid = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g]]
+        seen = [g for g in geoms if g not in solid] or solid
+        for kind, chosen in (("visual", seen), ("collision", solid)):
+            for geom in chosen:
+                self._shape(link, kind, geom)
+
+    def _shape(self, link: ElementTree.Element, kind: str, geom: int) -> None:
+        import trimesh
+
+        model, types = self._model, self._mujoco.mjtGeom
+        size, shape = model.geom_size[geom], int(model.geom_type[geom])
+        shapes: dict[int, tuple[str, dict[str, str]]] = {
+            int(types.mjGEOM_SPHERE): ("sphere", {"radius": f"{size[0]:.9g}"}),
+            int(types.mjGEOM_CAPSULE): ("capsule", {"radius": f"{size[0]:.9g}", "length": f"{2.0 * size[1]:.9g}"}),
+            int(types.mjGEOM_CYLINDER): ("cylinder", {"radius": f"{size[0]:.9g}", "length": f"{2.0 * size[1]:.9g}"}),
+            int(types.mjGEOM_BOX): ("box", {"size": _text(2.0 * size)}),
+        }
+        if shape == types.mjGEOM_MESH:
+            data = int(model.geom_dataid[geom])
+            if data not in self._meshes:
+                vertices = model.mesh_vert[model.mesh_vertadr[data] :][: model.mesh_vertnum[data]]
+                faces = model.mesh_face[model.mesh_faceadr[data] :][: model.mesh_facenum[data]]
+                self._meshes[data] = self._write(self._name("mesh", data), trimesh.Trimesh(vertices, faces, process=False))
+            shapes[shape] = ("mesh", {"filename": str(self._meshes[data])})
+        elif shape == types.mjGEOM_ELLIPSOID:
+            ball = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
+            file = self._write(self._name("geom", geom), ball.apply_transform(np.diag([*size, 1.0])))
+            shapes[shape] = ("mesh", {"filename": str(file)})
+        if shape not in shapes:
+            self._result.notes.append(f"a shape of {link.get('name')} is left out: neither a solid nor a mesh")
+            return
+        element = ElementTree.SubElement(link, kind)
+        _origin(element, pin.SE3(_rotation(model.geom_quat[geom]), model.geom_pos[geom].copy()))
+        tag, attributes = shapes[shape]
+        ElementTree.SubElement(ElementTree.SubElement(element, "geometry"), tag, attributes)
+        if kind == "visual":
+            material = int(model.geom_matid[geom])
+            colour = model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]
+            named = ElementTree.SubElement(element, "material", name=f"{link.get('name')}_{geom}")
+            ElementTree.SubElement(named, "color", rgba=_text(colour))
+
+    def _write(self, name: str, mesh: Any) -> Path:
+        file = self._folder / f"{name}.stl"
+        self._folder.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(mesh.export(file_type="stl"))
+        return file
+
+    def _couplings(self) -> None:
+        """Write couplings of two joints as <mimic>."""
+        model, joints = self._model, {joint.get("name"): joint for joint in self._result.root.findall("joint")}
+        for k in np.flatnonzero(model.eq_type == int(self._mujoco.mjtEq.mjEQ_JOINT)):
+            names = [self._name("joint", int(ids[k])) for ids in (model.eq_obj1id, model.eq_obj2id) if ids[k] >= 0]
+            if len(names) == 2 and names[0] in joints and names[1] in joints and joints[names[0]].find("mimic") is None:
+                offset, factor = model.eq_data[k, :2]
+                ElementTree.SubElement(
+                    joints[names[0]], "mimic", joint=names[1], multiplier=f"{factor:.9g}", offset=f"{offset:.9g}"
+                )
+
+
+def _rotation(quaternion: Floats) -> Floats:
+    """Return the rotation, shape (3, 3), of a quaternion w, x, y, z."""
+    return np.array(pin.Quaternion(*(float(part) for part in quaternion)).normalized().matrix())
+
+
+def _text(values: Any) -> str:
+    return " ".join(f"{value:.9g}" for value in values)
+
+
+def _origin(element: ElementTree.Element, placement: pin.SE3) -> None:
+    ElementTree.SubElement(
+        element, "origin", xyz=_text(placement.translation), rpy=_text(pin.rpy.matrixToRpy(placement.rotation))
+    )
+
+
+def _connect(joint: ElementTree.Element, above: str, below: str, placement: pin.SE3) -> None:
+    _origin(joint, placement)
+    ElementTree.SubElement(joint, "parent", link=above)
+    ElementTree.SubElement(joint, "child", link=below)

@@ -1,0 +1,292 @@
+"""Makes a robot's folder of a file that was downloaded: robot.yaml, URDF, SRDF, meshes and a home."""
+
+from __future__ import annotations
+
+import dataclasses
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import yaml
+
+from vkc_pin.arguments import flag, mapping, text, whole
+from vkc_pin.arrays import Floats
+from vkc_pin.errors import InputError
+from vkc_pin.files.resources import file_path
+from vkc_pin.files.srdf import read_srdf
+from vkc_pin.files.urdf import UrdfFile
+from vkc_pin.files.writing import folder_at_once
+from vkc_pin.importing.robots.arms import Arm, base_kind, bodies, choose, find_arms, own_base
+from vkc_pin.importing.robots.doctor import Diagnosis, Finding, doctor
+from vkc_pin.importing.robots.hands import Hand, look_at
+from vkc_pin.importing.robots.homes import HOME_ROOM, Home, find_home, never_apart, standing
+from vkc_pin.importing.robots.pieces import Piece, own_meshes
+from vkc_pin.importing.robots.sources import Source, read_source
+from vkc_pin.models.robot import Robot
+from vkc_pin.models.robot_file import load_robot
+from vkc_pin.models.robot_model import full_model, nearest_position
+from vkc_pin.models.self_collisions import write_srdf
+from vkc_pin.options import Options
+
+__all__ = ["ImportedRobot", "import_robot"]
+
+_SAMPLES = 2000
+_NEAR = 500  # of them, to find pairs that no configuration brings apart by the margin
+_PIECES = 8
+_STANDING = 0.005  # [m]: a root that is closer to the floor stands on it
+
+
+@dataclass(frozen=True, eq=False)
+class ImportedRobot:
+    """A robot that was imported.
+
+    Attributes:
+        folder: Where its files are; `load_robot` takes it.
+        robot: The robot.
+        arms: The names of all arms that were found, the one that was taken first.
+        pieces: What became of the meshes that collide.
+        diagnosis: What was guessed, and what `doctor` finds.
+    """
+
+    folder: Path
+    robot: Robot
+    arms: tuple[str, ...]
+    pieces: tuple[Piece, ...]
+    diagnosis: Diagnosis
+
+    def __str__(self) -> str:
+        return f"{self.diagnosis}\nwrote {self.folder}"
+
+
+def import_robot(
+    file: str | Path,
+    folder: str | Path | None = None,
+    *,
+    arm: str | None = None,
+    tool_frame: str | None = None,
+    srdf: str | Path | None = None,
+    packages: Mapping[str, str | Path] | None = None,
+    arguments: Mapping[str, str] | None = None,
+    most_pieces: int = _PIECES,
+    samples: int = _SAMPLES,
+    seed: int = 0,
+    force: bool = False,
+) -> ImportedRobot:
+    """Make a robot's folder of a URDF, xacro or MJCF file.
+
+    The folder holds robot.yaml, a URDF with a frame `tool` where the hand grasps, an SRDF with sampled pairs that need no check,
+    and meshes, those that collide as convex pieces. What the file does not say is guessed from names and shapes, and told.
+
+    Args:
+        file: The file; its first element says what it is.
+        folder: Where to write; by default a folder of the file's name in the current one.
+        arm: Which arm to plan: a name of `ImportedRobot.arms`, or a part of one ("left"); of groups of the SRDF if there are any.
+        tool_frame: The frame that grasps, if it is not to be guessed; see docs/robots.md for how it has to lie.
+        srdf: An SRDF; by default the one beside the file.
+        packages: Folders for `package://` and `$(find ...)`; others are looked for around the file.
+        arguments: Of a xacro file.
+        most_pieces: The largest number of convex pieces of a mesh; 1 keeps hulls.
+        samples: How many configurations are looked at for pairs that need no check.
+        seed: Of the random numbers.
+        force: Replace a folder that is there.
+
+    Raises:
+        InputError: The file cannot be read, no arm was found, the folder is there, or a package of the extra `import` is missing.
+        UnknownNameError: There is no such arm or frame; the error names the nearest one.
+    """
+    path = file_path(file, "file", "a URDF, xacro or MJCF file")
+    name = path.name.split(".")[0]
+    target = Path(name) if folder is None else file_path(folder, "folder", "a folder")
+    for field, given in (("arm", arm), ("tool_frame", tool_frame)):
+        if given is not None:
+            text(given, field, "a name")
+    whole(most_pieces, "most_pieces", low=1)
+    whole(samples, "samples", low=1)
+    places = {key: file_path(place, f"packages.{key}") for key, place in mapping(packages or {}, "packages").items()}
+    given_arguments = {key: str(value) for key, value in mapping(arguments or {}, "arguments").items()}
+    beside = None if srdf is None else file_path(srdf, "srdf")
+    with folder_at_once(target, force=flag(force, "force")) as staging:
+        source = read_source(path, staging / ".meshes", packages=places, arguments=given_arguments, srdf=beside)
+        made = _Importer(source, staging, target.resolve().name).make(arm, tool_frame, most_pieces, samples, seed)
+    robot = load_robot(target / "robot.yaml")
+    return dataclasses.replace(made, folder=target, robot=robot)
+
+
+class _Importer:
+    def __init__(self, source: Source, folder: Path, name: str) -> None:
+        self._source, self._folder, self._name = source, folder, name
+        self._file = source.file
+        self._settings: dict[str, Any] = {"urdf": f"{name}.urdf", "srdf": f"{name}.srdf"}
+        self._findings = [Finding("note", "file", note) for note in source.notes]
+
+    def make(self, arm: str | None, tool_frame: str | None, most_pieces: int, samples: int, seed: int) -> ImportedRobot:
+        """Write everything into the folder."""
+        solid = {shape.link for shape in self._file.shapes("collision")}
+        if not solid:
+            self._collide_as_seen()
+            solid = {shape.link for shape in self._file.shapes("collision")}
+        tree = bodies(self._file)
+        driving = own_base(tree, solid)
+        arms = find_arms(self._file, tree, self._source.groups, solid)
+        chosen = None if tool_frame is not None and not arms else choose(arms, arm, self._file)
+        self._arm(chosen, arms, driving)
+        root, pieces, notes = own_meshes(self._file, self._folder, most_pieces=most_pieces)
+        self._findings += [Finding("warning", "shapes", note) for note in notes]
+        self._file = UrdfFile(self._folder / f"{self._name}.urdf", ElementTree.tostring(root, encoding="unicode"), root)
+        if chosen is not None:
+            self._hand(look_at(self._file, full_model(self._file), chosen), tool_frame)
+        if tool_frame is not None:
+            self._settings["tool_frame"] = tool_frame
+        self._write()
+        robot = self._on_the_floor(load_robot(self._folder / "robot.yaml", pairs="all"), seed)
+        robot, home = self._rest(robot, samples, seed)
+        self._told(pieces, home)
+        return self._result(robot, arms, chosen, pieces)
+
+    def _result(self, robot: Robot, arms: list[Arm], chosen: Arm | None, pieces: list[Piece]) -> ImportedRobot:
+        examined = doctor(robot)
+        order = ("fault", "warning", "note")
+        findings = sorted([*examined.findings, *self._findings], key=lambda finding: order.index(finding.level))
+        names = [] if chosen is None else [chosen.name, *(arm.name for arm in arms if arm is not chosen)]
+        return ImportedRobot(self._folder, robot, tuple(names), tuple(pieces), Diagnosis(self._name, tuple(findings)))
+
+    def _collide_as_seen(self) -> None:
+        """Let links collide as they are seen: nothing else is there."""
+        for link in self._file.root.findall("link"):
+            for visual in link.findall("visual"):
+                element = ElementTree.SubElement(link, "collision")
+                element.extend(child for child in visual if child.tag in ("origin", "geometry"))
+        if not self._file.shapes("collision"):
+            raise InputError("this robot has no shapes", file=self._file.path, expected="<collision> or <visual> elements")
+        self._guess("guess", "no link has a shape that collides: those that are seen do")
+
+    def _guess(self, sure: str, text: str, hint: str = "") -> None:
+        self._findings.append(Finding("warning" if sure == "guess" else "note", "guessed", f"{text} [{sure}]", hint))
+
+    def _arm(self, chosen: Arm | None, arms: list[Arm], driving: tuple[str, ...]) -> None:
+        if driving:
+            self._settings.setdefault("locked_joints", {}).update(dict.fromkeys(driving, 0.0))
+            self._guess("sure", f"the file has a base of its own, which the planner's replaces: {', '.join(driving)} are locked")
+        kind, why = base_kind(self._file.root)
+        self._guess(
+            "likely" if kind != "omni" else "guess", f"base: {kind} ({why})", "scenes and `load_robot` choose it: `base: ...`"
+        )
+        if chosen is not None:
+            others = [other.name for other in arms if other is not chosen]
+            also = f"; others: {', '.join(others)}" if others else ""
+            self._guess(chosen.sure, f"arm: {chosen.name}, {chosen.why}{also}", "another one: arm=..., `--arm`" if others else "")
+
+    def _hand(self, hand: Hand, tool_frame: str | None) -> None:
+        links = [link for link in hand.touch_links if link in set(self._file.links)]
+        self._settings["touch_links"] = links
+        opened = {joint: round(value, 6) for joint, value in hand.open.items()}
+        if opened:
+            self._settings.setdefault("locked_joints", {}).update(opened)
+        if tool_frame is None:
+            tool = _free_name("tool", self._names())
+            self._add_link(tool, hand.link, hand.tool)
+            self._settings["tool_frame"] = tool
+            self._guess(hand.sure, f"hand: frame '{tool}' {hand.why}", "if it is wrong: `tool_frame`, see docs/robots.md")
+
+    def _names(self) -> set[str]:
+        return {element.get("name", "") for tag in ("link", "joint") for element in self._file.root.findall(tag)}
+
+    def _add_link(self, name: str, parent: str, placement: pin.SE3) -> None:
+        root = self._file.root
+        ElementTree.SubElement(root, "link", name=name)
+        joint = ElementTree.SubElement(root, "joint", name=f"{name}_joint", type="fixed")
+        angles = pin.rpy.matrixToRpy(placement.rotation)
+        xyz, rpy = (" ".join(f"{value:.9g}" for value in values) for values in (placement.translation, angles))
+        ElementTree.SubElement(joint, "origin", xyz=xyz, rpy=rpy)
+        ElementTree.SubElement(joint, "parent", link=parent)
+        ElementTree.SubElement(joint, "child", link=name)
+
+    def _write(self) -> None:
+        settings = {key: value for key, value in self._settings.items() if key != "srdf" or (self._folder / value).is_file()}
+        ElementTree.indent(self._file.root)
+        said = (
+            f"# Written by `vkc-pin import-robot` from {self._source.file.path.name} ({self._source.kind}). Units: m, rad, s.\n"
+        )
+        body = yaml.safe_dump(settings, sort_keys=False, default_flow_style=None, width=120)
+        (self._folder / "robot.yaml").write_text(said + body, encoding="utf-8")
+        ElementTree.ElementTree(self._file.root).write(
+            self._folder / f"{self._name}.urdf", encoding="utf-8", xml_declaration=True
+        )
+
+    def _on_the_floor(self, robot: Robot, seed: int) -> Robot:
+        """Return the robot with a root that stands on the floor, so high that its arm can be clear of it."""
+        low, above = standing(robot, seed=seed)
+        lift = -low if abs(low) > _STANDING else 0.0
+        raised = max(0.0, HOME_ROOM - above - lift)
+        if lift + raised == 0.0:
+            return robot
+        floor, root = _free_name("floor", self._names()), bodies(self._file).links[0]
+        self._file.root.insert(0, ElementTree.Element("link", name=floor))
+        joint = ElementTree.SubElement(self._file.root, "joint", name=f"{floor}_joint", type="fixed")
+        ElementTree.SubElement(joint, "origin", xyz=f"0 0 {lift + raised:.6g}", rpy="0 0 0")
+        ElementTree.SubElement(joint, "parent", link=floor)
+        ElementTree.SubElement(joint, "child", link=root)
+        why = f"{1e3 * raised:.0f} mm of it so that no link of the arm is always at the floor" if raised else ""
+        why = why or "it stands on what is lowest of it"
+        self._guess("likely", f"{root} is {lift + raised:.3f} m above the floor, the new root '{floor}': {why}")
+        self._write()
+        return load_robot(self._folder / "robot.yaml", pairs="all")
+
+    def _rest(self, robot: Robot, samples: int, seed: int) -> tuple[Robot, Home]:
+        """Write SRDF and home, and return the robot with them."""
+        srdf = self._folder / f"{self._name}.srdf"
+        write_srdf(robot, srdf, samples=samples, seed=seed)
+        allowed = {**self._source.srdf.allowed, **read_srdf(srdf, links=self._file.links).allowed}
+        self._write()
+        self._write_srdf(srdf, robot, robot.home, allowed)
+        robot = load_robot(self._folder / "robot.yaml")
+        arm = robot.coordinates.names[3:]
+        near = never_apart(robot, Options().dist_safe, samples=_NEAR, seed=seed)
+        for (one, other), furthest in near.items():
+            text = f"{one} and {other} are never more than {1e3 * furthest:.1f} mm apart: they are not kept apart"
+            self._findings.append(Finding("warning" if furthest < 0.0 else "note", "pairs", text))
+            allowed[min(one, other), max(one, other)] = "Near"
+        if near:
+            self._write_srdf(srdf, robot, robot.home, allowed)
+            robot = load_robot(self._folder / "robot.yaml")
+        states = {name: state for name, state in self._source.srdf.states.items() if set(arm) <= set(state)}
+        named = [(f"the state '{name}' of the file", _state(robot, state)) for name, state in states.items()]
+        home = find_home(robot, [*named, ("joints at 0, or in the middle", robot.home)], seed=seed)
+        self._settings["home"] = {joint: round(float(value), 6) for joint, value in zip(arm, home.positions, strict=True)}
+        self._write_srdf(srdf, robot, home.positions, allowed)
+        self._write()
+        return load_robot(self._folder / "robot.yaml"), home
+
+    def _write_srdf(self, path: Path, robot: Robot, home: Floats, allowed: Mapping[tuple[str, str], str]) -> None:
+        root = ElementTree.Element("robot", name=self._name)
+        arm = ElementTree.SubElement(root, "group", name="arm")
+        state = ElementTree.SubElement(root, "group_state", name="home", group="arm")
+        for joint, value in zip(robot.coordinates.names[3:], home, strict=True):
+            ElementTree.SubElement(arm, "joint", name=joint)
+            ElementTree.SubElement(state, "joint", name=joint, value=f"{value:.9g}")
+        for (one, other), reason in sorted(allowed.items()):
+            ElementTree.SubElement(root, "disable_collisions", link1=one, link2=other, reason=reason)
+        ElementTree.indent(root)
+        ElementTree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
+
+    def _told(self, pieces: list[Piece], home: Home) -> None:
+        values = ", ".join(f"{value:.2f}" for value in home.positions)
+        self._guess(
+            "sure" if home.clearance > 0.0 else "guess", f"home: {home.how} ({values}), clearance {1e3 * home.clearance:.0f} mm"
+        )
+        for piece in {piece.mesh: piece for piece in pieces if piece.count > 1}.values():
+            what = f"{piece.mesh} in {piece.count} pieces, {100.0 * piece.overhead:.0f} % more than its volume"
+            hull = f"its hull: {100.0 * piece.hull:.0f} %"
+            self._findings.append(Finding("note", "shapes", f"{piece.link}: {what} ({hull}), off by {1e3 * piece.error:.0f} mm"))
+
+
+def _state(robot: Robot, state: Mapping[str, float]) -> Floats:
+    return np.array([nearest_position(robot.model, joint, state[joint]) for joint in robot.coordinates.names[3:]])
+
+
+def _free_name(name: str, taken: set[str]) -> str:
+    return name if name not in taken and f"{name}_joint" not in taken else _free_name(f"{name}_", taken)

@@ -42,12 +42,8 @@ def test_what_is_wrong_is_said_on_one_line(tmp_path: Path, capsys: pytest.Captur
 
 def test_import_object_writes_and_reports(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "box.sdf").write_text(SDF)
-    assert (
-        commands.run(
-            ["import-object", str(tmp_path / "box.sdf"), "--output", str(tmp_path / "out"), "--height", "0.7", "--most", "1"]
-        )
-        == 0
-    )
+    box, folder = str(tmp_path / "box.sdf"), str(tmp_path / "out")
+    assert commands.run(["import-object", box, "--output", folder, "--height", "0.7", "--most", "1"]) == 0
     said = capsys.readouterr().out
     assert "0.70 m" in said
     assert "door_bar (bar, called a handle)" in said

@@ -231,7 +231,6 @@ def make_parser() -> argparse.ArgumentParser:
     srdf.add_argument("--seed", type=natural, default=0)
     srdf.set_defaults(run=_srdf)
 
-    add_importing(commands)
     return parser
 
 

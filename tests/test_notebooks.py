@@ -358,3 +358,21 @@ def test_when_planning_fails(tmp_path: Path) -> None:
     before, after = text(cells["validation"]).strip().split("\n\n")
     assert "penetration base_link – parcel: overlap by" in before
     assert after.endswith("every constraint holds")
+
+
+@pytest.mark.long
+@pytest.mark.timeout(600)
+def test_from_a_file_to_a_plan(tmp_path: Path) -> None:
+    cells = executed("10_from_a_file_to_a_plan", tmp_path)
+
+    assert "arm: arm, 7 joints, 2 fingers" in text(cells["robot"])
+    assert "wrote my_panda" in text(cells["robot"])
+    (proposal,) = re.findall(r"^  [\d.]+  (\w+) \(bar\)", text(cells["object"]), re.MULTILINE)
+    assert min(size(cells["picture"])) > 300
+    assert re.search(rf"oven\.{proposal}, approach .*: reached from", text(cells["scene"]))
+    report = text(cells["plan"])
+    assert report.startswith(f"kitchen: success — reach oven.{proposal}, move oven.microwave")
+    assert "every constraint holds" in report
+    assert "iframe" in result(cells["show"])["text/html"]
+    for made in ("my_panda/robot.yaml", "my_panda/my_panda.urdf", "my_panda/my_panda.srdf", "microwave/microroot.yaml"):
+        assert (tmp_path / made).is_file()

@@ -11,6 +11,7 @@ from vkc_pin.arrays import Floats
 
 if TYPE_CHECKING:
     import trimesh
+    from scipy.spatial import ConvexHull
 
 __all__ = ["FLAT", "outer_hull", "thickened"]
 
@@ -66,7 +67,7 @@ def outer_hull(points: ArrayLike, *, vertices: int = 40) -> trimesh.Trimesh:
         chosen_normals, chosen_offsets = box, (corners @ box.T).max(axis=0)
         polytope = _intersect(chosen_normals, chosen_offsets, corners)
         for _ in range(4 * vertices):
-            depth = (np.asarray(polytope.vertices) @ normals.T).max(axis=0) - offsets
+            depth = (polytope.points @ normals.T).max(axis=0) - offsets
             order = np.argsort(-depth)[:12]
             trials = []
             for k in order[depth[order] > _GAP]:
@@ -78,7 +79,7 @@ def outer_hull(points: ArrayLike, *, vertices: int = 40) -> trimesh.Trimesh:
                 break
             polytope, (chosen_normals, chosen_offsets) = min(trials, key=lambda trial: trial[0].volume)
         found.append(polytope)
-    return min(found, key=lambda polytope: polytope.volume)
+    return trimesh.convex.convex_hull(min(found, key=lambda polytope: polytope.volume).points)
 
 
 def _directions(hull: trimesh.Trimesh) -> Floats:
@@ -90,13 +91,12 @@ def _directions(hull: trimesh.Trimesh) -> Floats:
     return np.vstack([np.asarray(hull.face_normals)[np.sort(first)], spread])
 
 
-def _intersect(normals: NDArray[Any], offsets: NDArray[Any], inner: NDArray[Any]) -> trimesh.Trimesh:
+def _intersect(normals: NDArray[Any], offsets: NDArray[Any], inner: NDArray[Any]) -> ConvexHull:
     """Return the polytope {x: normals·x ≤ offsets}; `inner` are points in it."""
-    import trimesh
-    from scipy.spatial import HalfspaceIntersection
+    from scipy.spatial import ConvexHull, HalfspaceIntersection
 
     centre = inner.mean(axis=0)
     corners = HalfspaceIntersection(np.column_stack([normals, -offsets]), centre).intersections
     corners = corners[np.isfinite(corners).all(axis=1)]
     _, first = np.unique(corners.round(7), axis=0, return_index=True)
-    return trimesh.convex.convex_hull(corners[np.sort(first)])
+    return ConvexHull(corners[np.sort(first)])

@@ -35,6 +35,7 @@ PIECES = 12
 _MOST_TRIANGLES = 2000  # that CoACD is given: with more it takes minutes
 _CORNERS = 40  # of a piece, at most; as in the collision geometry that comes with the package
 _SPARE = 1.5  # times as many corners as asked for are left alone: making them fewer takes a second
+_PER_CELL, _MOST_SAMPLES = 16, 4_000_000  # points by which cells of that grid are found that the skin passes
 _SAMPLES = 1000  # points on a surface, beside its corners
 _SPECK = 1e-6  # [m] radius of what distances are measured to
 _CELLS = 96  # of the longest edge, in which volumes of open meshes are counted
@@ -130,6 +131,7 @@ def solid_volume(mesh: trimesh.Trimesh) -> float:
 
     Cells that the skin itself passes count half. Holes narrower than a hundredth of the mesh count as closed.
     """
+    import trimesh
     from scipy import ndimage
 
     if mesh.is_volume and mesh.body_count == 1:
@@ -138,7 +140,8 @@ def solid_volume(mesh: trimesh.Trimesh) -> float:
     low = mesh.bounds[0] - 1.5 * pitch
     size = np.ceil((mesh.bounds[1] - low) / pitch).astype(int) + 2
     skin = np.zeros(size, bool)
-    points = np.asarray(mesh.subdivide_to_size(0.7 * pitch, max_iter=20).vertices)
+    count = int(min(_PER_CELL * mesh.area / pitch**2, _MOST_SAMPLES)) + 1
+    points = np.vstack([mesh.vertices, trimesh.sample.sample_surface(mesh, count, seed=0)[0]])
     skin[tuple(np.floor((points - low) / pitch).astype(int).T)] = True
     regions, _ = ndimage.label(~skin)
     inside = ~skin & (regions != regions[0, 0, 0])

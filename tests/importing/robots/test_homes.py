@@ -61,6 +61,13 @@ def test_pairs_that_stay_close_are_found(tmp_path: Path) -> None:
     assert never_apart(robot, 0.025, samples=50) == {}
 
 
+def test_pairs_that_are_close_mostly(tmp_path: Path) -> None:
+    """The boxes of arm_2 and arm_3 are 40 mm apart where they are in line, and closer by the more they turn."""
+    robot = vkc.load_robot(write_arms(tmp_path), pairs="all")
+    assert ("arm_2", "arm_3") not in never_apart(robot, 0.035, samples=50)
+    assert ("arm_2", "arm_3") in never_apart(robot, 0.035, samples=50, share=0.5)
+
+
 def test_what_stands_and_what_the_arm_can_clear(robot: vkc.Robot) -> None:
     low, above = standing(robot)
     assert low == pytest.approx(-HEIGHT)

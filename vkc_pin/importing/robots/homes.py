@@ -145,13 +145,14 @@ def find_home(robot: Robot, named: Iterable[tuple[str, Floats]], *, seed: int = 
     return Home(arm, look.least(), "searched for")
 
 
-def never_apart(robot: Robot, margin: float, *, samples: int, seed: int = 0) -> dict[tuple[str, str], float]:
+def never_apart(robot: Robot, margin: float, *, samples: int, share: float = 1.0, seed: int = 0) -> dict[tuple[str, str], float]:
     """Return the pairs of links that no random configuration brings apart by `margin` [m], with the furthest that one does.
 
     Args:
         robot: The robot, with its collision pairs and its home, which is looked at as well.
         margin: A distance [m].
         samples: How many configurations to look at.
+        share: Of these, so many have to leave a pair closer than the margin: less than 1 is for pairs that are hardly ever apart.
         seed: Of the random numbers.
     """
     look, rng = Clearances(robot), np.random.default_rng(seed)
@@ -159,12 +160,14 @@ def never_apart(robot: Robot, margin: float, *, samples: int, seed: int = 0) -> 
     left: dict[tuple[str, str], list[tuple[int, int]]] = {}
     for pair in look.pairs:
         left.setdefault((robot.link_of(pair[0]), robot.link_of(pair[1])), []).append(pair)
-    furthest = dict.fromkeys(left, -np.inf)
+    furthest, apart = dict.fromkeys(left, -np.inf), dict.fromkeys(left, 0)
     for arm in (robot.home, *rng.uniform(low, high, (samples, len(low)))):
         look.place(arm)
         for links, pairs in list(left.items()):
-            furthest[links] = max(furthest[links], min(look.between(pair, margin) for pair in pairs))
-            if furthest[links] >= margin:
+            distance = min(look.between(pair, margin) for pair in pairs)
+            furthest[links] = max(furthest[links], distance)
+            apart[links] += distance >= margin
+            if apart[links] > (1.0 - share) * samples:
                 del left[links]
         if not left:
             break

@@ -48,6 +48,7 @@ OPENED = {"door": ("hinge", 1.0), "drawer": ("slide", 0.22), "dishwasher": ("rac
 
 sys.path.insert(0, str(ROOT / "tests"))
 from helpers.browser import screenshot  # noqa: E402
+from helpers.homes import home_urdf  # noqa: E402
 
 
 def look(target: tuple[float, ...], position: tuple[float, ...]) -> None:
@@ -159,6 +160,19 @@ def check_picture() -> None:
     vkc.check_scene(vkc.load_scene("household")).plot(IMAGES / "scene_check.png")
 
 
+def import_picture() -> None:
+    """A home of three rooms that was one URDF, and the motion that opens its refrigerator, from above."""
+    with tempfile.TemporaryDirectory() as folder:
+        file, _ = home_urdf(Path(folder))
+        scene = vkc.import_home(file, Path(folder) / "out").scene
+        plan = vkc.plan(scene, [vkc.Actuate("refrigerator_body", {"refrigerator_hinge": 0.94})])
+        sys.stdout.write(plan.report() + "\n")
+        with styled():
+            figure = new_figure(8.0, 6.6)
+            draw_top_view(figure, World(scene), plan.trajectory)
+            save_figure(figure, IMAGES / "import_home.png")
+
+
 def chore_pictures(chore: vkc.Plan) -> None:
     """Write a picture of the chore in the home, and the page that shows all of it."""
     look(*HOME)
@@ -216,6 +230,7 @@ def main() -> int:
     furniture_picture()
     task_picture()
     check_picture()
+    import_picture()
     chore_pictures(chore)
     gap_picture(through)
     tray_picture()

@@ -2,6 +2,7 @@ from . import baselines, benchmarks, cpin, plotting, validation, visualization
 from .chain.chain import VirtualKinematicChain, consolidate
 from .chain.inversion import invert
 from .errors import BuildError, InputError, UnknownNameError, VkcError
+from .importing.homes.home_import import ImportedHome, import_home
 from .importing.objects.object_import import ImportedObject, import_object
 from .importing.robots.doctor import Diagnosis, doctor
 from .importing.robots.robot_import import ImportedRobot, import_robot
@@ -47,6 +48,7 @@ __all__ = [
     "GoTo",
     "Grasp",
     "Hold",
+    "ImportedHome",
     "ImportedObject",
     "ImportedRobot",
     "InputError",
@@ -85,6 +87,7 @@ __all__ = [
     "cpin",
     "doctor",
     "goals",
+    "import_home",
     "import_object",
     "import_robot",
     "invert",

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from helpers.arm_urdf import write_arms
 from helpers.downloads import SDF
+from helpers.homes import HOME_MJCF
 
 import vkc_pin as vkc
 from vkc_pin.cli import commands
@@ -51,3 +52,19 @@ def test_import_object_writes_and_reports(tmp_path: Path, capsys: pytest.Capture
     assert sorted(file.name for file in (tmp_path / "out").iterdir()) == ["attachments.png", "box.urdf", "box.yaml"]
     assert commands.run(["import-object", str(tmp_path / "box.sdf"), "--output", str(tmp_path / "out")]) == commands.EXIT_MISUSE
     assert "something already" in capsys.readouterr().err
+
+
+def test_import_home_writes_a_scene_and_reports(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("mujoco")
+    (tmp_path / "small.xml").write_text(HOME_MJCF)
+    command = ["import-home", str(tmp_path / "small.xml"), "--output", str(tmp_path / "out"), "--most", "1", "--seed", "3"]
+    assert run(command) == 0
+    said = capsys.readouterr().out
+    assert "5 obstacles, 1 with joints, 1 to carry" in said
+    assert said.endswith(f"wrote {tmp_path / 'out' / 'scene.yaml'}\n")
+    assert run(command) == EXIT_MISUSE
+    assert "--force" in capsys.readouterr().err
+    assert run([*command, "--force"]) == 0
+    assert run(["check", str(tmp_path / "out" / "scene.yaml")]) == 0
+    assert run(["import-home", str(tmp_path / "none.xml")]) == EXIT_MISUSE
+    assert "none.xml" in capsys.readouterr().err

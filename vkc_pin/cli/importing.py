@@ -1,4 +1,4 @@
-"""The commands that bring descriptions from elsewhere: import-robot, import-object, and doctor, which examines robots."""
+"""The commands that bring descriptions from elsewhere: import-robot, -object, -home, and doctor, which examines robots."""
 
 from __future__ import annotations
 
@@ -47,6 +47,18 @@ def add_importing(commands: Any) -> None:
     item.add_argument("--robot", default="husky_ur5e", help="whose hand shall open it: name or file (default husky_ur5e)")
     item.add_argument("--most", type=positive, default=3, metavar="N", help="attachments for one joint, at most (default 3)")
     item.set_defaults(run=_import_object)
+    about = """Make a scene of a URDF or MJCF file of a whole home: what stands fixed becomes obstacles in convex pieces, what has
+    joints becomes objects with proposed attachments, what moves freely becomes objects to carry, and the robot starts at a free
+    place. The report says what was changed, and what no hand can open."""
+    home = commands.add_parser("import-home", help="make a scene of a file of a whole home", description=about)
+    home.add_argument("file", metavar="FILE", help="URDF or MJCF")
+    home.add_argument("--output", metavar="FOLDER", help="a new folder for the scene (default: the file's name)")
+    home.add_argument("--force", action="store_true", help="replace a folder that import-home made before")
+    home.add_argument("--floor", type=float, default=0.0, metavar="METRES", help="height of the floor in the file (default 0)")
+    home.add_argument("--robot", default="husky_ur5e", help="the robot that is there: name or file (default husky_ur5e)")
+    home.add_argument("--most", type=positive, default=2, metavar="N", help="attachments for one joint, at most (default 2)")
+    home.add_argument("--seed", type=natural, default=0, help="of the places where a start is looked for (default 0)")
+    home.set_defaults(run=_import_home)
 
     about = "Examine a robot's description: home, pairs, limits, hand, shapes. Exit code 1 if plans would fail for it."
     doctor = commands.add_parser("doctor", help="examine a robot's description", description=about)
@@ -89,6 +101,22 @@ def _import_object(arguments: argparse.Namespace) -> int:
         most=arguments.most,
     )
     sys.stdout.write(f"{done.report()}\nwrote {done.file}\nwrote {done.picture}\n")
+    return EXIT_OK
+
+
+def _import_home(arguments: argparse.Namespace) -> int:
+    from vkc_pin.importing.homes.home_import import import_home
+
+    done = import_home(
+        arguments.file,
+        arguments.output,
+        floor=arguments.floor,
+        robot=arguments.robot,
+        most=arguments.most,
+        seed=arguments.seed,
+        force=arguments.force,
+    )
+    sys.stdout.write(f"{done.report()}\nwrote {done.file}\n")
     return EXIT_OK
 
 

@@ -43,6 +43,8 @@ def goals(scene: Scene, *, share: float = 0.5) -> tuple[Step, ...]:
         raise InputError("out of range", field="share", expected="above 0 and at most 1", got=share)
     found: list[Step] = []
     for name, placed in scene.objects.items():
+        if placed.object.free and not placed.object.attachments:
+            continue  # too thick for any hand
         if placed.object.free:
             found.append(Grasp(name, _freest(list(placed.object.attachments.values())).name))
         else:

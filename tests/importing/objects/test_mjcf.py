@@ -29,6 +29,15 @@ def test_bodies_joints_and_shapes(tmp_path: Path) -> None:
     assert "'floor'" in notes
 
 
+def test_bodies_that_move_freely_are_kept_if_wanted(tmp_path: Path) -> None:
+    (tmp_path / "t.xml").write_text(MJCF)
+    found = read_object_mjcf(tmp_path / "t.xml", free=True)
+    assert (found.joints["cup"].kind, found.joints["cup"].parent) == ("floating", "world")
+    assert found.placements()["cup"].translation == pytest.approx([2.0, 0.0, 0.0])
+    assert [part.kind for part in found.links["cup"].collision] == ["sphere"]
+    assert "'cup'" not in " ".join(found.notes)
+
+
 def test_meshes_are_where_the_file_has_them(tmp_path: Path) -> None:
     """MuJoCo moves meshes into their principal axes."""
     (tmp_path / "t.xml").write_text(MJCF)

@@ -37,6 +37,9 @@ def test_limits_the_wrong_way_round_and_unknown_joints_are_noted(tmp_path: Path)
     assert np.allclose(found.joints["b"].axis, [1.0, 0.0, 0.0])
     assert found.joints["c"].kind == "fixed"
     assert [word in " ".join(found.notes) for word in ("wrong way round", "floating", "mimics")] == [True] * 3
+    free = read_object_urdf(tmp_path / "t.urdf", free=True)
+    assert free.joints["c"].kind == "floating"
+    assert "floating" not in " ".join(free.notes)
 
 
 def test_errors_name_file_and_element(tmp_path: Path) -> None:

@@ -87,7 +87,7 @@ class Joint:
 
     Attributes:
         name: Its name.
-        kind: "fixed", "revolute", "continuous" or "prismatic".
+        kind: "fixed", "revolute", "continuous" or "prismatic"; in homes also "floating".
         parent, child: Names of links.
         placement: Of the child's frame in the parent's.
         axis: Unit axis in the child's frame, shape (3,).

@@ -14,11 +14,16 @@ from vkc_pin.importing.objects.description import Description, Joint, Link, Part
 
 __all__ = ["read_object_mjcf"]
 
+_FREE = 0  # the type of a joint that leaves a body free
 _HIDDEN = 3  # MuJoCo's viewer hides groups from here on: by custom, what collides and is not to be seen
 
 
-def read_object_mjcf(file: Path) -> Description:
-    """Return what an MJCF file says about an object; what stands in the world is one link, `world`.
+def read_object_mjcf(file: Path, *, free: bool = False) -> Description:
+    """Return what an MJCF file says about an object, or a home; what stands in the world is one link, `world`.
+
+    Args:
+        file: The file.
+        free: Whether to keep bodies that move freely, on floating joints; else they are left out.
 
     Raises:
         InputError: MuJoCo is not installed, or cannot read the file.
@@ -31,7 +36,7 @@ def read_object_mjcf(file: Path) -> Description:
     data = mujoco.MjData(model)
     data.qpos[:] = model.qpos0
     mujoco.mj_kinematics(model, data)
-    return _Reader(mujoco, model, data, file).description()
+    return _Reader(mujoco, model, data, file).description(free=free)
 
 
 class _Reader:
@@ -39,7 +44,7 @@ class _Reader:
         self.mujoco, self.model, self.data, self.file = mujoco, model, data, file
         self.notes = list[str]()
 
-    def description(self) -> Description:
+    def description(self, *, free: bool) -> Description:
         model = self.model
         frames, links, joints = dict[str, pin.SE3](), dict[str, Link](), dict[str, Joint]()
         left_out: set[int] = set()
@@ -50,11 +55,14 @@ class _Reader:
             if parent in left_out and body:
                 left_out.add(body)
                 continue
-            if any(int(model.jnt_type[j]) == 0 for j in moving):
+            here = _placement(self.data.xpos[body], self.data.xmat[body])
+            floats = any(int(model.jnt_type[j]) == _FREE for j in moving)
+            if floats and not free:
                 self.notes.append(f"body '{name}' moves freely, it is an object of its own: left out")
                 left_out.add(body)
                 continue
-            here = _placement(self.data.xpos[body], self.data.xmat[body])
+            if floats:  # has no other joints
+                moving = range(0)
             last = above
             for count, j in enumerate(moving):  # several joints of one body: links without shapes between them
                 link = name if count == len(moving) - 1 else f"{name}_{count}"
@@ -65,8 +73,9 @@ class _Reader:
             if not len(moving):
                 frames[name] = here
                 if body:
+                    kind = "floating" if floats else "fixed"
                     joints[name] = Joint(
-                        name=f"{name}_fixed", kind="fixed", parent=above, child=name, placement=frames[above].inverse() * here
+                        name=f"{name}_{kind}", kind=kind, parent=above, child=name, placement=frames[above].inverse() * here
                     )
             links[name] = Link(name, *self._parts(body, frames[name]))
         return Description(self.file, links, joints, tuple(self.notes))

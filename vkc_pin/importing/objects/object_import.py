@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +22,18 @@ from vkc_pin.importing.objects.description import Description
 from vkc_pin.importing.objects.mjcf import read_object_mjcf
 from vkc_pin.importing.objects.pieces import with_pieces
 from vkc_pin.importing.objects.sdf import read_object_sdf
-from vkc_pin.importing.objects.tidying import bounds, only, renamed, rooted, scaled, surfaces, tidied, upright, with_limits
+from vkc_pin.importing.objects.tidying import (
+    bounds,
+    closed,
+    only,
+    renamed,
+    rooted,
+    scaled,
+    surfaces,
+    tidied,
+    upright,
+    with_limits,
+)
 from vkc_pin.importing.objects.urdf import read_object_urdf
 from vkc_pin.importing.objects.writing import write_description, write_urdf
 from vkc_pin.models.articulation import ArticulatedObject
@@ -68,8 +81,12 @@ class ImportedObject:
         return "\n".join(lines)
 
 
-def read_description(file: str | Path) -> Description:
+def read_description(file: str | Path, *, free: bool = False) -> Description:
     """Return what a URDF, MJCF or SDF file says; which it is, its first element tells.
+
+    Args:
+        file: The file.
+        free: Whether to keep what moves freely, on floating joints, which URDF and MJCF have.
 
     Raises:
         InputError: It is none of them, or cannot be read.
@@ -77,7 +94,11 @@ def read_description(file: str | Path) -> Description:
     """
     path = file_path(file, "file", "a URDF, MJCF or SDF file")
     root = parse_xml(read_text(path, "URDF, MJCF or SDF"), path).tag
-    readers = {"robot": read_object_urdf, "mujoco": read_object_mjcf, "sdf": read_object_sdf}
+    readers: dict[str, Callable[[Path], Description]] = {
+        "robot": partial(read_object_urdf, free=free),
+        "mujoco": partial(read_object_mjcf, free=free),
+        "sdf": read_object_sdf,
+    }
     if root not in readers:
         expected = "a URDF (<robot>), MJCF (<mujoco>) or SDF (<sdf>) file"
         raise InputError("this is no object", file=path, expected=expected, got=f"<{root}>")
@@ -174,8 +195,3 @@ def _settled(description: Description) -> Description:
     """Return the object with its root's frame on the floor, below its middle, joints closed."""
     low, high = bounds(description, surfaces(description), closed(description))
     return rooted(description, pin.SE3(np.eye(3), -np.array([(low[0] + high[0]) / 2.0, (low[1] + high[1]) / 2.0, low[2]])))
-
-
-def closed(description: Description) -> dict[str, float]:
-    """Return the values at which joints are closed, zero or the limit next to it, [rad] or [m]."""
-    return {joint.name: min(max(0.0, joint.limits[0]), joint.limits[1]) for joint in description.joints.values() if joint.limits}

@@ -17,7 +17,7 @@ from vkc_pin.importing.objects.description import Description, Link, Part
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["Surfaces", "bounds", "only", "renamed", "rooted", "scaled", "surfaces", "tidied", "upright", "with_limits"]
+__all__ = ["Surfaces", "bounds", "closed", "only", "renamed", "rooted", "scaled", "surfaces", "tidied", "upright", "with_limits"]
 
 Surfaces = Mapping[int, "trimesh.Trimesh"]
 """The surfaces of parts in the frame of their link, by `id` of the part."""
@@ -128,6 +128,11 @@ def bounds(description: Description, meshes: Surfaces, values: Mapping[str, floa
         raise InputError("nothing in this file has a shape", file=description.file, expected="<collision> or <visual> elements")
     joined = np.vstack(points)
     return joined.min(axis=0), joined.max(axis=0)
+
+
+def closed(description: Description) -> dict[str, float]:
+    """Return the values at which joints are closed, zero or the limit next to it, [rad] or [m]."""
+    return {joint.name: min(max(0.0, joint.limits[0]), joint.limits[1]) for joint in description.joints.values() if joint.limits}
 
 
 def scaled(description: Description, factor: float) -> Description:

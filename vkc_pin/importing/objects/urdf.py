@@ -19,8 +19,12 @@ __all__ = ["read_object_urdf"]
 _KINDS = ("fixed", "revolute", "continuous", "prismatic")
 
 
-def read_object_urdf(file: Path) -> Description:
-    """Return what a URDF says about an object.
+def read_object_urdf(file: Path, *, free: bool = False) -> Description:
+    """Return what a URDF says about an object, or a home.
+
+    Args:
+        file: The file.
+        free: Whether joints may be floating; else they are taken as fixed.
 
     Raises:
         InputError: It cannot be read, its links are no tree, or a mesh file is missing.
@@ -30,7 +34,7 @@ def read_object_urdf(file: Path) -> Description:
     notes = list[str]()
     stated = {joint.get("name", ""): _stated(file, joint, notes) for joint in root.findall("joint")}
     for joint in root.findall("joint"):
-        if joint.get("type") not in _KINDS:
+        if joint.get("type") not in (*_KINDS, "floating") or (joint.get("type") == "floating" and not free):
             notes.append(f"joint '{joint.get('name')}' is {joint.get('type')}: taken as fixed")
             joint.set("type", "fixed")
         if (mimic := joint.find("mimic")) is not None:
@@ -88,7 +92,7 @@ def _joint(file: Path, element: ElementTree.Element, limits: tuple[float, float]
         xyz, rpy = (numbers_of(file, origin, key, 3, default="0 0 0", where=name) for key in ("xyz", "rpy"))
         placement = pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array(xyz))
     direction = np.array([1.0, 0.0, 0.0])
-    if axis is not None and kind != "fixed":
+    if axis is not None and kind not in ("fixed", "floating"):
         direction = np.array(numbers_of(file, axis, "xyz", 3, default="1 0 0", where=name))
     velocity = numbers_of(file, limit, "velocity", 1, default="0", where=name)[0] if limit is not None else 0.0
     ends = [(found.get("link", "") if (found := element.find(key)) is not None else "") for key in ("parent", "child")]

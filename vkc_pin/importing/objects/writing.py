@@ -49,7 +49,9 @@ def write_urdf(description: Description, file: Path) -> None:
     write_atomically(file, ("\n".join([*lines, "</robot>"]) + "\n").encode())
 
 
-def write_description(file: Path, urdf: str, attachments: Sequence[Mapping[str, Any]], *, about: Sequence[str]) -> None:
+def write_description(
+    file: Path, urdf: str, attachments: Sequence[Mapping[str, Any]], *, about: Sequence[str], free: bool = False
+) -> None:
     """Write the description of an object.
 
     Args:
@@ -57,9 +59,11 @@ def write_description(file: Path, urdf: str, attachments: Sequence[Mapping[str, 
         urdf: Its URDF, from the folder of `file`.
         attachments: As data, best first.
         about: Lines for its head.
+        free: Whether it can be carried away.
     """
     head = "".join(f"# {line}\n" for line in about)
-    body = yaml.safe_dump({"urdf": urdf, "attachments": [dict(item) for item in attachments]}, sort_keys=False, width=130)
+    data = {"urdf": urdf, **({"free": True} if free else {}), "attachments": [dict(item) for item in attachments]}
+    body = yaml.safe_dump(data, sort_keys=False, width=130)
     write_atomically(file, (head + body).encode())
 
 

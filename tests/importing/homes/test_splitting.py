@@ -1,0 +1,119 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vkc_pin.importing.homes.splitting import split
+from vkc_pin.importing.objects.description import Description, Joint, Link, Part
+
+
+def _box(name: str, size: tuple[float, float, float] = (0.2, 0.2, 0.2), z: float = 0.5) -> Link:
+    part = Part(name=name, placement=pin.SE3(np.eye(3), np.array([0.0, 0.0, z])), kind="box", size=size)
+    return Link(name, (), (part,))
+
+
+def _hung(parent: str, child: str, kind: str, limits: tuple[float, float] | None = (0.0, 1.0)) -> Joint:
+    up = pin.SE3(np.eye(3), np.array([0.3, 0.0, 0.0]))
+    return Joint(
+        name=f"to_{child}", kind=kind, parent=parent, child=child, placement=up, limits=limits if kind != "fixed" else None
+    )
+
+
+def _home(links: list[Link], joints: list[Joint]) -> Description:
+    return Description(Path("home.urdf"), {link.name: link for link in links}, {joint.child: joint for joint in joints})
+
+
+def test_on_the_building_each_joint_is_a_thing_of_its_own() -> None:
+    links = [
+        Link("world"),
+        _box("walls", (8.0, 0.1, 2.5)),
+        _box("left"),
+        _box("right"),
+        _box("knob"),
+        _box("cabinet"),
+        _box("leaf"),
+    ]
+    joints = [
+        _hung("world", "walls", "fixed"),
+        _hung("walls", "left", "revolute"),
+        _hung("walls", "right", "prismatic"),
+        _hung("right", "knob", "revolute"),
+        _hung("world", "cabinet", "fixed"),
+        _hung("cabinet", "leaf", "revolute"),
+    ]
+    home = split(_home(links, joints))
+    assert [link.name for link in home.building] == ["walls"]
+    assert not home.furniture
+    found = {thing.name: set(thing.description.links) for thing in home.things}
+    assert found == {"left": {"left", "left_base"}, "right": {"right", "right_base", "knob"}, "cabinet": {"cabinet", "leaf"}}
+
+
+def test_joints_that_move_nothing_or_nowhere_are_fixed_where_they_are() -> None:
+    links = [_box("room"), _box("stuck"), Link("dead"), _box("leaf")]
+    joints = [
+        _hung("room", "stuck", "prismatic", (0.4, 0.4)),
+        _hung("room", "dead", "revolute"),
+        _hung("room", "leaf", "revolute"),
+    ]
+    home = split(_home(links, joints))
+    assert [thing.name for thing in home.things] == ["leaf"]
+    assert [link.name for link in home.furniture] == ["stuck"]
+    assert home.furniture[0].collision[0].placement.translation == pytest.approx([0.7, 0.0, 0.5])
+    assert any("to_stuck" in note and "one value" in note for note in home.notes)
+    assert any("to_dead" in note and "moves nothing" in note for note in home.notes)
+
+
+def test_what_is_carried_is_stiff_and_comes_out_of_what_it_is_in() -> None:
+    links = [Link("world"), _box("case"), _box("drawer"), _box("laptop"), _box("lid"), Link("ghost")]
+    joints = [
+        _hung("world", "case", "fixed"),
+        _hung("case", "drawer", "prismatic", (0.1, 0.5)),
+        _hung("drawer", "laptop", "floating", None),
+        _hung("laptop", "lid", "revolute"),
+        _hung("world", "ghost", "floating", None),
+    ]
+    home = split(_home(links, joints))
+    case, laptop = home.things
+    assert set(case.description.links) == {"case", "drawer"}
+    assert laptop.free
+    assert laptop.position == pytest.approx((1.15, 0.0, 0.4))  # with the drawer at its lower limit: as the scene has it
+    assert [joint.kind for joint in laptop.description.joints.values()] == ["fixed"]
+    assert any("'to_lid'" in note for note in home.notes)
+    assert any("'ghost'" in note for note in home.notes)
+
+
+def test_what_is_flat_on_the_floor_is_part_of_it() -> None:
+    links = [_box("world", (9.0, 9.0, 0.2), -0.1), _box("carpet", (1.0, 1.0, 0.02), 0.01), _box("step", (1.0, 1.0, 0.05), 0.025)]
+    home = split(_home(links, [_hung("world", "carpet", "fixed"), _hung("world", "step", "fixed")]))
+    assert home.floor == ("world", "carpet")
+    assert [link.name for link in home.furniture] == ["step"]
+    assert not home.building
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_no_shape_is_lost_whatever_the_tree(data: st.DataObject) -> None:
+    count = data.draw(st.integers(1, 12))
+    links = [_box("link_0", z=data.draw(st.sampled_from([0.5, -0.1])))]
+    joints = []
+    for number in range(1, count):
+        name, parent = f"link_{number}", f"link_{data.draw(st.integers(0, number - 1))}"
+        size = data.draw(st.sampled_from([(0.2, 0.2, 0.2), (5.0, 0.1, 2.0)]))
+        links.append(data.draw(st.sampled_from([_box(name, size), Link(name)])))
+        kind = data.draw(st.sampled_from(["fixed", "revolute", "prismatic", "continuous", "floating"]))
+        limits = (
+            data.draw(st.sampled_from([None, (0.0, 1.0), (0.2, 0.2), (0.1, 0.4)])) if kind in ("revolute", "prismatic") else None
+        )
+        joints.append(_hung(parent, name, kind, limits))
+    home = split(_home(links, joints))
+    kept = [part.name for link in (*home.building, *home.furniture) for part in link.solid] + list(home.floor)
+    kept += [part.name for thing in home.things for link in thing.description.links.values() for part in link.solid]
+    assert sorted(kept) == sorted(part.name for link in links for part in link.solid)
+    assert home.shapes == len(kept)
+    names = [thing.name for thing in home.things]
+    assert len(set(names)) == len(names)

@@ -1,0 +1,1 @@
+"""Homes that can be planned in, made from one large file of another program."""

@@ -1,0 +1,110 @@
+"""Writes what stands fixed in a home as obstacles of a scene."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.importing.homes.splitting import Home
+from vkc_pin.importing.objects.description import Colour, Description, Link, Part
+from vkc_pin.importing.objects.pieces import with_pieces
+from vkc_pin.importing.objects.tidying import bounds, rooted, surfaces
+from vkc_pin.importing.objects.writing import write_urdf
+
+__all__ = ["write_obstacles"]
+
+_ALIKE = 1e-4  # [m], and without unit: shapes that are seen and collide, written twice
+
+
+def write_obstacles(home: Home, source: Path, folder: Path, taken: set[str]) -> tuple[list[dict[str, Any]], list[str]]:
+    """Write what stands fixed, and return it as a scene's obstacles, and what was changed.
+
+    A piece of furniture is one obstacle, so that reports name it; so is each shape of the building. Boxes and the like stay
+    what they are, in the scene itself. What else there is becomes a URDF with convex pieces; its origin is on the floor,
+    below its middle.
+
+    Args:
+        home: The home.
+        source: Its file.
+        folder: The scene's.
+        taken: Names that obstacles cannot have; theirs are added.
+
+    Raises:
+        InputError: A mesh is concave, and CoACD is not installed.
+    """
+    entries, notes = list[dict[str, Any]](), list[str]()
+    for link in _alone(home):
+        name = _name(link.name, taken)
+        if len(link.solid) == 1 and link.solid[0].kind != "mesh":
+            entries.append(_simple(name, link))
+            continue
+        description = Description(source, {name: Link(name, link.visual, link.collision)}, {})
+        low, high = bounds(description, surfaces(description))
+        origin = np.array([*((low + high) / 2.0)[:2], 0.0]).round(6)
+        description = rooted(description, pin.SE3(np.eye(3), -origin))
+        description = with_pieces(description, surfaces(description))
+        notes += description.notes
+        address = f"obstacles/{_plain(name)}/{_plain(name)}.urdf"
+        write_urdf(description, folder / address)
+        entries.append({"name": name, "type": "urdf", "file": address, "position": _numbers(origin)})
+    return entries, notes
+
+
+def _alone(home: Home) -> Iterator[Link]:
+    """Yield links that become one obstacle each."""
+    for link in home.building:
+        for number, part in enumerate(link.solid):
+            colour = _colour(part, link.visual)
+            seen = part if colour is None else _painted(part, colour)
+            yield Link(part.name or (link.name if len(link.solid) == 1 else f"{link.name}_{number}"), (seen,), (seen,))
+    yield from home.furniture
+
+
+def _simple(name: str, link: Link) -> dict[str, Any]:
+    """Return the entry of a link that collides as a box, ball, cylinder or capsule."""
+    (part,) = link.solid
+    keys = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length"), "capsule": ("radius", "length")}[part.kind]
+    size = [round(float(value), 6) for value in part.size]
+    entry: dict[str, Any] = {"name": name, "type": part.kind}
+    entry |= {"size": size} if part.kind == "box" else dict(zip(keys, size, strict=True))
+    entry["position"] = _numbers(part.placement.translation)
+    if not np.allclose(part.placement.rotation, np.eye(3), atol=1e-9):
+        entry["rpy"] = _numbers(pin.rpy.matrixToRpy(part.placement.rotation), 9)
+    colour = _colour(part, link.visual)
+    return entry if colour is None else {**entry, "colour": [round(float(value), 4) for value in colour]}
+
+
+def _colour(part: Part, looks: Iterable[Part]) -> Colour | None:
+    """Return the colour of a shape, or of what is seen in its place."""
+    if part.colour is not None:
+        return part.colour
+    there = part.placement.homogeneous
+    return next((other.colour for other in looks if np.allclose(other.placement.homogeneous, there, atol=_ALIKE)), None)
+
+
+def _painted(part: Part, colour: Colour) -> Part:
+    return dataclasses.replace(part, colour=colour)
+
+
+def _name(wanted: str, taken: set[str]) -> str:
+    """Return a name that a scene can have and that nothing has yet."""
+    stem, number = re.sub(r"[\s./]+", "_", wanted).strip("_") or "part", 1
+    while (name := stem if number == 1 else f"{stem}_{number}") in taken:
+        number += 1
+    taken.add(name)
+    return name
+
+
+def _plain(name: str) -> str:
+    """Return a name that any file can have."""
+    return re.sub(r"[^A-Za-z0-9_-]", "_", name)
+
+
+def _numbers(values: Any, digits: int = 6) -> list[float]:
+    return [float(value) + 0.0 for value in np.round(np.asarray(values, float), digits) + 0.0]

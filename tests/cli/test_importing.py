@@ -58,13 +58,13 @@ def test_import_home_writes_a_scene_and_reports(tmp_path: Path, capsys: pytest.C
     pytest.importorskip("mujoco")
     (tmp_path / "small.xml").write_text(HOME_MJCF)
     command = ["import-home", str(tmp_path / "small.xml"), "--output", str(tmp_path / "out"), "--most", "1", "--seed", "3"]
-    assert run(command) == 0
+    assert commands.run(command) == 0
     said = capsys.readouterr().out
     assert "5 obstacles, 1 with joints, 1 to carry" in said
     assert said.endswith(f"wrote {tmp_path / 'out' / 'scene.yaml'}\n")
-    assert run(command) == EXIT_MISUSE
+    assert commands.run(command) == commands.EXIT_MISUSE
     assert "--force" in capsys.readouterr().err
-    assert run([*command, "--force"]) == 0
-    assert run(["check", str(tmp_path / "out" / "scene.yaml")]) == 0
-    assert run(["import-home", str(tmp_path / "none.xml")]) == EXIT_MISUSE
+    assert commands.run([*command, "--force"]) == 0
+    assert commands.run(["check", str(tmp_path / "out" / "scene.yaml")]) == 0
+    assert commands.run(["import-home", str(tmp_path / "none.xml")]) == commands.EXIT_MISUSE
     assert "none.xml" in capsys.readouterr().err

@@ -40,6 +40,14 @@ def test_joints_without_limits_are_turned_by_a_share_of_a_turn() -> None:
     assert step.joints["turn"] == pytest.approx(np.pi / 2, abs=1e-3)
 
 
+def test_no_goal_is_beyond_a_limit() -> None:
+    scene = vkc.load_scene("corridor_door")
+    door = scene.objects["door"].object
+    (step,) = vkc.goals(scene, share=0.5)
+    assert isinstance(step, vkc.Actuate)
+    assert step.joints["hinge"] == door.upper[door.coordinates.index("hinge")] == np.pi / 2.0, "rounded it would be 1.571"
+
+
 @pytest.mark.parametrize("share", [0.0, 1.1, -0.5, "half", float("nan")])
 def test_wrong_shares(share: object) -> None:
     with pytest.raises(vkc.InputError) as found:

@@ -97,7 +97,8 @@ def _openings(name: str, placed: PlacedObject, share: float) -> list[Step]:
         )
         by = share * (upper - lower)
         goal = now + by if now <= (lower + upper) / 2.0 else now - by
-        steps.append(Actuate(name, {joint: round(float(np.clip(goal, lower, upper)), 3)}, _freest(attachments).name))
+        within = float(np.clip(round(goal, 3), lower, upper))  # in this order: rounded, a limit may be beyond itself
+        steps.append(Actuate(name, {joint: within}, _freest(attachments).name))
     return steps
 
 

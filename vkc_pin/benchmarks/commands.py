@@ -65,6 +65,15 @@ def add_bench(commands: Any) -> None:
     about = "Plan to drive through a gap of 0.85 m and to reach over a table beyond it, from random starts of base and arm."
     _add_experiment(benches, "gap", "reach over a table beyond a gap of 0.85 m", about, jobs=1)
 
+    about = "Open objects with robots, by attachments that are proposed from the shapes, from random starts in a hall."
+    shown = "robots × objects, by proposed attachments"
+    anything = _add_experiment(
+        benches, "anything", shown, about, "--starts", default=5, jobs=1, what="random starts of each combination"
+    )
+    anything.set_defaults(benchmark="anything.run")
+    _add_choice(anything, "robots", "what `load_robot` takes: names, or paths (default: ten)")
+    _add_choice(anything, "objects", "<kind>_<seed> of random_object, names in scenes/objects, paths (default: 29 of ten kinds)")
+
     _add_problems(benches)
 
 

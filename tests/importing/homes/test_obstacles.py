@@ -28,7 +28,7 @@ def test_simple_shapes_stay_what_they_are_and_others_become_urdf(tmp_path: Path)
     ball = Link("a wall", (), (_part("", "sphere", (0.2,), turned),))
     home = Home((building,), (mesh, ball), (), (), 4, ())
     taken = {"ball", "wedge"}
-    entries, notes = write_obstacles(home, tmp_path / "home.urdf", tmp_path, taken)
+    entries, notes = write_obstacles(home, tmp_path / "home.urdf", tmp_path, taken, {})
     assert [entry["name"] for entry in entries] == ["a_wall", "walls_1", "wedge_2", "a_wall_2"]
     assert [entry["type"] for entry in entries] == ["box", "capsule", "urdf", "sphere"]
     assert entries[0]["colour"] == list(red)

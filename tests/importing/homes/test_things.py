@@ -17,7 +17,7 @@ def _can(radius: float) -> Thing:
 
 
 def test_what_is_carried_has_no_joint_and_is_held_above_what_it_stands_on(tmp_path: Path) -> None:
-    done = write_thing(_can(0.03), vkc.load_robot("husky_ur5e"), tmp_path, most=2, dist_safe=0.02, grasp_clearance=0.005)
+    done = write_thing(_can(0.03), vkc.load_robot("husky_ur5e"), tmp_path, {}, most=2, dist_safe=0.02, grasp_clearance=0.005)
     item = vkc.load_object(tmp_path / "objects" / "can" / "can.yaml")
     assert item.free
     assert item.coordinates.size == 0
@@ -31,6 +31,6 @@ def test_what_is_carried_has_no_joint_and_is_held_above_what_it_stands_on(tmp_pa
 
 
 def test_what_is_too_thick_says_so(tmp_path: Path) -> None:
-    done = write_thing(_can(0.3), vkc.load_robot("husky_ur5e"), tmp_path, most=2, dist_safe=0.02, grasp_clearance=0.005)
+    done = write_thing(_can(0.3), vkc.load_robot("husky_ur5e"), tmp_path, {}, most=2, dist_safe=0.02, grasp_clearance=0.005)
     assert not vkc.load_object(tmp_path / "objects" / "can" / "can.yaml").attachments
     assert "carried by no hand: nothing of it fits" in done.report()

@@ -9,7 +9,7 @@ import trimesh
 from helpers.downloads import partnet
 
 from vkc_pin.importing.objects.description import Description, Joint, Link, Part
-from vkc_pin.importing.objects.pieces import with_pieces
+from vkc_pin.importing.objects.pieces import Known, with_pieces
 from vkc_pin.importing.objects.tidying import surfaces, tidied
 from vkc_pin.importing.objects.urdf import read_object_urdf
 
@@ -64,3 +64,20 @@ def test_boxes_stay_boxes_and_what_is_seen_collides_where_nothing_else_does() ->
     found = with_pieces(Description(Path("f"), {"a": Link("a", (box,))}, {}), {id(box): box.mesh()})
     assert found.links["a"].collision == (box,)
     assert any("collides as what it looks like" in note for note in found.notes)
+
+
+def test_a_file_that_is_there_twice_is_cut_once_and_is_where_it_stands(tmp_path: Path) -> None:
+    trimesh.creation.annulus(0.3, 0.5, 0.2).export(tmp_path / "ring.stl")
+    places = [pin.SE3(pin.rpy.rpyToMatrix(0.2, 0.3, k), np.array([float(k), 0.0, 0.5])) for k in range(2)]
+    parts = tuple(Part(name="", placement=at, kind="mesh", size=(1.0, 1.0, 1.0), file=tmp_path / "ring.stl") for at in places)
+    known: Known = {}
+    found = []
+    for part in parts:
+        description = Description(tmp_path / "t.urdf", {"ring": Link("ring", (), (part,))}, {})
+        found.append(with_pieces(description, surfaces(description), known).links["ring"].collision)
+    assert len(known) == 1
+    (cut,) = known.values()
+    assert len(found[0]) == len(found[1]) == len(cut) > 1
+    for at, pieces in zip(places, found, strict=True):
+        for part, piece in zip(pieces, cut, strict=True):
+            assert np.allclose(part.mesh().vertices, piece.copy().apply_transform(at.homogeneous).vertices)

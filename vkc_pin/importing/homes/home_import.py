@@ -26,6 +26,7 @@ from vkc_pin.importing.homes.splitting import FLOOR_RISE, Home, split
 from vkc_pin.importing.homes.starting import free_start
 from vkc_pin.importing.homes.things import ImportedThing, write_thing
 from vkc_pin.importing.objects.object_import import read_description
+from vkc_pin.importing.objects.pieces import Known
 from vkc_pin.importing.objects.tidying import bounds, renamed, rooted, surfaces
 from vkc_pin.models.robot_file import load_robot
 from vkc_pin.options import Options
@@ -131,10 +132,11 @@ def import_home(
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=".import-home-") as scratch:
         made = Path(scratch) / "home"
+        known: Known = {}
         taken = {FLOOR} | {thing.name for thing in home.things}
         clearances = {"dist_safe": options.dist_safe, "grasp_clearance": options.grasp_clearance}
-        things = tuple(write_thing(thing, hand, made, most=most, **clearances) for thing in home.things)
-        obstacles, changed = write_obstacles(home, path, made, taken)
+        things = tuple(write_thing(thing, hand, made, known, most=most, **clearances) for thing in home.things)
+        obstacles, changed = write_obstacles(home, path, made, taken, known)
         document: dict[str, Any] = {
             "name": _name(path),
             "robot": _robot(robot),

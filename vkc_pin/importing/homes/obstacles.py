@@ -13,7 +13,7 @@ import pinocchio as pin
 
 from vkc_pin.importing.homes.splitting import Home
 from vkc_pin.importing.objects.description import Colour, Description, Link, Part
-from vkc_pin.importing.objects.pieces import with_pieces
+from vkc_pin.importing.objects.pieces import Known, with_pieces
 from vkc_pin.importing.objects.tidying import bounds, rooted, surfaces
 from vkc_pin.importing.objects.writing import write_urdf
 
@@ -22,7 +22,9 @@ __all__ = ["write_obstacles"]
 _ALIKE = 1e-4  # [m], and without unit: shapes that are seen and collide, written twice
 
 
-def write_obstacles(home: Home, source: Path, folder: Path, taken: set[str]) -> tuple[list[dict[str, Any]], list[str]]:
+def write_obstacles(
+    home: Home, source: Path, folder: Path, taken: set[str], known: Known
+) -> tuple[list[dict[str, Any]], list[str]]:
     """Write what stands fixed, and return it as a scene's obstacles, and what was changed.
 
     A piece of furniture is one obstacle, so that reports name it; so is each shape of the building. Boxes and the like stay
@@ -34,6 +36,7 @@ def write_obstacles(home: Home, source: Path, folder: Path, taken: set[str]) -> 
         source: Its file.
         folder: The scene's.
         taken: Names that obstacles cannot have; theirs are added.
+        known: Pieces of files that were cut before; theirs are added.
 
     Raises:
         InputError: A mesh is concave, and CoACD is not installed.
@@ -48,7 +51,7 @@ def write_obstacles(home: Home, source: Path, folder: Path, taken: set[str]) -> 
         low, high = bounds(description, surfaces(description))
         origin = np.array([*((low + high) / 2.0)[:2], 0.0]).round(6)
         description = rooted(description, pin.SE3(np.eye(3), -origin))
-        description = with_pieces(description, surfaces(description))
+        description = with_pieces(description, surfaces(description), known)
         notes += description.notes
         address = f"obstacles/{_plain(name)}/{_plain(name)}.urdf"
         write_urdf(description, folder / address)

@@ -14,7 +14,7 @@ import pinocchio as pin
 
 from vkc_pin.importing.homes.splitting import Thing
 from vkc_pin.importing.objects.description import Description, Joint, Link
-from vkc_pin.importing.objects.pieces import with_pieces
+from vkc_pin.importing.objects.pieces import Known, with_pieces
 from vkc_pin.importing.objects.tidying import surfaces, tidied, with_limits
 from vkc_pin.importing.objects.writing import write_description, write_urdf
 from vkc_pin.models.object_file import load_object
@@ -55,7 +55,7 @@ class ImportedThing:
         return f"{self.name}: {'; '.join(said)}"
 
 
-def write_thing(thing: Thing, robot: Robot, folder: Path, *, most: int, **clearances: float) -> ImportedThing:
+def write_thing(thing: Thing, robot: Robot, folder: Path, known: Known, *, most: int, **clearances: float) -> ImportedThing:
     """Write an object, and return what it is in a scene.
 
     What is carried is taken hold of as what slides upwards from where it stands.
@@ -64,6 +64,7 @@ def write_thing(thing: Thing, robot: Robot, folder: Path, *, most: int, **cleara
         thing: The thing.
         robot: Whose hand the attachments are for.
         folder: The scene's.
+        known: Pieces of files that were cut before; its own are added.
         most: Attachments for one joint at most.
         clearances: As of `propose_attachments`.
 
@@ -74,7 +75,7 @@ def write_thing(thing: Thing, robot: Robot, folder: Path, *, most: int, **cleara
     if thing.free:
         description = _standing(description)
     description = with_limits(description, surfaces(description))
-    description = with_pieces(description, surfaces(description))
+    description = with_pieces(description, surfaces(description), known)
     name = re.sub(r"[^A-Za-z0-9_-]", "_", thing.name)
     address = f"objects/{name}/{name}.yaml"
     yaml, urdf = folder / address, (folder / address).with_suffix(".urdf")

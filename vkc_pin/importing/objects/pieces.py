@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,18 +19,23 @@ from vkc_pin.importing.slicing import THICKNESS, flat, thickened
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["with_pieces"]
+__all__ = ["Known", "with_pieces"]
 
 _FINE = 0.006  # [m]: how far pieces of what moves may stand out; a finger keeps about as much from a handle
 _INSIDE = 1e-3  # [m]: what stands out of another piece by less is part of it
 
 
-def with_pieces(description: Description, meshes: Surfaces) -> Description:
+Known = dict[tuple[Path | None, tuple[float, ...], float], "Sequence[trimesh.Trimesh]"]
+"""Pieces of mesh files, in the frame of their mesh, by file, scale and error [m]."""
+
+
+def with_pieces(description: Description, meshes: Surfaces, known: Known | None = None) -> Description:
     """Return the object with convex shapes alone to collide with, what is flat or lies inside of others noted.
 
     Args:
         description: The object.
         meshes: Its surfaces.
+        known: Pieces of files that were cut before, to which this adds: the chairs of a home are one file.
 
     Raises:
         InputError: A mesh is concave, and CoACD is not installed.
@@ -44,7 +50,7 @@ def with_pieces(description: Description, meshes: Surfaces) -> Description:
                 continue
             if flat(mesh.vertices):
                 thick.append(part.name or "a mesh")
-            found = _convex(mesh, error)
+            found = _convex(mesh, error) if known is None or part.file is None else _placed(part, error, known)
             solids += [
                 Part(
                     name=part.name,
@@ -63,6 +69,14 @@ def with_pieces(description: Description, meshes: Surfaces) -> Description:
             notes.append(f"link '{name}' has nothing to collide with: it collides as what it looks like")
         links[name] = Link(name, link.visual or link.collision, tuple(kept))
     return dataclasses.replace(description, links=links, notes=tuple(notes))
+
+
+def _placed(part: Part, error: float, known: Known) -> Sequence[trimesh.Trimesh]:
+    """Return convex pieces of a part that is a file, in the frame of its link."""
+    key = (part.file, part.size, error)
+    if key not in known:
+        known[key] = _convex(dataclasses.replace(part, placement=pin.SE3.Identity()).mesh(), error)
+    return [piece.copy().apply_transform(part.placement.homogeneous) for piece in known[key]]
 
 
 def _convex(mesh: trimesh.Trimesh, error: float) -> Sequence[trimesh.Trimesh]:

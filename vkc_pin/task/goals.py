@@ -85,7 +85,7 @@ def _openings(name: str, placed: PlacedObject, share: float) -> list[Step]:
     item, reached = placed.object, dict[str, list[Attachment]]()
     for attachment in item.attachments.values():
         joint = _first_joint(item, attachment)
-        if joint is not None:
+        if joint is not None and attachment.contact == "grasp":  # what is pushed goes one way only
             reached.setdefault(joint, []).append(attachment)
     steps: list[Step] = []
     for joint, attachments in reached.items():

@@ -95,7 +95,7 @@ def test_check_of_a_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert f"wrote {tmp_path / 'drawer.png'}" in out
     assert (tmp_path / "drawer.png").stat().st_size > 10_000
     document = vkc.load_scene("drawer").document
-    box = {"name": "box", "type": "box", "size": [0.2, 0.5, 0.5], "position": [1.66, 0.0, 0.75]}
+    box = {"name": "box", "type": "box", "size": [0.2, 1.6, 1.2], "position": [1.66, 0.0, 0.6]}
     (tmp_path / "blocked.yaml").write_text(yaml.safe_dump({**document, "obstacles": [box]}))
     assert cli.main(["check", str(tmp_path / "blocked.yaml")]) == 1
     assert "not reached" in capsys.readouterr().out

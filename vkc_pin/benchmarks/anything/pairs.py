@@ -29,7 +29,7 @@ from vkc_pin.task.steps import Actuate
 
 __all__ = ["OBJECTS", "ROBOTS", "SHARE", "Pair", "description_of", "hall", "kind_of", "pair"]
 
-ROBOTS = ("husky_ur5e", "panda", "tiago", "tiago_dual", "tiago_pro", "ur3_gripper", "ur5_gripper", "xarm7", "kinova", "z1")
+ROBOTS = ("husky_ur5e", "panda", "tiago_pro", "pr2", "kinova", "ur5_gripper", "ur3_gripper", "tiago", "tiago_dual", "baxter")
 """Mobile manipulators, and arms that ride on the virtual base, by the names that `load_robot` knows."""
 OBJECTS = (
     *(f"{kind}_{number}" for kind in KINDS for number in range(2)),

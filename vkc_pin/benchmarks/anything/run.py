@@ -16,10 +16,13 @@ from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.limits import LIMITS
 from vkc_pin.benchmarks.harness.record import trial
 from vkc_pin.errors import InputError
+from vkc_pin.importing.robots.robot_import import import_robot
 from vkc_pin.models.robot_file import find_robot, load_robot
 from vkc_pin.planning.planner import plan
 
 __all__ = ["run"]
+
+_SAMPLES = 1000  # for pairs that need no check, as of robots that are loaded without an SRDF
 
 
 def run(
@@ -38,7 +41,7 @@ def run(
         out: The folder; if it has trials of the same settings already, they are not run again.
         starts: How many random starts of each robot at each object, at least 1.
         seed: Of the starts and of planning.
-        robots: What `load_robot` takes.
+        robots: What `load_robot` takes. Those without a description of their hand are imported into `out`/robots first.
         objects: `<kind>_<seed>` of `random_object`, names in scenes/objects, or paths of descriptions.
         jobs: Number of processes.
         progress: Whether to show a progress bar.
@@ -61,10 +64,11 @@ def run(
             raise InputError("not a choice", field=field, expected="names, each once", got=" ".join(map(str, given)) or "none")
     for name in things.values():
         description_of(name)
+    ready = {name: _ready(name, file, Path(out) / "robots") for name, file in called.items()}
     settings = {"benchmark": "anything", "seed": seed, "starts": starts, "share": SHARE, "robots": list(called), **LIMITS}
     specs = [
         {"key": f"{robot}/{thing}", "robot": robot, "object": thing, "files": [file, path], "starts": starts, "seed": seed}
-        for robot, file in called.items()
+        for robot, file in ready.items()
         for thing, path in things.items()
     ]
     result = runner.run(specs, _records, out, settings=settings, report=report, jobs=jobs, progress=progress)
@@ -78,6 +82,18 @@ def _called(name: str) -> str:
     if file.name == "robot.yaml":
         return file.resolve().parent.name
     return file.stem if str(name).endswith(".urdf") else str(name)
+
+
+def _ready(name: str, file: str, folder: Path) -> str:
+    """Return what to load for a robot: what was asked for if that says what its hand is, else a folder made by importing it."""
+    made = folder / name
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the doctor's report has them
+        if not (made / "robot.yaml").is_file():
+            if load_robot(file).touch_links:
+                return file
+            import_robot(find_robot(file), made, samples=_SAMPLES)
+    return str(made)
 
 
 def _records(spec: dict[str, Any]) -> list[dict[str, Any]]:

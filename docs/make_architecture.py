@@ -21,7 +21,7 @@ CHECKING = {"validation"}
 COLUMNS = {
     **dict.fromkeys(("cli", "benchmarks", "baselines", "planning", "solver", "motion", "scene", "models", "files"), 2),
     **{"seeds": 0, "driving": 0, "program": 1, "chain": 1, "task": 1, "cpin": 1},
-    **{"visualization": 3, "validation": 3, "plotting": 4, "options": 3, "distances": 2, "importing": 4},
+    **{"visualization": 3, "validation": 3, "plotting": 4, "options": 3, "distances": 3, "importing": 4},
 }
 WIDTH, COLUMN, ROW, MARGIN = 1100, 200, 88, 46  # [pixels], as are all lengths here
 BOX_WIDTH, BOX_HEIGHT, CHARACTERS = 186, 60, 30

@@ -1,1 +1,1 @@
-"""Descriptions of robots, objects and homes, made from files that were made for other programs."""
+"""Robots, objects and homes from files that were made for other programs."""

@@ -171,6 +171,8 @@ def test_outputs_that_get_in_each_others_way(tmp_path: Path) -> None:
             check_outputs({"--a": one, "--b": again})
     with pytest.raises(InputError, match=r"--a: this file is named twice .*than PLAN"):
         check_outputs({"--a": one}, kept={"PLAN": one})
+    with pytest.raises(InputError, match="PLAN: no file can be called that"):
+        check_outputs({"--a": one}, kept={"PLAN": "a\ud800"})
     with pytest.raises(InputError, match=r"--b: a file cannot be a folder .*file of --a"):
         check_outputs({"--a": one, "--b": one / "two" / "three"})
     assert everything(tmp_path) == {"link"}

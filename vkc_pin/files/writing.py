@@ -76,7 +76,7 @@ def check_outputs(files: Mapping[str, str | Path], *, kept: Mapping[str, str | P
     Raises:
         InputError: One of them cannot be written, names what another one does, or needs a folder where another one is a file.
     """
-    taken = {Path(os.path.realpath(path)): field for field, path in (kept or {}).items()}
+    taken = {Path(os.path.realpath(file_path(path, field))): field for field, path in (kept or {}).items()}
     targets: dict[Path, str] = {}
     for field, path in files.items():
         target = check_writable(path, field=field)

@@ -25,7 +25,7 @@ def press() -> None:
 
 def test_it_waits_for_the_end_of_what_is_short() -> None:
     done = []
-    with pytest.raises(KeyboardInterrupt), deferred():  # noqa: PT012
+    with pytest.raises(KeyboardInterrupt), raising(), deferred():  # noqa: PT012
         press()
         press()
         done.append("all")

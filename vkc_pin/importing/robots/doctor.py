@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
 from pathlib import Path
@@ -85,10 +86,12 @@ def doctor(robot: str | Path | Robot, *, margin: float | None = None, samples: i
         InputError: The robot cannot be loaded, or an argument is wrong.
     """
     whole(samples, "samples", low=1)
-    examined = robot if isinstance(robot, Robot) else load_robot(robot)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        examined = robot if isinstance(robot, Robot) else load_robot(robot)
     kept = Options().dist_safe if margin is None else Options(dist_safe=margin).dist_safe
     findings = [*_home(examined, kept), *_pairs(examined, kept, samples, seed), *_numbers(examined), *_hand(examined)]
-    findings += _shapes(examined)
+    findings += [*_shapes(examined), *(Finding("warning", "loading", str(one.message)) for one in told)]
     order = ("fault", "warning", "note")
     return Diagnosis(examined.name, tuple(sorted(findings, key=lambda finding: order.index(finding.level))))
 

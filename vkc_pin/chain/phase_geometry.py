@@ -73,9 +73,10 @@ class PhaseGeometry:
             rows: Which of these each pair is looked at in, shape (n,).
         """
         margins = self.margins[pairs]
-        for pair, moments in self.eased.items():
-            (which,) = np.nonzero(pairs == pair)
-            for first, last, margin in moments:
+        some = np.flatnonzero(self._is_eased[pairs])  # few, and mostly none
+        for pair in dict.fromkeys(pairs[some].tolist()):
+            which = some[pairs[some] == pair]
+            for first, last, margin in self.eased[pair]:
                 inside = which[(first <= waypoints[which]) & (waypoints[which] <= last)]
                 margins[inside] = np.minimum(margins[inside], margin)
         if z is None:
@@ -127,6 +128,13 @@ class PhaseGeometry:
             standing: Whether what stands in the world counts, too; otherwise only pairs of which both move.
         """
         return self._pairs_near.near(reach, rotations, translations, standing=standing)
+
+    @cached_property
+    def _is_eased(self) -> Bools:
+        """Whether each pair may come closer for a while, shape (P,)."""
+        found = np.zeros(len(self.pairs), bool)
+        found[list(self.eased)] = True
+        return found
 
     @cached_property
     def _moving_count(self) -> int:

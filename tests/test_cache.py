@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import platform
+import resource
 import threading
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -55,6 +59,29 @@ def test_trimming_lets_go_of_the_oldest_until_it_fits(sizes: list[int], nbytes: 
     left = cache.info()
     expected = next(sizes[k:] for k in range(len(sizes)) if sum(sizes[k:]) <= nbytes or k == len(sizes) - 1)
     assert (left.entries, left.nbytes) == (len(expected), sum(expected))
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries give memory back by themselves, or never")
+def test_trimming_gives_memory_back() -> None:
+    """Also what lies between blocks that are still in use: otherwise a process grows with every structure that it meets."""
+    cache, between = Cache(nbytes=1.0), []
+    for key in range(20):
+        blocks = []
+        for _ in range(100):
+            blocks.append(np.ones(7500))  # 60 kB: too small for pages of their own
+            between.append(np.ones(30))
+        cache.get(key, lambda blocks=blocks: SimpleNamespace(nbytes=6_000_000, blocks=blocks))
+    del blocks
+    before = resident()
+    cache.trim()
+    assert cache.info().entries == 1
+    assert before - resident() > 0.8 * 19 * 6.0
+    assert len(between) == 2000
+
+
+def resident() -> float:
+    """Return how much memory this process has [MB]."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 1e6
 
 
 def test_what_failed_to_be_built_is_not_kept() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
@@ -86,12 +88,20 @@ class Cache:
             del self._kept[key]
 
     def trim(self) -> None:
-        """Let go of what there is no room for: objects grow while they are used."""
+        """Let go of what there is no room for, and give its memory back: objects grow while they are used."""
         total = self.info().nbytes
+        if total <= self.nbytes:
+            return
         while total > self.nbytes and len(self._kept) > 1:
-            _, value = self._kept.popitem(last=False)
-            total -= int(value.nbytes)
+            total -= int(self._kept.popitem(last=False)[1].nbytes)
+        _give_back()
 
     def info(self) -> CacheInfo:
         """Return how full it is."""
         return CacheInfo(len(self._kept), sum(int(value.nbytes) for value in self._kept.values()), self._hits, self._misses)
+
+
+def _give_back() -> None:
+    """Give freed memory back to the system: glibc keeps what lies between blocks that are in use, ever more of it."""
+    with contextlib.suppress(AttributeError, OSError, TypeError):  # other C libraries have no such call
+        ctypes.CDLL(None).malloc_trim(0)

@@ -28,6 +28,18 @@ def collision(shape: str, origin: str = "") -> str:
     return f"<collision>{origin}<geometry>{shape}</geometry></collision>"
 
 
+@pytest.mark.parametrize("kind", ["visual", "collision"])
+def test_shapes_without_end_are_refused_before_anything_is_built_of_them(tmp_path: Path, kind: str) -> None:
+    """Seven thousand of them took Pinocchio minutes."""
+    shape = collision('<sphere radius="0.2"/>')
+    many = shape.replace("collision", kind) * 7000
+    with pytest.raises(InputError, match=f"too many <{kind}> elements.*expected at most 1000.*got 7000"):
+        load_urdf(urdf(tmp_path, shape + many if kind == "visual" else many))
+    enough = shape.replace("collision", kind) * 1000
+    _, collides, drawn = load_urdf(urdf(tmp_path, shape + enough if kind == "visual" else enough))
+    assert len((drawn if kind == "visual" else collides).geometryObjects) == 1000
+
+
 @pytest.mark.parametrize(
     ("shape", "volume"),
     [

@@ -346,6 +346,17 @@ def test_left_behind() -> None:
     assert "not in the hand" in found.detail
 
 
+def test_taken_hold_of_as_the_motion_ends() -> None:
+    """To ask for it twice asks for nothing more; to go on with it does."""
+    up = above(STICK)
+    motion = Script(hall()).go(up).go(reaching(tool_at(STICK), up)).motion()
+    grasp, here = vkc.Grasp("stick"), vkc.GoTo(*map(float, motion.positions[-1, :2]))
+    for steps in ([grasp], [grasp, grasp], [here, grasp, grasp]):
+        assert judged(hall(), steps, motion).ok, steps
+    found = only(judged(hall(), [grasp, grasp, here], motion))
+    assert (found.constraint, found.subject) == ("goal", "stick")
+
+
 # --- touching ---------------------------------------------------------------------------------------------------------
 
 

@@ -28,6 +28,7 @@ __all__ = ["UrdfFile", "UrdfShape", "load_urdf", "read_urdf", "tree_model"]
 
 Colour = tuple[float, float, float, float]
 _LIGHT_GREY: Colour = (0.9, 0.9, 0.9, 1.0)
+_MOST = 1000  # shapes of a kind that become one model: Pinocchio's take the third power of their number in time to grow
 _JOINTS = ("revolute", "continuous", "prismatic", "fixed")
 
 
@@ -120,6 +121,17 @@ class UrdfFile:
             for index, element in enumerate(link.findall(kind)):
                 found.append(self._shape(name, f"{name}_{index}", element, colours))
         return found
+
+    def few_shapes(self, kind: str) -> list[UrdfShape]:
+        """Return all elements of a kind for one model; see `shapes`.
+
+        Raises:
+            InputError: As there, or there are too many.
+        """
+        shapes = self.shapes(kind)
+        if len(shapes) > _MOST:
+            raise InputError(f"too many <{kind}> elements", file=self.path, expected=f"at most {_MOST}", got=len(shapes))
+        return shapes
 
     def resolve(self, address: str) -> Path:
         """Return the file that a mesh's address means: `package://NAME/...`, `file://...`, absolute or beside the URDF.
@@ -268,7 +280,7 @@ def load_urdf(path: str | Path, *, text: str | None = None) -> tuple[pin.Model, 
 def _geometry(model: pin.Model, file: UrdfFile, kind: str) -> pin.GeometryModel:
     """Return the shapes of `kind`, "visual" or "collision", on the links of `model`, in the order of its frames."""
     geometry = pin.GeometryModel()
-    shapes = [(model.getFrameId(shape.link, pin.FrameType.BODY), shape) for shape in file.shapes(kind)]
+    shapes = [(model.getFrameId(shape.link, pin.FrameType.BODY), shape) for shape in file.few_shapes(kind)]
     for index, shape in sorted(shapes, key=lambda pair: pair[0]):
         frame = model.frames[index]
         solid = to_bvh(load_mesh(shape.file, shape.size)) if kind == "visual" and shape.file is not None else shape.solid()

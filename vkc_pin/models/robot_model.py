@@ -199,7 +199,7 @@ def collision_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
         InputError: A shape is not understood, a mesh cannot be read or is flat, or there is no shape.
     """
     geometry = pin.GeometryModel()
-    for shape in file.shapes("collision"):
+    for shape in file.few_shapes("collision"):
         geometry.addGeometryObject(_geometry_object(model, shape, shape.name, shape.solid(), _GREY))
     if len(geometry.geometryObjects) == 0:
         raise InputError("nothing of this robot can collide", file=file.path, expected="<collision> elements", got="none")
@@ -216,7 +216,7 @@ def visual_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
         InputError: A shape is not understood, or a mesh cannot be read.
     """
     geometry = pin.GeometryModel()
-    for shape in file.shapes("visual"):
+    for shape in file.few_shapes("visual"):
         if shape.file is None:
             geometry.addGeometryObject(_geometry_object(model, shape, shape.name, shape.solid(), shape.colour or _GREY))
             continue

@@ -113,8 +113,8 @@ def _dropped(samples: Samples, steps: Sequence[Step], hands: list[set[str]], num
     near |= set() if end else set(samples.scene.held)
     wanted = set(hands[number + 1])
     step = steps[number]
-    if isinstance(step, Grasp) and number == len(steps) - 1:
-        wanted.discard(step.object)  # taken hold of, and nothing more
+    if isinstance(step, Grasp) and end == len(phases):
+        wanted.discard(step.object)  # taken hold of as the motion ends, and nothing more
     return [Miss(name, 1.0, "holds", "is not in the hand") for name in sorted(wanted - near)]
 
 

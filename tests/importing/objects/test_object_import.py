@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -107,3 +108,19 @@ def test_what_is_no_object_and_wrong_arguments(tmp_path: Path) -> None:
         with pytest.raises(vkc.InputError, match=word):
             vkc.import_object(file, **{"folder": tmp_path / "out", **wrong})  # type: ignore[arg-type]
     assert not (tmp_path / "out").exists()
+
+
+def test_nothing_is_left_of_what_fails_halfway(tmp_path: Path) -> None:
+    (tmp_path / "box.sdf").write_text(SDF)
+    out = tmp_path / "made" / "box"
+    handless = dataclasses.replace(vkc.load_robot("husky_ur5e"), touch_links=())
+    with pytest.raises(vkc.InputError, match="touch_links"):
+        vkc.import_object(tmp_path / "box.sdf", out, robot=handless)
+    assert list((tmp_path / "made").iterdir()) == []
+    out.mkdir()
+    done = vkc.import_object(tmp_path / "box.sdf", out, most=1)
+    assert [path.name for path in out.parent.iterdir()] == ["box"]
+    assert done.file == out / "box.yaml"
+    assert done.picture.is_file()
+    again = vkc.propose_attachments(done.proposals.object, "husky_ur5e", most=1)
+    assert [one.attachment.name for one in again.found] == list(done.object.attachments)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
-import tempfile
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,7 +17,7 @@ from vkc_pin.arguments import instance, number, whole
 from vkc_pin.errors import InputError
 from vkc_pin.files.documents import read_text
 from vkc_pin.files.resources import file_path
-from vkc_pin.files.writing import write_atomically
+from vkc_pin.files.writing import folder_at_once, write_atomically
 from vkc_pin.files.xml import parse_xml
 from vkc_pin.importing.homes.obstacles import write_obstacles
 from vkc_pin.importing.homes.splitting import FLOOR_RISE, Home, split
@@ -129,9 +127,7 @@ def import_home(
         raise InputError(
             "nothing in this file can move", file=path, expected=expected, got=f"{home.shapes} shapes that stand fixed"
         )
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=target.parent, prefix=".import-home-") as scratch:
-        made = Path(scratch) / "home"
+    with folder_at_once(target, force=True) as made:  # what is there may be replaced
         known: Known = {}
         taken = {FLOOR} | {thing.name for thing in home.things}
         clearances = {"dist_safe": options.dist_safe, "grasp_clearance": options.grasp_clearance}
@@ -151,9 +147,6 @@ def import_home(
             scene, reached = free_start(Scene.from_document(document, made), rng)
         document["start"] = {"base": scene.start[:3].tolist()}
         _write(made / "scene.yaml", path, document)
-        if target.exists():
-            shutil.rmtree(target)
-        made.rename(target)
     notes = (*home.notes, *_floor_notes(home), *changed, *(note for thing in things for note in thing.notes))
     return ImportedHome(target / "scene.yaml", load_scene(target / "scene.yaml"), things, _counts(home), reached, notes)
 

@@ -89,6 +89,7 @@ def write_thing(thing: Thing, robot: Robot, folder: Path, known: Known, *, most:
     about = [f"Attachments as proposed for the hand of {proposals.hand.robot}, best first."]
     about += [f"No hand can move {joint}: {reason}." for joint, reason in proposals.because.items()]
     write_description(yaml, urdf.name, [item.description() for item in proposals.found], about=about, free=thing.free)
+    proposals = dataclasses.replace(proposals, object=dataclasses.replace(proposals.object, urdf=None))  # its file does not stay
     entry = {"name": thing.name, "type": address, "position": list(thing.position)}
     return ImportedThing(thing.name, thing.free, proposals, entry, description.notes)
 

@@ -17,6 +17,7 @@ from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError, shown
 from vkc_pin.files.documents import read_text
 from vkc_pin.files.resources import file_path
+from vkc_pin.files.writing import folder_at_once
 from vkc_pin.files.xml import parse_xml
 from vkc_pin.importing.objects.description import Description
 from vkc_pin.importing.objects.mjcf import read_object_mjcf
@@ -158,17 +159,19 @@ def import_object(
     meshes = surfaces(description)
     description = _settled(with_limits(description, meshes))
     description = with_pieces(description, surfaces(description))
-    yaml, urdf = target / f"{name}.yaml", target / f"{name}.urdf"
-    write_urdf(description, urdf)
-    about = [f"Made of {path.name} by vkc-pin import-object."]
-    write_description(yaml, urdf.name, (), about=about)
-    proposals = propose_attachments(load_object(yaml), robot, most=most, **clearances)
-    about.append(f"Attachments as proposed for the hand of {proposals.hand.robot}, best first.")
-    about += [f"No hand can open {joint}: {reason}." for joint, reason in proposals.because.items()]
-    write_description(yaml, urdf.name, [item.description() for item in proposals.found], about=about)
-    picture = target / "attachments.png"
-    plot_attachments(proposals, picture)
-    return ImportedObject(yaml, load_object(yaml), proposals, size, description.notes, picture)
+    with folder_at_once(target, force=True) as made:  # what is there is empty
+        yaml, urdf, picture = made / f"{name}.yaml", made / f"{name}.urdf", made / "attachments.png"
+        write_urdf(description, urdf)
+        about = [f"Made of {path.name} by vkc-pin import-object."]
+        write_description(yaml, urdf.name, (), about=about)
+        proposals = propose_attachments(load_object(yaml), robot, most=most, **clearances)
+        about.append(f"Attachments as proposed for the hand of {proposals.hand.robot}, best first.")
+        about += [f"No hand can open {joint}: {reason}." for joint, reason in proposals.because.items()]
+        write_description(yaml, urdf.name, [item.description() for item in proposals.found], about=about)
+        plot_attachments(proposals, picture)
+    done = load_object(target / yaml.name)
+    proposals = dataclasses.replace(proposals, object=dataclasses.replace(done, attachments={}))  # where its files are now
+    return ImportedObject(target / yaml.name, done, proposals, size, description.notes, target / picture.name)
 
 
 def _name(path: Path, link: str | None) -> str:

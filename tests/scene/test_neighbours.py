@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 from pathlib import Path
 from typing import Any
@@ -59,6 +60,37 @@ def test_a_drawer_beside_a_panel_is_its_neighbour_until_it_is_past_it(gap: float
     # The front's back face leaves the panel's end; then both are √(gap² + way²) apart. What is behind the front is further away.
     leaves = 1.903 - begin + np.sqrt(SAFE**2 - gap**2)
     assert upper == (np.inf if leaves > drawer_scene().objects["drawer"].object.upper[0] else pytest.approx(leaves, abs=2e-4))
+
+
+def test_what_is_remembered_is_of_these_obstacles_and_states() -> None:
+    scene = beside(0.004, 1.4)
+    (one,) = allowances(scene, SAFE)
+    kept = [k for k, label in enumerate(scene.obstacle_labels) if label != "side"]
+    parts = {name: tuple(getattr(scene, name)[k] for k in kept) for name in ("obstacles", "obstacle_labels")}
+    assert allowances(dataclasses.replace(scene, **parts), SAFE) == ()
+    assert allowances(scene.with_start(base=[0.0, 0.0, 0.0]), SAFE) == (one,)
+    ahead = with_boxes(
+        drawer_scene(), ahead=((0.1, 0.5, 0.2), (1.43, 0.0, 0.755))
+    )  # 0.37 m before the front, which is 0.59 m wide
+    assert allowances(ahead, SAFE) == ()
+    (met,) = allowances(ahead.with_state("drawer", {"slide": 0.4}), SAFE)
+    assert (met.first, met.second, met.margin) == ("drawer.tray", "ahead", -np.inf)
+
+
+def test_two_drawers_side_by_side_are_neighbours_until_either_is_past_the_other() -> None:
+    gap, thick = 0.015, 0.018  # between the fronts, and of each
+    drawer = {"type": "drawer", "position": [1.93, 0.0, 0.0]}
+    at = [[1.93, y, 0.0] for y in (0.0, 2 * TRAY + gap)]
+    pair = [{**drawer, "name": name, "position": place} for name, place in zip(("near", "next"), at, strict=True)]
+    scene = changed(drawer_scene(), objects=pair, obstacles=[])
+    (one,) = allowances(scene, SAFE)
+    assert one.between("near.tray", "next.tray")
+    leaves = thick + np.sqrt(SAFE**2 - gap**2)
+    assert {name: ends[1] for name, ends in one.ranges.items()} == {
+        f"{name}.slide": pytest.approx(leaves, abs=2e-4) for name in ("near", "next")
+    }
+    out = np.array([[0.0, 0.0], [0.02, 0.03], [0.05, 0.0], [0.0, 0.05]])
+    assert one.holds(["near.slide", "next.slide"], out).tolist() == [True, True, False, False]
 
 
 def test_nothing_is_close_in_scenes_that_come_along() -> None:

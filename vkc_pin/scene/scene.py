@@ -60,7 +60,7 @@ class Scene:
         holds: What the robot holds at the start, each hold after the one it depends on.
         allowed: Pairs of links, by label, that may be close, and what they must keep: a margin [m], or -inf if nothing.
         described: What it was made of; `document` takes from it what cannot be told from the rest: robot, obstacles, files.
-        memory: What was found out about it and can serve changed copies; makes no difference to anything but time.
+        memory: What was found out about it and serves what the `with_` methods return; makes no difference to anything but time.
     """
 
     name: str
@@ -79,7 +79,7 @@ class Scene:
     holds: tuple[Hold, ...]
     allowed: Mapping[frozenset[str], float]
     described: SceneSchema
-    memory: dict[Any, Any] = dataclasses.field(default_factory=dict, repr=False)
+    memory: dict[Any, Any] = dataclasses.field(default_factory=dict, init=False, repr=False)
 
     def __repr__(self) -> str:
         return (
@@ -212,7 +212,9 @@ class Scene:
     def _with(self, **fields: Any) -> Scene:
         """Return the scene with other attributes, and every free object that is held where the robot then holds it."""
         changed = dataclasses.replace(self, **fields)
-        return dataclasses.replace(changed, objects=in_hand(changed.objects, changed.tool_placement, changed.holds))
+        changed = dataclasses.replace(changed, objects=in_hand(changed.objects, changed.tool_placement, changed.holds))
+        object.__setattr__(changed, "memory", self.memory)  # other copies begin anew: their obstacles may be others
+        return changed
 
     def tool_placement(self) -> pin.SE3:
         """Return the placement of the robot's tool frame in the world frame at the start."""

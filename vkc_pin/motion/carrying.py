@@ -45,8 +45,9 @@ class FreeObjects:
             now = np.flatnonzero(((times > begin) | (number == 0)) & ((times <= end) | last))
             if not (len(now) and rows):
                 continue
-            moving = self._within(number, np.clip(np.concatenate([[begin], times[now]]), begin, end))
-            for name, placement in self._begins[number].items():
+            where, rides = self._begins[number]
+            moving = self._within(phase, np.clip(np.concatenate([[begin], times[now]]), begin, end), where, rides)
+            for name, placement in where.items():
                 rows[name][now] = [as_numbers(p) for p in moving[name][1:]] if name in moving else as_numbers(placement)
         for row in rows.values():
             flips = np.concatenate([[1.0], np.sign(np.einsum("kc,kc->k", row[1:, 3:], row[:-1, 3:]))])
@@ -56,24 +57,25 @@ class FreeObjects:
     @cached_property
     def rides(self) -> list[dict[str, str]]:
         """For every phase, free object → "<object>.<link>" of what rides in it."""
-        return [
-            self._rides(phase, where) if where else {} for phase, where in zip(self.trajectory.phases, self._begins, strict=True)
-        ]
+        return [rides for _, rides in self._begins]
 
     @cached_property
-    def _begins(self) -> list[dict[str, pin.SE3]]:
-        """Where free objects are when each phase begins."""
-        found = [{name: self.scene.objects[name].placement for name in self.names}]
-        for number, phase in enumerate(self.trajectory.phases[:-1] if self.names else ()):
-            ends = self._within(number, self.trajectory.times[[phase.first, phase.last]], found[-1])
-            found.append({**found[-1], **{name: placements[-1] for name, placements in ends.items()}})
-        return found if self.names else [{} for _ in self.trajectory.phases]
+    def _begins(self) -> list[tuple[dict[str, pin.SE3], dict[str, str]]]:
+        """Where free objects are when each phase begins, and what of them rides in it; see `rides`."""
+        where, found = {name: self.scene.objects[name].placement for name in self.names}, []
+        for phase in self.trajectory.phases:
+            rides = self._rides(phase, where) if where else {}
+            found.append((where, rides))
+            ends = self._within(phase, self.trajectory.times[[phase.first, phase.last]], where, rides) if where else {}
+            where = {**where, **{name: placements[-1] for name, placements in ends.items()}}
+        return found
 
-    def _within(self, number: int, times: Floats, where: Mapping[str, pin.SE3] | None = None) -> dict[str, list[pin.SE3]]:
+    def _within(
+        self, phase: PhaseSpan, times: Floats, where: Mapping[str, pin.SE3], rides: Mapping[str, str]
+    ) -> dict[str, list[pin.SE3]]:
         """Return the placements of what moves in a phase at times, the first of which is its begin, where they are `where`."""
-        phase, where = self.trajectory.phases[number], self._begins[number] if where is None else where
         held = self._held(phase, times, where)
-        return {**held, **self._riding(self._rides(phase, where), times, where, held)}
+        return {**held, **self._riding(rides, times, where, held)}
 
     def _held(self, phase: PhaseSpan, times: Floats, where: Mapping[str, pin.SE3]) -> dict[str, list[pin.SE3]]:
         values, robot = self.trajectory.at(times), self.scene.robot

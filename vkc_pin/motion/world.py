@@ -105,12 +105,13 @@ class World:
             graft_geometry(geometry, source.geometryObjects, joints=self._joints[name], placement=where, prefix=f"{name}.")
         return geometry
 
-    def positions(self, trajectory: Trajectory, times: ArrayLike | None = None) -> Floats:
+    def positions(self, trajectory: Trajectory, times: ArrayLike | None = None, free: FreeObjects | None = None) -> Floats:
         """Return minimal coordinates, shape (K, n), of the world along `trajectory`.
 
         Args:
             trajectory: A motion in this scene; what it does not name stays as it is at the start, unless it is carried.
             times: [s], shape (K,), in increasing order; None takes the waypoints.
+            free: The scene's free objects along it, if somebody has them already.
         """
         times = trajectory.times if times is None else np.asarray(times, float)
         values = trajectory.at(times)
@@ -119,7 +120,8 @@ class World:
         for column, name in enumerate(trajectory.names):
             if name in index:  # virtual joints of grasps belong to no body
                 rows[:, index[name]] = values[:, column]
-        for name, placements in FreeObjects(self.scene, trajectory).at(times).items():
+        free = FreeObjects(self.scene, trajectory) if free is None else free
+        for name, placements in free.at(times).items():
             rows[:, self.placement_columns(name)] = placements
         return rows
 

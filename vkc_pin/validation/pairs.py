@@ -35,6 +35,7 @@ class PairTable:
         dist_safe: Clearance to keep at the waypoints [m].
         self_distance: The same between links of the robot that can [m]; `dist_safe` if left out.
         windows: Which pairs may be closer than that, and when.
+        rows: Configurations of the world at the waypoints, shape (T, n), if somebody has them already.
     """
 
     def __init__(
@@ -46,10 +47,11 @@ class PairTable:
         self_distance: float | None = None,
         *,
         windows: Sequence[Window] = (),
+        rows: Floats | None = None,
     ) -> None:
         self.scene, self.world, self.solids = scene, solids.world, solids
         world, own_margin = self.world, dist_safe if self_distance is None else self_distance
-        rows = world.positions(trajectory)
+        rows = world.positions(trajectory) if rows is None else rows
         self._moves = np.array([self._moved(rows[phase.first : phase.last + 1]) for phase in trajectory.phases])
         self._phase = np.searchsorted([phase.last for phase in trajectory.phases], np.arange(len(rows)))  # the earlier of two
         labels, bodies = world.collision_labels, range(solids.bodies)
@@ -81,12 +83,14 @@ class PairTable:
 
     def _by_pair(self, windows: Sequence[Window]) -> dict[int, list[Window]]:
         """Return pair → when it may be close."""
-        number = {pair: k for k, pair in enumerate(map(tuple, self.pairs.tolist()))}
-        found: dict[int, list[Window]] = {}
+        base, found = np.array([len(self.group), 1]), dict[int, list[Window]]()
+        numbers = self.pairs @ base  # of each pair another one: the smaller index comes first here and there
+        order = np.argsort(numbers)
         for window in windows:
-            for pair in map(tuple, window.pairs.tolist()):
-                if pair in number:
-                    found.setdefault(number[pair], []).append(window)
+            wanted = window.pairs @ base
+            at = order[np.minimum(np.searchsorted(numbers, wanted, sorter=order), len(order) - 1)]
+            for k in at[numbers[at] == wanted].tolist():
+                found.setdefault(k, []).append(window)
         return found
 
     def margins_at(self, pairs: Ints, waypoints: Ints) -> Floats:

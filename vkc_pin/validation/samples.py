@@ -11,6 +11,7 @@ import pinocchio as pin
 from vkc_pin.arrays import Floats, Ints
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.models.articulation import Freedom
+from vkc_pin.motion.carrying import FreeObjects
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.motion.world import World
 from vkc_pin.scene.contact import hand_frame
@@ -33,6 +34,7 @@ class Samples:
     Attributes:
         scene, trajectory: What it was made of.
         world: The scene as one plain tree.
+        free: Its free objects along the motion.
         times: When it is looked at, shape (S,) [s]; evenly spaced between two waypoints.
         waypoint_rows: Which of these are the waypoints, shape (T,).
         z: Minimal coordinates of the world, shape (S, n).
@@ -56,7 +58,8 @@ class Samples:
         self._check_names()
         self._check_size()
         self.times, self.waypoint_rows = self._sample()
-        self.z = self.world.positions(trajectory, self.times)
+        self.free = FreeObjects(scene, trajectory)
+        self.z = self.world.positions(trajectory, self.times, self.free)
 
     def _check_size(self) -> None:
         far = np.argwhere(np.abs(self.trajectory.positions) > _LARGEST)

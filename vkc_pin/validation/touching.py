@@ -9,7 +9,6 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.arrays import Ints
-from vkc_pin.motion.carrying import FreeObjects
 from vkc_pin.options import Options
 from vkc_pin.scene.contact import CONTACT, EASED_TIME, grasped, hand_clearance, hand_frame, moves_as_one, touching
 from vkc_pin.scene.hold import Hold
@@ -93,7 +92,7 @@ class _Windows:
         self.q = world.coordinates.q(samples.z[samples.waypoint_rows])
         self.steps = np.abs(np.diff(self.trajectory.positions, axis=0)).max(axis=1) > _STILL
         self.robots = len(self.scene.robot.collision.geometryObjects)
-        self.rides = FreeObjects(self.scene, self.trajectory).rides
+        self.rides = samples.free.rides
 
     def of(self, steps: Sequence[Step]) -> Iterator[Window]:
         for one in allowances(self.scene, self.options.dist_safe):

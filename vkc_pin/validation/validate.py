@@ -12,10 +12,9 @@ import numpy as np
 
 from vkc_pin.arguments import instance
 from vkc_pin.arrays import Floats
-from vkc_pin.motion.carrying import FreeObjects
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.options import Options
-from vkc_pin.scene.neighbours import allowances
+from vkc_pin.scene.neighbours import Allowance, allowances
 from vkc_pin.scene.resting import LEVEL, tilt
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.steps import Step, as_list
@@ -185,12 +184,11 @@ class _Check:
             rest = float(times[end] - times[begin])
             if not rest >= self.options.grasp_time - DWELL_TOLERANCE:
                 detail = f"the robot stands still for {rest:.2f} s, {self.options.grasp_time:g} s are asked for"
-                subject = ", ".join(sorted(map(str, changed)))
-                self._add("dwell", subject, self.options.grasp_time - rest, "s", detail, waypoint=at)
+                self._add("dwell", ", ".join(sorted(map(str, changed))), self.options.grasp_time - rest, "s", detail, waypoint=at)
 
     def _tips(self) -> None:
         """What something stands on stays level while it moves."""
-        for phase, riding in zip(self.trajectory.phases, FreeObjects(self.scene, self.trajectory).rides, strict=True):
+        for phase, riding in zip(self.trajectory.phases, self.samples.free.rides, strict=True):
             rows = self.samples.rows(phase)
             for owner, label in riding.items():
                 links = self.samples.placements(rows, label)
@@ -266,14 +264,13 @@ class _Check:
                     detail = f"the hand moves on '{owner}' by "
                     self._still(phase, "slide", f"{owner}.{name}", detail, " while it clamps it")
 
-    def _still(self, phase: PhaseSpan, constraint: str, name: str, before: str, after: str) -> None:
+    def _still(self, phase: PhaseSpan, kind: str, name: str, before: str, after: str) -> None:
         """A coordinate does not change in a phase; what is said of it goes around by how much."""
         values = self.trajectory.column(name)[phase.first : phase.last + 1]
         moved, unit = np.abs(values - values[0]), self.samples.unit(name)
         worst = int(np.argmax(moved))
         if not moved[worst] <= MOTION_TOLERANCE:
-            detail = f"{before}{moved[worst]:.4f} {unit}{after}"
-            self._add(constraint, name, moved[worst], unit, detail, waypoint=phase.first + worst)
+            self._add(kind, name, moved[worst], unit, f"{before}{moved[worst]:.4f} {unit}{after}", waypoint=phase.first + worst)
 
     def _clearance(self) -> Floats:
         """Nothing comes too close at a waypoint (eqs. 6 and 7) or penetrates anywhere; return each phase's smallest distance [m].
@@ -281,12 +278,15 @@ class _Check:
         What moves as one does not count. The start is where the robot is: it may be close to something, but not inside.
         """
         samples, solids, lasts = self.samples, Solids(self.samples.world), [phase.last for phase in self.trajectory.phases]
-        nearest = np.full(len(lasts), np.inf)
-        near, safe = windows(samples, solids, self.steps, self.options), self.options.dist_safe
-        pairs = PairTable(self.scene, solids, self.trajectory, safe, self.options.self_distance, windows=near)
-        neighbours = [one for one in allowances(self.scene, safe) if one.margin == -np.inf]
+        near = windows(samples, solids, self.steps, self.options)
+        safe, own = self.options.dist_safe, self.options.self_distance
+        pairs = PairTable(self.scene, solids, self.trajectory, safe, own, windows=near, rows=samples.z[samples.waypoint_rows])
+        nearest, neighbours = np.full(len(lasts), np.inf), dict[frozenset[str], list[Allowance]]()
+        for one in allowances(self.scene, safe):
+            if one.margin == -np.inf:
+                neighbours.setdefault(frozenset((one.first, one.second)), []).append(one)
         for hit in sweep(pairs, samples.z, samples.waypoint_rows):
-            named, state = (one for one in neighbours if one.between(hit.first, hit.second)), samples.z[[hit.row]]
+            named, state = neighbours.get(frozenset((hit.first, hit.second)), ()), samples.z[[hit.row]]
             if any(one.holds(samples.world.coordinates.names, state)[0] for one in named):
                 continue  # on the way to the waypoint at which they are neighbours no more, or first are
             if hit.margin > -np.inf:

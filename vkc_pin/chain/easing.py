@@ -61,11 +61,11 @@ def eased_pairs(
 
     for holds, begin, end in ((phase.leaves, first, first + steps), (phase.grasps, last - steps, last)):
         for hold in holds:
-            links, owner = touching(scene, hold), f"{hold.object}."
-            for k, (i, j) in enumerate(part.pairs.tolist()):
-                if part.labels[i] in links and part.labels[j].startswith(owner):
-                    margin = hand_clearance(scene, hold, part.labels[j], options)
-                    eased.setdefault(k, []).append((begin, end, margin))
+            hand = np.isin(part.labels, list(touching(scene, hold)))
+            its = np.array([label.startswith(f"{hold.object}.") for label in part.labels])
+            for k in np.flatnonzero(hand[part.pairs[:, 0]] & its[part.pairs[:, 1]]).tolist():
+                margin = hand_clearance(scene, hold, part.labels[part.pairs[k, 1]], options)
+                eased.setdefault(k, []).append((begin, end, margin))
     for geometries, placed, begins in _moments(scene, chain, phase):
         stands = {shape.name: shape.placement for shape in standing_geometry(placed)}
         for i in geometries:

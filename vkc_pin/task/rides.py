@@ -106,11 +106,7 @@ def rides_of(scene: Scene, now: Mapping[str, PlacedObject], hold: Hold, joints: 
         InputError: Something stands on what moves and on what does not.
     """
     thing = now[hold.object].object
-    moved = [
-        joint for joint in range(1, thing.model.njoints) if joints & {thing.model.names[k] for k in thing.model.supports[joint]}
-    ]
-    frames = [frame for frame in thing.model.frames if frame.type == pin.FrameType.BODY]
-    links = {str(frame.name) for frame in frames if thing.free or frame.parentJoint in moved}
+    links = set(thing.links) if thing.free else thing.links_moved_by(joints)
     free = [name for name, placed in now.items() if placed.object.free and name != hold.object]
     riding = borne(now, {hold.object: links}, free)
     if not riding:

@@ -33,12 +33,8 @@ def upright_bar(article: Article, link: Link, at: Point, length: float, out: flo
         out: From the face to the bar's centre line [m].
         name: Of the attachment.
     """
-    x, y, z = at
-    link.cylinder((x - out, y, z), 0.01, length, "z", "steel")
-    for side in (-1, 1):
-        link.cylinder((x - out / 2.0, y, z + side * (length / 2.0 - _POST)), 0.006, out, "x", "steel")
-    reach = max(length / 2.0 - _POST - _THUMB, 0.0)
-    where: tuple[Link, Point, Point, Point] = (link, (x - out, y, z), (1, 0, 0), (0, 1, 0))
+    middle, reach = _bar(link, at, length, out, "z")
+    where: tuple[Link, Point, Point, Point] = (link, middle, (1, 0, 0), (0, 1, 0))
     article.attach(name, *where)
     limits, turn = _interval(reach), _interval(_SWING)
     article.attach(f"{name}_free", *where, joint="cylindrical", axis=[0, 1, 0], limits=limits, turn=turn)
@@ -67,14 +63,10 @@ def level_bar(
         name: Of the attachment.
         turn: How far a hand may turn about the bar [rad]; None: as far as it may tilt.
     """
-    x, y, z = at
-    link.cylinder((x - out, y, z), 0.01, length, "y", "steel")
-    for side in (-1, 1):
-        link.cylinder((x - out / 2.0, y + side * (length / 2.0 - _POST), z), 0.006, out, "x", "steel")
-    reach = max(length / 2.0 - _POST - _THUMB, 0.0)
+    middle, reach = _bar(link, at, length, out, "y")
     down = _STEEPEST * float(np.clip((_LEVEL - height) / 0.25, 0.0, 1.0))
     approach, closing = (math.cos(down), 0.0, -math.sin(down)), (math.sin(down), 0.0, math.cos(down))
-    where: tuple[Link, Point, Point, Point] = (link, (x - out, y, z), approach, closing)
+    where: tuple[Link, Point, Point, Point] = (link, middle, approach, closing)
     article.attach(name, *where)
     limits = list(turn) if turn is not None else _interval(_TILT)
     article.attach(f"{name}_free", *where, joint="cylindrical", axis=[0, 1, 0], limits=_interval(reach), turn=limits)
@@ -96,6 +88,17 @@ def knob(article: Article, link: Link, at: Point, out: float, name: str = "handl
     where: tuple[Link, Point, Point, Point] = (link, (x - out, y, z), (1, 0, 0), (0, 1, 0))
     article.attach(name, *where)
     article.attach(f"{name}_free", *where, joint="spherical", limits=_interval(_SWING))
+
+
+def _bar(link: Link, at: Point, length: float, out: float, axis: str) -> tuple[Point, float]:
+    """Add a bar along an axis on two posts; return its middle, and how far a hand may slide from there to either side [m]."""
+    x, y, z = at
+    middle, end = (x - out, y, z), length / 2.0 - _POST
+    link.cylinder(middle, 0.01, length, axis, "steel")
+    for shift in (-end, end):
+        post = (x - out / 2.0, y, z + shift) if axis == "z" else (x - out / 2.0, y + shift, z)
+        link.cylinder(post, 0.006, out, "x", "steel")
+    return middle, max(end - _THUMB, 0.0)
 
 
 def _interval(reach: float) -> list[float]:

@@ -87,6 +87,36 @@ def test_a_door_is_pushed_shut_or_further_open(begin: float, end: float, face: s
     assert (reach.pushed, move.pushed, move.name) == ({}, {"door.hinge": way}, "move door.hinge")
 
 
+def test_a_goal_beyond_the_limit_is_the_limit() -> None:
+    """A door that is as far open as it goes is not pulled further."""
+    (_, move) = compiled(at(1.57), {"hinge": 2.0}, "push_back").phases
+    assert move.pushed == {"door.hinge": -1}
+
+
+def test_which_way_a_push_moves_a_joint_is_asked_where_the_steps_before_have_left_the_others() -> None:
+    """A face on a tray that slides on an arm: pulled out, it is on the other side of the axis about which the arm swings."""
+    scene, slides = full_scene(), (0.0, 0.3)
+    normal, along = np.array([1.0, -1.0, 0.0]) / np.sqrt(2.0), np.array([0.0, -1.0, 0.0])  # the tray slides along its -y axis
+
+    def face(shift: float) -> Attachment:
+        placement = pin.SE3(pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), normal).matrix(), shift * along)
+        return Attachment(name="face", link="tray", placement=placement, contact="push")
+
+    def yields(value: float, shift: float) -> float:
+        return advance(scene.objects["cabinet"].with_state({"slide": value}), face(shift), "swing")[0]
+
+    root = yields(0.0, 0.0) / (yields(0.0, 0.0) - yields(0.0, 1.0))  # the lever is linear along the axis
+    middle = face(root - sum(slides) / 2.0)
+    signs = [np.sign(advance(scene.objects["cabinet"].with_state({"slide": value}), middle, "swing")[0]) for value in slides]
+    assert signs[0] == -signs[1] != 0.0
+    there = with_objects(scene, {"cabinet": with_attachment(scene.objects["cabinet"].with_state({"slide": 0.0}), middle)})
+    swing_by = 0.3 + 0.2 * signs[1]
+    steps = [vkc.Actuate("cabinet", {"slide": 0.3}, "face"), vkc.Actuate("cabinet", {"swing": swing_by}, "face")]
+    assert compile_task(there, steps, Options()).phases[-1].pushed == {"cabinet.swing": signs[1]}
+    with pytest.raises(InputError, match="cannot pull"):
+        compile_task(there, steps[1:], Options())
+
+
 def test_a_hand_that_takes_hold_may_go_any_way() -> None:
     assert [phase.pushed for phase in compiled(at(0.0), {"hinge": 1.0}, "handle").phases] == [{}, {}, {}]
 
@@ -119,6 +149,7 @@ def test_a_drawer_is_not_pulled_out_at_its_front() -> None:
     [
         ("tray", [0.0, 0.0, 0.0], [0.0, 0.0, 1.0], "slide"),  # across the way it slides
         ("arm", [0.0, 0.0, 0.0], [1.0, 0.0, 0.0], "swing"),  # at the axis itself
+        ("arm", [0.0, 6e-4, 0.0], [1.0, 0.0, 0.0], "swing"),  # half a millimetre beside it
     ],
 )
 def test_a_face_whose_joint_does_not_yield_is_refused(

@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.carrying import STICK, TOP, above, box, lifted, moved_base, reaching, room, table, tool_at
+from helpers.riding import plates
 from helpers.small_problems import SHORT, program_of
 
 from vkc_pin.chain.easing import EASED_SHARE
@@ -16,7 +17,7 @@ from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.scene.contact import EASED_TIME
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.scene import Scene
-from vkc_pin.task.steps import GoTo, Grasp, Place, Reach, Step, Touch
+from vkc_pin.task.steps import Actuate, GoTo, Grasp, Place, Reach, Step, Touch
 
 GAP = 4e-3  # [m] of what the stick lies on
 NEAR = SHORT.steps(EASED_TIME)
@@ -121,6 +122,21 @@ def test_taken_again_it_is_eased_where_it_was_put() -> None:
     p = problem(room(table(gap=GAP)), Place("stick", ASIDE), Grasp("stick"), GoTo(0.0, 0.0))
     assert [phase.name for phase in p.task.phases] == ["reach stick.grip", "place stick", "reach stick.grip", "go to"]
     only_near(margins(p, 3)["stick.stick", "table"], EASED_SHARE * GAP, begin=True)
+
+
+def test_taken_again_it_stands_in_nothing() -> None:
+    """What it stood in at the start it may leave once; after that it was put down, and nothing is put down inside of things."""
+    p = problem(room(table(gap=-1e-3)), Place("stick", ASIDE), Grasp("stick"), GoTo(0.0, 0.0))
+    only_near(margins(p, 3)["stick.stick", "table"], 0.0, begin=True)
+
+
+def test_what_rides_is_eased_from_what_is_beside_it_where_the_ride_begins_alone() -> None:
+    options = dataclasses.replace(LONG, move_waypoints=N)
+    p = program_of(plates(cups=1, wall=0.01), [Actuate("plate", {"slide": 0.3})], options=options)
+    (number,) = (k for k, phase in enumerate(p.task.phases) if phase.rides)
+    row = margins(p, number)["cup.cup", "wall"]
+    assert row[0] == pytest.approx(EASED_SHARE * 0.01, abs=1e-4)
+    assert row[-1] == LONG.dist_safe
 
 
 def test_in_a_short_phase_both_ends_must_be_possible() -> None:

@@ -15,8 +15,11 @@ from hypothesis import strategies as st
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.models.shapes import link_name, shape_distance
 from vkc_pin.scene import neighbours
 from vkc_pin.scene.neighbours import Allowance, allowances, close_pairs
+from vkc_pin.scene.obstacles import FLOOR
+from vkc_pin.scene.placed import standing_geometry
 from vkc_pin.scene.scene import Scene, load_scene
 from vkc_pin.validation.validate import validate
 
@@ -60,6 +63,21 @@ def test_a_drawer_beside_a_panel_is_its_neighbour_until_it_is_past_it(gap: float
     # The front's back face leaves the panel's end; then both are √(gap² + way²) apart. What is behind the front is further away.
     leaves = 1.903 - begin + np.sqrt(SAFE**2 - gap**2)
     assert upper == (np.inf if leaves > drawer_scene().objects["drawer"].object.upper[0] else pytest.approx(leaves, abs=2e-4))
+
+
+def test_the_distance_of_two_links_is_that_of_their_closest_shapes() -> None:
+    scene = beside(0.012).with_state("drawer", {"slide": 0.2})
+    shapes = [(f"drawer.{link_name(shape.name)}", shape) for shape in standing_geometry(scene.objects["drawer"])]
+    moving = [shape for label, shape in shapes if label == "drawer.tray"]
+    least: dict[str, float] = {}
+    for label, other in zip(scene.obstacle_labels, scene.obstacles, strict=True):
+        for shape in moving if label != FLOOR else ():
+            distance = shape_distance(shape.geometry, shape.placement, other.geometry, other.placement)
+            least[label] = min(least.get(label, np.inf), distance)
+    found = {pair.second: pair.distance for pair in close_pairs(scene, 0.6)}
+    assert len(moving) > 3
+    assert found == pytest.approx({label: distance for label, distance in least.items() if distance < 0.6}, abs=1e-9)
+    assert {"side", "wall_east"} <= set(found)
 
 
 def test_what_is_remembered_is_of_these_obstacles_and_states() -> None:
@@ -119,6 +137,13 @@ def test_a_door_that_stands_open_is_still_built_into_its_wall() -> None:
     assert {one.ranges["door.hinge"] for one in shut} == {ajar}
 
 
+def test_a_drawer_that_stands_open_is_a_neighbour_of_what_it_was_built_beside() -> None:
+    (one,) = allowances(beside(0.004), SAFE)
+    assert close_pairs(beside(0.004).with_state("drawer", {"slide": 0.4}), SAFE) == []
+    (other,) = allowances(beside(0.004).with_state("drawer", {"slide": 0.4}), SAFE)
+    assert (other.first, other.second, other.margin, other.ranges) == (one.first, one.second, one.margin, one.ranges)
+
+
 def test_what_is_in_the_hand_or_on_a_table_is_nobodys_neighbour() -> None:
     scene = load_scene("init_1")
     assert close_pairs(scene, 0.3) == []
@@ -157,6 +182,7 @@ def test_what_a_scene_allows(tmp_path: Path, allow: list[Any], margin: float) ->
         warnings.simplefilter("error")  # what is allowed is not told of
         scene = Scene.from_document({**in_wall(-0.004).document, "allow": allow}, tmp_path)
     assert scene.allowed[frozenset(("door.panel", "wall"))] == margin
+    assert close_pairs(scene, SAFE) == []
     assert all(isinstance(label, str) for pair in scene.allowed for label in pair)
     again = Scene.from_document(scene.document, tmp_path)
     assert dict(again.allowed) == dict(scene.allowed)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Sequence
 
 import numpy as np
@@ -22,6 +23,7 @@ from helpers.carrying import (
     tool_at,
     with_object,
 )
+from helpers.drawers import changed, drawer_scene, with_boxes
 from helpers.drives import of_rows, through
 from helpers.riding import plates, slid
 from helpers.small_problems import door_scene
@@ -158,6 +160,50 @@ def test_what_lies_on_the_floor() -> None:
     taken = Script(scene).take("ball", "grip", (0.0, 0.0, 0.0)).go(moved_base(scene.start, x=-0.2)).motion()
     found = near(scene, taken)
     assert found == {**hand_on("ball.ball", (0, 20)), ("ball.ball", FLOOR): [(0, STEPS)]}
+
+
+@pytest.mark.parametrize(
+    ("gap", "allow", "expected"),
+    [
+        (0.005, [], (2, 6, 0.0, CONTACT, False)),  # until the front, 18 mm thick, has left it by √(20² - 5²) mm
+        (-0.002, [], (2, 6, -np.inf, np.inf, True)),
+        (-0.002, [{"pair": ["drawer.tray", "side"], "margin": -0.003}], (0, 8, -0.003, 0.003, False)),
+    ],
+)
+def test_neighbours_at_the_waypoints_at_which_their_joints_have_them_so(
+    gap: float, allow: list[object], expected: tuple[float, ...]
+) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        side = with_boxes(drawer_scene(), side=((0.4, 0.1, 0.9), (2.085, 0.295 + gap + 0.05, 0.45)))
+        scene = changed(side, allow=allow).with_state("drawer", {"slide": 0.3})
+    slide = np.array([0.3, 0.1, 0.03, 0.0, 0.0, 0.0, 0.03, 0.1, 0.3])
+    rows = np.column_stack([np.tile(scene.start, (9, 1)), slide])
+    motion = Trajectory((*scene.robot.coordinates.names, "drawer.slide"), np.arange(9.0), rows, (PhaseSpan("slide", 0, 8),), 9)
+    samples = Samples(scene, motion)
+    found = [window for window in windows(samples, Solids(samples.world), [], Options()) if len(window.pairs)]
+    for window in found:
+        assert {frozenset(samples.world.collision_labels[k] for k in pair) for pair in window.pairs.tolist()} == {
+            frozenset(("drawer.tray", "side"))
+        }
+    assert expected in [tuple(window[1:]) for window in found]
+    assert len(found) == 1 + (bool(allow))
+
+
+def test_what_stands_in_something_leaves_it_once_and_within_a_second() -> None:
+    """It may not be put back there, nor be lifted out of there again."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        scene = room(table(gap=-0.002))
+    down, up = reaching(tool_at(STICK), above(STICK)), np.array(scene.start)
+    script = Script(scene).go(down).take("stick").go(up).go(down).let_go().go(up).go(down).take("stick").go(up)
+    samples = Samples(scene, script.motion())
+    inside = [window for window in windows(samples, Solids(samples.world), [], Options()) if window.margin < 0.0]
+    assert inside
+    for window in inside:
+        assert (window.first, window.last) == (20, 20 + STEPS)
+        assert (window.margin, window.contact) == (pytest.approx(-0.002, abs=1e-6), pytest.approx(0.002 + CONTACT, abs=1e-6))
+        assert {samples.world.collision_labels[k] for pair in window.pairs.tolist() for k in pair} == {"stick.stick", "table"}
 
 
 def test_things_that_lie_side_by_side() -> None:

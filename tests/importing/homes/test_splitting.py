@@ -80,6 +80,7 @@ def test_what_is_carried_is_stiff_and_comes_out_of_what_it_is_in() -> None:
     home = split(_home(links, joints))
     case, laptop = home.things
     assert set(case.description.links) == {"case", "drawer"}
+    assert case.position[2] == 0.0  # on the floor, above which it hangs
     assert laptop.free
     assert laptop.position == pytest.approx((1.15, 0.0, 0.4))  # with the drawer at its lower limit: as the scene has it
     assert [joint.kind for joint in laptop.description.joints.values()] == ["fixed"]

@@ -51,3 +51,11 @@ def test_what_stands_beside_it_ends_the_slide_and_the_way(tmp_path: Path) -> Non
     shelf = '<collision><origin xyz="-0.7 0.3 0.5"/><geometry><box size="0.4 0.8 1.0"/></geometry></collision>'
     hand, opening, _ = grip(tmp_path, before=shelf)
     assert hand.follow(opening) < 1.0
+
+
+def test_what_stands_beside_it_ends_the_turn_also_where_it_is_free_behind(tmp_path: Path) -> None:
+    post = '<collision><origin xyz="-0.2 0.66 0.5"/><geometry><box size="0.04 0.04 1.0"/></geometry></collision>'
+    (_, free), (_, turn) = (grip(tmp_path, **what)[0].freedoms()[1] for what in ({}, {"before": post}))
+    ends = sorted([-turn.lower, turn.upper])
+    assert ends[0] < 0.9 < ends[1] <= max(-free.lower, free.upper)  # the post is at 0.9 rad to one side
+    assert -free.lower > 0.9 < free.upper

@@ -56,6 +56,22 @@ def test_what_stands_before_a_handle_is_named() -> None:
     assert any("not reached" in line for line in blocked.lines())
 
 
+def test_what_is_too_high_is_not_reached() -> None:
+    (drawer,) = drawer_scene().document["objects"]
+    high = check_scene(changed(drawer_scene(), objects=[{**drawer, "position": [1.93, 0.0, 2.0]}]))
+    assert not high.ok
+    assert [one.configuration for one in high.attachments] == [None] * len(drawer_scene().objects["drawer"].object.attachments)
+
+
+def test_what_is_in_the_hand_is_not_tried_and_does_not_fill_it() -> None:
+    """Whether the rest can be reached is asked of an empty hand."""
+    cup = {"name": "cup", "type": "cup", "position": [0.0, 0.0, 1.5]}
+    scene = changed(drawer_scene(), objects=[*drawer_scene().document["objects"], cup])
+    held = check_scene(scene.with_held({"cup": next(iter(scene.objects["cup"].object.attachments))}))
+    assert {one.object for one in held.attachments} == {"drawer"}
+    assert any(one.configuration is not None for one in held.attachments)
+
+
 def test_a_robot_in_something_and_what_is_close_are_told(tmp_path: Path) -> None:
     scene = with_boxes(drawer_scene(), side=((0.6, 0.1, 0.9), (2.0, 0.295 + 0.05 + 0.004, 0.45)))
     x, y, _ = scene.start[:3]

@@ -35,6 +35,7 @@ def problem(
     object_type: str | dict[str, Any] | None = None,
     state: float = 0.0,
     size: Sequence[float] = (0.08, 0.1, 0.5),
+    allow: Sequence[Any] = (),
 ) -> TrajectoryProblem:
     scene = door_scene().with_state("door", {"hinge": state})
     document = scene.document
@@ -43,7 +44,7 @@ def problem(
         document = {**document, "obstacles": [*document["obstacles"], box]}
     else:
         document = {**document, "objects": [*document["objects"], {"name": "post", "type": object_type, "position": list(at)}]}
-    scene = Scene.from_document(document, scene.folder)
+    scene = Scene.from_document({**document, "allow": list(allow)}, scene.folder)
     options = Options(reach_waypoints=4, turn_waypoints=3, move_waypoints=6)
     return TrajectoryProblem(scene, compile_task(scene, [Actuate("door", {"hinge": hinge})], options), options)
 
@@ -111,3 +112,10 @@ def test_an_overlap_that_validation_might_overlook_proves_nothing(deep: float, p
     middle = around_the_hinge(0.6, (placed.placement * pin.SE3.Identity()).act(np.array([0.0, -0.5, 0.0])))
     slab = [*middle[:2], low + deep - 0.05]
     assert bool(swept(problem(1.3, slab, size=(0.1, 0.1, 0.1)))) == proven
+
+
+@pytest.mark.parametrize(("margin", "proven"), [(-0.01, True), (-0.5, False), (None, False)])
+def test_what_the_scene_allows_proves_nothing(margin: float | None, proven: bool) -> None:
+    pair = ["door.panel", "post"]
+    allow: Any = pair if margin is None else {"pair": pair, "margin": margin}
+    assert bool(swept(problem(1.3, POST, allow=[allow]))) == proven

@@ -62,6 +62,19 @@ def test_some_may_be_closer_for_a_while(door: Scene) -> None:
         np.testing.assert_array_equal(np.flatnonzero(table.together_at(every, at, at + 1)), as_one)
 
 
+def test_a_window_of_pairs_that_are_not_looked_at_is_nobody_elses(door: Scene) -> None:
+    """Neighbouring links, or two walls: what is said of them must not end up with another pair."""
+    motion = wander(door, 0, size=0.1)
+    plain = PairTable(door, Solids(World(door)), motion, 0.02)
+    known, count = {(min(pair), max(pair)) for pair in plain.pairs.tolist()}, len(plain.group)
+    absent = np.array([(i, j) for i in range(count) for j in range(i + 1, count) if (i, j) not in known])
+    assert len(absent) > 10
+    table = PairTable(door, Solids(World(door)), motion, 0.02, windows=[Window(absent, 0, 3, -1.0, 1.0, together=True)])
+    every = np.arange(len(plain.pairs))
+    assert (table.margins_at(every, np.zeros_like(every)) == 0.02).all()
+    assert not table.contact_at(every, np.zeros_like(every), np.ones_like(every)).any()
+
+
 def test_a_side_branch_that_nothing_moves_hits_nothing_that_stands() -> None:
     """A second door in a cabinet may well be shut next to a wall."""
     scene = full_scene()

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -50,15 +51,23 @@ def test_clearance_is_that_of_coal(fitting: Fitting) -> None:
         name: [(s.geometry, data.oMi[s.parentJoint] * s.placement) for s in shapes if s.name.startswith(name)]
         for name in ("case", "flap")
     }
-    seen = set()
-    for x in np.linspace(-0.4, 0.1, 26):
+
+    def free(x: float) -> bool:
         tool = pin.SE3(FRONT, np.array([x, 0.5, 0.5]))
         touch, others = ([(shape, tool * where) for shape, where in group] for group in (hand.touch, hand.others))
-        free = (
+        found = (
             clearance(touch, groups["flap"]) >= 0.005
             and clearance([*touch, *others], groups["case"]) >= 0.02
             and clearance(others, groups["flap"]) >= 0.02
         )
-        assert (fitting.blocked(tool, "flap") is None) == free
-        seen.add(free)
-    assert seen == {True, False}
+        assert (fitting.blocked(tool, "flap") is None) == found
+        return found
+
+    places = np.linspace(-0.4, 0.1, 26).tolist()
+    changes = [(a, b) for a, b in itertools.pairwise(places) if free(a) != free(b)]
+    assert changes
+    for one, other in changes:  # and where that changes, to 0.1 mm
+        before = free(one)
+        while abs(other - one) > 1e-4:
+            middle = (one + other) / 2.0
+            one, other = (middle, other) if free(middle) == before else (one, middle)

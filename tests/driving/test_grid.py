@@ -7,6 +7,7 @@ from helpers.base_scenes import BLINK, HALL, MARGIN, arm, at, between, chassis, 
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
+from vkc_pin.compiled import compiled_module
 from vkc_pin.driving.body import Shape
 from vkc_pin.driving.grid import HEADINGS, BaseGrid
 from vkc_pin.errors import InputError
@@ -113,6 +114,13 @@ def test_distances_from_where_the_base_cannot_be() -> None:
     assert np.isfinite(grid.distances_from(np.array([(0.7, 0.0)]))).any()
     everywhere = BaseGrid(chassis(), [], [(coal.Box(20.0, 20.0, 1.0), at(0.0, 0.0, 0.5))], HALL, MARGIN)
     assert np.isinf(everywhere.distances_from(np.zeros((1, 2)))).all()
+
+
+def test_moves_that_lead_nowhere_are_refused(grid: BaseGrid) -> None:
+    floor = compiled_module("vkc_pin.driving._driving").Floor
+    for lengths in (np.zeros(HEADINGS), -grid.lengths, np.full(HEADINGS, np.nan)):
+        with pytest.raises(ValueError, match="lead"):
+            floor(grid.stuck.view(np.uint8), grid.moves, lengths)
 
 
 def test_an_arena_that_is_not_square() -> None:

@@ -141,18 +141,22 @@ private:
   void spread()
   {
     least_.assign(lattice_.size(), NEVER);
-    ::spread(
-      least_,
-      [&](const auto & reach) {
-        for (const auto & end : ends_)
-          reach(end.node / HEADINGS, end.cost);
-      },
-      [&](Index cell, Index cost, const auto & reach) {
-        for (Index node = cell * HEADINGS; node < (cell + 1) * HEADINGS; ++node)
-          for (const Index kind : {AHEAD, BACK})
-            if (const Index from = leads(node, opposite(kind)); from >= 0)
-              reach(from / HEADINGS, cost + price(from, kind));
-      });
+    std::vector<std::pair<Index, Index>> first;
+    for (const auto & end : ends_)
+      first.emplace_back(end.cost, end.node / HEADINGS);
+    Index shortest = NEVER, longest = 0;
+    for (Index heading = 0; heading < HEADINGS; ++heading)
+      for (const Index kind : {AHEAD, BACK})
+      {
+        shortest = std::min(shortest, price(heading, kind));
+        longest = std::max(longest, price(heading, kind));
+      }
+    ::spread(least_, std::move(first), shortest, longest, [&](Index cell, Index cost, const auto & reach) {
+      for (Index node = cell * HEADINGS; node < (cell + 1) * HEADINGS; ++node)
+        for (const Index kind : {AHEAD, BACK})
+          if (const Index from = leads(node, opposite(kind)); from >= 0)
+            reach(from / HEADINGS, cost + price(from, kind));
+    });
   }
 
   // Where a move leads; negative where it is known not to be free.

@@ -1,4 +1,4 @@
-// How far the base drives at least from places to every cell, if turns are free (Dijkstra).
+// How far the base drives at least from places to every cell, if turns are free.
 #pragma once
 
 #include <array>
@@ -19,6 +19,8 @@ public:
       throw std::invalid_argument("nodes are of shape (cells, cells, 16)");
     if (lengths.shape(0) != HEADINGS)
       throw std::invalid_argument("lengths are of shape (16,)");
+    if (!std::all_of(lengths.data(), lengths.data() + HEADINGS, [](double length) { return length > 0.0; }))
+      throw std::invalid_argument("moves lead somewhere");
     std::vector<std::uint16_t> open(leads_.size(), 0); // at which headings the base may be in a cell
     for (Index i = 0; i < cells_; ++i)
       for (Index j = 0; j < cells_; ++j)
@@ -51,20 +53,18 @@ public:
     {
       nb::gil_scoped_release released;
       std::vector<double> least(leads_.size());
+      const auto [shortest, longest] = std::minmax_element(lengths_.begin(), lengths_.end());
       for (std::size_t k = 0; k < places; ++k)
       {
         std::fill(least.begin(), least.end(), std::numeric_limits<double>::infinity());
-        spread(
-          least,
-          [&](const auto & reach) {
-            for (Index entry = firsts(k); entry < firsts(k + 1); ++entry)
-              reach(inner(begins(entry)), costs(entry));
-          },
-          [&](Index cell, double cost, const auto & reach) {
-            for (std::size_t heading = 0; heading < HEADINGS; ++heading)
-              if (leads_[std::size_t(cell)] >> heading & 1u)
-                reach(cell + moves_[heading], cost + lengths_[heading]);
-          });
+        std::vector<std::pair<double, Index>> first;
+        for (Index entry = firsts(k); entry < firsts(k + 1); ++entry)
+          first.emplace_back(costs(entry), inner(begins(entry)));
+        spread(least, std::move(first), *shortest, *longest, [&](Index cell, double cost, const auto & reach) {
+          for (std::size_t heading = 0; heading < HEADINGS; ++heading)
+            if (leads_[std::size_t(cell)] >> heading & 1u)
+              reach(cell + moves_[heading], cost + lengths_[heading]);
+        });
         for (Index i = 0; i < cells_; ++i)
           std::copy_n(least.begin() + inner(i * cells_), cells_, found.begin() + std::ptrdiff_t(k * count) + i * cells_);
       }

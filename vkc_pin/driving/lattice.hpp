@@ -4,7 +4,6 @@
 #include <algorithm>
 #include <functional>
 #include <limits>
-#include <queue>
 #include <stdexcept>
 #include <utility>
 #include <vector>
@@ -79,26 +78,42 @@ private:
   std::vector<Index> moves_; // in nodes, by heading
 };
 
-// Lowers what it costs to reach each cell, by Dijkstra's algorithm: begin(reach) and moves(cell, cost, reach) call
-// reach(cell, cost) where it begins, and for where moves lead from a cell.
-template<typename Cost, typename Begin, typename Moves>
-void spread(std::vector<Cost> & least, const Begin & begin, const Moves & moves)
+// Lowers what it costs to reach each cell, from those where it begins, to what the cheapest moves come to: moves(cell, cost, reach)
+// calls reach(other, cost) for where moves lead from a cell, each of which costs between `shortest` and `longest`.
+//
+// Cells wait in buckets as wide as the shortest move, so that no order is kept among them (Denardo and Fox 1979). The least of all
+// sums comes out as by Dijkstra's algorithm, to the last bit: adding never changes an order.
+template<typename Cost, typename Moves>
+void spread(
+  std::vector<Cost> & least, std::vector<std::pair<Cost, Index>> begins, Cost shortest, Cost longest, const Moves & moves)
 {
-  using Entry = std::pair<Cost, Index>;
-  std::priority_queue<Entry, std::vector<Entry>, std::greater<Entry>> queue;
+  const double scale = 1.0 / double(shortest);
+  const auto place = [scale](Cost cost) { return std::size_t(double(cost) * scale); };
+  std::vector<std::vector<std::pair<Cost, Index>>> buckets(place(longest) + 3); // in a ring
+  std::size_t waiting = 0, level = 0;
   const auto reach = [&](Index cell, Cost cost) {
     if (cost < least[std::size_t(cell)])
     {
       least[std::size_t(cell)] = cost;
-      queue.emplace(cost, cell);
+      buckets[place(cost) % buckets.size()].emplace_back(cost, cell);
+      ++waiting;
     }
   };
-  begin(reach);
-  while (!queue.empty())
+  std::sort(begins.begin(), begins.end(), std::greater<>());
+  for (; waiting || !begins.empty(); ++level)
   {
-    const auto [cost, cell] = queue.top();
-    queue.pop();
-    if (!(cost > least[std::size_t(cell)]))
-      moves(cell, cost, reach);
+    if (!waiting)
+      level = place(begins.back().first);
+    for (; !begins.empty() && place(begins.back().first) <= level; begins.pop_back())
+      reach(begins.back().second, begins.back().first);
+    auto & bucket = buckets[level % buckets.size()];
+    while (!bucket.empty())
+    {
+      const auto [cost, cell] = bucket.back();
+      bucket.pop_back();
+      --waiting;
+      if (!(cost > least[std::size_t(cell)]))
+        moves(cell, cost, reach);
+    }
   }
 }

@@ -67,7 +67,7 @@ def test_nothing_that_is_close_is_left_out(seed: int, reach: float, standing: bo
     rng = np.random.default_rng(seed)
     part, joints = random_geometry(rng), random_joints(rng, 5)
     distances = all_distances(part, *joints)
-    at, pairs, bounds = part.maybe_within(reach, *joints, standing=standing)
+    at, pairs, bounds = part.boxes.near(reach, *joints, standing=standing)
     assert (bounds <= distances[at, pairs] + COAL).all()
     assert (bounds < reach).all()
     assert (np.diff(at * len(part.pairs) + pairs) > 0).all(), "in order, none twice"
@@ -82,7 +82,7 @@ def test_what_is_far_is_left_out() -> None:
     rng = np.random.default_rng(0)
     part, joints = random_geometry(rng, 12, 60), random_joints(rng, 20)
     distances = all_distances(part, *joints)
-    at, pairs, _ = part.maybe_within(0.05, *joints)
+    at, pairs, _ = part.boxes.near(0.05, *joints)
     assert 0 < (distances < 0.05).sum() <= len(at) < 0.05 * distances.size
     assert (distances[at, pairs] < 0.4).all()
 
@@ -92,10 +92,10 @@ def test_what_is_far_is_left_out() -> None:
 def test_what_is_placed_elsewhere(seed: int) -> None:
     rng = np.random.default_rng(seed)
     part, joints = random_geometry(rng), random_joints(rng, 4)
-    part.maybe_within(0.1, *joints)  # what is kept must not be taken over
+    part.boxes.near(0.1, *joints)  # what is kept must not be taken over
     where = {geometry: random_placement(rng, 1.5) for geometry in (8, 11)}
     moved = part.placed(where)
-    at, pairs, _ = moved.maybe_within(0.1, *joints)
+    at, pairs, _ = moved.boxes.near(0.1, *joints)
     for geometry, placement in where.items():
         assert moved.shapes[geometry].placement.isApprox(placement)
         assert not part.shapes[geometry].placement.isApprox(placement), "the first one stays as it is"

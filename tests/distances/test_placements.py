@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import coal
 import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.small_problems import door_scene, random_configurations
 
-from vkc_pin.distances import placements
 from vkc_pin.distances.placements import ShapePlacements, columns_of
 from vkc_pin.motion.world import World
 
@@ -19,25 +19,50 @@ def test_numbers_of_a_placement() -> None:
     assert columns_of([]).shape == (0, 12)
 
 
-@pytest.mark.parametrize("known", [True, False])
-def test_shapes_are_where_pinocchio_says(known: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also where the memory of its placements is not what it is now."""
-    if not known:
-        monkeypatch.setattr(placements, "_memory", lambda _: None)
-    world = World(door_scene())
-    mine = ShapePlacements(world.model, world.bodies)
-    assert (mine._numbers is not None) == known
-    limits = (np.full(world.coordinates.size, limit) for limit in (-1.0, 1.0))
-    q = world.coordinates.q(random_configurations(*limits, 5, np.random.default_rng(0)))
+def check(model: pin.Model, geometry: pin.GeometryModel, q: np.ndarray) -> None:
+    mine = ShapePlacements(model, geometry)
     found = mine.at(q)
-    assert found.shape == (5, len(world.bodies.geometryObjects), 12)
-    data, placed = world.model.createData(), pin.GeometryData(world.bodies)
+    assert found.shape == (len(q), len(geometry.geometryObjects), 12)
+    data, placed = model.createData(), pin.GeometryData(geometry)
     for row, configuration in zip(found, q, strict=True):
-        pin.updateGeometryPlacements(world.model, data, world.bodies, placed, configuration)
+        pin.updateGeometryPlacements(model, data, geometry, placed, configuration)
         for numbers, placement in zip(row, placed.oMg, strict=True):
             np.testing.assert_array_equal(numbers[:9].reshape(3, 3).T, placement.rotation)
             np.testing.assert_array_equal(numbers[9:], placement.translation)
     np.testing.assert_array_equal(mine.at(q[:1]), found[:1])  # what was handed out before has not changed
+
+
+def test_shapes_are_where_pinocchio_says() -> None:
+    world = World(door_scene())
+    limits = (np.full(world.coordinates.size, limit) for limit in (-1.0, 1.0))
+    check(world.model, world.bodies, world.coordinates.q(random_configurations(*limits, 5, np.random.default_rng(0))))
+
+
+JOINTS = [
+    *(getattr(pin, f"JointModel{kind}{axis}") for kind in ("R", "P", "RUB") for axis in "XYZ"),
+    lambda: pin.JointModelRevoluteUnaligned(np.array([0.6, 0.0, 0.8])),
+    lambda: pin.JointModelPrismaticUnaligned(np.array([0.0, -0.6, 0.8])),
+    pin.JointModelPlanar,
+    pin.JointModelFreeFlyer,
+    pin.JointModelSpherical,
+]
+
+
+def test_joints_of_all_types_carry_shapes() -> None:
+    rng, model, geometry, parent = np.random.default_rng(3), pin.Model(), pin.GeometryModel(), 0
+    for k, joint in enumerate(JOINTS):
+        parent = model.addJoint(parent, joint(), pin.SE3.Random(), f"j{k}")
+        shape = pin.GeometryObject(f"s{k}", parent, 0, pin.SE3.Random(), coal.Sphere(0.1))
+        geometry.addGeometryObject(shape)
+    geometry.addGeometryObject(pin.GeometryObject("stands", 0, 0, pin.SE3.Random(), coal.Sphere(0.1)))
+    neutral = pin.neutral(model)
+    check(model, geometry, np.array([pin.integrate(model, neutral, rng.normal(size=model.nv)) for _ in range(4)]))
+
+
+def test_configurations_of_another_size_are_refused() -> None:
+    world = World(door_scene())
+    with pytest.raises(ValueError, match="nq"):
+        ShapePlacements(world.model, world.bodies).at(np.zeros((2, world.model.nq + 1)))
 
 
 def test_no_states_and_no_shapes() -> None:

@@ -9,6 +9,7 @@ import types
 
 import coal
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from vkc_pin import compiled
@@ -85,12 +86,14 @@ def test_faces_of_no_points_are_refused(wrong: np.ndarray) -> None:
 
 
 def test_a_module_that_does_not_fit_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It was compiled against another coal, or is not there."""
+    """It was compiled against another coal or Pinocchio, or is not there."""
     solids.compiled.cache_clear()
-    with monkeypatch.context() as patch:
-        patch.setattr(solids, "compiled_module", lambda _: types.SimpleNamespace(COAL_VERSION="2.9.1"))
-        with pytest.raises(BuildError, match=r"against coal 2\.9\.1"):
-            solids.compiled()
+    for theirs, mine, said in (("2.9.1", pin.__version__, r"against coal 2\.9\.1"), (coal.__version__, "3.9.0", r"pin 3\.9\.0")):
+        with monkeypatch.context() as patch:
+            built = types.SimpleNamespace(COAL_VERSION=theirs, PINOCCHIO_VERSION=mine)
+            patch.setattr(solids, "compiled_module", lambda _, built=built: built)
+            with pytest.raises(BuildError, match=said):
+                solids.compiled()
 
     def missing(name: str) -> types.ModuleType:
         raise ImportError(f"no {name}")

@@ -21,6 +21,7 @@ from vkc_pin.benchmarks.scale import crowded
 from vkc_pin.chain import easing
 from vkc_pin.chain.contacts import ContactModel
 from vkc_pin.chain.phase_geometry import PhaseGeometry
+from vkc_pin.distances.clearances import Clearances, Nearest
 from vkc_pin.distances.shapes import asked
 from vkc_pin.driving.body import Body
 from vkc_pin.models import shapes as geometry
@@ -272,12 +273,22 @@ def test_bounds_are_bounds(seed: int, count: int, size: float) -> None:
 def cull_nothing(patch: pytest.MonkeyPatch) -> None:
     """Let every pair be asked of coal, at every configuration that anybody asks about."""
 
-    def all_pairs_of(
-        part: PhaseGeometry, reach: float, rotations: np.ndarray, _: np.ndarray, *, standing: bool = True
-    ) -> tuple[np.ndarray, ...]:
-        w, k = np.indices((len(rotations), len(part.pairs))).reshape(2, -1)
-        counts = np.full(len(w), True) if standing else part.joint[part.pairs[k, 1]] != 0
-        return w[counts], k[counts], np.full(np.count_nonzero(counts), -np.inf)
+    def all_of_them(
+        near: Clearances, q: np.ndarray, z: np.ndarray, at: np.ndarray, *, reach: float, most: Any = None, standing: bool = True
+    ) -> Nearest:
+        where, every = near.placements.at(q), near.boxes.pairs
+        w, k = np.indices((len(q), len(every))).reshape(2, -1)
+        margins = near.margins.at(k, at[w], z, w)
+        counts = (margins > -np.inf) & (standing | (every[k, 1] < where.shape[1]))
+        w, k, margins = w[counts], k[counts], margins[counts]
+        known: dict[str, Any] = {"numbers": k, "margins": margins, "bounds": np.full(len(k), -np.inf), "rounding": 0.0}
+        edges = np.searchsorted(w, np.arange(len(q) + 1))
+        chosen, found = near.shapes.shortest(where, edges, every[k], reach=reach, most=most, **known)
+        return Nearest(w[chosen], k[chosen], found.distance, margins[chosen], *found[1:])
+
+    def one_by_one(near: Clearances, q: np.ndarray, z: np.ndarray, waypoint: int, *, reach: float, allowed: float) -> int:
+        found = all_of_them(near, q, z, np.full(len(q), waypoint), reach=reach)
+        return int(min(found.row[found.margin - found.distance > allowed], default=len(q)))
 
     def nowhere(placed: Placed, states: np.ndarray, pairs: np.ndarray) -> np.ndarray:
         return np.full(len(pairs), -np.inf)
@@ -290,7 +301,8 @@ def cull_nothing(patch: pytest.MonkeyPatch) -> None:
     def everywhere(shape: coal.CollisionGeometry, placement: pin.SE3) -> tuple[np.ndarray, np.ndarray]:
         return np.full(3, -1e3), np.full(3, 1e3)
 
-    patch.setattr(PhaseGeometry, "maybe_within", all_pairs_of)
+    patch.setattr(Clearances, "nearest", all_of_them)
+    patch.setattr(Clearances, "first_blocked", one_by_one)
     patch.setattr(Placed, "bounds", nowhere)
     patch.setattr(PairTable, "close", all_of)
     patch.setattr(Body, "_close", lambda body, along: np.arange(len(body.moving)))

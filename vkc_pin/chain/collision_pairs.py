@@ -13,7 +13,8 @@ from vkc_pin.arrays import Floats, Ints
 from vkc_pin.budget import spend
 from vkc_pin.chain.chain import VirtualKinematicChain
 from vkc_pin.chain.easing import EASED_SHARE, eased_pairs
-from vkc_pin.chain.phase_geometry import Neighbours, PhaseGeometry
+from vkc_pin.chain.phase_geometry import PhaseGeometry
+from vkc_pin.distances.margins import Place
 from vkc_pin.errors import InputError
 from vkc_pin.models.shapes import bounding_box, link_name, own_name
 from vkc_pin.options import Options
@@ -138,7 +139,7 @@ class _Pairing:
             return -np.inf
         return hand_clearance(self.scene, hold, link, self.options) or -CONTACT
 
-    def _allowed(self, phase: Phase, table: Floats, labels: Sequence[str]) -> tuple[Floats, list[Neighbours]]:
+    def _allowed(self, phase: Phase, table: Floats, labels: Sequence[str]) -> tuple[Floats, list[Place]]:
         """Return pairs with their margins, shape (P, 3), as the scene allows them, and those that may be close for a while."""
         if not self._allowances:
             return table, []
@@ -158,7 +159,7 @@ class _Pairing:
             pairs, within = place[rows[one]][kept[rows[one]]], self._within(phase, one.ranges)
             if one.ranges and len(pairs) and within is not None:
                 margin = EASED_SHARE * max(one.distance, 0.0) if np.isfinite(one.margin) else -np.inf
-                near.append(Neighbours(pairs, margin, *within))
+                near.append(Place(pairs, margin, *within))
         return table[kept], near
 
     def _within(self, phase: Phase, ranges: Mapping[str, tuple[float, float]]) -> tuple[Ints, Floats, Floats] | None:

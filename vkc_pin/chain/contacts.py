@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +20,8 @@ from vkc_pin.arrays import Floats, Ints
 from vkc_pin.budget import spend
 from vkc_pin.chain.chain import VirtualKinematicChain
 from vkc_pin.chain.collision_pairs import phase_geometries
+from vkc_pin.chain.phase_geometry import PhaseGeometry
+from vkc_pin.distances.clearances import Clearances
 from vkc_pin.distances.placements import ShapePlacements
 from vkc_pin.distances.shapes import Shapes
 from vkc_pin.options import Options
@@ -30,7 +31,6 @@ from vkc_pin.task.phases import Task
 
 __all__ = ["ContactModel", "Contacts", "no_contacts"]
 
-_ROUNDING = 1e-6  # [m] of coal
 _TOLERANCE = 1e-8  # of coal's distances: at its own 1e-6 the gradients of planes are off by up to 5e-3; this takes no longer
 _ROWS = 256  # configurations whose kinematics are computed at once
 
@@ -103,10 +103,16 @@ class ContactModel:
         self.first_waypoint = np.concatenate([[0], np.cumsum([phase.segments for phase in task.phases])])
         self._placed = ShapePlacements(chain.model, chain.collision)
         self.phases = phase_geometries(scene, chain, task, options)
-        self._shapes = [_shapes_of(part.shapes, len(chain.collision.geometryObjects)) for part in self.phases]
+        self._clearances = [self._clearances_of(part) for part in self.phases]
         # Beyond the chain's own geometries everything stands in the world.
         own = [shape.parentJoint for shape in chain.collision.geometryObjects]
         self._joints = np.array(own + [0] * (max(len(part.labels) for part in self.phases) - len(own)))
+
+    def _clearances_of(self, part: PhaseGeometry) -> Clearances:
+        moving = len(self.chain.collision.geometryObjects)
+        standing = [shape.placement for shape in part.shapes[moving:]]
+        shapes = Shapes([shape.geometry for shape in part.shapes], standing, tolerance=_TOLERANCE)
+        return Clearances(self._placed, part.boxes, shapes, part.margin_table)
 
     def settled(self, z: Floats) -> ContactModel:
         """Return the same, where what the motion z_1..z_N, shape (N, n), leaves behind stands where that motion leaves it.
@@ -116,7 +122,7 @@ class ContactModel:
         if not any(phase.left for phase in self.task.phases):
             return self
         view = copy.copy(self)
-        view.phases, view._shapes = list(self.phases), list(self._shapes)
+        view.phases, view._clearances = list(self.phases), list(self._clearances)
         for number, phase in enumerate(self.task.phases):
             where: dict[int, pin.SE3] = {}
             for name, (hold, before) in phase.left.items():
@@ -128,7 +134,7 @@ class ContactModel:
                 where |= {index: shape.placement for index, shape in shapes}
             if where:
                 view.phases[number] = self.phases[number].placed(where)
-                view._shapes[number] = self._shapes[number].placed(where)
+                view._clearances[number] = self._clearances[number].placed(view.phases[number].boxes, where)
         return view
 
     def carried(self, phase: int) -> list[int]:
@@ -162,39 +168,36 @@ class ContactModel:
             standing: Whether what stands in the world counts, too; otherwise only pairs of which both move.
         """
         spend(len(z))
-        rotations, translations = self.placements(z)
-        phase_of = self.phases_of(waypoints)
+        q, phase_of = self.chain.coordinates.q(z), self.phases_of(waypoints)
         parts: list[tuple[NDArray[Any], ...]] = []
-        for number in set(phase_of.tolist()):
-            part, inside = self.phases[number], np.flatnonzero(phase_of == number)
-            at, pairs, bounds = part.maybe_within(reach, rotations[inside], translations[inside], standing=standing)
-            margins = part.margins_at(pairs, waypoints[inside[at]], z, inside[at])
-            if part.neighbours:
-                asked = margins > -np.inf
-                at, pairs, bounds, margins = at[asked], pairs[asked], bounds[asked], margins[asked]
-            if not len(at):
-                continue
-            least = bounds - margins
-            order = np.lexsort((pairs, least, at))
-            at, pairs, margins, least = at[order], pairs[order], margins[order], least[order]
-            begins = np.flatnonzero(np.diff(at, prepend=-1))
-            where = self._placed.at(self.chain.coordinates.q(z[inside[at[begins]]]))
-            chosen, found = self._shapes[number].shortest(
-                where,
-                np.append(begins, len(at)),
-                part.pairs[pairs],
-                numbers=pairs,
-                margins=margins,
-                bounds=least,
-                reach=reach,
-                most=nearest,
-                rounding=_ROUNDING,
-            )
-            parts.append((inside[at[chosen]], part.pairs[pairs[chosen]], found.distance, margins[chosen], *found[1:]))
+        for number in dict.fromkeys(phase_of.tolist()):
+            inside = np.flatnonzero(phase_of == number)
+            asked = (q, z, waypoints) if len(inside) == len(z) else (q[inside], z[inside], waypoints[inside])
+            found = self._clearances[number].nearest(*asked, reach=reach, most=nearest, standing=standing)
+            pairs = self.phases[number].pairs[found.pair]
+            parts.append((inside[found.row], pairs, *found[2:]))
+        if len(parts) == 1:
+            return Contacts(*parts[0])
         if not parts:
             return no_contacts()
         columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
         return Contacts(*columns).select(np.argsort(columns[0], kind="stable"))
+
+    def first_blocked(self, z: Floats, waypoint: int, *, reach: float, allowed: float) -> int:
+        """Return the first configuration in which a pair falls short of its margin by more than `allowed` [m]; W: none.
+
+        Nothing is looked at beyond that pair. That saves most of what `evaluate` does where all that counts is what is hit first.
+
+        Args:
+            z: Configurations, shape (W, n).
+            waypoint: To whose phase all of them belong.
+            reach: Pairs further apart do not count [m].
+            allowed: [m].
+        """
+        clearances = self._clearances[self.phase_of(waypoint)]
+        found = clearances.first_blocked(self.chain.coordinates.q(z), z, waypoint, reach=reach, allowed=allowed)
+        spend(min(found + 1, len(z)))
+        return found
 
     def placements(self, z: Floats) -> tuple[Floats, Floats]:
         """Return the same as the chain's `joint_placements`; in portions of one size, as CasADi prepares for each size anew."""
@@ -224,7 +227,7 @@ class ContactModel:
         for number in set(phase_of.tolist()):
             inside = np.flatnonzero(phase_of == number)
             where = self._placed.at(self.chain.coordinates.q(z[inside]))
-            found[inside] = self._shapes[number].witnesses(where, np.arange(len(inside)), pairs[inside]).normal
+            found[inside] = self._clearances[number].shapes.witnesses(where, np.arange(len(inside)), pairs[inside]).normal
         return found
 
     def planes(self, z: Floats, contacts: Contacts, *, slots: int) -> tuple[Floats, Floats]:
@@ -256,8 +259,3 @@ class ContactModel:
             coefficients[r, s, j - 1, 3] += sign * n
         offsets[row, slot] = offset
         return coefficients.reshape(len(z), slots, 12 * joints), offsets
-
-
-def _shapes_of(shapes: Sequence[pin.GeometryObject], moving: int) -> Shapes:
-    """Return shapes, the first of which are `moving`, to ask for distances."""
-    return Shapes([shape.geometry for shape in shapes], [shape.placement for shape in shapes[moving:]], tolerance=_TOLERANCE)

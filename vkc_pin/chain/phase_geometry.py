@@ -1,36 +1,19 @@
-"""Geometry and pairs of one phase, and which of these may be close at many configurations."""
+"""Geometry and pairs of one phase, and which clearances these must keep."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.arrays import Bools, Floats, Ints
+from vkc_pin.arrays import Floats, Ints
 from vkc_pin.distances.boxes import Boxes
+from vkc_pin.distances.margins import Margins, Place
 
-__all__ = ["Neighbours", "PhaseGeometry"]
-
-
-class Neighbours(NamedTuple):
-    """Pairs that may be closer than others as long as some coordinates are within limits; see `scene.neighbours`.
-
-    Attributes:
-        pairs: Which, shape (k,).
-        margin: What they keep there [m]; -inf: nothing.
-        columns: The coordinates in z, shape (m,).
-        lower, upper: Their limits, shape (m,) each.
-    """
-
-    pairs: Ints
-    margin: float
-    columns: Ints
-    lower: Floats
-    upper: Floats
+__all__ = ["PhaseGeometry"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -46,7 +29,7 @@ class PhaseGeometry:
         center, half: Bounding box per geometry, in the geometry's own frame: centre and half extents, shape (G, 3) [m].
         rotation, translation: Placement of each geometry in its joint's frame, shapes (G, 3, 3) and (G, 3).
         eased: Pair → (first waypoint, last waypoint, margin) [m]: between these it may come closer than `margins` says, so close.
-        neighbours: Pairs that may come closer than `margins` says where some coordinates have some values.
+        neighbours: Where pairs may come closer than `margins` says; see `scene.neighbours`.
         left: Object → its geometries, for what the motion leaves behind at a place that it chooses.
     """
 
@@ -60,7 +43,7 @@ class PhaseGeometry:
     rotation: Floats
     translation: Floats
     eased: Mapping[int, Sequence[tuple[int, int, float]]] = field(default_factory=dict)
-    neighbours: Sequence[Neighbours] = ()
+    neighbours: Sequence[Place] = ()
     left: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
     def margins_at(self, pairs: Ints, waypoints: Ints, z: Floats | None = None, rows: Ints | None = None) -> Floats:
@@ -72,21 +55,9 @@ class PhaseGeometry:
             z: Configurations, shape (W, m); None: anywhere but where pairs are neighbours.
             rows: Which of these each pair is looked at in, shape (n,).
         """
-        margins = self.margins[pairs]
-        some = np.flatnonzero(self._is_eased[pairs])  # few, and mostly none
-        for pair in dict.fromkeys(pairs[some].tolist()):
-            which = some[pairs[some] == pair]
-            for first, last, margin in self.eased[pair]:
-                inside = which[(first <= waypoints[which]) & (waypoints[which] <= last)]
-                margins[inside] = np.minimum(margins[inside], margin)
         if z is None:
-            return margins
-        for near in self.neighbours:
-            values = z[:, near.columns]
-            holds: Bools = np.all((near.lower <= values) & (values <= near.upper), axis=1)
-            which = np.flatnonzero(np.isin(pairs, near.pairs) & holds[rows])
-            margins[which] = np.minimum(margins[which], near.margin)
-        return margins
+            return self._usual.at(pairs, waypoints, np.empty((1, 0)), np.zeros(len(pairs), int))
+        return self.margin_table.at(pairs, waypoints, z, np.arange(len(z)) if rows is None else rows)
 
     def placed(self, where: Mapping[int, pin.SE3]) -> PhaseGeometry:
         """Return the same with geometries that stand placed elsewhere in the world."""
@@ -96,10 +67,10 @@ class PhaseGeometry:
             shapes[geometry].placement = placement
             rotation[geometry], translation[geometry] = placement.rotation, placement.translation
         moved = replace(self, shapes=tuple(shapes), rotation=rotation, translation=translation)
-        for name in ("_moving_count", "_number"):  # the same wherever they stand
+        for name in ("_moving_count", "_number", "margin_table"):  # the same wherever they stand
             moved.__dict__[name] = getattr(self, name)
         which = np.array(list(where), int)
-        moved.__dict__["_pairs_near"] = self._pairs_near.placed(which, rotation[which], moved._middle[which])
+        moved.__dict__["boxes"] = self.boxes.placed(which, rotation[which], moved._middle[which])
         return moved
 
     def within(self, reach: float, lower: Floats, upper: Floats) -> Ints:
@@ -113,28 +84,15 @@ class PhaseGeometry:
         numbers = self._number[first, seconds - self._moving_count]
         return numbers[numbers >= 0]
 
-    def maybe_within(
-        self, reach: float, rotations: Floats, translations: Floats, *, standing: bool = True
-    ) -> tuple[Ints, Ints, Floats]:
-        """Return (configuration, pair) of all pairs that bounding volumes cannot prove to be `reach` [m] apart, in this order.
-
-        First balls (against boxes where they stand in the world), then what the face normals of both boxes separate. The third
-        array has lower bounds of the signed distances [m].
-
-        Args:
-            reach: [m].
-            rotations: Of all joints in the world, shape (W, J, 3, 3).
-            translations: Of all joints in the world, shape (W, J, 3) [m].
-            standing: Whether what stands in the world counts, too; otherwise only pairs of which both move.
-        """
-        return self._pairs_near.near(reach, rotations, translations, standing=standing)
+    @cached_property
+    def margin_table(self) -> Margins:
+        """What pairs must keep, wherever that is less than `margins`."""
+        return Margins(self.margins, self.eased, self.neighbours)
 
     @cached_property
-    def _is_eased(self) -> Bools:
-        """Whether each pair may come closer for a while, shape (P,)."""
-        found = np.zeros(len(self.pairs), bool)
-        found[list(self.eased)] = True
-        return found
+    def _usual(self) -> Margins:
+        """What they must keep anywhere but where they are neighbours."""
+        return Margins(self.margins, self.eased)
 
     @cached_property
     def _moving_count(self) -> int:
@@ -147,8 +105,8 @@ class PhaseGeometry:
         return np.einsum("gij,gj->gi", self.rotation, self.center) + self.translation
 
     @cached_property
-    def _pairs_near(self) -> Boxes:
-        """The boxes, to find pairs that may be close."""
+    def boxes(self) -> Boxes:
+        """Boxes around all geometries, to find pairs that may be close."""
         return Boxes(self.joint, self.rotation, self._middle, self.half, self.pairs)
 
     @cached_property

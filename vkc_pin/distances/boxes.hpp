@@ -4,6 +4,7 @@
 // what each joint carries are compared with those of all that stands. Only what is left is looked at pair by pair.
 #pragma once
 
+#include <array>
 #include <cmath>
 #include <limits>
 #include <memory>
@@ -54,6 +55,7 @@ public:
       const Index a = pairs(k, 0), b = pairs(k, 1);
       if (a < 0 || a >= Index(known.moving) || b < 0 || b >= Index(count))
         throw std::out_of_range("of every pair the first moves, and both are among the boxes");
+      known.pairs.push_back({a, b});
       if (b < Index(known.moving))
         known.own.push_back({Index(k), a, b, known.radii[a] + known.radii[b]});
       else
@@ -66,9 +68,8 @@ public:
     for (std::size_t a = 0; a < known.moving; ++a)
       if (meets[a])
         known.groups[known.joints[a]].push_back(a);
-    known.groups.erase(
-      std::remove_if(known.groups.begin(), known.groups.end(), [](const auto & group) { return group.empty(); }),
-      known.groups.end());
+    const auto empty = [](const auto & group) { return group.empty(); };
+    known.groups.erase(std::remove_if(known.groups.begin(), known.groups.end(), empty), known.groups.end());
     corners();
   }
 
@@ -122,10 +123,16 @@ public:
           gaps.push_back(found.gap);
         }
     }
-    const std::size_t count = where.size();
-    return {
-      handed_over(std::move(where), {count}), handed_over(std::move(which), {count}), handed_over(std::move(gaps), {count})};
+    const std::size_t n = where.size();
+    return {handed_over(std::move(where), {n}), handed_over(std::move(which), {n}), handed_over(std::move(gaps), {n})};
   }
+
+  struct Found { Index state, pair; double gap; };
+
+  const std::vector<std::array<Index, 2>> & pairs() const { return pairs_->pairs; }
+  std::size_t size() const { return turns_.size(); }
+  std::size_t moving() const { return pairs_->moving; }
+  Index most_joints() const { return pairs_->most_joints; }
 
 private:
   struct Own // a pair of which both move
@@ -134,17 +141,12 @@ private:
     double radii;
   };
 
-  struct Found
-  {
-    Index state, pair;
-    double gap;
-  };
-
   // What is the same wherever shapes stand.
   struct Pairs
   {
     std::size_t moving = 0, standing = 0;
     Index most_joints = 0;
+    std::vector<std::array<Index, 2>> pairs;
     std::vector<Index> joints, number; // number: of the pair of one that moves with one that stands; -1: none
     std::vector<Vector> halves;
     std::vector<double> radii;
@@ -152,6 +154,7 @@ private:
     std::vector<std::vector<std::size_t>> groups; // what can hit something that stands, by the joint that carries it
   };
 
+public:
   // Looks at one configuration after the other.
   class Looking
   {
@@ -272,11 +275,11 @@ private:
     std::vector<Vector> centers_, lower_, upper_;
   };
 
+private:
   // Corners of boxes along the world's axes around what stands.
   void corners()
   {
-    lows_.resize(pairs_->standing);
-    highs_.resize(pairs_->standing);
+    lows_ = highs_ = std::vector<Vector>(pairs_->standing);
     for (std::size_t s = 0; s < pairs_->standing; ++s)
     {
       const std::size_t g = pairs_->moving + s;
@@ -291,8 +294,7 @@ private:
 
   std::shared_ptr<Pairs> pairs_;
   std::vector<Matrix> turns_;  // of what moves in its joint's frame, of what stands in the world
-  std::vector<Vector> centers_; // the same
-  std::vector<Vector> lows_, highs_;
+  std::vector<Vector> centers_, lows_, highs_; // the same; corners, see above
 };
 
 } // namespace

@@ -1,4 +1,7 @@
-"""Which pairs of shapes may be close: bounding boxes, at many configurations at once."""
+"""Which pairs of shapes may be close: bounding boxes, at many configurations at once.
+
+`clearances` asks them in compiled code; here is what they say, alone.
+"""
 
 from __future__ import annotations
 
@@ -26,6 +29,9 @@ class Boxes:
         pairs: Which of them to look at, shape (P, 2); of every pair at least the first moves.
         threads: How many look at most; None: see `available_threads`.
 
+    Attributes:
+        pairs: Which pairs it looks at, shape (P, 2).
+
     Raises:
         ValueError: Those that move are not the first, or arrays do not fit together.
         IndexError: There is no such box.
@@ -36,12 +42,14 @@ class Boxes:
         self, joints: Ints, rotations: Floats, centers: Floats, halves: Floats, pairs: Ints, *, threads: int | None = None
     ) -> None:
         self.threads = available_threads() if threads is None else threads
-        self._boxes: Any = compiled().Boxes(joints, rotations, centers, halves, pairs)
+        self.pairs = pairs
+        self.compiled: Any = compiled().Boxes(joints, rotations, centers, halves, pairs)
 
     def placed(self, which: Ints, rotations: Floats, centers: Floats) -> Boxes:
         """Return the same with some that stand, shape (n,), placed elsewhere: shapes (n, 3, 3) and (n, 3) [m]."""
         other = object.__new__(Boxes)
-        other.threads, other._boxes = self.threads, self._boxes.placed(which, rotations, centers)
+        other.threads, other.pairs = self.threads, self.pairs
+        other.compiled = self.compiled.placed(which, rotations, centers)
         return other
 
     def near(self, reach: float, rotations: Floats, translations: Floats, *, standing: bool = True) -> tuple[Ints, Ints, Floats]:
@@ -60,5 +68,5 @@ class Boxes:
             IndexError: A box is on none of these joints.
         """
         threads = max(1, min(self.threads, len(rotations) // _WORTH))
-        at, pairs, gaps = self._boxes.near(reach, rotations, translations, standing, threads)
+        at, pairs, gaps = self.compiled.near(reach, rotations, translations, standing, threads)
         return np.asarray(at), np.asarray(pairs), np.asarray(gaps)

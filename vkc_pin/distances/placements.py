@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.lib.stride_tricks import as_strided
 
 from vkc_pin.arrays import Floats
+from vkc_pin.distances.solids import compiled
 
 __all__ = ["ShapePlacements", "columns_of"]
 
@@ -24,38 +25,22 @@ def columns_of(placements: Sequence[pin.SE3]) -> Floats:
 
 
 class ShapePlacements:
-    """Where the shapes of a model are, at one configuration after the other.
+    """Where the shapes of a model are, at one configuration after the other: Pinocchio's kinematics, to the last bit.
 
     Args:
         model: The model.
         geometry: The shapes on its joints, M of them.
+
+    Raises:
+        BuildError: See `solids.compiled`.
     """
 
     def __init__(self, model: pin.Model, geometry: pin.GeometryModel) -> None:
-        self._model, self._geometry = model, geometry
-        self._data, self._placed = model.createData(), pin.GeometryData(geometry)
-        self._numbers = _memory(self._placed.oMg)
+        shapes, described = geometry.geometryObjects, pin.serialization.StreamBuffer()
+        model.saveToBinary(described)
+        joints = np.array([shape.parentJoint for shape in shapes], np.int64)
+        self.compiled: Any = compiled().Bodies(described.tobytes(), joints, columns_of([shape.placement for shape in shapes]))
 
     def at(self, q: Floats) -> Floats:
         """Return the placements in the world at Pinocchio's configurations, shape (W, nq): shape (W, M, 12), see `columns_of`."""
-        found = np.empty((len(q), len(self._placed.oMg), _NUMBERS))
-        for row, configuration in zip(found, q, strict=True):
-            pin.updateGeometryPlacements(self._model, self._data, self._geometry, self._placed, configuration)
-            row[:] = columns_of(self._placed.oMg) if self._numbers is None else self._numbers
-        return found
-
-
-def _memory(placements: pin.StdVec_SE3) -> Floats | None:
-    """Return the memory of Pinocchio's placements as an array, shape (n, 12); None if they lie otherwise than they do so far.
-
-    To read them one by one takes ten times as long as to compute them.
-    """
-    if not len(placements):
-        return np.empty((0, _NUMBERS))
-    size, first = np.dtype(float).itemsize, placements[0].rotation
-    places = [(placed.rotation.ctypes.data, placed.translation.ctypes.data) for placed in placements]
-    begins = [first.ctypes.data + _NUMBERS * size * k for k in range(len(places))]
-    expected = [(begin, begin + 9 * size) for begin in begins]
-    if places != expected or first.strides != (size, 3 * size):
-        return None
-    return as_strided(first, (len(placements), _NUMBERS), (_NUMBERS * size, size), writeable=False)
+        return np.asarray(self.compiled.placements(q), float)

@@ -64,13 +64,13 @@ class Shapes:
     ) -> None:
         self.threads = available_threads() if threads is None else threads
         solids = [solid_of(geometry) for geometry in geometries]
-        self._shapes: Any = compiled().Shapes(solids, columns_of(standing), tolerance)
+        self.compiled: Any = compiled().Shapes(solids, columns_of(standing), tolerance)
 
     def placed(self, where: Mapping[int, pin.SE3]) -> Shapes:
         """Return the same with some that stand placed elsewhere in the world; `where` goes by their numbers among the G."""
         other = object.__new__(Shapes)
         other.threads = self.threads
-        other._shapes = self._shapes.placed(np.array(list(where), np.int64), columns_of(list(where.values())))
+        other.compiled = self.compiled.placed(np.array(list(where), np.int64), columns_of(list(where.values())))
         return other
 
     def distances(self, moving: Floats, states: Ints, pairs: Ints) -> Floats:
@@ -84,12 +84,12 @@ class Shapes:
         Raises:
             IndexError: There is no such state or shape.
         """
-        found = self._shapes.distances(moving, states, pairs, False, self._threads(len(pairs)))
+        found = self.compiled.distances(moving, states, pairs, False, self._threads(len(pairs)))
         return np.asarray(found, float)
 
     def witnesses(self, moving: Floats, states: Ints, pairs: Ints) -> Witnesses:
         """Return distances, normals and the closest points; arguments and errors as of `distances`."""
-        return _witnesses(self._shapes.distances(moving, states, pairs, True, self._threads(len(pairs))))
+        return _witnesses(self.compiled.distances(moving, states, pairs, True, self._threads(len(pairs))))
 
     def shortest(
         self,
@@ -126,7 +126,7 @@ class Shapes:
         """
         limits, limit = np.column_stack([margins, bounds]), -1 if most is None else most
         threads = self._threads(len(pairs))
-        chosen, table = self._shapes.shortest(moving, edges, pairs, numbers, limits, reach, limit, rounding, threads)
+        chosen, table = self.compiled.shortest(moving, edges, pairs, numbers, limits, reach, limit, rounding, threads)
         return chosen, _witnesses(table)
 
     def _threads(self, rows: int) -> int:

@@ -8,6 +8,7 @@ from typing import Any
 
 import coal
 import numpy as np
+import pinocchio as pin
 
 from vkc_pin.arrays import Floats
 from vkc_pin.compiled import REBUILD, compiled_module
@@ -19,18 +20,22 @@ __all__ = ["compiled", "solid_of"]
 
 @cache
 def compiled() -> Any:
-    """Return the compiled module, imported once and after coal, whose library it uses.
+    """Return the compiled module, imported once and after coal and Pinocchio, whose libraries it uses.
 
     Raises:
-        BuildError: It is missing, or was compiled against another release of coal than is installed.
+        BuildError: It is missing, or was compiled against another release of one of these than is installed.
     """
     module = compiled_module("vkc_pin.distances._distances")
-    built, installed = (version.split(".")[:2] for version in (module.COAL_VERSION, coal.__version__))
-    if built != installed:
-        raise BuildError(
-            f"vkc_pin.distances was compiled against coal {module.COAL_VERSION}, but {coal.__version__} is installed. "
-            f"Either pip install 'coal=={'.'.join(built)}.*', or {REBUILD}"
-        )
+    for package, version, installed in (
+        ("coal", module.COAL_VERSION, coal.__version__),
+        ("pin", module.PINOCCHIO_VERSION, pin.__version__),
+    ):
+        built = version.split(".")[:2]
+        if built != installed.split(".")[:2]:
+            raise BuildError(
+                f"vkc_pin.distances was compiled against {package} {version}, but {installed} is installed. "
+                f"Either pip install '{package}=={'.'.join(built)}.*', or {REBUILD}"
+            )
     return module
 
 

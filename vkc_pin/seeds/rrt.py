@@ -21,7 +21,6 @@ TRIES = 1500
 """How often a tree may grow until they meet."""
 
 _STEPS = (0.15, 0.04)  # [rad] between configurations that are looked at; the latter where the former overlooked something
-_LOOKED_AT_FIRST = 1  # of these, then twice as many: eight of ten lines are blocked there
 _BESIDE_PATH = 0.1  # [m] and [rad] standard deviation, at most, of bases beside their path
 _AROUND = 0.4  # [m] and [rad] standard deviation, at most, of bases around the ends, and of arms
 
@@ -165,20 +164,19 @@ class _Search:
     def _along(self, a: Floats, b: Floats) -> float:
         """Return what share of the straight line from `a` to `b`, both (m,), is free."""
         count = max(1, int(np.ceil(np.abs((b - a) * self.weights).max() / self.step)))
-        s, begin, size = np.arange(count + 1) / count, 1, _LOOKED_AT_FIRST
-        while begin <= count:  # most lines are blocked near their begin
-            part = s[begin : begin + size]
-            blocked = np.flatnonzero(self._depth(a + part[:, None] * (b - a)) > self.allowed)
-            if len(blocked):
-                return float(s[begin - 1 + blocked[0]])
-            begin, size = begin + size, 2 * size
-        return 1.0
+        s = np.arange(count + 1) / count
+        z = self._robot_at(a + s[1:, None] * (b - a))
+        return float(s[self.problem.contacts.first_blocked(z, self.waypoint, reach=0.0, allowed=self.allowed)])
 
     def _depth(self, rows: Floats) -> Floats:
         """Return how far the robot, shape (B, m), falls short of its margins where it overlaps something, shape (B,) [m]."""
+        return depth(self.problem, self._robot_at(rows), self.waypoint, reach=0.0)
+
+    def _robot_at(self, rows: Floats) -> Floats:
+        """Return configurations with the robot at `rows`, shape (B, m): shape (B, n)."""
         z = np.tile(self.first, (len(rows), 1))
         z[:, : self.size] = rows
-        return depth(self.problem, z, self.waypoint, reach=0.0)
+        return z
 
     def _shortened(self, path: Floats) -> Floats:
         """Return a path that goes straight between random places on it, as many as it has, where nothing is in the way."""

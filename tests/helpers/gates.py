@@ -28,15 +28,14 @@ def walled(gap: float) -> vkc.TrajectoryProblem:
     return _across([wall], (4.0, 1.5, 0.0))
 
 
-def gated(width: float, *, height: float = 1.5, beyond: Sequence[dict[str, Any]] = ()) -> vkc.TrajectoryProblem:
-    """Return the problem of driving through a gate of some width [m] in a wall from side to side, with obstacles beyond it."""
+def gated(width: float, *, height: float = 1.5) -> vkc.TrajectoryProblem:
+    """Return the problem of driving through a gate of some width [m] in a wall from side to side."""
     size = (6.4 - width) / 2
     return _across(
         [
             {"name": name, "type": "box", "size": [0.2, size, height], "position": [2.0, side * (size + width) / 2, height / 2]}
             for name, side in (("left", 1.0), ("right", -1.0))
-        ]
-        + list(beyond),
+        ],
         GOAL,
     )
 

@@ -294,18 +294,6 @@ def test_in_turn_trees_come_first_where_the_others_hit_things() -> None:
     assert found[0].overlap < _POOR < found[1].overlap
 
 
-@pytest.mark.parametrize("blocked", [False, True])
-def test_whether_the_goal_is_blocked_is_asked_only_where_no_search_has_found_it_free(blocked: bool) -> None:
-    """To ask takes time, as trees do."""
-    there: list[dict[str, Any]] = []
-    if blocked:
-        there = [{"name": "block", "type": "box", "size": [0.5, 0.5, 1.0], "position": [GOAL[0], GOAL[1], 0.5]}]
-    problem, asked = gated(NARROW, beyond=there), list[bool]()
-    found = initialize(problem, "auto", 0, hopeless=lambda: asked.append(True) or blocked)
-    assert (next(found).name == "rrt") == (not blocked)
-    assert asked == [True] * blocked
-
-
 def test_no_trees_are_grown_where_the_way_is_wide(monkeypatch: pytest.MonkeyPatch) -> None:
     """They take their time; they are asked last."""
     grown: list[int] = []

@@ -52,8 +52,7 @@ def initialize(
         count: How many different seeds to return.
         perturbation: Standard deviation of what is added to the robot's coordinates, smoothly over time, [m] and [rad].
         notes: Gets a line for every phase in which there is no way for the base.
-        hopeless: Asked by "auto" before trees grow, unless configurations are known that are free wherever something must hold:
-            whether no way helps, since a goal is blocked; then none grow.
+        hopeless: Asked by "auto" before trees grow: whether no way helps, since a goal is blocked; then none grow.
     """
     said: list[str] = [] if notes is None else notes
     if method == "stationary":
@@ -72,7 +71,7 @@ def _kind(method: str, shared: _Shared, count: int, hopeless: Callable[[], bool]
     """Yield the seeds of one kind; nothing is made before the first is asked for."""
     if method != "rrt":
         yield from _SeedSearch(shared, method).seeds(count)
-    elif shared.known.free or not hopeless():  # trees take their time
+    elif not hopeless():  # trees take their time
         yield from _Rrt(shared).seeds(count)
 
 
@@ -184,7 +183,7 @@ class _SeedSearch:
     alike: ClassVar[int | None] = None
 
     def __init__(self, shared: _Shared, method: str) -> None:
-        self.problem, self.notes, self.method, self.known = shared.problem, shared.notes, method, shared.known
+        self.problem, self.notes, self.method = shared.problem, shared.notes, method
         self.beam, self.joiner = self._parts(shared)
 
     def _parts(self, shared: _Shared) -> tuple[Beam, Joiner]:
@@ -214,7 +213,6 @@ class _SeedSearch:
     def _search(self, attempt: int) -> Found | None:
         """Return what a search finds: a quick one, None if it is no good, then thorough ones."""
         found = self.beam.search(thorough=attempt > 0)
-        self.known.free |= bool((found.trouble <= 0.0).any())
         return found if attempt > 0 or self.beam.tolerable(found) else None
 
     def _ordered(self, found: Found) -> Iterable[Floats]:

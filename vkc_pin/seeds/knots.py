@@ -26,14 +26,12 @@ class Known:
         drawn: From the state of the random numbers, a waypoint and what configurations come from to these, which of them are what
             must hold there, and the state that follows.
         depths, cleared: From a waypoint and a configuration to how far that falls short, and to what it is when pushed.
-        free: Whether a search has found configurations that are free at all knots.
     """
 
     def __init__(self) -> None:
         self.drawn: dict[tuple[str, int, bytes], tuple[Floats, Bools, Any]] = {}
         self.depths: dict[tuple[int, bytes], Floats] = {}
         self.cleared: dict[tuple[int, bytes], Floats] = {}
-        self.free = False
 
 
 _Found = dict[tuple[int, bytes], Floats]

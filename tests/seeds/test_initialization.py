@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cache
 from typing import Any
 
@@ -292,6 +292,19 @@ def test_in_turn_trees_come_first_where_the_others_hit_things() -> None:
     found = list(initialize(gated(NARROW), "auto", 0, count=2))
     assert [seed.name for seed in found[:2]] == ["rrt", "interpolated"]
     assert found[0].overlap < _POOR < found[1].overlap
+
+
+@pytest.mark.parametrize("hopeless", [True, False])
+def test_trees_grow_unless_a_goal_is_blocked_of_which_no_search_knows_better(hopeless: bool) -> None:
+    asked: list[Sequence[int]] = []
+
+    def answer(phases: Sequence[int]) -> bool:
+        asked.append(phases)
+        return hopeless
+
+    names = {seed.name for seed in initialize(gated(NARROW), "auto", 0, hopeless=answer)}
+    assert ("rrt" in names) == (not hopeless)
+    assert asked == [[]], "the searches before have come to the goal, where the robot is free"
 
 
 def test_no_trees_are_grown_where_the_way_is_wide(monkeypatch: pytest.MonkeyPatch) -> None:

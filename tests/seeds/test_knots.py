@@ -122,6 +122,21 @@ def test_depth_is_the_largest_shortfall_of_any_pair(problem: vkc.TrajectoryProbl
     np.testing.assert_allclose(depth(problem, z, grasp), expected, atol=1e-5)
 
 
+def test_what_is_known_to_be_free_is_what_must_hold_there(problem: vkc.TrajectoryProblem) -> None:
+    search, grasp = knots(problem), int(problem.ends[0])
+    z, found = search.knot(np.tile(problem.start, (64, 1)), grasp, "scatter")
+    away = z[found] + 0.01 * np.eye(problem.chain.size)[0]  # a centimetre from the handle
+    assert (search.depth(away, grasp) <= 0.0).any()
+    assert not search.knows_free(grasp)
+    depths = search.depth(z[found], grasp)
+    assert 0 < np.count_nonzero(depths > 0.0) < len(depths)
+    assert search.knows_free(grasp)
+    assert not search.knows_free(grasp + 1)
+    other = knots(problem)
+    other.depth(z[found][depths > 0.0], grasp)
+    assert not other.knows_free(grasp)
+
+
 def test_scatter_tells_what_does_not_fit(problem: vkc.TrajectoryProblem) -> None:
     drawn = scatter(problem, int(problem.ends[0]), np.random.default_rng(0))
     assert drawn is not None

@@ -16,7 +16,7 @@ from vkc_pin.budget import ENDINGS, SpentError, spend, unlimited
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.planning.outcome import TIMES, outcome, spent, still
 from vkc_pin.planning.plan import Plan
-from vkc_pin.planning.reasons.diagnosis import Blocked, explain, impossible
+from vkc_pin.planning.reasons.diagnosis import Blocked, blocked, impossible
 from vkc_pin.planning.reasons.proofs import proofs
 from vkc_pin.planning.reasons.swept import swept
 from vkc_pin.planning.reasons.ways import ways
@@ -89,7 +89,7 @@ class OneProblem:
         self.history: list[dict[str, float]] = []
         self.blocked: list[str] = []  # phases in which there is no way for the base
         self._best: _Try | None = None
-        self._explained: list[Blocked] | None = None
+        self._explained: dict[int, Blocked | None] = {}
         self._proven: list[str] | None = None
 
     def run(self, seed: Callable[[TrajectoryProblem], Seed] | None = None) -> Plan:
@@ -170,11 +170,14 @@ class OneProblem:
             self._proven = swept(problem) or proofs(problem)
         return self._proven
 
-    def _goals(self, problem: TrajectoryProblem) -> list[Blocked]:
-        """Return the goals for which no free configuration is found, looked for once."""
-        if self._explained is None:
-            self._explained = explain(problem, self.settings.random_seed)
-        return self._explained
+    def _goals(self, problem: TrajectoryProblem, numbers: Iterable[int] | None = None) -> list[Blocked]:
+        """Return the goals of some phases, None: of all, for which no free configuration is found, each looked for once."""
+        found = []
+        for number in range(len(problem.task.phases)) if numbers is None else numbers:
+            if number not in self._explained:
+                self._explained[number] = blocked(problem, number, self.settings.random_seed)
+            found.append(self._explained[number])
+        return [goal for goal in found if goal is not None]
 
     def _seeds(self, problem: TrajectoryProblem) -> Iterator[Seed]:
         s = self.settings
@@ -185,7 +188,7 @@ class OneProblem:
             count=s.options.max_restarts,
             perturbation=s.perturbation,
             notes=self.blocked,
-            hopeless=lambda: bool(self._proofs(problem)) or any(goal.deep for goal in self._goals(problem)),
+            hopeless=lambda phases: bool(self._proofs(problem)) or any(goal.deep for goal in self._goals(problem, phases)),
         )
         while True:
             began, built = time.perf_counter(), s.cache.building

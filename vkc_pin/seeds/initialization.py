@@ -36,7 +36,7 @@ def initialize(
     count: int = 1,
     perturbation: float = 0.0,
     notes: list[str] | None = None,
-    hopeless: Callable[[], bool] = lambda: False,
+    hopeless: Callable[[Sequence[int]], bool] = lambda _: False,
 ) -> Iterator[Seed]:
     """Yield up to `count` seeds of each kind, best first; each is looked for when it is asked for.
 
@@ -52,7 +52,8 @@ def initialize(
         count: How many different seeds to return.
         perturbation: Standard deviation of what is added to the robot's coordinates, smoothly over time, [m] and [rad].
         notes: Gets a line for every phase in which there is no way for the base.
-        hopeless: Asked by "auto" before trees grow: whether no way helps, since a goal is blocked; then none grow.
+        hopeless: Asked by "auto" before trees grow: whether no way helps, since a goal is blocked; then none grow. It is told
+            which phases, by number, have ends at which no search has come upon a free configuration.
     """
     said: list[str] = [] if notes is None else notes
     if method == "stationary":
@@ -60,18 +61,18 @@ def initialize(
     else:
         shared = _Shared(problem, random_seed, said, Routes(problem), Known())
         kinds = ("interpolated", "astar", "rrt") if method == "auto" else (method,)
-        asked = hopeless if method == "auto" else lambda: False
+        asked = hopeless if method == "auto" else lambda _: False
         seeds = _in_turn(*(_kind(kind, shared, count, asked) for kind in kinds))
     rng = np.random.default_rng([random_seed, 1])
     for item in seeds:
         yield replace(item, z=_perturbed(problem, item.z, perturbation, rng)) if perturbation else item
 
 
-def _kind(method: str, shared: _Shared, count: int, hopeless: Callable[[], bool]) -> Iterator[Seed | None]:
+def _kind(method: str, shared: _Shared, count: int, hopeless: Callable[[Sequence[int]], bool]) -> Iterator[Seed | None]:
     """Yield the seeds of one kind; nothing is made before the first is asked for."""
     if method != "rrt":
         yield from _SeedSearch(shared, method).seeds(count)
-    elif not hopeless():  # trees take their time
+    elif not hopeless(shared.unknown()):  # trees take their time
         yield from _Rrt(shared).seeds(count)
 
 
@@ -167,6 +168,10 @@ class _Shared:
     def knots(self) -> Knots:
         """Return where configurations come from, with random numbers of its own."""
         return Knots(self.problem, np.random.default_rng(self.random_seed), self.known)
+
+    def unknown(self) -> list[int]:
+        """Return the numbers of the phases at whose ends no search has come upon a free configuration so far."""
+        return [number for number, end in enumerate(self.problem.ends.tolist()) if not self.knots().knows_free(end)]
 
 
 class _SeedSearch:

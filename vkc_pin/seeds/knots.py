@@ -188,6 +188,15 @@ class Knots:
         """Return how far each configuration falls short of its margins [m], shape (B,)."""
         return _row_by_row(self.known.depths, lambda rows, at: depth(self.problem, rows, at), z, waypoint)
 
+    def knows_free(self, waypoint: int) -> bool:
+        """Return whether a search has come upon a configuration that is free, and is what must hold at a waypoint."""
+        rows = [np.frombuffer(row) for (at, row), depth in self.known.depths.items() if at == waypoint and depth <= 0.0]
+        pose = self.pose_at(waypoint)
+        if pose is None or not rows:
+            return bool(rows)
+        solver, target = self.solver(pose)
+        return bool((np.abs(solver.evaluate(np.array(rows), target)[0]).max(axis=1) < TOLERANCE).any())
+
 
 def depth(problem: TrajectoryProblem, z: Floats, waypoint: int, *, standing: bool = True, reach: float | None = None) -> Floats:
     """Return how far configurations at a waypoint, shape (B, n), fall short of their margins [m], shape (B,).

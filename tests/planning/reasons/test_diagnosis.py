@@ -6,7 +6,7 @@ from helpers.drives import hall
 from helpers.small_problems import SHORT, door_scene, program_of
 
 import vkc_pin as vkc
-from vkc_pin.planning.reasons.diagnosis import explain, impossible
+from vkc_pin.planning.reasons.diagnosis import blocked, explain, impossible
 
 CRATE = {"name": "crate", "type": "box", "size": [0.6, 0.6, 0.4], "position": [1.5, 0.0, 0.2]}
 
@@ -60,12 +60,18 @@ def test_what_blocks_every_goal_configuration() -> None:
     assert short_by == pytest.approx(0.27 + SHORT.dist_safe)
 
 
+def test_each_phase_is_judged_on_its_own() -> None:
+    two = problem(hall(obstacles=[CRATE]), vkc.GoTo(0.2, 0.0, 0.0), vkc.GoTo(1.5, 0.0, 0.0))
+    assert blocked(two, 0, 0) is None
+    assert [blocked(two, 1, 0)] == explain(two, 0)
+
+
 def test_a_goal_that_leaves_the_base_free_is_not_judged() -> None:
     grasp = problem(door_scene(), vkc.Grasp("door"))
     assert explain(grasp, 0) == explain(grasp, 1) == []
 
 
 def test_the_same_seed_says_the_same() -> None:
-    blocked = problem(hall(obstacles=[CRATE]), vkc.Reach((1.5, 0.0, 0.2, 0.0, np.pi, 0.0)))
-    assert explain(blocked, 3) == explain(blocked, 3)
-    assert explain(blocked, 3)
+    crate = problem(hall(obstacles=[CRATE]), vkc.Reach((1.5, 0.0, 0.2, 0.0, np.pi, 0.0)))
+    assert explain(crate, 3) == explain(crate, 3)
+    assert explain(crate, 3)

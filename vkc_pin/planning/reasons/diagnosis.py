@@ -12,7 +12,7 @@ from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.knots import depth, scatter
 from vkc_pin.validation.report import Violation
 
-__all__ = ["Blocked", "explain", "impossible"]
+__all__ = ["Blocked", "blocked", "explain", "impossible"]
 
 _DRAWS = 4  # batches of `SCATTER` random configurations before a goal counts as blocked
 _DEEP = 0.05  # [m] or [rad]
@@ -76,34 +76,38 @@ def explain(problem: TrajectoryProblem, random_seed: int) -> list[Blocked]:
         problem: What could not be solved.
         random_seed: Of the random configurations tried.
     """
-    found = []
-    for phase, end in zip(problem.task.phases, problem.ends, strict=True):
-        tried = _try(problem, int(end), np.random.default_rng(random_seed))
-        if tried is None:
-            continue
-        z, residual = tried
-        if residual.min() > TOLERANCE:
-            nearest = int(np.argmin(residual))
-            text = (
-                f"{phase.name}: out of reach, none of {len(z)} configurations tried gets there; "
-                f"the nearest stays {residual[nearest]:.3f} m or rad short"
-            )
-            found.append(Blocked(text, float(residual[nearest])))
-            continue
-        reached = z[residual < TOLERANCE]
-        contacts = problem.contacts.evaluate(reached, np.full(len(reached), int(end)), reach=problem.options.largest_margin)
-        shortfall = contacts.shortfall(len(reached))
-        if shortfall.min() > 0.0:
-            best = int(np.argmin(shortfall))
-            worst = int(np.flatnonzero(contacts.waypoint == best)[0])
-            labels = problem.contacts.phases[problem.contacts.phase_of(int(end))].labels
-            first, second = contacts.pair[worst]
-            text = (
-                f"{phase.name}: all {len(reached)} configurations found there are blocked; in the least blocked one "
-                f"{labels[first]} – {labels[second]} {_gap(contacts.distance[worst])}"
-            )
-            found.append(Blocked(text, float(shortfall[best])))
-    return found
+    found = (blocked(problem, number, random_seed) for number in range(len(problem.task.phases)))
+    return [goal for goal in found if goal is not None]
+
+
+def blocked(problem: TrajectoryProblem, number: int, random_seed: int) -> Blocked | None:
+    """Return the same for the goal of one phase, by its number; None if a free configuration was found for it."""
+    phase, end = problem.task.phases[number], int(problem.ends[number])
+    tried = _try(problem, end, np.random.default_rng(random_seed))
+    if tried is None:
+        return None
+    z, residual = tried
+    if residual.min() > TOLERANCE:
+        nearest = int(np.argmin(residual))
+        text = (
+            f"{phase.name}: out of reach, none of {len(z)} configurations tried gets there; "
+            f"the nearest stays {residual[nearest]:.3f} m or rad short"
+        )
+        return Blocked(text, float(residual[nearest]))
+    reached = z[residual < TOLERANCE]
+    contacts = problem.contacts.evaluate(reached, np.full(len(reached), end), reach=problem.options.largest_margin)
+    shortfall = contacts.shortfall(len(reached))
+    if shortfall.min() <= 0.0:
+        return None
+    best = int(np.argmin(shortfall))
+    worst = int(np.flatnonzero(contacts.waypoint == best)[0])
+    labels = problem.contacts.phases[problem.contacts.phase_of(end)].labels
+    first, second = contacts.pair[worst]
+    text = (
+        f"{phase.name}: all {len(reached)} configurations found there are blocked; in the least blocked one "
+        f"{labels[first]} – {labels[second]} {_gap(contacts.distance[worst])}"
+    )
+    return Blocked(text, float(shortfall[best]))
 
 
 def _try(problem: TrajectoryProblem, waypoint: int, rng: np.random.Generator) -> tuple[Floats, Floats] | None:

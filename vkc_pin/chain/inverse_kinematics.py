@@ -42,8 +42,11 @@ class PoseSolver:
 
     def evaluate(self, z: Floats, target: pin.SE3) -> tuple[Floats, Floats]:
         """Return residuals, shape (B, m) ([m], [rad]), and their Jacobians, shape (B, m, n), at `z`, shape (B, n)."""
+        return self._evaluate(z, target_vector(target))
+
+    def _evaluate(self, z: Floats, target: Floats) -> tuple[Floats, Floats]:
         spend(len(z))
-        residual, jacobian = self._function(z, target_vector(target))
+        residual, jacobian = self._function(z, target)
         return residual, jacobian.reshape(len(z), self.size, self.rows).swapaxes(1, 2)
 
     def solve(
@@ -71,20 +74,21 @@ class PoseSolver:
         Returns:
             Configurations, shape (B, n), and a mask, shape (B,).
         """
-        z = np.clip(z, lower, upper)
+        z, goal = np.clip(z, lower, upper), target_vector(target)
         lower, upper = np.broadcast_to(lower, z.shape), np.broadcast_to(upper, z.shape)
-        error = np.empty(len(z))
-        at = np.arange(len(z))  # what is not solved yet
+        errors = np.empty(len(z))
+        at, rows = np.arange(len(z)), z  # what is not solved yet, with its limits
         for remaining in range(iterations, -1, -1):
-            residual, jacobian = self.evaluate(z[at], target)
-            error[at] = np.abs(residual).max(axis=1)
-            still = error[at] >= tolerance
-            at, residual, jacobian = at[still], residual[still], jacobian[still]
+            residual, jacobian = self._evaluate(rows, goal)
+            errors[at] = error = np.abs(residual).max(axis=1)
+            still = error >= tolerance
+            if not still.all():
+                at, rows, lower, upper, residual, jacobian = (a[still] for a in (at, rows, lower, upper, residual, jacobian))
             if not len(at) or not remaining:
                 break
-            z[at] += _step(z[at], residual, jacobian, weights, (lower[at], upper[at]))
-            np.clip(z, lower, upper, out=z)
-        return z, error < tolerance
+            rows = np.clip(rows + _step(rows, residual, jacobian, weights, (lower, upper)), lower, upper)
+            z[at] = rows
+        return z, errors < tolerance
 
 
 def _step(z: Floats, residual: Floats, jacobian: Floats, weights: Floats, limits: tuple[Floats, Floats]) -> Floats:
@@ -92,10 +96,11 @@ def _step(z: Floats, residual: Floats, jacobian: Floats, weights: Floats, limits
     lower, upper = limits
     free = upper - lower > 1e-9
     damping = 1e-8 + 1e-3 * np.minimum(1.0, np.sum(residual**2, axis=1))
+    damped = damping[:, None, None] * np.eye(residual.shape[1])
     step = np.zeros_like(z)
     for _ in range(2):
         scaled = jacobian * (free / weights)[:, None, :]
-        system = scaled @ jacobian.transpose(0, 2, 1) + damping[:, None, None] * np.eye(residual.shape[1])
+        system = scaled @ jacobian.transpose(0, 2, 1) + damped
         step = -np.einsum("bij,bi->bj", scaled, np.linalg.solve(system, residual[..., None])[..., 0])
         step *= np.minimum(1.0, LONGEST_STEP / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12))
         blocked = free & ((z + step < lower - 1e-12) | (z + step > upper + 1e-12))

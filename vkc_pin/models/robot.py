@@ -157,9 +157,9 @@ class Robot:
         Args:
             margin: What pairs keep that can: `Options.self_distance` [m].
         """
-        found = {}
+        found, links = {}, [link_name(shape.name) for shape in self.collision.geometryObjects]
         for pair in self.collision.collisionPairs:
-            one, other = sorted((self.link_of(pair.first), self.link_of(pair.second)))
+            one, other = sorted((links[pair.first], links[pair.second]))
             found[pair.first, pair.second] = self.own_margin((one, other), margin)
         return found
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -66,9 +66,7 @@ class PairTable:
             raise InputError("no pair of geometries can collide", field="scene", expected="collision geometry")
         self.margins = np.full(len(self.pairs), float(dist_safe))
         self.margins[: len(own)] = [self._robot_pairs.get(frozenset(pair), dist_safe) for pair in own.tolist()]
-        self._windows = self._by_pair(windows)
-        self._special = np.zeros(len(self.pairs), bool)
-        self._special[list(self._windows)] = True
+        self._windows = _Windows(windows, self.pairs)
         self._sort()
 
     def _moved(self, rows: Floats) -> Bools:
@@ -81,45 +79,23 @@ class PairTable:
         robots = len(self.scene.robot.collision.geometryObjects)
         return np.array([i < robots or moved[shape.parentJoint] for i, shape in enumerate(world.shapes)])
 
-    def _by_pair(self, windows: Sequence[Window]) -> dict[int, list[Window]]:
-        """Return pair → when it may be close."""
-        base, found = np.array([len(self.group), 1]), dict[int, list[Window]]()
-        numbers = self.pairs @ base  # of each pair another one: the smaller index comes first here and there
-        order = np.argsort(numbers)
-        for window in windows:
-            wanted = window.pairs @ base
-            at = order[np.minimum(np.searchsorted(numbers, wanted, sorter=order), len(order) - 1)]
-            for k in at[numbers[at] == wanted].tolist():
-                found.setdefault(k, []).append(window)
-        return found
-
     def margins_at(self, pairs: Ints, waypoints: Ints) -> Floats:
         """Return the clearances that pairs must keep at waypoints, both of shape (n,), shape (n,) [m]; -inf: none."""
-        margins = self.margins[pairs]
-        for k, window in self._at(pairs, waypoints, waypoints):
-            margins[k] = min(margins[k], window.margin)
+        margins, (k, which) = self.margins[pairs], self._windows.at(pairs, waypoints, waypoints)
+        np.minimum.at(margins, k, self._windows.margin[which])
         return margins
 
     def contact_at(self, pairs: Ints, first: Ints, last: Ints) -> Floats:
         """Return the overlap that counts as contact between waypoints `first` and `last`, all of shape (n,), shape (n,) [m]."""
-        overlap = np.zeros(len(pairs))
-        for k, window in self._at(pairs, first, last):
-            overlap[k] = max(overlap[k], window.contact)
+        overlap, (k, which) = np.zeros(len(pairs)), self._windows.at(pairs, first, last)
+        np.maximum.at(overlap, k, self._windows.contact[which])
         return overlap
 
     def together_at(self, pairs: Ints, first: Ints, last: Ints) -> Bools:
         """Return whether pairs move as one between waypoints `first` and `last`, all of shape (n,), shape (n,)."""
-        as_one = np.zeros(len(pairs), bool)
-        for k, window in self._at(pairs, first, last):
-            as_one[k] |= window.together
+        as_one, (k, which) = np.zeros(len(pairs), bool), self._windows.at(pairs, first, last)
+        as_one[k[self._windows.together[which]]] = True
         return as_one
-
-    def _at(self, pairs: Ints, first: Ints, last: Ints) -> Iterator[tuple[int, Window]]:
-        """Yield for each of some pairs the windows that hold all the time from waypoint `first` to `last`."""
-        for k in np.flatnonzero(self._special[pairs]).tolist():
-            for window in self._windows[int(pairs[k])]:
-                if window.first <= first[k] and last[k] <= window.last:
-                    yield k, window
 
     def _counts(self, i: int, j: int) -> bool:
         """Return whether two bodies i < j (robot first, then objects) can collide at all."""
@@ -196,3 +172,37 @@ class PairTable:
         at, pairs = at[active], pairs[active]
         order = np.lexsort((pairs, at))
         return at[order], pairs[order]
+
+
+class _Windows:
+    """When which pairs may be close, to be asked for many of them at once.
+
+    Attributes:
+        margin, contact, together: What holds in each window, see `Window`; shape (K,).
+    """
+
+    def __init__(self, windows: Sequence[Window], pairs: Ints) -> None:
+        most = max((int(window.pairs.max()) for window in windows if len(window.pairs)), default=0)
+        base = np.array([max(most, int(pairs.max())) + 1, 1])
+        numbers, rows = pairs @ base, [np.zeros((0, 2), int)]  # of each pair another number
+        order = np.argsort(numbers)
+        for w, window in enumerate(windows):
+            wanted = window.pairs @ base
+            at = order[np.minimum(np.searchsorted(numbers, wanted, sorter=order), len(order) - 1)]
+            rows.append(np.column_stack([at, np.full(len(at), w)])[numbers[at] == wanted])
+        found = np.concatenate(rows)
+        of_pair, self._which = found[np.lexsort((found[:, 1], found[:, 0]))].T
+        self._count = np.bincount(of_pair, minlength=len(pairs))
+        self._begin = np.cumsum(self._count) - self._count
+        self._first, self._last = (np.array([getattr(window, end) for window in windows], int) for end in ("first", "last"))
+        self.margin, self.contact = (np.array([getattr(w, name) for w in windows], float) for name in ("margin", "contact"))
+        self.together = np.array([window.together for window in windows], bool)
+
+    def at(self, pairs: Ints, first: Ints, last: Ints) -> tuple[Ints, Ints]:
+        """Return (k, window) for each of some pairs and the windows that hold all the time from waypoint `first` to `last`."""
+        some = np.flatnonzero(self._count[pairs])
+        count = self._count[pairs[some]]
+        k, place = np.repeat(some, count), np.repeat(self._begin[pairs[some]] - np.cumsum(count) + count, count)
+        which = self._which[place + np.arange(len(k))]
+        holds = (self._first[which] <= first[k]) & (last[k] <= self._last[which])
+        return k[holds], which[holds]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,9 +11,10 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.carrying import STICK, Script, above, carried_over, lifted, moved_base, room, table, tool_at
-from helpers.small_problems import full_scene, program_of
+from helpers.small_problems import full_scene, program_of, with_objects
 
 import vkc_pin as vkc
+from vkc_pin.benchmarks.anything.pairs import description_of, hall
 from vkc_pin.budget import Budget
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.motion.world import scene_after
@@ -151,7 +154,7 @@ def test_what_is_returned_and_what_it_took(
 
     monkeypatch.setattr(module, "step_by_step", step_by_step)
     settings = Settings("auto", vkc.Options())
-    result = module.all_at_once(None, SimpleNamespace(steps=(1, 2)), settings)  # type: ignore[arg-type]
+    result = module.all_at_once(None, SimpleNamespace(steps=(1, 2), holds=()), settings)  # type: ignore[arg-type]
     assert result.status == status
     assert result.metrics["planning_time"] == pytest.approx(spent)
     assert result.metrics["own"] == own  # what is no time stays that of the plan that is returned
@@ -161,7 +164,7 @@ def test_what_is_returned_and_what_it_took(
 def test_one_step_that_fails_is_not_planned_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "OneProblem", lambda *_: SimpleNamespace(run=lambda: fake("rejected", 10.0)))
     monkeypatch.setattr(module, "step_by_step", lambda *_: pytest.fail("the same again"))
-    task = SimpleNamespace(steps=(1,))
+    task = SimpleNamespace(steps=(1,), holds=())
     assert module.all_at_once(None, task, Settings("auto", vkc.Options())).status == "rejected"  # type: ignore[arg-type]
 
 
@@ -173,3 +176,87 @@ def test_building_before_planning_costs_no_negative_time() -> None:
     metrics = vkc.plan(scene, steps, options=options).metrics
     parts = sum(value for key, value in metrics.items() if key.startswith("time_"))
     assert metrics["planning_time"] >= parts > 0.0
+
+
+# --- attachments that the steps leave open ----------------------------------------------------------------------------
+
+
+def with_first(scene: Scene, owner: str, name: str, z: float) -> Scene:
+    """Return the scene with one more attachment of an object before its others: the first one, so much higher."""
+    placed = scene.objects[owner]
+    grip = placed.object.attachment()
+    lifted = pin.SE3(grip.placement.rotation, grip.placement.translation + np.array([0.0, 0.0, z]))
+    attachments = {name: dataclasses.replace(grip, name=name, placement=lifted), **placed.object.attachments}
+    return with_objects(
+        scene, {owner: dataclasses.replace(placed, object=dataclasses.replace(placed.object, attachments=attachments))}
+    )
+
+
+def refrigerator() -> Scene:
+    """Two leaves side by side, each with a handle, before the robot."""
+    return hall("husky_ur5e", "refrigerator_0", description_of("refrigerator_0")).sample_start(np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("planned", [vkc.plan, vkc.plan_chore])
+def test_where_the_first_attachment_leads_nowhere_another_does(planned: Callable[..., vkc.Plan]) -> None:
+    scene = with_first(vkc.load_scene("drawer"), "drawer", "ceiling", 4.0)
+    step = vkc.Actuate("drawer", {"slide": 0.2})
+    result = planned(scene, [step])
+    assert result.success, result.report()
+    (asked,) = result.steps
+    assert asked == dataclasses.replace(step, attachment="handle")
+    assert result.trajectory.phases[-1].held == {"drawer": "handle"}
+    alone = planned(scene, [asked])
+    np.testing.assert_array_equal(result.trajectory.positions, alone.trajectory.positions)
+    assert result.metrics["effort"] > alone.metrics["effort"], "it took what the first one took as well"
+    named = planned(scene, [dataclasses.replace(step, attachment="ceiling")])
+    assert not named.success, "who names one means it"
+
+
+def test_what_was_tried_is_said_where_all_fail() -> None:
+    scene = with_first(vkc.load_scene("drawer"), "drawer", "ceiling", 4.0)
+    thing = scene.objects["drawer"]
+    attachments = {name: one for name, one in thing.object.attachments.items() if name == "ceiling"}
+    attachments["roof"] = dataclasses.replace(attachments["ceiling"], name="roof")
+    scene = with_objects(
+        scene, {"drawer": dataclasses.replace(thing, object=dataclasses.replace(thing.object, attachments=attachments))}
+    )
+    result = vkc.plan(scene, [vkc.Actuate("drawer", {"slide": 0.2})])
+    assert result.status == "infeasible"
+    assert result.steps == (vkc.Actuate("drawer", {"slide": 0.2}),)
+    assert result.validation.notes[-1].startswith("at drawer.roof: reach drawer.roof: out of reach")
+
+
+def test_of_several_steps_only_the_one_that_fails_is_held_elsewhere() -> None:
+    scene = with_first(vkc.load_scene("drawer"), "drawer", "ceiling", 4.0)
+    there = vkc.GoTo(*(scene.start[:2] + 0.1))
+    result = vkc.plan(scene, [there, vkc.Actuate("drawer", {"slide": 0.2})])
+    assert result.success, result.report()
+    assert result.steps == (there, vkc.Actuate("drawer", {"slide": 0.2}, "handle"))
+
+
+def test_two_leaves_of_one_thing_are_opened_as_one_problem() -> None:
+    steps = [vkc.Actuate("it", {"hinge_left": 0.6}), vkc.Actuate("it", {"hinge_right": 0.5})]
+    result = vkc.plan(refrigerator(), steps)
+    assert result.success, result.report()
+    assert "," not in result.initialization, "of one seed"
+    assert [phase.held for phase in result.trajectory.phases] == [{}, {"it": "handle_left"}, {}, {"it": "handle_right"}]
+    ends = dict(zip(result.trajectory.names, result.trajectory.positions[-1], strict=True))
+    assert (ends["it.hinge_left"], ends["it.hinge_right"]) == (pytest.approx(0.6, abs=1e-3), pytest.approx(0.5, abs=1e-3))
+    assert result.end_scene().held == {"it": "handle_right"}
+
+
+def test_one_leaf_opened_here_and_then_there_is_planned_step_by_step() -> None:
+    """The hinge has no place twice in one chain; nor is it held twice where a second plan begins at the end of the first."""
+    first, second = (
+        vkc.Actuate("it", {"hinge_left": value}, name) for value, name in ((0.3, "handle_left"), (0.6, "handle_left_free"))
+    )
+    both = vkc.plan(refrigerator(), [first, second])
+    assert both.success, both.report()
+    assert [phase.held for phase in both.trajectory.phases] == [{}, {"it": "handle_left"}, {}, {"it": "handle_left_free"}]
+    begun = vkc.plan(refrigerator(), [first])
+    ended = vkc.plan(begun.end_scene(), [second])
+    assert ended.success, ended.report()
+    assert "it.handle_left" not in ended.trajectory.names
+    chore = vkc.plan_chore(refrigerator(), [first, second])
+    assert chore.success, chore.report()

@@ -99,14 +99,14 @@ def test_one_problem_costs_less_than_step_after_step() -> None:
     settings = Settings("astar", vkc.Options())
     steps = [vkc.Grasp("stick"), vkc.Touch("stick.tip", TARGET)]
     parts = stages(start(), compile_task(start(), steps, settings.options), settings)
-    assert [part.success for _, part in parts] == [True, True]
-    pieces = [one.piece() for one, _ in parts]
+    assert [part.plan.success for part in parts] == [True, True]
+    pieces = [part.one.piece() for part in parts]
     one = problem(start(), steps, settings)
     whole = one.run(lambda problem: seed_of(problem, pieces))
     assert whole.success, whole.report()
     before = objective(one.problem, seed_of(one.problem, pieces).z)
     assert objective(one.problem, one.z) < before
-    assert np.abs(one.z[39, :3] - parts[0][0].z[39, :3]).max() > 1e-3  # the grasp has moved in favour of what follows
+    assert np.abs(one.z[39, :3] - parts[0].one.z[39, :3]).max() > 1e-3  # the grasp has moved in favour of what follows
 
 
 def test_each_step_begins_where_the_one_before_it_ends() -> None:
@@ -114,7 +114,7 @@ def test_each_step_begins_where_the_one_before_it_ends() -> None:
     steps = [vkc.Grasp("stick"), vkc.Grasp("stick"), vkc.Touch("stick.tip", TARGET)]
     parts = stages(start(), compile_task(start(), steps, settings.options), settings)
     assert len(parts) == 2  # grasping what is held changes nothing
-    (first, grasped), (second, _) = parts
+    (_, first, grasped), (_, second, _) = parts
     end = grasped.trajectory
     after = scene_after(start(), end, first.task.after)
     np.testing.assert_allclose(after.start, end.positions[-1, : end.robot_size], atol=1e-9)

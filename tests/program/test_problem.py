@@ -632,7 +632,7 @@ def test_scene_steps_and_options_are_left_as_they_were() -> None:
         ([Actuate("dor", {"hinge": 1.0})], UnknownNameError, r"dor.*door"),
         ([Actuate("door", {"hing": 1.0})], UnknownNameError, r"hing.*hinge"),
         ([Grasp("door", "handel")], UnknownNameError, r"handel.*handle"),
-        ([Grasp("door", "handle"), Grasp("door", "handle_free")], InputError, "two different attachments"),
+        ([Grasp("door", "handle"), Grasp("door", "handle_free")], InputError, "two grasps of one joint"),
         ([Reach(POSE, frame="tol")], UnknownNameError, r"tol.*tool"),
         (["open the door"], InputError, "not a step"),
     ],

@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.small_problems import CABINET_STATE, door_scene, full_scene
+from helpers.small_problems import CABINET_STATE, door_scene, full_scene, with_attachment, with_objects
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.options import Options
 from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.compiler import LATCH_MARGIN, compile_task
+from vkc_pin.task.handling import clash
 from vkc_pin.task.lookup import path_joints
 from vkc_pin.task.phases import Task
 from vkc_pin.task.steps import Actuate, GoTo, Grasp, Reach, Release, Step
@@ -38,6 +39,14 @@ def with_link(scene: Scene, name: str, link: str) -> Scene:
     attachment = dataclasses.replace(placed.object.attachment(), name=name, link=link, placement=pin.SE3.Identity())
     thing = dataclasses.replace(placed.object, attachments={**placed.object.attachments, name: attachment})
     return dataclasses.replace(scene, objects={**scene.objects, "door": dataclasses.replace(placed, object=thing)})
+
+
+def with_link_of(scene: Scene, owner: str, link: str) -> Scene:
+    """Return the scene with one more attachment of an object, named after its link and like the first."""
+    placed = scene.objects[owner]
+    return with_objects(
+        scene, {owner: with_attachment(placed, dataclasses.replace(placed.object.attachment(), name=link, link=link))}
+    )
 
 
 def test_opening_a_door_is_reaching_turning_and_moving() -> None:
@@ -238,11 +247,72 @@ def test_what_is_no_step(steps: Any, field: str) -> None:
     assert caught.value.field == field
 
 
-def test_two_attachments_of_one_object() -> None:
-    with pytest.raises(InputError, match="two different attachments") as caught:
-        phases([Grasp("door"), Grasp("door", "handle_free")])
-    assert caught.value.field == "steps[1].attachment"
-    assert (caught.value.expected, caught.value.got) == ("handle", "handle_free")
+def test_what_is_left_open_is_the_first_attachment_that_moves_the_joints() -> None:
+    """The first of all moves only some of them."""
+    placed = full_scene().objects["cabinet"]
+    named = {name: dataclasses.replace(placed.object.attachment(), name=name, link=name) for name in ("case", "arm", "lid")}
+    thing = dataclasses.replace(placed.object, attachments={**named, **placed.object.attachments})
+    scene = with_objects(full_scene(), {"cabinet": dataclasses.replace(placed, object=thing)})
+    for joints, taken in (({"swing": 0.5}, "arm"), ({"lid_hinge": 0.2}, "lid"), ({"swing": 0.5, "slide": 0.2}, "grip")):
+        task = phases([Actuate("cabinet", joints)], scene)
+        assert task.holds == (Hold("cabinet", taken),)
+        assert task == dataclasses.replace(phases([Actuate("cabinet", joints, taken)], scene), steps=task.steps)
+    assert phases([Grasp("cabinet")], scene).holds == (Hold("cabinet", "case"),)
+    with pytest.raises(InputError, match="no attachment of 'cabinet' can bring 'swing' and 'lid_hinge' there") as caught:
+        phases([Actuate("cabinet", {"swing": 0.5, "lid_hinge": 0.2})], scene)
+    assert caught.value.field == "steps[0].joints"
+    assert "case moves nothing; arm moves swing; lid moves lid_hinge; grip moves swing, slide" in str(caught.value.expected)
+
+
+def test_what_the_hand_has_is_taken_before_what_comes_first() -> None:
+    task = phases([Actuate("door", {"hinge": 1.2}, "handle_free"), GoTo(0.0, 0.0), Actuate("door", {"hinge": 0.5})])
+    assert task.holds == (Hold("door", "handle_free"),)
+    task = phases([OPEN], door_scene().with_held({"door": "handle_free"}))
+    assert task.holds == (Hold("door", "handle_free"),)
+
+
+def test_what_holds_a_latch_is_passed_over() -> None:
+    """The plate moves the hinge, and no knob: while the latch is shut, it will not do."""
+    scene = with_link(door_scene(), "plate", "panel")
+    attachments = scene.objects["door"].object.attachments
+    thing = dataclasses.replace(scene.objects["door"].object, attachments={"plate": attachments["plate"], **attachments})
+    scene = with_objects(scene, {"door": dataclasses.replace(scene.objects["door"], object=thing)})
+    assert phases([OPEN], scene).holds == (HANDLE,)
+    assert phases([OPEN], scene.with_state("door", {"hinge": 0.2})).holds == (Hold("door", "plate"),)
+
+
+def test_one_object_held_here_and_then_there() -> None:
+    """Each by its own joints, in one chain; by the same joint, it is told which has no place in one."""
+    lid = with_link_of(full_scene(), "cabinet", "lid")
+    task = phases([Actuate("cabinet", {"swing": 0.5}), Actuate("cabinet", {"lid_hinge": 0.2})], lid)
+    grip, other = Hold("cabinet", "grip"), Hold("cabinet", "lid")
+    assert task.holds == (grip, other)
+    assert [phase.name for phase in task.phases] == [
+        "reach cabinet.grip",
+        "move cabinet.swing",
+        "reach cabinet.lid",
+        "move cabinet.lid_hinge",
+    ]
+    assert [phase.held for phase in task.phases] == [(), (grip,), (), (other,)]
+    assert task.phases[2].leaves == (grip,)
+    assert task.phases[3].before == {"cabinet.swing": 0.5, "cabinet.slide": 0.1, "cabinet.lid_hinge": -0.4}
+    assert clash(lid, task.holds) is None
+    both = phases([OPEN, Actuate("door", {"hinge": 0.5}, "handle_free")])
+    assert both.holds == (HANDLE, Hold("door", "handle_free"))
+    assert clash(door_scene(), both.holds) == "door.hinge"
+
+
+def test_what_the_start_holds_is_let_go_of_where_another_hold_moves_the_same() -> None:
+    """With the joints that the new one does not move, which then are none of the task."""
+    scene = (
+        with_link(door_scene(), "plate", "panel").with_state("door", {"hinge": 0.4, "knob": 0.6}).with_held({"door": "handle"})
+    )
+    for steps in ([Actuate("door", {"hinge": 0.9}, "plate")], [GoTo(0.0, 0.0), Actuate("door", {"hinge": 0.9}, "plate")]):
+        task = phases(steps, scene)
+        assert task.holds == (Hold("door", "plate"),)
+        assert task.state == {"door.hinge": 0.4}
+        assert all(phase.before == {"door.hinge": 0.4} for phase in task.phases)
+        assert task.phases[0].leaves == (HANDLE,)
 
 
 def test_an_object_without_attachments() -> None:

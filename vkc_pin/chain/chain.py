@@ -193,7 +193,7 @@ def consolidate(
 
     Raises:
         UnknownNameError: The scene has no such object, or the object no such attachment.
-        InputError: A grasp that leaves a freedom is called like a joint of its object.
+        InputError: Two grasps move the same joint, or one that leaves a freedom is called like a joint of its object.
     """
     robot = instance(scene, Scene, "scene").robot
     holds = checked_holds(scene.objects, holds_of(holds) if isinstance(holds, Mapping) else holds)
@@ -247,8 +247,8 @@ def consolidate(
         closures[hold] = Closure(base.parentJoint, pin.SE3(base.placement), target)
     for joint_name in names:
         if names.count(joint_name) > 1:
-            problem = "two grasps, or an attachment and a joint of its object, share a name"
-            raise InputError(problem, field=joint_name, expected="different names")
+            problem = "two grasps of one joint, or an attachment and a joint of its object, share a name"
+            raise InputError(problem, field=joint_name, expected="a coordinate that is in the chain once")
     ride_geometries = {}
     for number, ride in enumerate(rides):
         frame = model.frames[model.getFrameId(prefixes[ride.hold] + ride.link)]

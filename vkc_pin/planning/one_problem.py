@@ -75,14 +75,15 @@ class OneProblem:
     Attributes:
         scene: Where it begins.
         task: What is asked for.
+        goals_first: Whether free configurations are looked for at the goals before any seed, since most likely there are none.
         problem: The program, once it is built.
         z: Its best z_1..z_N, shape (N, n), once `run` has found something.
         initialization: The name of the seed that led there.
         checking: How long the last check of a motion took [s].
     """
 
-    def __init__(self, scene: Scene, task: Task, settings: Settings) -> None:
-        self.scene, self.task, self.settings = scene, task, settings
+    def __init__(self, scene: Scene, task: Task, settings: Settings, *, goals_first: bool = False) -> None:
+        self.scene, self.task, self.settings, self.goals_first = scene, task, settings, goals_first
         self.times = dict.fromkeys(TIMES, 0.0)
         self.rounds = self.iterations = 0
         self.checking = 0.0
@@ -121,6 +122,8 @@ class OneProblem:
         if reasons:
             best = self._stationary(problem)
             return dataclasses.replace(best, report=best.report.with_reasons(reasons)), "infeasible"
+        if self.goals_first and (blocked := self._goals(problem)):
+            return self._stationary(problem).noted(goal.text for goal in blocked), "infeasible"
         seeds = self._seeds(problem) if seed is None else iter([seed(problem)])
         return self._try_seeds(problem, seeds, searched=seed is None)
 

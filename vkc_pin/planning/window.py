@@ -19,8 +19,9 @@ from vkc_pin.planning.settings import Settings
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.scene.scene import Scene
 from vkc_pin.seeds.seed import PhaseWaypoints, Seed, seed_of
-from vkc_pin.task.actions import actions_of
+from vkc_pin.task.actions import actions_of, alternatives
 from vkc_pin.task.compiler import compile_task
+from vkc_pin.task.handling import clash
 from vkc_pin.task.phases import Task
 from vkc_pin.task.steps import Step
 
@@ -52,7 +53,7 @@ class SlidingWindow:
     """A list of steps that is being planned.
 
     Attributes:
-        actions: The steps of each action.
+        actions: The steps of each action, by the attachments that lead there.
         kept: What is decided: parts of the first actions.
         ahead: Parts of the actions after those, from which the next problem starts.
         spent, history: What every problem took, and every round of the solver.
@@ -132,21 +133,44 @@ class SlidingWindow:
         return alone
 
     def _last(self, first: int, window: int) -> int:
-        """Return the end of a window: as wide as it may be, but without what can be said only once the rest is planned."""
+        """Return the end of a window: as wide as it may be.
+
+        But without what can be said only once the rest is planned, or has no place in one chain with it.
+        """
         last = first + 1
         while last < min(first + window, len(self.actions)):
             try:
-                self._task(self._now, first, last + 1, self.settings.options)
+                holds = self._task(self._now, first, last + 1, self.settings.options).holds
             except InputError:
+                break
+            if clash(self._now, holds) is not None:
                 break
             last += 1
         return last
 
     def _look_ahead(self) -> Plan | None:
-        """Plan one more action alone, from where those planned ahead end; return the plan if it fails."""
+        """Plan one more action alone, from where those planned ahead end; return the plan if it fails.
+
+        What fails is tried by the other attachments that it leaves open; the one that leads there is the action's from then on.
+        """
         number, scene = len(self.kept) + len(self.ahead), self.ahead[-1].after if self.ahead else self._now
+        failed, chosen = self._alone(number, scene), self.actions[number]
+        if failed is None or failed.status in ENDINGS:
+            return failed
+        for _, steps in alternatives(scene, self._task(scene, number, number + 1, self.settings.options)):
+            self.actions[number] = steps
+            other = self._alone(number, scene, goals_first=True)
+            if other is None:
+                return None
+            self.actions[number] = chosen
+            if other.status in ENDINGS:
+                return other
+        return failed
+
+    def _alone(self, number: int, scene: Scene, *, goals_first: bool = False) -> Plan | None:
+        """Plan an action alone; return the plan if it fails."""
         for attempt in range(self._searches):
-            one = self._problem(scene, number, number + 1, attempt)
+            one = self._problem(scene, number, number + 1, attempt, goals_first=goals_first)
             if not one.task.phases:
                 self.ahead.append(_Part(None, _NOTHING, scene))
                 return None
@@ -197,7 +221,7 @@ class SlidingWindow:
         """Compile actions anew: from where in the world they begin is known only once those before them are planned."""
         return compile_task(scene, self._steps(first, last), options, nothing=True)
 
-    def _problem(self, scene: Scene, first: int, last: int, attempt: int = 0) -> OneProblem:
+    def _problem(self, scene: Scene, first: int, last: int, attempt: int = 0, *, goals_first: bool = False) -> OneProblem:
         """Return the problem of the actions from `first` to before `last`.
 
         There are few seeds to an attempt: where an action cannot be done from where the last one ends, all others fail as well,
@@ -208,10 +232,11 @@ class SlidingWindow:
             first: Their number.
             last: That of what follows.
             attempt: Other random numbers for each.
+            goals_first: See `OneProblem`.
         """
         options = dataclasses.replace(self.settings.options, max_restarts=1)
         settings = dataclasses.replace(self.settings, options=options, random_seed=self.settings.random_seed + attempt)
-        return OneProblem(scene, self._task(scene, first, last, options), settings)
+        return OneProblem(scene, self._task(scene, first, last, options), settings, goals_first=goals_first)
 
     def _joined(self, failed: Plan | None) -> Plan:
         """Return one plan of all that is decided, and of what failed."""
@@ -220,10 +245,10 @@ class SlidingWindow:
         if failed is not None:
             parts.append(failed)
             number = len(self._steps(0, len(self.kept)))
-            notes.append(f"steps[{number}], {self.steps[number]}, could not be planned: {failed.status}")
+            notes.append(f"steps[{number}], {self._steps(0, len(self.actions))[number]}, could not be planned: {failed.status}")
         return joined(
             self.scene,
-            self.steps,
+            self._steps(0, len(self.actions)),
             self.settings,
             parts,
             began=self.began,

@@ -22,6 +22,7 @@ from vkc_pin.program.term_places import TermNumbers, term_goals
 from vkc_pin.program.term_rows import TermRow
 from vkc_pin.program.transcription import transcribe
 from vkc_pin.program.waypoint import Structure
+from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.phases import Phase, Task
 from vkc_pin.task.terms import Term
@@ -123,11 +124,15 @@ class TrajectoryProblem:
         start[: len(self.scene.start)] = self.scene.start
         for name, value in self.task.state.items():
             start[self.chain.index(name)] = value
-        for hold in self.scene.holds:
+        for hold in self._held_at_start():
             names = self.scene.objects[hold.object].object.attachment(hold.attachment).coordinates
             for name, value in zip(names, hold.at, strict=True):
                 start[self.chain.index(f"{hold.object}.{name}")] = value
         return start
+
+    def _held_at_start(self) -> list[Hold]:
+        """Return what the start holds, without what is let go of then and there to be held otherwise."""
+        return [hold for hold in self.scene.holds if hold in self.task.holds]
 
     def _bounds(self) -> tuple[Floats, Floats]:
         """Return the joint limits (eq. 4) at every waypoint, narrowed to what the phases and firm holds ask for."""
@@ -151,7 +156,7 @@ class TrajectoryProblem:
                         turn = wrapped(goal - self.start[2])  # to the nearest of the equal headings
                         lower[end - 1, column] = upper[end - 1, column] = self.start[2] + turn if column == 2 else goal
             begin = end
-        for hold in self.scene.holds:  # until it is let go of, what is clamped stays where it is
+        for hold in self._held_at_start():  # until it is let go of, what is clamped stays where it is
             if self.scene.objects[hold.object].object.attachments[hold.attachment].firm:
                 held = [hold in phase.held for phase in self.task.phases]
                 until = int(self.ends[(held.index(False) if False in held else len(held)) - 1]) if held[0] else 0

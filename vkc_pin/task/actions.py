@@ -1,18 +1,20 @@
-"""What a list of steps comes to before anything is planned: actions, and what cannot be done at its place."""
+"""What steps come to before anything is planned: actions, what they leave open, and what cannot be done at its place."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from vkc_pin.options import Options
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.compiler import compile_task, nothing_to_do
+from vkc_pin.task.handling import driving
 from vkc_pin.task.phases import Task
 from vkc_pin.task.steps import Actuate, Grasp, Place, Release, Step, as_list
 
-__all__ = ["actions_of", "foresee"]
+__all__ = ["actions_of", "alternatives", "foresee", "is_open"]
 
 
 def actions_of(steps: Sequence[Step]) -> list[tuple[Step, ...]]:
@@ -27,6 +29,32 @@ def actions_of(steps: Sequence[Step]) -> list[tuple[Step, ...]]:
         else:
             actions.append((step,))
     return actions
+
+
+def is_open(scene: Scene, step: Step) -> bool:
+    """Return whether a step moves joints of what is not held yet, and leaves open by which of several attachments."""
+    if not isinstance(step, Actuate) or step.attachment is not None or step.object in scene.held:
+        return False
+    return len(scene.objects[step.object].object.attachments) > 1
+
+
+def alternatives(scene: Scene, task: Task) -> Iterator[tuple[str, tuple[Step, ...]]]:
+    """Yield the steps of a task by attachments that it does not use, each with "<object>.<attachment>".
+
+    There are some only where a single one of its steps leaves that open: of several, each is planned alone before.
+
+    Args:
+        scene: Where the task begins.
+        task: What its steps come to if nobody says otherwise.
+    """
+    own = [(number, step) for number, step in enumerate(task.steps) if isinstance(step, Actuate) and is_open(scene, step)]
+    for number, step in own if len(own) == 1 else ():
+        used = {hold.attachment for hold in task.holds if hold.object == step.object}
+        values = {f"{step.object}.{joint}": value for joint, value in step.joints.items()}
+        for name in driving(scene.objects[step.object], {}, values, f"steps[{number}]"):
+            if name not in used:
+                changed = dataclasses.replace(step, attachment=name)
+                yield f"{step.object}.{name}", (*task.steps[:number], changed, *task.steps[number + 1 :])
 
 
 def foresee(scene: Scene, steps: Sequence[Step], options: Options) -> list[Task]:

@@ -14,9 +14,9 @@ from vkc_pin.options import Options
 from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.placed import PlacedObject
 from vkc_pin.scene.scene import Scene
+from vkc_pin.task.handling import clash, driven, driver, latched, pushed_ways
 from vkc_pin.task.lookup import attachment_of, check_link, joint_limits, path_joints, placed_object, robot_frame
 from vkc_pin.task.phases import FrameGoal, Mark, Phase, PhaseKind, Task
-from vkc_pin.task.pushing import pushed_ways
 from vkc_pin.task.rides import Riders
 from vkc_pin.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch, as_list
 
@@ -108,13 +108,7 @@ class _Compiler:
             raise InputError(
                 f"'{name}' stands fixed in the world", field=f"{where}.by", expected="the hand itself", got=shown(by)
             )
-        if not placed.object.free:
-            other = next((h for h in self.holds if h.object == name and h != hold), None)
-            if other is not None:
-                problem = f"object '{name}' is grasped by two different attachments in one plan"
-                expected, got = (str(one).partition(".")[2] for one in (other, hold))
-                raise InputError(problem, field=f"{where}.attachment", expected=expected, got=got)
-        elif name in self.left:
+        if name in self.left:
             problem = f"where '{name}' stands by then is known only after planning"
             expected = "Place with a full pose before, or a second plan from where the first ends"
             raise InputError(problem, field=f"{where}.object", expected=expected)
@@ -122,6 +116,7 @@ class _Compiler:
             problem = f"'{name}' stands on what the robot carries"
             raise InputError(problem, field=f"{where}.object", expected="Place or Release before")
         if hold not in self.holds:
+            self._forget_for(hold)
             self.holds.append(hold)
         self._enter(placed, attachment.name)
         about = (hold.object, hold.attachment, hold.frame or "")
@@ -130,6 +125,16 @@ class _Compiler:
         self.riders.load(hold, self.state, where)
         self.standing.pop(name, None)
         return hold
+
+    def _forget_for(self, hold: Hold) -> None:
+        """Leave out what the start holds and no phase does, if a new hold moves the same joints: one chain has those once."""
+        used = {*self.held, *(one for phase in self.phases for one in (*phase.held, *phase.grasps))}
+        kept = [one for one in self.holds if one in used or clash(self.scene, (one, hold)) is None]
+        if len(kept) < len(self.holds):
+            self.holds, left = kept, {name for one in kept for name in driven(self.scene, one)}
+            for values in (self.initial, self.state):
+                for name in values.keys() - left:
+                    del values[name]
 
     def _through(self, frame: str, name: str, where: str) -> tuple[Hold, str]:
         """Return the hold and link of `frame`, "<object>.<link>", that object `name` is to be held through."""
@@ -154,34 +159,20 @@ class _Compiler:
         if placed.object.free:
             problem = f"'{step.object}' stands free: its joints are not driven by a hand"
             raise InputError(problem, field=f"{where}.object", expected="a fixed object")
-        hold = self.grasp(step.object, step.attachment, where)
-        attachment = placed.object.attachments[hold.attachment]
-        path = path_joints(placed, attachment)
-        for joint in step.joints:
-            if joint not in path:
-                problem = f"joint '{joint}' does not move when '{step.object}' is held at '{attachment.name}'"
-                expected = f"one of {', '.join(path)}" if path else "an attachment that moves with it"
-                raise InputError(problem, field=f"{where}.joints", expected=expected)
         values = {f"{step.object}.{joint}": value for joint, value in step.joints.items()}
+        used = [one.attachment for one in (*self.held, *reversed(self.holds)) if one.object == step.object]
+        hold = self.grasp(step.object, driver(placed, step.attachment, used, self.state, values, where), where)
         ranges = {coordinate: joint_limits(placed, coordinate) for coordinate in values}
-        after: dict[str, float] = {}  # what must wait until the latch is left behind
-        for latch in placed.object.latches:
-            held, release = f"{step.object}.{latch.joint}", f"{step.object}.{latch.released_by}"
-            if held not in values or values[held] == self.state[held]:
+        path, after = path_joints(placed, placed.object.attachments[hold.attachment]), dict[str, float]()
+        for latch in latched(placed, self.state, values):
+            release = f"{step.object}.{latch.released_by}"
+            if latch.released_by not in path:  # and is where it lets go
                 continue
-            if abs(self.state[held] - latch.held_at) > latch.engaged_within:
-                continue
-            if latch.released_by not in path:
-                if placed.state[names.index(latch.released_by)] >= latch.threshold:
-                    continue
-                problem = f"'{latch.joint}' is latched, and '{latch.released_by}', which releases it, does not move when "
-                problem += f"'{step.object}' is held at '{attachment.name}'"
-                raise InputError(problem, field=f"{where}.attachment", expected=f"an attachment that moves '{latch.released_by}'")
             lower, upper = joint_limits(placed, release)
             turned = min(latch.threshold + LATCH_MARGIN, upper)
             if self.state[release] < turned:
                 self._move("turn", hold, where, {release: turned}, {release: (lower, upper)})
-            if values.get(release, upper) < turned:
+            if values.get(release, upper) < turned:  # must wait until the latch is left behind
                 after[release] = values[release]
             ranges[release] = (turned, upper)
             values[release] = turned if release in after else values.get(release, turned)
@@ -288,7 +279,11 @@ def compile_task(scene: Scene, steps: Sequence[Step], options: Options, *, nothi
     if not compiler.phases and not nothing:
         raise nothing_to_do()
     # Objects that are grasped later stand as they are at the start until then.
-    phases = tuple(replace(phase, before={**compiler.initial, **phase.before}) for phase in compiler.phases)
+    initial = compiler.initial
+    phases = tuple(
+        replace(phase, before={**initial, **{name: value for name, value in phase.before.items() if name in initial}})
+        for phase in compiler.phases
+    )
     return Task(steps, phases, tuple(compiler.holds), compiler.initial, compiler.held, tuple(marks))
 
 

@@ -79,7 +79,8 @@ class Actuate:
     Attributes:
         object: The object's name in the scene.
         joints: Joint name → value at the end, [rad] or [m].
-        attachment: Where to grasp it if it is not held yet; None is the object's first attachment.
+        attachment: Where to grasp it if it is not held there; None leaves that open: it is held on to if the joints move so, else
+            taken by the object's first attachment that moves them, and where planning with that one fails, by the others that do.
     """
 
     object: str

@@ -18,8 +18,8 @@ from vkc_pin.options import Options
 from vkc_pin.scene.placed import PlacedObject
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.compiler import compile_task
+from vkc_pin.task.handling import advance
 from vkc_pin.task.phases import Task
-from vkc_pin.task.pushing import advance
 
 STEP = 1e-6  # [rad] or [m]
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import inspect
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -103,6 +104,32 @@ def test_a_bar_close_to_the_flap_is_taken_with_the_finger_tips(tmp_path: Path) -
     assert best.attachment.standoff > 0.0
     tight = vkc.propose_attachments(flap(tmp_path, close), grasp_clearance=0.02)
     assert all(proposal.kind != "bar" for proposal in tight.found)
+
+
+def knob(z: float, turned: float = 0.0) -> str:
+    """Return a square knob, 30 mm wide, on the flap at some height, turned about its own axis."""
+    shape = '<geometry><box size="0.05 0.03 0.03"/></geometry>'
+    return f'<collision><origin xyz="-0.055 0.5 {z}" rpy="{turned} 0 0"/>{shape}</collision>'
+
+
+def test_two_knobs_come_before_one_with_the_hand_turned(tmp_path: Path) -> None:
+    """Turned, the hand has the better one nearly as well as before; but what keeps it from there does so in both cases."""
+    alone, two = (vkc.propose_attachments(flap(tmp_path, text), most=2).found for text in (knob(0.0), knob(0.0) + knob(0.25)))
+    (first, turned), (same, other) = alone, two
+    assert turned.score > 0.9 * first.score
+    assert (same.score, other.score < turned.score) == (pytest.approx(first.score), True)
+    heights = [proposal.attachment.placement.translation[2] for proposal in (first, turned, same, other)]
+    np.testing.assert_allclose(heights, [0.0, 0.0, 0.0, 0.25], atol=1e-6)
+
+
+def test_a_hand_that_is_turned_a_little_is_not_proposed_again(tmp_path: Path) -> None:
+    """Of two pieces one in the other, turned by 45°, each has its own faces."""
+    found = vkc.propose_attachments(flap(tmp_path, knob(0.0) + knob(0.0, np.pi / 4)), most=8).found
+    places = [proposal.attachment.placement for proposal in found if proposal.kind == "knob"]
+    assert len(places) >= 2
+    for one, other in itertools.combinations(places, 2):
+        same = one.rotation[:, 2] @ other.rotation[:, 2] > 0.5 and np.linalg.norm(one.translation - other.translation) < 0.03
+        assert not same or abs(one.rotation[:, 1] @ other.rotation[:, 1]) < 0.5
 
 
 def test_posts_end_the_slide(tmp_path: Path) -> None:

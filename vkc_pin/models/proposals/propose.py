@@ -29,7 +29,9 @@ _TRIED = 600  # of one body, the best ones by geometry: the hand is not put to m
 _WAY = 0.25  # [m]: how far a hand must be able to draw back straight
 _STEP = 0.015  # [m]: of that way
 _HELD = 0.005  # [m]: what is in the fingers at least goes so far beyond its middle, if they take it with their tips
-_NEAR, _ALIKE = 0.06, 0.9  # [m], cosine: grasps closer together than that are one
+_NEAR, _ALIKE = 0.06, 0.5  # [m], cosine: grasps closer together than that, turned by less than 60°, are one
+_TURNED = 0.5  # of the rank of a hand that only is turned about its approach, where a better one is proposed: what one
+# of the two cannot reach, the other mostly cannot either
 _ROOM = (0.02, 0.01)  # [m]: more clearance than needed is better, up to this
 _SLACK = 0.05  # [m]: to either side; so is more of a bar to hold on to, up to this
 _WORTH = 0.1  # of the score of a joint's best grasp: what has less is of no use beside it
@@ -140,7 +142,8 @@ class _Search:
         ranked.sort(key=lambda entry: -entry[0])  # stable: the order of the file where they are alike
         kept = list[tuple[Proposal, Candidate]]()
         for best, grasp, named in ranked[:_TRIED]:
-            if len(kept) >= self.most and best <= kept[self.most - 1][0].score:
+            ranks = _ranks(kept)
+            if len(kept) >= self.most and best <= ranks[self.most - 1][0]:
                 break
             if any(best <= other.score and _alike(taken, other, grasp) for other, taken in kept):
                 continue
@@ -151,7 +154,8 @@ class _Search:
             proposal = dataclasses.replace(proposal, when=when)
             kept = [(other, taken) for other, taken in kept if not _alike(grasp, proposal, taken)]
             kept = sorted([*kept, (proposal, grasp)], key=lambda entry: -entry[0].score)
-        return [proposal for proposal, _ in kept[: self.most] if proposal.score >= _WORTH * kept[0][0].score]
+        chosen = [proposal for _, proposal in _ranks(kept)[: self.most]]
+        return [proposal for proposal in chosen if proposal.score >= _WORTH * chosen[0].score]
 
     def _tried(self, best: float, grasp: Candidate, opening: Opening, tally: _Tally, named: bool) -> Proposal | None:
         """Return what becomes of a grasp when the hand is put there; None if there is no room, which `tally` gets to know."""
@@ -246,10 +250,25 @@ def _back(way: float) -> pin.SE3:
     return pin.SE3(np.eye(3), np.array([0.0, 0.0, -way]))
 
 
-def _alike(taken: Candidate, proposal: Proposal, other: Candidate) -> bool:
-    """Return whether a grasp is about one that is proposed: from the same side, and where the hand can slide to from there."""
+def _ranks(kept: list[tuple[Proposal, Candidate]]) -> list[tuple[float, Proposal]]:
+    """Return proposals by rank, the best first: by score, but less for a hand that is only turned where a better one is."""
+    ranked, better = list[tuple[float, Proposal]](), list[tuple[Proposal, Candidate]]()
+    for proposal, grasp in kept:
+        count = sum(_alike(taken, other, grasp, turned=True) for other, taken in better)
+        ranked.append((proposal.score * _TURNED**count, proposal))
+        better.append((proposal, grasp))
+    return sorted(ranked, key=lambda entry: -entry[0])
+
+
+def _alike(taken: Candidate, proposal: Proposal, other: Candidate, *, turned: bool = False) -> bool:
+    """Return whether a grasp is about one that is proposed: from the same side, and where the hand can slide to from there.
+
+    The hand is held the same way as well, unless it may be `turned` about its approach.
+    """
     first, second = taken.placement, other.placement
-    if first.rotation[:, 2] @ second.rotation[:, 2] < 0.5 or abs(first.rotation[:, 1] @ second.rotation[:, 1]) < _ALIKE:
+    if first.rotation[:, 2] @ second.rotation[:, 2] < _ALIKE:
+        return False
+    if not turned and abs(first.rotation[:, 1] @ second.rotation[:, 1]) < _ALIKE:
         return False
     apart = first.rotation.T @ (second.translation - first.translation)
     slide = next((item for item in proposal.attachment.freedoms if item.kind == "prismatic"), None)

@@ -14,6 +14,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from helpers.drawers import changed, drawer_scene, handle, holding, off, open_scene, with_boxes
 from helpers.small_problems import door_scene
@@ -462,6 +463,20 @@ def test_the_same_thing_twice() -> None:
     assert plan.success, plan.report()
     names = [phase.name for phase in plan.trajectory.phases]
     assert names == ["go to", "reach drawer.handle", "move drawer.slide", "move drawer.slide"]
+
+
+def test_what_is_taken_is_what_moves_the_joints(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first attachment of a refrigerator with two leaves moves the left one."""
+    thing = vkc.load_object(vkc.random_object("refrigerator", 0))
+    placed = vkc.PlacedObject("it", thing, pin.SE3.Identity(), np.zeros(2))
+    scene = dataclasses.replace(door_scene(), objects={"it": placed})
+    taken: list[Any] = []
+    one = attempt.Attempt(scene, vkc.Options(), refine=False, seed=[0, 0])
+    monkeypatch.setattr(one, "_take_hold", taken.extend)
+    monkeypatch.setattr(one, "_move", taken.append)
+    step = vkc.Actuate("it", {"hinge_right": 0.5})
+    one._actuate(step)
+    assert taken == [vkc.Grasp("it", "handle_right"), step]
 
 
 def test_what_is_held_at_the_start() -> None:

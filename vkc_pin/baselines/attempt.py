@@ -96,9 +96,10 @@ class Attempt:
 
     def _actuate(self, step: Actuate) -> None:
         """Move joints of an object: drive to its handle and reach for it, unless it is held, and move it."""
-        held = self.scene.held.get(step.object)
-        if held is None or step.attachment not in (None, held):
-            self._take_hold([Grasp(step.object, step.attachment)])
+        after = compile_task(self.scene, [step], self.options, nothing=True).after
+        (attachment,) = (hold.attachment for hold in after if hold.object == step.object)
+        if self.scene.held.get(step.object) != attachment:
+            self._take_hold([Grasp(step.object, attachment)])
         self._move(step)
 
     def _place(self, step: Place) -> None:

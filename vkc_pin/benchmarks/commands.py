@@ -71,8 +71,9 @@ def add_bench(commands: Any) -> None:
         benches, "anything", shown, about, "--starts", default=5, jobs=1, what="random starts of each combination"
     )
     anything.set_defaults(benchmark="anything.run")
-    _add_choice(anything, "robots", "what `load_robot` takes: names, or paths (default: ten)")
-    _add_choice(anything, "objects", "<kind>_<seed> of random_object, names in scenes/objects, paths (default: 29 of ten kinds)")
+    _add_choice(anything, "robots", "what `load_robot` takes: names, paths, name=path, and the word default (ten)")
+    objects = "<kind>_<seed> of random_object, names in scenes/objects, paths, name=path#link, and the word default (29 of ten)"
+    _add_choice(anything, "objects", objects)
 
     _add_problems(benches)
 

@@ -15,6 +15,8 @@ from vkc_pin.benchmarks.anything.pairs import OBJECTS, SHARE, description_of, ha
 from vkc_pin.files.resources import folder
 from vkc_pin.models.furniture.catalogue import KINDS
 from vkc_pin.models.shapes import world_box
+from vkc_pin.planning.reasons.diagnosis import Blocked
+from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.scene.placed import standing_geometry
 from vkc_pin.scene.scene import START_CLEARANCE
 
@@ -55,7 +57,7 @@ def test_an_object_must_say_what_it_is_made_of(tmp_path: Path) -> None:
         description_of(str(file))
 
 
-@pytest.mark.parametrize("name", ["drawers_0", "faucet_0", "narrow_door"])
+@pytest.mark.parametrize("name", ["drawers_0", "faucet_0", "narrow_door", "low_drawer"])
 def test_everything_stands_where_it_belongs(name: str) -> None:
     scene = hall("husky_ur5e", name, description_of(name))
     boxes = np.array([world_box(shape.geometry, shape.placement) for shape in standing_geometry(scene.objects["it"])])
@@ -78,11 +80,44 @@ def test_half_of_the_range_by_what_was_proposed(husky: vkc.Robot) -> None:
     assert found.step is not None
     item = found.scene.objects["it"].object
     proposals = vkc.propose_attachments(vkc.load_object(vkc.random_object("drawers", 0)), husky)
-    assert list(item.attachments) == [proposal.attachment.name for proposal in proposals.found]
     ((joint, goal),) = found.step.joints.items()
+    assert found.step.attachment is None, "planning chooses"
     assert goal == pytest.approx(SHARE * (item.upper - item.lower)[item.coordinates.index(joint)], abs=1e-3)
-    proposed = {proposal.attachment.name: proposal for proposal in proposals.found}
-    assert proposed[str(found.step.attachment)].opens[joint] >= goal
+    opening = {proposal.attachment.name: proposal.opens[joint] for proposal in proposals.opening(joint)}
+    assert list(item.attachments) == [name for name, value in opening.items() if value >= goal]
+
+
+def test_what_is_reached_shut_but_not_open_is_not_taken_first(husky: vkc.Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is there but for one configuration is as good as what is not there: the next one is first then."""
+    looked: list[str] = []
+    real = pairs.explain
+
+    def explain(problem: TrajectoryProblem, seed: int) -> list[Blocked]:
+        (hold,) = problem.task.holds
+        looked.append(hold.attachment)
+        return [Blocked("move it.lid: out of reach", 0.3)] if len(looked) == 1 else real(problem, seed)
+
+    monkeypatch.setattr(pairs, "explain", explain)
+    found = pair(husky, "husky_ur5e", "chest_0")
+    assert found.scene is not None
+    assert found.step == vkc.Actuate("it", found.step.joints if found.step else {})
+    first, second = looked
+    assert list(found.scene.objects["it"].object.attachments)[:2] == [second, first], "it is left to planning, after the other"
+    monkeypatch.setattr(pairs, "explain", lambda *_: [Blocked("move it.lid: out of reach", 0.3)])
+    nowhere = pair(husky, "husky_ur5e", "chest_0")
+    assert (nowhere.step, nowhere.because.split("; ")[0]) == (None, f"{first}: move it.lid: out of reach")
+
+
+@pytest.mark.parametrize(("height", "raised"), [(0.4, True), (0.8, False)])
+def test_what_is_low_stands_on_a_counter(tmp_path: Path, height: float, raised: bool) -> None:
+    urdf = SMOOTH.replace("0.4 0.4 0.4", f"0.4 0.4 {height}").replace("0 0 0.5", f"0 0 {height / 2}")
+    file = _written(tmp_path / "box.yaml", urdf=urdf)
+    scene = hall("husky_ur5e", file, description_of(file))
+    boxes = np.array([world_box(shape.geometry, shape.placement) for shape in standing_geometry(scene.objects["it"])])
+    counters = [label for label in scene.obstacle_names if "worktop" in label]
+    assert bool(counters) == raised
+    assert boxes[:, 0].min(axis=0)[2] == pytest.approx(0.801 if raised else 0.0, abs=1e-6)
+    assert not [pair for pair in vkc.check_scene(scene).close if pair.distance < 0.0]
 
 
 def _written(path: Path, **more: Any) -> str:

@@ -44,8 +44,9 @@ def report(result: Mapping[str, Any]) -> str:
         "# Robots × objects",
         f"{len(robots)} robots, {len(objects)} objects of {len(set(map(kind_of, objects)))} kinds, "
         f"{about['starts']} random starts each, seed {about['seed']}, {allowed(about)} each. A joint is opened by "
-        f"{about['share']:.0%} of its range, by the best proposed attachment that the hand gets to. Success is the word of the "
-        "independent validation. Times are those of all plans; loading again is the median over all combinations of a robot.",
+        f"{about['share']:.0%} of its range, by whichever proposed attachment leads there; within reach is what the hand gets to "
+        "both shut and open by so much. Success is the word of the independent validation. "
+        "Times are those of all plans; loading again is the median over all combinations of a robot.",
         markdown(_SUMMARY, [*(_summary(robot, groups) for robot in robots), _summary(_ALL, groups)]),
         "## Every combination",
         "How many starts succeed; – is out of reach, ! could not be tried.",

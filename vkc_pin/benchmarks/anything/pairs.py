@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from vkc_pin.cache import Cache
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.files.documents import read_yaml
 from vkc_pin.files.resources import available, folder, located
@@ -19,11 +20,14 @@ from vkc_pin.models.proposals.hand import hand_of
 from vkc_pin.models.proposals.proposal import Proposals
 from vkc_pin.models.proposals.propose import propose_attachments
 from vkc_pin.models.robot import Robot
-from vkc_pin.planning.scene_check import check_scene
+from vkc_pin.options import Options
+from vkc_pin.planning.reasons.diagnosis import explain
+from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.scene.rooms import parts
-from vkc_pin.scene.rooms.fixtures import RANDOM, fixture
+from vkc_pin.scene.rooms.fixtures import RANDOM, Counter, Fixture, fixture
 from vkc_pin.scene.rooms.footprints import Floor
 from vkc_pin.scene.scene import Scene
+from vkc_pin.task.compiler import compile_task
 from vkc_pin.task.goals import goals
 from vkc_pin.task.steps import Actuate
 
@@ -44,6 +48,8 @@ _SIZE, _HEIGHT = 8.0, 2.4  # inner length of the walls, and their height [m]
 _FRONT = 3.0  # depth of the floor before the object that stays free [m]
 _BEYOND = 2.0  # of floor beyond a wall with a door [m]
 _START: Mapping[str, Any] = {"x": [-2.0, 1.0], "y": [-2.0, 2.0]}  # the object is at x = 4 m at most; any heading
+_LOW, _COUNTER = 0.6, 0.8  # [m]: what is lower than the one and nobody says where it stands, stands on a counter so high
+_DEPTH, _BESIDE, _MARGIN, _AIR = 0.5, 0.2, 0.03, 0.001  # [m] of it: its depth, beside, before and behind what stands there, below
 _OF_KIND = re.compile(r"(?P<kind>[a-z]+)_(?P<seed>\d+)")
 _SAME = 1e-6  # [rad] or [m]
 
@@ -54,7 +60,7 @@ class Pair:
 
     Attributes:
         scene: Their hall, with random starts of the base; None where the robot has no hand.
-        step: What is to be done; None where the hand can take hold nowhere.
+        step: What is to be done; None where the hand can take hold nowhere, or not go along so far.
         because: Why not.
     """
 
@@ -103,6 +109,8 @@ def hall(robot: str, name: str, description: Mapping[str, Any]) -> Scene:
     """
     match, floor = _of_kind(name), Floor(_SIZE, _SIZE)
     own = fixture(RANDOM + match[0], match[1]) if match else fixture(name)
+    if _is_path(name) and own.high[2] - own.low[2] < _LOW:
+        own = _on_a_counter(own)
     part = parts.opened(_IT, own, floor, 0, 0.0, _FRONT)
     (entry,) = part.objects
     half = _SIZE / 2.0
@@ -119,13 +127,15 @@ def hall(robot: str, name: str, description: Mapping[str, Any]) -> Scene:
 
 
 def pair(robot: Robot, called: str, name: str, *, seed: int = 0) -> Pair:
-    """Return what is asked: to open the object by the best proposed attachment that the hand gets to.
+    """Return what is asked: to open the object by whichever proposed attachment leads there.
+
+    The first is the best one that the hand gets to, shut and open by so much; the others of that joint are left to planning.
 
     Args:
         robot: The robot.
         called: Its name, or the path of its file.
         name: The object; see `description_of`.
-        seed: Of the configurations with which attachments are tried.
+        seed: Of the configurations that are looked for.
     """
     try:
         hand_of(robot)
@@ -138,12 +148,25 @@ def pair(robot: Robot, called: str, name: str, *, seed: int = 0) -> Pair:
     asked = _asked(scene, proposals)
     if not asked:
         return Pair(scene, None, _why_not(proposals))
-    found = {one.attachment: one for one in check_scene(scene, seed=seed).attachments}
-    reached = [step for step in asked if found[str(step.attachment)].configuration is not None]
-    if not reached:
-        names = dict.fromkeys(str(step.attachment) for step in asked)
-        return Pair(scene, None, "; ".join(f"{attachment}: {found[attachment].because}" for attachment in names))
-    return Pair(scene, reached[0])
+    cache, said = Cache(), list[str]()
+    for step in asked:
+        blocked = _blocked(scene, step, seed, cache)
+        if blocked is not None:
+            said.append(f"{step.attachment}: {blocked}")
+            continue
+        first = str(step.attachment)
+        others = [str(other.attachment) for other in asked if other.joints == step.joints and other.attachment != first]
+        entries = {entry["name"]: entry for entry in taken}
+        left = [entries[attachment] for attachment in (first, *others)]
+        return Pair(hall(called, name, {**description, "attachments": left}), Actuate(_IT, step.joints))
+    return Pair(scene, None, "; ".join(said))
+
+
+def _blocked(scene: Scene, step: Actuate, seed: int, cache: Cache) -> str | None:
+    """Return at the end of which phase no free configuration is found, and why not; None if there is one at all of them."""
+    options = Options()
+    problem = TrajectoryProblem(scene, compile_task(scene, [step], options), options, (), cache=cache)
+    return next((goal.text for goal in explain(problem, seed)), None)
 
 
 def _asked(scene: Scene, proposals: Proposals) -> list[Actuate]:
@@ -169,6 +192,14 @@ def _why_not(proposals: Proposals) -> str:
         ends += [f"{joint} must be at {value:.3g} before" for joint, value in proposal.when.items()]
         said.append(f"{proposal.attachment.name} ends with {', '.join(ends)}")
     return "; ".join(said) or "nothing of it is to be opened"
+
+
+def _on_a_counter(own: Fixture) -> Fixture:
+    """Return something low as it stands on a counter that is deep enough for it."""
+    setback = round(float(-own.low[0]) + _MARGIN, 3)
+    depth, width = max(_DEPTH, setback + float(own.high[0]) + _MARGIN), float(own.high[1] - own.low[1]) + 2.0 * _BESIDE
+    counter = Counter((round(depth, 2), round(width, 2), _COUNTER), setback)
+    return replace(own, counter=counter, lift=own.lift + _AIR)
 
 
 def _of_kind(name: str) -> tuple[str, int] | None:

@@ -10,19 +10,17 @@ from typing import Any
 
 import numpy as np
 
+from vkc_pin.benchmarks.anything.given import parsed, ready_object, ready_robot
 from vkc_pin.benchmarks.anything.matrix import chart, report
-from vkc_pin.benchmarks.anything.pairs import OBJECTS, ROBOTS, SHARE, description_of, kind_of, pair
+from vkc_pin.benchmarks.anything.pairs import OBJECTS, ROBOTS, SHARE, kind_of, pair
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.limits import LIMITS
 from vkc_pin.benchmarks.harness.record import trial
 from vkc_pin.errors import InputError
-from vkc_pin.importing.robots.robot_import import import_robot
-from vkc_pin.models.robot_file import find_robot, load_robot
+from vkc_pin.models.robot_file import load_robot
 from vkc_pin.planning.planner import plan
 
 __all__ = ["run"]
-
-_SAMPLES = 1000  # for pairs that need no check, as of robots that are loaded without an SRDF
 
 
 def run(
@@ -41,8 +39,11 @@ def run(
         out: The folder; if it has trials of the same settings already, they are not run again.
         starts: How many random starts of each robot at each object, at least 1.
         seed: Of the starts and of planning.
-        robots: What `load_robot` takes. Those without a description of their hand are imported into `out`/robots first.
-        objects: `<kind>_<seed>` of `random_object`, names in scenes/objects, or paths of descriptions.
+        robots: What `load_robot` takes, or MJCF files, each as such or as "name=..."; "default" stands for `ROBOTS`. Those
+            without a description of their hand are imported into `out`/robots first, once.
+        objects: `<kind>_<seed>` of `random_object`, names in scenes/objects, paths of descriptions, or of URDF, MJCF and SDF
+            files, each as such or as "name=..."; "...#link" is that link of a file alone, "default" stands for `OBJECTS`. Files
+            are imported into `out`/objects first, once.
         jobs: Number of processes.
         progress: Whether to show a progress bar.
 
@@ -57,15 +58,10 @@ def run(
     """
     if starts < 1:
         raise InputError("out of range", field="starts", expected="at least 1", got=starts)
-    called = {_called(name): str(name) for name in robots}
-    things = {Path(name).stem: str(name) for name in objects}
-    for field, given, different in (("robots", robots, called), ("objects", objects, things)):
-        if not given or len(different) < len(given):
-            raise InputError("not a choice", field=field, expected="names, each once", got=" ".join(map(str, given)) or "none")
-    for name in things.values():
-        description_of(name)
-    ready = {name: _ready(name, file, Path(out) / "robots") for name, file in called.items()}
-    settings = {"benchmark": "anything", "seed": seed, "starts": starts, "share": SHARE, "robots": list(called), **LIMITS}
+    chosen = [parsed(robots, "robots", ROBOTS), parsed(objects, "objects", OBJECTS)]
+    things = {one.called: ready_object(one, Path(out) / "objects") for one in chosen[1]}
+    ready = {one.called: ready_robot(one, Path(out) / "robots") for one in chosen[0]}
+    settings = {"benchmark": "anything", "seed": seed, "starts": starts, "share": SHARE, "robots": list(ready), **LIMITS}
     specs = [
         {"key": f"{robot}/{thing}", "robot": robot, "object": thing, "files": [file, path], "starts": starts, "seed": seed}
         for robot, file in ready.items()
@@ -74,26 +70,6 @@ def run(
     result = runner.run(specs, _records, out, settings=settings, report=report, jobs=jobs, progress=progress)
     chart(result["trials"], Path(out) / "success.png")
     return result
-
-
-def _called(name: str) -> str:
-    """Return what a robot is called in tables: its name, or that of its folder or file."""
-    file = find_robot(str(name))
-    if file.name == "robot.yaml":
-        return file.resolve().parent.name
-    return file.stem if str(name).endswith(".urdf") else str(name)
-
-
-def _ready(name: str, file: str, folder: Path) -> str:
-    """Return what to load for a robot: what was asked for if that says what its hand is, else a folder made by importing it."""
-    made = folder / name
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the doctor's report has them
-        if not (made / "robot.yaml").is_file():
-            if load_robot(file).touch_links:
-                return file
-            import_robot(find_robot(file), made, samples=_SAMPLES)
-    return str(made)
 
 
 def _records(spec: dict[str, Any]) -> list[dict[str, Any]]:
@@ -113,11 +89,12 @@ def _records(spec: dict[str, Any]) -> list[dict[str, Any]]:
             out_of_reach = {"success": False, "status": status, "seed": seed, "because": found.because}
             return [{**about, **out_of_reach}]
         ((joint, goal),) = found.step.joints.items()
-        about |= {"joint": joint, "goal": goal, "attachment": found.step.attachment}
+        about |= {"joint": joint, "goal": goal}
         records = []
         for number in range(spec["starts"]):
             scene = found.scene.sample_start(np.random.default_rng([7, seed, number]))
             one = plan(scene, [found.step], seed=seed, **LIMITS)
             because = "; ".join(one.validation.notes)
-            records.append(trial(one, method="VKC", seed=seed, number=number, **about, because=because))
+            taken = one.trajectory.phases[-1].held.get(found.step.object, "")
+            records.append(trial(one, method="VKC", seed=seed, number=number, **about, attachment=taken, because=because))
     return records

@@ -1,0 +1,176 @@
+"""Makes docs/images/gallery.png: robots with things that were not made for them, at the end of plans that open these.
+
+Usage: make_gallery.py [FOLDER]: where imported robots and plans are kept, and not made again (default: out/gallery).
+The pictures are drawn here, point by point, as they need no more than shades: dozens of them in a browser take long.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+from PIL import Image
+
+import vkc_pin as vkc
+from vkc_pin.benchmarks.anything.given import parsed, ready_robot
+from vkc_pin.benchmarks.anything.pairs import pair
+from vkc_pin.benchmarks.harness.limits import LIMITS
+from vkc_pin.motion.world import World
+from vkc_pin.plotting.style import new_figure, save_figure, styled
+from vkc_pin.visualization.room import drawn_parts
+
+ROOT = Path(__file__).parent.parent
+ROBOTS = {"husky_ur5e": "Husky, UR5e", "tiago_pro": "TIAGo Pro", "pr2": "PR2", "panda": "Panda"}
+OBJECTS = {
+    **{"door_0": "door", "drawers_0": "drawer", "refrigerator_0": "refrigerator"},
+    **{"dishwasher_0": "dishwasher", "microwave_0": "microwave", "chest_0": "chest"},
+}
+STARTS = 5  # random ones: the first from which it is opened is shown
+SIDE, FINER, COLOURS = 180, 2, 160  # [pixels] of a picture in the grid; in each of these so many; of the palette
+AWAY = np.array([-0.85, -0.85, 0.62])  # from what is looked at to the camera, before it is scaled
+FIELD = 0.62  # half of what is seen, at 1 m
+PIECE, NEAR = 0.4, 1.0  # [m] longest edges of triangles that are drawn or left out whole; how far before the camera they are
+DOTS, PARTS = (
+    (0.7, 1.5),
+    (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256),
+)  # [pixels] between points, also of shadows
+SUN = np.array([-0.35, -0.45, 0.82]) / np.linalg.norm([-0.35, -0.45, 0.82])
+FLOOR, SKY, SHADOW = np.array([0.90, 0.89, 0.87]), np.array([0.97, 0.97, 0.98]), 0.82
+
+
+def opened(robot: str, file: str, thing: str, folder: Path) -> vkc.Plan:
+    """Return the plan of a robot that opens a thing, from the first random start from which it does."""
+    kept = folder / "plans" / f"{robot}_{thing}.npz"
+    if kept.is_file():
+        return vkc.Plan.load(kept)
+    found = pair(vkc.load_robot(file), file, thing)
+    if found.scene is None or found.step is None:
+        raise SystemExit(f"{robot} opens no {thing}: {found.because}")
+    for number in range(STARTS):
+        plan = vkc.plan(found.scene.sample_start(np.random.default_rng([7, 0, number])), [found.step], **LIMITS)
+        if plan.success:
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            plan.save(kept)
+            return plan
+    raise SystemExit(f"{robot} opens no {thing}: {plan.report()}")
+
+
+def triangles_of(scene: vkc.Scene) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield triangles in the world, shape (n, 3, 3), in pieces of `PIECE` at most, and the colour of each, shape (n, 3)."""
+    world = World(scene)
+    data = world.model.createData()
+    pin.forwardKinematics(world.model, data, world.coordinates.q(world.start))
+    for shape in world.visual.geometryObjects:
+        for solid, colour in drawn_parts(shape):
+            placed = data.oMi[shape.parentJoint] * shape.placement
+            corners = (solid.vertices @ placed.rotation.T + placed.translation)[solid.faces.astype(int)]
+            while True:
+                edges = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
+                large = edges.max(axis=1) > PIECE
+                if not large.any():
+                    break
+                a, b, c = (corners[large, k] for k in range(3))
+                ab, bc, ca = (a + b) / 2.0, (b + c) / 2.0, (c + a) / 2.0
+                four = [np.stack(one, axis=1) for one in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+                corners = np.concatenate([corners[~large], *four])
+            yield corners, np.tile(np.array(colour[:3]), (len(corners), 1))
+
+
+class Camera:
+    """Where points are in a picture of `size` pixels a side."""
+
+    def __init__(self, target: np.ndarray, position: np.ndarray, size: int) -> None:
+        ahead = (target - position) / np.linalg.norm(target - position)
+        right = np.cross(ahead, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        self.axes, self.position, self.size = np.array([right, np.cross(ahead, right), ahead]), position, size
+
+    def seen(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return columns and rows in the picture, shape (..., 2), and the distances along the view [m]."""
+        own = (points - self.position) @ self.axes.T
+        ahead = np.maximum(own[..., 2], 1e-6)
+        return (own[..., :2] / ahead[..., None] / FIELD + 1.0) * self.size / 2.0, own[..., 2]
+
+    def on_floor(self) -> np.ndarray:
+        """Return for every pixel how far along the view the floor is [m], shape (size, size); infinite above the horizon."""
+        along = (np.arange(self.size) + 0.5) / self.size * 2.0 - 1.0
+        down = -(self.axes[0, 2] * along[None] * FIELD + self.axes[1, 2] * along[:, None] * FIELD + self.axes[2, 2])
+        return np.where(down > 1e-6, self.position[2] / np.maximum(down, 1e-6), np.inf)
+
+
+def dotted(corners: np.ndarray, pixels: np.ndarray, apart: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield which triangles points belong to, and the points, shape (k, 3), no further `apart` in the picture [pixels]."""
+    longest = np.linalg.norm(pixels - np.roll(pixels, -1, axis=1), axis=2).max(axis=1)
+    parts = np.array(PARTS)[np.searchsorted(PARTS[:-1], longest / apart)]
+    for count in np.unique(parts):
+        first, second = (grid.ravel() for grid in np.meshgrid(np.arange(count + 1), np.arange(count + 1)))
+        inside = first + second <= count
+        u, v = first[inside] / count, second[inside] / count
+        own = np.flatnonzero(parts == count)
+        points = np.einsum("nkd,kp->npd", corners[own], np.stack([1.0 - u - v, u, v]))
+        yield np.repeat(own, len(u)), points.reshape(-1, 3)
+
+
+def drawn(scene: vkc.Scene) -> Image.Image:
+    """Return the picture of a scene, seen from beside the robot and what it holds."""
+    tool, base = scene.tool_placement().translation, scene.start[:2]
+    target = np.array([*(0.5 * (tool[:2] + base)), 0.72])
+    size = SIDE * FINER
+    camera = Camera(target, target + AWAY * (1.15 + 0.5 * float(np.linalg.norm(tool[:2] - base))), size)
+    floor = camera.on_floor()
+    depth, dark = floor.ravel().copy(), np.zeros(size * size, bool)
+    image = np.where(np.isfinite(depth)[:, None], FLOOR, SKY)
+    for corners, colours in triangles_of(scene):
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        shades = np.clip(colours * (0.62 + 0.38 * np.abs(normals @ SUN))[:, None], 0.0, 1.0)
+        fallen = corners - corners[..., 2:] * SUN / SUN[2]
+        for own, shown, apart in ((corners, True, DOTS[0]), (fallen, False, DOTS[1])):
+            pixels, ahead = camera.seen(own)
+            visible = (
+                (ahead.min(axis=1) > NEAR) & (pixels.max(axis=1) > 0.0).all(axis=1) & (pixels.min(axis=1) < size).all(axis=1)
+            )
+            numbers = np.flatnonzero(visible)
+            for which, points in dotted(own[numbers], pixels[numbers], apart):
+                place, away = camera.seen(points)
+                columns, rows = place.astype(int).T
+                kept = (columns >= 0) & (columns < size) & (rows >= 0) & (rows < size)
+                at, which, away = (rows * size + columns)[kept], numbers[which[kept]], away[kept]
+                if not shown:
+                    dark[at] = True
+                    continue
+                order = np.argsort(-away, kind="stable")  # of several on one pixel the nearest is written last
+                at, which, away = at[order], which[order], away[order]
+                nearer = away < depth[at] + 1e-9
+                depth[at[nearer]], image[at[nearer]] = away[nearer], shades[which[nearer]]
+    image[dark & (depth >= floor.ravel() - 1e-3) & np.isfinite(depth)] *= SHADOW
+    picture = Image.fromarray((255.0 * image.reshape(size, size, 3)).round().astype(np.uint8))
+    return picture.resize((SIDE, SIDE), Image.Resampling.LANCZOS)
+
+
+def main() -> int:
+    """Make it."""
+    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "out" / "gallery"
+    ready = {one.called: ready_robot(one, folder / "robots") for one in parsed(list(ROBOTS), "robots", ())}
+    target = ROOT / "docs" / "images" / "gallery.png"
+    with styled():
+        figure = new_figure(2.0 * len(OBJECTS) + 0.3, 2.0 * len(ROBOTS) + 0.3)
+        axes = figure.subplots(len(ROBOTS), len(OBJECTS), gridspec_kw={"wspace": 0.02, "hspace": 0.02})
+        for row, (robot, file) in enumerate(ready.items()):
+            for column, (thing, name) in enumerate(OBJECTS.items()):
+                axis = axes[row, column]
+                axis.imshow(drawn(opened(robot, file, thing, folder).end_scene()))
+                axis.set(xticks=[], yticks=[])
+                axis.set_title(name if row == 0 else "", fontsize=10)
+                axis.set_ylabel(ROBOTS[robot] if column == 0 else "", fontsize=10)
+                print(f"{robot}: {name}", flush=True)
+        save_figure(figure, target)
+    Image.open(target).convert("RGB").quantize(COLOURS).save(target, optimize=True)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

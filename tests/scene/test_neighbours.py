@@ -297,3 +297,15 @@ def test_of_ten_thousand_obstacles_only_those_nearby_are_measured(monkeypatch: p
     scene = Scene.from_document({**document, "obstacles": [*document["obstacles"], *boxes]})
     assert [pair[:2] for pair in close_pairs(scene, SAFE)] == [("door.panel", "wall")]
     assert 1 <= len(asked) < 10
+
+
+def test_what_a_link_does_not_reach_is_never_near() -> None:
+    """Of all that stands in a home a refrigerator's door meets few things, and none but those that it reaches."""
+    home = load_scene("household")
+    standing = neighbours.Standing(home, home.objects)
+    label, values = "refrigerator.door", np.linspace(0.0, 2.0, 9)
+    reached = standing.reached(label, 0, values)
+    others = {one for one in standing.labels if not one.startswith("refrigerator.")}
+    met = {one for one in others if standing.distance(label, one, 0, 0.0)(values).min() < 0.0}
+    assert met <= reached
+    assert len(reached & others) < len(others) / 5

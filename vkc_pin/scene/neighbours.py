@@ -18,11 +18,10 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.arrays import Bools, Floats
-from vkc_pin.distances.placements import columns_of
 from vkc_pin.distances.shapes import Shapes
-from vkc_pin.models.shapes import bounding_box, link_name, shape_distance, world_box
+from vkc_pin.models.shapes import link_name, shape_distance, world_box
 from vkc_pin.scene.obstacles import FLOOR
-from vkc_pin.scene.placed import PlacedObject, standing_geometry
+from vkc_pin.scene.placed import PlacedObject, link_shapes, moved_shapes, standing_geometry
 
 __all__ = ["CONTACT", "Allowance", "Close", "Standing", "Surroundings", "allowances", "close_pairs", "warn_of_overlaps"]
 
@@ -247,32 +246,33 @@ class Standing:
 
         Where it is more than `reach` [m], it may say that it is infinite.
         """
-        placed = self.objects[label.partition(".")[0]]
-        model, coordinates = placed.object.model, placed.object.coordinates
-        own = [shape for shape in placed.object.collision.geometryObjects if link_name(shape.name) == label.partition(".")[2]]
+        own = link_shapes(self.objects[label.partition(".")[0]], label.partition(".")[2])
         others = [shape for shape, one in zip(self._shapes, self._labels, strict=True) if one == other]
         shapes = Shapes([shape.geometry for shape in (*own, *others)], [shape.placement for shape in others])
-        data = model.createData()
-        lower, upper = (np.array(side) for side in zip(*(world_box(s.geometry, s.placement) for s in others), strict=True))
-        boxes = [bounding_box(shape) for shape in own]
 
         def apart(values: Floats) -> Floats:
-            where, near = np.empty((len(values), len(own), 12)), []
-            state = placed.state.copy()
-            for row, value in enumerate(values):
-                state[index] = value
-                pin.forwardKinematics(model, data, coordinates.q(state))
-                placements = [placed.placement * data.oMi[shape.parentJoint] * shape.placement for shape in own]
-                where[row] = columns_of(placements)
-                for k, (placement, (center, half)) in enumerate(zip(placements, boxes, strict=True)):
-                    middle, extent = placement.act(center), np.abs(placement.rotation) @ half
-                    close = ((lower < middle + extent + reach) & (upper > middle - extent - reach)).all(axis=1)
-                    near += [(row, k, len(own) + j) for j in np.flatnonzero(close).tolist()]
-            found, table = np.full(len(values), np.inf), np.array(near, int).reshape(-1, 3)
-            np.minimum.at(found, table[:, 0], shapes.distances(where, table[:, 0], table[:, 1:]))
+            where, near = self._moved(label, index, values, others, reach)
+            row, k, j = np.nonzero(near)
+            found = np.full(len(values), np.inf)
+            np.minimum.at(found, row, shapes.distances(where, row, np.column_stack([k, len(own) + j])))
             return found
 
         return apart
+
+    def reached(self, label: str, index: int, values: Floats) -> set[str]:
+        """Return the labels of what the boxes of a link meet while one of its object's coordinates takes values, shape (V,)."""
+        _, near = self._moved(label, index, values, self._shapes, 0.0)
+        return {self._labels[j] for j in np.flatnonzero(near.any(axis=(0, 1)))}
+
+    def _moved(
+        self, label: str, index: int, values: Floats, others: Sequence[pin.GeometryObject], reach: float
+    ) -> tuple[Floats, Bools]:
+        """Return where a link's shapes are at values of a coordinate, (V, K, 12), and which are near `others`, (V, K, others)."""
+        owner, _, link = label.partition(".")
+        where, lower, upper = moved_shapes(self.objects[owner], link, index, values)
+        lows, highs = (np.array(side) for side in zip(*(world_box(s.geometry, s.placement) for s in others), strict=True))
+        near = (lows < upper[:, :, None] + reach) & (highs > lower[:, :, None] - reach)
+        return where, np.asarray(near.all(axis=3))
 
     def joints(self, label: str) -> list[str]:
         """Return the joints that move a link of an object that stands fixed; none for any other."""

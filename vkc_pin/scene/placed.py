@@ -12,11 +12,12 @@ import pinocchio as pin
 
 from vkc_pin.arguments import mapping, number
 from vkc_pin.arrays import Floats
+from vkc_pin.distances.placements import columns_of
 from vkc_pin.errors import UnknownNameError
 from vkc_pin.models.articulation import ArticulatedObject
-from vkc_pin.models.shapes import copy_shape, within_limits
+from vkc_pin.models.shapes import bounding_box, copy_shape, link_name, within_limits
 
-__all__ = ["PlacedObject", "standing_geometry"]
+__all__ = ["PlacedObject", "link_shapes", "moved_shapes", "standing_geometry"]
 
 _OTHER_SIDE = pin.SE3(np.diag([1.0, -1.0, -1.0]), np.zeros(3))  # half a turn about the line on which fingers close
 
@@ -93,3 +94,39 @@ def standing_geometry(placed: PlacedObject, *, visual: bool = False) -> list[pin
         copy_shape(shape, shape.name, placed.placement * data.oMi[shape.parentJoint] * shape.placement)
         for shape in geometry.geometryObjects
     ]
+
+
+def link_shapes(placed: PlacedObject, link: str) -> list[pin.GeometryObject]:
+    """Return the convex shapes of a link of an object, in the frames of their joints."""
+    return [shape for shape in placed.object.collision.geometryObjects if link_name(shape.name) == link]
+
+
+def moved_shapes(placed: PlacedObject, link: str, index: int, values: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return where a link's shapes are in the world while one coordinate of the object takes values, shape (V,).
+
+    Args:
+        placed: The object; its other coordinates stay.
+        link: The link, with K shapes.
+        index: Of the coordinate.
+        values: [rad] or [m].
+
+    Returns:
+        Placements, shape (V, K, 12), see `placements.columns_of`, and the corners of boxes around the shapes, both (V, K, 3) [m].
+    """
+    model, data, own, state = (
+        placed.object.model,
+        placed.object.model.createData(),
+        link_shapes(placed, link),
+        placed.state.copy(),
+    )
+    boxes = [bounding_box(shape) for shape in own]
+    where, lower, upper = np.empty((len(values), len(own), 12)), *np.empty((2, len(values), len(own), 3))
+    for row, value in enumerate(values):
+        state[index] = value
+        pin.forwardKinematics(model, data, placed.object.coordinates.q(state))
+        placements = [placed.placement * data.oMi[shape.parentJoint] * shape.placement for shape in own]
+        where[row] = columns_of(placements)
+        for k, (placement, (center, half)) in enumerate(zip(placements, boxes, strict=True)):
+            middle, extent = placement.act(center), np.abs(placement.rotation) @ half
+            lower[row, k], upper[row, k] = middle - extent, middle + extent
+    return where, lower, upper

@@ -43,9 +43,10 @@ def _hit(problem: TrajectoryProblem, phase: Phase, coordinate: str) -> str:
     others = {f"{owner}.{link}" for owner, one in fixed.items() if owner != name for link in one.object.links}
     others = {label for label in others if not standing.joints(label)} | set(scene.obstacle_labels) - {FLOOR}
     deepest, text = -_SURE, ""
+    index = placed.object.coordinates.index(joint)
     for label in links:
-        for other in sorted(others & standing.labels):
-            distance = standing.distance(label, other, placed.object.coordinates.index(joint), 0.0)(values)
+        for other in sorted(others & standing.reached(label, index, values)):
+            distance = standing.distance(label, other, index, 0.0)(values)
             for one in known:
                 if one.between(label, other):
                     distance[one.holds([coordinate], values[:, None])] += max(0.0, -one.margin)

@@ -86,6 +86,12 @@ def home_pictures() -> None:
     picture(home, "household_kitchen", SMALL)
 
 
+def cluttered_picture() -> None:
+    """Write the picture of the home that is as full and as tight as real ones."""
+    look(*HOME)
+    picture(chores.cluttered_home(), "household_cluttered", WIDE)
+
+
 def room_picture() -> None:
     """Write random rooms from above, with little and with much in them."""
     rooms = [vkc.random_room(number, clutter=clutter) for number, clutter in ((3, 0.2), (1, 0.5), (2, 0.9))]
@@ -226,6 +232,7 @@ def main() -> int:
         look(*camera)
         picture(vkc.load_scene(name), name, SMALL)
     home_pictures()
+    cluttered_picture()
     room_picture()
     furniture_picture()
     task_picture()

@@ -13,8 +13,12 @@ import pytest
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks import chores
+from vkc_pin.benchmarks.harness import step_by_step as stepwise
 from vkc_pin.cli import main
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.models.shapes import clearance
+from vkc_pin.scene.neighbours import close_pairs
+from vkc_pin.scene.placed import standing_geometry
 from vkc_pin.task.actions import actions_of, foresee
 
 
@@ -32,6 +36,34 @@ def test_the_cluttered_home_is_the_home_and_more() -> None:
     assert full.document["obstacles"][: len(home.document["obstacles"])] == list(home.document["obstacles"])
     shapes = [len(placed.object.collision.geometryObjects) for placed in full.objects.values()]
     assert len(full.obstacles) + sum(shapes) > 500
+
+
+def gap(scene: vkc.Scene, first: str, second: str) -> float:
+    """Return how far two links stand apart [m]."""
+    (pair,) = [pair for pair in close_pairs(scene, 0.02) if {pair.first, pair.second} == {first, second}]
+    return pair.distance
+
+
+def test_the_cluttered_home_is_as_tight_as_real_ones() -> None:
+    """Leaves stand in and at their walls, and handles next to other things, at the start or where the chore leaves them."""
+    full = chores.cluttered_home()
+    opened = full.with_state("door", {"hinge": 1.52})
+    assert gap(full, "door.panel", "casing_above") == pytest.approx(-0.05, abs=1e-4)
+    assert gap(opened, "door.panel", "casing_above") == pytest.approx(-0.05, abs=1e-4)
+    assert gap(full, "door.panel", "casing_beside") == pytest.approx(-0.02, abs=1e-4)
+    assert gap(full, "refrigerator.door", "panel_east") == pytest.approx(0.0, abs=1e-4)
+    assert gap(full, "refrigerator.door", "panel_west") == pytest.approx(0.009, abs=1e-4)
+    assert gap(full, "door.lever", "bag") == pytest.approx(0.01, abs=1e-4)
+    assert gap(opened, "door.lever", "wardrobe") == pytest.approx(0.01, abs=5e-4)
+    assert chores.CHORES["cluttered"].options.dist_safe == 0.005
+
+
+@pytest.mark.parametrize(("carried", "other"), [("cold_cup", "bottle"), ("broom", "mop")])
+def test_what_is_carried_has_a_neighbour(carried: str, other: str) -> None:
+    full = chores.cluttered_home()
+    shapes = [(shape.geometry, shape.placement) for shape in standing_geometry(full.objects[carried])]
+    (index,) = [i for i, label in enumerate(full.obstacle_labels) if label == other]
+    assert clearance(shapes, [(full.obstacles[index].geometry, full.obstacles[index].placement)]) == pytest.approx(0.01, abs=1e-4)
 
 
 def test_one_step_less_is_noticed() -> None:
@@ -63,6 +95,38 @@ def test_every_trial_is_on_record(tmp_path: Path) -> None:
     assert "not converged 1" in table
     assert table.count("| fetch | ") == 4
     assert json.loads((tmp_path / "results.json").read_text(encoding="utf-8")) == result
+
+
+def test_what_hangs_on_seeds_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two seeds one call fails with the first; step by step, the second step fails."""
+
+    def some(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
+        return stay(scene, {**spec, "number": spec["seed"] - 4})
+
+    def two(scene: vkc.Scene, steps: list[vkc.Step], *, options: vkc.Options, seed: int) -> list[vkc.Plan]:
+        plans = [stay(scene, {"seed": seed, "number": number}) for number in (1, 0)]
+        return [dataclasses.replace(one, metrics={**one.metrics, "arm_effort": float(seed)}) for one in plans]
+
+    monkeypatch.setattr(stepwise, "step_by_step", two)
+    settings = {"trials": 1, "seed": 4, "seeds": 2, "step_by_step": True, "chores": ("fetch",), "progress": False}
+    result = chores.run(out=tmp_path, solve=some, **settings)
+    assert [(one["seed"], one["method"], one["success"]) for one in result["trials"]] == [
+        (4, "VKC", False),
+        (4, "step by step", False),
+        (5, "VKC", True),
+        (5, "step by step", False),
+    ]
+    assert [one["arm_effort"] for one in result["trials"][1::2]] == [8.0, 10.0]
+    assert [one["steps_done"] for one in result["trials"]] == [None, 1, 10, 1]
+    table = (tmp_path / "table.md").read_text(encoding="utf-8")
+    assert "| fetch | 0 | in one call | 1 of 2 | all |" in table
+    assert "| fetch | 0 | step by step | 0 of 2 | 1, 1 |" in table
+    assert "nan" not in table
+
+
+def test_spread_is_of_the_least_and_of_the_middle() -> None:
+    assert chores._apart(50.0, 70.0) == ["50.0–70.0", "40", "17"]
+    assert chores._apart(0.0, 70.0) == ["0.0–70.0", "–", "–"]
 
 
 def test_unknown_chores_are_named(tmp_path: Path) -> None:

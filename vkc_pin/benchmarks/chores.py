@@ -1,9 +1,11 @@
-"""Chores of many steps, each planned in one call from random starts: eighteen in a home, also cluttered, and ten in an arena."""
+"""Chores of many steps, each planned in one call, or step after step: eighteen in a home, also cluttered, and ten in an arena."""
 
 from __future__ import annotations
 
 import functools
+import itertools
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.benchmarks.harness import runner
+from vkc_pin.benchmarks.harness import step_by_step as stepwise
 from vkc_pin.benchmarks.harness.limits import LIMITS
-from vkc_pin.benchmarks.harness.record import Solve, distribution, trial
+from vkc_pin.benchmarks.harness.record import Record, Solve, distribution, trial, values
 from vkc_pin.benchmarks.harness.tables import decimal, failures, foot, markdown
 from vkc_pin.options import Options
 from vkc_pin.planning.chore import plan_chore
@@ -25,9 +28,16 @@ from vkc_pin.task.steps import Actuate, Grasp, Place, Step
 __all__ = ["CHORES", "Chore", "cluttered_home", "fetch", "home", "plan_trial", "report", "run"]
 
 WINDOW = 2
+ONE_CALL, STEP_BY_STEP = "VKC", "step by step"
 THINGS = 300  # in the cluttered home
 _AROUND = 0.2  # [m] around what the chore is about that stays free there
 _LIMITS = {**LIMITS, "effort": 4 * LIMITS["effort"]}  # eighteen steps take half a million units and more
+
+_METHODS = {ONE_CALL: "in one call", STEP_BY_STEP: "step by step"}
+_SEEDS_ABOUT = (
+    "Spread is the largest value of the successes over the least, minus 1; ± is half their range over its middle. Step by step, "
+    "each begins where the motion of the one before ends, and nothing comes after the first that fails."
+)
 
 BAR_TABLE = (-3.0, 1.3, 1.051)  # [m], where the cup stands in between
 DESK = (1.75, 3.5, 0.741)
@@ -77,11 +87,36 @@ def fetch(scene: Scene) -> list[Step]:
     ]
 
 
+def _box(name: str, *sides: tuple[float, float], colour: str = "white") -> dict[str, Any]:
+    """Return a box as an obstacle, by where it begins and ends along x, y and z [m]."""
+    size, middle = [round(high - low, 4) for low, high in sides], [round((low + high) / 2.0, 5) for low, high in sides]
+    return {"name": name, "type": "box", "size": size, "position": middle, "colour": colour}
+
+
+TIGHT: tuple[dict[str, Any], ...] = (
+    # The narrow door's leaf stands 50 mm in the wall above it, and 20 mm in that beside its hinge, wherever it is.
+    _box("casing_above", (1.105, 2.01), (1.2, 1.3), (1.945, 2.07), colour="wall"),
+    _box("casing_beside", (1.105, 1.22), (1.2, 1.3), (0.0, 2.07), colour="wall"),
+    # The refrigerator's door touches the panel on its hinge's side, and is 9 mm from that beside the kitchen.
+    _box("panel_east", (-1.255, -1.235), (3.354, 4.0), (0.0, 2.1)),
+    _box("panel_west", (-1.889, -1.859), (3.3, 4.0), (0.0, 2.1)),
+    # 10 mm from the narrow door's levers: a bag that hangs from its frame, and a wardrobe, once the door is open as far as asked.
+    _box("bag", (1.875, 1.985), (1.11, 1.19), (0.8, 1.04), colour="teal"),
+    _box("wardrobe", (0.2, 1.099), (1.3, 1.9), (0.0, 2.0), colour="oak"),
+    # 10 mm from what is carried: a bottle behind the cup in the refrigerator, a mop between broom and wall.
+    {"name": "bottle", "type": "cylinder", "radius": 0.035, "length": 0.25, "position": [-1.55, 3.64, 1.105], "colour": "green"},
+    {"name": "mop", "type": "cylinder", "radius": 0.0125, "length": 1.0, "position": [2.4, -3.935, 0.62], "colour": "blue"},
+)
+"""What the home lacks to be as tight as real ones, as obstacles."""
+
+
 @functools.cache
 def cluttered_home() -> Scene:
-    """Return the scene `household` as full as homes are: with 300 things more there are 553 convex shapes."""
-    places = (BAR_TABLE, DESK, CLEAR, BIN)
-    return cluttered(load_scene("household"), THINGS, clear=[(place, _AROUND) for place in places])
+    """Return the scene `household` as full as homes are: with `TIGHT` and 300 things more there are 561 convex shapes."""
+    home, places = load_scene("household"), (BAR_TABLE, DESK, CLEAR, BIN)
+    with warnings.catch_warnings(action="ignore", category=UserWarning):  # of leaves in their walls, which are meant
+        tight = Scene.from_document({**home.document, "obstacles": [*home.document["obstacles"], *TIGHT]}, home.folder)
+        return cluttered(tight, THINGS, clear=[(place, _AROUND) for place in places])
 
 
 @dataclass(frozen=True)
@@ -113,7 +148,7 @@ CHORES = {
 
 def plan_trial(scene: Scene, spec: Mapping[str, Any]) -> Plan:
     """Plan the chore of one trial."""
-    chore = CHORES[spec["chore"]]
+    chore = CHORES[spec["scene"]]
     return plan_chore(scene, chore.steps(scene), window=WINDOW, options=chore.options, seed=spec["seed"], **_LIMITS)
 
 
@@ -124,6 +159,8 @@ def run(
     out: str | Path,
     jobs: int = 1,
     chores: Sequence[str] = tuple(CHORES),
+    seeds: int = 1,
+    step_by_step: bool = False,
     progress: bool = True,
     solve: Solve = plan_trial,
 ) -> dict[str, Any]:
@@ -135,8 +172,10 @@ def run(
         out: The folder; if it has trials of the same settings already, they are not run again.
         jobs: Number of processes.
         chores: Some of `CHORES`.
+        seeds: How many seeds of planning there are to each start: `seed` and those that follow it.
+        step_by_step: Whether to plan the steps one by one as well, each from where the one before ends.
         progress: Whether to show a progress bar.
-        solve: What plans a trial.
+        solve: What plans a trial in one call.
 
     Returns:
         {"meta": ..., "trials": [...]}; see `runner.run`.
@@ -146,15 +185,17 @@ def run(
         InputError: No chores, or `out` has trials of other settings.
         KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
     """
-    chores = runner.chosen("chore", chores, CHORES)
-    specs = []
+    chores, specs = runner.chosen("chore", chores, CHORES), list[dict[str, Any]]()
+    methods = (ONE_CALL, *((STEP_BY_STEP,) if step_by_step else ()))
     for chore in chores:
         scene = CHORES[chore].scene()
         rng = np.random.default_rng([seed, list(CHORES).index(chore)])
         for number in range(trials):
             base = (scene.sample_start(rng) if number else scene).start[:3].tolist()
-            specs.append({"key": f"{chore}/{number:04d}", "chore": chore, "number": number, "base": base, "seed": seed})
-    settings = {"benchmark": "chores", "seed": seed, "starts": trials, "chores": chores}
+            for own, method in itertools.product(range(seed, seed + seeds), methods):
+                key = f"{chore}/{number:04d}/{own:04d}/{method}"
+                specs.append({"key": key, "scene": chore, "number": number, "base": base, "seed": own, "method": method})
+    settings = {"benchmark": "chores", "seed": seed, "starts": trials, "seeds": seeds, "methods": methods, "chores": chores}
     settings |= {"window": WINDOW, **_LIMITS, "steps": {name: list(map(str, CHORES[name].planned())) for name in chores}}
     settings |= {"dist_safe": {name: CHORES[name].options.dist_safe for name in chores}}
     return runner.run(
@@ -163,10 +204,11 @@ def run(
 
 
 def report(result: Mapping[str, Any]) -> str:
-    """Return the table of a result in Markdown, with versions and machine at the foot."""
+    """Return the tables of a result in Markdown, with versions and machine at the foot."""
     about, rows = result["meta"], []
+    seeds, methods = about.get("seeds", 1), about.get("methods", [ONE_CALL])
     for chore in about["chores"]:
-        own = [record for record in result["trials"] if record["scene"] == chore]
+        own = [record for record in result["trials"] if (record["scene"], record["method"]) == (chore, ONE_CALL)]
         good = [record for record in own if record["success"]]
         planning, late = distribution(own, "planning_time")
         wall, _ = distribution(own, "wall_time")
@@ -176,28 +218,70 @@ def report(result: Mapping[str, Any]) -> str:
         rows.append([chore, number, f"{len(good)} of {len(own)}", *times, *efforts, failures(own)])
     head = ["chore", "steps", "success", "in all, median [s]", "planning, median [s]", "95th percentile [s]"]
     head += ["base [m]", "arm [rad]", "duration [s]", "failures"]
+    fields = ("wall_time", "planning_time", "base_effort", "arm_effort")
     every = [
-        [record["scene"], str(record["number"]), record["status"]]
-        + [decimal(record.get(field) or float("nan")) for field in ("wall_time", "planning_time", "base_effort", "arm_effort")]
+        [record["scene"], str(record["number"]), str(record["seed"]), _METHODS[record["method"]], record["status"]]
+        + [decimal(record.get(field) or float("nan")) for field in fields]
         for record in result["trials"]
     ]
     parts = [
         "# Chores",
-        f"Each chore in one call, from {about['starts']} starts, the first of them the scene's own; seed {about['seed']}, a "
-        f"window of {about['window']} actions. Success is the word of the independent validation of the whole motion. The time "
-        "in all is that of planning and of building symbolic programs; efforts and durations are medians of successes.",
+        f"Each chore in one call, from {about['starts']} starts, the first of them the scene's own, with {seeds} seeds each from "
+        f"{about['seed']} on; a window of {about['window']} actions. Success is the word of the independent validation of the "
+        "whole motion. The time in all is that of planning and of building symbolic programs; efforts and durations are medians "
+        "of successes.",
         markdown(head, rows),
+    ]
+    if seeds > 1 or len(methods) > 1:
+        parts += ["## Seeds", _SEEDS_ABOUT, _seeds_table(result)]
+    parts += [
         "## Every trial",
-        markdown(["chore", "start", "status", "in all [s]", "planning [s]", "base [m]", "arm [rad]"], every, text=3),
+        markdown(
+            ["chore", "start", "seed", "planned", "status", "in all [s]", "planning [s]", "base [m]", "arm [rad]"], every, text=5
+        ),
         foot(about),
     ]
     return "\n\n".join(parts) + "\n"
 
 
+def _seeds_table(result: Mapping[str, Any]) -> str:
+    """Return what hangs on the seed of planning, per chore, start and way of planning."""
+    groups = dict[tuple[str, int, str], list[Record]]()
+    for record in result["trials"]:
+        groups.setdefault((record["scene"], record["number"], record["method"]), []).append(record)
+    rows = []
+    for (chore, number, method), own in groups.items():
+        good, steps = [record for record in own if record["success"]], len(result["meta"]["steps"][chore])
+        done = ", ".join("all" if n == steps else f"{n:.0f}" for n in values(own, "steps_done")) or "–"
+        spent, spreads = values(own, "cpu_time"), list[str]()
+        for effort in ("base_effort", "arm_effort"):
+            found = values(good, effort)
+            spreads += _apart(min(found), max(found)) if found else ["–"] * 3
+        cpu = (decimal(float(np.median(spent))), decimal(max(spent))) if spent else ("–", "–")
+        rows.append([chore, str(number), _METHODS[method], f"{len(good)} of {len(own)}", done, *cpu, *spreads])
+    head = ["chore", "start", "planned", "success", "steps done", "CPU, median [s]", "most [s]"]
+    head += ["base [m]", "spread [%]", "±[%]", "arm [rad]", "spread [%]", "±[%]"]
+    return markdown(head, rows, text=3)
+
+
+def _apart(low: float, high: float) -> list[str]:
+    """Return a range, by how much its end is more than its begin, and half of it over its middle, both in percent."""
+    shares = (high / low - 1.0, (high - low) / (high + low)) if low > 0.0 else (np.nan, np.nan)
+    return [f"{low:.1f}–{high:.1f}", *("–" if np.isnan(share) else f"{100.0 * share:.0f}" for share in shares)]
+
+
 def _record(spec: dict[str, Any], solve: Solve) -> dict[str, Any]:
-    scene = CHORES[spec["chore"]].scene().with_start(base=spec["base"])
-    began = time.perf_counter()
+    chore = CHORES[spec["scene"]]
+    scene = chore.scene().with_start(base=spec["base"])
+    steps = chore.steps(scene)
+    began, before = time.perf_counter(), time.process_time()
+    about = {"method": spec["method"], "seed": spec["seed"]}
+    more: dict[str, Any] = {"number": spec["number"]}
+    if spec["method"] == STEP_BY_STEP:
+        plans = stepwise.step_by_step(scene, steps, options=chore.options, seed=spec["seed"])
+        more |= {"wall_time": time.perf_counter() - began, "cpu_time": time.process_time() - before}
+        return {**stepwise.combined(plans, len(steps), **about, **more), "scene": spec["scene"]}
     plan = solve(scene, spec)
-    spent = time.perf_counter() - began
-    own = {"number": spec["number"], "wall_time": spent, "duration": plan.trajectory.metrics()["duration"]}
-    return {**trial(plan, method="VKC", seed=spec["seed"], **own), "scene": spec["chore"]}
+    more |= {"wall_time": time.perf_counter() - began, "cpu_time": time.process_time() - before}
+    more |= {"duration": plan.trajectory.metrics()["duration"], "steps_done": len(steps) if plan.success else None}
+    return {**trial(plan, **about, **more), "scene": spec["scene"]}

@@ -53,6 +53,8 @@ def add_bench(commands: Any) -> None:
     shown = "chores of many steps, in a home and in an arena"
     chores = _add_experiment(benches, "chores", shown, about, default=5, jobs=1)
     _add_choice(chores, "chores", "home fetch cluttered (default: all)")
+    chores.add_argument("--seeds", type=positive, default=1, metavar="K", help="seeds of planning to each start (default 1)")
+    chores.add_argument("--step-by-step", action="store_true", help="plan the steps one by one as well")
 
     shown = "planning time against the number of obstacles or segments"
     about = "Measure planning time against the number of obstacles, or of segments, at the door from random starts."

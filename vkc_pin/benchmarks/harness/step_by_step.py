@@ -1,0 +1,50 @@
+"""Steps planned one after the other, each from where the motion of the one before ends."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from vkc_pin.benchmarks.harness.limits import LIMITS
+from vkc_pin.benchmarks.harness.record import trial
+from vkc_pin.options import Options
+from vkc_pin.planning.plan import Plan
+from vkc_pin.planning.planner import plan
+from vkc_pin.scene.scene import Scene
+from vkc_pin.task.steps import Step
+
+__all__ = ["combined", "step_by_step"]
+
+
+def step_by_step(scene: Scene, steps: Sequence[Step], *, options: Options, seed: int) -> list[Plan]:
+    """Return the plans of steps, each planned alone from where the one before ends; the last is the first that fails."""
+    plans: list[Plan] = []
+    for step in steps:
+        plans.append(plan(scene, [step], options=options, seed=seed, **LIMITS))
+        if not plans[-1].success:
+            break
+        scene = plans[-1].end_scene()
+    return plans
+
+
+def combined(plans: Sequence[Plan], of: int, *, method: str, seed: int, **more: Any) -> dict[str, Any]:
+    """Return the record of `of` steps of which these are the plans: what the last one says, and all that they come to."""
+    records = [trial(one, method=method, seed=seed, duration=one.trajectory.metrics()["duration"]) for one in plans]
+    sums = ("planning_time", "base_effort", "base_effort_l1", "arm_effort", "duration", "build_time")
+    counts = ("iterations", "rounds", "effort", "waypoints")
+    times = [key for key in records[0] if key.startswith("time_")]
+    clearances = [record["clearance"] for record in records if record["clearance"] is not None]
+    good = sum(record["success"] for record in records)
+    failed = records[-1]["failed_constraint"]
+    return {
+        **records[-1],
+        **{field: sum(record[field] for record in records) for field in (*sums, *counts, *times)},
+        "start": records[0]["start"],
+        "success": good == of,
+        "clearance": min(clearances, default=None),
+        "closure_error": max(record["closure_error"] for record in records),
+        "initialization": "; ".join(dict.fromkeys(record["initialization"] for record in records)),
+        "failed_constraint": failed and f"{failed} at steps[{len(plans) - 1}], {plans[-1].steps[0]}",
+        "steps_done": good,
+        **more,
+    }

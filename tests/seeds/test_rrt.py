@@ -74,6 +74,35 @@ def test_what_a_coarse_search_overlooks_a_finer_one_does_not(monkeypatch: pytest
     assert worst[0] > margin + 0.02
 
 
+def test_joints_that_turn_there_and_back_for_nothing_stay_where_they_are() -> None:
+    """A wrist that turns by 2 rad on its way to 0.4 rad goes there straight."""
+    problem, guide, arms = gate()
+    first = problem.start[:SIZE]
+    middle, last = first.copy(), first.copy()
+    middle[-1] += 2.0
+    last[-1] += 0.4
+    search = trees._Search(problem, 0, problem.start, guide, arms, np.random.default_rng(0), 0.04)
+    path = np.array([first, middle, last])
+    straight = search.straightened(path)
+    np.testing.assert_array_equal(straight[0], first)
+    np.testing.assert_allclose(straight[-1], last, atol=1e-12)
+    assert np.abs(np.diff(straight[:, -1])).sum() == pytest.approx(0.4, abs=1e-6)
+    assert search.free(straight)
+
+
+@settings(max_examples=4, deadline=None)
+@given(SEEDS)
+def test_straight_ways_are_free_and_no_longer(seed: int) -> None:
+    problem, guide, arms = gate()
+    path = through(seed)
+    assert path is not None
+    search = trees._Search(problem, 0, problem.start, guide, arms, np.random.default_rng(seed), 0.04)
+    again = search.straightened(path)
+    assert length(again) <= length(path) + 1e-9
+    np.testing.assert_allclose(again[[0, -1]], path[[0, -1]], atol=1e-12)
+    is_a_way(problem, again)
+
+
 def is_a_way(problem: vkc.TrajectoryProblem, path: np.ndarray) -> None:
     short, allowed = missing(problem, finely(path)), GRAZE * problem.options.dist_safe
     assert short.max() <= allowed + HIDDEN

@@ -21,6 +21,8 @@ TRIES = 1500
 """How often a tree may grow until they meet."""
 
 _STEPS = (0.15, 0.04)  # [rad] between configurations that are looked at; the latter where the former overlooked something
+_STRAIGHTENINGS = 24  # times that the arm and each of its joints are tried to be straightened
+_WORTH = 1e-3  # share of a path's length that is to be saved by it
 _BESIDE_PATH = 0.1  # [m] and [rad] standard deviation, at most, of bases beside their path
 _AROUND = 0.4  # [m] and [rad] standard deviation, at most, of bases around the ends, and of arms
 
@@ -50,10 +52,10 @@ def connect(
     """
     coarse, fine = (_Search(problem, phase, first, poses, arms, rng, step) for step in _STEPS)
     path = coarse.run(ends, tries)
-    if path is None or fine.free(path):
-        return path
-    finer = fine.run(ends, tries)
-    return path if finer is None else finer
+    if path is not None and not fine.free(path):
+        finer = fine.run(ends, tries)
+        path = path if finer is None else finer
+    return None if path is None else fine.straightened(path)
 
 
 def spread(path: Floats, steps: int, metric: Floats) -> Floats:
@@ -183,7 +185,7 @@ class _Search:
         for _ in path:
             if len(path) < 3:
                 break
-            passed = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0) * self.weights, axis=1))])
+            passed = self._passed(path)
             s, t = np.sort(self.rng.uniform(0.0, passed[-1], 2))
             i, j = np.searchsorted(passed, [s, t], side="right") - 1
             if i == j:
@@ -192,6 +194,32 @@ class _Search:
             if self._along(a, b) == 1.0:
                 path = np.concatenate([path[: i + 1], [a, b], path[j + 1 :]])
         return path
+
+    def straightened(self, path: Floats) -> Floats:
+        """Return a path on which the arm, and each of its joints alone, moves evenly between two places where nothing hinders it.
+
+        What leads through a passage with another posture takes all joints along; straight lines of all coordinates seldom undo
+        that, and the solver cannot, since things are between. So coordinates are taken apart (partial shortcuts: Geraerts and
+        Overmars, IJRR 2007), at first all along the path, then between random places on it.
+        """
+        groups = [np.arange(3, self.size), *(np.array([column]) for column in range(3, self.size))]
+        length = self._passed(path)[-1]
+        for attempt, columns in itertools.product(range(_STRAIGHTENINGS), groups):
+            passed = self._passed(path)
+            s, t = np.sort(self.rng.uniform(0.0, passed[-1], 2)) if attempt else (0.0, passed[-1])
+            at = np.concatenate([[s], passed[(s < passed) & (passed < t)], [t]])
+            part = np.column_stack([np.interp(at, passed, column) for column in path.T])
+            share = ((at - s) / max(t - s, 1e-12))[:, None]
+            part[1:-1, columns] = (part[0, columns] + share * (part[-1, columns] - part[0, columns]))[1:-1]
+            changed = np.concatenate([path[passed <= s], part, path[passed >= t]])
+            shorter = self._passed(changed)[-1]
+            if shorter < (1.0 - _WORTH) * length and self.free(part):
+                path, length = changed[np.diff(self._passed(changed), prepend=-1.0) > 0.0], shorter
+        return path
+
+    def _passed(self, path: Floats) -> Floats:
+        """Return how far it is along a path to each of its configurations, shape (K,)."""
+        return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0) * self.weights, axis=1))])
 
 
 class _Tree:

@@ -16,8 +16,11 @@ from hypothesis import strategies as st
 
 from vkc_pin.errors import InputError
 from vkc_pin.files.meshes import MeshPart, to_bvh
+from vkc_pin.models.robot_file import load_robot
 from vkc_pin.models.shapes import (
     LIMIT_SLACK,
+    LinkDistances,
+    ShapeDistances,
     bounding_box,
     clearance,
     copy_shape,
@@ -149,3 +152,34 @@ def test_the_first_question_of_a_process_does_not_change_the_others() -> None:
         command = [sys.executable, "-c", FIRST.format(first=first)]
         found.append(subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout)
     assert found[0] == found[1]
+
+
+@pytest.mark.parametrize("worth", [0.0, 0.05, np.inf])
+def test_distances_of_links_are_those_of_their_shapes(worth: float) -> None:
+    """At random configurations, however many pairs of links are left: exact up to what they are worth, above it otherwise."""
+    robot, rng = load_robot("husky_ur5e"), np.random.default_rng(5)
+    shapes = robot.collision.geometryObjects
+    groups: dict[tuple[str, str], list[tuple[int, int]]] = {}
+    for pair in robot.collision.collisionPairs:
+        groups.setdefault((robot.link_of(pair.first), robot.link_of(pair.second)), []).append((pair.first, pair.second))
+    distances = ShapeDistances(robot.model, robot.coordinates.q, shapes)
+    links, data = LinkDistances(distances, groups), robot.model.createData()
+    assert links.links == list(groups)
+    for _ in range(4):
+        z = rng.uniform(-2.0, 2.0, len(robot.lower))
+        distances.place(z)
+        pin.forwardKinematics(robot.model, data, robot.coordinates.q(z))
+        placed = [(shape.geometry, data.oMi[shape.parentJoint] * shape.placement) for shape in shapes]
+        np.testing.assert_allclose(distances.lowest(), [world_box(*one)[0][2] for one in placed], atol=1e-12)
+        bounds = links.bounds()
+        for k, name in enumerate(links.links):
+            exact = min(shape_distance(*placed[one], *placed[other]) for one, other in groups[name])
+            assert bounds[k] <= exact + 1e-6
+            found = links.between(k, worth)
+            assert found == pytest.approx(exact, abs=1e-6) if exact <= worth else found > worth
+        links.keep([k % 3 > 0 for k in range(len(links.links))])
+        if not links.links:
+            break
+    links.keep([False] * len(links.links))
+    assert links.links == []
+    assert links.bounds().shape == (0,)

@@ -23,7 +23,7 @@ from vkc_pin.files.writing import write_atomically
 from vkc_pin.kept import record
 from vkc_pin.models.robot import Robot
 from vkc_pin.models.robot_model import neighbours
-from vkc_pin.models.shapes import ShapeDistances
+from vkc_pin.models.shapes import LinkDistances, ShapeDistances
 
 Pair = tuple[str, str]
 Parts = list[tuple[int, int]]
@@ -128,24 +128,25 @@ def sample_allowed_pairs(robot: Robot, *, samples: int = _SAMPLES, seed: int = 0
     allowed = {links: "Adjacent" for links in groups if links in joined}
     groups = {links: parts for links, parts in groups.items() if links not in joined}
     rng, distances, (low, high) = np.random.default_rng(seed), _distances(robot), _ranges(robot)
-    free: set[Pair] = set()
-    hit: set[Pair] = set()
-    closest: dict[Pair, list[tuple[float, tuple[float, ...]]]] = {links: [] for links in groups}
-    undecided = list(groups)
+    look, undecided, (free, hit) = LinkDistances(distances, groups), np.arange(len(groups)), np.zeros((2, len(groups)), bool)
+    closest: list[list[tuple[float, tuple[float, ...]]]] = [[] for _ in groups]
     for z in rng.uniform(low, high, (samples, len(low))):
         distances.place(z)
-        for links in undecided:
-            best = closest[links]
-            distance = distances.between(groups[links], min(_FAR, best[-1][0]) if len(best) == _STARTS else _FAR)
-            (free if distance > 0.0 else hit).add(links)
-            if distance < _FAR and links not in hit and (len(best) < _STARTS or distance < best[-1][0]):
-                closest[links] = sorted([*best, (distance, tuple(z))])[:_STARTS]
-        undecided = [links for links in undecided if links not in free or links not in hit]
-    for links, parts in groups.items():
-        if links not in free:
+        free[undecided[(bounds := look.bounds()) > 0.0]] = True
+        for k in np.flatnonzero(bounds <= _FAR).tolist():
+            best = closest[pair := undecided[k]]
+            distance = look.between(k, min(_FAR, best[-1][0]) if len(best) == _STARTS else _FAR)
+            free[pair] |= distance > 0.0
+            hit[pair] |= distance <= 0.0
+            if distance < _FAR and not hit[pair] and (len(best) < _STARTS or distance < best[-1][0]):
+                closest[pair] = sorted([*best, (distance, tuple(z))])[:_STARTS]
+        look.keep(left := ~(free & hit)[undecided])
+        undecided = undecided[left]
+    for pair, (links, parts) in enumerate(groups.items()):
+        if not free[pair]:
             allowed[links] = "Always"
-        elif links not in hit:
-            starts = (np.array(z) for _, z in closest[links])
+        elif not hit[pair]:
+            starts = (np.array(z) for _, z in closest[pair])
             if not any(_drive_together(distances, parts, z, (low, high), rng) for z in starts):
                 allowed[links] = "Never"
     unsure = {links: groups[links] for links in welded & groups.keys() if allowed.get(links) != "Never"}
@@ -224,14 +225,14 @@ def _groups(robot: Robot) -> dict[Pair, Parts]:
 def _rooms(robot: Robot, groups: Mapping[Pair, Parts], samples: int) -> dict[Pair, float]:
     """Return how far links are apart at most [m], at home or in random configurations; 50 mm or more where that is certain."""
     distances, (low, high), rng = _distances(robot), _ranges(robot), np.random.default_rng(0)
-    rooms, left = dict.fromkeys(groups, -np.inf), list(groups)
+    look, rooms = LinkDistances(distances, groups), dict.fromkeys(groups, -np.inf)
     for z in (np.array([0.0, 0.0, 0.0, *robot.home]), *rng.uniform(low, high, (samples, len(low)))):
-        if not left:
+        if not look.links:
             break
         distances.place(z)
-        for links in left:
-            rooms[links] = max(rooms[links], distances.between(groups[links], _FAR))
-        left = [links for links in left if rooms[links] < _FAR]
+        for k, (links, bound) in enumerate(zip(look.links, look.bounds(), strict=True)):
+            rooms[links] = max(rooms[links], float(bound) if bound > _FAR else look.between(k, _FAR))
+        look.keep([rooms[links] < _FAR for links in look.links])
     return rooms
 
 

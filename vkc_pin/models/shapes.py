@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import coal
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from vkc_pin.arrays import Floats
+from vkc_pin.arrays import Bools, Floats, Ints
 from vkc_pin.errors import InputError
 from vkc_pin.files.meshes import indices
 from vkc_pin.models.grafting import clean
 
 __all__ = [
     "LIMIT_SLACK",
+    "LinkDistances",
     "ShapeDistances",
     "bounding_box",
     "clearance",
@@ -134,16 +135,14 @@ def triangles(shape: coal.CollisionGeometry) -> tuple[Floats, NDArray[np.int64]]
 def bounding_box(shape: pin.GeometryObject) -> tuple[Floats, Floats]:
     """Return centre and half extents of a shape's bounding box in its own frame."""
     shape.geometry.computeLocalAABB()
-    box = shape.geometry.aabb_local
-    return np.asarray(box.center(), float), np.array([box.width(), box.height(), box.depth()]) / 2
+    return np.asarray(shape.geometry.aabb_local.center(), float), _half_extents(shape.geometry)
 
 
 def world_box(shape: coal.CollisionGeometry, placement: pin.SE3) -> tuple[Floats, Floats]:
     """Return the lower and upper corner, shape (3,) each [m], of a box along the world's axes around a shape."""
     shape.computeLocalAABB()
-    box = shape.aabb_local
-    centre = placement.act(np.asarray(box.center(), float))
-    extent = np.abs(placement.rotation) @ np.array([box.width(), box.height(), box.depth()]) / 2
+    centre = placement.act(np.asarray(shape.aabb_local.center(), float))
+    extent = np.abs(placement.rotation) @ _half_extents(shape)
     return centre - extent, centre + extent
 
 
@@ -165,6 +164,8 @@ class ShapeDistances:
             solid.computeLocalAABB()
         self._radii = np.array([solid.aabb_radius for solid in self._solids])
         self._middles = np.array([place.act(solid.aabb_center) for place, solid in zip(self._locals, self._solids, strict=True)])
+        self._turns = np.array([place.rotation for place in self._locals])
+        self._halves = np.array([_half_extents(solid) for solid in self._solids])
         self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
 
     def place(self, z: Floats) -> None:
@@ -173,7 +174,19 @@ class ShapeDistances:
         rotations = np.array([place.rotation for place in self._data.oMi])[self._joints]
         positions = np.array([place.translation for place in self._data.oMi])[self._joints]
         self._centres = np.einsum("kij,kj->ki", rotations, self._middles) + positions
+        self._verticals = rotations[:, 2]
         self._places: dict[int, coal.Transform3s] = {}
+
+    def lowest(self) -> Floats:
+        """Return the height of the lowest point of the box around each shape [m], shape (shapes,)."""
+        across = np.abs(np.einsum("kj,kji->ki", self._verticals, self._turns))
+        return np.asarray(self._centres[:, 2] - np.einsum("ki,ki->k", across, self._halves))
+
+    def bounds(self, pairs: Ints) -> Floats:
+        """Return lower bounds of the distances of pairs of shapes, shape (pairs, 2): those of balls around them [m]."""
+        first, second = pairs[:, 0], pairs[:, 1]
+        gaps = self._centres[first] - self._centres[second]
+        return np.asarray(np.sqrt(np.einsum("ki,ki->k", gaps, gaps)) - self._radii[first] - self._radii[second])
 
     def between(self, parts: Iterable[tuple[int, int]], worth: float = np.inf) -> float:
         """Return the smallest distance [m] of pairs of shapes; a lower bound of it where it is larger than `worth`."""
@@ -193,3 +206,54 @@ class ShapeDistances:
             place = self._data.oMi[int(self._joints[shape])] * self._locals[shape]
             self._places[shape] = coal.Transform3s(place.rotation, place.translation)
         return self._places[shape]
+
+
+class LinkDistances:
+    """Distances of pairs of links, each by the pairs of their shapes, at one configuration after the other.
+
+    Most pairs of links are far apart in most configurations; balls around the shapes say so for all of them at once.
+
+    Args:
+        distances: Of the shapes.
+        groups: Pair of links → pairs of their shapes.
+
+    Attributes:
+        links: The pairs of links that are looked at, in the order in which they were given.
+    """
+
+    links: list[tuple[str, str]]
+
+    def __init__(self, distances: ShapeDistances, groups: Mapping[tuple[str, str], Sequence[tuple[int, int]]]) -> None:
+        self._distances, self._groups = distances, {links: np.array(parts, np.int64) for links, parts in groups.items()}
+        self._gather()
+
+    def keep(self, chosen: Sequence[bool] | Bools) -> None:
+        """Look only at some of the pairs of links from now on: those `chosen`, shape (links,)."""
+        if not all(chosen):
+            self._groups = {links: parts for (links, parts), keep in zip(self._groups.items(), chosen, strict=True) if keep}
+            self._gather()
+
+    def bounds(self) -> Floats:
+        """Return lower bounds of the distances of all pairs of links where the model is placed [m], shape (links,)."""
+        if not self._groups:
+            return np.zeros(0)
+        self._found = self._distances.bounds(self._pairs)
+        return np.asarray(np.minimum.reduceat(self._found, self._starts))
+
+    def between(self, number: int, worth: float) -> float:
+        """Return the distance of pair of links `number` [m], or some number above `worth`; after `bounds`."""
+        start, end = self._starts[number], self._ends[number]
+        close = self._pairs[start:end][self._found[start:end] <= worth]
+        return self._distances.between(map(tuple, close.tolist()), worth)
+
+    def _gather(self) -> None:
+        self.links = list(self._groups)
+        counts = np.array([len(parts) for parts in self._groups.values()], np.int64)
+        self._ends = np.cumsum(counts)
+        self._starts = self._ends - counts
+        self._pairs = np.vstack([np.zeros((0, 2), np.int64), *self._groups.values()])
+
+
+def _half_extents(solid: coal.CollisionGeometry) -> Floats:
+    box = solid.aabb_local
+    return np.array([box.width(), box.height(), box.depth()]) / 2

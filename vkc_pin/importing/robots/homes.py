@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-import coal
 import numpy as np
 import pinocchio as pin
 
 from vkc_pin.arrays import Floats
 from vkc_pin.models.robot import Robot
-from vkc_pin.models.shapes import world_box
+from vkc_pin.models.shapes import LinkDistances, ShapeDistances
 
 __all__ = ["HOME_ROOM", "Clearances", "Home", "find_home", "never_apart", "standing"]
 
@@ -46,57 +45,51 @@ class Clearances:
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
-        self._data, self._shapes = robot.model.createData(), robot.collision.geometryObjects
-        self.request, self.result = coal.DistanceRequest(), coal.DistanceResult()
+        shapes = robot.collision.geometryObjects
+        self._distances = ShapeDistances(robot.model, robot.coordinates.q, shapes)
         self.pairs = [(pair.first, pair.second) for pair in robot.collision.collisionPairs]
-        for shape in self._shapes:
-            shape.geometry.computeLocalAABB()
+        self._pairs = np.array(self.pairs, np.int64).reshape(-1, 2)
+        self._carried = np.array([shape.parentJoint > 1 for shape in shapes])
+        self._names = [robot.link_of(k) for k in range(len(shapes))]
 
     def place(self, arm: Floats) -> None:
         """Put the arm at `arm`, shape (n − 3,), the base at the origin."""
-        q = self.robot.coordinates.q(np.concatenate([np.zeros(3), arm]))
-        pin.forwardKinematics(self.robot.model, self._data, q)
-        self._places = [self._data.oMi[shape.parentJoint] * shape.placement for shape in self._shapes]
-
-    def between(self, pair: tuple[int, int], worth: float = np.inf) -> float:
-        """Return the distance of two shapes [m]; a lower bound of it where it is larger than `worth`."""
-        one, other = (self._shapes[k].geometry for k in pair)
-        here, there = (self._places[k] for k in pair)
-        gap = here.act(one.aabb_center) - there.act(other.aabb_center)
-        bound = float(np.linalg.norm(gap)) - one.aabb_radius - other.aabb_radius
-        if bound > worth:
-            return bound
-        self.result.clear()
-        places = (coal.Transform3s(place.rotation, place.translation) for place in (here, there))
-        first, second = places
-        return float(coal.distance(one, first, other, second, self.request, self.result))
+        self._distances.place(np.concatenate([np.zeros(3), arm]))
 
     def floor(self, *, moved: bool = True) -> list[tuple[str, float]]:
         """Return link → how far above the floor it is [m], of those that the arm moves or of the others, the lowest first."""
         heights: dict[str, float] = {}
-        for k in (k for k, shape in enumerate(self._shapes) if (shape.parentJoint > 1) == moved):
-            low = float(world_box(self._shapes[k].geometry, self._places[k])[0][2])
-            link = self.robot.link_of(k)
-            heights[link] = min(low, heights.get(link, np.inf))
+        lowest = self._distances.lowest()
+        for k in np.flatnonzero(self._carried == moved).tolist():
+            heights[self._names[k]] = min(float(lowest[k]), heights.get(self._names[k], np.inf))
         return sorted(heights.items(), key=lambda item: item[1])
 
     def least(self, worth: float = np.inf) -> float:
         """Return the least distance between links and to the floor [m], looked at up to `worth`."""
-        floor = self.floor()
-        nearest = min(worth, floor[0][1]) if floor else worth
-        for pair in self.pairs:
-            nearest = min(nearest, self.between(pair, nearest))
+        nearest = float(min(worth, self._distances.lowest()[self._carried].min(initial=np.inf)))
+        bounds = self._distances.bounds(self._pairs)
+        for k in np.argsort(bounds).tolist():
+            if bounds[k] > nearest:
+                break
+            nearest = min(nearest, self._distances.between([self.pairs[k]], nearest))
         return nearest
 
     def links(self, below: float) -> list[tuple[str, str, float]]:
         """Return pairs of links closer than `below` [m], the closest first."""
         found: dict[tuple[str, str], float] = {}
-        for pair in self.pairs:
-            distance = self.between(pair, below)
+        for k in np.flatnonzero(self._distances.bounds(self._pairs) < below).tolist():
+            distance = self._distances.between([self.pairs[k]])
             if distance < below:
-                names = (self.robot.link_of(pair[0]), self.robot.link_of(pair[1]))
+                names = (self._names[self.pairs[k][0]], self._names[self.pairs[k][1]])
                 found[names] = min(distance, found.get(names, np.inf))
         return sorted(((*names, distance) for names, distance in found.items()), key=lambda item: item[2])
+
+    def by_links(self) -> LinkDistances:
+        """Return distances of its pairs of links, where it is placed."""
+        groups: dict[tuple[str, str], list[tuple[int, int]]] = {}
+        for one, other in self.pairs:
+            groups.setdefault((self._names[one], self._names[other]), []).append((one, other))
+        return LinkDistances(self._distances, groups)
 
 
 def find_home(robot: Robot, named: Iterable[tuple[str, Floats]], *, seed: int = 0) -> Home:
@@ -157,21 +150,18 @@ def never_apart(robot: Robot, margin: float, *, samples: int, share: float = 1.0
     """
     look, rng = Clearances(robot), np.random.default_rng(seed)
     low, high = np.maximum(robot.lower[3:], -np.pi), np.minimum(robot.upper[3:], np.pi)
-    left: dict[tuple[str, str], list[tuple[int, int]]] = {}
-    for pair in look.pairs:
-        left.setdefault((robot.link_of(pair[0]), robot.link_of(pair[1])), []).append(pair)
-    furthest, apart = dict.fromkeys(left, -np.inf), dict.fromkeys(left, 0)
+    pairs = look.by_links()
+    furthest, apart = dict.fromkeys(pairs.links, -np.inf), dict.fromkeys(pairs.links, 0)
     for arm in (robot.home, *rng.uniform(low, high, (samples, len(low)))):
         look.place(arm)
-        for links, pairs in list(left.items()):
-            distance = min(look.between(pair, margin) for pair in pairs)
+        for k, (links, bound) in enumerate(zip(pairs.links, pairs.bounds(), strict=True)):
+            distance = float(bound) if bound > margin else pairs.between(k, margin)
             furthest[links] = max(furthest[links], distance)
             apart[links] += distance >= margin
-            if apart[links] > (1.0 - share) * samples:
-                del left[links]
-        if not left:
+        pairs.keep([apart[links] <= (1.0 - share) * samples for links in pairs.links])
+        if not pairs.links:
             break
-    return {links: furthest[links] for links in left}
+    return {links: furthest[links] for links in pairs.links}
 
 
 def standing(robot: Robot, *, samples: int = 200, seed: int = 0) -> tuple[float, float]:

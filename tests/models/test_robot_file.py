@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -216,6 +217,9 @@ def test_a_base_of_its_own_is_noticed(tmp_path: Path, order: str) -> None:
     with pytest.warns(UserWarning, match=r"small.urdf: the virtual base .* are locked: drive_0, drive_1, drive_2$"):
         robot = load_robot(file)
     assert robot.coordinates.names == ("base_x", "base_y", "base_yaw", "j0", "j1", "j2")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # who says where they are locked knows of them
+        load_robot(file, locked_joints={f"drive_{k}": 0.0 for k in range(3)})
     (tmp_path / "plain").mkdir()
     plain = load_robot(small_urdf(tmp_path / "plain"))
     z = np.array([0.3, -0.2, 1.0, 0.5, -0.4, 0.3])

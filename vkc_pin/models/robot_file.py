@@ -102,7 +102,7 @@ def load_robot(
     are π rad/s (m/s) and 1.4 rad/s² (m/s²) for joints, 1 m/s, 2 rad/s, 3 m/s² and 6 rad/s² for the base, ±20 m.
 
     Where the URDF begins with joints that drive the robot about, the virtual base takes their place: they are locked at 0, with a
-    warning, unless `base` is "fixed".
+    warning unless something says where, and unless `base` is "fixed".
 
     Pairs of links that may touch come from the SRDF. Without one they are adjacent links and those that sampling
     finds always, or never, in collision. In any case neighbours may that are always close, links that always overlap, and those
@@ -158,11 +158,9 @@ def load_robot(
             raise UnknownNameError("joint", joint, rest, file=urdf.path, field=field)
         if joint not in replaced or joint in said:
             files.check_limits(full, joint, given[joint], field)
-    if replaced:
-        text_of = ", ".join(replaced)
-        warnings.warn(
-            f"{urdf.path}: the virtual base moves the robot; joints of its own that do are locked: {text_of}", stacklevel=2
-        )
+    if unsaid := ", ".join(joint for joint in replaced if joint not in said):
+        problem = "the virtual base moves the robot; joints of its own that do are locked"
+        warnings.warn(f"{urdf.path}: {problem}: {unsaid}", stacklevel=2)
     raised = settings.base.height if raised is None else raised
     model = planned_model(full, urdf, tool, rest, locked, height=raised)
     coordinates, lower, upper, velocity, acceleration = _limits(model, settings, base)

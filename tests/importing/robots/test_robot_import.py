@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -81,6 +82,40 @@ def test_reachable_poses_are_planned(imported: vkc.ImportedRobot, tmp_path: Path
     for goal in goals:
         plan = vkc.plan(loaded, [vkc.Reach(goal)])
         assert plan.success, plan.report()
+
+
+def test_home_keeps_apart_what_overlaps_at_zero(tmp_path: Path) -> None:
+    """Folded at 0, so that its links are in each other there: these pairs are kept apart all the same, and home is elsewhere."""
+    file = write_arms(tmp_path / "given")
+    text = file.read_text(encoding="utf-8")
+    for joint in ("arm_2_joint", "arm_3_joint"):
+        text = text.replace(
+            f'name="{joint}" type="revolute"><origin xyz="0 0 0.2"/>',
+            f'name="{joint}" type="revolute"><origin xyz="0 0 0.2" rpy="0 1.9 0"/>',
+        )
+    file.write_text(text, encoding="utf-8")
+    plain = vkc.load_robot(file, pairs="all")
+    look = Clearances(plain)
+    look.place(np.zeros(5))
+    assert ("arm_4", "body") in {tuple(sorted(pair[:2])) for pair in look.links(0.0)}, "the test's own premise"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # "links that overlap at home are not kept apart", and names of folders that are gone
+        imported = vkc.import_robot(file, tmp_path / "mine", samples=SAMPLES)
+    look = Clearances(imported.robot)
+    look.place(imported.robot.home)
+    assert look.least() >= HOME_ROOM
+    kept_apart = {tuple(sorted((imported.robot.link_of(a), imported.robot.link_of(b)))) for a, b in look.pairs}
+    assert ("arm_4", "body") in kept_apart
+
+
+def test_warnings_name_files_that_are_there_to_stay(tmp_path: Path) -> None:
+    file = write_arms(tmp_path / "given", own_base=True)
+    text = file.read_text(encoding="utf-8").replace('lower="-2" upper="2" effort', "effort", 2)
+    file.write_text(text, encoding="utf-8")
+    with pytest.warns(UserWarning, match="arm_1_joint") as told:
+        imported = vkc.import_robot(file, tmp_path / "mine", samples=20)
+    named = {str(warning.message).partition(":")[0] for warning in told}
+    assert named == {str(imported.folder.resolve() / "mine.urdf")}
 
 
 def test_a_folder_is_replaced_only_if_asked_and_left_alone_if_importing_fails(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from vkc_pin.arguments import whole
 from vkc_pin.files.meshes import load_mesh
 from vkc_pin.importing.convex import concavity
+from vkc_pin.importing.robots.envelopes import envelopes
 from vkc_pin.importing.robots.homes import Clearances, never_apart
 from vkc_pin.models.robot import Robot
 from vkc_pin.models.robot_file import load_robot
@@ -47,11 +48,15 @@ class Diagnosis:
 
     Attributes:
         name: The robot.
-        findings: Faults first.
+        findings: Faults first, in whatever order they are given.
     """
 
     name: str
     findings: tuple[Finding, ...]
+
+    def __post_init__(self) -> None:
+        order = ("fault", "warning", "note")
+        object.__setattr__(self, "findings", tuple(sorted(self.findings, key=lambda finding: order.index(finding.level))))
 
     @property
     def healthy(self) -> bool:
@@ -92,8 +97,7 @@ def doctor(robot: str | Path | Robot, *, margin: float | None = None, samples: i
     kept = Options().dist_safe if margin is None else Options(dist_safe=margin).dist_safe
     findings = [*_home(examined, kept), *_pairs(examined, kept, samples, seed), *_numbers(examined), *_hand(examined)]
     findings += [*_shapes(examined), *(Finding("warning", "loading", str(one.message)) for one in told)]
-    order = ("fault", "warning", "note")
-    return Diagnosis(examined.name, tuple(sorted(findings, key=lambda finding: order.index(finding.level))))
+    return Diagnosis(examined.name, tuple(findings))
 
 
 def _home(robot: Robot, margin: float) -> list[Finding]:
@@ -166,6 +170,10 @@ def _mass(link: ElementTree.Element) -> float:
 
 def _hand(robot: Robot) -> list[Finding]:
     found = []
+    for link, share in envelopes(robot).items():
+        text = f"{link} is a shape around the hand, {share:.0%} of which is in it: the fingers get at nothing"
+        hint = "remove its <collision> from the URDF, as `vkc-pin import-robot` does"
+        found.append(Finding("warning", "hand", text, hint))
     if not robot.touch_links:
         hint = "`touch_links` in robot.yaml: palm and fingers; without them a grasp is reported as a collision"
         found.append(Finding("warning", "hand", "no link may touch what is grasped", hint))

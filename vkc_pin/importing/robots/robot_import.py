@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pinocchio as pin
@@ -17,11 +18,11 @@ from vkc_pin.arguments import flag, mapping, text, whole
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
 from vkc_pin.files.resources import file_path
-from vkc_pin.files.srdf import read_srdf
 from vkc_pin.files.urdf import UrdfFile
 from vkc_pin.files.writing import folder_at_once
 from vkc_pin.importing.robots.arms import Arm, base_kind, bodies, choose, find_arms, own_base
 from vkc_pin.importing.robots.doctor import Diagnosis, Finding, doctor
+from vkc_pin.importing.robots.envelopes import envelopes, leave_out
 from vkc_pin.importing.robots.hands import Hand, look_at
 from vkc_pin.importing.robots.homes import HOME_ROOM, Home, find_home, never_apart, standing
 from vkc_pin.importing.robots.pieces import Piece, own_meshes
@@ -29,7 +30,7 @@ from vkc_pin.importing.robots.sources import Source, read_source
 from vkc_pin.models.robot import Robot
 from vkc_pin.models.robot_file import load_robot
 from vkc_pin.models.robot_model import full_model, nearest_position
-from vkc_pin.models.self_collisions import write_srdf
+from vkc_pin.models.self_collisions import sample_allowed_pairs, with_collision_pairs
 from vkc_pin.options import Options
 
 __all__ = ["ImportedRobot", "import_robot"]
@@ -112,7 +113,9 @@ def import_robot(
     beside = None if srdf is None else file_path(srdf, "srdf")
     with folder_at_once(target, force=flag(force, "force")) as staging:
         source = read_source(path, staging / ".meshes", packages=places, arguments=given_arguments, srdf=beside)
-        made = _Importer(source, staging, target.resolve().name).make(arm, tool_frame, most_pieces, samples, seed)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # they name files that are gone soon; loading the whole folder warns of the same
+            made = _Importer(source, staging, target.resolve().name).make(arm, tool_frame, most_pieces, samples, seed)
     robot = load_robot(target / "robot.yaml")
     return dataclasses.replace(made, folder=target, robot=robot)
 
@@ -143,17 +146,14 @@ class _Importer:
         if tool_frame is not None:
             self._settings["tool_frame"] = tool_frame
         self._write()
-        robot = self._on_the_floor(load_robot(self._folder / "robot.yaml", pairs="all"), seed)
-        robot, home = self._rest(robot, samples, seed)
-        self._told(pieces, home)
-        return self._result(robot, arms, chosen, pieces)
+        robot = self._on_the_floor(self._without_envelopes(self._load("all")), seed)
+        self._told(pieces, self._rest(robot, samples, seed))
+        return self._result(self._load("srdf"), arms, chosen, pieces)
 
     def _result(self, robot: Robot, arms: list[Arm], chosen: Arm | None, pieces: list[Piece]) -> ImportedRobot:
-        examined = doctor(robot)
-        order = ("fault", "warning", "note")
-        findings = sorted([*examined.findings, *self._findings], key=lambda finding: order.index(finding.level))
+        findings = (*doctor(robot).findings, *self._findings)
         names = [] if chosen is None else [chosen.name, *(arm.name for arm in arms if arm is not chosen)]
-        return ImportedRobot(self._folder, robot, tuple(names), tuple(pieces), Diagnosis(self._name, tuple(findings)))
+        return ImportedRobot(self._folder, robot, tuple(names), tuple(pieces), Diagnosis(self._name, findings))
 
     def _collide_as_seen(self) -> None:
         """Let links collide as they are seen: nothing else is there."""
@@ -218,6 +218,17 @@ class _Importer:
             self._folder / f"{self._name}.urdf", encoding="utf-8", xml_declaration=True
         )
 
+    def _without_envelopes(self, robot: Robot) -> Robot:
+        """Return the robot without shapes that are but around its hand."""
+        if not (found := envelopes(robot)):
+            return robot
+        leave_out(self._file.root, found)
+        self._settings["touch_links"] = [link for link in self._settings.get("touch_links", ()) if link not in found]
+        told = [f"{link} is a shape around the hand, {share:.0%} of which is in it: left out" for link, share in found.items()]
+        self._findings += [Finding("warning", "hand", text) for text in told]
+        self._write()
+        return self._load("all")
+
     def _on_the_floor(self, robot: Robot, seed: int) -> Robot:
         """Return the robot with a root that stands on the floor, so high that its arm can be clear of it."""
         low, above = standing(robot, seed=seed)
@@ -235,32 +246,27 @@ class _Importer:
         why = why or "it stands on what is lowest of it"
         self._guess("likely", f"{root} is {lift + raised:.3f} m above the floor, the new root '{floor}': {why}")
         self._write()
-        return load_robot(self._folder / "robot.yaml", pairs="all")
+        return self._load("all")
 
-    def _rest(self, robot: Robot, samples: int, seed: int) -> tuple[Robot, Home]:
-        """Write SRDF and home, and return the robot with them."""
-        srdf = self._folder / f"{self._name}.srdf"
-        write_srdf(robot, srdf, samples=samples, seed=seed)
-        allowed = {**self._source.srdf.allowed, **read_srdf(srdf, links=self._file.links).allowed}
-        self._write()
-        self._write_srdf(srdf, robot, robot.home, allowed)
-        robot = load_robot(self._folder / "robot.yaml")
-        arm = robot.coordinates.names[3:]
-        near = never_apart(robot, _NEIGHBOURS, samples=_NEAR, share=_MOSTLY, seed=seed)
-        for one, other in near:
+    def _rest(self, robot: Robot, samples: int, seed: int) -> Home:
+        """Write SRDF and home of a robot that is loaded with all pairs, and return the home."""
+        allowed = {**self._source.srdf.allowed, **sample_allowed_pairs(robot, samples=samples, seed=seed)}
+        sampled = with_collision_pairs(robot, allowed)
+        for one, other in never_apart(sampled, _NEIGHBOURS, samples=_NEAR, share=_MOSTLY, seed=seed):
             text = f"{one} and {other} are hardly ever {1e3 * _NEIGHBOURS:.0f} mm apart: they are not kept apart"
             self._findings.append(Finding("note", "pairs", text))
             allowed[min(one, other), max(one, other)] = "Near"
-        if near:
-            self._write_srdf(srdf, robot, robot.home, allowed)
-            robot = load_robot(self._folder / "robot.yaml")
-        states = {name: state for name, state in self._source.srdf.states.items() if set(arm) <= set(state)}
-        named = [(f"the state '{name}' of the file", _state(robot, state)) for name, state in states.items()]
-        home = find_home(robot, [*named, ("joints at 0, or in the middle", robot.home)], seed=seed)
+        apart, arm = with_collision_pairs(robot, allowed), robot.coordinates.names[3:]
+        states = [(name, state) for name, state in self._source.srdf.states.items() if set(arm) <= set(state)]
+        named = [(f"the state '{name}' of the file", _state(robot, state)) for name, state in states]
+        home = find_home(apart, [*named, ("joints at 0, or in the middle", robot.home)], seed=seed)
         self._settings["home"] = {joint: round(float(value), 6) for joint, value in zip(arm, home.positions, strict=True)}
-        self._write_srdf(srdf, robot, home.positions, allowed)
+        self._write_srdf(self._folder / f"{self._name}.srdf", robot, home.positions, allowed)
         self._write()
-        return load_robot(self._folder / "robot.yaml"), home
+        return home
+
+    def _load(self, pairs: Literal["srdf", "all"]) -> Robot:
+        return load_robot(self._folder / "robot.yaml", pairs=pairs)
 
     def _write_srdf(self, path: Path, robot: Robot, home: Floats, allowed: Mapping[tuple[str, str], str]) -> None:
         root = ElementTree.Element("robot", name=self._name)

@@ -10,6 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import vkc_pin as vkc
+from vkc_pin import kept
+from vkc_pin.importing import convex
 from vkc_pin.importing.convex import concavity, decompose, solid_volume
 
 box = trimesh.creation.box
@@ -121,3 +123,24 @@ def test_what_cannot_be_cut_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert len(decompose(box((1, 1, 1))).meshes) == 1  # nothing to cut
     with pytest.raises(vkc.InputError, match=r"vkc-pin\[import\]"):
         decompose(tray())
+
+
+def test_a_mesh_that_was_cut_is_not_cut_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is kept gives the same pieces to the last bit; other meshes and settings are cut on their own."""
+    monkeypatch.setenv(kept.VARIABLE, str(tmp_path / "cache"))
+    cut, real = [], convex._cut
+    monkeypatch.setattr(convex, "_cut", lambda *rest: (cut.append(rest), real(*rest))[1])
+    mesh = tray()
+    first, again = decompose(mesh), decompose(mesh)
+    assert len(cut) == 1
+    assert (first.solid, first.error) == (again.solid, again.error)
+    for one, other in zip(first.meshes, again.meshes, strict=True):
+        np.testing.assert_array_equal(one.vertices, other.vertices)
+        np.testing.assert_array_equal(one.faces, other.faces)
+    wider = mesh.copy()
+    wider.apply_scale((1.0, 1.0, 1.01))
+    asked: list[float] = []
+    monkeypatch.setattr(convex, "_cut", lambda mesh, most, *_: (asked.append(most), [mesh.vertices])[1])
+    for other, changed in ((wider, {}), (mesh, {"most_pieces": 6}), (mesh, {"error": 0.03}), (mesh, {"seed": 1})):
+        decompose(other, **changed)  # type: ignore[arg-type]
+    assert len(asked) == 4

@@ -6,6 +6,8 @@ meshes of few triangles; others are cut by planes, see `slicing`.
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +24,7 @@ from vkc_pin.files.meshes import MeshPart, coarser, load_mesh, to_bvh
 from vkc_pin.files.resources import file_path
 from vkc_pin.importing.extras import extra
 from vkc_pin.importing.slicing import flat, slices, thickened
+from vkc_pin.kept import record
 
 if TYPE_CHECKING:
     import trimesh
@@ -32,6 +35,7 @@ ERROR = 0.02
 """How far pieces may stand out over the surface before more of them are made, [m]: about the margin that motions keep anyway."""
 PIECES = 12
 """The most pieces of one mesh: the time of a plan grows with their number."""
+_VERSION = 1  # of what is kept on disk: another one whenever the same mesh would be cut otherwise
 _MOST_TRIANGLES = 2000  # that CoACD is given: with more it takes minutes
 _CORNERS = 40  # of a piece, at most; as in the collision geometry that comes with the package
 _SPARE = 1.5  # times as many corners as asked for are left alone: making them fewer takes a second
@@ -79,7 +83,7 @@ def decompose(
     """Return convex pieces that contain a mesh.
 
     That is its hull where this is close to it, else the hulls of the bodies that it consists of, else the parts that CoACD cuts
-    it into. The same mesh gives the same pieces.
+    it into. The same mesh gives the same pieces; the parts of one that had to be cut are kept on disk.
 
     Args:
         mesh: A mesh file in [m], or a mesh; it need not be closed.
@@ -109,10 +113,15 @@ def decompose(
     if most_pieces > 1 and hull.volume > (1.0 + overhead) * solid and _standing_out(found, given) > error:
         found = _bodies(given, most_pieces)
         if not found or _standing_out(found, given) > error:
-            found = _containing(_cut(given, most_pieces, error, seed, file) or [np.asarray(hull.vertices)], _surface(given))
-    pieces = tuple(
-        outer_hull(piece.vertices, vertices=corners) if len(piece.vertices) > _SPARE * corners else piece for piece in found
-    )
+
+            def cut() -> list[list[list[float]]]:
+                parts = _cut(given, most_pieces, error, seed, file) or [np.asarray(hull.vertices)]
+                return [piece.vertices.tolist() for piece in _simple(_containing(parts, _surface(given)), corners)]
+
+            found = [
+                trimesh.convex.convex_hull(np.array(part)) for part in record(_key(given, most_pieces, error, corners, seed), cut)
+            ]
+    pieces = tuple(_simple(found, corners))
     solid = min(solid, float(sum(piece.volume for piece in pieces)))  # which contain it: of open meshes, it is but measured
     return Pieces(pieces, solid, _standing_out(pieces, given))
 
@@ -146,6 +155,17 @@ def solid_volume(mesh: trimesh.Trimesh) -> float:
     regions, _ = ndimage.label(~skin)
     inside = ~skin & (regions != regions[0, 0, 0])
     return float((inside.sum() + 0.5 * skin.sum()) * pitch**3)
+
+
+def _key(mesh: trimesh.Trimesh, *settings: float) -> bytes:
+    """Return all that the pieces of a mesh depend on."""
+    surface = hashlib.sha256(np.asarray(mesh.vertices, float).tobytes() + np.asarray(mesh.faces, np.int64).tobytes())
+    return json.dumps(("pieces", _VERSION, settings, surface.hexdigest())).encode()
+
+
+def _simple(pieces: Sequence[trimesh.Trimesh], corners: int) -> list[trimesh.Trimesh]:
+    """Return pieces with few corners: polytopes around those that have many."""
+    return [outer_hull(one.vertices, vertices=corners) if len(one.vertices) > _SPARE * corners else one for one in pieces]
 
 
 def _bodies(mesh: trimesh.Trimesh, most: int) -> list[trimesh.Trimesh]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import pytest
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.files.srdf import Srdf, read_srdf
+from vkc_pin.files.srdf import Srdf, group_tip, read_groups, read_srdf
 
 LINKS = ("base", "arm", "hand")
 
@@ -58,3 +59,27 @@ def test_links_that_there_are_not(tmp_path: Path) -> None:
 def test_what_is_no_srdf(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot read the SRDF"):
         read_srdf(tmp_path / "none.srdf", links=LINKS)
+
+
+def test_groups_are_joints_or_chains(tmp_path: Path) -> None:
+    """A chain has the joints between its links, the last one first; groups of links alone are no groups of joints."""
+    chain = [("a", "base", "one"), ("b", "one", "two"), ("c", "two", "three")]
+    joints = (f'<joint name="{name}"><parent link="{above}"/><child link="{below}"/></joint>' for name, above, below in chain)
+    urdf = ElementTree.fromstring(f"<robot>{''.join(joints)}</robot>")
+    file = tmp_path / "groups.srdf"
+    file.write_text(
+        '<robot name="r"><group name="arm"><chain base_link="one" tip_link="three"/></group>'
+        '<group name="shoulder"><joint name="a"/><joint name="b"/><joint name="elsewhere"/></group>'
+        '<group name="hand"><link name="three"/></group></robot>'
+    )
+    groups = read_groups(file, urdf)
+    assert {name: (group.joints, group.tip) for name, group in groups.items()} == {
+        "arm": (("c", "b"), "three"),
+        "shoulder": (("a", "b"), "two"),
+    }
+    assert group_tip(file, urdf, "arm") == "three"
+    with pytest.raises(UnknownNameError, match="There are: arm, shoulder") as caught:
+        group_tip(file, urdf, "shouldr")
+    assert (caught.value.nearest, caught.value.file, caught.value.field) == ("shoulder", file, "arm")
+    with pytest.raises(UnknownNameError, match="there are: none"):
+        group_tip(None, urdf, "arm")

@@ -252,3 +252,27 @@ def test_height_of_the_root(tmp_path: Path) -> None:
             np.testing.assert_allclose(shape.placement.translation - other.placement.translation, [0.0, 0.0, height], atol=1e-12)
     with pytest.raises(InputError, match="height"):
         load_robot(file, height=float("nan"))
+
+
+def test_a_group_of_the_srdf_says_what_grasps(tmp_path: Path) -> None:
+    file = small_urdf(tmp_path)
+    (tmp_path / "small.srdf").write_text(
+        '<robot name="small"><group name="short"><chain base_link="l0" tip_link="l2"/></group>'
+        '<group name="whole"><joint name="j0"/><joint name="j1"/><joint name="j2"/></group></robot>'
+    )
+    short, whole = (load_robot(file, arm=arm) for arm in ("short", "whole"))
+    assert (short.tool_frame, len(short.home)) == ("l2", 2)
+    assert (whole.tool_frame, len(whole.home)) == ("l3", 3)
+    (tmp_path / "robot.yaml").write_text("urdf: small.urdf\narm: short\n")
+    assert load_robot(tmp_path).tool_frame == "l2"
+    assert load_robot(tmp_path, arm="whole").tool_frame == "l3"
+    assert load_robot(tmp_path, tool_frame="l1").tool_frame == "l1"
+    with pytest.raises(UnknownNameError, match="There are: short, whole") as caught:
+        load_robot(tmp_path, arm="shrt")
+    assert (caught.value.nearest, caught.value.field) == ("short", "arm")
+    with pytest.raises(InputError, match="both say what grasps"):
+        load_robot(tmp_path, arm="short", tool_frame="l2")
+    (tmp_path / "robot.yaml").write_text("urdf: small.urdf\ntool_frame: l3\narm: short\n")
+    with pytest.raises(InputError, match="tool_frame says what grasps, too") as both:
+        load_robot(tmp_path)
+    assert (both.value.file, both.value.line) == (tmp_path / "robot.yaml", 3)

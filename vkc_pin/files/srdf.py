@@ -1,7 +1,8 @@
-"""Reads SRDF files: pairs of links that may touch, and named configurations."""
+"""Reads SRDF files: pairs of links that may touch, named configurations, and groups of joints."""
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 from vkc_pin.errors import UnknownNameError
 from vkc_pin.files.xml import read_xml
 
-__all__ = ["Srdf", "read_srdf"]
+__all__ = ["Srdf", "SrdfGroup", "group_tip", "read_groups", "read_srdf"]
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,57 @@ class Srdf:
             if name in fitting:
                 return fitting[name]
         return next(iter(fitting.values()), {})
+
+
+@dataclass(frozen=True)
+class SrdfGroup:
+    """A group of joints.
+
+    Attributes:
+        joints: Those that it names, or that lie on its chain.
+        tip: The link at its end: that of its chain, else the one that its last joint moves.
+    """
+
+    joints: tuple[str, ...]
+    tip: str
+
+
+def read_groups(path: str | Path, urdf: ElementTree.Element) -> dict[str, SrdfGroup]:
+    """Return the groups of an SRDF that have joints, by name.
+
+    Args:
+        path: The file.
+        urdf: The robot it belongs to.
+
+    Raises:
+        InputError: It cannot be read or is no SRDF.
+    """
+    above, moved = dict[str, tuple[str, str]](), dict[str, str]()
+    for joint in urdf.findall("joint"):
+        parent, child = (
+            element.get("link", "") if (element := joint.find(key)) is not None else "" for key in ("parent", "child")
+        )
+        above[child], moved[joint.get("name", "")] = (joint.get("name", ""), parent), child
+    groups: dict[str, SrdfGroup] = {}
+    for group in read_xml(path, "SRDF")[1].findall("group"):
+        joints = [name for joint in group.findall("joint") if (name := joint.get("name", "")) in moved]
+        tip = moved[joints[-1]] if joints else ""
+        for chain in group.findall("chain"):
+            tip = below = chain.get("tip_link", "")
+            while below in above and below != chain.get("base_link"):
+                name, below = above[below]
+                joints.append(name)
+        if joints:
+            groups[group.get("name", "")] = SrdfGroup(tuple(joints), tip)
+    return groups
+
+
+def group_tip(path: Path | None, urdf: ElementTree.Element, name: str) -> str:
+    """Return the link at the end of a group of an SRDF. Raises `UnknownNameError` if there is no such group, or no SRDF."""
+    groups = {} if path is None else read_groups(path, urdf)
+    if name not in groups:
+        raise UnknownNameError("group of an SRDF", name, groups, file=path, field="arm")
+    return groups[name].tip
 
 
 def read_srdf(path: str | Path, *, links: Collection[str]) -> Srdf:

@@ -17,7 +17,7 @@ from vkc_pin.errors import InputError, UnknownNameError, shown
 from vkc_pin.files import resources
 from vkc_pin.files.documents import Document
 from vkc_pin.files.resources import file_path
-from vkc_pin.files.srdf import Srdf, read_srdf
+from vkc_pin.files.srdf import Srdf, group_tip, read_srdf
 from vkc_pin.files.urdf import UrdfFile, read_urdf
 from vkc_pin.models.coordinates import Coordinates
 from vkc_pin.models.robot import Base, Robot
@@ -86,6 +86,7 @@ def load_robot(
     *,
     base: Base = "omni",
     tool_frame: str | None = None,
+    arm: str | None = None,
     locked_joints: Mapping[str, float] | None = None,
     home: Mapping[str, float] | None = None,
     srdf: str | Path | None = None,
@@ -112,6 +113,7 @@ def load_robot(
         name: A robot in robots/, one of example-robot-data ("panda", "tiago", "ur5"), or the path of a URDF.
         base: "omni", "differential" (the planner keeps it from moving sideways) or "fixed" (its limits are 0).
         tool_frame: The frame that grasps; by default that of robot.yaml, else the last frame of the longest chain.
+        arm: A group of the SRDF, instead of `tool_frame`: the link at its end grasps.
         locked_joints: More joints to lock, and where, [m] or [rad]; joints locked anyway rest at 0 or the nearest limit.
         home: Where joints rest, [m] or [rad]; by default what robot.yaml says, else a group state of the SRDF that
             covers all planned joints (one called home if there is one), else 0, or the middle if 0 is outside the limits. Where
@@ -129,8 +131,11 @@ def load_robot(
     for value, field, choices, kind in ((base, "base", _BASES, "kind of base"), (pairs, "pairs", _PAIRS, "source of pairs")):
         if not isinstance(value, str) or value not in choices:
             raise InputError(f"wrong {kind}", field=field, expected=" or ".join(choices), got=shown(value))
-    if tool_frame is not None:
-        text(tool_frame, "tool_frame", "the name of a frame")
+    for field, given_name, kind in (("tool_frame", tool_frame, "the name of a frame"), ("arm", arm, "the name of a group")):
+        if given_name is not None:
+            text(given_name, field, kind)
+    if arm is not None and tool_frame is not None:
+        raise InputError("both say what grasps", field="arm, tool_frame", expected="one of them", got=f"{arm}, {tool_frame}")
     positions = {}
     for field, values in (("locked_joints", locked_joints), ("home", home)):
         named = mapping({} if values is None else values, field, "joints, each with its position")
@@ -143,7 +148,7 @@ def load_robot(
     semantics = read_srdf(beside, links=urdf.links) if beside is not None and pairs == "srdf" else None
 
     full = full_model(urdf)
-    tool = tool_frame if tool_frame is not None else settings.tool_frame or default_tool_frame(full, urdf)
+    tool = tool_frame if tool_frame is not None else files.tool_frame(arm, beside) or default_tool_frame(full, urdf)
     if tool not in (frames := dict.fromkeys(frame.name for frame in full.frames)):
         raise UnknownNameError("frame", tool, frames, file=urdf.path, field="tool_frame")
     replaced = own_base(full, urdf) if base != "fixed" else ()
@@ -215,6 +220,11 @@ class _Files:
         stems = (path.stem, path.stem.removesuffix("_robot"))
         places = [folder / f"{stem}.srdf" for stem in stems for folder in (path.parent, path.parent.parent / "srdf")]
         return next((place for place in places if place.is_file()), None)
+
+    def tool_frame(self, arm: str | None, srdf: Path | None) -> str | None:
+        """Return the frame that grasps, as a group of the SRDF or robot.yaml names it; None if neither does."""
+        named = self.settings.arm if arm is None else arm
+        return self.settings.tool_frame if named is None else group_tip(srdf, self.urdf.root, named)
 
     def check_names(self, joints: Collection[str]) -> None:
         """Check that the joints and links that robot.yaml names exist. Raises `UnknownNameError` if one does not."""

@@ -36,6 +36,7 @@ class RobotSchema(Schema):
     srdf: str | None = None
     packages: tuple[str, ...] = ()
     tool_frame: str | None = None
+    arm: str | None = None
     touch_links: tuple[str, ...] = ()
     base: BaseSchema = BaseSchema()
     home: dict[str, Number] = Field(default_factory=dict)
@@ -52,7 +53,10 @@ def read_robot(file: Path) -> tuple[RobotSchema, Document]:
     document = read_yaml(file)
     if not isinstance(document.data, dict):
         raise InputError("not a robot", file=file, expected="fields (name: value)", got=type(document.data).__name__)
-    return check(document, RobotSchema), document
+    settings = check(document, RobotSchema)
+    if settings.arm is not None and settings.tool_frame is not None:
+        raise document.error(("arm",), "tool_frame says what grasps, too", expected="one of them", got=settings.arm)
+    return settings, document
 
 
 def python_packages(names: tuple[str, ...], document: Document) -> dict[str, Path]:

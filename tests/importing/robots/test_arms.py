@@ -19,13 +19,13 @@ def test_both_arms_are_found_by_their_hands(tmp_path: Path) -> None:
     file = read_urdf(write_arms(tmp_path, sides=("left_", "right_")))
     arms = arms_of(file)
     assert sorted(arm.name for arm in arms) == ["left", "right"]
-    left = choose(arms, "Left", file)
+    left = choose(arms, "Left", file, {})
     assert left.joints == tuple(f"left_arm_{k}_joint" for k in range(1, 6))
     assert [finger.name for finger in left.fingers] == ["left_finger_a_joint", "left_finger_b_joint"]
     assert left.palm.links == ["left_arm_5", "left_hand"]
     assert left.sure == "sure"
     with pytest.raises(vkc.UnknownNameError) as caught:
-        choose(arms, "midle", file)
+        choose(arms, "midle", file, {})
     assert set(caught.value.choices) == {"left", "right"}
 
 
@@ -37,6 +37,12 @@ def test_groups_of_an_srdf_name_arms(tmp_path: Path) -> None:
     }
     named = find_arms(file, bodies(file), groups, {"body"})
     assert [arm.name for arm in named if arm.joints[0].startswith("left")] == ["port"]
+    groups |= {"port_and_more": ["lift", *groups["port"]], "hand": ["left_finger_a_joint"]}
+    assert choose(named, "port_and_more", file, groups).name == "port"
+    with pytest.raises(vkc.UnknownNameError, match="did you mean 'port_and_more'") as caught:
+        choose(named, "port_and_mor", file, groups)
+    assert {"port", "all", "port_and_more"} <= set(caught.value.choices)
+    assert "hand" not in caught.value.choices, "no arm"
 
 
 def test_a_base_of_its_own_is_no_part_of_the_arm(tmp_path: Path) -> None:
@@ -78,7 +84,7 @@ def test_legs_and_hands_alone_are_no_arms(pattern: str) -> None:
     file = read_urdf(robots(pattern))
     assert arms_of(file) == []
     with pytest.raises(vkc.InputError, match="no arm was found"):
-        choose([], None, file)
+        choose([], None, file, {})
 
 
 def test_wheels_say_how_the_base_moves(tmp_path: Path) -> None:

@@ -192,8 +192,8 @@ def find_arms(file: UrdfFile, root: Body, groups: Mapping[str, Sequence[str]], s
     return [arm if names.count(arm.name) == 1 else Arm(arm.palm.links[0], *_rest(arm)) for arm in found]
 
 
-def choose(arms: Sequence[Arm], name: str | None, file: UrdfFile) -> Arm:
-    """Return the arm of a name, or that contains it, or the best one.
+def choose(arms: Sequence[Arm], name: str | None, file: UrdfFile, groups: Mapping[str, Sequence[str]]) -> Arm:
+    """Return the arm of a name, or that a group of this name has the last joints of, or whose name contains it, or the best one.
 
     Raises:
         InputError: There is no arm.
@@ -204,10 +204,18 @@ def choose(arms: Sequence[Arm], name: str | None, file: UrdfFile) -> Arm:
         raise InputError("no arm was found", file=file.path, expected=expected)
     if name is None:
         return arms[0]
-    fitting = [arm for arm in arms if arm.name == name] or [arm for arm in arms if name.lower() in arm.name.lower()]
+    fitting = [arm for arm in arms if arm.name == name]
+    fitting = fitting or [arm for arm in arms if _last(arm.joints) <= set(groups.get(name, ()))]
+    fitting = fitting or [arm for arm in arms if name.lower() in arm.name.lower()]
     if not fitting:
-        raise UnknownNameError("arm", name, [arm.name for arm in arms], file=file.path, field="arm")
+        also = [group for group, joints in groups.items() if any(_last(arm.joints) <= set(joints) for arm in arms)]
+        raise UnknownNameError("arm", name, dict.fromkeys([*(arm.name for arm in arms), *also]), file=file.path, field="arm")
     return fitting[0]
+
+
+def _last(joints: Sequence[str]) -> set[str]:
+    """Return the joints by which an arm is known."""
+    return set(joints[-4:])
 
 
 def _rest(arm: Arm) -> tuple[tuple[str, ...], Body, tuple[Body, ...], str, str, float]:
@@ -234,8 +242,7 @@ def _planned(body: Body, base: Collection[str]) -> tuple[str, ...]:
 
 def _named(joints: Sequence[str], palm: Body, groups: Mapping[str, Sequence[str]]) -> str:
     """Return what an arm is called: by the smallest group that has its last joints, by its side, or by its end."""
-    last = set(joints[-4:])
-    if fitting := [name for name, members in groups.items() if last <= set(members)]:
+    if fitting := [name for name, members in groups.items() if _last(joints) <= set(members)]:
         return min(fitting, key=lambda name: (len(groups[name]), name))
     for side, pattern in _SIDES.items():
         if sum(bool(pattern.search(name)) for name in [*joints[-3:], palm.links[0]]) >= 2:

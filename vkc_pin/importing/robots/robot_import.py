@@ -86,7 +86,7 @@ def import_robot(
     Args:
         file: The file; its first element says what it is.
         folder: Where to write; by default a folder of the file's name in the current one.
-        arm: Which arm to plan: a name of `ImportedRobot.arms`, or a part of one ("left"); of groups of the SRDF if there are any.
+        arm: Which arm to plan: a name of `ImportedRobot.arms`, or a part of one ("left"), or a group of the SRDF with its joints.
         tool_frame: The frame that grasps, if it is not to be guessed; see docs/robots.md for how it has to lie.
         srdf: An SRDF; by default the one beside the file.
         packages: Folders for `package://` and `$(find ...)`; others are looked for around the file.
@@ -136,7 +136,7 @@ class _Importer:
         tree = bodies(self._file)
         driving = own_base(tree, solid)
         arms = find_arms(self._file, tree, self._source.groups, solid)
-        chosen = None if tool_frame is not None and not arms else choose(arms, arm, self._file)
+        chosen = None if tool_frame is not None and not arms else choose(arms, arm, self._file, self._source.groups)
         self._arm(chosen, arms, driving)
         root, pieces, notes = own_meshes(self._file, self._folder, most_pieces=most_pieces)
         self._findings += [Finding("warning", "shapes", note) for note in notes]

@@ -10,7 +10,7 @@ from pathlib import Path
 from vkc_pin.errors import InputError
 from vkc_pin.files.documents import read_text
 from vkc_pin.files.kinematic_tree import check_tree
-from vkc_pin.files.srdf import Srdf, read_srdf
+from vkc_pin.files.srdf import Srdf, read_groups, read_srdf
 from vkc_pin.files.urdf import UrdfFile
 from vkc_pin.files.xml import parse_xml
 from vkc_pin.importing.robots.mjcf import convert
@@ -83,7 +83,7 @@ def read_source(
     if semantics is None:
         notes.append(f"{beside.name} beside it is of another robot: it names links that are not here")
         return Source(read, kind, Srdf({}, states), {}, tuple(notes))
-    return Source(read, kind, Srdf(semantics.allowed, {**states, **semantics.states}), _groups(beside, read), tuple(notes))
+    return Source(read, kind, Srdf(semantics.allowed, {**states, **semantics.states}), _joints(beside, read), tuple(notes))
 
 
 def _completed(root: ElementTree.Element) -> list[str]:
@@ -122,21 +122,5 @@ def _fitting(path: Path, file: UrdfFile) -> Srdf | None:
         return None
 
 
-def _groups(path: Path, file: UrdfFile) -> dict[str, tuple[str, ...]]:
-    """Return the groups of an SRDF with the joints that they name, or that lie on their chains."""
-    parents = {
-        child.get("link", ""): (joint.get("name", ""), parent.get("link", ""))
-        for joint in file.root.findall("joint")
-        if (child := joint.find("child")) is not None and (parent := joint.find("parent")) is not None
-    }
-    groups: dict[str, tuple[str, ...]] = {}
-    for group in parse_xml(read_text(path, "SRDF"), path).findall("group"):
-        joints = [joint.get("name", "") for joint in group.findall("joint")]
-        for chain in group.findall("chain"):
-            link = chain.get("tip_link", "")
-            while link in parents and link != chain.get("base_link"):
-                joint, link = parents[link]
-                joints.append(joint)
-        if joints:
-            groups[group.get("name", "")] = tuple(joints)
-    return groups
+def _joints(path: Path, file: UrdfFile) -> dict[str, tuple[str, ...]]:
+    return {name: group.joints for name, group in read_groups(path, file.root).items()}

@@ -77,6 +77,13 @@ def add_bench(commands: Any) -> None:
     objects = "<kind>_<seed> of random_object, names in scenes/objects, paths, name=path#link, and the word default (29 of ten)"
     _add_choice(anything, "objects", objects)
 
+    about = "Import robots from their makers' files, and let each reach random poses that it can reach."
+    shown = "robots imported from their makers' files reach random poses"
+    robots = _add_experiment(benches, "robots", shown, about, "--goals", default=20, jobs=1, what="poses for each robot")
+    robots.set_defaults(benchmark="anything.robots")
+    choices = "names of example-robot-data, paths of URDF, xacro and MJCF files (default: all arms and mobile manipulators there)"
+    _add_choice(robots, "robots", choices)
+
     _add_problems(benches)
 
 

@@ -61,7 +61,7 @@ def own_meshes(file: UrdfFile, folder: Path, *, most_pieces: int) -> tuple[Eleme
     shapes: dict[str, list[UrdfShape]] = {}
     for shape in file.shapes("collision"):
         shapes.setdefault(shape.link, []).append(shape)
-    done: dict[tuple[Path, tuple[float, ...]], Pieces] = {}
+    done: dict[tuple[Path, tuple[float, ...]], tuple[Pieces, float]] = {}  # with the volume of the hull
     for name, link in links.items():
         elements = link.findall("collision")
         written = 0
@@ -75,15 +75,17 @@ def own_meshes(file: UrdfFile, folder: Path, *, most_pieces: int) -> tuple[Eleme
                 if key not in done:
                     mesh = load_mesh(shape.file, shape.size)
                     error = min(_WHOLE, _SHARE * float(mesh.extents.max()))
-                    done[key] = decompose(mesh, most_pieces=most_pieces, error=error, overhead=_MORE)
+                    pieces = decompose(mesh, most_pieces=most_pieces, error=error, overhead=_MORE)
+                    done[key] = pieces, float(mesh.convex_hull.volume)
             except InputError as error_:
                 if "flat" not in error_.problem:
                     raise
                 notes.append(f"{name}: {shape.file.name} is flat, and collides with nothing any more")
                 continue
-            pieces = done[key]
-            hull = float(load_mesh(shape.file, shape.size).convex_hull.volume) / pieces.solid - 1.0
-            found.append(Piece(name, shape.file.name, len(pieces.meshes), pieces.overhead, hull, pieces.error))
+            pieces, hull = done[key]
+            found.append(
+                Piece(name, shape.file.name, len(pieces.meshes), pieces.overhead, hull / pieces.solid - 1.0, pieces.error)
+            )
             for mesh in pieces.meshes:
                 path = folder / "collision" / f"{_plain(name)}_{written}.stl"
                 path.parent.mkdir(parents=True, exist_ok=True)

@@ -55,11 +55,11 @@ def test_what_fails_is_told_by_robot() -> None:
     trials = [
         {"robot": "one", **facts, "success": True, "status": "success", "planning_time": 1.0},
         {"robot": "one", **facts, "success": False, "status": "infeasible", "planning_time": 3.0, "violations": ["too deep"]},
-        {"robot": "two", **facts, "success": False, "status": "hardly free", "because": "only 1 of 9"},
+        {"robot": "two", **facts, "home_room": None, "success": False, "status": "hardly free", "because": "only 1 of 9"},
     ]
     text = report({"meta": about, "trials": trials})
     assert "| one | 6 | 7 | 4.00 | 0.50 | -4 | 1/2 | 2.00 | 2.90 |" in text
-    assert "| two | 6 | 7 | 4.00 | 0.50 | -4 | – |" in text
+    assert "| two | 6 | 7 | 4.00 | 0.50 | – | – |" in text
     assert "| one | infeasible | too deep |" in text
     assert "| two | hardly free | only 1 of 9 |" in text
 

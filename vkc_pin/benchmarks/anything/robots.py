@@ -122,7 +122,8 @@ def _row(name: str, own: Sequence[Record]) -> list[str]:
     reached = "–" if first["status"] in _NOT_IMPORTED else f"{good}/{len(own)}"
     times = map(decimal, distribution(own, "planning_time"))
     loads = (decimal(first[field]) for field in ("import_time", "load_time"))
-    return [name, str(first["joints"]), str(first["pairs"]), *loads, f"{1e3 * first['home_room']:.0f}", reached, *times]
+    room = "–" if first["home_room"] is None else f"{1e3 * first['home_room']:.0f}"  # nothing that could come close
+    return [name, str(first["joints"]), str(first["pairs"]), *loads, room, reached, *times]
 
 
 def _files(robots: Sequence[str]) -> dict[str, Path]:

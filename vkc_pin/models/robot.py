@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,8 +16,11 @@ import pinocchio as pin
 
 from vkc_pin.arguments import whole
 from vkc_pin.arrays import Floats
+from vkc_pin.errors import InputError
 from vkc_pin.files.urdf import UrdfFile
 from vkc_pin.models.coordinates import Coordinates
+from vkc_pin.models.grafting import clean
+from vkc_pin.models.hands.gripper import Gripper
 from vkc_pin.models.robot_model import visual_geometry
 from vkc_pin.models.shapes import link_name, shape_distance, triangles
 
@@ -49,6 +53,7 @@ class Robot:
         base: How the base moves: "omni" in any direction, "differential" forwards and round, "fixed" not at all.
         touch_links: The links that may touch what is grasped.
         height: Of its root link above the floor [m].
+        gripper: How its fingers open, if its description says so; otherwise they stand still.
         tight: Pairs of links, each sorted, that are never, or not at home, 50 mm apart: how far they are at most, or there [m].
     """
 
@@ -66,8 +71,10 @@ class Robot:
     base: Base
     touch_links: tuple[str, ...] = ()
     height: float = 0.0
+    gripper: Gripper | None = field(default=None, repr=False)
     tight: Mapping[tuple[str, str], float] = field(default_factory=dict, repr=False)
     file: UrdfFile = field(repr=False)
+    _opened: dict[float, Robot] = field(default_factory=dict, repr=False)
 
     @cached_property
     def visual(self) -> pin.GeometryModel:
@@ -124,6 +131,34 @@ class Robot:
             digest.update(repr((shape.name, shape.parentJoint, points.shape, faces.shape)).encode())
             digest.update(points.tobytes() + shape.placement.homogeneous.tobytes())
         return digest.hexdigest()
+
+    def opening(self, asked: float | None) -> float | None:
+        """Return how far its gripper opens, as near as it can to what is asked for [m]; None: nothing is, so that it rests."""
+        return None if asked is None or self.gripper is None else self.gripper.nearest(asked)
+
+    def opened(self, opening: float | None) -> Robot:
+        """Return the robot with its fingers locked where they are so far open [m]; None: the robot itself, with them at rest.
+
+        Pairs and margins of its links stay the same.
+
+        Raises:
+            InputError: It has no gripper that opens, or that cannot be so far open.
+        """
+        if opening is None:
+            return self
+        if self.gripper is None:
+            expected = "a `gripper` in its robot.yaml"
+            raise InputError(f"the gripper of '{self.name}' does not open", field="opening", expected=expected, got=opening)
+        if opening not in self._opened:
+            model, collision = pin.Model(self.model), self.collision.copy()
+            for name, placement in self.gripper.frames(opening).items():
+                model.frames[model.getFrameId(name)].placement = placement
+            for shape in collision.geometryObjects:
+                old, new = (there.frames[shape.parentFrame].placement for there in (self.model, model))
+                if old != new:
+                    shape.placement = clean(new * old.actInv(shape.placement))
+            self._opened[opening] = dataclasses.replace(self, model=model, collision=collision, _opened={})
+        return self._opened[opening]
 
     @property
     def start_limits(self) -> tuple[Floats, Floats]:

@@ -20,6 +20,7 @@ from vkc_pin.files.resources import file_path
 from vkc_pin.files.srdf import Srdf, group_tip, read_srdf
 from vkc_pin.files.urdf import UrdfFile, read_urdf
 from vkc_pin.models.coordinates import Coordinates
+from vkc_pin.models.hands.gripper import described_gripper
 from vkc_pin.models.robot import Base, Robot
 from vkc_pin.models.robot_model import (
     collision_geometry,
@@ -152,8 +153,9 @@ def load_robot(
     if tool not in (frames := dict.fromkeys(frame.name for frame in full.frames)):
         raise UnknownNameError("frame", tool, frames, file=urdf.path, field="tool_frame")
     replaced = own_base(full, urdf) if base != "fixed" else ()
+    fingers = {joint: finger.open for joint, finger in settings.gripper.items()}
     said = {**settings.locked_joints, **locked_joints}
-    locked = {**dict.fromkeys(replaced, 0.0), **said}
+    locked = {**fingers, **dict.fromkeys(replaced, 0.0), **said}
     given = {**settings.home, **home, **locked}
     rest = rest_positions(full, urdf, given)
     files.check_names(rest)
@@ -161,20 +163,21 @@ def load_robot(
         field = "home" if joint in home else "locked_joints"
         if joint not in rest:
             raise UnknownNameError("joint", joint, rest, file=urdf.path, field=field)
-        if joint not in replaced or joint in said:
+        if joint in said or joint not in (*replaced, *fingers):
             files.check_limits(full, joint, given[joint], field)
     if unsaid := ", ".join(joint for joint in replaced if joint not in said):
         problem = "the virtual base moves the robot; joints of its own that do are locked"
         warnings.warn(f"{urdf.path}: {problem}: {unsaid}", stacklevel=2)
-    raised = settings.base.height if raised is None else raised
+    raised, rest = settings.base.height if raised is None else raised, {**rest, **locked}
     model = planned_model(full, urdf, tool, rest, locked, height=raised)
     coordinates, lower, upper, velocity, acceleration = _limits(model, settings, base)
     state = _state(model, semantics, given)
+    collision = collision_geometry(model, urdf)
     robot = Robot(
         name=files.name,
         urdf=urdf.path,
         model=model,
-        collision=collision_geometry(model, urdf),
+        collision=collision,
         coordinates=coordinates,
         lower=lower,
         upper=upper,
@@ -185,6 +188,7 @@ def load_robot(
         base=base,
         touch_links=settings.touch_links,
         height=raised,
+        gripper=described_gripper(full, urdf, model, collision, tool, rest, settings.gripper, files.document, height=raised),
         file=urdf,
     )
     if pairs == "all":
@@ -229,8 +233,8 @@ class _Files:
     def check_names(self, joints: Collection[str]) -> None:
         """Check that the joints and links that robot.yaml names exist. Raises `UnknownNameError` if one does not."""
         settings = self.settings
-        for key, named in (("home", settings.home), ("locked_joints", settings.locked_joints), ("joints", settings.joints)):
-            for joint in named:
+        for key in ("home", "locked_joints", "gripper", "joints"):
+            for joint in getattr(settings, key):
                 if joint not in joints:
                     raise self.document.unknown((key, joint), "joint", joint, joints)
         for link in settings.touch_links:

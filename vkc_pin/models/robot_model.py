@@ -19,11 +19,13 @@ __all__ = [
     "collision_geometry",
     "default_tool_frame",
     "full_model",
+    "mimics",
     "nearest_position",
     "neighbours",
     "own_base",
     "planned_model",
     "rest_positions",
+    "unlocked_model",
     "visual_geometry",
 ]
 
@@ -70,12 +72,28 @@ def planned_model(
     named = [frame for frame in full.frames if frame.name == tool_frame]
     frame = next((frame for frame in named if frame.type == pin.FrameType.BODY), named[0])  # a link before a joint
     path = full.supports[frame.parentJoint]  # from the world on
-    fixed = {*locked, *_mimics(file.root)}
+    fixed = {*locked, *mimics(file.root)}
     planned = [j for j in path if j > 1 and full.names[j] in rest and full.names[j] not in fixed]
     if not planned:
         expected = "a frame at the end of an arm"
         raise InputError("no joint moves this frame", file=file.path, field="tool_frame", expected=expected, got=tool_frame)
     return _reduced(full, {1, *planned}, configuration(full, {**rest, **locked}), height)
+
+
+def unlocked_model(
+    full: pin.Model, model: pin.Model, joints: Collection[str], rest: Mapping[str, float], height: float
+) -> pin.Model:
+    """Return `model`, which `planned_model` made of `full`, with more `joints` that are not locked, all of them after its own.
+
+    Args:
+        full: See `full_model`.
+        model: The planned joints.
+        joints: The others.
+        rest: Where the rest is locked, [m] or [rad].
+        height: As for `planned_model` [m].
+    """
+    free = {full.getJointId(str(name)) for name in [*list(model.names)[1:], *joints]}
+    return _reduced(full, free, configuration(full, rest), height)
 
 
 def rest_positions(full: pin.Model, file: UrdfFile, given: Mapping[str, float]) -> dict[str, float]:
@@ -90,7 +108,7 @@ def rest_positions(full: pin.Model, file: UrdfFile, given: Mapping[str, float]) 
             i = full.joints[j].idx_q
             low, high = (-np.inf, np.inf) if full.joints[j].nq == 2 else (full.lowerPositionLimit[i], full.upperPositionLimit[i])
             rest[full.names[j]] = float(given.get(full.names[j], 0.0 if low <= 0.0 <= high else 0.5 * (low + high)))
-    for name, (master, factor, offset) in _mimics(file.root).items():
+    for name, (master, factor, offset) in mimics(file.root).items():
         if name in rest and master in rest and name not in given:
             rest[name] = factor * rest[master] + offset
     return rest
@@ -176,12 +194,12 @@ def configuration(model: pin.Model, positions: Mapping[str, float]) -> Floats:
 
 def default_tool_frame(full: pin.Model, file: UrdfFile) -> str:
     """Return the last frame of the longest chain of joints, before it branches into fingers."""
-    mimics = _mimics(file.root)
+    following = mimics(file.root)
     children: dict[int, list[int]] = {j: [] for j in range(full.njoints)}
     depth = np.zeros(full.njoints, int)
     for j in range(full.njoints - 1, 1, -1):
         children[full.parents[j]].insert(0, j)
-        counts = full.joints[j].nv == 1 and full.names[j] not in mimics
+        counts = full.joints[j].nv == 1 and full.names[j] not in following
         depth[full.parents[j]] = max(depth[full.parents[j]], depth[j] + counts)
     joint, above = 1, 0
     while children[joint]:
@@ -255,7 +273,7 @@ def _reduced(full: pin.Model, planned: Collection[int], q: Floats, height: float
     return model
 
 
-def _mimics(root: ElementTree.Element) -> dict[str, tuple[str, float, float]]:
+def mimics(root: ElementTree.Element) -> dict[str, tuple[str, float, float]]:
     """Return joint → (the joint it follows, factor, offset)."""
     found = {}
     for joint in root.findall("joint"):

@@ -12,7 +12,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.files.documents import Document, check, read_yaml
 from vkc_pin.files.fields import JointSchema, Number, Positive, Schema, require
 
-__all__ = ["BaseSchema", "RobotSchema", "python_packages", "read_robot"]
+__all__ = ["BaseSchema", "FingerSchema", "RobotSchema", "python_packages", "read_robot"]
 
 
 Limits = Annotated[
@@ -29,6 +29,13 @@ class BaseSchema(Schema):
     height: Number = 0.0
 
 
+class FingerSchema(Schema):
+    """A joint of a finger: where it is when the gripper is closed, and when it is fully open, [m] or [rad]."""
+
+    closed: Number
+    open: Number
+
+
 class RobotSchema(Schema):
     """A robot.yaml beside a URDF; every field but `urdf` may be left out."""
 
@@ -41,6 +48,7 @@ class RobotSchema(Schema):
     base: BaseSchema = BaseSchema()
     home: dict[str, Number] = Field(default_factory=dict)
     locked_joints: dict[str, Number] = Field(default_factory=dict)
+    gripper: dict[str, FingerSchema] = Field(default_factory=dict)
     joints: dict[str, JointSchema] = Field(default_factory=dict)
 
 

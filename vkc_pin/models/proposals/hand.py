@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import coal
@@ -10,15 +9,13 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
+from vkc_pin.models.hands.bars import THIN, widest_bar
 from vkc_pin.models.robot import Robot
 from vkc_pin.models.shapes import placed_shapes, world_box
 
 __all__ = ["Hand", "hand_of"]
 
 Placed = tuple[coal.CollisionGeometry, pin.SE3]
-_THIN = 2e-3  # [m]: how thick what is put between the fingers is, across the direction that is measured
-_WIDEST = 0.5  # [m]: no hand opens wider
-_EXACT = 1e-4  # [m]: of what is measured
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +60,8 @@ def hand_of(robot: Robot) -> Hand:
         elif frame.parentJoint in robot.model.supports[shape.parentJoint]:
             others.append(placed)
     fingers, rest = tuple(placed_shapes(touch)), tuple(placed_shapes(others))
-    opening = _largest(lambda width: _is_free(np.array([width, _THIN, _THIN]), np.zeros(3), fingers))
-    if opening < 2.0 * _THIN:
+    opening = widest_bar(fingers)
+    if opening < 2.0 * THIN:
         problem = f"there is no room between the fingers of '{robot.name}' at its tool frame '{robot.tool_frame}'"
         raise InputError(problem, field="tool_frame", expected="an open hand around its origin, x the direction of closing")
     beside = [
@@ -73,23 +70,3 @@ def hand_of(robot: Robot) -> Hand:
     ends = beside or [world_box(geometry, where) for geometry, where in fingers]
     width = max(high[1] for _, high in ends) - min(low[1] for low, _ in ends)
     return Hand(robot.name, fingers, rest, opening, max(0.0, float(max(high[2] for _, high in ends))), float(width))
-
-
-def _is_free(size: np.ndarray, centre: np.ndarray, shapes: Iterable[Placed]) -> bool:
-    """Return whether a box, in the tool frame, hits none of some shapes."""
-    box, where = coal.Box(*size), coal.Transform3s(np.eye(3), centre)
-    request, result = coal.CollisionRequest(), coal.CollisionResult()
-    for geometry, placement in shapes:
-        result.clear()
-        if coal.collide(box, where, geometry, coal.Transform3s(placement.rotation, placement.translation), request, result):
-            return False
-    return True
-
-
-def _largest(fits: Callable[[float], bool]) -> float:
-    """Return the largest size [m] that fits, 0 if none does: all below one that fits do."""
-    low, high = 0.0, _WIDEST
-    while high - low > _EXACT:
-        middle = (low + high) / 2.0
-        low, high = (middle, high) if fits(middle) else (low, middle)
-    return low

@@ -73,8 +73,8 @@ def test_yaml_examples_fit_their_schemas(tmp_path: Path) -> None:
         (tmp_path / "room.yaml").write_text(scene, encoding="utf-8")
         loaded = vkc.load_scene(tmp_path / "room.yaml")
         assert (list(loaded.objects), len(loaded.allowed)) == (objects, allowed)
-    described, rim, push, whole = blocks(ROOT / "docs/objects.md", "yaml")
-    for text, urdf in ((rim, "bowl.urdf"), (push, "drawer.urdf")):
+    described, rim, narrow, push, whole = blocks(ROOT / "docs/objects.md", "yaml")
+    for text, urdf in ((rim, "bowl.urdf"), (narrow, "drawer.urdf"), (push, "drawer.urdf")):
         assert check(Document(yaml.safe_load(text)), ObjectSchema).urdf == urdf
     (tmp_path / "hatch.yaml").write_text(whole, encoding="utf-8")
     assert vkc.load_scene(tmp_path / "hatch.yaml").objects["hatch"].object.name == "hatch"

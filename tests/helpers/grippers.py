@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import itertools
+import re
 from pathlib import Path
 from typing import Any
 
 from helpers.arm_urdf import HEIGHT, write_arms
 from vkc_pin.scene.scene import Scene
 
-__all__ = ["WIDEST", "between_cheeks", "write_gripper"]
+__all__ = ["WIDEST", "between_cheeks", "cheeky_drawer", "write_gripper"]
 
 WIDEST = 0.08  # [m] between the faces of the fingers
 _GRIPPER = "gripper:\n  finger_a_joint: {closed: 0.0, open: 0.04}\n"
@@ -39,9 +40,9 @@ def write_gripper(folder: Path, *, gripper: str = _GRIPPER, more: str = "") -> P
     before, joint, after = text.partition('<joint name="finger_b_joint"')
     body, end, rest = after.partition("</joint>")
     mimic = "<mimic joint='finger_a_joint'/>"
-    file.write_text(
-        (before + joint + body + mimic + end + rest).replace("</robot>", _FLOOR + _TOOL + "</robot>"), encoding="utf-8"
-    )
+    text = (before + joint + body + mimic + end + rest).replace("</robot>", _FLOOR + _TOOL + "</robot>")
+    seen = re.sub(r"<collision>(.*?)</collision>", r"<visual>\1</visual><collision>\1</collision>", text)
+    file.write_text(seen, encoding="utf-8")
     links = ["body", *(f"arm_{k + 1}" for k in range(5)), "hand", "finger_a", "finger_b"]
     pairs = [*itertools.pairwise(links), ("hand", "finger_b"), ("arm_5", "finger_a"), ("arm_5", "finger_b"), ("body", "arm_2")]
     near = "".join(f'<disable_collisions link1="{one}" link2="{other}" reason="Adjacent"/>' for one, other in pairs)
@@ -66,7 +67,13 @@ _DRAWER = """<robot name="drawer">
 
 
 def between_cheeks(
-    robot: Path, *, opening: Any = None, start: Any = None, gap: float = 0.06, other: tuple[float, ...] | None = None
+    robot: Path,
+    *,
+    opening: Any = None,
+    start: Any = None,
+    gap: float = 0.06,
+    other: tuple[float, ...] | None = None,
+    height: float = 1.1,
 ) -> Scene:
     """Return a scene: a drawer's handle, 20 mm thick, half way between two cheeks that are no part of it.
 
@@ -76,13 +83,14 @@ def between_cheeks(
         start: How far the gripper is open at the start [m]; None: as the robot rests.
         gap: From the middle of the handle to either cheek [m]; fingers that are fully open leave 10 mm of the default.
         other: Where another drawer stands, whose attachment says nothing.
+        height: Of the drawer [m].
     """
     plain: dict[str, Any] = {"name": "grip", "link": "front", "position": [-0.05, 0.0, 0.0]}
     plain |= {"approach": [1.0, 0.0, 0.0], "closing": [0.0, 1.0, 0.0]}
     grip = plain if opening is None else {**plain, "opening": opening}
-    drawers = [("drawer", grip, [1.2, 0.0, 1.1]), *([("other", plain, list(other))] if other else [])]
+    drawers = [("drawer", grip, [1.2, 0.0, height]), *([("other", plain, list(other))] if other else [])]
     cheeks = [
-        {"name": name, "type": "box", "size": [0.08, 0.04, 0.2], "position": [1.16, side * (gap + 0.02), 1.1]}
+        {"name": name, "type": "box", "size": [0.08, 0.04, 0.2], "position": [1.16, side * (gap + 0.02), height]}
         for name, side in (("left", 1.0), ("right", -1.0))
     ]
     document = {
@@ -96,3 +104,12 @@ def between_cheeks(
         ],
     }
     return Scene.from_document(document, robot.parent)
+
+
+def cheeky_drawer(gap: float = 0.06) -> dict[str, Any]:
+    """Return the description of a drawer without attachments whose frame has posts so far from the middle of its handle [m]."""
+    posts = "".join(
+        f'<collision><origin xyz="-0.04 {side * (gap + 0.02)} 0"/><geometry><box size="0.08 0.04 0.2"/></geometry></collision>'
+        for side in (1.0, -1.0)
+    )
+    return {"urdf": _DRAWER.replace('<link name="frame"/>', f'<link name="frame">{posts}</link>'), "attachments": []}

@@ -113,6 +113,8 @@ def test_unknown_names_in_a_description(old: str, new: str, line: int, field: st
         ("link: panel", "link: panel\n    standoff: -0.01", 7, "attachments[0].standoff"),
         ("link: panel", "link: panel\n    firm: 2", 7, "attachments[0].firm"),
         ("link: panel", "link: panel\n    clearance: -0.001", 7, "attachments[0].clearance"),
+        ("link: panel", "link: panel\n    opening: -0.001", 7, "attachments[0].opening"),
+        ("link: panel", "link: panel\n    opening: wide", 7, "attachments[0].opening"),
         ("link: panel", "link: panel\n    contact: pull", 7, "attachments[0].contact"),
         ("link: panel", "link: panel\n    contact: push\n    firm: true", 5, "attachments[0]"),
         ("link: panel", f"link: panel\n    freedoms: [{{{ALONG}}}, {{{ALONG}}}]", 5, "attachments[0]"),

@@ -92,7 +92,7 @@ def _grasp(world: World, step: dict[str, Any], end: End, far: float, turn: float
         index = world.plan.index(f"{step['object']}.{freedom}")
         values[freedom] = np.array([0.0 if index is None else end.stage.columns[row, index]])
     right, hand = end.frame(f"{step['object']}.{grasp.link}") @ grasp.tool(values), end.frame(step["by"])
-    hand = hand @ world.front if grasp.pushed else hand
+    hand = hand @ world.front(grasp.opening) if grasp.pushed else hand
     off, angle = float(np.linalg.norm(hand.at - right.at)), float(turn_between(hand.turn, right.turn)[0])
     subject = f"{step['object']}.{grasp.name}"
     found = [(subject, off - far, f"Grasp: {off:.5f} m away")] if off > far + 1e-7 else []

@@ -43,12 +43,13 @@ class Hold:
 
 @dataclass(frozen=True)
 class Phase:
-    """A stretch of the motion, from waypoint `first` to waypoint `last`."""
+    """A stretch of the motion, from waypoint `first` to waypoint `last`; `opening` of the gripper [m], or None: it rests."""
 
     name: str
     first: int
     last: int
     holds: tuple[Hold, ...]
+    opening: float | None
 
 
 @dataclass(frozen=True)
@@ -100,7 +101,9 @@ def read_plan(path: Path) -> SavedPlan:
         beside = path.resolve().parent / where["relative"]
         folder = beside if beside.is_dir() else Path(where["absolute"])
     motion = about["trajectory"]
-    phases = [Phase(p["name"], p["first"], p["last"], in_order(p["held"], p.get("by") or {})) for p in motion["phases"]]
+    holds = [in_order(p["held"], p.get("by") or {}) for p in motion["phases"]]
+    both = zip(motion["phases"], holds, strict=True)
+    phases = [Phase(p["name"], p["first"], p["last"], held, p.get("opening")) for p, held in both]
     return SavedPlan(
         scene=about["scene"],
         folder=folder,

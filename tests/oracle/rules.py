@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from .gripper import check_openings
 from .plan import Hold, Violation
 from .poses import pose, turn_between
 from .stage import Stage, World
@@ -41,6 +42,7 @@ def check_motion(world: World) -> Iterator[Violation]:
         slip = np.abs(np.cos(heading) * step[:, 1] - np.sin(heading) * step[:, 0])
         yield from _worst("slip", "base", slip - 1e-4, plan.times, "moves sideways")
     yield from _dwell(world)
+    yield from check_openings(world)
 
 
 def _worst(rule: str, subject: str, excess: np.ndarray, times: np.ndarray, detail: str) -> Iterator[Violation]:
@@ -70,17 +72,18 @@ def _dwell(world: World) -> Iterator[Violation]:
     """Where a hand closes or opens inside the motion, everything rests for `grasp_time`."""
     plan, still = world.plan, world.resting
     for one, other in zip(plan.phases, plan.phases[1:], strict=False):
-        if set(one.holds) == set(other.holds):
+        opens = one.opening != other.opening
+        if set(one.holds) == set(other.holds) and not opens:
             continue
         first = last = one.last
-        while first > 0 and still[first - 1]:
+        while first > 0 and still[first - 1] and not opens:  # fingers move from here on
             first -= 1
         while last < len(still) and still[last]:
             last += 1
         rest = plan.times[last] - plan.times[first]
         short = float(plan.options["grasp_time"] - rest)
         if short > 1e-9:
-            what = ", ".join(sorted(hold.object for hold in set(one.holds) ^ set(other.holds)))
+            what = ", ".join(sorted(hold.object for hold in set(one.holds) ^ set(other.holds))) or "gripper"
             yield Violation("dwell", what, float(plan.times[one.last]), short, f"rests for {rest:.3f} s while the hand moves")
 
 
@@ -138,7 +141,7 @@ def _push(world: World, stage: Stage, hold: Hold) -> Iterator[Violation]:
         return
     size, link = len(stage.times), stage.links[hold.object, grasp.link]
     turns, middles = np.broadcast_to(link.turn, (size, 3, 3)), np.broadcast_to(link.at, (size, 3))
-    touched = (stage.tool @ world.front @ pose((0.0, 0.0, grasp.standoff))).at  # in the world
+    touched = (stage.tool @ world.front(grasp.opening) @ pose((0.0, 0.0, grasp.standoff))).at  # in the world
     in_link = np.einsum("kji,kj->ki", turns, touched - middles)
     later = np.einsum("kij,kj->ki", turns[1:], in_link[:-1]) + middles[1:]
     into = (turns @ grasp.place.turn[0])[:-1, :, 2]
@@ -151,7 +154,7 @@ def _push(world: World, stage: Stage, hold: Hold) -> Iterator[Violation]:
 def _closure(world: World, stage: Stage, hold: Hold) -> Iterator[Violation]:
     """The tool, or what takes its place, is where the attachment has it."""
     grasp = world.things[hold.object].grasps[hold.attachment]
-    holder = stage.tool @ world.front if grasp.pushed else stage.tool
+    holder = stage.tool @ world.front(grasp.opening) if grasp.pushed else stage.tool
     if hold.by is not None:
         owner, _, link = hold.by.partition(".")
         holder = stage.links[owner, link]

@@ -10,6 +10,7 @@ from typing import Any
 import coal
 import numpy as np
 
+from .gripper import Fingers, required
 from .plan import Hold, NotJudged, Phase, SavedPlan
 from .poses import IDENTITY, Poses, orientation, pose
 from .riding import distance, riders
@@ -113,11 +114,11 @@ class World:
             return thing.slides(own)
         return next(f[1] for grasp in thing.grasps.values() for f in grasp.freedoms if f[0] == own)
 
-    @cached_property
-    def front(self) -> Poses:
-        """The hand's foremost point, in the tool's frame: as far ahead as any of its touch links reaches."""
+    def front(self, opening: float | None) -> Poses:
+        """The hand's foremost point, in the tool's frame: as far ahead as any of its touch links reaches, so far open."""
         robot, wall = self.robot, coal.Halfspace(np.array([0.0, 0.0, -1.0]), -1.0)  # all that is a metre ahead, and beyond
-        frames = robot.tree.links(robot.locked, None, sorted({robot.tool, *robot.touch}))
+        fingers = self.fingers.at(self.fingers.near(opening))
+        frames = robot.tree.links({**robot.locked, **fingers}, None, sorted({robot.tool, *robot.touch}))
         tool = frames[robot.tool].inverse()
         hand = [shape for shape in robot.tree.urdf.shapes if shape.link in robot.touch]
         gaps = [distance(shape.solid, tool @ frames[shape.link] @ shape.place, wall, IDENTITY) for shape in hand]
@@ -130,18 +131,45 @@ class World:
         bodies = [k < self.plan.robot_size or name in things for k, name in enumerate(self.plan.names)]
         return np.asarray(np.abs(np.diff(self.plan.positions[:, bodies], axis=0)).max(axis=1) < 1e-9)
 
-    def samples(self, phase: Phase) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return times, coordinates and which rows are waypoints, of a phase."""
-        plan = self.plan
+    @cached_property
+    def fingers(self) -> Fingers:
+        """The gripper."""
+        return Fingers(self.robot)
+
+    @cached_property
+    def at_first(self) -> float | None:
+        """How far it is open at the start."""
+        hold = next((hold for hold in self.held if hold.by is None), None)
+        return self.fingers.near(self.plan.scene["start"].get("opening")) if hold is None else required(self, hold)
+
+    def opened(self, number: int) -> np.ndarray:
+        """Return where the fingers' joints are at a phase's waypoints, shape (T, k): they move from the first to the second."""
+        phases, fingers = self.plan.phases, self.fingers
+        phase = phases[number]
+        here = fingers.at(phase.opening)
+        rows = np.tile([here[joint] for joint in fingers.joints], (phase.last - phase.first + 1, 1))
+        moves = bool(number) or not np.ptp(self.plan.positions[:2, : self.plan.robot_size], axis=0).any()
+        if moves:
+            before = fingers.at(phases[number - 1].opening if number else self.at_first)
+            rows[0] = [before[joint] for joint in fingers.joints]
+        return rows
+
+    def samples(self, number: int) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], np.ndarray]:
+        """Return times, coordinates, where the fingers' joints are, and which rows are waypoints, of a phase."""
+        plan, phase, fingers = self.plan, self.plan.phases[number], self.opened(number)
         z, t = plan.positions[phase.first : phase.last + 1], plan.times[phase.first : phase.last + 1]
         steps = np.abs(np.diff(z, axis=0))
         units = np.array([LENGTH if self.slides(name) else ANGLE for name in plan.names])
         ratio = np.maximum((steps / units).max(axis=1), np.linalg.norm(steps[:, :2], axis=1) / LENGTH)
+        if self.fingers.joints:
+            own = np.array([LENGTH if self.slides(joint) else ANGLE for joint in self.fingers.joints])
+            ratio = np.maximum(ratio, (np.abs(np.diff(fingers, axis=0)) / own).max(axis=1))
         counts = np.maximum(1, np.ceil(ratio - 1e-9)).astype(int)
         share = np.concatenate([k + np.arange(n) / n for k, n in enumerate(counts)] + [[len(counts)]])
         waypoints = np.arange(len(t))
         columns = np.stack([np.interp(share, waypoints, column) for column in z.T], axis=1)
-        return np.interp(share, waypoints, t), columns, np.concatenate([[0], np.cumsum(counts)])
+        hand = {name: np.interp(share, waypoints, column) for name, column in zip(self.fingers.joints, fingers.T, strict=True)}
+        return np.interp(share, waypoints, t), columns, hand, np.concatenate([[0], np.cumsum(counts)])
 
     def stages(self) -> Iterator[Stage]:
         """Yield the phases, one after the other; free objects stay where the phase before has left them."""
@@ -150,9 +178,9 @@ class World:
         robot, plan = self.robot, self.plan
         wanted = sorted({shape.link for shape in robot.tree.urdf.shapes} | {robot.tool, robot.tree.urdf.base} | self._asked())
         for number, phase in enumerate(plan.phases):
-            times, columns, rows = self.samples(phase)
+            times, columns, hand, rows = self.samples(number)
             arm = {name: columns[:, 3 + k] for k, name in enumerate(robot.arm)}
-            frames = robot.tree.links({**robot.locked, **arm}, columns[:, :3], wanted)
+            frames = robot.tree.links({**robot.locked, **hand, **arm}, columns[:, :3], wanted)
             if number == 0:
                 first = {name: frame.row(0) for name, frame in frames.items()}
                 free |= self._in_hand(first[robot.tool], free)

@@ -84,6 +84,7 @@ class Grasp:
     firm: bool
     clearance: float | None
     pushed: bool
+    opening: float | None
 
     def tool(self, values: Mapping[str, np.ndarray]) -> Poses:
         """Return the tool in the link's frame at values of the freedoms, shape (S,) each."""
@@ -120,7 +121,7 @@ class Thing:
 
 @dataclass(frozen=True)
 class Robot:
-    """A robot: `arm` are its planned joints; `exempt` pairs of links that need no check."""
+    """A robot: `arm` are its planned joints; `exempt` pairs of links that need no check; `gripper` where fingers close, open."""
 
     tree: Tree
     base: str
@@ -131,6 +132,7 @@ class Robot:
     limits: dict[str, tuple[float, float, float, float]]
     home: dict[str, float]
     exempt: set[frozenset[str]]
+    gripper: dict[str, tuple[float, float]]
 
     @cached_property
     def moved_by(self) -> dict[str, tuple[str, ...]]:
@@ -209,7 +211,8 @@ def _grasp(entry: Mapping[str, Any], free: bool, reversed_ones: Sequence[str]) -
     standoff, firm = float(entry.get("standoff", 0.0)), bool(entry.get("firm", free))
     through = through or [np.zeros(3) for _ in freedoms]
     pushed = entry.get("contact") == "push"
-    return Grasp(name, entry["link"], place, tuple(freedoms), tuple(through), standoff, firm, entry.get("clearance"), pushed)
+    own = entry.get("clearance"), pushed, entry.get("opening")
+    return Grasp(name, entry["link"], place, tuple(freedoms), tuple(through), standoff, firm, *own)
 
 
 def load_robot(item: Mapping[str, Any] | str, folder: Path, arm: list[str]) -> Robot:
@@ -243,7 +246,9 @@ def load_robot(item: Mapping[str, Any] | str, folder: Path, arm: list[str]) -> R
         said = joints.get(joint, {})
         fastest = said.get("velocity", fastest if 0.0 < fastest < 1e3 else np.pi)
         limits[joint] = (low, high, float(fastest), float(said.get("acceleration", 1.4)))
-    locked = {**own.get("home", {}), **own.get("locked_joints", {})}
+    gripper = {joint: (said["closed"], said["open"]) for joint, said in (own.get("gripper") or {}).items()}
+    wide = {joint: opened for joint, (_, opened) in gripper.items()}
+    locked = {**own.get("home", {}), **wide, **own.get("locked_joints", {})}
     rest = {}
     for joint in (name for name in urdf.joints if urdf.moves(name) and name not in arm):
         low, high, _ = urdf.limits(joint)
@@ -251,6 +256,10 @@ def load_robot(item: Mapping[str, Any] | str, folder: Path, arm: list[str]) -> R
     for joint in rest:
         if (mimic := urdf.mimics(joint)) is not None and joint not in locked and mimic[0] in rest:
             rest[joint] = mimic[1] * rest[mimic[0]] + mimic[2]
+    for joint, (master, factor, offset) in ((joint, urdf.mimics(joint) or ("", 0.0, 0.0)) for joint in rest):
+        if master in gripper:
+            closed, opened = (factor * end + offset for end in gripper[master])
+            gripper[joint] = (closed, opened)
     return Robot(
         tree=Tree(urdf, drives=True),
         base=about.get("base", "omni"),
@@ -261,6 +270,7 @@ def load_robot(item: Mapping[str, Any] | str, folder: Path, arm: list[str]) -> R
         limits=limits,
         home={**_home(semantics, arm), **{joint: value for joint, value in own.get("home", {}).items() if joint in arm}},
         exempt={frozenset((pair.get("link1", ""), pair.get("link2", ""))) for pair in semantics.findall("disable_collisions")},
+        gripper=gripper,
     )
 
 

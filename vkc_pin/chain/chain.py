@@ -160,6 +160,15 @@ class VirtualKinematicChain:
         moved = turned + np.cross(about, point[:, None] - translations[:, owner][which])
         return np.asarray((moved * self.carries[joint][:, owner, None]).swapaxes(1, 2))
 
+    def opened(self, opening: float | None) -> pin.GeometryModel:
+        """Return its collision geometry with the robot's gripper so far open [m]; None: as the robot rests."""
+        if opening is None:
+            return self.collision
+        geometry = self.collision.copy()
+        for k, shape in enumerate(self.robot.opened(opening).collision.geometryObjects):
+            geometry.geometryObjects[k].placement = shape.placement
+        return geometry
+
     def index(self, name: str) -> int:
         """Return the position of coordinate `name` in z. Raises `UnknownNameError` if there is none."""
         if name not in self.names:

@@ -61,7 +61,8 @@ class _Pairing:
     def phase(self, number: int) -> PhaseGeometry:
         phase, scene, chain = self.task.phases[number], self.scene, self.chain
         holds = {hold.object: hold for hold in phase.held}
-        shapes, labels = list(chain.collision.geometryObjects), list(self._labels)
+        shapes, labels = list(chain.opened(phase.opening).geometryObjects), list(self._labels)
+        of_chain = self._boxes[0] if phase.opening is None else _boxes(shapes)
         robots, own, margin = range(len(scene.robot.collision.geometryObjects)), len(shapes), self.options.dist_safe
         pairs = [(*pair, own_margin) for pair, own_margin in scene.robot.own_margins(self.options.self_distance).items()]
         moving, mine = list(robots), dict[str, tuple[int, ...]]()
@@ -108,7 +109,7 @@ class _Pairing:
         if not len(table):
             expected = "collision geometry in robot or scene"
             raise InputError("no pair of geometries can collide", field=phase.name, expected=expected)
-        boxes = zip(self._boxes[0], _boxes(shapes[own:]), self._boxes[1], strict=True)
+        boxes = zip(of_chain, _boxes(shapes[own:]), self._boxes[1], strict=True)
         center, half, rotation, translation = (np.concatenate(parts) for parts in boxes)
         shapes += self._obstacles
         part = PhaseGeometry(

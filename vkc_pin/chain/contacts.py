@@ -101,18 +101,21 @@ class ContactModel:
     def __init__(self, scene: Scene, chain: VirtualKinematicChain, task: Task, options: Options) -> None:
         self.scene, self.chain, self.task = scene, chain, task
         self.first_waypoint = np.concatenate([[0], np.cumsum([phase.segments for phase in task.phases])])
-        self._placed = ShapePlacements(chain.model, chain.collision)
+        openings = dict.fromkeys(phase.opening for phase in task.phases)
+        placed = {opening: ShapePlacements(chain.model, chain.opened(opening)) for opening in openings}
         self.phases = phase_geometries(scene, chain, task, options)
-        self._clearances = [self._clearances_of(part) for part in self.phases]
+        self._clearances = [
+            self._clearances_of(part, placed[phase.opening]) for part, phase in zip(self.phases, task.phases, strict=True)
+        ]
         # Beyond the chain's own geometries everything stands in the world.
         own = [shape.parentJoint for shape in chain.collision.geometryObjects]
         self._joints = np.array(own + [0] * (max(len(part.labels) for part in self.phases) - len(own)))
 
-    def _clearances_of(self, part: PhaseGeometry) -> Clearances:
+    def _clearances_of(self, part: PhaseGeometry, placed: ShapePlacements) -> Clearances:
         moving = len(self.chain.collision.geometryObjects)
         standing = [shape.placement for shape in part.shapes[moving:]]
         shapes = Shapes([shape.geometry for shape in part.shapes], standing, tolerance=_TOLERANCE)
-        return Clearances(self._placed, part.boxes, shapes, part.margin_table)
+        return Clearances(placed, part.boxes, shapes, part.margin_table)
 
     def settled(self, z: Floats) -> ContactModel:
         """Return the same, where what the motion z_1..z_N, shape (N, n), leaves behind stands where that motion leaves it.
@@ -226,7 +229,7 @@ class ContactModel:
         found, phase_of = np.empty((len(z), 3)), self.phases_of(waypoints)
         for number in set(phase_of.tolist()):
             inside = np.flatnonzero(phase_of == number)
-            where = self._placed.at(self.chain.coordinates.q(z[inside]))
+            where = self._clearances[number].placements.at(self.chain.coordinates.q(z[inside]))
             found[inside] = self._clearances[number].shapes.witnesses(where, np.arange(len(inside)), pairs[inside]).normal
         return found
 

@@ -77,6 +77,7 @@ class Attachment:
         standoff: How far before the joint's centre the tool stops, along its approach [m].
         firm: Whether the hand clamps: v is chosen when grasping, and stays while the object is held.
         clearance: What the hand keeps from the object's links near the grasp [m]; None: `Options.grasp_clearance`.
+        opening: How far the gripper is open on the way to it and while it holds on [m]; None: as the robot rests, fully open.
         contact: "grasp": the hand closes on it, and moves it any way. "push": the hand's foremost point is where the tool frame
             would be, against a face whose inward normal is `placement`'s z axis, and moves it that way only.
     """
@@ -89,6 +90,7 @@ class Attachment:
     standoff: float = 0.0
     firm: bool = False
     clearance: float | None = None
+    opening: float | None = None
     contact: str = "grasp"
 
     @property

@@ -80,6 +80,7 @@ class AttachmentSchema(Schema):
     freedoms: tuple[FreedomSchema, ...] = ()
     firm: bool | None = None  # not stated: as the object is free or not
     clearance: NotNegative | None = None
+    opening: NotNegative | None = None
     contact: Literal["grasp", "push"] = "grasp"
 
     @model_validator(mode="after")
@@ -232,6 +233,7 @@ def _attachment(item: AttachmentSchema, *, firm: bool) -> Attachment:
         standoff=item.standoff,
         firm=firm if item.firm is None else item.firm,
         clearance=item.clearance,
+        opening=item.opening,
         contact=item.contact,
     )
 

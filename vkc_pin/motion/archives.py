@@ -79,6 +79,7 @@ class _Phase(Schema):
     last: Count
     held: Named
     by: Named = Field(default_factory=dict)
+    opening: Measured | None = None
 
 
 class _Motion(Schema):

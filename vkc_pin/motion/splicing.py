@@ -42,7 +42,7 @@ def join(parts: Sequence[Trajectory], *, pause: float) -> Trajectory:
                 raise InputError("a motion does not begin where the one before it ends", field=where, got=f"{apart:g} apart")
             before, after = phases[-1], part.phases[0]
             shift = len(rows) - 1
-            if set(before.holds) != set(after.holds):
+            if set(before.holds) != set(after.holds) or before.opening != after.opening:
                 rows.append(values[0])
                 times.append(start + pause)
                 start, shift = start + pause, shift + 1

@@ -43,6 +43,7 @@ LARGEST_MOTION = 20_000_000
 MOST_LINES, MOST_COLUMNS = 200_000, 1000
 """Most lines and columns of a table."""
 _TIME, _PHASES = "time", ("phase", "phase_name", "held")  # the first column of a table, and the last ones
+_OPENING = "opening"  # after these, where a gripper opens
 
 
 def write_csv(
@@ -51,8 +52,9 @@ def write_csv(
     """Write a table, a line a waypoint, whole or not at all; return the path.
 
     The first line names the columns, with units in brackets where they are known: `time [s]`, `base_x [m]`, `base_y [m]`,
-    `base_yaw [rad]`, the arm's joints, the objects' joints, then `phase` (counted from 1), `phase_name` and `held`, as JSON. A
-    waypoint between two phases is in the earlier one. Numbers have as many digits as it takes to read back the very same.
+    `base_yaw [rad]`, the arm's joints, the objects' joints, then `phase` (counted from 1), `phase_name` and `held`, as JSON, and
+    `opening [m]` of the gripper if a phase says what it is, empty where it rests. A waypoint between two phases is in the earlier
+    one. Numbers have as many digits as it takes to read back the very same.
 
     Args:
         motion: What to write.
@@ -71,14 +73,17 @@ def write_csv(
     lines: list[str] = []
     table = csv.writer(SimpleNamespace(write=lines.append))  # its lines end with "\r\n", so it puts either of them in quotes
     names = [motion["names"][k] for k in columns]
-    table.writerow([f"{_TIME} [s]", *(f"{name} [{known[name]}]" if name in known else name for name in names), *_PHASES])
+    opens = [f"{_OPENING} [m]"] if any(phase.get(_OPENING) is not None for phase in phases) else []
+    named = [f"{name} [{known[name]}]" if name in known else name for name in names]
+    table.writerow([f"{_TIME} [s]", *named, *_PHASES, *opens])
     number = 0
     for k, (moment, row) in enumerate(zip(motion["times"], motion["positions"], strict=True)):
         number += k > phases[number]["last"]
         phase = phases[number]
         held = {name: [at, phase["by"][name]] if name in phase["by"] else at for name, at in phase["held"].items()}
         values = [repr(float(row[column])) for column in columns]
-        table.writerow([repr(float(moment)), *values, number + 1, phase["name"], json.dumps(held)])
+        opening = "" if phase.get(_OPENING) is None else repr(float(phase[_OPENING]))
+        table.writerow([repr(float(moment)), *values, number + 1, phase["name"], json.dumps(held), *([opening] if opens else [])])
     return write_atomically(path, "".join(line.removesuffix("\r\n") + "\n" for line in lines).encode("utf-8"))
 
 
@@ -107,8 +112,10 @@ def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, An
         raise InputError(
             "not a table of waypoints", file=path, line=1, field="first column", expected=_TIME, got=shown(header[0])
         )
-    told = tuple(header[-3:]) == _PHASES
-    names = header[1 : -3 if told else None]
+    opens = tuple(header[-4:]) == (*_PHASES, _OPENING)
+    told = opens or tuple(header[-3:]) == _PHASES
+    last = len(header) - (len(_PHASES) + opens if told else 0)
+    names = header[1:last]
     rows: list[list[float]] = []
     phases: list[dict[str, Any]] = []
     for number, cells in lines:
@@ -118,7 +125,8 @@ def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, An
             raise InputError("wrong number of columns", file=path, line=number, expected=len(header), got=len(cells))
         rows.append([_number(cell, path, number, name) for cell, name in zip(cells, [_TIME, *names], strict=False)])
         if told:
-            _add_phase(phases, cells[-3:], len(rows) - 1, path, number)
+            opening = _number(cells[-1], path, number, _OPENING) if opens and cells[-1] else None
+            _add_phase(phases, cells[last : last + 3], opening, len(rows) - 1, path, number)
     if not told and len(rows) > 1:
         phases = [one_phase(len(rows))]
     return {
@@ -197,8 +205,10 @@ def _number(cell: str, path: Path, line: int, column: str) -> float:
     return value
 
 
-def _add_phase(phases: list[dict[str, Any]], cells: Sequence[str], row: int, path: Path, line: int) -> None:
-    """Take the last cells of a line: the phase's number, its name, and what is held in it."""
+def _add_phase(
+    phases: list[dict[str, Any]], cells: Sequence[str], opening: float | None, row: int, path: Path, line: int
+) -> None:
+    """Take the last cells of a line: the phase's number, its name, what is held in it, and the gripper's opening [m]."""
     number, name, held = cells
     expected = f"{len(phases)} or {len(phases) + 1}" if phases else "1"
     if number not in expected.split(" or "):
@@ -213,4 +223,5 @@ def _add_phase(phases: list[dict[str, Any]], cells: Sequence[str], row: int, pat
     except (ValueError, AttributeError, TypeError, LookupError, RecursionError):
         wanted = 'JSON such as {"door": "handle"}'
         raise InputError("not what is held", file=path, line=line, field="held", expected=wanted, got=shown(held)) from None
-    phases.append({"name": name, "first": max(row - 1, 0), "last": row, "held": at, "by": by})
+    stands = {} if opening is None else {_OPENING: opening}
+    phases.append({"name": name, "first": max(row - 1, 0), "last": row, "held": at, "by": by, **stands})

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vkc_pin.arguments import instance, items, known, mapping, numbers, text, whole
+from vkc_pin.arguments import instance, items, known, mapping, number, numbers, text, whole
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
 from vkc_pin.motion import ros, tables
@@ -28,21 +28,26 @@ class PhaseSpan:
         name: What happens in it, e.g. "reach door.handle".
         first, last: Its waypoints; `last` is the next phase's `first`.
         holds: All that is held in it, each hold after the one it depends on.
+        opening: How far the gripper is open in it [m]; None: as the robot rests. If it was otherwise in the phase before, the
+            fingers move from the first waypoint to the second.
 
     Raises:
-        InputError: Something is held through what is not.
+        InputError: Something is held through what is not, or an opening is none.
     """
 
     name: str
     first: int
     last: int
     holds: tuple[Hold, ...] = ()
+    opening: float | None = None
 
     def __post_init__(self) -> None:
         text(self.name, "PhaseSpan.name")
         for name in ("first", "last"):
             object.__setattr__(self, name, whole(getattr(self, name), f"PhaseSpan.{name}", low=0))
         object.__setattr__(self, "holds", in_order(self.holds))
+        if self.opening is not None:
+            object.__setattr__(self, "opening", number(self.opening, "PhaseSpan.opening", "a distance [m]", low=0.0, high=1.0))
 
     @property
     def held(self) -> dict[str, str]:
@@ -52,7 +57,8 @@ class PhaseSpan:
     def to_dict(self) -> dict[str, Any]:
         """Return plain data of it; `by` names the link, "<object>.<link>", for what is held through another object."""
         by = {hold.object: hold.frame for hold in self.holds if hold.by}
-        return {"name": self.name, "first": self.first, "last": self.last, "held": self.held, "by": by}
+        data = {"name": self.name, "first": self.first, "last": self.last, "held": self.held, "by": by}
+        return data if self.opening is None else {**data, "opening": self.opening}
 
 
 @dataclass(frozen=True)
@@ -190,10 +196,11 @@ class Trajectory:
         if not isinstance(data, Mapping):
             raise InputError("not a trajectory", expected="an object", got=type(data).__name__)
         listed: tuple[Any, ...] = items(_part(data, "phases"), "phases", "a list of phases")
-        for number, item in enumerate(listed):
-            phase = mapping(item, f"phases[{number}]")
+        for k, item in enumerate(listed):
+            phase = mapping(item, f"phases[{k}]")
             held = holds_of(_part(phase, "held"), phase.get("by"))
-            phases.append(PhaseSpan(_part(phase, "name"), _part(phase, "first"), _part(phase, "last"), held))
+            name, first, last = (_part(phase, key) for key in ("name", "first", "last"))
+            phases.append(PhaseSpan(name, first, last, held, phase.get("opening")))
         names, times, positions, size = (_part(data, key) for key in ("names", "times", "positions", "robot_size"))
         return cls(names, times, positions, tuple(phases), size)
 

@@ -1,7 +1,7 @@
 """The scene as one plain tree, nothing inverted: robot and objects side by side, rooted in the world.
 
 Validation, pictures and plots use it; being built without the chain, it can catch the chain's mistakes. A free object has
-a free joint, where `carrying` has it: it moves rigidly with what holds it or what it stands on.
+a free joint, where `carrying` has it: it moves rigidly with what holds it or what it stands on. Fingers that open are joints.
 """
 
 from __future__ import annotations
@@ -17,9 +17,11 @@ from numpy.typing import ArrayLike
 from vkc_pin.arrays import Floats
 from vkc_pin.models.coordinates import Coordinates
 from vkc_pin.models.grafting import graft, graft_geometry
+from vkc_pin.models.hands.gripper import Gripper
 from vkc_pin.models.shapes import link_name
 from vkc_pin.motion.carrying import FreeObjects, as_numbers
 from vkc_pin.motion.trajectory import Trajectory
+from vkc_pin.scene.contact import opening_at_start
 from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.scene import Scene
 
@@ -33,8 +35,8 @@ class World:
     """A scene's robot, objects and obstacles in one `pinocchio.Model`.
 
     Attributes:
-        model: Robot (joint 1 is the planar base), then every object's own tree; joints of objects are `<object>.<joint>`,
-            the free joint of one that can be carried `<object>.placement`, frames `<object>.<link>`.
+        model: Robot (joint 1 is the planar base, fingers come last), then every object's own tree; joints of objects are
+            `<object>.<joint>`, the free joint of one that can be carried `<object>.placement`, frames `<object>.<link>`.
         coordinates: Its minimal coordinates, n of them: the robot's, then the objects'.
         bodies: Collision geometry of robot and objects.
         shapes: These shapes, then those of the obstacles, which stand in the world (parent joint 0).
@@ -47,7 +49,8 @@ class World:
     def __init__(self, scene: Scene) -> None:
         robot = scene.robot
         self.scene = scene
-        self.model = pin.Model(robot.model)
+        self.model = pin.Model(robot.model if robot.gripper is None else robot.gripper.model)
+        self._robot_joints = int(self.model.njoints)
         self._joints: dict[str, list[int]] = {}
         for name, placed in scene.objects.items():
             parent, placement = 0, placed.placement
@@ -64,7 +67,8 @@ class World:
             np.concatenate([as_numbers(placed.placement) if placed.object.free else [], placed.state])
             for placed in scene.objects.values()
         ]
-        self.start: Floats = np.concatenate([np.asarray(scene.start), *states])
+        fingers = np.zeros(0) if robot.gripper is None else robot.gripper.positions(opening_at_start(scene))
+        self.start: Floats = np.concatenate([np.asarray(scene.start), fingers, *states])
 
     @cached_property
     def collision(self) -> pin.GeometryModel:
@@ -97,8 +101,10 @@ class World:
 
     def _geometry(self, robot: pin.GeometryModel, objects: Mapping[str, pin.GeometryModel]) -> pin.GeometryModel:
         """Return the shapes of robot and objects, in this order."""
-        geometry, here = pin.GeometryModel(), pin.SE3.Identity()
-        graft_geometry(geometry, robot.geometryObjects, joints=list(range(self.scene.robot.model.njoints)), placement=here)
+        geometry, here, gripper = pin.GeometryModel(), pin.SE3.Identity(), self.scene.robot.gripper
+        own = list(robot.geometryObjects)
+        own = own if gripper is None else gripper.carried(own, self.scene.robot.model)
+        graft_geometry(geometry, own, joints=list(range(self._robot_joints)), placement=here)
         for name, source in objects.items():
             placed = self.scene.objects[name]
             where = here if placed.object.free else placed.placement
@@ -123,6 +129,10 @@ class World:
         free = FreeObjects(self.scene, trajectory) if free is None else free
         for name, placements in free.at(times).items():
             rows[:, self.placement_columns(name)] = placements
+        gripper = self.scene.robot.gripper
+        if gripper is not None:
+            first = len(self.scene.start)
+            rows[:, first : first + len(gripper.names)] = _fingers(gripper, opening_at_start(self.scene), trajectory, times)
         return rows
 
     def joints_of(self, name: str) -> list[int]:
@@ -139,6 +149,24 @@ class World:
         """Return which of the coordinates are the placement of a free object."""
         first = self.coordinates.index(f"{name}.{FREE_JOINT}_x")
         return slice(first, first + 7)
+
+
+def _fingers(gripper: Gripper, start: float | None, trajectory: Trajectory, times: Floats) -> Floats:
+    """Return where a gripper's fingers are along a motion, shape (K, k), [m] or [rad].
+
+    They move from one phase's opening to the next one's between the first two waypoints of that. They are at the first opening
+    from the start, unless the robot stands still there.
+    """
+    before, moments, values = gripper.positions(start), list[float](), list[Floats]()
+    robot = trajectory.positions[:, : trajectory.robot_size]
+    for number, phase in enumerate(trajectory.phases):
+        here = gripper.positions(phase.opening)
+        begin, then, end = (float(trajectory.times[k]) for k in (phase.first, phase.first + 1, phase.last))
+        still = number > 0 or np.array_equal(robot[0], robot[1])
+        moments += [begin, then, end]
+        values += [before if still else here, here, here]
+        before = here
+    return np.column_stack([np.interp(times, moments, column) for column in np.array(values).T])
 
 
 def scene_after(scene: Scene, trajectory: Trajectory, holds: Sequence[Hold]) -> Scene:
@@ -173,7 +201,7 @@ def scene_after(scene: Scene, trajectory: Trajectory, holds: Sequence[Hold]) -> 
         freedoms = zip(attachment.coordinates, attachment.freedoms, strict=True)
         at = tuple(end(f"{hold.object}.{name}", freedom.lower, freedom.upper) for name, freedom in freedoms)
         held.append(dataclasses.replace(hold, at=at))
-    return after.with_held(held)
+    return dataclasses.replace(after.with_held(held), opening=trajectory.phases[-1].opening)
 
 
 def units_of(scene: Scene) -> dict[str, str]:

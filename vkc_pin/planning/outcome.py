@@ -14,6 +14,7 @@ from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.settings import Settings
+from vkc_pin.scene.contact import opening_at_start
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.steps import Step
 from vkc_pin.task.terms import Term
@@ -173,5 +174,5 @@ def still(scene: Scene, options: Options) -> Trajectory:
         names = scene.objects[hold.object].object.attachment(hold.attachment).coordinates
         values |= {f"{hold.object}.{name}": value for name, value in zip(names, hold.at, strict=True)}
     row = list(values.values())
-    phases = (PhaseSpan("stand", 0, 1, scene.holds),)
+    phases = (PhaseSpan("stand", 0, 1, scene.holds, opening_at_start(scene)),)
     return Trajectory(tuple(values), np.array([0.0, options.dt]), np.array([row, row]), phases, len(scene.start))

@@ -13,11 +13,14 @@
   keep no clearance until their joints have taken them so far apart, and overlap only if they did there; see `neighbours`.
 - What a free object stands in where it is lifted for the first time, it may leave within `EASED_TIME`.
 - What the scene allows keeps the margin that the scene says, or none; see `Scene.allowed`.
+
+The gripper is as far open as the attachment says that it holds, or comes to next; it opens and closes where something is grasped
+or let go, and before the motion. Afterwards it stays as it is.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 
 import pinocchio as pin
 
@@ -28,7 +31,18 @@ from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.neighbours import CONTACT
 from vkc_pin.scene.scene import Scene
 
-__all__ = ["CONTACT", "EASED_TIME", "grasped", "hand_clearance", "hand_frame", "moves_as_one", "touching"]
+__all__ = [
+    "CONTACT",
+    "EASED_TIME",
+    "grasped",
+    "hand_clearance",
+    "hand_frame",
+    "in_gripper",
+    "moves_as_one",
+    "opening_at_start",
+    "opening_for",
+    "touching",
+]
 
 EASED_TIME = 1.0
 """For how long before and after a contact shapes may be close; at `Options.dt` a waypoint [s]."""
@@ -61,10 +75,26 @@ def hand_clearance(scene: Scene, hold: Hold, link: str, options: Options) -> flo
 
 def hand_frame(robot: Robot, attachment: Attachment) -> pin.SE3:
     """Return what of the hand is brought to an attachment, in the tool frame: that itself, or the foremost point that pushes."""
-    return robot.front if attachment.contact == "push" else pin.SE3.Identity()
+    return robot.opened(robot.opening(attachment.opening)).front if attachment.contact == "push" else pin.SE3.Identity()
 
 
 def moves_as_one(scene: Scene, hold: Hold) -> bool:
     """Return whether what holds does not move relative to what is grasped while it is held."""
     attachment = scene.objects[hold.object].object.attachments[hold.attachment]
     return attachment.contact != "push" and (attachment.firm or not attachment.freedoms)
+
+
+def in_gripper(holds: Iterable[Hold]) -> Hold | None:
+    """Return what the gripper itself holds; what is held through that does not matter to it."""
+    return next((hold for hold in holds if hold.by is None), None)
+
+
+def opening_for(scene: Scene, hold: Hold) -> float | None:
+    """Return how far the robot's gripper is open when it takes, or has, what it holds [m]; None: as at rest."""
+    return scene.robot.opening(scene.objects[hold.object].object.attachments[hold.attachment].opening)
+
+
+def opening_at_start(scene: Scene) -> float | None:
+    """Return how far the gripper is open at a scene's start [m]; None: as at rest."""
+    hold = in_gripper(scene.holds)
+    return scene.robot.opening(scene.opening) if hold is None else opening_for(scene, hold)

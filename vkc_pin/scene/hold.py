@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
@@ -18,12 +19,13 @@ from vkc_pin.models.robot import Robot
 from vkc_pin.models.shapes import clearance, placed_shapes, within_limits
 from vkc_pin.scene.placed import PlacedObject, standing_geometry
 
-__all__ = ["Hold", "Solids", "checked_holds", "holds_of", "in_hand", "in_order", "misdirected"]
+__all__ = ["Hold", "Solids", "checked_holds", "holds_of", "in_hand", "in_order", "misdirected", "warn_of_openings"]
 
 Solids = Sequence[tuple[coal.CollisionGeometry, pin.SE3]]
 """Shapes, each with where it is."""
 
 _DEEP = 0.01  # [m] of a hand in an object, or in the floor, that is no matter of how far it is open
+_ROUNDING = 2e-4  # [m] of an opening, which is measured less exactly than it is written
 _WAY = (0.0, 0.04, 0.08)  # [m] before the grasp where a hand is looked at
 MOST_HELD = 50
 """So many things may be held at once: they are followed one through the other."""
@@ -173,12 +175,16 @@ def misdirected(objects: Mapping[str, PlacedObject], holds: Iterable[Hold], robo
     Args:
         objects: All, where they stand.
         holds: What is to be held, where and through what.
-        robot: Whose hand it is, open as at home.
+        robot: Whose hand it is, as far open as the attachment says.
         floor: The floor, if there is one.
     """
-    found, own = list[Hold](), _hand(robot)
+    found, hands = list[Hold](), dict[float | None, Solids]()
     for hold in holds:
-        placed, hand = objects[hold.object], own
+        placed = objects[hold.object]
+        opening = robot.opening(placed.object.attachment(hold.attachment).opening)
+        if opening not in hands:
+            hands[opening] = _hand(robot.opened(opening))
+        hand = hands[opening]
         if hold.by is not None and hold.link is not None:
             holder = objects[hold.by.object]
             back = holder.link_placement(hold.link).inverse()
@@ -189,6 +195,32 @@ def misdirected(objects: Mapping[str, PlacedObject], holds: Iterable[Hold], robo
         if _free(placed.with_reversed(hold.attachment), hold.attachment, hand, solids):
             found.append(hold)
     return found
+
+
+def warn_of_openings(objects: Mapping[str, PlacedObject], robot: Robot, start: float | None, where: str) -> None:
+    """Warn of openings that a robot's gripper cannot stand at: it stands as near to them as it can.
+
+    Args:
+        objects: Whose attachments say how far the hand is open.
+        robot: Whose gripper it is.
+        start: How far it is open at the start [m]; None: nobody says so.
+        where: What the warning begins with.
+    """
+    asked = {} if start is None else {"the start": start}
+    for name, placed in objects.items():
+        own = placed.object.attachments.values()
+        asked |= {f"{name}.{one.name}": one.opening for one in own if one.opening is not None}
+    said = ", ".join(f"{what} {1e3 * opening:g} mm" for what, opening in asked.items())
+    if robot.gripper is None and asked:
+        hint = "it stays as it rests; `gripper` in its robot.yaml says how it opens"
+        warnings.warn(f"{where}: the gripper of '{robot.name}' does not open as asked for ({said}): {hint}", stacklevel=4)
+    elif robot.gripper is not None:
+        least, most = robot.gripper.narrowest, robot.gripper.widest
+        beyond = {what: opening for what, opening in asked.items() if abs(robot.gripper.nearest(opening) - opening) > _ROUNDING}
+        for what, opening in beyond.items():
+            can, nearest = f"{1e3 * least:.1f} to {1e3 * most:.1f} mm", 1e3 * robot.gripper.nearest(opening)
+            text = f"the gripper of '{robot.name}' opens from {can}, not {1e3 * opening:g} mm as asked for {what}"
+            warnings.warn(f"{where}: {text}: it opens to {nearest:.1f} mm", stacklevel=4)
 
 
 def _free(placed: PlacedObject, attachment: str, hand: Solids, solids: Solids) -> bool:

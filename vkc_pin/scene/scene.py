@@ -21,7 +21,7 @@ from vkc_pin.errors import InputError, shown
 from vkc_pin.files.resources import file_path, located
 from vkc_pin.models.shapes import clearance, placed_shapes, within_limits
 from vkc_pin.notebook import show
-from vkc_pin.scene.hold import Hold, checked_holds, holds_of, in_hand, misdirected
+from vkc_pin.scene.hold import Hold, checked_holds, holds_of, in_hand, misdirected, warn_of_openings
 from vkc_pin.scene.neighbours import warn_of_overlaps
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.placed import PlacedObject, standing_geometry
@@ -59,6 +59,7 @@ class Scene:
         start_region: Where `sample_start` draws from, if the scene says so.
         holds: What the robot holds at the start, each hold after the one it depends on.
         allowed: Pairs of links, by label, that may be close, and what they must keep: a margin [m], or -inf if nothing.
+        opening: How far the gripper is open at the start, unless it holds something [m]; None: as the robot rests.
         described: What it was made of; `document` takes from it what cannot be told from the rest: robot, obstacles, files.
         memory: What was found out about it and serves what the `with_` methods return; makes no difference to anything but time.
     """
@@ -79,6 +80,7 @@ class Scene:
     holds: tuple[Hold, ...]
     allowed: Mapping[frozenset[str], float]
     described: SceneSchema
+    opening: float | None = None
     memory: dict[Any, Any] = dataclasses.field(default_factory=dict, init=False, repr=False)
 
     def __repr__(self) -> str:
@@ -234,7 +236,7 @@ class Scene:
         if not is_number(reach) or reach != reach:
             raise InputError("not a number", field="reach", expected="a distance [m]", got=shown(reach))
         reach = float(min(reach, 1e300))
-        model, geometry = self.robot.model, self.robot.collision
+        model, geometry = self.robot.model, self.robot.opened(self.robot.opening(self.opening)).collision
         data, shapes = model.createData(), geometry.createData()
         pin.updateGeometryPlacements(model, data, geometry, shapes, self.robot.coordinates.q(self.start))
         moving = [(shape.geometry, where) for shape, where in zip(geometry.geometryObjects, shapes.oMg, strict=True)]
@@ -293,5 +295,6 @@ def load_scene(name_or_path: str | Path) -> Scene:
 def _checked(scene: Scene) -> Scene:
     """Return a scene that was made of a description; warn of what that may not have meant."""
     warn_of_overlaps(scene, str(scene.file or scene.name))
+    warn_of_openings(scene.objects, scene.robot, scene.opening, str(scene.file or scene.name))
     loose = ((name, placed.object.attachments) for name, placed in scene.objects.items() if name not in scene.held)
     return scene.with_approaches((Hold(name, one) for name, attachments in loose for one in attachments), stacklevel=4)

@@ -71,6 +71,7 @@ def scene_fields(document: Document, folder: Path) -> dict[str, Any]:
         "holds": _holds(document, description.start.held, objects),
         "allowed": MappingProxyType(_allowed(document, description, folder, robot, objects)),
         "described": description,
+        "opening": description.start.opening,
     }
 
 
@@ -107,6 +108,7 @@ def document_of(fields: Mapping[str, Any]) -> dict[str, Any]:
         "start": {
             "base": start[:3].tolist(),
             **({} if described.start.z is None else {"z": described.start.z}),
+            **({} if fields["opening"] is None else {"opening": fields["opening"]}),
             **({} if at_home else {"arm": start[3:].tolist()}),
             "held": held,
         },

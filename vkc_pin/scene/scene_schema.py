@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
 from vkc_pin.arrays import Floats
-from vkc_pin.files.fields import Name, Number, Positive, Quaternion, Schema, Vector3, count, fail, require, text_for
+from vkc_pin.files.fields import Name, NotNegative, Number, Positive, Quaternion, Schema, Vector3, count, fail, require, text_for
 
 __all__ = [
     "COLOURS",
@@ -198,11 +198,13 @@ class HeldSchema(Schema):
 class StartSchema(Schema):
     """Where the robot starts: base [x, y, yaw], arm joints [rad], and object → attachment (or more) of what it holds.
 
-    `z` is the height of the robot's root link [m], all the time; the robot's own if it is left out.
+    `z` is the height of the robot's root link [m], all the time; the robot's own if it is left out. `opening` is how far its
+    gripper is open [m]; as the robot rests if it is left out.
     """
 
     base: Vector3
     z: Number | None = None
+    opening: NotNegative | None = None
     arm: Annotated[tuple[Number, ...] | None, BeforeValidator(_arm)] = None
     held: Mapping[str, Annotated[HeldSchema, text_for("attachment")]] = Field(default_factory=dict)
 

@@ -32,13 +32,13 @@ def as_trajectory(problem: TrajectoryProblem, z: Floats, dt: Floats) -> Trajecto
         for row in range(begin + 1, int(end) + 1):
             rows.append(row)
             times.append(times[-1] + dt[row - 1])
-        phases.append(PhaseSpan(phase.name, first, len(rows) - 1, phase.held))
+        phases.append(PhaseSpan(phase.name, first, len(rows) - 1, phase.held, phase.opening))
         begin = int(end)
     last = problem.task.phases[-1]
     if set(problem.task.after) < {*last.held, *last.grasps}:
         rows.append(rows[-1])
         times.append(times[-1] + wait)
-        phases.append(PhaseSpan("let go", len(rows) - 2, len(rows) - 1, problem.task.after))
+        phases.append(PhaseSpan("let go", len(rows) - 2, len(rows) - 1, problem.task.after, last.opening))
     robot = problem.chain.robot.coordinates.size
     return Trajectory(problem.chain.names, np.array(times), waypoints[rows], tuple(phases), robot)
 

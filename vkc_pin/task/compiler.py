@@ -15,7 +15,7 @@ from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.placed import PlacedObject
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.handling import clash, driven, driver, latched, pushed_ways
-from vkc_pin.task.lookup import attachment_of, check_link, joint_limits, path_joints, placed_object, robot_frame
+from vkc_pin.task.lookup import attachment_of, check_link, joint_limits, openings, path_joints, placed_object, robot_frame
 from vkc_pin.task.phases import FrameGoal, Mark, Phase, PhaseKind, Task
 from vkc_pin.task.rides import Riders
 from vkc_pin.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch, as_list
@@ -281,8 +281,12 @@ def compile_task(scene: Scene, steps: Sequence[Step], options: Options, *, nothi
     # Objects that are grasped later stand as they are at the start until then.
     initial = compiler.initial
     phases = tuple(
-        replace(phase, before={**initial, **{name: value for name, value in phase.before.items() if name in initial}})
-        for phase in compiler.phases
+        replace(
+            phase,
+            before={**initial, **{name: value for name, value in phase.before.items() if name in initial}},
+            opening=opening,
+        )
+        for phase, opening in zip(compiler.phases, openings(scene, compiler.phases), strict=True)
     )
     return Task(steps, phases, tuple(compiler.holds), compiler.initial, compiler.held, tuple(marks))
 

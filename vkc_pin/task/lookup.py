@@ -1,16 +1,20 @@
-"""What steps name, found in a scene: objects, attachments, links, joints and frames."""
+"""What steps name, found in a scene: objects, attachments, links, joints, frames, and how far the gripper is open."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import pinocchio as pin
 
 from vkc_pin.arguments import known
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.models.articulation import Attachment
+from vkc_pin.scene.contact import in_gripper, opening_at_start, opening_for
 from vkc_pin.scene.placed import PlacedObject
 from vkc_pin.scene.scene import Scene
+from vkc_pin.task.phases import Phase
 
-__all__ = ["attachment_of", "check_link", "joint_limits", "path_joints", "placed_object", "robot_frame"]
+__all__ = ["attachment_of", "check_link", "joint_limits", "openings", "path_joints", "placed_object", "robot_frame"]
 
 
 def placed_object(scene: Scene, name: str, where: str) -> PlacedObject:
@@ -74,3 +78,16 @@ def joint_limits(placed: PlacedObject, coordinate: str) -> tuple[float, float]:
     """Return the limits of an object's coordinate `<object>.<joint>`, [rad] or [m]."""
     index = placed.object.coordinates.names.index(coordinate.partition(".")[2])
     return float(placed.object.lower[index]), float(placed.object.upper[index])
+
+
+def openings(scene: Scene, phases: Sequence[Phase]) -> list[float | None]:
+    """Return how far the gripper is open in each phase [m]; None: as the robot rests.
+
+    That is what the attachment says which it holds or comes to next. After the last one it stays as it is.
+    """
+    taken, found = [in_gripper((*phase.held, *phase.grasps)) for phase in phases], list[float | None]()
+    for number in range(len(phases)):
+        hold = next((one for one in taken[number:] if one is not None), None)
+        before = found[-1] if found else opening_at_start(scene)
+        found.append(before if hold is None else opening_for(scene, hold))
+    return found

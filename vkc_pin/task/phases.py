@@ -75,6 +75,7 @@ class Phase:
         lifted: Hold → placement in which its free object stood when it was grasped just before.
         lowered: Hold → placement in which its free object stands when it is let go of at the end.
         rides: What stands on something that moves, and moves along.
+        opening: How far the gripper is open [m]; None: as the robot rests.
     """
 
     kind: PhaseKind
@@ -94,6 +95,7 @@ class Phase:
     lifted: Mapping[Hold, pin.SE3] = field(default_factory=dict)
     lowered: Mapping[Hold, pin.SE3] = field(default_factory=dict)
     rides: tuple[Ride, ...] = ()
+    opening: float | None = None
 
     @property
     def name(self) -> str:

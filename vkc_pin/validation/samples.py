@@ -11,6 +11,7 @@ import pinocchio as pin
 from vkc_pin.arrays import Floats, Ints
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.models.articulation import Freedom
+from vkc_pin.models.hands.bars import EXACT
 from vkc_pin.motion.carrying import FreeObjects
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.motion.world import World
@@ -77,6 +78,8 @@ class Samples:
             if name not in known:
                 raise UnknownNameError("coordinate", name, known, field="trajectory.names")
         for number, phase in enumerate(self.trajectory.phases):
+            if phase.opening is not None:
+                self._check_opening(phase.opening, f"trajectory.phases[{number}].opening")
             for hold in phase.holds:
                 owner, attachment, field = hold.object, hold.attachment, f"trajectory.phases[{number}].held"
                 if owner not in self.scene.objects:
@@ -90,6 +93,15 @@ class Samples:
                     if f"{owner}.{name}" not in names:
                         problem = "this grasp's coordinate is missing"
                         raise InputError(problem, field="trajectory.names", expected=f"{owner}.{name}")
+
+    def _check_opening(self, opening: float, field: str) -> None:
+        gripper = self.scene.robot.gripper
+        if gripper is None:
+            expected = "a `gripper` in its robot.yaml"
+            raise InputError("the robot's gripper does not open", field=field, expected=expected, got=opening)
+        if abs(gripper.nearest(opening) - opening) > EXACT:
+            expected = f"{gripper.narrowest:.4g} to {gripper.widest:.4g} m"
+            raise InputError("the gripper cannot be so far open", field=field, expected=expected, got=opening)
 
     def check_frame(self, frame: str, field: str) -> None:
         """Check that "<object>.<link>" exists. Raises `UnknownNameError` if it does not."""

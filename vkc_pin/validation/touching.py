@@ -1,4 +1,4 @@
-"""Which pairs may be close, and when: by the rules of `scene.contact`, found in the motion itself."""
+"""What the hand does by the rules of `scene.contact`, and which pairs may be close, and when: found in the motion itself."""
 
 from __future__ import annotations
 
@@ -9,17 +9,31 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.arrays import Ints
+from vkc_pin.models.hands.bars import EXACT
 from vkc_pin.options import Options
-from vkc_pin.scene.contact import CONTACT, EASED_TIME, grasped, hand_clearance, hand_frame, moves_as_one, touching
+from vkc_pin.scene.contact import (
+    CONTACT,
+    EASED_TIME,
+    grasped,
+    hand_clearance,
+    hand_frame,
+    in_gripper,
+    moves_as_one,
+    opening_for,
+    touching,
+)
 from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.neighbours import Allowance, allowances
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.steps import Grasp, Step, Touch
 from vkc_pin.validation.distances import Solids
+from vkc_pin.validation.goals import MOTION_TOLERANCE
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.samples import Samples
 
-__all__ = ["Window", "check_pushes", "windows"]
+__all__ = ["Window", "check_gripper", "check_pushes", "windows"]
+
+_DWELL = 1e-6  # [s] by which a rest may be too short
 
 _STILL = 1e-9  # [m] or [rad]
 _T = TypeVar("_T")
@@ -54,6 +68,37 @@ def windows(samples: Samples, solids: Solids, steps: Sequence[Step], options: Op
         options: Clearances, and the time between waypoints that counts as one.
     """
     return list(_Windows(samples, solids, options).of(steps))
+
+
+def check_gripper(samples: Samples, options: Options) -> Iterator[Violation]:
+    """Yield where the robot does not stand still while its gripper closes or opens, and where that is not open as it should be.
+
+    On the way to what it grasps next, and while it holds it, it is as far open as the attachment says.
+    """
+    scene, trajectory, gripper = samples.scene, samples.trajectory, samples.scene.robot.gripper
+    times, robot, before = trajectory.times, trajectory.positions[:, : trajectory.robot_size], set(scene.holds)
+    for number, phase in enumerate(trajectory.phases):
+        changed, before, at = before ^ set(phase.holds), set(phase.holds), phase.first
+        opens = number > 0 and phase.opening != trajectory.phases[number - 1].opening
+        if changed or opens:
+            moved = np.flatnonzero(np.abs(robot - robot[at]).max(axis=1) > MOTION_TOLERANCE)
+            k = int(np.searchsorted(moved, at))
+            begin = at if opens else moved[k - 1] + 1 if k else 0  # fingers move from here on
+            end = moved[k] - 1 if k < len(moved) else len(times) - 1
+            rest = float(times[end] - times[begin])
+            if not rest >= options.grasp_time - _DWELL:
+                detail = f"the robot stands still for {rest:.2f} s, {options.grasp_time:g} s are asked for"
+                subject, amount = ", ".join(sorted(map(str, changed))) or "gripper", options.grasp_time - rest
+                yield Violation("dwell", subject, waypoint=at, time=float(times[at]), amount=amount, unit="s", detail=detail)
+        after = trajectory.phases[number + 1].holds if number + 1 < len(trajectory.phases) else ()
+        hold = in_gripper(phase.holds) or in_gripper(after)
+        if gripper is not None and hold is not None:
+            asked = opening_for(scene, hold)
+            wide, right = (gripper.resting if opening is None else opening for opening in (phase.opening, asked))
+            if not abs(wide - right) <= EXACT:
+                detail = f"the gripper is {1e3 * wide:.1f} mm open, {1e3 * right:.1f} mm are asked for"
+                time, amount = float(times[at]), abs(wide - right)
+                yield Violation("opening", str(hold), waypoint=at, time=time, amount=amount, unit="m", detail=detail)
 
 
 def check_pushes(samples: Samples) -> Iterator[Violation]:

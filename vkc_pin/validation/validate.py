@@ -26,7 +26,7 @@ from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.report import Report, Violation
 from vkc_pin.validation.samples import MOST, Samples
 from vkc_pin.validation.sweep import sweep
-from vkc_pin.validation.touching import check_pushes, windows
+from vkc_pin.validation.touching import check_gripper, check_pushes, windows
 
 __all__ = ["check_fits", "validate"]
 
@@ -36,7 +36,7 @@ START_LIMIT_TOLERANCE = 1e-2  # [m] or [rad]: a start slightly outside its limit
 ACCEPTED_RATE_TOLERANCE = 1e-3  # excess over a limit, relative to it
 LATCH_TOLERANCE = 1e-4
 WAYPOINT_TOLERANCE = 1e-3  # [m] that clearance at a waypoint may fall short of dist_safe
-SLIP_TOLERANCE, DWELL_TOLERANCE = 1e-4, 1e-6  # [m] per step, [s]
+SLIP_TOLERANCE = 1e-4  # [m] per step
 
 
 def validate(
@@ -53,9 +53,9 @@ def validate(
 
     Returns:
         Every violated constraint: start, limits, velocity, acceleration, slip of a differential base, closure, latches,
-        rests in which the gripper closes or opens, joints of objects that nobody holds, what tips on what it stands on, hands
-        that slide on what they clamp, pushes that would pull, goals and their order, clearance at waypoints and penetration
-        anywhere, and own constraints; or that it is longer than can be looked at.
+        rests in which the gripper closes or opens, how far it is open, joints of objects that nobody holds, what tips on what it
+        stands on, hands that slide on what they clamp, pushes that would pull, goals and their order, clearance at waypoints and
+        penetration anywhere, and own constraints; or that it is longer than can be looked at.
 
     Raises:
         InputError: The trajectory is none of this scene's robot and objects, or a step or term names what is not there.
@@ -81,11 +81,11 @@ class _Check:
 
     def report(self) -> Report:
         """Run every check."""
-        for check in (self._start, self._limits, self._rates, self._slip, self._dwell, self._unheld, self._tips, self._latches):
+        for check in (self._start, self._limits, self._rates, self._slip, self._unheld, self._tips, self._latches):
             check()
         self.found += check_goals(self.samples, self.steps, self.options)
         self.found += check_terms(self.samples, self.terms)
-        self.found += check_pushes(self.samples)
+        self.found += [*check_gripper(self.samples, self.options), *check_pushes(self.samples)]
         error, angle = self._closure()
         self._slides()
         nearest = self._clearance() if self._within_reason() else np.full(len(self.trajectory.phases), np.inf)
@@ -168,23 +168,6 @@ class _Check:
         if not slip[worst] <= SLIP_TOLERANCE:
             detail = f"the base slips sideways by {1e3 * slip[worst]:.2f} mm in a step"
             self._add("slip", "base", slip[worst], "m", detail, waypoint=worst)
-
-    def _dwell(self) -> None:
-        """The robot stands still while its gripper closes or opens."""
-        times, robot = self.trajectory.times, self.trajectory.positions[:, : self.trajectory.robot_size]
-        before = set(self.scene.holds)
-        for phase in self.trajectory.phases:
-            changed, before, at = before ^ set(phase.holds), set(phase.holds), phase.first
-            if not changed:
-                continue
-            moved = np.flatnonzero(np.abs(robot - robot[at]).max(axis=1) > MOTION_TOLERANCE)
-            k = int(np.searchsorted(moved, at))
-            begin = moved[k - 1] + 1 if k else 0
-            end = moved[k] - 1 if k < len(moved) else len(times) - 1
-            rest = float(times[end] - times[begin])
-            if not rest >= self.options.grasp_time - DWELL_TOLERANCE:
-                detail = f"the robot stands still for {rest:.2f} s, {self.options.grasp_time:g} s are asked for"
-                self._add("dwell", ", ".join(sorted(map(str, changed))), self.options.grasp_time - rest, "s", detail, waypoint=at)
 
     def _tips(self) -> None:
         """What something stands on stays level while it moves."""

@@ -138,8 +138,9 @@ class Drawing:
         if robot not in _meshes:
             _meshes[robot] = [to_solid(shape.geometry) for shape in robot.visual.geometryObjects]
         items = []
-        for shape, solid in zip(robot.visual.geometryObjects, _meshes[robot], strict=True):
-            link = str(robot.model.frames[shape.parentFrame].name)
+        placed = list(self.world.visual.geometryObjects)[: len(_meshes[robot])]  # on the joints of its fingers, too
+        for source, shape, solid in zip(robot.visual.geometryObjects, placed, _meshes[robot], strict=True):
+            link = str(robot.model.frames[source.parentFrame].name)
             path = f"{self.nodes[shape.parentJoint]}/{node_name(link)}/{node_name(shape.name)}"
             colour = tuple(map(float, shape.meshColor))
             items.append(Item(path, shape.parentJoint, shape.placement, solid, colour=colour, label=link))

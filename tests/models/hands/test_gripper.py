@@ -80,6 +80,26 @@ def test_a_robot_without_a_gripper_stays_as_it_is() -> None:
         robot.opened(0.05)
 
 
+def test_fingers_that_turn_need_no_formula(tmp_path: Path) -> None:
+    """Inner faces go through the joints' axes, 10 mm from the middle; the bar's near edge is 64 mm before these."""
+    file = write_gripper(tmp_path, gripper="gripper: {finger_a_joint: {closed: 0.0, open: 0.5}}\n")
+    urdf = file.parent / "robot.urdf"
+    text = urdf.read_text(encoding="utf-8")
+    for name, sign in (("a", 1), ("b", -1)):
+        straight = f'<joint name="finger_{name}_joint" type="prismatic"><origin xyz="0 0 0.06"/>'
+        turning = f'<joint name="finger_{name}_joint" type="revolute"><origin xyz="0 {sign * 0.01} 0.06"/>'
+        assert straight in text
+        text = text.replace(straight, turning).replace(f'<axis xyz="0 {sign} 0"/>', f'<axis xyz="{-sign} 0 0"/>')
+    urdf.write_text(text.replace('upper="0.04"', 'upper="0.5"'), encoding="utf-8")
+    gripper = vkc.load_robot(file).gripper
+    assert gripper is not None
+    assert gripper.narrowest == pytest.approx(0.02, abs=2e-4)
+    assert gripper.widest == pytest.approx(0.02 + 2.0 * 0.064 * np.tan(0.5), abs=2e-4)
+    for opening in (0.03, 0.05, 0.08):
+        angle = np.arctan((opening / 2.0 - 0.01) / 0.064)
+        np.testing.assert_allclose(gripper.positions(opening), [angle, angle], atol=1e-4)
+
+
 def test_an_arm_that_is_locked_otherwise_wins(tmp_path: Path) -> None:
     robot = vkc.load_robot(write_gripper(tmp_path), locked_joints={"finger_a_joint": 0.01})
     gripper = robot.gripper

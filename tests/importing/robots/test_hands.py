@@ -27,6 +27,9 @@ def test_the_frame_lies_between_the_fingertips(tmp_path: Path) -> None:
     np.testing.assert_allclose(hand.tool.translation[:2], 0.0, atol=2e-3)
     assert 0.2 + 0.06 + 0.05 < hand.tool.translation[2] < 0.2 + 0.06 + 0.08
     assert hand.open == {"finger_a_joint": 0.04, "finger_b_joint": 0.04}
+    assert hand.closed == {"finger_a_joint": 0.0, "finger_b_joint": 0.0}
+    ends = {"closed": 0.0, "open": 0.04}
+    assert hand.settings() == {"gripper": {"finger_a_joint": ends, "finger_b_joint": ends}}
     assert hand.opening == pytest.approx(0.08, abs=0.01)
     assert set(hand.touch_links) == {"arm_5", "hand", "finger_a", "finger_b"}
     assert hand.sure == "sure"
@@ -51,5 +54,6 @@ def test_a_flange_points_along_its_last_axis(tmp_path: Path) -> None:
     arm, hand = found(path)
     assert arm.fingers == ()
     assert hand.open == {}
+    assert hand.settings() == {}
     np.testing.assert_allclose(hand.tool.rotation[:, 2], [0, 0, 1], atol=0.2)
     assert hand.tool.translation[2] == pytest.approx(0.2 + 0.14, abs=0.01)  # in front of all that is there

@@ -7,6 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import trimesh
+import yaml
 from helpers.arm_urdf import HEIGHT, write_arms
 
 import vkc_pin as vkc
@@ -57,6 +58,28 @@ def test_the_base_is_hollow_and_stands_on_the_floor(imported: vkc.ImportedRobot)
     assert look.floor(moved=False)[0][1] == pytest.approx(0.0, abs=1e-5)
     robot = imported.robot.model
     assert robot.frames[robot.getFrameId("body")].placement.translation[2] == pytest.approx(HEIGHT, abs=1e-5)
+
+
+def test_the_gripper_opens_and_other_hands_stand_still(imported: vkc.ImportedRobot) -> None:
+    gripper, said = imported.robot.gripper, yaml.safe_load((imported.folder / "robot.yaml").read_text(encoding="utf-8"))
+    assert gripper is not None
+    assert gripper.names == ("right_finger_a_joint", "right_finger_b_joint")
+    assert (gripper.narrowest, gripper.widest) == (0.0, pytest.approx(0.08, abs=2e-4))
+    assert not set(said["locked_joints"]) & set(said["gripper"])
+
+
+def test_a_gripper_that_does_not_open_as_guessed_is_locked_and_told(tmp_path: Path) -> None:
+    """A bar across the fingertips leaves no room between the fingers, wherever they are."""
+    file = write_arms(tmp_path / "given")
+    bar = '<link name="bar"><collision><geometry><box size="0.02 0.02 0.09"/></geometry></collision></link>'
+    joint = '<joint name="bar_joint" type="fixed"><parent link="hand"/><child link="bar"/><origin xyz="0 0 0.1"/></joint>'
+    file.write_text(file.read_text(encoding="utf-8").replace("</robot>", bar + joint + "</robot>"), encoding="utf-8")
+    made = vkc.import_robot(file, tmp_path / "mine", samples=SAMPLES)
+    said = (made.folder / "robot.yaml").read_text(encoding="utf-8")
+    assert made.robot.gripper is None
+    assert "gripper" not in said
+    assert "finger_a_joint: 0.04" in said
+    assert "the fingers stand still: the gripper does not open" in str(made)
 
 
 def test_home_has_room(imported: vkc.ImportedRobot) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -23,6 +24,8 @@ _PAD = 0.02  # [m] behind the fingertips is where things are held,
 _SHARE = 0.3  # but no more than this share of a finger's length
 _SNAP = np.cos(np.radians(12.0))  # directions closer than this to an axis of the hand are meant to be that axis
 _STUB = 0.3  # of the longest finger: what is shorter is a part of a drive, not a finger
+_GRIPPER = 3  # fingers at most of a gripper, all of which close together
+_LITTLE = 1e-6  # [m] or [rad]: less is no way between open and closed
 _PASSES = 2  # over the fingers' joints
 
 
@@ -34,6 +37,7 @@ class Hand:
         link: The link of the palm that `tool` is placed on.
         tool: z is the direction of approach, x the one in which the fingers close, the origin between the fingertips.
         open: Finger joint → where it is open, [m] or [rad].
+        closed: Of these joints, those that close the hand → where it is closed; none if it is not clear how it closes.
         opening: Between the fingertips there, [m]; 0 without fingers.
         touch_links: Palm and fingers.
         sure: "sure", "likely" or "guess".
@@ -43,10 +47,17 @@ class Hand:
     link: str
     tool: pin.SE3
     open: Mapping[str, float]
+    closed: Mapping[str, float]
     opening: float
     touch_links: tuple[str, ...]
     sure: str
     why: str
+
+    def settings(self) -> dict[str, Any]:
+        """Return what a robot.yaml says of the fingers: how they open, and where those are locked that do not."""
+        opened = {joint: round(value, 6) for joint, value in self.open.items()}
+        gripper = {joint: {"closed": round(value, 6), "open": opened.pop(joint)} for joint, value in self.closed.items()}
+        return {key: said for key, said in (("locked_joints", opened), ("gripper", gripper)) if said}
 
 
 def look_at(file: UrdfFile, full: pin.Model, arm: Arm) -> Hand:
@@ -77,7 +88,7 @@ class _Looker:
         first, second = self._sides(fingers)
         self._ahead = approach = self._approach(fingers)
         joints = [body.name for finger in fingers for body in finger.below() if body.plans]
-        opened, gap, closed = self._opened(first, second, joints)
+        opened, shut, gap, closed = self._opened(first, second, joints)
         a, b = self._tips(first, second, opened, approach)
         closing = b.mean(axis=0) - a.mean(axis=0)
         closing = _snapped(_unit(closing - (closing @ approach) * approach))
@@ -94,7 +105,9 @@ class _Looker:
         sure = "sure" if len(fingers) == 2 and moves > 0.01 else "likely" if moves > 0.01 else "guess"
         how = "two fingers" if len(fingers) == 2 else "one jaw and the hand" if len(fingers) == 1 else f"{len(fingers)} fingers"
         why = f"between {how}, which open from {1e3 * closed:.0f} to {1e3 * gap:.0f} mm"
-        return Hand(self._link, tool, opened, float(gap), touch, sure, why)
+        closing_ones = {joint: value for joint, value in shut.items() if abs(value - opened[joint]) > _LITTLE}
+        known = moves > 0.01 and len(fingers) <= _GRIPPER
+        return Hand(self._link, tool, opened, closing_ones if known else {}, float(gap), touch, sure, why)
 
     def _place(self, positions: Mapping[str, float]) -> pin.SE3:
         rest = rest_positions(self._full, self._file, positions)
@@ -160,8 +173,8 @@ class _Looker:
 
     def _opened(
         self, first: Sequence[Body], second: Sequence[Body], joints: Sequence[str]
-    ) -> tuple[dict[str, float], float, float]:
-        """Return where the fingers' joints are open, and the gaps where they are open and shut [m]."""
+    ) -> tuple[dict[str, float], dict[str, float], float, float]:
+        """Return where the fingers' joints are open, where they are shut, and the gaps there [m]."""
         rest = rest_positions(self._full, self._file, {})
         chosen = {joint: rest[joint] for joint in joints if joint in rest}
         choices = {joint: self._choices(joint, rest[joint]) for joint in chosen}
@@ -174,7 +187,7 @@ class _Looker:
                     if gap > best + 1e-4:
                         best, chosen[joint] = gap, value
         shut = {joint: max(values, key=lambda value: abs(value - chosen[joint])) for joint, values in choices.items()}
-        return chosen, best, min(smallest, self._gap(first, second, shut))
+        return chosen, shut, best, min(smallest, self._gap(first, second, shut))
 
     def _choices(self, joint: str, rest: float) -> list[float]:
         moving = self._full.joints[self._full.getJointId(joint)]
@@ -229,7 +242,8 @@ class _Looker:
         place = wrist.translation + (depth - wrist.translation @ approach) * approach
         closing = _unit(np.cross(np.eye(3)[np.abs(approach).argmin()], approach))
         tool = pin.SE3(np.column_stack([closing, np.cross(approach, closing), approach]), place)
-        return Hand(self._link, tool, {}, 0.0, touch, "likely" if lined else "guess", "at the end of the arm: it has no fingers")
+        sure, why = "likely" if lined else "guess", "at the end of the arm: it has no fingers"
+        return Hand(self._link, tool, {}, {}, 0.0, touch, sure, why)
 
 
 def _points_of(file: UrdfFile, links: Sequence[str]) -> dict[str, Floats]:

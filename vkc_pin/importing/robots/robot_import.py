@@ -8,7 +8,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -116,8 +116,7 @@ def import_robot(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # they name files that are gone soon; loading the whole folder warns of the same
             made = _Importer(source, staging, target.resolve().name).make(arm, tool_frame, most_pieces, samples, seed)
-    robot = load_robot(target / "robot.yaml")
-    return dataclasses.replace(made, folder=target, robot=robot)
+    return dataclasses.replace(made, folder=target, robot=load_robot(target / "robot.yaml"))
 
 
 class _Importer:
@@ -145,10 +144,9 @@ class _Importer:
             self._hand(look_at(self._file, full_model(self._file), chosen), tool_frame)
         if tool_frame is not None:
             self._settings["tool_frame"] = tool_frame
-        self._write()
-        robot = self._on_the_floor(self._without_envelopes(self._load("all")), seed)
+        robot = self._on_the_floor(self._without_envelopes(self._loaded()), seed)
         self._told(pieces, self._rest(robot, samples, seed))
-        return self._result(self._load("srdf"), arms, chosen, pieces)
+        return self._result(load_robot(self._folder / "robot.yaml"), arms, chosen, pieces)
 
     def _result(self, robot: Robot, arms: list[Arm], chosen: Arm | None, pieces: list[Piece]) -> ImportedRobot:
         findings = (*doctor(robot).findings, *self._findings)
@@ -173,9 +171,8 @@ class _Importer:
             self._settings.setdefault("locked_joints", {}).update(dict.fromkeys(driving, 0.0))
             self._guess("sure", f"the file has a base of its own, which the planner's replaces: {', '.join(driving)} are locked")
         kind, why = base_kind(self._file.root)
-        self._guess(
-            "likely" if kind != "omni" else "guess", f"base: {kind} ({why})", "scenes and `load_robot` choose it: `base: ...`"
-        )
+        sure = "likely" if kind != "omni" else "guess"
+        self._guess(sure, f"base: {kind} ({why})", "scenes and `load_robot` choose it: `base: ...`")
         if chosen is not None:
             others = [other.name for other in arms if other is not chosen]
             also = f"; others: {', '.join(others)}" if others else ""
@@ -184,14 +181,26 @@ class _Importer:
     def _hand(self, hand: Hand, tool_frame: str | None) -> None:
         links = [link for link in hand.touch_links if link in set(self._file.links)]
         self._settings["touch_links"] = links
-        opened = {joint: round(value, 6) for joint, value in hand.open.items()}
-        if opened:
-            self._settings.setdefault("locked_joints", {}).update(opened)
+        for key, said in hand.settings().items():
+            self._settings.setdefault(key, {}).update(said)
         if tool_frame is None:
             tool = _free_name("tool", self._names())
             self._add_link(tool, hand.link, hand.tool)
             self._settings["tool_frame"] = tool
             self._guess(hand.sure, f"hand: frame '{tool}' {hand.why}", "if it is wrong: `tool_frame`, see docs/robots.md")
+
+    def _loaded(self) -> Robot:
+        """Write what there is and return the robot; with fingers that are locked if the gripper, as guessed, does not open."""
+        self._write()
+        try:
+            return load_robot(self._folder / "robot.yaml", pairs="all")
+        except InputError as error:
+            if not str(error.field).startswith("gripper"):
+                raise
+            fingers = self._settings.pop("gripper")
+            self._settings.setdefault("locked_joints", {}).update({joint: ends["open"] for joint, ends in fingers.items()})
+            self._guess("guess", f"the fingers stand still: {error.problem}, {error.got}", "`gripper`, see docs/robots.md")
+            return self._loaded()
 
     def _names(self) -> set[str]:
         return {element.get("name", "") for tag in ("link", "joint") for element in self._file.root.findall(tag)}
@@ -209,14 +218,12 @@ class _Importer:
     def _write(self) -> None:
         settings = {key: value for key, value in self._settings.items() if key != "srdf" or (self._folder / value).is_file()}
         ElementTree.indent(self._file.root)
-        said = (
-            f"# Written by `vkc-pin import-robot` from {self._source.file.path.name} ({self._source.kind}). Units: m, rad, s.\n"
-        )
+        source = f"{self._source.file.path.name} ({self._source.kind})"
+        said = f"# Written by `vkc-pin import-robot` from {source}. Units: m, rad, s.\n"
         body = yaml.safe_dump(settings, sort_keys=False, default_flow_style=None, width=120)
         (self._folder / "robot.yaml").write_text(said + body, encoding="utf-8")
-        ElementTree.ElementTree(self._file.root).write(
-            self._folder / f"{self._name}.urdf", encoding="utf-8", xml_declaration=True
-        )
+        urdf = self._folder / f"{self._name}.urdf"
+        ElementTree.ElementTree(self._file.root).write(urdf, encoding="utf-8", xml_declaration=True)
 
     def _without_envelopes(self, robot: Robot) -> Robot:
         """Return the robot without shapes that are but around its hand."""
@@ -226,8 +233,7 @@ class _Importer:
         self._settings["touch_links"] = [link for link in self._settings.get("touch_links", ()) if link not in found]
         told = [f"{link} is a shape around the hand, {share:.0%} of which is in it: left out" for link, share in found.items()]
         self._findings += [Finding("warning", "hand", text) for text in told]
-        self._write()
-        return self._load("all")
+        return self._loaded()
 
     def _on_the_floor(self, robot: Robot, seed: int) -> Robot:
         """Return the robot with a root that stands on the floor, so high that its arm can be clear of it."""
@@ -245,8 +251,7 @@ class _Importer:
         why = f"{1e3 * raised:.0f} mm of it so that no link of the arm is always at the floor" if raised else ""
         why = why or "it stands on what is lowest of it"
         self._guess("likely", f"{root} is {lift + raised:.3f} m above the floor, the new root '{floor}': {why}")
-        self._write()
-        return self._load("all")
+        return self._loaded()
 
     def _rest(self, robot: Robot, samples: int, seed: int) -> Home:
         """Write SRDF and home of a robot that is loaded with all pairs, and return the home."""
@@ -265,9 +270,6 @@ class _Importer:
         self._write()
         return home
 
-    def _load(self, pairs: Literal["srdf", "all"]) -> Robot:
-        return load_robot(self._folder / "robot.yaml", pairs=pairs)
-
     def _write_srdf(self, path: Path, robot: Robot, home: Floats, allowed: Mapping[tuple[str, str], str]) -> None:
         root = ElementTree.Element("robot", name=self._name)
         arm = ElementTree.SubElement(root, "group", name="arm")
@@ -282,9 +284,8 @@ class _Importer:
 
     def _told(self, pieces: list[Piece], home: Home) -> None:
         values = ", ".join(f"{value:.2f}" for value in home.positions)
-        self._guess(
-            "sure" if home.clearance > 0.0 else "guess", f"home: {home.how} ({values}), clearance {1e3 * home.clearance:.0f} mm"
-        )
+        sure = "sure" if home.clearance > 0.0 else "guess"
+        self._guess(sure, f"home: {home.how} ({values}), clearance {1e3 * home.clearance:.0f} mm")
         for piece in {piece.mesh: piece for piece in pieces if piece.count > 1}.values():
             what = f"{piece.mesh} in {piece.count} pieces, {100.0 * piece.overhead:.0f} % more than its volume"
             hull = f"its hull: {100.0 * piece.hull:.0f} %"

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import itertools
 from pathlib import Path
@@ -8,9 +9,11 @@ import numpy as np
 import pytest
 import yaml
 from helpers.furniture import BAR, flap
+from helpers.grippers import cheeky_drawer, write_gripper
 
 import vkc_pin as vkc
 from vkc_pin.models.proposals.fitting import Fitting
+from vkc_pin.models.proposals.hand import hand_of
 
 POSTS = "".join(
     f'<collision><origin xyz="-0.045 0.5 {z}"/><geometry><box size="0.07 0.09 0.014"/></geometry></collision>'
@@ -179,3 +182,25 @@ def test_the_best_proposal_opens_it(name: str, tmp_path: Path) -> None:
     plan = vkc.plan(vkc.load_scene(tmp_path / "alone.yaml"), [vkc.Actuate("it", {joint: 0.3})])
     assert plan.success, plan.report()
     assert plan.trajectory.column(f"it.{joint}")[-1] == pytest.approx(0.3, abs=1e-3)
+
+
+def test_fingers_come_closer_together_where_they_have_no_room_fully_open(tmp_path: Path) -> None:
+    """Posts of the drawer's frame stand 60 mm from the middle of its handle, on both sides."""
+    item, robot = vkc.load_object(cheeky_drawer()), vkc.load_robot(write_gripper(tmp_path))
+    found = vkc.propose_attachments(item, robot)
+    best = found.opening("slide")[0]
+    assert best.thickness == pytest.approx(0.02)
+    assert best.attachment.opening == pytest.approx(0.03)  # 5 mm on both sides
+    assert best.description()["opening"] == 0.03
+    assert "20 mm thick, fingers 30 mm apart" in found.report()
+    fitting = Fitting(item, hand_of(robot.opened(best.attachment.opening)), 0.02, 0.005)
+    tool = item.link_placement("front", [0.0]) * best.attachment.tool(np.zeros(len(best.attachment.freedoms)))
+    assert fitting.blocked(tool, "front") is None
+    assert Fitting(item, found.hand, 0.02, 0.005).blocked(tool, "front") is not None
+    still = dataclasses.replace(robot, gripper=None)
+    assert best.kind not in {one.kind for one in vkc.propose_attachments(item, still).found}
+
+
+def test_fingers_that_have_room_stay_fully_open(tmp_path: Path) -> None:
+    item, robot = vkc.load_object(cheeky_drawer(gap=0.15)), vkc.load_robot(write_gripper(tmp_path))
+    assert [one.attachment.opening for one in vkc.propose_attachments(item, robot).found][:1] == [None]

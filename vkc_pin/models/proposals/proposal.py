@@ -55,6 +55,8 @@ class Proposal:
             data["turn"] = [item.freedoms[1].lower, item.freedoms[1].upper]
         if item.standoff:
             data["standoff"] = round(item.standoff, 5)
+        if item.opening is not None:
+            data["opening"] = round(item.opening, 5)
         return data
 
 
@@ -100,8 +102,10 @@ class Proposals:
                 free = f", {1e3 * (slide.upper - slide.lower):.0f} mm to slide along" if slide else ""
                 freedom = proposal.attachment.joint
                 when = "".join(f", while {other} is at {value:.3g}" for other, value in proposal.when.items())
+                wide = proposal.attachment.opening
+                narrow = "" if wide is None else f", fingers {1e3 * wide:.0f} mm apart"
                 lines.append(
-                    f"  {proposal.score:.2f}  {name}: {1e3 * proposal.thickness:.0f} mm thick, {freedom}{free}, "
+                    f"  {proposal.score:.2f}  {name}: {1e3 * proposal.thickness:.0f} mm thick{narrow}, {freedom}{free}, "
                     f"opens to {proposal.opens[joint]:.3g} {unit}{when}"
                 )
             if joint in self.because:

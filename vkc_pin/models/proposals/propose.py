@@ -11,12 +11,13 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.arguments import instance, number, whole
+from vkc_pin.arrays import Floats
 from vkc_pin.files.urdf import read_urdf
 from vkc_pin.models.articulation import ArticulatedObject, Attachment
 from vkc_pin.models.proposals.candidates import Candidate, Thickness, candidates
 from vkc_pin.models.proposals.fitting import Blocked, Fitting
 from vkc_pin.models.proposals.freedom import Grip
-from vkc_pin.models.proposals.hand import Hand, hand_of
+from vkc_pin.models.proposals.hand import hand_of
 from vkc_pin.models.proposals.proposal import Proposal, Proposals
 from vkc_pin.models.proposals.ranking import Opening, names_of_pieces, openings, worth
 from vkc_pin.models.proposals.sections import Piece
@@ -35,6 +36,7 @@ _TURNED = 0.5  # of the rank of a hand that only is turned about its approach, w
 _ROOM = (0.02, 0.01)  # [m]: more clearance than needed is better, up to this
 _SLACK = 0.05  # [m]: to either side; so is more of a bar to hold on to, up to this
 _WORTH = 0.1  # of the score of a joint's best grasp: what has less is of no use beside it
+_ROUND = 0.01  # [m]: openings are whole multiples, and narrower by as much at least
 _LITTLE = 0.1  # of a joint's range: by a grasp that opens less, it cannot be opened
 
 
@@ -60,7 +62,8 @@ def propose_attachments(
 
     Every convex piece of a link that moves is looked at in cross-section. Where its thickness fits between the open fingers,
     and their pads meet faces that they do not slip off from, is a bar, a knob or an edge. The hand is put there, fingers open,
-    and drawn back straight, among all shapes of the closed object; then it goes along as the joint opens.
+    and drawn back straight, among all shapes of the closed object; then it goes along as the joint opens. Where fingers that are
+    fully open have no room, those of a gripper that opens are tried closer together; the attachment has that `opening` then.
 
     Args:
         item: The object, standing upright on what its lowest point touches.
@@ -81,7 +84,7 @@ def propose_attachments(
     robot = robot if isinstance(robot, Robot) else load_robot(robot)
     for name, value in (("dist_safe", dist_safe), ("grasp_clearance", grasp_clearance)):
         number(value, name, "a distance [m]", low=0.0, high=1.0)
-    search = _Search(item, hand_of(robot), dist_safe, grasp_clearance, most)
+    search = _Search(item, robot, dist_safe, grasp_clearance, most)
     found = [proposal for number in range(1, item.model.njoints) for proposal in search.body(number)]
     found = search.named(sorted(found, key=lambda proposal: -proposal.score))
     because = {
@@ -93,14 +96,15 @@ def propose_attachments(
 
 
 class _Search:
-    def __init__(self, item: ArticulatedObject, hand: Hand, dist_safe: float, grasp_clearance: float, most: int) -> None:
-        self.item, self.hand, self.most = item, hand, most
+    def __init__(self, item: ArticulatedObject, robot: Robot, dist_safe: float, grasp_clearance: float, most: int) -> None:
+        self.item, self.robot, self.hand, self.most = item, robot, hand_of(robot), most
         self.safe, self.close = dist_safe, grasp_clearance
         self.pieces: dict[int, list[Piece]] = {}
         for shape in item.collision.geometryObjects:
             self.pieces.setdefault(int(shape.parentJoint), []).append(Piece.of(shape))
         self.openings = openings(item, self.pieces)
-        self.fitting = Fitting(item, hand, dist_safe, grasp_clearance)
+        self.fitting = Fitting(item, self.hand, dist_safe, grasp_clearance)
+        self.narrower: dict[float, Fitting] = {}
         self.closed = self.fitting.state.copy()
         self.tallies: dict[int, _Tally] = {}
         self._handles = {} if item.urdf is None else names_of_pieces(read_urdf(item.urdf).root)
@@ -148,7 +152,7 @@ class _Search:
             if any(best <= other.score and _alike(taken, other, grasp) for other, taken in kept):
                 continue
             self.fitting.place(state)
-            proposal = self._tried(best, grasp, opening, tally, named)
+            proposal = self._tried(best, grasp, opening, tally, named) or self._tried_narrower(best, grasp, opening, named, state)
             if proposal is None or any(_alike(taken, other, grasp) and other.score >= proposal.score for other, taken in kept):
                 continue
             proposal = dataclasses.replace(proposal, when=when)
@@ -157,10 +161,26 @@ class _Search:
         chosen = [proposal for _, proposal in _ranks(kept)[: self.most]]
         return [proposal for proposal in chosen if proposal.score >= _WORTH * chosen[0].score]
 
+    def _tried_narrower(self, best: float, grasp: Candidate, opening: Opening, named: bool, state: Floats) -> Proposal | None:
+        """Return what becomes of a grasp with the fingers no further apart than it takes; None if they do not come closer."""
+        room = _ROUND * float(np.ceil((grasp.thickness + 2.0 * self.close) / _ROUND - 1e-9))
+        wide = self.robot.opening(room)
+        if wide is None or not room <= wide <= self.hand.opening - _ROUND:
+            return None
+        if wide not in self.narrower:
+            self.narrower[wide] = Fitting(self.item, hand_of(self.robot.opened(wide)), self.safe, self.close)
+        open_, self.fitting = self.fitting, self.narrower[wide]
+        try:
+            self.fitting.place(state)
+            found = self._tried(best, grasp, opening, _Tally(), named)
+        finally:
+            self.fitting = open_
+        return found and dataclasses.replace(found, attachment=dataclasses.replace(found.attachment, opening=wide))
+
     def _tried(self, best: float, grasp: Candidate, opening: Opening, tally: _Tally, named: bool) -> Proposal | None:
         """Return what becomes of a grasp when the hand is put there; None if there is no room, which `tally` gets to know."""
         link, at = grasp.piece.link, self.fitting.joint(opening.number)
-        furthest = max(0.0, self.hand.tip - _HELD) if grasp.kind != "edge" else 0.0
+        furthest = max(0.0, self.fitting.hand.tip - _HELD) if grasp.kind != "edge" else 0.0
         reasons = list[Blocked]()
         for standoff in dict.fromkeys((0.0, furthest / 2.0, furthest)):
             tool = at * grasp.placement * _back(standoff)

@@ -16,7 +16,7 @@ import vkc_pin as vkc
 from vkc_pin.benchmarks import chores, gap
 from vkc_pin.models.shapes import triangles
 from vkc_pin.motion.world import World
-from vkc_pin.plotting.style import new_figure, save_figure, styled
+from vkc_pin.plotting.style import COLOURS, new_figure, save_figure, styled
 from vkc_pin.plotting.top_view import draw_top_view
 from vkc_pin.scene.placed import standing_geometry
 from vkc_pin.visualization import drawing
@@ -38,6 +38,7 @@ TRAY = (0.0, -0.5, 0.5), (-3.2, -2.6, 2.6)
 PUSHED = (2.3, -0.2, 0.8), (-0.5, -2.6, 2.9)
 PUSHING = 14.0  # [s] of the motion at the door that stands open
 CARRIED = 15.0  # [s] of the motion with the tray
+FINGERS = 0.04  # [m] between them
 GAP = (0.1, -0.3, 0.2), (-3.4, -5.0, 5.6)
 FURNITURE = {  # kinds, and the seeds of those that are shown
     **{"door": 1, "drawers": 2, "cabinet": 1, "refrigerator": 2, "dishwasher": 0},
@@ -48,6 +49,7 @@ OPENED = {"door": ("hinge", 1.0), "drawer": ("slide", 0.22), "dishwasher": ("rac
 
 sys.path.insert(0, str(ROOT / "tests"))
 from helpers.browser import screenshot  # noqa: E402
+from helpers.grippers import between_cheeks, write_gripper  # noqa: E402
 from helpers.homes import home_urdf  # noqa: E402
 
 
@@ -206,6 +208,40 @@ def push_picture() -> None:
     picture(vkc.plan(scene, [vkc.Actuate("door", {"hinge": 0.0}, "push")]), "pushing", SMALL, PUSHING)
 
 
+def opening_picture() -> None:
+    """Write a picture of fingers between two cheeks, from above: fully open, and as far as the attachment says."""
+    from scipy.spatial import ConvexHull
+
+    with tempfile.TemporaryDirectory() as folder, styled():
+        scene = between_cheeks(write_gripper(Path(folder)), opening=FINGERS)
+        plan = vkc.plan(scene, [vkc.Grasp("drawer")])
+        sys.stdout.write(plan.report() + "\n")
+        world, figure = World(scene), new_figure(8.0, 3.4)
+        row = world.positions(plan.trajectory)[-1]
+        first = world.coordinates.index("finger_a_joint")
+        for number, opening in enumerate((None, FINGERS)):
+            row[first : first + 2] = scene.robot.gripper.positions(opening)
+            data = world.model.createData()
+            pin.forwardKinematics(world.model, data, world.coordinates.q(row))
+            axes = figure.add_subplot(1, 2, number + 1)
+            for shape, label in zip(world.shapes, world.collision_labels, strict=True):
+                if label == "floor" or label.startswith(("body", "arm_1", "arm_2", "arm_3")):
+                    continue
+                points = triangles(shape.geometry)[0]
+                placed = data.oMi[shape.parentJoint] * shape.placement
+                outline = (points @ placed.rotation.T + placed.translation)[:, :2]
+                outline = outline[ConvexHull(outline).vertices]
+                colour = "0.75" if label in scene.obstacle_labels else COLOURS[label.startswith("drawer")]
+                axes.fill(-outline[:, 1], outline[:, 0], facecolor=colour, edgecolor="0.25", linewidth=0.8)
+            wide = scene.robot.gripper.resting if opening is None else opening
+            axes.set_title("fully open" if opening is None else f"opening: {opening:g}")
+            finger, cheek = -wide / 2.0 - 0.01, -0.06  # outer and inner face [m]
+            axes.annotate("", (cheek, 1.15), (finger, 1.15), arrowprops={"arrowstyle": "<->", "shrinkA": 0, "shrinkB": 0})
+            axes.text(-0.045, 1.208, f"{1e3 * (finger - cheek):.0f} mm", ha="right", fontsize=9)
+            axes.set(xlim=(-0.13, 0.13), ylim=(1.0, 1.24), aspect="equal", xlabel="m")
+        save_figure(figure, IMAGES / "opening.png")
+
+
 def main() -> int:
     """Write the pictures; return 1 if there is no motion to show."""
     saved = [vkc.Plan.load(name) for name in sys.argv[1:]]
@@ -242,6 +278,7 @@ def main() -> int:
     gap_picture(through)
     tray_picture()
     push_picture()
+    opening_picture()
     return 0
 
 

@@ -57,6 +57,11 @@ def write_gripper(folder: Path, *, gripper: str = _GRIPPER, more: str = "") -> P
 _DRAWER = """<robot name="drawer">
   <link name="frame"/>
   <link name="front">
+    <visual><origin xyz="0.01 0 0"/><geometry><box size="0.02 0.08 0.2"/></geometry></visual>
+    <visual>
+      <origin xyz="-0.05 0 0"/><geometry><box size="0.02 0.02 0.1"/></geometry>
+      <material name="orange"><color rgba="0.87 0.53 0.24 1"/></material>
+    </visual>
     <collision><origin xyz="0.01 0 0"/><geometry><box size="0.02 0.08 0.2"/></geometry></collision>
     <collision><origin xyz="-0.05 0 0"/><geometry><box size="0.02 0.02 0.1"/></geometry></collision>
   </link>

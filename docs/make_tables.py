@@ -98,6 +98,32 @@ def door() -> str:
     return "\n\n".join([markdown([*head, "build, at most [s]"], rows), markdown(split, parts), about])
 
 
+def drawn() -> str:
+    """Return the tables of random problems: what came of them, and whether the oracle agrees."""
+    found = result("random")
+    about, trials = found["meta"], found["trials"]
+    statuses = sorted({trial["status"] for trial in trials} - {"success"})
+    rows = []
+    for kind in ("room", "scene"):
+        own = of(trials, {"kind": kind})
+        counts = [str(len(of(own, {"status": status}))) for status in statuses]
+        rows.append([kind, good(own), *counts, *(f"{value:.2f}" for value in distribution(own, "planning_time"))])
+    agreed = [
+        [
+            "success" if success else "failure",
+            *(str(sum(trial["success"] == success and bool(trial["oracle"]) == wrong for trial in trials)) for wrong in (False, True)),
+        ]
+        for success in (True, False)
+    ]
+    return "\n\n".join(
+        [
+            markdown(["problems in", "success", *statuses, "time, median [s]", "95th percentile [s]"], rows),
+            markdown(["by its own word", "the oracle finds nothing", "it finds something"], agreed),
+            foot(about),
+        ]
+    )
+
+
 def good(trials: Sequence[Mapping[str, Any]]) -> str:
     """Return how many succeed."""
     return f"{sum(trial['success'] for trial in trials)} of {len(trials)}"
@@ -105,7 +131,7 @@ def good(trials: Sequence[Mapping[str, Any]]) -> str:
 
 def reported(name: str) -> str:
     """Return the tables of a record, as its experiment reports them."""
-    own: dict[str, Callable[[], str]] = {"status": status, "door": door}
+    own: dict[str, Callable[[], str]] = {"status": status, "door": door, "random": drawn}
     if name in own:
         return own[name]() + "\n"
     module = importlib.import_module(f"vkc_pin.benchmarks.{REPORTS[name]}")

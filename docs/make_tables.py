@@ -108,13 +108,10 @@ def drawn() -> str:
         own = of(trials, {"kind": kind})
         counts = [str(len(of(own, {"status": status}))) for status in statuses]
         rows.append([kind, good(own), *counts, *(f"{value:.2f}" for value in distribution(own, "planning_time"))])
-    agreed = [
-        [
-            "success" if success else "failure",
-            *(str(sum(trial["success"] == success and bool(trial["oracle"]) == wrong for trial in trials)) for wrong in (False, True)),
-        ]
-        for success in (True, False)
-    ]
+    agreed = []
+    for success, said in ((True, "success"), (False, "failure")):
+        own = [bool(trial["oracle"]) for trial in trials if trial["success"] == success]
+        agreed.append([said, str(own.count(False)), str(own.count(True))])
     return "\n\n".join(
         [
             markdown(["problems in", "success", *statuses, "time, median [s]", "95th percentile [s]"], rows),

@@ -19,10 +19,12 @@ from vkc_pin.budget import Budget
 from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.motion.world import scene_after
 from vkc_pin.planning import stepwise as module
+from vkc_pin.planning.one_problem import OneProblem
 from vkc_pin.planning.outcome import TIMES
 from vkc_pin.planning.settings import Settings
 from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.scene import Scene
+from vkc_pin.validation.validate import validate
 
 
 def ending(scene: Scene, base: list[float], arm: np.ndarray, **objects: float) -> Trajectory:
@@ -166,6 +168,37 @@ def test_one_step_that_fails_is_not_planned_again(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(module, "step_by_step", lambda *_: pytest.fail("the same again"))
     task = SimpleNamespace(steps=(1,), holds=())
     assert module.all_at_once(None, task, Settings("auto", vkc.Options())).status == "rejected"  # type: ignore[arg-type]
+
+
+@pytest.mark.made_up
+@pytest.mark.parametrize(("held", "asked"), [(True, None), (True, "handle"), (False, "handle")])
+def test_what_cannot_be_moved_as_it_is_held_is_taken_anew(monkeypatch: pytest.MonkeyPatch, held: bool, asked: str | None) -> None:
+    """Only where the step moves what is held: then letting go of it comes first, and the motion ends as it should."""
+    scene = vkc.load_scene("drawer")
+    if held:
+        scene = vkc.plan(scene, [vkc.Grasp("drawer", "handle")]).end_scene()
+    tried, efforts = list[str](), list[float]()
+    real = OneProblem.run
+
+    def run(self: OneProblem) -> vkc.Plan:
+        tried.append(type(self.task.steps[0]).__name__)
+        plan = real(self)
+        efforts.append(plan.metrics["effort"])
+        return plan if tried[-1] == "Release" else dataclasses.replace(plan, status="not converged")
+
+    monkeypatch.setattr(OneProblem, "run", run)
+    plan = vkc.plan(scene, [vkc.Actuate("drawer", {"slide": 0.2}, asked)])
+    if not held:
+        assert (plan.success, tried) == (False, ["Actuate"])
+        return
+    assert plan.success
+    assert tried == ["Actuate", "Release"]
+    assert plan.steps == (vkc.Release("drawer"), vkc.Actuate("drawer", {"slide": 0.2}, "handle"))
+    assert plan.metrics["effort"] == pytest.approx(sum(efforts))
+    after = plan.end_scene()
+    assert dict(after.held) == {"drawer": "handle"}
+    assert after.objects["drawer"].state[0] == pytest.approx(0.2, abs=1e-3)
+    assert validate(scene, plan.steps, plan.trajectory).ok
 
 
 def test_building_before_planning_costs_no_negative_time() -> None:

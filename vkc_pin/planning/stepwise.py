@@ -75,7 +75,8 @@ def all_at_once(scene: Scene, task: Task, settings: Settings) -> Plan:
 def by_any_attachment(scene: Scene, task: Task, settings: Settings) -> tuple[OneProblem, Plan]:
     """Plan a task as one problem; if that fails, by the other attachments that its steps leave open, one after the other.
 
-    Those at which no free configuration is found for the end of a phase are left aside at once.
+    What is held and cannot be moved so is let go of and taken anew. Attachments at which no free configuration is found for the
+    end of a phase are left aside at once.
 
     Args:
         scene: Robot, objects and obstacles.
@@ -89,7 +90,7 @@ def by_any_attachment(scene: Scene, task: Task, settings: Settings) -> tuple[One
     first = OneProblem(scene, task, settings)
     result = first.run()
     plans, notes = [result], list[str]()
-    for name, steps in alternatives(scene, task):
+    for name, steps in alternatives(scene, task, anew=not settings.terms):  # terms may name phases by their numbers
         if plans[-1].success or plans[-1].status in ENDINGS:
             break
         one = OneProblem(scene, compile_task(scene, steps, settings.options), settings, goals_first=True)

@@ -38,15 +38,22 @@ def is_open(scene: Scene, step: Step) -> bool:
     return len(scene.objects[step.object].object.attachments) > 1
 
 
-def alternatives(scene: Scene, task: Task) -> Iterator[tuple[str, tuple[Step, ...]]]:
+def alternatives(scene: Scene, task: Task, *, anew: bool = True) -> Iterator[tuple[str, tuple[Step, ...]]]:
     """Yield the steps of a task by attachments that it does not use, each with "<object>.<attachment>".
 
-    There are some only where a single one of its steps leaves that open: of several, each is planned alone before.
+    There are some only where a single one of its steps leaves that open: of several, each is planned alone before. What is held
+    already may have been grasped where it cannot be moved from: then it is let go of, and taken anew.
 
     Args:
         scene: Where the task begins.
         task: What its steps come to if nobody says otherwise.
+        anew: Whether something may be taken anew, which makes more phases.
     """
+    first = task.steps[0]
+    held = scene.held.get(first.object) if isinstance(first, Actuate) else None
+    if anew and isinstance(first, Actuate) and held is not None and first.attachment in (None, held):
+        steps = (Release(first.object), dataclasses.replace(first, attachment=held), *task.steps[1:])
+        yield f"{first.object}.{held}, taken anew", steps
     own = [(number, step) for number, step in enumerate(task.steps) if isinstance(step, Actuate) and is_open(scene, step)]
     for number, step in own if len(own) == 1 else ():
         used = {hold.attachment for hold in task.holds if hold.object == step.object}

@@ -21,7 +21,7 @@ TRIES = 1500
 """How often a tree may grow until they meet."""
 
 _STEPS = (0.15, 0.04)  # [rad] between configurations that are looked at; the latter where the former overlooked something
-_STRAIGHTENINGS = 24  # times that the arm and each of its joints are tried to be straightened
+_STRAIGHTENINGS = 12  # times that the arm and each of its joints are tried to be straightened
 _WORTH = 1e-3  # share of a path's length that is to be saved by it
 _BESIDE_PATH = 0.1  # [m] and [rad] standard deviation, at most, of bases beside their path
 _AROUND = 0.4  # [m] and [rad] standard deviation, at most, of bases around the ends, and of arms

@@ -15,7 +15,7 @@ import vkc_pin as vkc
 OBJECTS = Path(vkc.load_object("drawer").urdf).parent
 FINGERS = 0.0742  # [m] from the tool frame to where the open fingers end, in the direction in which they close
 BAR = 0.755  # [m] height of the drawer's bar
-STEPS = [vkc.Actuate("drawer", {"slide": 0.3})]
+STEPS = [vkc.Actuate("drawer", {"slide": 0.3}, "handle")]
 
 
 def below_a_ledge(folder: Path, *, gap: float, clearance: float | None = None, own: bool = True) -> vkc.Scene:

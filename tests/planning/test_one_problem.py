@@ -57,7 +57,7 @@ class Scripted:
         monkeypatch.setattr(module, "initialize", self.initialize)
         monkeypatch.setattr(module, "solve", self.solve)
         monkeypatch.setattr(module, "validate", self.validate)
-        monkeypatch.setattr(module, "explain", lambda *_: [])
+        monkeypatch.setattr(module, "blocked", lambda *_: None)
 
     def note(self, event: str) -> None:
         self.events.append(event)

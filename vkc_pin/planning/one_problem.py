@@ -80,6 +80,7 @@ class OneProblem:
         z: Its best z_1..z_N, shape (N, n), once `run` has found something.
         initialization: The name of the seed that led there.
         checking: How long the last check of a motion took [s].
+        hindered: Whether it is certain that no grasp helps: a joint's own way leads into something.
     """
 
     def __init__(self, scene: Scene, task: Task, settings: Settings, *, goals_first: bool = False) -> None:
@@ -92,6 +93,7 @@ class OneProblem:
         self._best: _Try | None = None
         self._explained: dict[int, Blocked | None] = {}
         self._proven: list[str] | None = None
+        self.hindered = False
 
     def run(self, seed: Callable[[TrajectoryProblem], Seed] | None = None) -> Plan:
         """Try seeds until validation accepts a motion, there are no more, or the budget is at its end.
@@ -170,7 +172,8 @@ class OneProblem:
     def _proofs(self, problem: TrajectoryProblem) -> list[str]:
         """Return what is certain, looked for once, and only when something has failed: most tasks can be done."""
         if self._proven is None:
-            self._proven = swept(problem) or proofs(problem)
+            hindered = swept(problem)
+            self.hindered, self._proven = bool(hindered), hindered or proofs(problem)
         return self._proven
 
     def _goals(self, problem: TrajectoryProblem, numbers: Iterable[int] | None = None) -> list[Blocked]:

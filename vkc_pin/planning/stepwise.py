@@ -91,7 +91,7 @@ def by_any_attachment(scene: Scene, task: Task, settings: Settings) -> tuple[One
     result = first.run()
     plans, notes = [result], list[str]()
     for name, steps in alternatives(scene, task, anew=not settings.terms):  # terms may name phases by their numbers
-        if plans[-1].success or plans[-1].status in ENDINGS:
+        if plans[-1].success or plans[-1].status in ENDINGS or first.hindered:
             break
         one = OneProblem(scene, compile_task(scene, steps, settings.options), settings, goals_first=True)
         plans.append(one.run())

@@ -155,8 +155,7 @@ class Scene:
             UnknownNameError: There is no such object, or it has no such joint.
             InputError: A value is not finite or outside the joint's limits.
         """
-        placed = self._placed(name).with_state(values)
-        return self._with(objects=MappingProxyType({**self.objects, name: placed}))
+        return self._with(objects=MappingProxyType({**self.objects, name: self._placed(name).with_state(values)}))
 
     def with_placement(self, name: str, placement: pin.SE3) -> Scene:
         """Return the scene with object `name` at `placement` (of its base link, in the world frame); see `as_placement`.
@@ -296,5 +295,6 @@ def _checked(scene: Scene) -> Scene:
     """Return a scene that was made of a description; warn of what that may not have meant."""
     warn_of_overlaps(scene, str(scene.file or scene.name))
     warn_of_openings(scene.objects, scene.robot, scene.opening, str(scene.file or scene.name))
-    loose = ((name, placed.object.attachments) for name, placed in scene.objects.items() if name not in scene.held)
-    return scene.with_approaches((Hold(name, one) for name, attachments in loose for one in attachments), stacklevel=4)
+    unsaid = [item.name for item in scene.described.objects if item.reversed is None and item.name not in scene.held]
+    holds = (Hold(name, attachment) for name in unsaid for attachment in scene.objects[name].object.attachments)
+    return scene.with_approaches(holds, stacklevel=4)

@@ -91,12 +91,15 @@ def document_of(fields: Mapping[str, Any]) -> dict[str, Any]:
         held[hold.object] = {key: value for key, value in said.items() if value is not None}
     for item, entry in zip(described.objects, plain["objects"], strict=True):
         placed = objects[item.name]
-        entry["state"] = dict(zip(placed.object.coordinates.names, placed.state.tolist(), strict=True))
-        entry.pop("reversed", None)
-        if placed.reversed:
-            entry["reversed"] = list(placed.reversed)
+        names, neutral = placed.object.coordinates.names, np.clip(0.0, placed.object.lower, placed.object.upper)
+        entry["state"] = dict(zip(names, placed.state.tolist(), strict=True))
         in_hand = placed.object.free and item.name in held
-        if not in_hand and not np.array_equal(placed.placement.homogeneous, _pose(item).homogeneous):
+        moved = not in_hand and not np.array_equal(placed.placement.homogeneous, _pose(item).homogeneous)
+        entry.pop("reversed", None)
+        as_described = not moved and entry["state"] == {**dict(zip(names, neutral.tolist(), strict=True)), **item.state}
+        if placed.reversed or item.reversed is not None or not as_described:  # else whoever reads this finds the same
+            entry["reversed"] = list(placed.reversed)
+        if moved:
             for orientation in ("yaw", "quaternion"):
                 entry.pop(orientation, None)
             entry["position"] = placed.placement.translation.tolist()
@@ -242,7 +245,7 @@ def _object(document: Document, path: tuple[str | int, ...], item: schema.Placed
     for joint, value in item.state.items():
         with document.at((*path, "state", joint)):
             placed = placed.with_state({joint: value})
-    for number, attachment in enumerate(item.reversed):
+    for number, attachment in enumerate(item.reversed or ()):
         with document.at((*path, "reversed", number)):
             placed = placed.with_reversed(attachment)
     return placed

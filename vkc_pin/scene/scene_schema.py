@@ -170,13 +170,14 @@ ObstacleSchema = Annotated[
 class PlacedObjectSchema(PoseSchema):
     """An articulated object: `type` names its description or its file, or is one; `state` its joint values (others are 0).
 
-    Attachments that are `reversed` are approached from the other side than the object's description says.
+    Attachments that are `reversed` are approached from the other side than the object's description says; None: those whose hand
+    would come out of the object or from below the floor.
     """
 
     name: Name
     type: Description
     state: Mapping[str, Number] = Field(default_factory=dict)
-    reversed: tuple[str, ...] = ()
+    reversed: tuple[str, ...] | None = None
 
 
 class SceneRobotSchema(Schema):

@@ -38,7 +38,7 @@ def is_open(scene: Scene, step: Step) -> bool:
     return len(scene.objects[step.object].object.attachments) > 1
 
 
-def alternatives(scene: Scene, task: Task, *, anew: bool = True) -> Iterator[tuple[str, tuple[Step, ...]]]:
+def alternatives(scene: Scene, task: Task, *, anew: bool = False) -> Iterator[tuple[str, tuple[Step, ...]]]:
     """Yield the steps of a task by attachments that it does not use, each with "<object>.<attachment>".
 
     There are some only where a single one of its steps leaves that open: of several, each is planned alone before. What is held

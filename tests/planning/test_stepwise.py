@@ -201,6 +201,21 @@ def test_what_cannot_be_moved_as_it_is_held_is_taken_anew(monkeypatch: pytest.Mo
     assert validate(scene, plan.steps, plan.trajectory).ok
 
 
+def test_a_goal_beyond_a_limit_is_not_asked_of_other_attachments(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No grasp helps, and the report says why."""
+    tried, real = list[str](), OneProblem.run
+
+    def run(self: OneProblem) -> vkc.Plan:
+        tried.append(str(self.task.holds[0]))
+        return real(self)
+
+    monkeypatch.setattr(OneProblem, "run", run)
+    plan = vkc.plan(vkc.load_scene("door"), [vkc.Actuate("door", {"hinge": 3.0})])
+    assert (plan.status, tried) == ("infeasible", ["door.handle"])
+    assert plan.validation.notes == ()
+    assert "3 is beyond the limits" in plan.report()
+
+
 def test_building_before_planning_costs_no_negative_time() -> None:
     scene = vkc.load_scene("drawer")
     steps = [vkc.Actuate("drawer", {"slide": 0.2})]

@@ -80,7 +80,8 @@ class OneProblem:
         z: Its best z_1..z_N, shape (N, n), once `run` has found something.
         initialization: The name of the seed that led there.
         checking: How long the last check of a motion took [s].
-        hindered: Whether it is certain that no grasp helps: a joint's own way leads into something.
+        hindered: Whether it is certain that no grasp helps: it is wrong before anything moves, or a joint's own way leads into
+            something.
     """
 
     def __init__(self, scene: Scene, task: Task, settings: Settings, *, goals_first: bool = False) -> None:
@@ -122,6 +123,7 @@ class OneProblem:
         s.budget.checking = s.budget.checking or _CHECK * problem.segments
         reasons = impossible(problem)
         if reasons:
+            self.hindered = True
             best = self._stationary(problem)
             return dataclasses.replace(best, report=best.report.with_reasons(reasons)), "infeasible"
         if self.goals_first and (blocked := self._goals(problem)):

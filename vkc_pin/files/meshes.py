@@ -16,7 +16,7 @@ import coal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vkc_pin.arrays import Floats, Ints
+from vkc_pin.arrays import LARGEST, Floats, Ints
 from vkc_pin.errors import InputError
 from vkc_pin.files.hulls import FLAT, outer_hull, thickened
 from vkc_pin.files.resources import file_path
@@ -83,6 +83,10 @@ def load_mesh(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0)) -> trimesh.T
         raise InputError("the mesh is empty", file=file, expected="at least one triangle")
     if not np.isfinite(mesh.vertices).all():
         raise InputError("the mesh has vertices that are no numbers", file=file, expected="finite coordinates")
+    with np.errstate(over="ignore"):
+        farthest = float(np.abs(mesh.vertices * factors).max())
+    if farthest > LARGEST:
+        raise InputError("the mesh is out of range", file=file, expected=f"coordinates up to {LARGEST:g} m", got=f"{farthest:g}")
     mesh.apply_transform(np.diag([*factors, 1.0]))
     return mesh
 

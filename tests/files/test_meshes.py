@@ -87,6 +87,7 @@ def test_less_detail_keeps_the_shape(tmp_path: Path) -> None:
         ("broken.stl", "not an STL file", "empty|cannot read"),
         ("thing.xyz3", "?", "cannot read"),
         ("number.obj", "v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "no numbers|cannot|empty"),
+        ("flat.obj", "v 0 0\nv 1 0\nv 0 1\nv 1 1\nf 1 2 3\nf 2 3 4\n", "cannot read"),
         ("far.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1e300\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 3 1 4\n", "out of range"),
     ],
 )

@@ -81,6 +81,8 @@ def load_mesh(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0)) -> trimesh.T
         raise InputError(f"cannot read the mesh: {error}", file=file, expected=expected) from error
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise InputError("the mesh is empty", file=file, expected="at least one triangle")
+    if np.shape(mesh.vertices)[1:] != (3,):
+        raise InputError("cannot read the mesh: its vertices have no three coordinates", file=file, expected="x, y and z of each")
     if not np.isfinite(mesh.vertices).all():
         raise InputError("the mesh has vertices that are no numbers", file=file, expected="finite coordinates")
     with np.errstate(over="ignore"):

@@ -105,6 +105,7 @@ def test_an_empty_file_is_nothing(tmp_path: Path) -> None:
         ("name: a\nmass: yes\n", 2, "mass", "a number"),
         ("name: a\nmass: .inf\n", 2, "mass", "a finite number"),
         ("name: a/b\n", 1, "name", "not a name"),
+        ('name: "a\\0"\n', 1, "name", "not a name"),
         ("name: a\nparts:\n  - size: 1\n  - size: -1\n", 4, "parts[1].size", "a number > 0"),
         ("name: a\nparts:\n  - size: 1\n    at: [1, 2]\n", 4, "parts[0].at", "3 values"),
         ("name: a\nparts: 3\n", 2, "parts", "a list"),

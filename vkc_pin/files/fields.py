@@ -73,8 +73,11 @@ Number = Annotated[float, BeforeValidator(_number), Field(allow_inf_nan=False), 
 Positive = Annotated[Number, Field(gt=0.0)]
 NotNegative = Annotated[Number, Field(ge=0.0)]
 Vector3 = Annotated[tuple[Number, Number, Number], count(3)]
-_is_name = re.compile(r"[^\s./]([^./]*[^\s./])?").fullmatch
-Name = Annotated[str, require(_is_name, "not a name", "text without '.', '/' or spaces around it")]
+_NAME = re.compile(r"[^\s./]([^./]*[^\s./])?")
+_is_name = require(
+    lambda name: name.isprintable() and _NAME.fullmatch(name), "not a name", "text without '.', '/' or spaces around it"
+)
+Name = Annotated[str, _is_name]
 
 
 def _normalised(value: tuple[float, ...]) -> tuple[float, ...]:

@@ -201,6 +201,28 @@ def test_what_cannot_be_moved_as_it_is_held_is_taken_anew(monkeypatch: pytest.Mo
     assert validate(scene, plan.steps, plan.trajectory).ok
 
 
+@pytest.mark.made_up
+def test_what_is_taken_anew_is_taken_anew_among_other_steps_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Then the steps of the plan are more than those that were asked for, and the motion is one of them all."""
+    real = OneProblem.run
+
+    def run(self: OneProblem) -> vkc.Plan:
+        plan = real(self)
+        return dataclasses.replace(plan, status="not converged") if isinstance(self.task.steps[0], vkc.Actuate) else plan
+
+    monkeypatch.setattr(OneProblem, "run", run)
+    scene, grasp, opened = (
+        vkc.load_scene("drawer"),
+        vkc.Grasp("drawer", "handle"),
+        vkc.Actuate("drawer", {"slide": 0.2}, "handle"),
+    )
+    plan = vkc.plan(scene, [grasp, opened], joint=False)
+    assert plan.success, plan.report()
+    assert plan.steps == (grasp, vkc.Release("drawer"), opened)
+    assert validate(scene, plan.steps, plan.trajectory).ok
+    assert plan.end_scene().objects["drawer"].state[0] == pytest.approx(0.2, abs=1e-3)
+
+
 def test_a_goal_beyond_a_limit_is_not_asked_of_other_attachments(monkeypatch: pytest.MonkeyPatch) -> None:
     """No grasp helps, and the report says why."""
     tried, real = list[str](), OneProblem.run

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from typing import NamedTuple
 
 from vkc_pin.budget import ENDINGS
@@ -16,6 +17,7 @@ from vkc_pin.task.actions import alternatives, is_open
 from vkc_pin.task.compiler import compile_task
 from vkc_pin.task.handling import clash
 from vkc_pin.task.phases import Task
+from vkc_pin.task.steps import Step
 
 __all__ = ["Stage", "all_at_once", "by_any_attachment", "stages", "step_by_step"]
 
@@ -42,10 +44,11 @@ def step_by_step(scene: Scene, task: Task, settings: Settings) -> Plan:
         task: What should change in the world.
         settings: How to plan.
     """
-    parts, steps = stages(scene, task, settings), list(task.steps)
-    for part in parts:
-        (steps[part.number],) = part.plan.steps
-    return joined(scene, steps, settings, [part.plan for part in parts])
+    parts = stages(scene, task, settings)
+    steps: list[tuple[Step, ...]] = [(step,) for step in task.steps]
+    for part in parts:  # one step becomes several where something is taken anew
+        steps[part.number] = part.plan.steps
+    return joined(scene, list(itertools.chain(*steps)), settings, [part.plan for part in parts])
 
 
 def all_at_once(scene: Scene, task: Task, settings: Settings) -> Plan:

@@ -216,6 +216,16 @@ def test_bytes_within_bounds(tmp_path: Path) -> None:
         read_bytes("a\0b", "plan")
 
 
+def test_what_has_no_end_is_refused() -> None:
+    """What yields as it is asked could fill the memory; what is handed over whole is taken."""
+    for endless in (itertools.repeat(0.0), (0.0 for _ in itertools.count()), map(abs, itertools.count())):
+        with pytest.raises(InputError, match=r"parts\[0\].at: wrong kind of value") as raised:
+            check(Document({"name": "a", "parts": [{"size": 1.0, "at": endless}]}), Thing)
+        assert raised.value.expected == "a list, fields, text or a number"
+    for at in ((1.0, 2.0, 3.0), [1, 2, 3]):
+        assert check(Document({"name": "a", "parts": [{"size": 1.0, "at": at}]}), Thing).parts[0].at == (1.0, 2.0, 3.0)
+
+
 def test_text_can_be_written() -> None:
     for document in (Document({"name": "x", "parts": ["a\ud800"]}), Document({"x\udfff": [1]}), Document(["\ud800"])):
         with pytest.raises(InputError, match="not text"):

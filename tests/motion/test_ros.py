@@ -157,11 +157,24 @@ def test_points_at_a_rate(plan: Plan, rate: float) -> None:
         ({"rate": "10"}, "rate: out of range"),
         ({"derivatives": 3}, "derivatives: out of range"),
         ({"stamp": -1.0}, "stamp: out of range"),
+        ({"joints": []}, "joints: no joints"),
+        ({"joints": (), "rate": 10.0}, "joints: no joints"),
     ],
 )
 def test_bad_options(plan: Plan, options: dict[str, Any], message: str) -> None:
     with pytest.raises(vkc.InputError, match=message):
         plan.to_ros(**options)
+
+
+@pytest.mark.parametrize("smooth", [True, False])
+def test_a_group_may_be_empty(plan: Plan, smooth: bool) -> None:
+    """A motion in which no object moves has no coordinates of objects."""
+    motion = plan.trajectory
+    spans = (vkc.PhaseSpan("drive", 0, len(motion.times) - 1),)
+    base = vkc.Trajectory(motion.names[:3], motion.times, motion.positions[:, :3], spans, 3)
+    message = base.to_ros(joints="objects", rate=2.0, smooth=smooth)
+    assert message["joint_names"] == []
+    assert {len(point["positions"]) for point in message["points"]} == {0}
 
 
 def changed(message: dict[str, Any], path: str, value: Any) -> dict[str, Any]:

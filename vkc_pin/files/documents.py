@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Set
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -192,7 +192,7 @@ def check(document: Document, schema: type[T]) -> T:
         InputError: It does not fit; the error is about the first wrong field in the file.
         UnknownNameError: The same, where a name resembles one that would fit.
     """
-    _check_text(document)
+    _check_plain(document)
     try:
         return schema.model_validate(document.data)
     except pydantic.ValidationError as problem:
@@ -202,8 +202,11 @@ def check(document: Document, schema: type[T]) -> T:
     raise _translate(document, path, first)
 
 
-def _check_text(document: Document) -> None:
-    """Raise InputError if a text, or the name of a field, is none that could be written: half of a surrogate pair is in it."""
+def _check_plain(document: Document) -> None:
+    """Raise InputError if something has no end, or a text could not be written.
+
+    What yields when it is asked may do so for ever. A text, and the name of a field, may hold half of a surrogate pair.
+    """
     left: list[tuple[tuple[Key, ...], Any]] = [((), document.data)]
     while left:
         path, value = left.pop()
@@ -219,6 +222,8 @@ def _check_text(document: Document) -> None:
                 value.encode("utf-8")
             except UnicodeEncodeError:
                 raise document.error(path, "not text", expected="text in UTF-8", got=ascii(value)) from None
+        elif isinstance(value, Iterable) and not isinstance(value, Mapping | Set | bytes | bytearray):
+            raise document.error(path, "wrong kind of value", expected="a list, fields, text or a number", got=shown(value))
 
 
 def _check_depth(events: Iterable[yaml.Event], file: Path) -> None:

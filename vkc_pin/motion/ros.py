@@ -58,7 +58,7 @@ def to_ros(
 
     Raises:
         UnknownNameError: There is no such group or coordinate.
-        InputError: `rate`, `derivatives` or `stamp` is out of range.
+        InputError: `joints` names none, or one twice; `rate`, `derivatives` or `stamp` is out of range.
     """
     derivatives, smooth, frame = whole(derivatives, "derivatives", low=0, high=2), flag(smooth, "smooth"), text(frame, "frame")
     if (stamp := number(stamp, "stamp", "seconds, at least 0", low=0.0)) >= 2.0**31:
@@ -69,7 +69,7 @@ def to_ros(
     velocities, accelerations = rates(times, positions)
     if rate is not None:
         rate = number(rate, "rate", "points a second, more than 0", low=0.0, above=True)
-        most = _MOST // len(columns)
+        most = _MOST // max(len(columns), 1)  # a group may be empty
         if times[-1] * rate > most:
             expected = f"at most {most} points, {most / times[-1]:.4g} a second for this motion of {times[-1]:.4g} s"
             raise InputError("too many points", field="rate", expected=expected, got=rate)

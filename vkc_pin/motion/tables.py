@@ -158,7 +158,7 @@ def chosen_columns(motion: Mapping[str, Any], joints: str | Sequence[str]) -> li
 
     Raises:
         UnknownNameError: There is no such group or coordinate.
-        InputError: A name occurs twice.
+        InputError: There is no name, or one occurs twice.
     """
     known, robot, size = motion["names"], motion["robot_size"], len(motion["names"])
     groups = {"all": (0, size), "robot": (0, robot), "base": (0, 3), "arm": (3, robot), "objects": (robot, size)}
@@ -167,6 +167,8 @@ def chosen_columns(motion: Mapping[str, Any], joints: str | Sequence[str]) -> li
             raise UnknownNameError("group of joints", joints, GROUPS, field="joints")
         return list(range(*groups[joints]))
     names = items(joints, "joints", f"one of {', '.join(GROUPS)}, or a list of names", str)
+    if not names:
+        raise InputError("no joints", field="joints", expected=f"one of {', '.join(GROUPS)}, or at least one name", got="none")
     for k, name in enumerate(names):
         if name not in known:
             raise UnknownNameError("coordinate", name, known, field=f"joints[{k}]")

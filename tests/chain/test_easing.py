@@ -124,6 +124,19 @@ def test_taken_again_it_is_eased_where_it_was_put() -> None:
     only_near(margins(p, 3)["stick.stick", "table"], EASED_SHARE * GAP, begin=True)
 
 
+@pytest.mark.parametrize(("gap", "margin"), [(GAP, EASED_SHARE * GAP), (0.0, 0.0), (-1e-3, -1e-3)])
+def test_what_is_in_the_hand_at_the_start_may_leave_what_it_lies_on(gap: float, margin: float) -> None:
+    """So a step that is planned on its own begins as well as in the middle of a chore."""
+    scene, row = room(table(gap=gap)), reaching(tool_at(STICK), above(STICK))
+    held = scene.with_start(base=row[:3], arm=row[3:]).with_held({"stick": "grip"})
+    found = margins(problem(held, GoTo(0.0, 1.0), GoTo(0.0, 0.0)), 0)
+    assert set(found) == {("stick.stick", "table")}
+    only_near(found["stick.stick", "table"], margin, begin=True)
+    assert margins(problem(held, GoTo(0.0, 1.0), GoTo(0.0, 0.0)), 1) == {}
+    raised = held.with_start(base=moved_base(row, x=-0.1)[:3], arm=above(STICK)[3:])
+    assert margins(problem(raised, GoTo(0.0, 1.0)), 0) == {}
+
+
 def test_taken_again_it_stands_in_nothing() -> None:
     """What it stood in at the start it may leave once; after that it was put down, and nothing is put down inside of things."""
     p = problem(room(table(gap=-1e-3)), Place("stick", ASIDE), Grasp("stick"), GoTo(0.0, 0.0))

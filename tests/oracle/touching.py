@@ -107,9 +107,9 @@ def _held(world: World, clock: _Clock) -> Iterator[Licence]:
 
 
 def _lifted(world: World, stages: list[Stage], clock: _Clock) -> Iterator[Licence]:
-    carried = {hold.object for hold in world.held}
+    carried: set[str] = set()  # what is in the hand at the start is lifted there
     for number, stage in enumerate(stages):
-        before = {hold.object for hold in (world.held if number == 0 else stages[number - 1].phase.holds)}
+        before = {hold.object for hold in stages[number - 1].phase.holds} if number else set()
         now = {hold.object for hold in stage.phase.holds}
         after = {hold.object for hold in stages[number + 1].phase.holds} if number + 1 < len(stages) else now
         for name in now:

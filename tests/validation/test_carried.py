@@ -88,6 +88,18 @@ def test_a_stick_that_is_carried_over_is_accepted(values: tuple[float, float]) -
         assert report.clearance == pytest.approx(1e-3, abs=1e-6)  # of the discs above the table
 
 
+def test_a_stick_that_is_in_the_hand_on_the_table_at_the_start_is_accepted() -> None:
+    """And it leaves what it lies on in time: a second later it keeps its distance."""
+    up, down = above(STICK), reaching(tool_at(STICK), above(STICK))
+    for gap in (1e-3, 0.0, -2e-3):
+        held = room(table(gap=gap)).with_start(base=down[:3], arm=down[3:]).with_held({"stick": "grip"})
+        report = judged(held, [vkc.GoTo(0.0, 0.5)], Script(held).go(up).go(moved_base(up, y=0.5)).motion())
+        assert report.ok, "\n".join(report.lines())
+        late = Script(held).go(moved_base(down, y=0.1), steps=60).go(up).go(moved_base(up, y=0.5)).motion()
+        what = "penetration" if gap < 0.0 else "clearance"
+        assert names(judged(held, [vkc.GoTo(0.0, 0.5)], late)) == {(what, "stick.stick – table")}
+
+
 def test_a_ball_that_is_fetched_with_the_stick_is_accepted() -> None:
     for steps in (
         [vkc.Place("ball", lifted(BALL, [0.0, 0.3, 0.0]))],

@@ -17,7 +17,7 @@ from vkc_pin.scene.contact import CONTACT, EASED_TIME, hand_clearance, touching
 from vkc_pin.scene.placed import PlacedObject, standing_geometry
 from vkc_pin.scene.resting import Ride
 from vkc_pin.scene.scene import Scene
-from vkc_pin.task.phases import Phase, Task
+from vkc_pin.task.phases import Task
 
 __all__ = ["EASED_SHARE", "eased_pairs"]
 
@@ -32,9 +32,9 @@ def eased_pairs(
     """Return pair → (first waypoint, last waypoint, margin [m]) for what may be close for a while; see `scene.contact`.
 
     A hand keeps the attachment's clearance from the object that it takes or lets go of. A free object rests on something where it
-    is lifted from and where it is put down, with what rides on it; a frame that touches a target may come close to what the
-    target is on: there the margin is half the distance at the contact. What a free object stands in at the start it may stand in
-    then.
+    is lifted from and where it is put down, and may still do so in the hand at the start, with what rides on it; a frame that
+    touches a target may come close to what the target is on: there the margin is half the distance at the contact. What a free
+    object stands in at the start it may stand in then.
 
     Args:
         scene: Where it happens.
@@ -66,7 +66,7 @@ def eased_pairs(
             for k in np.flatnonzero(hand[part.pairs[:, 0]] & its[part.pairs[:, 1]]).tolist():
                 margin = hand_clearance(scene, hold, part.labels[part.pairs[k, 1]], options)
                 eased.setdefault(k, []).append((begin, end, margin))
-    for geometries, placed, begins in _moments(scene, chain, phase):
+    for geometries, placed, begins in _moments(scene, chain, task, number):
         stands = {shape.name: shape.placement for shape in standing_geometry(placed)}
         for i in geometries:
             begin, end = (first, first + steps) if begins else (last - steps, last)
@@ -85,10 +85,19 @@ def eased_pairs(
     return eased
 
 
-def _moments(scene: Scene, chain: VirtualKinematicChain, phase: Phase) -> Iterator[tuple[Sequence[int], PlacedObject, bool]]:
-    """Yield the geometries, and where their object stands, of what begins or ends to be carried in a phase: (..., begins)."""
-    for moments, begins in ((phase.lifted, True), (phase.lowered, False)):
+def _moments(
+    scene: Scene, chain: VirtualKinematicChain, task: Task, number: int
+) -> Iterator[tuple[Sequence[int], PlacedObject, bool]]:
+    """Yield the geometries, and where their object stands, of what begins or ends to be carried in a phase: (..., begins).
+
+    What is in the hand at the start begins there.
+    """
+    phase = task.phases[number]
+    at_start = {hold: scene.objects[hold.object].placement for hold in phase.held if number == 0 and hold in scene.holds}
+    for moments, begins in ((at_start, True), (phase.lifted, True), (phase.lowered, False)):
         for hold, placement in moments.items():
+            if not scene.objects[hold.object].object.free:
+                continue
             placed = dataclasses.replace(scene.objects[hold.object], placement=placement)
             yield chain.held_geometries[hold], placed, begins
             for ride in phase.rides:

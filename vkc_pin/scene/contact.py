@@ -12,6 +12,7 @@
 - Links of objects that are closer than `Options.dist_safe` to what else stands there, at the start or with all joints at zero,
   keep no clearance until their joints have taken them so far apart, and overlap only if they did there; see `neighbours`.
 - What a free object stands in where it is lifted for the first time, it may leave within `EASED_TIME`.
+- What is in the hand at the start is lifted there: what it is next to, or in, it may leave within `EASED_TIME`.
 - What the scene allows keeps the margin that the scene says, or none; see `Scene.allowed`.
 
 The gripper is as far open as the attachment says that it holds, or comes to next; it opens and closes where something is grasped

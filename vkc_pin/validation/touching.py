@@ -146,10 +146,9 @@ class _Windows:
         for hold, first, last in self._runs([set(self.scene.holds), *holds]):
             yield from self._hand(hold, first, last)
         yield from self._grasps([step for step in steps if isinstance(step, Grasp)])
-        moved = {name for name in self.scene.held if self.scene.objects[name].object.free}
+        moved = set[str]()
         for owner, first, last in sorted(self._runs(self._carried()), key=lambda run: -1 if run[1] is None else run[1]):
-            for at in [first] if first is not None else []:
-                yield from self._beside(owner, at, self._until(at), new=owner not in moved)
+            yield from self._beside(owner, first or 0, self._until(first or 0), new=owner not in moved)
             for at in [last] if last is not None else []:
                 yield from self._beside(owner, at, self._since(at), begin=False)
             moved.add(owner)
@@ -208,7 +207,7 @@ class _Windows:
     def _beside(self, owner: str, at: int, other: int, *, begin: bool = True, new: bool = False) -> Iterator[Window]:
         """Yield what a free object is next to where it begins or ends to be carried, at waypoint `at`.
 
-        Where it is lifted for the first time (`new`), it may be as deep in something as it stood there.
+        Where it is lifted for the first time, or in the hand from the start (`new`), it may be as deep in something as it was.
         """
         mine = self._shapes(owner)
         pairs = self._pairs(mine, [k for k in range(self.robots, len(self.labels)) if k not in mine])

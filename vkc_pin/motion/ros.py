@@ -77,7 +77,8 @@ def to_ros(
         if smooth:
             positions, velocities, accelerations = along(times, positions, velocities, moments)
         else:
-            positions = np.stack([np.interp(moments, times, column) for column in positions.T], axis=-1)
+            rows = [np.interp(moments, times, column) for column in positions.T]
+            positions = np.reshape(rows, (len(columns), len(moments))).T
             velocities, accelerations = rates(moments, positions)
         times = moments
     parts = [positions, *(rows[:, : len(columns) * (derivatives > k)] for k, rows in enumerate((velocities, accelerations)))]

@@ -211,7 +211,7 @@ def changed(data: Any, changes: list[list[Any]]) -> Any:
                 around[value] = around.pop(key)
             elif what == "double" and isinstance(around, list):
                 around.insert(key, copy.deepcopy(around[key]))
-        except (LookupError, TypeError):
+        except (LookupError, TypeError, ValueError):  # the last: of what became an array
             continue
     return data
 

@@ -159,7 +159,8 @@ class SlidingWindow:
             return failed
         for _, steps in alternatives(scene, self._task(scene, number, number + 1, self.settings.options)):
             self.actions[number] = steps
-            other = self._alone(number, scene, goals_first=True)
+            held_twice = clash(scene, self._task(scene, number, number + 1, self.settings.options).holds) is not None
+            other = failed if held_twice else self._alone(number, scene, goals_first=True)
             if other is None:
                 return None
             self.actions[number] = chosen

@@ -180,6 +180,8 @@ class Beam:
             distances = self.routes.distances(phase, first[:, :3], last[:, :3], folded=self.careful)
             cost[:, 0] = self.metric[0] * distances
             np.minimum(cost, _NOT_FOUND, out=cost)  # where there is no path, others come first
+        elif self.routes is not None:
+            cost[:, 0] += _TOLERABLE * (np.abs(last - first)[:, :2].max(axis=1) > _JUMP)
         return np.asarray(cost.sum(axis=1))
 
     def _continue(self, paths: Floats, cost: Floats, waypoint: int, phase: int, mode: _Mode) -> tuple[Ints, Floats, Floats]:

@@ -9,6 +9,7 @@ import numpy as np
 from vkc_pin.arrays import Floats
 from vkc_pin.program.merit import TOLERANCE
 from vkc_pin.program.problem import TrajectoryProblem
+from vkc_pin.scene.contact import CONTACT
 from vkc_pin.seeds.knots import depth, scatter
 from vkc_pin.validation.report import Violation
 
@@ -40,7 +41,7 @@ def impossible(problem: TrajectoryProblem) -> list[Violation]:
     found = []
     contacts = problem.contacts.evaluate(problem.start[None], np.array([0]), reach=0.0)
     for (first, second), distance, margin in zip(contacts.pair, contacts.distance, contacts.margin, strict=True):
-        if distance >= margin:  # as the scene allows
+        if distance >= (margin if margin > 0.0 else margin - CONTACT):  # as the scene allows, or in contact where that may be
             continue
         labels = problem.contacts.phases[0].labels
         subject = f"{labels[first]} – {labels[second]}"

@@ -12,6 +12,7 @@ import json
 import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -98,13 +99,13 @@ def door() -> str:
     return "\n\n".join([markdown([*head, "build, at most [s]"], rows), markdown(split, parts), about])
 
 
-def drawn() -> str:
-    """Return the tables of random problems: what came of them, and whether the oracle agrees."""
-    found = result("random")
+def drawn(name: str) -> str:
+    """Return the tables of random problems on record: what came of them, and whether the oracle agrees."""
+    found = result(name)
     about, trials = found["meta"], found["trials"]
     statuses = sorted({trial["status"] for trial in trials} - {"success"})
     rows = []
-    for kind in ("room", "scene"):
+    for kind in sorted({trial["kind"] for trial in trials}):
         own = of(trials, {"kind": kind})
         counts = [str(len(of(own, {"status": status}))) for status in statuses]
         rows.append([kind, good(own), *counts, *(f"{value:.2f}" for value in distribution(own, "planning_time"))])
@@ -128,7 +129,11 @@ def good(trials: Sequence[Mapping[str, Any]]) -> str:
 
 def reported(name: str) -> str:
     """Return the tables of a record, as its experiment reports them."""
-    own: dict[str, Callable[[], str]] = {"status": status, "door": door, "random": drawn}
+    own: dict[str, Callable[[], str]] = {
+        "status": status,
+        "door": door,
+        **{name: partial(drawn, name) for name in ("random", "rooms")},
+    }
     if name in own:
         return own[name]() + "\n"
     module = importlib.import_module(f"vkc_pin.benchmarks.{REPORTS[name]}")

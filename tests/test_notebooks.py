@@ -122,7 +122,7 @@ def test_first_plan(tmp_path: Path) -> None:
     assert "wrist_3_joint" in text(cells["files"])
     count = int(re.findall(r"(\d+) points", text(cells["files"]))[0])
     assert count == pytest.approx(100 * motion.times[-1], abs=2)
-    assert len((tmp_path / "door.csv").read_text(encoding="utf-8").splitlines()) == len(motion.times) + 1
+    assert len((tmp_path / "door.csv").read_text(encoding="utf-8").splitlines()) == len(motion.curve.times) + 1
     assert (tmp_path / "door.html").stat().st_size > 100_000
     assert result(cells["again"])["text/plain"].count("True") == 3
 

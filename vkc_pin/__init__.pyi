@@ -13,7 +13,8 @@ from .models.proposals.proposal import Proposal, Proposals
 from .models.proposals.propose import propose_attachments
 from .models.robot import Robot
 from .models.robot_file import load_robot
-from .motion.trajectory import PhaseSpan, Trajectory
+from .motion.spans import PhaseSpan
+from .motion.trajectory import Trajectory
 from .options import Options
 from .planning.chore import plan_chore
 from .planning.plan import Plan

@@ -21,7 +21,8 @@ from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.limits import EFFORT, LIMITS
 from vkc_pin.cli import main
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.motion.spans import PhaseSpan
+from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.planning.outcome import spent
 from vkc_pin.validation.report import Report, Violation
 

@@ -21,7 +21,7 @@ FIELDS = {
     *("key", "scene", "method", "number", "repeat", "perturbation", "start", "seed", "success", "status", "planning_time"),
     *("base_effort", "base_effort_l1", "arm_effort", "clearance", "closure_error", "iterations", "rounds", "effort", "waypoints"),
     *("initialization", "build_time", "failed_constraint", "violations"),
-    *(f"time_{part}" for part in ("initialization", "coal", "casadi", "ipopt", "validation")),
+    *(f"time_{part}" for part in ("initialization", "coal", "casadi", "ipopt", "retiming", "validation")),
     "commit",
 }
 

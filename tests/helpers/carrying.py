@@ -12,7 +12,8 @@ import pinocchio as pin
 
 from helpers.drives import DT, hall
 from vkc_pin.models.object_file import load_object
-from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.motion.spans import PhaseSpan
+from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.scene.hold import holds_of
 from vkc_pin.scene.placed import PlacedObject
 from vkc_pin.scene.scene import Scene

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.motion.spans import PhaseSpan
+from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.scene.hold import Hold

@@ -45,6 +45,4 @@ def with_attachments(scene: Scene, change: Mapping[str, Attachment]) -> Scene:
 
 def until_the_grasp(plan: vkc.Plan) -> Trajectory:
     """Return the first phase of the planned motion."""
-    first = plan.trajectory.phases[0]
-    times, positions = plan.trajectory.times[: first.last + 1], plan.trajectory.positions[: first.last + 1]
-    return dataclasses.replace(plan.trajectory, times=times, positions=positions, phases=(first,))
+    return plan.trajectory.parts()[0]

@@ -6,7 +6,8 @@ import numpy as np
 import pinocchio as pin
 
 from helpers.carrying import Script, room, table
-from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.motion.spans import PhaseSpan
+from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.scene import Scene
 from vkc_pin.validation.pairs import PairTable

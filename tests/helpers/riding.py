@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.motion.spans import PhaseSpan
+from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.scene import Scene
 

@@ -9,7 +9,8 @@ import numpy as np
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
-from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.motion.spans import PhaseSpan
+from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.scene.hold import Hold
 
 FILES = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60, deadline=None)

@@ -7,8 +7,9 @@ import pytest
 from helpers.written import NAMES, PHASES, ROWS, TIMES, example
 
 from vkc_pin.errors import InputError
+from vkc_pin.motion.spans import PhaseSpan
 from vkc_pin.motion.splicing import cut, filled, join
-from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.scene.hold import Hold, holds_of
 
 

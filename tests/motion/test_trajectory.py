@@ -10,7 +10,8 @@ import pytest
 from helpers.written import NAMES, PHASES, ROWS, TIMES, example
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.motion.spans import PhaseSpan
+from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.scene.hold import holds_of
 
 

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import vkc_pin as vkc
-from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.motion.spans import PhaseSpan
+from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.motion.world import World, units_of
 from vkc_pin.planning.plan import Plan
 from vkc_pin.scene.placed import standing_geometry

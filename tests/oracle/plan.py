@@ -1,4 +1,4 @@
-"""Reads a saved plan: an .npz with a JSON text `about`, `times` and `positions`."""
+"""Reads a saved plan: an .npz with a JSON text `about`, `times` and `positions`, and with the knots of a curve if it has one."""
 
 from __future__ import annotations
 
@@ -52,6 +52,33 @@ class Phase:
     opening: float | None
 
 
+_FINE = 8  # parts of a cubic that are looked at
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Cubics between knots, by positions and velocities there."""
+
+    times: np.ndarray
+    positions: np.ndarray
+    rates: np.ndarray
+
+    def inside(self, parts: int) -> np.ndarray:
+        """Moments in every cubic, both ends among them."""
+        return self.times[:-1, None] + np.diff(self.times)[:, None] * np.linspace(0.0, 1.0, parts + 1)
+
+    def derivative(self, moments: np.ndarray, order: int, number: np.ndarray | None = None) -> np.ndarray:
+        """The positions (0), velocities (1) or accelerations (2) at some moments, of the cubics with these numbers."""
+        k = np.clip(np.searchsorted(self.times, moments, side="right") - 1, 0, len(self.times) - 2) if number is None else number
+        h, since = np.diff(self.times)[k][:, None], (moments - self.times[k])[:, None]
+        p, v, step = self.positions[k], self.rates[k], self.positions[k + 1] - self.positions[k]
+        c2 = (3.0 * step / h - 2.0 * v - self.rates[k + 1]) / h
+        c3 = (v + self.rates[k + 1] - 2.0 * step / h) / h**2
+        if order == 0:
+            return p + since * (v + since * (c2 + since * c3))
+        return v + since * (2.0 * c2 + 3.0 * since * c3) if order == 1 else 2.0 * c2 + 6.0 * since * c3
+
+
 @dataclass(frozen=True)
 class SavedPlan:
     """What a file says; `says` is the plan's own verdict: its violated constraints, by name and subject."""
@@ -63,6 +90,7 @@ class SavedPlan:
     names: list[str]
     times: np.ndarray
     positions: np.ndarray
+    curve: Curve | None
     robot_size: int
     phases: list[Phase]
     status: str
@@ -72,6 +100,18 @@ class SavedPlan:
     @property
     def success(self) -> bool:
         return self.status == "success" and not self.says
+
+    def at(self, moments: np.ndarray) -> np.ndarray:
+        """Where all coordinates are at some times."""
+        if self.curve is not None:
+            return self.curve.derivative(moments, 0)
+        return np.stack([np.interp(moments, self.times, column) for column in self.positions.T], axis=1)
+
+    def fine(self) -> np.ndarray:
+        """Where all coordinates are all along: at the waypoints, and so often between them that nothing is missed."""
+        if self.curve is None:
+            return self.positions
+        return self.at(np.concatenate([self.curve.inside(_FINE).ravel(), self.times]))
 
     def index(self, name: str) -> int | None:
         return self.names.index(name) if name in self.names else None
@@ -94,6 +134,8 @@ def read_plan(path: Path) -> SavedPlan:
     with np.load(path, allow_pickle=False) as archive:
         about = json.loads(str(archive["about"]))
         times, positions = np.array(archive["times"]), np.array(archive["positions"])
+        knots = ("knot_times", "knot_positions", "knot_rates")
+        curve = Curve(*(np.array(archive[name]) for name in knots)) if knots[0] in archive else None
     where = about["folder"]
     if "package" in where:
         folder = ROOT / where["package"]
@@ -112,6 +154,7 @@ def read_plan(path: Path) -> SavedPlan:
         names=motion["names"],
         times=times,
         positions=positions,
+        curve=curve,
         robot_size=motion["robot_size"],
         phases=phases,
         status=about["status"],

@@ -21,21 +21,31 @@ STILL = 1e-5  # [m] or [rad]
 def check_motion(world: World) -> Iterator[Violation]:
     """Check what the waypoints alone tell."""
     plan = world.plan
+    fine = plan.fine()
     for k, name in enumerate(plan.names):
         column = plan.positions[:, k]
         if name in world.start and (off := abs(column[0] - world.start[name])) > 1e-9:
             yield Violation("start", name, 0.0, off, f"{column[0]:.6g} instead of {world.start[name]:.6g}")
         low, high, fastest, strongest = _limits(world, name)
-        outside = np.maximum(low - column, column - high)
-        outside[0] -= 1e-2  # the robot is where it is
-        yield from _worst("limit", name, outside - 1e-5, plan.times, f"limits {low:.4g} to {high:.4g}")
-        spans = np.diff(plan.times)
-        speed = np.diff(column) / spans
-        yield from _worst("velocity", name, np.abs(speed) - 1.001 * fastest - 1e-9, plan.times, f"limit {fastest:g}")
-        change = np.abs(np.diff(np.concatenate([[0.0], speed, [0.0]])))  # from rest, to rest
-        shorter = np.minimum(np.append(spans, np.inf), np.append(np.inf, spans))
-        excess = change / shorter - 1.001 * strongest - 1e-9
-        yield from _worst("acceleration", name, excess, plan.times, f"limit {strongest:g}")
+        outside = np.maximum(low - fine[:, k], fine[:, k] - high)
+        most = 1e-2 if max(low - column[0], column[0] - high) <= 1e-2 else 0.0  # the robot is where it is
+        near = np.abs(fine[:, k] - column[0]) <= 1e-9
+        outside[near] -= most
+        yield from _worst("limit", name, outside - 1e-5, np.zeros(len(outside)), f"limits {low:.4g} to {high:.4g}")
+        if plan.curve is None:
+            spans = np.diff(plan.times)
+            speed = np.diff(column) / spans
+            change = np.abs(np.diff(np.concatenate([[0.0], speed, [0.0]])))  # from rest, to rest
+            shorter = np.minimum(np.append(spans, np.inf), np.append(np.inf, spans))
+            strength, when, moments = change / shorter, plan.times, plan.times
+        else:
+            inside = plan.curve.inside(8)
+            number, when = np.repeat(np.arange(len(inside)), inside.shape[1]), inside.ravel()
+            speed, strength = (np.abs(plan.curve.derivative(when, order, number)[:, k]) for order in (1, 2))
+            moments = when
+            yield from _worst("velocity", name, np.abs(plan.curve.rates[[0, -1], k]) - 1e-6, plan.times[[0, -1]], "no rest")
+        yield from _worst("velocity", name, np.abs(speed) - 1.001 * fastest - 1e-9, moments, f"limit {fastest:g}")
+        yield from _worst("acceleration", name, strength - 1.001 * strongest - 1e-9, when, f"limit {strongest:g}")
     if world.robot.base == "differential":
         step = np.diff(plan.positions[:, :3], axis=0)
         heading = plan.positions[:-1, 2] + step[:, 2] / 2

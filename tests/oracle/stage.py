@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,6 +22,7 @@ __all__ = ["FLOOR", "Solid", "Stage", "World"]
 
 LENGTH, ANGLE = 2e-3, 5e-3  # [m], [rad] from sample to sample, at most
 FLOOR = "floor"
+_PARTS = 16  # of a step between two waypoints, to see how far it goes
 
 
 @dataclass(frozen=True)
@@ -129,7 +131,9 @@ class World:
         """For every step between waypoints, whether robot and objects stand still; freedoms of grasps are not looked at."""
         things = {f"{name}.{joint}" for name, thing in self.things.items() for joint in thing.limits}
         bodies = [k < self.plan.robot_size or name in things for k, name in enumerate(self.plan.names)]
-        return np.asarray(np.abs(np.diff(self.plan.positions[:, bodies], axis=0)).max(axis=1) < 1e-9)
+        plan = self.plan
+        along = [plan.at(a + (b - a) * np.linspace(0.0, 1.0, _PARTS + 1))[:, bodies] for a, b in itertools.pairwise(plan.times)]
+        return np.array([np.ptp(rows, axis=0).max() < 1e-9 for rows in along])
 
     @cached_property
     def fingers(self) -> Fingers:
@@ -158,7 +162,11 @@ class World:
         """Return times, coordinates, where the fingers' joints are, and which rows are waypoints, of a phase."""
         plan, phase, fingers = self.plan, self.plan.phases[number], self.opened(number)
         z, t = plan.positions[phase.first : phase.last + 1], plan.times[phase.first : phase.last + 1]
-        steps = np.abs(np.diff(z, axis=0))
+        if plan.curve is None:
+            steps = np.abs(np.diff(z, axis=0))
+        else:  # as often as the fastest stretch of it asks for
+            parts = np.stack([plan.at(a + (b - a) * np.linspace(0.0, 1.0, _PARTS + 1)) for a, b in itertools.pairwise(t)])
+            steps = _PARTS * np.abs(np.diff(parts, axis=1)).max(axis=1)
         units = np.array([LENGTH if self.slides(name) else ANGLE for name in plan.names])
         ratio = np.maximum((steps / units).max(axis=1), np.linalg.norm(steps[:, :2], axis=1) / LENGTH)
         if self.fingers.joints:
@@ -167,7 +175,7 @@ class World:
         counts = np.maximum(1, np.ceil(ratio - 1e-9)).astype(int)
         share = np.concatenate([k + np.arange(n) / n for k, n in enumerate(counts)] + [[len(counts)]])
         waypoints = np.arange(len(t))
-        columns = np.stack([np.interp(share, waypoints, column) for column in z.T], axis=1)
+        columns = plan.at(np.interp(share, waypoints, t))
         hand = {name: np.interp(share, waypoints, column) for name, column in zip(self.fingers.joints, fingers.T, strict=True)}
         return np.interp(share, waypoints, t), columns, hand, np.concatenate([[0], np.cumsum(counts)])
 

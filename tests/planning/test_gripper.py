@@ -20,7 +20,8 @@ import vkc_pin as vkc
 from vkc_pin.chain.chain import consolidate
 from vkc_pin.chain.contacts import ContactModel
 from vkc_pin.motion.placements import sample_motion
-from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.motion.spans import PhaseSpan
+from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.motion.world import World
 from vkc_pin.scene.contact import opening_at_start
 from vkc_pin.scene.scene import Scene

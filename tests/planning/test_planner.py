@@ -98,11 +98,12 @@ def test_the_demo_holds_the_handle(demo: vkc.Plan) -> None:
 def test_the_demo_is_one_unbroken_motion(demo: vkc.Plan) -> None:
     trajectory, robot = demo.trajectory, demo.scene.robot
     np.testing.assert_allclose(trajectory.positions[0, :9], demo.scene.start, atol=1e-9)
-    steps, spans = np.diff(trajectory.positions[:, :9], axis=0), np.diff(trajectory.times)[:, None]
-    assert np.all(np.abs(steps) <= robot.velocity * spans * 1.001 + 1e-9)  # nowhere a gap
-    velocity = np.vstack([np.zeros(9), steps / spans, np.zeros(9)])
-    shorter = np.minimum(np.vstack([spans, spans[-1:]]), np.vstack([spans[:1], spans]))
-    assert np.all(np.abs(np.diff(velocity, axis=0)) <= robot.acceleration * shorter * 1.001 + 1e-9)
+    times = np.linspace(trajectory.times[0], trajectory.times[-1], 20_001)
+    rows, step = trajectory(times)[:, :9], times[1] - times[0]
+    speeds = np.diff(rows, axis=0) / step  # in numbers alone; nowhere a gap, and from rest to rest
+    assert np.all(np.abs(speeds) <= robot.velocity * 1.001 + 1e-9)
+    speeds = np.vstack([np.zeros(9), speeds, np.zeros(9)])
+    assert np.all(np.abs(np.diff(speeds, axis=0)) <= robot.acceleration * step * 1.001 + 1e-9)
     # The robot waits at the handle for the gripper to close.
     grasp = trajectory.phases[0].last
     np.testing.assert_array_equal(trajectory.positions[grasp], trajectory.positions[grasp + 1])
@@ -112,11 +113,11 @@ def test_the_demo_is_one_unbroken_motion(demo: vkc.Plan) -> None:
 
 
 def test_metrics_are_the_trajectorys(demo: vkc.Plan) -> None:
-    m, positions = demo.metrics, demo.trajectory.positions
+    m, positions = demo.metrics, demo.trajectory(np.linspace(0.0, demo.trajectory.times[-1], 50_001))
     base = np.diff(positions[:, :2], axis=0)
-    assert m["base_effort"] == pytest.approx(np.sqrt((base**2).sum(axis=1)).sum())
-    assert m["base_effort_l1"] == pytest.approx(np.abs(base).sum())
-    assert m["arm_effort"] == pytest.approx(np.abs(np.diff(positions[:, 3:9], axis=0)).sum())
+    assert m["base_effort"] == pytest.approx(np.sqrt((base**2).sum(axis=1)).sum(), rel=1e-3)
+    assert m["base_effort_l1"] == pytest.approx(np.abs(base).sum(), rel=1e-3)
+    assert m["arm_effort"] == pytest.approx(np.abs(np.diff(positions[:, 3:9], axis=0)).sum(), rel=1e-3)
     assert m["duration"] == demo.trajectory.times[-1]
     assert m["clearance"] == demo.validation.clearance
     assert m["clearance"] > 0.0

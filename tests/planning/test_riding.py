@@ -76,7 +76,11 @@ def test_the_hand_closes_while_the_robot_stands_still() -> None:
     begin = plan.trajectory.phases[1].first
     times = plan.trajectory.times.copy()
     times[begin + 1 :] -= 0.4  # less time for the gripper
-    hasty = validate(plan.scene, plan.steps, dataclasses.replace(plan.trajectory, times=times), plan.options)
+    curve = plan.trajectory.curve
+    assert curve is not None
+    knots = np.where(curve.times > plan.trajectory.times[begin], curve.times - 0.4, curve.times)
+    hurried = dataclasses.replace(plan.trajectory, times=times, curve=dataclasses.replace(curve, times=knots))
+    hasty = validate(plan.scene, plan.steps, hurried, plan.options)
     assert names(hasty) == {("dwell", "plate.handle")}
     (found,) = hasty.violations
     assert found.amount == pytest.approx(0.4, abs=1e-6)

@@ -16,7 +16,8 @@ from helpers.small_problems import full_scene, program_of, with_objects
 import vkc_pin as vkc
 from vkc_pin.benchmarks.anything.pairs import description_of, hall
 from vkc_pin.budget import Budget
-from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.motion.spans import PhaseSpan
+from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.motion.world import scene_after
 from vkc_pin.planning import stepwise as module
 from vkc_pin.planning.one_problem import OneProblem

@@ -30,7 +30,8 @@ from helpers.carrying import (
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.motion.spans import PhaseSpan
+from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.steps import Step

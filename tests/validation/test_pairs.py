@@ -10,7 +10,8 @@ from helpers.carrying import Script, moved_base, room, stand, table
 from helpers.motions import pair_names, wander
 from helpers.small_problems import door_scene, full_scene, program_of
 
-from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.motion.spans import PhaseSpan
+from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.motion.world import World
 from vkc_pin.options import Options
 from vkc_pin.scene.hold import Hold

@@ -39,6 +39,7 @@ from vkc_pin.planning.outcome import outcome, spent
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import Planner, borrowed
 from vkc_pin.planning.settings import budget_for, check_arguments
+from vkc_pin.retiming.repair import accepted
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.compiler import compile_task
 from vkc_pin.task.steps import Step
@@ -105,7 +106,7 @@ def plan_separately(
             attempt = Attempt(scene, options, refine=method == "B2", seed=[int(seed), number], cache=cache)
             trajectory, came, cause = attempt.run(actions)
             checked = time.perf_counter()
-            report = validate(scene, task.steps, trajectory, options)
+            trajectory, report = _timed(scene, task.steps, trajectory, options, failed=cause != "")
             budget.checking = time.perf_counter() - checked
             attempt.times["validation"] += budget.checking
             status = "success" if report.ok else cause or "rejected"
@@ -126,3 +127,18 @@ def plan_separately(
     took = spent(time.perf_counter() - began - built, built, **counts, times=times)
     name = f"{method}, try {tried + 1}"
     return outcome(scene, task.steps, options, trajectory, report, status, took=took, random_seed=int(seed), initialization=name)
+
+
+def _timed(
+    scene: Scene, steps: Sequence[Step], trajectory: Trajectory, options: Options, *, failed: bool
+) -> tuple[Trajectory, Report]:
+    """Return a motion timed as those of `plan` are, or in its own time if only that is accepted, and what validation says."""
+
+    def check(motion: Trajectory) -> Report:
+        return validate(scene, steps, motion, options)
+
+    if not failed:
+        timed, report = accepted(scene, trajectory, check)
+        if report.ok:
+            return timed, report
+    return trajectory, check(trajectory)

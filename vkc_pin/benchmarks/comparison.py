@@ -181,9 +181,10 @@ def goals(steps: Sequence[Step]) -> dict[str, Any]:
 
 def peaks(trajectory: Trajectory) -> dict[str, float]:
     """Return the largest velocity [rad/s] and acceleration [rad/s²] of an arm joint: peak_velocity, peak_acceleration."""
-    arm = slice(3, trajectory.robot_size)
-    rates = {"peak_velocity": trajectory.velocities(), "peak_acceleration": trajectory.accelerations()}
-    return {name: float(np.abs(rate[:, arm]).max(initial=0.0)) for name, rate in rates.items()}
+    arm, curve = slice(3, trajectory.robot_size), trajectory.curve
+    rates = (trajectory.velocities(), trajectory.accelerations()) if curve is None else curve.speeds()
+    largest = [float(np.abs(rate[:, arm]).max(initial=0.0)) for rate in rates]
+    return dict(zip(("peak_velocity", "peak_acceleration"), largest, strict=True))
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from vkc_pin.cli.checking import add_check
 from vkc_pin.cli.importing import add_importing
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.files.writing import check_outputs, write_atomically
-from vkc_pin.motion.tables import GROUPS
+from vkc_pin.motion.formats.tables import GROUPS
 
 __all__ = ["EXIT_MISUSE", "make_parser", "parse_settings", "run"]
 

@@ -203,10 +203,7 @@ def check(document: Document, schema: type[T]) -> T:
 
 
 def _check_plain(document: Document) -> None:
-    """Raise InputError if something has no end, or a text could not be written.
-
-    What yields when it is asked may do so for ever. A text, and the name of a field, may hold half of a surrogate pair.
-    """
+    """Raise InputError if something may have no end, or a text, or a field's name, holds half of a surrogate pair."""
     left: list[tuple[tuple[Key, ...], Any]] = [((), document.data)]
     while left:
         path, value = left.pop()

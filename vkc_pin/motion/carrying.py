@@ -10,7 +10,8 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.arrays import Floats
-from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.motion.spans import PhaseSpan
+from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.scene.placed import PlacedObject
 from vkc_pin.scene.resting import borne
 from vkc_pin.scene.scene import Scene
@@ -53,6 +54,10 @@ class FreeObjects:
             flips = np.concatenate([[1.0], np.sign(np.einsum("kc,kc->k", row[1:, 3:], row[:-1, 3:]))])
             row[:, 3:] *= np.cumprod(np.where(flips == 0.0, 1.0, flips))[:, None]
         return rows
+
+    @cached_property
+    def _ranges(self) -> tuple[Floats, Floats]:
+        return self.trajectory.ranges()
 
     @cached_property
     def rides(self) -> list[dict[str, str]]:
@@ -132,9 +137,10 @@ class FreeObjects:
 
     def _rides(self, phase: PhaseSpan, where: Mapping[str, pin.SE3]) -> dict[str, str]:
         """Return free object → "<object>.<link>" of what rides in a phase, before which free objects are at `where`."""
-        inside, names = self.trajectory.positions[phase.first : phase.last + 1], self.trajectory.names
-        moved = {name for name, spread in zip(names, np.ptp(inside, axis=0), strict=True) if spread > 0.0}
-        begin = dict(zip(names, inside[0].tolist(), strict=True))
+        names, (low, high) = self.trajectory.names, self._ranges
+        spreads = high[phase.first : phase.last].max(axis=0) - low[phase.first : phase.last].min(axis=0)
+        moved = {name for name, spread in zip(names, spreads, strict=True) if spread > 0.0}
+        begin = dict(zip(names, self.trajectory.positions[phase.first].tolist(), strict=True))
         moving, objects = dict[str, set[str]](), dict[str, PlacedObject]()
         for name, placed in self.scene.objects.items():
             joints = placed.object.coordinates.names

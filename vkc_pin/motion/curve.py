@@ -13,8 +13,11 @@ from vkc_pin.arguments import numbers
 from vkc_pin.arrays import Floats, Ints
 from vkc_pin.errors import InputError
 
-__all__ = ["Curve"]
+__all__ = ["SHORTEST", "Curve", "joined"]
 
+SHORTEST = 1e-9
+"""Least time from knot to knot [s]."""
+_OFF = 1e-9  # [m] or [rad] beside a waypoint
 _LARGEST = 1e12  # [m] or [rad] of a coordinate, and of its rate [m/s], [rad/s]
 
 
@@ -40,8 +43,9 @@ class Curve:
 
     def __post_init__(self) -> None:
         times, positions, rates = (numbers(getattr(self, name), f"curve.{name}") for name in ("times", "positions", "rates"))
-        if times.ndim != 1 or len(times) < 2 or not np.all(np.diff(times) > 0):
-            raise InputError("times do not increase", field="curve.times", expected="at least 2 increasing numbers")
+        if times.ndim != 1 or len(times) < 2 or not np.all(np.diff(times) >= SHORTEST):
+            expected = f"at least 2 numbers, each {SHORTEST:g} s after the one before or more"
+            raise InputError("times do not increase", field="curve.times", expected=expected)
         if positions.ndim != 2 or len(positions) != len(times):
             expected = f"({len(times)}, n)"
             raise InputError("wrong shape", field="curve.positions", expected=expected, got=positions.shape)
@@ -87,10 +91,22 @@ class Curve:
         before, after = self.positions[k], self.positions[k + 1]
         return before, before + third * self.rates[k], after - third * self.rates[k + 1], after
 
-    def bounds(self) -> tuple[Floats, Floats]:
-        """Return least and largest position on each cubic at most, shape (K − 1, n) each."""
-        points = np.stack(self._control(np.arange(len(self.times) - 1)))
-        return np.asarray(points.min(axis=0)), np.asarray(points.max(axis=0))
+    def extremes(self) -> tuple[Floats, Floats]:
+        """Return the exact least and largest position on each cubic, shape (K − 1, n) each."""
+        p, c, d, q = self._control(np.arange(len(self.times) - 1))
+        first, middle, last = c - p, d - c, q - d
+        bend, sides = first - 2.0 * middle + last, [p, q]
+        root = np.sqrt(np.maximum(middle**2 - first * last, 0.0))
+        for sign in (-1.0, 1.0):  # where the velocity, first·(1−s)² + 2·middle·s(1−s) + last·s², is zero: bend·s² + ... + first
+            straight = first - middle + sign * root
+            other = first - middle - sign * root
+            at = np.divide(
+                straight, bend, out=np.divide(first, other, out=np.zeros_like(p), where=other != 0.0), where=bend != 0.0
+            )
+            at = np.clip(at, 0.0, 1.0)
+            r = 1.0 - at
+            sides.append(r**3 * p + 3.0 * at * r**2 * c + 3.0 * at**2 * r * d + at**3 * q)
+        return np.asarray(np.min(sides, axis=0)), np.asarray(np.max(sides, axis=0))
 
     def speeds(self) -> tuple[Floats, Floats]:
         """Return the exact largest |velocity| and |acceleration| on each cubic, shape (K − 1, n) each."""
@@ -115,6 +131,42 @@ class Curve:
         rows = slice(int(np.searchsorted(self.times, begin)), int(np.searchsorted(self.times, end, side="right")))
         return Curve(self.times[rows], self.positions[rows][:, columns], self.rates[rows][:, columns])
 
+    def check_through(self, times: Floats, positions: Floats) -> None:
+        """Check that it leads from the first of some waypoints through all others to the last.
+
+        Args:
+            times: Of the waypoints, shape (T,) [s].
+            positions: Shape (T, n).
+
+        Raises:
+            InputError: It does not; every waypoint must be one of the knots, in time to the last bit.
+        """
+        if self.positions.shape[1] != positions.shape[1]:
+            expected, got = positions.shape[1], self.positions.shape[1]
+            raise InputError("wrong number of coordinates", field="curve.positions", expected=expected, got=got)
+        at = np.minimum(np.searchsorted(self.times, times), len(self.times) - 1)
+        if at[0] != 0 or at[-1] != len(self.times) - 1 or not np.array_equal(self.times[at], times):
+            raise InputError("a waypoint is none of its knots", field="curve.times", expected="the times of all waypoints")
+        apart = np.abs(self.positions[at] - positions).max(axis=1)
+        if not apart.max() <= _OFF:
+            where, got = f"positions[{int(np.argmax(apart))}]", f"{apart.max():g} apart"
+            raise InputError("the curve does not lead through a waypoint", field=where, expected=f"at most {_OFF:g}", got=got)
+
+    def shifted(self, time: float) -> Curve:
+        """Return the same, later by some time [s]."""
+        return Curve(self.times + time, self.positions, self.rates)
+
     def to_dict(self) -> dict[str, Any]:
         """Return plain data of it."""
         return {"times": self.times.tolist(), "positions": self.positions.tolist(), "rates": self.rates.tolist()}
+
+
+def joined(pieces: Sequence[Curve]) -> Curve:
+    """Return curves as one, the first where it is in time; each begins where, and as fast as, the one before it ends."""
+    times, first = [pieces[0].times], pieces[0]
+    for piece in pieces[1:]:
+        times.append(times[-1][-1] + piece.times[1:] - piece.times[0])
+    rest = pieces[1:]
+    positions = np.concatenate([first.positions, *(piece.positions[1:] for piece in rest)])
+    rates = np.concatenate([first.rates, *(piece.rates[1:] for piece in rest)])
+    return Curve(np.concatenate(times), positions, rates)

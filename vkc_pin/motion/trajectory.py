@@ -1,4 +1,4 @@
-"""Trajectory: waypoints of robot and objects over time, linear in the coordinates between them."""
+"""Trajectory: waypoints of robot and objects over time, and the curve through them."""
 
 from __future__ import annotations
 
@@ -14,56 +14,19 @@ from numpy.typing import ArrayLike
 from vkc_pin.arguments import instance, items, known, mapping, number, numbers, text, whole
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
-from vkc_pin.motion import ros, tables
-from vkc_pin.scene.hold import Hold, holds_of, in_order
+from vkc_pin.motion.curve import Curve
+from vkc_pin.motion.formats import ros, tables
+from vkc_pin.motion.spans import PhaseSpan, part_of
 
-__all__ = ["PhaseSpan", "Trajectory"]
+__all__ = ["Trajectory"]
 
-
-@dataclass(frozen=True)
-class PhaseSpan:
-    """A stretch of a trajectory in which the same things are held.
-
-    Attributes:
-        name: What happens in it, e.g. "reach door.handle".
-        first, last: Its waypoints; `last` is the next phase's `first`.
-        holds: All that is held in it, each hold after the one it depends on.
-        opening: How far the gripper is open in it [m]; None: as the robot rests. If it was otherwise in the phase before, the
-            fingers move from the first waypoint to the second.
-
-    Raises:
-        InputError: Something is held through what is not, or an opening is none.
-    """
-
-    name: str
-    first: int
-    last: int
-    holds: tuple[Hold, ...] = ()
-    opening: float | None = None
-
-    def __post_init__(self) -> None:
-        text(self.name, "PhaseSpan.name")
-        for name in ("first", "last"):
-            object.__setattr__(self, name, whole(getattr(self, name), f"PhaseSpan.{name}", low=0))
-        object.__setattr__(self, "holds", in_order(self.holds))
-        if self.opening is not None:
-            object.__setattr__(self, "opening", number(self.opening, "PhaseSpan.opening", "a distance [m]", low=0.0, high=1.0))
-
-    @property
-    def held(self) -> dict[str, str]:
-        """Object → attachment, for all that is held in it."""
-        return {hold.object: hold.attachment for hold in self.holds}
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain data of it; `by` names the link, "<object>.<link>", for what is held through another object."""
-        by = {hold.object: hold.frame for hold in self.holds if hold.by}
-        data = {"name": self.name, "first": self.first, "last": self.last, "held": self.held, "by": by}
-        return data if self.opening is None else {**data, "opening": self.opening}
+MOST_SAMPLES = 1_000_000
+"""Most moments that a motion is sampled at."""
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Waypoints over time.
+    """Waypoints over time, and how the motion goes on between them: along a curve, or else linearly in the coordinates.
 
     Attributes:
         names: The coordinates' names, n of them: base x, y, yaw, arm joints, then `<object>.<joint>`.
@@ -71,10 +34,11 @@ class Trajectory:
         positions: Shape (T, n), [m] and [rad]; angles are not wrapped, so that they interpolate.
         phases: Which stretch of it does what; each begins where the one before ends, and together they cover it all.
         robot_size: How many of the coordinates are the robot's (3 for the base, then the arm).
+        curve: Where it is at every moment; None: on the straight line between two waypoints.
 
     Raises:
         InputError: Names that occur twice, numbers that are not finite, shapes that do not fit, times that do not increase,
-            or phases that leave a gap.
+            phases that leave a gap, or a curve that does not lead from the first waypoint through all others to the last.
     """
 
     names: tuple[str, ...]
@@ -82,6 +46,7 @@ class Trajectory:
     positions: Floats
     phases: tuple[PhaseSpan, ...]
     robot_size: int
+    curve: Curve | None = None
 
     def __post_init__(self) -> None:
         listed: tuple[Any, ...] = items(self.names, "Trajectory.names", "a list of names")
@@ -104,6 +69,8 @@ class Trajectory:
             problem = "phases do not follow one another from the first waypoint to the last"
             got = ", ".join(f"{phase.first} to {phase.last}" for phase in phases[:20]) or "none"
             raise InputError(problem, field="Trajectory.phases", expected=f"0 to {len(times) - 1}", got=got)
+        if self.curve is not None:
+            instance(self.curve, Curve, "Trajectory.curve").check_through(times, positions)
         for array in (times, positions):
             array.setflags(write=False)
         for key, value in (
@@ -122,8 +89,49 @@ class Trajectory:
             InputError: `time` is none.
         """
         time = numbers(time, "time")
+        if self.curve is not None:
+            return self.curve.at(time)
         columns = [np.interp(time, self.times, column) for column in self.positions.T]
         return np.stack(columns, axis=-1)
+
+    def __call__(self, time: ArrayLike) -> Floats:
+        """Return the positions at `time`; see `at`."""
+        return self.at(time)
+
+    def velocity(self, time: ArrayLike) -> Floats:
+        """Return the velocities, shape (..., n) [m/s], [rad/s], at `time` [s], shape (...,); outside the motion, 0.
+
+        Without a curve they jump at waypoints, to those of the segment after. Raises `InputError` for what is no time.
+        """
+        time = numbers(time, "time")
+        if self.curve is not None:
+            return self.curve.velocity(time)
+        inside = ((time >= self.times[0]) & (time <= self.times[-1]))[..., None]
+        segment = np.clip(np.searchsorted(self.times, time, side="right") - 1, 0, len(self.times) - 2)
+        return np.asarray(np.where(inside, self.velocities()[segment], 0.0))
+
+    def acceleration(self, time: ArrayLike) -> Floats:
+        """Return the accelerations, shape (..., n) [m/s²], [rad/s²], at `time` [s], shape (...,); they jump at the curve's knots.
+
+        Without a curve they are 0: velocities jump then. Raises `InputError` for what is no time.
+        """
+        time = numbers(time, "time")
+        if self.curve is not None:
+            return self.curve.acceleration(time)
+        return np.zeros((*time.shape, len(self.names)))
+
+    def sample(self, rate: float) -> tuple[Floats, Floats]:
+        """Return times, shape (K,) [s], so many a second and the last, and the positions then, shape (K, n).
+
+        Raises:
+            InputError: `rate` is no positive number, or that are too many.
+        """
+        rate = number(rate, "rate", "samples a second, more than 0", low=0.0, above=True)
+        duration = float(self.times[-1] - self.times[0])
+        if duration * rate > MOST_SAMPLES:
+            raise InputError("too many samples", field="rate", expected=f"at most {MOST_SAMPLES / duration:.4g}", got=rate)
+        times = np.append(self.times[0] + np.arange(np.ceil(duration * rate - 1e-6)) / rate, self.times[-1])
+        return times, self.at(times)
 
     def column(self, name: str) -> Floats:
         """Return one coordinate over the waypoints, shape (T,).
@@ -133,14 +141,23 @@ class Trajectory:
         """
         return np.array(self.positions[:, self.names.index(known(name, self.names, "coordinate"))])
 
+    def ranges(self) -> tuple[Floats, Floats]:
+        """Return the least and the largest position between every two waypoints, both among them, shape (T − 1, n) each."""
+        if self.curve is None:
+            return np.minimum(self.positions[:-1], self.positions[1:]), np.maximum(self.positions[:-1], self.positions[1:])
+        begins = np.searchsorted(self.curve.times, self.times[:-1])
+        low, high = self.curve.extremes()
+        return np.asarray(np.minimum.reduceat(low, begins)), np.asarray(np.maximum.reduceat(high, begins))
+
     def velocities(self) -> Floats:
-        """Return the velocity of every segment, shape (T − 1, n), [m/s] and [rad/s]."""
+        """Return the mean velocity of every segment between two waypoints, shape (T − 1, n), [m/s] and [rad/s]."""
         return np.asarray(np.diff(self.positions, axis=0) / np.diff(self.times)[:, None])
 
     def accelerations(self) -> Floats:
         """Return the acceleration at every waypoint, shape (T, n), [m/s²] and [rad/s²].
 
-        It is the velocity step there over the shorter of the two segments' durations; the motion starts and ends at rest.
+        It is the step of the mean velocities there over the shorter of the two segments' durations, as eq. 5 has it; the motion
+        starts and ends at rest. The accelerations of a curve are `acceleration`'s.
         """
         durations = np.diff(self.times)
         velocity = np.vstack([np.zeros(len(self.names)), self.velocities(), np.zeros(len(self.names))])
@@ -149,22 +166,35 @@ class Trajectory:
 
     def base_effort(self) -> float:
         """Return the distance the base travels over the floor, Σ √(δx² + δy²) [m]."""
-        return float(np.linalg.norm(np.diff(self.positions[:, :2], axis=0), axis=1).sum())
+        return float(np.linalg.norm(np.diff(self._way[:, :2], axis=0), axis=1).sum())
 
     def base_effort_l1(self) -> float:
         """Return Σ |δx| + |δy| [m], which the method's authors log."""
-        return float(np.abs(np.diff(self.positions[:, :2], axis=0)).sum())
+        return float(np.abs(np.diff(self._way[:, :2], axis=0)).sum())
 
     def arm_effort(self) -> float:
         """Return the sum of the arm joints' absolute displacements, Σ |δq_arm| [rad]."""
-        return float(np.abs(np.diff(self.positions[:, 3 : self.robot_size], axis=0)).sum())
+        return float(np.abs(np.diff(self._way[:, 3 : self.robot_size], axis=0)).sum())
+
+    @property
+    def _way(self) -> Floats:
+        """Points close enough to each other to measure the way between them, shape (K, n)."""
+        return self.positions if self.curve is None else self.curve.positions
 
     def parts(self) -> list[Trajectory]:
         """Return the motion of each phase, with its own times."""
         spans = [slice(phase.first, phase.last + 1) for phase in self.phases]
         alone = [replace(phase, first=0, last=phase.last - phase.first) for phase in self.phases]
-        own = [(self.times[span], self.positions[span], (phase,)) for span, phase in zip(spans, alone, strict=True)]
-        return [replace(self, times=times, positions=positions, phases=phases) for times, positions, phases in own]
+        return [
+            replace(
+                self,
+                times=self.times[span],
+                positions=self.positions[span],
+                phases=(phase,),
+                curve=None if self.curve is None else self.curve.part(self.times[span.start], self.times[span.stop - 1]),
+            )
+            for span, phase in zip(spans, alone, strict=True)
+        ]
 
     def metrics(self) -> dict[str, float]:
         """Return duration [s], base_effort and base_effort_l1 [m], and arm_effort [rad]."""
@@ -177,13 +207,14 @@ class Trajectory:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data of it, e.g. for JSON."""
-        return {
+        data = {
             "names": list(self.names),
             "times": self.times.tolist(),
             "positions": self.positions.tolist(),
             "robot_size": self.robot_size,
             "phases": [phase.to_dict() for phase in self.phases],
         }
+        return data if self.curve is None else {**data, "curve": self.curve.to_dict()}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Trajectory:
@@ -192,17 +223,15 @@ class Trajectory:
         Raises:
             InputError: Something is missing from it or does not fit.
         """
-        phases = []
         if not isinstance(data, Mapping):
             raise InputError("not a trajectory", expected="an object", got=type(data).__name__)
-        listed: tuple[Any, ...] = items(_part(data, "phases"), "phases", "a list of phases")
-        for k, item in enumerate(listed):
-            phase = mapping(item, f"phases[{k}]")
-            held = holds_of(_part(phase, "held"), phase.get("by"))
-            name, first, last = (_part(phase, key) for key in ("name", "first", "last"))
-            phases.append(PhaseSpan(name, first, last, held, phase.get("opening")))
-        names, times, positions, size = (_part(data, key) for key in ("names", "times", "positions", "robot_size"))
-        return cls(names, times, positions, tuple(phases), size)
+        listed: tuple[Any, ...] = items(part_of(data, "phases"), "phases", "a list of phases")
+        phases = [PhaseSpan.from_dict(item, f"phases[{k}]") for k, item in enumerate(listed)]
+        names, times, positions, size = (part_of(data, key) for key in ("names", "times", "positions", "robot_size"))
+        curve = data.get("curve")
+        if curve is not None:
+            curve = Curve(*(part_of(mapping(curve, "curve"), key) for key in ("times", "positions", "rates")))
+        return cls(names, times, positions, tuple(phases), size, curve)
 
     def to_csv(self, path: str | Path, **options: Any) -> Path:
         """Write a table with a line a waypoint: times [s], positions [m] and [rad], phases; see `tables.write_csv`."""
@@ -258,13 +287,6 @@ class Trajectory:
         except InputError as error:
             field = ".".join(part for part in (inside, error.field) if part) or None
             raise InputError(error.problem, file=file, field=field, expected=error.expected, got=error.got) from error
-
-
-def _part(data: Mapping[str, Any], name: str) -> Any:
-    """Return an entry of data. Raises `InputError` if it is not there."""
-    if name not in data:
-        raise InputError("this is missing from a trajectory", field=name)
-    return data[name]
 
 
 def _numbers(values: Any, name: str) -> Floats:

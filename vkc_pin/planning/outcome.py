@@ -9,8 +9,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from vkc_pin.budget import ENDINGS
+from vkc_pin.motion.spans import PhaseSpan
 from vkc_pin.motion.splicing import join
-from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.settings import Settings
@@ -23,7 +24,7 @@ from vkc_pin.validation.validate import validate
 
 __all__ = ["FINAL", "TIMES", "charged", "joined", "outcome", "spent", "still", "summed"]
 
-TIMES = ("initialization", "coal", "casadi", "ipopt", "validation")
+TIMES = ("initialization", "coal", "casadi", "ipopt", "retiming", "validation")
 """What planning spends its time on."""
 
 FINAL = (*ENDINGS, "infeasible")

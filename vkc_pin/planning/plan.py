@@ -15,7 +15,7 @@ from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.files.resources import file_path
 from vkc_pin.files.writing import write_atomically
-from vkc_pin.motion.archives import folder_from_data, folder_to_data, read_archive, write_archive
+from vkc_pin.motion.formats.archives import folder_from_data, folder_to_data, read_archive, write_archive
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.motion.world import scene_after, units_of
 from vkc_pin.options import Options
@@ -173,7 +173,7 @@ class Plan:
             "folder": folder_to_data(self.scene.folder, file_path(path, "path")),
             "steps": [step_to_dict(step) for step in self.steps],
             "options": asdict(self.options),
-            "trajectory": {k: v for k, v in self.trajectory.to_dict().items() if k not in ("times", "positions")},
+            "trajectory": self.trajectory.to_dict(),
             "validation": self.validation.to_dict(),
             "status": self.status,
             "metrics": {**self.metrics, **_measured(self.trajectory, self.validation)},
@@ -182,7 +182,7 @@ class Plan:
             "history": [dict(row) for row in self.history],
             "terms": [term_to_dict(term) for term in self.terms],
         }
-        return write_archive(path, about, self.trajectory.times, self.trajectory.positions)
+        return write_archive(path, about)
 
     @classmethod
     def load(cls, path: str | Path, *, check: bool = False) -> Plan:

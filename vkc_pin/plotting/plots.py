@@ -124,14 +124,16 @@ def _limit(plan: Judged, name: str) -> float:
 def _draw_joints(figure: FigureBase, plan: Judged) -> None:
     groups, trajectory = _groups(plan), plan.trajectory
     rows: Any = figure.subplots(len(groups), 2, sharex=True, squeeze=False)
-    velocities = trajectory.velocities()
+    fine = np.unique(np.concatenate([np.linspace(trajectory.times[0], trajectory.times[-1], _SAMPLES), trajectory.times]))
+    places, velocities = trajectory(fine), trajectory.velocity(fine)
     units = {"base": "m, rad", "arm": "rad", "object": "rad, m"}
     for (position, velocity), (group, columns) in zip(rows, groups.items(), strict=True):
         limits = []
         for k, column in enumerate(columns):
             name, colour = trajectory.names[column], COLOURS[k % len(COLOURS)]
-            position.plot(trajectory.times, trajectory.positions[:, column], color=colour, label=name.removesuffix("_joint"))
-            velocity.stairs(velocities[:, column], trajectory.times, baseline=None, color=colour, linewidth=1.3)
+            position.plot(fine, places[:, column], color=colour, label=name.removesuffix("_joint"))
+            drawn = {"color": colour, "linewidth": 1.3, "drawstyle": "default" if trajectory.curve is not None else "steps-post"}
+            velocity.plot(fine, velocities[:, column], **drawn)
             limits.append(_limit(plan, name))
         for limit in sorted(set(filter(np.isfinite, limits))):
             same = [k for k, other in enumerate(limits) if other == limit]

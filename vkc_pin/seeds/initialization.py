@@ -171,8 +171,7 @@ class _Shared:
 
     def unknown(self) -> list[int]:
         """Return the numbers of the phases at whose ends no search has come upon a free configuration so far."""
-        knots = self.knots()
-        return [number for number, end in enumerate(self.problem.ends.tolist()) if not knots.knows_free(end)]
+        return [number for number, end in enumerate(self.problem.ends.tolist()) if not self.knots().knows_free(end)]
 
 
 class _SeedSearch:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from vkc_pin.arrays import Floats
-from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.motion.spans import PhaseSpan
+from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.program.problem import TrajectoryProblem
 
 __all__ = ["as_trajectory"]

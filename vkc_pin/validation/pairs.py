@@ -12,6 +12,7 @@ from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.scene import Scene
 from vkc_pin.validation.distances import Placed, Solids
+from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.touching import Window
 
 __all__ = ["PairTable"]
@@ -35,7 +36,7 @@ class PairTable:
         dist_safe: Clearance to keep at the waypoints [m].
         self_distance: The same between links of the robot that can [m]; `dist_safe` if left out.
         windows: Which pairs may be closer than that, and when.
-        rows: Configurations of the world at the waypoints, shape (T, n), if somebody has them already.
+        samples: The motion's samples, if somebody has them already.
     """
 
     def __init__(
@@ -47,13 +48,13 @@ class PairTable:
         self_distance: float | None = None,
         *,
         windows: Sequence[Window] = (),
-        rows: Floats | None = None,
+        samples: Samples | None = None,
     ) -> None:
         self.scene, self.world, self.solids = scene, solids.world, solids
         world, own_margin = self.world, dist_safe if self_distance is None else self_distance
-        rows = world.positions(trajectory) if rows is None else rows
-        self._moves = np.array([self._moved(rows[phase.first : phase.last + 1]) for phase in trajectory.phases])
-        self._phase = np.searchsorted([phase.last for phase in trajectory.phases], np.arange(len(rows)))  # the earlier of two
+        samples, lasts = Samples(scene, trajectory) if samples is None else samples, [phase.last for phase in trajectory.phases]
+        self._moves = np.array([self._moved(samples.z[samples.rows(phase)]) for phase in trajectory.phases])
+        self._phase = np.searchsorted(lasts, np.arange(len(trajectory.times)))  # the earlier of two
         labels, bodies = world.collision_labels, range(solids.bodies)
         owners = [label.partition(".")[0] if "." in label else "" for label in labels]
         robots = len(scene.robot.collision.geometryObjects)

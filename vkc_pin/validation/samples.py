@@ -13,7 +13,8 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.models.articulation import Freedom
 from vkc_pin.models.hands.bars import EXACT
 from vkc_pin.motion.carrying import FreeObjects
-from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.motion.spans import PhaseSpan
+from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.motion.world import World
 from vkc_pin.scene.contact import hand_frame
 from vkc_pin.scene.hold import Hold
@@ -36,7 +37,7 @@ class Samples:
         scene, trajectory: What it was made of.
         world: The scene as one plain tree.
         free: Its free objects along the motion.
-        times: When it is looked at, shape (S,) [s]; evenly spaced between two waypoints.
+        times: When it is looked at, shape (S,) [s]; evenly spaced between two waypoints, or knots of the curve.
         waypoint_rows: Which of these are the waypoints, shape (T,).
         z: Minimal coordinates of the world, shape (S, n).
         virtual: Coordinate → the freedom of a grasp that it is.
@@ -116,16 +117,19 @@ class Samples:
 
     def _sample(self) -> tuple[Floats, Ints]:
         """Return the times to look at, and where among them the waypoints are."""
-        steps = np.abs(np.diff(self.trajectory.positions, axis=0))
+        curve, edges = self.trajectory.curve, self.trajectory.times
+        if curve is None:
+            steps = np.abs(np.diff(self.trajectory.positions, axis=0))
+        else:  # as far as it would go at the largest speed on each cubic
+            steps, edges = curve.speeds()[0] * np.diff(curve.times)[:, None], curve.times
         units = np.array([LENGTH_STEP if self.unit(name) == "m" else ANGLE_STEP for name in self.trajectory.names])
         planar = np.linalg.norm(steps[:, :2], axis=1) / LENGTH_STEP
         counts = np.maximum(1, np.ceil(np.maximum(planar, (steps / units).max(axis=1)) - 1e-9))
         self.needed = float(counts.sum())
         counts = np.minimum(counts, 1 if self.needed > max(MOST, len(counts)) else np.inf).astype(int)
-        edges = itertools.pairwise(self.trajectory.times)
-        times = [np.linspace(a, b, n, endpoint=False) for (a, b), n in zip(edges, counts, strict=True)]
+        times = [np.linspace(a, b, n, endpoint=False) for (a, b), n in zip(itertools.pairwise(edges), counts, strict=True)]
         rows = np.concatenate([[0], np.cumsum(counts)])
-        return np.concatenate([*times, self.trajectory.times[-1:]]), rows
+        return np.concatenate([*times, edges[-1:]]), rows[np.searchsorted(edges, self.trajectory.times)]
 
     def unit(self, name: str) -> str:
         """Return a coordinate's unit, "m" or "rad"."""

@@ -76,15 +76,18 @@ def check_gripper(samples: Samples, options: Options) -> Iterator[Violation]:
     On the way to what it grasps next, and while it holds it, it is as far open as the attachment says.
     """
     scene, trajectory, gripper = samples.scene, samples.trajectory, samples.scene.robot.gripper
-    times, robot, before = trajectory.times, trajectory.positions[:, : trajectory.robot_size], set(scene.holds)
+    times, (low, high), before = trajectory.times, trajectory.ranges(), set(scene.holds)
+    low, high = low[:, : trajectory.robot_size], high[:, : trajectory.robot_size]
     for number, phase in enumerate(trajectory.phases):
         changed, before, at = before ^ set(phase.holds), set(phase.holds), phase.first
         opens = number > 0 and phase.opening != trajectory.phases[number - 1].opening
         if changed or opens:
-            moved = np.flatnonzero(np.abs(robot - robot[at]).max(axis=1) > MOTION_TOLERANCE)
+            here = trajectory.positions[at, : trajectory.robot_size]
+            moves = np.maximum(high - here, here - low).max(axis=1) > MOTION_TOLERANCE  # between one waypoint and the next
+            moved = np.flatnonzero(moves)
             k = int(np.searchsorted(moved, at))
             begin = at if opens else moved[k - 1] + 1 if k else 0  # fingers move from here on
-            end = moved[k] - 1 if k < len(moved) else len(times) - 1
+            end = moved[k] if k < len(moved) else len(times) - 1
             rest = float(times[end] - times[begin])
             if not rest >= options.grasp_time - _DWELL:
                 detail = f"the robot stands still for {rest:.2f} s, {options.grasp_time:g} s are asked for"
@@ -135,7 +138,8 @@ class _Windows:
         self.scene, self.trajectory, world = samples.scene, samples.trajectory, samples.world
         self.labels = np.array(world.collision_labels)
         self.q = world.coordinates.q(samples.z[samples.waypoint_rows])
-        self.steps = np.abs(np.diff(self.trajectory.positions, axis=0)).max(axis=1) > _STILL
+        low, high = self.trajectory.ranges()
+        self.steps = (high - low).max(axis=1) > _STILL
         self.robots = len(self.scene.robot.collision.geometryObjects)
         self.rides = samples.free.rides
 

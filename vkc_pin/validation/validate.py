@@ -12,7 +12,8 @@ import numpy as np
 
 from vkc_pin.arguments import instance
 from vkc_pin.arrays import Floats
-from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.motion.spans import PhaseSpan
+from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.options import Options
 from vkc_pin.scene.neighbours import Allowance, allowances
 from vkc_pin.scene.resting import LEVEL, tilt
@@ -36,6 +37,7 @@ START_LIMIT_TOLERANCE = 1e-2  # [m] or [rad]: a start slightly outside its limit
 ACCEPTED_RATE_TOLERANCE = 1e-3  # excess over a limit, relative to it
 LATCH_TOLERANCE = 1e-4
 WAYPOINT_TOLERANCE = 1e-3  # [m] that clearance at a waypoint may fall short of dist_safe
+REST_TOLERANCE = 1e-6  # [m/s] or [rad/s]
 SLIP_TOLERANCE = 1e-4  # [m] per step
 
 
@@ -47,7 +49,7 @@ def validate(
     Args:
         scene: Where it happens; its start is where the motion must start.
         steps: What it must bring about, in this order.
-        trajectory: The motion, linear between waypoints.
+        trajectory: The motion, along its curve, or linear between waypoints.
         options: Tolerances and dist_safe; `Options()` if left out.
         terms: The user's own constraints; costs are nothing to check.
 
@@ -78,6 +80,7 @@ class _Check:
         self.samples, self.steps, self.options, self.terms = samples, steps, options, terms
         self.scene, self.trajectory = samples.scene, samples.trajectory
         self.found: list[Violation] = []
+        self._ranges = samples.trajectory.ranges()
 
     def report(self) -> Report:
         """Run every check."""
@@ -130,32 +133,42 @@ class _Check:
 
     def _limits(self) -> None:
         """Every coordinate stays within its limits (eq. 4)."""
-        for name, column in zip(self.trajectory.names, self.trajectory.positions.T, strict=True):
+        ranges = zip(self.trajectory.names, self.trajectory.positions[0], *(side.T for side in self._ranges), strict=True)
+        for name, start, low, high in ranges:
             lower, upper, _, _ = self.samples.bounds(name)
-            excess = np.maximum(lower - column, column - upper)
-            if excess[0] <= START_LIMIT_TOLERANCE:
-                excess[0] = 0.0
+            most = max(lower - start, start - upper)
+            excess = np.maximum(lower - low, high - upper)
+            excess[0] -= most if 0.0 < most <= START_LIMIT_TOLERANCE else 0.0  # no further out than it begins
             worst = int(np.argmax(excess))
             if not excess[worst] <= LIMIT_TOLERANCE:
-                unit = self.samples.unit(name)
-                detail = f"{column[worst]:.4f} {unit} is outside {lower:.4f} to {upper:.4f} {unit} by {excess[worst]:.4f} {unit}"
-                self._add("limit", name, excess[worst], unit, detail, waypoint=worst)
+                unit, value = (
+                    self.samples.unit(name),
+                    float(max(low[worst], high[worst], key=lambda v: max(lower - v, v - upper))),
+                )
+                out, ends = max(lower - value, value - upper), self.trajectory.column(name)[worst : worst + 2]
+                detail = f"{value:.4f} {unit} is outside {lower:.4f} to {upper:.4f} {unit} by {out:.4f} {unit}"
+                self._add("limit", name, out, unit, detail, waypoint=worst + int(np.argmin(np.abs(ends - value))))
 
     def _rates(self) -> None:
-        """Velocities and accelerations stay within theirs (eq. 5)."""
-        velocities, accelerations = self.trajectory.velocities(), self.trajectory.accelerations()
+        """Velocities and accelerations stay within theirs (eq. 5), and a curve begins and ends at rest."""
+        curve, times = self.trajectory.curve, self.trajectory.times
+        rests = np.zeros((2, len(self.trajectory.names))) if curve is None else np.abs(curve.rates[[0, -1]])
+        of_waypoints = self.trajectory.velocities(), self.trajectory.accelerations()
+        velocities, accelerations = of_waypoints if curve is None else curve.speeds()
         for i, name in enumerate(self.trajectory.names):
             _, _, fastest, strongest = self.samples.bounds(name)
             unit = self.samples.unit(name)
-            for kind, values, limit, per in (
-                ("velocity", velocities[:, i], fastest, "s"),
-                ("acceleration", accelerations[:, i], strongest, "s²"),
+            for kind, values, limit, per, moments in (
+                ("velocity", velocities[:, i], fastest, "s", times if curve is None else curve.times),
+                ("acceleration", accelerations[:, i], strongest, "s²", times if curve is None else curve.times),
+                ("velocity", rests[:, i], REST_TOLERANCE, "s", times[[0, -1]]),
             ):
                 worst = int(np.argmax(np.abs(values)))
                 value = abs(float(values[worst]))
                 if not value <= limit * (1 + ACCEPTED_RATE_TOLERANCE) + 1e-9:
                     detail = f"{value:.3f} {unit}/{per} is more than {limit:.3f} {unit}/{per}"
-                    self._add(kind, name, value - limit, f"{unit}/{per}", detail, waypoint=worst)
+                    at = max(int(np.searchsorted(times, moments[worst], side="right")) - 1, 0)
+                    self._add(kind, name, value - limit, f"{unit}/{per}", detail, waypoint=at)
 
     def _slip(self) -> None:
         """A differential base does not move sideways, seen at the middle of each step."""
@@ -249,11 +262,13 @@ class _Check:
 
     def _still(self, phase: PhaseSpan, kind: str, name: str, before: str, after: str) -> None:
         """A coordinate does not change in a phase; what is said of it goes around by how much."""
-        values = self.trajectory.column(name)[phase.first : phase.last + 1]
-        moved, unit = np.abs(values - values[0]), self.samples.unit(name)
+        column, begin = self.trajectory.names.index(name), self.trajectory.column(name)[phase.first]
+        low, high = (side[phase.first : phase.last, column] for side in self._ranges)
+        moved, unit = np.maximum(high - begin, begin - low), self.samples.unit(name)
         worst = int(np.argmax(moved))
         if not moved[worst] <= MOTION_TOLERANCE:
-            self._add(kind, name, moved[worst], unit, f"{before}{moved[worst]:.4f} {unit}{after}", waypoint=phase.first + worst)
+            at = phase.first + worst + 1
+            self._add(kind, name, moved[worst], unit, f"{before}{moved[worst]:.4f} {unit}{after}", waypoint=at)
 
     def _clearance(self) -> Floats:
         """Nothing comes too close at a waypoint (eqs. 6 and 7) or penetrates anywhere; return each phase's smallest distance [m].
@@ -263,7 +278,7 @@ class _Check:
         samples, solids, lasts = self.samples, Solids(self.samples.world), [phase.last for phase in self.trajectory.phases]
         near = windows(samples, solids, self.steps, self.options)
         safe, own = self.options.dist_safe, self.options.self_distance
-        pairs = PairTable(self.scene, solids, self.trajectory, safe, own, windows=near, rows=samples.z[samples.waypoint_rows])
+        pairs = PairTable(self.scene, solids, self.trajectory, safe, own, windows=near, samples=samples)
         nearest, neighbours = np.full(len(lasts), np.inf), dict[frozenset[str], list[Allowance]]()
         for one in allowances(self.scene, safe):
             if one.margin == -np.inf:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["criteria_chart", "means_chart", "motions_chart", "success_chart"]
 
 _WIDTH = 0.8  # of a group of bars; the distance between groups is 1
+_SAMPLES = 400  # moments of a motion that are drawn
 _ROOM = 2.0  # a scale that is not made for all motions reaches so many times farther than the others
 _BASE = ("x [m/s]", "y [m/s]", "yaw [rad/s]")
 
@@ -169,13 +170,14 @@ def motions_chart(plans: Mapping[str, Plan], path: str | Path | None, *, title: 
         columns: Any = figure.subplots(3, len(plans), sharex=True, sharey="row", squeeze=False).T
         for (position, velocity, base), (name, plan) in zip(columns, plans.items(), strict=True):
             motion = plan.trajectory
-            rates = motion.velocities()
+            fine = np.unique(np.concatenate([np.linspace(motion.times[0], motion.times[-1], _SAMPLES), motion.times]))
+            places, rates = motion(fine), motion.velocity(fine)
             for k, joint in enumerate(range(3, motion.robot_size)):
                 colour, label = COLOURS[k % len(COLOURS)], motion.names[joint].removesuffix("_joint")
-                position.plot(motion.times, motion.positions[:, joint], color=colour, label=label)
-                velocity.stairs(rates[:, joint], motion.times, baseline=None, color=colour, linewidth=1.2)
+                position.plot(fine, places[:, joint], color=colour, label=label)
+                velocity.plot(fine, rates[:, joint], color=colour, linewidth=1.2)
             for k, label in enumerate(_BASE):
-                base.stairs(rates[:, k], motion.times, baseline=None, color=COLOURS[k], linewidth=1.2, label=label)
+                base.plot(fine, rates[:, k], color=COLOURS[k], linewidth=1.2, label=label)
             for axes in (position, velocity, base):
                 shade_phases(axes, motion)
                 axes.margins(x=0.0)
@@ -185,7 +187,7 @@ def motions_chart(plans: Mapping[str, Plan], path: str | Path | None, *, title: 
         good = [plan.trajectory for plan in plans.values() if plan.success]
         for row, part in ((1, lambda motion: slice(3, motion.robot_size)), (2, lambda motion: slice(0, 3))):
             if good and len(good) < len(plans):
-                largest = max(float(np.abs(motion.velocities()[:, part(motion)]).max()) for motion in good)
+                largest = max(float(np.abs(motion.velocity(motion.times)[:, part(motion)]).max()) for motion in good)
                 columns[0][row].set_ylim(-_ROOM * largest, _ROOM * largest)
         for axes, label in zip(columns[0], ("arm positions [rad]", "arm velocities [rad/s]", "base velocity"), strict=True):
             axes.set_ylabel(label)

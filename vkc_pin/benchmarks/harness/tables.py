@@ -39,7 +39,7 @@ TIMES = {
     "time_ipopt": "Ipopt",
     "time_validation": "validation",
 }
-"""What planning time is spent on: field → name. The rest is setting up the problem."""
+"""What planning time is spent on: field → name. The rest is setting up the problem, and retiming."""
 _LEAST = 1e-6  # in any unit, by which a value must be less to be called lower
 
 

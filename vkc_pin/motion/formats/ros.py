@@ -17,7 +17,8 @@ from vkc_pin.arguments import flag, is_number, number, text, whole
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError, shown
 from vkc_pin.files.resources import file_path
-from vkc_pin.motion.tables import chosen_columns, one_phase, read_json, size_of_robot
+from vkc_pin.motion.curve import Curve
+from vkc_pin.motion.formats.tables import chosen_columns, one_phase, read_json, size_of_robot
 
 __all__ = ["along", "from_ros", "rates", "to_ros"]
 
@@ -31,7 +32,7 @@ def to_ros(
     joints: str | Sequence[str] = "robot",
     rate: float | None = None,
     smooth: bool = True,
-    derivatives: int = 2,
+    derivatives: int | None = None,
     frame: str = "world",
     stamp: float = 0.0,
 ) -> dict[str, Any]:
@@ -45,10 +46,11 @@ def to_ros(
         motion: What to convert.
         joints: One of `GROUPS`, or names of coordinates in the order wanted. The joints of objects are not in it unless asked
             for: no motor moves them.
-        rate: Points a second, and one at the end [Hz]; None: the waypoints themselves.
-        smooth: Whether points at a rate are on the cubics; otherwise they are on the straight lines between waypoints, where
-            velocities jump.
-        derivatives: 0: positions only; 1: velocities as well; 2: accelerations as well.
+        rate: Points a second, and one at the end [Hz]; None: the knots of the curve, or else the waypoints.
+        smooth: Of a motion without a curve: whether points at a rate are on cubics through its waypoints; otherwise they are on
+            the straight lines between these, where velocities jump.
+        derivatives: 0: positions only; 1: velocities as well; 2: accelerations as well. None: 1 if there is a curve, since
+            controllers that are given no more go along the very cubics of it, and otherwise 2.
         frame: `header.frame_id`, the frame of the base's coordinates.
         stamp: `header.stamp` [s]; in ROS, zero means at once.
 
@@ -60,13 +62,19 @@ def to_ros(
         UnknownNameError: There is no such group or coordinate.
         InputError: `joints` names none, or one twice; `rate`, `derivatives` or `stamp` is out of range.
     """
-    derivatives, smooth, frame = whole(derivatives, "derivatives", low=0, high=2), flag(smooth, "smooth"), text(frame, "frame")
+    curve, smooth, frame = motion.get("curve"), flag(smooth, "smooth"), text(frame, "frame")
+    derivatives = (2 if curve is None else 1) if derivatives is None else whole(derivatives, "derivatives", low=0, high=2)
     if (stamp := number(stamp, "stamp", "seconds, at least 0", low=0.0)) >= 2.0**31:
         raise InputError("out of range", field="stamp", expected="seconds, less than 2^31", got=stamp)
     columns = chosen_columns(motion, joints)
-    times, positions = np.array(motion["times"], float), np.array(motion["positions"], float)[:, columns]
+    source = motion if curve is None else curve
+    times, positions = np.array(source["times"], float), np.array(source["positions"], float)[:, columns]
     times = times - times[0]
-    velocities, accelerations = rates(times, positions)
+    if curve is None:
+        velocities, accelerations = rates(times, positions)
+    else:
+        velocities = np.array(curve["rates"], float)[:, columns]
+        accelerations = Curve(times, positions, velocities).acceleration(times)
     if rate is not None:
         rate = number(rate, "rate", "points a second, more than 0", low=0.0, above=True)
         most = _MOST // max(len(columns), 1)  # a group may be empty
@@ -74,7 +82,10 @@ def to_ros(
             expected = f"at most {most} points, {most / times[-1]:.4g} a second for this motion of {times[-1]:.4g} s"
             raise InputError("too many points", field="rate", expected=expected, got=rate)
         moments = np.append(np.arange(math.ceil(times[-1] * rate - 1e-6)) / rate, times[-1])
-        if smooth:
+        if curve is not None:
+            cubics = Curve(times, positions, velocities)
+            positions, velocities, accelerations = (read(moments) for read in (cubics.at, cubics.velocity, cubics.acceleration))
+        elif smooth:
             positions, velocities, accelerations = along(times, positions, velocities, moments)
         else:
             rows = [np.interp(moments, times, column) for column in positions.T]
@@ -112,6 +123,7 @@ def from_ros(
     names = _field(data, "joint_names", list, file, "")
     times: list[float] = []
     rows: list[list[float]] = []
+    slopes: list[list[float]] = []
     for k, point in enumerate(_field(data, "points", list, file, "")):
         where = f"points[{k}]."
         row = _field(point, "positions", list, file, where)
@@ -124,6 +136,7 @@ def from_ros(
         since = _field(point, "time_from_start", dict, file, where)
         sec, nanosec = (_field(since, key, int, file, f"{where}time_from_start.") for key in ("sec", "nanosec"))
         rows.append(row)
+        slopes.append(_rates(point, len(names), file, where))
         times.append(number(sec, f"{where}time_from_start.sec") + number(nanosec, f"{where}time_from_start.nanosec") / _NANO)
     size = size_of_robot(names) if robot_size is None else whole(robot_size, "robot_size", low=3)
     phases = [one_phase(len(rows))] if len(rows) > 1 else []
@@ -133,7 +146,22 @@ def from_ros(
         at = np.abs(np.asarray(times)[:, None] - edges).argmin(axis=0).tolist() if times else []
         ends = zip(like["phases"], at, at[1:], strict=False)
         phases = [{**phase, "first": first, "last": last} for phase, first, last in ends]
-    return {"names": names, "times": times, "positions": rows, "robot_size": size, "phases": phases}
+    cubic = {"curve": {"times": times, "positions": rows, "rates": slopes}} if slopes and all(slopes) else {}
+    return {"names": names, "times": times, "positions": rows, "robot_size": size, "phases": phases, **cubic}
+
+
+def _rates(point: Any, size: int, file: Path | None, where: str) -> list[float]:
+    """Return a point's velocities, if controllers go along cubics through it: there are some, and no accelerations."""
+    values = point.get("velocities", ())
+    if not isinstance(values, list) or not len(values) or point.get("accelerations"):
+        return []
+    if len(values) != size:
+        raise InputError("wrong number of values", file=file, field=where + "velocities", expected=size, got=len(values))
+    for place, value in enumerate(values):
+        if not is_number(value):
+            field = f"{where}velocities[{place}]"
+            raise InputError("not a number", file=file, field=field, expected="a number", got=shown(value))
+    return values
 
 
 def rates(times: Floats, positions: Floats) -> tuple[Floats, Floats]:

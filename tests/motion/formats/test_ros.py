@@ -15,7 +15,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.interpolate import PchipInterpolator
 
 import vkc_pin as vkc
-from vkc_pin.motion.ros import along, rates
+from vkc_pin.motion.formats.ros import along, rates
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.planning.plan import Plan
 

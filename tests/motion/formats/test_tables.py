@@ -17,7 +17,8 @@ from hypothesis import given
 
 import vkc_pin as vkc
 from vkc_pin import cli
-from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
+from vkc_pin.motion.spans import PhaseSpan
+from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.planning.outcome import spent
 from vkc_pin.planning.plan import Plan
 from vkc_pin.scene.hold import Hold

@@ -21,8 +21,8 @@ import pytest
 
 import vkc_pin as vkc
 from vkc_pin.baselines import attempt, following
-from vkc_pin.motion import archives
-from vkc_pin.motion.archives import METRICS, STATUSES, read_archive, write_archive
+from vkc_pin.motion.formats import archives
+from vkc_pin.motion.formats.archives import METRICS, STATUSES, read_archive, write_archive
 
 
 @pytest.fixture(scope="module")
@@ -57,12 +57,18 @@ def changed(path: Path, saved: Path, change: Callable[[dict[str, Any]], Any]) ->
 
 def test_what_is_written_is_read(tmp_path: Path, saved: Path) -> None:
     about, arrays = read_archive(saved)
-    again = write_archive(tmp_path / "again", about, arrays["times"], arrays["positions"])
+    whole = {**about, "trajectory": {**about["trajectory"], **arrays}}
+    again = write_archive(tmp_path / "again", whole)
     assert json.dumps(read_archive(again)[0]) == json.dumps(about)
-    assert [read_archive(again)[1][name].tobytes() for name in arrays] == [array.tobytes() for array in arrays.values()]
+    for found, kept in ((read_archive(again)[1], arrays), (read_archive(again)[1]["curve"], arrays["curve"])):
+        assert found.keys() == kept.keys()
+        assert all(found[name].tobytes() == kept[name].tobytes() for name in kept if name != "curve")
     other = {"times": packed(arrays["times"].astype(">f8")), "positions": packed(np.asfortranarray(arrays["positions"]))}
     for name, array in read_archive(written(tmp_path / "other", {**parts(saved), **other}))[1].items():
-        np.testing.assert_array_equal(array, arrays[name])
+        for key, values in array.items() if name == "curve" else [(name, array)]:
+            np.testing.assert_array_equal(values, arrays["curve"][key] if name == "curve" else arrays[key])
+    straight = {name: value for name, value in whole["trajectory"].items() if name != "curve"}
+    assert set(read_archive(write_archive(tmp_path / "straight", {**about, "trajectory": straight}))[1]) == {"times", "positions"}
 
 
 DESCRIPTIONS: list[tuple[Callable[[dict[str, Any]], Any], str]] = [

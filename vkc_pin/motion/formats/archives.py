@@ -30,6 +30,9 @@ LARGEST_ARCHIVE, LARGEST_MEMBER = 20_000_000, 40_000_000
 """Largest file, and largest part of it unpacked [bytes]: some 200 000 waypoints of 25 coordinates."""
 ARRAYS = {"about": ("U", 0), "times": ("f", 1), "positions": ("f", 2)}
 """Parts of the file: kind of their items and number of axes."""
+CURVE = {"knot_times": ("f", 1), "knot_positions": ("f", 2), "knot_rates": ("f", 2)}
+"""Parts that it has as well if the motion has a curve."""
+_PARTS = ARRAYS | CURVE
 STATUSES = (
     *("success", "infeasible", "not converged", "time limit", "effort spent", "interrupted", "rejected"),
     *("no base pose", "no base path", "arm does not reach", "no inverse kinematics", "collision", "too fast", "closure"),
@@ -37,7 +40,17 @@ STATUSES = (
 """What plans end with; those in the second line are the baselines'."""
 METRICS = (
     *("planning_time", "build_time", "base_effort", "base_effort_l1", "arm_effort", "clearance", "closure_error", "duration"),
-    *("iterations", "rounds", "effort", "time_initialization", "time_coal", "time_casadi", "time_ipopt", "time_validation"),
+    *(
+        "iterations",
+        "rounds",
+        "effort",
+        "time_initialization",
+        "time_coal",
+        "time_casadi",
+        "time_ipopt",
+        "time_validation",
+        "time_retiming",
+    ),
 )
 """What every plan is measured by; baselines have more."""
 
@@ -111,7 +124,7 @@ class _Others(BaseModel):
         return self
 
 
-_LATER = ("effort",)  # older files do not have it
+_LATER = ("effort", "time_retiming")  # older files do not have it
 _kinds: dict[str, Any] = {
     name: (Distance if name == "clearance" else Measured, 0.0 if name in _LATER else ...) for name in METRICS
 }
@@ -146,15 +159,21 @@ class _About(Schema):
     terms: Annotated[list[dict[str, Any]], FailFast()] = Field(default_factory=list)
 
 
-def write_archive(file: str | Path, about: Mapping[str, Any], times: Floats, positions: Floats) -> Path:
-    """Write the file of a saved plan, whole or not at all, from its description and its arrays; return the path."""
-    buffer, text = io.BytesIO(), json.dumps({"format": FORMAT, **about})
-    np.savez_compressed(buffer, about=np.array(text), times=times, positions=positions)
+def write_archive(file: str | Path, about: Mapping[str, Any]) -> Path:
+    """Write the file of a saved plan, whole or not at all, from its description; return the path.
+
+    Numbers of its `trajectory`, see `Trajectory.to_dict`, are arrays of their own in the file.
+    """
+    motion = dict(about["trajectory"])
+    arrays = {name: np.array(motion.pop(name), float) for name in ("times", "positions")}
+    arrays |= {f"knot_{name}": np.array(values, float) for name, values in motion.pop("curve", {}).items()}
+    buffer, text = io.BytesIO(), json.dumps({"format": FORMAT, **about, "trajectory": motion})
+    np.savez_compressed(buffer, allow_pickle=False, about=np.array(text), **arrays)
     return write_atomically(file, buffer.getvalue())
 
 
-def read_archive(file: Path) -> tuple[dict[str, Any], dict[str, Floats]]:
-    """Return the description in the file of a saved plan, and its arrays "times" and "positions".
+def read_archive(file: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the description in the file of a saved plan, and its arrays: "times", "positions", and "curve", if there is one.
 
     Nothing is unpacked before its size is known, and there are no pickles in it.
 
@@ -163,11 +182,11 @@ def read_archive(file: Path) -> tuple[dict[str, Any], dict[str, Floats]]:
     """
     data = read_bytes(file, "plan", LARGEST_ARCHIVE)
     try:
-        if (parts := data.count(b"PK\x01\x02")) > 2 * len(ARRAYS):  # before a list of them is made
+        if (parts := data.count(b"PK\x01\x02")) > 2 * len(_PARTS):  # before a list of them is made
             raise ValueError(f"{parts} parts")
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             names = sorted(name.removesuffix(".npy") for name in archive.namelist())
-            if names != sorted(ARRAYS):
+            if names not in (sorted(ARRAYS), sorted(_PARTS)):
                 raise ValueError(f"its parts are {', '.join(names) or 'none'}, not {', '.join(sorted(ARRAYS))}")
             arrays = {info.filename.removesuffix(".npy"): _array(archive, info) for info in archive.infolist()}
     except _DAMAGED as error:
@@ -178,13 +197,15 @@ def read_archive(file: Path) -> tuple[dict[str, Any], dict[str, Floats]]:
     about = parse_json(text, file)
     if isinstance(about, dict) and about.get("format") != FORMAT:
         raise InputError("unknown format", file=file, field="format", expected=FORMAT, got=about.get("format"))
-    return check(Document(about, file), _About).model_dump(), {name: _finite(file, name, arrays[name]) for name in arrays}
+    found: dict[str, Any] = {name: _finite(file, name, array) for name, array in arrays.items()}
+    knots = {name.removeprefix("knot_"): found.pop(name) for name in CURVE if name in found}
+    return check(Document(about, file), _About).model_dump(), found | ({"curve": knots} if knots else {})
 
 
 def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Any:
     """Return one part of an archive; the header must say what there is of it."""
     name = info.filename.removesuffix(".npy")
-    kind, axes = ARRAYS[name]
+    kind, axes = _PARTS[name]
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise ValueError(f"{name} is packed in an unknown way")
     with archive.open(info) as packed:

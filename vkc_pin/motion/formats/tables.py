@@ -43,6 +43,7 @@ LARGEST_MOTION = 20_000_000
 MOST_LINES, MOST_COLUMNS = 200_000, 1000
 """Most lines and columns of a table."""
 _TIME, _PHASES = "time", ("phase", "phase_name", "held")  # the first column of a table, and the last ones
+_RATE, _WAYPOINT = " velocity", "waypoint"  # of the columns of a curve
 _OPENING = "opening"  # after these, where a gripper opens
 
 
@@ -55,6 +56,9 @@ def write_csv(
     `base_yaw [rad]`, the arm's joints, the objects' joints, then `phase` (counted from 1), `phase_name` and `held`, as JSON, and
     `opening [m]` of the gripper if a phase says what it is, empty where it rests. A waypoint between two phases is in the earlier
     one. Numbers have as many digits as it takes to read back the very same.
+
+    A motion that has a curve has a line a knot, with the same coordinates' velocities, `base_x velocity [m/s]` and so on, after
+    their positions, and then `waypoint`, 1 for a knot that is one and 0 for the others.
 
     Args:
         motion: What to write.
@@ -75,16 +79,33 @@ def write_csv(
     names = [motion["names"][k] for k in columns]
     opens = [f"{_OPENING} [m]"] if any(phase.get(_OPENING) is not None for phase in phases) else []
     named = [f"{name} [{known[name]}]" if name in known else name for name in names]
+    curve = motion.get("curve")
+    if curve is not None:
+        named += [f"{name}{_RATE} [{known[name]}/s]" if name in known else name + _RATE for name in names] + [_WAYPOINT]
     table.writerow([f"{_TIME} [s]", *named, *_PHASES, *opens])
     number = 0
-    for k, (moment, row) in enumerate(zip(motion["times"], motion["positions"], strict=True)):
-        number += k > phases[number]["last"]
+    for moment, waypoint, row, told in _written(motion, columns):
+        number += waypoint > phases[number]["last"]
         phase = phases[number]
         held = {name: [at, phase["by"][name]] if name in phase["by"] else at for name, at in phase["held"].items()}
-        values = [repr(float(row[column])) for column in columns]
+        values = [*(repr(float(value)) for value in row), *told]
         opening = "" if phase.get(_OPENING) is None else repr(float(phase[_OPENING]))
         table.writerow([repr(float(moment)), *values, number + 1, phase["name"], json.dumps(held), *([opening] if opens else [])])
     return write_atomically(path, "".join(line.removesuffix("\r\n") + "\n" for line in lines).encode("utf-8"))
+
+
+def _written(motion: Mapping[str, Any], columns: Sequence[int]) -> Iterator[tuple[float, int, list[float], list[str]]]:
+    """Yield the time of every line, its waypoint or the next, its numbers, and whether it is a waypoint, if that is told."""
+    curve = motion.get("curve")
+    if curve is None:
+        for k, (moment, row) in enumerate(zip(motion["times"], motion["positions"], strict=True)):
+            yield moment, k, [row[column] for column in columns], []
+        return
+    next_one = 0
+    for moment, row, rates in zip(curve["times"], curve["positions"], curve["rates"], strict=True):
+        is_one = moment == motion["times"][next_one]
+        yield moment, next_one, [values[column] for values in (row, rates) for column in columns], [str(int(is_one))]
+        next_one = min(next_one + is_one, len(motion["times"]) - 1)
 
 
 def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, Any]:
@@ -105,7 +126,7 @@ def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, An
     header = next(lines, (0, []))[1]
     if len(header) > MOST_COLUMNS:
         raise InputError("too many columns", file=path, line=1, expected=f"at most {MOST_COLUMNS}", got=len(header))
-    header = [re.sub(r" \[(s|m|rad)\]$", "", name) for name in header]
+    header = [re.sub(r" \[(s|m|rad|m/s|rad/s)\]$", "", name) for name in header]
     if not header:
         raise InputError("an empty file", file=path, expected="a table with a line of names")
     if header[0] != _TIME:
@@ -115,21 +136,40 @@ def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, An
     opens = tuple(header[-4:]) == (*_PHASES, _OPENING)
     told = opens or tuple(header[-3:]) == _PHASES
     last = len(header) - (len(_PHASES) + opens if told else 0)
-    names = header[1:last]
+    names, curved = header[1:last], header[last - 1] == _WAYPOINT and last > 1
+    if curved:
+        half = (len(names) - 1) // 2
+        names, rates = names[:half], names[half:-1]
+        if rates != [name + _RATE for name in names]:
+            expected = ", ".join(name + _RATE for name in names)
+            raise InputError("not the velocities of its coordinates", file=path, line=1, expected=expected, got=", ".join(rates))
     rows: list[list[float]] = []
+    knots: list[list[float]] = []
     phases: list[dict[str, Any]] = []
     for number, cells in lines:
         if not cells:
             continue
         if len(cells) != len(header):
             raise InputError("wrong number of columns", file=path, line=number, expected=len(header), got=len(cells))
-        rows.append([_number(cell, path, number, name) for cell, name in zip(cells, [_TIME, *names], strict=False)])
+        row = [_number(cell, path, number, name) for cell, name in zip(cells[:last], header, strict=False)]
+        if curved:
+            knots.append(row)
+            if not row[-1]:
+                continue
+        rows.append(row[: len(names) + 1])
         if told:
             opening = _number(cells[-1], path, number, _OPENING) if opens and cells[-1] else None
             _add_phase(phases, cells[last : last + 3], opening, len(rows) - 1, path, number)
     if not told and len(rows) > 1:
         phases = [one_phase(len(rows))]
+    own = slice(1, len(names) + 1)
+    curve = {
+        "times": [knot[0] for knot in knots],
+        "positions": [knot[own] for knot in knots],
+        "rates": [knot[own.stop : -1] for knot in knots],
+    }
     return {
+        **({"curve": curve} if curved else {}),
         "names": names,
         "times": [row[0] for row in rows],
         "positions": [row[1:] for row in rows],

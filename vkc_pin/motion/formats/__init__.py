@@ -1,0 +1,1 @@
+"""Motions as files and messages: saved plans, tables, JSON, ROS."""

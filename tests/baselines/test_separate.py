@@ -88,11 +88,11 @@ def test_in_open_space(task: str, method: str) -> None:
 @pytest.mark.parametrize("task", PLANS)
 def test_efforts_are_the_trajectorys(task: str, method: str) -> None:
     plan = PLANS[task](method)
-    m, positions = plan.metrics, plan.trajectory.positions
-    change = np.diff(positions, axis=0)
-    assert m["base_effort"] == pytest.approx(sum(np.hypot(x, y) for x, y in change[:, :2]))
-    assert m["base_effort_l1"] == pytest.approx(np.abs(change[:, 0]).sum() + np.abs(change[:, 1]).sum())
-    assert m["arm_effort"] == pytest.approx(np.abs(change[:, 3:9]).sum())
+    m, motion = plan.metrics, plan.trajectory
+    change = np.diff(motion(np.linspace(motion.times[0], motion.times[-1], 50_001)), axis=0)
+    assert m["base_effort"] == pytest.approx(sum(np.hypot(x, y) for x, y in change[:, :2]), rel=1e-3)
+    assert m["base_effort_l1"] == pytest.approx(np.abs(change[:, 0]).sum() + np.abs(change[:, 1]).sum(), rel=1e-3)
+    assert m["arm_effort"] == pytest.approx(np.abs(change[:, 3:9]).sum(), rel=1e-3)
     assert m["duration"] == plan.trajectory.times[-1]
     assert m["clearance"] == plan.validation.clearance
     assert m["closure_error"] == plan.validation.closure_error
@@ -352,7 +352,7 @@ class Tries:
         # Which try it comes from can be seen at the first waypoint.
         positions = np.array(self.trajectory.positions)
         positions[0, 0] = len(self.seeds)
-        return dataclasses.replace(self.trajectory, positions=positions), came, self.status
+        return dataclasses.replace(self.trajectory, positions=positions, curve=None), came, self.status
 
     def validate(self, *_: Any) -> vkc.Report:
         wrong = vkc.Violation("goal", "drawer.slide", waypoint=0, time=0.0, amount=1.0, unit="m", detail="")

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.carrying import STICK, TOP, above, box, reaching, room, table, tool_at
 from helpers.drives import hall
 from helpers.small_problems import SHORT, door_scene, program_of
 
@@ -44,6 +45,17 @@ def test_a_start_that_touches() -> None:
     (violation, *_) = impossible(problem(scene, vkc.GoTo(-1.0, 0.0)))
     assert (violation.constraint, violation.subject, violation.waypoint) == ("start", "base_link – crate", 0)
     assert violation.amount == pytest.approx(0.495 + 0.3 - 0.7, abs=1e-6)
+
+
+@pytest.mark.parametrize("gap", [1e-3, 1e-17, 0.0, -5e-5, -2e-3])
+def test_what_the_hand_holds_at_the_start_may_lie_on_something(gap: float) -> None:
+    down = reaching(tool_at(STICK), above(STICK))
+    held = room(table(gap=gap)).with_start(base=down[:3], arm=down[3:]).with_held({"stick": "grip"})
+    assert impossible(problem(held, vkc.GoTo(0.0, 1.0))) == []
+    inside = box("table", [0.5, 2.4, 0.02], [0.8, 0.0, TOP - 0.01 + 0.002])  # the arm, which holds nothing there, in a block
+    block = room(inside, box("block", [0.2, 0.2, 0.2], [float(down[0]), float(down[1]), 0.3]))
+    start = block.with_start(base=down[:3], arm=down[3:]).with_held({"stick": "grip"})
+    assert {v.constraint for v in impossible(problem(start, vkc.GoTo(0.0, 1.0)))} == {"start"}
 
 
 def test_how_far_a_target_stays_out_of_reach() -> None:

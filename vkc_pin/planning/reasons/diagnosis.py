@@ -41,7 +41,7 @@ def impossible(problem: TrajectoryProblem) -> list[Violation]:
     found = []
     contacts = problem.contacts.evaluate(problem.start[None], np.array([0]), reach=0.0)
     for (first, second), distance, margin in zip(contacts.pair, contacts.distance, contacts.margin, strict=True):
-        if distance >= (margin if margin > 0.0 else margin - CONTACT):  # as the scene allows, or in contact where that may be
+        if distance >= (margin if margin > CONTACT else margin - CONTACT):  # as the scene allows, or in contact where that may be
             continue
         labels = problem.contacts.phases[0].labels
         subject = f"{labels[first]} – {labels[second]}"

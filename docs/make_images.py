@@ -258,6 +258,7 @@ def main() -> int:
     attachments()
     picture(door, "door", WIDE, HALF_OPEN)
     plots(door, "door", "joints", "clearance", "top_view")
+    door.simulate().plot(IMAGES / "physics.png")
     plots(stick, "stick", "top_view")
     look(*UNDER_THE_TABLE)
     picture(stick, "stick", WIDE, float(stick.trajectory.times[-1]))

@@ -1,4 +1,4 @@
-from . import baselines, benchmarks, cpin, plotting, validation, visualization
+from . import baselines, benchmarks, cpin, plotting, simulation, validation, visualization
 from .chain.chain import VirtualKinematicChain, consolidate
 from .chain.inversion import invert
 from .errors import BuildError, InputError, UnknownNameError, VkcError
@@ -27,6 +27,8 @@ from .scene.placed import PlacedObject
 from .scene.rooms.random_room import random_room
 from .scene.rooms.settings import RoomSettings
 from .scene.scene import Scene, load_scene
+from .simulation.physics import Physics
+from .simulation.result import SimulationResult
 from .solver.solution import Iteration
 from .task.formula import State
 from .task.goals import goals, random_task
@@ -57,6 +59,7 @@ __all__ = [
     "Latch",
     "Options",
     "PhaseSpan",
+    "Physics",
     "Place",
     "PlacedObject",
     "Plan",
@@ -71,6 +74,7 @@ __all__ = [
     "RoomSettings",
     "Scene",
     "SceneCheck",
+    "SimulationResult",
     "State",
     "Touch",
     "Trajectory",
@@ -102,6 +106,7 @@ __all__ = [
     "random_object",
     "random_room",
     "random_task",
+    "simulation",
     "validate",
     "validation",
     "visualization",

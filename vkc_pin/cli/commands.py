@@ -1,4 +1,4 @@
-"""The commands of `vkc-pin`: plan, check, view, export, srdf, and those of other modules. Files are written before reports."""
+"""The commands of `vkc-pin`: plan, view, export, srdf, and those of other modules. Files are written before reports."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from typing import Any
 from vkc_pin.benchmarks.commands import EXIT_INTERRUPTED, EXIT_OK, add_bench, natural, positive
 from vkc_pin.cli.checking import add_check
 from vkc_pin.cli.importing import add_importing
+from vkc_pin.cli.simulating import add_simulate
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.files.writing import check_outputs, write_atomically
 from vkc_pin.motion.formats.tables import GROUPS
@@ -203,6 +204,7 @@ def make_parser() -> argparse.ArgumentParser:
     plan.set_defaults(run=_plan)
 
     add_check(commands)
+    add_simulate(commands)
 
     view = commands.add_parser("view", help="look at a scene or plan", description="Show a scene or a saved plan in the browser.")
     view.add_argument("what", metavar="SCENE|PLAN")

@@ -22,6 +22,8 @@ from vkc_pin.options import Options
 from vkc_pin.plotting import plots as plotting
 from vkc_pin.plotting.cards import motion_html
 from vkc_pin.scene.scene import Scene
+from vkc_pin.simulation.execution import simulate
+from vkc_pin.simulation.result import SimulationResult
 from vkc_pin.task.actions import foresee
 from vkc_pin.task.steps import Step, step_from_dict, step_to_dict
 from vkc_pin.task.terms import Term, term_from_dict, term_to_dict
@@ -87,6 +89,10 @@ class Plan:
             raise InputError("this plan is no success", field="end_scene", expected="a motion that is valid", got=self.status)
         after = foresee(self.scene, self.steps, self.options)[-1].after
         return scene_after(self.scene, self.trajectory, after)
+
+    def simulate(self, **options: Any) -> SimulationResult:
+        """Execute the motion in physics, with masses and servos; see `simulation.simulate`. Needs the extra `sim`."""
+        return simulate(self.scene, self.steps, self.trajectory, **options)
 
     def contradictions(self) -> list[str]:
         """Return what the file that the plan was loaded from says otherwise than the check of its motion, one line each."""
@@ -210,8 +216,7 @@ class Plan:
         except InputError as error:
             if error.file is not None:
                 raise
-            got, expected = error.got, error.expected
-            raise InputError(error.problem, file=path, field=error.field, expected=expected, got=got) from error
+            raise InputError(error.problem, file=path, field=error.field, expected=error.expected, got=error.got) from error
         except (ValueError, LookupError, TypeError, AttributeError, OSError, OverflowError, RecursionError) as error:
             raise InputError("not a saved plan", file=path, expected="a file written by Plan.save", got=str(error)) from error
         return plan
@@ -234,7 +239,7 @@ class Plan:
             options=_saved(about["options"]),
             trajectory=trajectory,
             validation=cast(Report, validation),
-            status=cast(str, _status) if status == "success" else status,
+            status=cast(str, lambda plan: "success" if plan.validation.ok else "rejected") if status == "success" else status,
             metrics=cast(Mapping[str, float], partial(_metrics, metrics)),
             seed=about["seed"],
             initialization=about["initialization"],
@@ -256,11 +261,6 @@ def _recalled(plan: Plan) -> Report:
         return report
     report = replace(report, notes=claimed.notes)
     return report.with_reasons(claimed.violations or report.violations) if vars(plan)["status"] == "infeasible" else report
-
-
-def _status(plan: Plan) -> str:
-    """Return the status of a loaded plan that is said to be a success."""
-    return "success" if plan.validation.ok else "rejected"
 
 
 def _metrics(taken: Mapping[str, float], plan: Plan) -> Mapping[str, float]:

@@ -40,6 +40,7 @@ _ALARM_TIME = 0.4  # [s] that an offending link stays red before and after
 _GHOST_DETAIL = 0.007  # [m]
 _AXES = {"x": (0.86, 0.13, 0.13), "y": (0.13, 0.60, 0.16), "z": (0.11, 0.27, 0.90)}  # of frames
 _AXIS_LENGTH, _AXIS_RADIUS = 0.16, 0.007  # [m]
+_BESIDE = "beside"  # where the other motion is in the tree
 _meshes: weakref.WeakKeyDictionary[Robot, list[Solid]] = weakref.WeakKeyDictionary()
 
 
@@ -64,14 +65,25 @@ class Drawing:
         scene: What to draw, as it is at its start.
         trajectory: The motion to animate; the start and the end appear as ghosts.
         report: Links that it says come too close turn red at that time.
+        world: The tree that moves; None: along the trajectory.
+        times: Of the key frames, shape (K,) [s]; None: as many as it takes.
+        beside: Another motion at these times, to appear as a ghost.
     """
 
     def __init__(
-        self, viewer: meshcat.Visualizer, scene: Scene, trajectory: Trajectory | None = None, report: Report | None = None
+        self,
+        viewer: meshcat.Visualizer,
+        scene: Scene,
+        trajectory: Trajectory | None = None,
+        report: Report | None = None,
+        *,
+        world: World | None = None,
+        times: Floats | None = None,
+        beside: Motion | None = None,
     ) -> None:
-        self.viewer, self.scene, self.trajectory, self.report = viewer, scene, trajectory, report
-        self.world = World(scene)
-        self.motion: Motion = sample_motion(self.world, trajectory)
+        self.viewer, self.scene, self.trajectory, self.report, self.beside = viewer, scene, trajectory, report, beside
+        self.world = World(scene) if world is None else world
+        self.motion: Motion = sample_motion(self.world, trajectory, times)
         self.room = Room(scene)
         self.nodes = self._nodes()
         self.movers = self._movers()
@@ -103,8 +115,9 @@ class Drawing:
             self._paths()
             moving = np.any([*self.movers.values(), np.zeros(self.world.model.njoints, bool)], axis=0)
             self.light = [coarse(item.solid, _GHOST_DETAIL) if moving[item.joint] else None for item in self.items]
-            self._ghosts("start", 0, _START)
-            self._ghosts("end", -1, _END)
+            for name, row, colour in (("start", 0, _START), ("end", -1, _END)) if self.beside is None else ():
+                self._ghosts(name, row, colour)
+            self._other()
         self.viewer.window.send(SetAnimation(self._animation(), play=play, repetitions=1))
 
     def viewpoint(self) -> tuple[Floats, Floats]:
@@ -207,6 +220,18 @@ class Drawing:
             if solids:
                 self.viewer[f"ghosts/{name}/{owner}"].set_object(Ghost(merge_solids(solids), colour))
 
+    def _other(self) -> None:
+        """Draw what moves once more, for the other motion."""
+        if self.beside is None:
+            return
+        for item, light in zip(self.items, self.light, strict=True):
+            if light is not None:
+                ghost = f"{_BESIDE}/{item.path}"
+                self.viewer[ghost].set_object(Ghost(light, _START))
+                self.viewer[ghost].set_transform(item.placement.homogeneous)
+        for joint in range(1, self.world.model.njoints):
+            self.viewer[f"{_BESIDE}/{self.nodes[joint]}"].set_transform(self.beside.local[joint][0].homogeneous)
+
     def _movers(self) -> dict[str, Bools]:
         """Return the joints that move in the world, of the robot and of every object: name → shape (joints,)."""
         model, moves = self.world.model, self.motion.moving.copy()
@@ -240,14 +265,15 @@ class Drawing:
         if self.trajectory is None:
             return movie
         times = (self.motion.times - self.motion.times[0]).tolist()
-        for j in np.flatnonzero(self.motion.moving):
-            local = self.motion.local[j]
-            quaternions = [pin.Quaternion(placement.rotation).coeffs().tolist() for placement in local]
-            tracks = [Track("quaternion", "quaternion", times, quaternions)]
-            if np.ptp([placement.translation for placement in local], axis=0).max() > 1e-9:
-                tracks.append(Track("position", "vector3", times, [placement.translation.tolist() for placement in local]))
-            self._clip(movie, self.nodes[j], tracks)
-        for name, row in (("start", 0), ("end", -1)):
+        for motion, above in ((self.motion, ""), *([] if self.beside is None else [(self.beside, f"{_BESIDE}/")])):
+            for j in np.flatnonzero(motion.moving):
+                local = motion.local[j]
+                quaternions = [pin.Quaternion(placement.rotation).coeffs().tolist() for placement in local]
+                tracks = [Track("quaternion", "quaternion", times, quaternions)]
+                if np.ptp([placement.translation for placement in local], axis=0).max() > 1e-9:
+                    tracks.append(Track("position", "vector3", times, [placement.translation.tolist() for placement in local]))
+                self._clip(movie, above + self.nodes[j], tracks)
+        for name, row in (("start", 0), ("end", -1)) if self.beside is None else ():
             for owner, joints in self.movers.items():
                 away = self.motion.away(joints, row).tolist()
                 self._clip(movie, f"ghosts/{name}/{owner}", [Track("visible", "bool", times, away)])

@@ -15,7 +15,7 @@ from vkc_pin.models.shapes import world_box
 from vkc_pin.scene.scene import Scene
 from vkc_pin.visualization.solids import Solid, box_solid, shade, to_solid
 
-__all__ = ["Part", "Room", "drawn_parts"]
+__all__ = ["Part", "Room", "drawn_parts", "is_wall"]
 
 _THIN, _HIGH = 0.25, 2.0  # [m]: an upright box at most this thick that reaches at least this high is a wall
 _BEYOND = 0.35  # [m]: a wall with more of the arena than this behind it divides a room
@@ -58,7 +58,7 @@ class Room:
         self._walls: list[pin.GeometryObject] = []
         self._furniture: list[pin.GeometryObject] = []
         for shape in scene.obstacle_visual:
-            (self._walls if _is_wall(shape) else self._furniture).append(shape)
+            (self._walls if is_wall(shape) else self._furniture).append(shape)
 
     def parts(self) -> list[Part]:
         """Return what to draw."""
@@ -137,7 +137,8 @@ def drawn_parts(shape: pin.GeometryObject) -> list[tuple[Solid, tuple[float, ...
     return [(to_solid(shape.geometry), colour)]
 
 
-def _is_wall(shape: pin.GeometryObject) -> bool:
+def is_wall(shape: pin.GeometryObject) -> bool:
+    """Return whether a shape that stands in the world is a wall: an upright box, thin and high."""
     if not isinstance(shape.geometry, coal.Box):
         return False
     half = np.asarray(shape.geometry.halfSide)

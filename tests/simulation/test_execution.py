@@ -1,0 +1,120 @@
+"""Plans do in physics what they say, and what is wrong with the world comes out."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.executions import door_plan, drawer_plan, holding, still, with_mass
+
+import vkc_pin as vkc
+from vkc_pin.scene.scene import Scene
+from vkc_pin.simulation.execution import simulate
+
+
+def test_a_drawer_is_pulled() -> None:
+    result = drawer_plan().simulate()
+    assert result.ok, result.report()
+    (miss,) = result.misses
+    assert (miss.subject, miss.unit) == ("drawer.slide", "m")
+    assert miss.amount < 2e-3
+    assert abs(result.trajectory.column("drawer.slide")[-1] - 0.3) == pytest.approx(miss.amount, abs=1e-9)
+    assert np.degrees(result.tracking.arm[0]) < 1.0
+    assert result.tracking.base[0] < 0.02
+    (grip,) = result.grips
+    assert grip.what == "drawer.handle"
+    assert grip.broken is None
+    # What the hand must give at least: the drawer's mass times the plan's largest acceleration.
+    plan = drawer_plan().trajectory
+    column = plan.names.index("drawer.slide")
+    assert grip.force > 0.3 * 5.0 * np.abs(plan.accelerations()[:, column]).max()
+    assert result.contacts == ()
+
+
+def test_a_latched_door_is_opened_with_its_lever() -> None:
+    result = door_plan().simulate()
+    assert result.ok, result.report()
+    before = result.trajectory.times < result.grips[0].begin
+    assert np.abs(result.trajectory.column("door.hinge")[before]).max() < 1e-3
+    assert result.trajectory.column("door.hinge")[-1] == pytest.approx(1.2, abs=0.02)
+    assert result.trajectory.column("door.knob").max() > 0.4
+    assert set(result.tracking.shares) == set(result.scene.robot.coordinates.names[3:])
+    assert max(result.tracking.shares.values()) < 1.0
+
+
+def test_a_lever_that_is_not_turned_keeps_the_door_shut() -> None:
+    """The same motion of the robot at a latch that needs more: the door stays shut, and its handle is torn from the hand."""
+    plan = door_plan()
+    document = plan.scene.document
+    scene = Scene.from_document(document, plan.scene.folder).with_start(base=plan.scene.start[:3], arm=plan.scene.start[3:])
+    (latch,) = scene.objects["door"].object.latches
+    object.__setattr__(latch, "threshold", 0.75)
+    result = plan.simulate(actual=scene)
+    assert not result.ok
+    assert result.grips[0].broken is not None
+    assert any("pulled out of the hand" in line for line in result.problems())
+    assert any("door.hinge" in line for line in result.problems())
+
+
+def test_what_is_too_heavy_is_lost() -> None:
+    scene = holding()
+    light = simulate(scene, [vkc.Grasp("stick")], still(scene))
+    heavy = simulate(scene, [vkc.Grasp("stick")], still(scene), actual=with_mass(scene, "stick", 60.0))
+    assert light.grips[0].broken is None
+    assert heavy.grips[0].broken is not None
+    assert "stick.grip was pulled out of the hand" in heavy.report()
+    assert not heavy.ok
+
+
+def test_what_was_moved_into_the_way_is_named() -> None:
+    plan = drawer_plan()
+    middle = plan.trajectory.at(10.0)[:2]
+    document = dict(plan.scene.document)
+    crate = {"name": "crate", "type": "box", "size": [0.3, 0.3, 0.4], "position": [*middle.tolist(), 0.2]}
+    document["obstacles"] = [*document["obstacles"], crate]
+    changed = Scene.from_document(document, plan.scene.folder)
+    result = plan.simulate(actual=changed)
+    assert not result.ok
+    hit = [contact for contact in result.contacts if "crate" in (contact.first, contact.second)]
+    assert hit
+    assert 0.0 < hit[0].begin < 11.0
+    assert max(contact.depth for contact in hit) > 1e-4
+    assert any("drawer.slide" in line for line in result.problems())  # it did not get there
+    assert "crate" in result.report()
+
+
+def test_the_same_again_is_the_same() -> None:
+    one, other = drawer_plan().simulate(), drawer_plan().simulate()
+    np.testing.assert_array_equal(one.rows, other.rows)
+
+
+def test_results_are_plain_data(tmp_path: Path) -> None:
+    result = drawer_plan().simulate()
+    data = json.loads(result.to_json(tmp_path / "result.json").read_text(encoding="utf-8"))
+    assert data["ok"] is True
+    assert data["misses"][0]["subject"] == "drawer.slide"
+    assert vkc.Trajectory.from_dict(data["trajectory"]).names == result.trajectory.names
+    assert data["physics"]["timestep"] == result.physics.timestep
+
+
+@pytest.mark.parametrize(
+    ("options", "field"),
+    [
+        ({"grasp": "friction"}, "grasp"),
+        ({"grasp": "glue"}, "grasp"),
+        ({"physics": 3}, "physics"),
+        ({"actual": "drawer"}, "actual"),
+    ],
+)
+def test_wrong_arguments_are_named(options: dict[str, object], field: str) -> None:
+    with pytest.raises(vkc.InputError) as caught:
+        drawer_plan().simulate(**options)
+    assert caught.value.field == field
+
+
+def test_another_scene_is_refused() -> None:
+    with pytest.raises(vkc.InputError, match="not there") as caught:
+        drawer_plan().simulate(actual=vkc.load_scene("door"))
+    assert caught.value.expected == "drawer"

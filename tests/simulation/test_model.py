@@ -1,0 +1,80 @@
+"""The model has the kinematics, masses and shapes of the tree that it is made of."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.executions import still
+
+import vkc_pin as vkc
+from vkc_pin.models.shapes import triangles
+from vkc_pin.motion.world import World
+from vkc_pin.scene.scene import Scene
+from vkc_pin.simulation.contacts import touching_pairs
+from vkc_pin.simulation.grips import latched
+from vkc_pin.simulation.model import Builder, PhysicalWorld
+from vkc_pin.simulation.physics import Physics, weigh
+from vkc_pin.simulation.servos import servos
+
+
+def built(scene: Scene) -> PhysicalWorld:
+    physics, world, holds = Physics(), World(scene), scene.holds
+    assert weigh(world, physics) == []
+    driven = servos(world, world.positions(still(scene)), physics)
+    latches = [(joint, at) for joint, at, _, _ in latched(scene)]
+    return Builder(world, physics).built(touching_pairs(world, holds), driven, holds, latches)
+
+
+def random_rows(world: World, count: int) -> np.ndarray:
+    rows = world.start + np.random.default_rng(1).uniform(-2.0, 2.0, (count, world.coordinates.size))
+    for name, placed in world.scene.objects.items():
+        if placed.object.free:
+            columns = world.placement_columns(name)
+            turns = rows[:, columns.start + 3 : columns.stop]
+            turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+    return rows
+
+
+@pytest.mark.parametrize("name", ["door", "drawer", "household", "init_1", "tray"])
+def test_bodies_and_shapes_are_where_pinocchio_has_them(name: str) -> None:
+    scene = vkc.load_scene(name)
+    physical = built(scene)
+    world, model = physical.world, physical.model
+    data, tree = mujoco.MjData(model), world.model.createData()
+    for row in random_rows(world, 5):
+        data.qpos[:] = physical.qpos(row)
+        mujoco.mj_kinematics(model, data)
+        pin.forwardKinematics(world.model, tree, world.coordinates.q(row))
+        for joint in range(1, world.model.njoints):
+            body = physical.bodies[joint]
+            np.testing.assert_allclose(data.xpos[body], tree.oMi[joint].translation, atol=1e-9)
+            np.testing.assert_allclose(data.xmat[body].reshape(3, 3), tree.oMi[joint].rotation, atol=1e-9)
+        np.testing.assert_allclose(physical.row(data.qpos), row, atol=1e-12)
+        for number, shape in enumerate(world.shapes):
+            geom = int(physical.geoms[number])
+            where = tree.oMi[shape.parentJoint] * shape.placement if shape.parentJoint else shape.placement
+            place, turn = data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3)
+            if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_MESH:
+                np.testing.assert_allclose(place, where.translation, atol=1e-9)
+                continue
+            mesh = int(model.geom_dataid[geom])  # MuJoCo turns meshes into their principal axes
+            first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
+            seen = model.mesh_vert[first : first + count] @ turn.T + place
+            points = triangles(shape.geometry)[0] @ where.rotation.T + where.translation
+            np.testing.assert_allclose(seen.min(axis=0), points.min(axis=0), atol=1e-5)
+            np.testing.assert_allclose(seen.max(axis=0), points.max(axis=0), atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["door", "household", "tray"])
+def test_masses_agree(name: str) -> None:
+    physical = built(vkc.load_scene(name))
+    tree = World(physical.world.scene).model  # as the files have it
+    for joint in range(1, tree.njoints):
+        inertia, body = tree.inertias[joint], int(physical.bodies[joint])
+        assert physical.model.body_mass[body] == pytest.approx(inertia.mass)
+        np.testing.assert_allclose(physical.model.body_ipos[body], inertia.lever, atol=1e-9)
+        principal = np.sort(np.linalg.eigvalsh(np.asarray(inertia.inertia)))
+        principal += max(0.0, principal[2] - principal[0] - principal[1])  # the cabinet's are rounded
+        np.testing.assert_allclose(np.sort(physical.model.body_inertia[body]), principal, rtol=1e-3)

@@ -1,0 +1,38 @@
+"""Snapshots show the robot and what it moves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.executions import drawer_plan
+
+import vkc_pin as vkc
+from vkc_pin.simulation import snapshots
+from vkc_pin.simulation.snapshots import Stage
+
+
+def test_snapshots_differ_where_things_move(tmp_path: Path) -> None:
+    result = drawer_plan().simulate()
+    stage = Stage(result)
+    try:
+        first, again, last = stage.pictures(np.array([0.0, 0.0, result.trajectory.times[-1]]), stage.viewpoint())
+    except vkc.VkcError as error:  # no OpenGL on this machine
+        pytest.skip(str(error))
+    np.testing.assert_array_equal(first, again)
+    assert first.std() > 10.0
+    moved = (np.abs(first.astype(int) - last).max(axis=2) > 30).mean()
+    assert 0.005 < moved < 0.5
+    picture = result.plot(tmp_path / "strip.png", count=3).read_bytes()
+    assert picture.startswith(b"\x89PNG")
+
+
+def test_without_opengl_the_error_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    result = drawer_plan().simulate()
+    monkeypatch.setattr(snapshots, "_CONTEXTS", ("no_such_context",))
+    with pytest.raises(vkc.VkcError, match="EGL or OSMesa"):
+        result.plot(tmp_path / "strip.png")
+    assert not (tmp_path / "strip.png").exists()
+    with pytest.raises(vkc.InputError, match="count"):
+        result.plot(tmp_path / "strip.png", count=1)

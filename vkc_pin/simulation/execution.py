@@ -1,0 +1,206 @@
+"""Executes a motion in physics: servos follow it, hands hold what it holds, and everything else goes as it goes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from vkc_pin.arguments import instance
+from vkc_pin.arrays import Floats
+from vkc_pin.errors import InputError
+from vkc_pin.motion.trajectory import Trajectory
+from vkc_pin.motion.world import World
+from vkc_pin.scene.contact import CONTACT
+from vkc_pin.scene.hold import Hold
+from vkc_pin.scene.scene import Scene
+from vkc_pin.simulation.contacts import Contact, Pairs, touching_pairs, unwanted
+from vkc_pin.simulation.goals import missed
+from vkc_pin.simulation.grips import Grips, Latches, latched, spans
+from vkc_pin.simulation.model import Builder, PhysicalWorld
+from vkc_pin.simulation.physics import Physics, engine, weigh
+from vkc_pin.simulation.result import SimulationResult, Tracking
+from vkc_pin.simulation.servos import Servo, finger_rows, reference, servos
+from vkc_pin.task.steps import Step, as_list
+
+__all__ = ["GRASPS", "simulate"]
+
+GRASPS = ("weld",)
+"""How a hand can hold on."""
+_FRAME, _LOOK = 0.02, 0.01  # [s] between recorded states, and between two looks at the contacts
+
+
+def simulate(
+    scene: Scene,
+    steps: Sequence[Step],
+    trajectory: Trajectory,
+    *,
+    actual: Scene | None = None,
+    grasp: str = "weld",
+    physics: Physics | None = None,
+) -> SimulationResult:
+    """Execute a motion in MuJoCo.
+
+    Args:
+        scene: The scene that it was planned in.
+        steps: What it was to bring about.
+        trajectory: The motion.
+        actual: The scene that it happens in, if that is another: something stands elsewhere, or is heavier.
+        grasp: "weld": what is held is welded to the hand as long as the motion says, unless it is pulled too hard.
+        physics: What to assume; `Physics()` if left out.
+
+    Returns:
+        What came of it.
+
+    Raises:
+        InputError: MuJoCo is not installed, `actual` has another robot or lacks objects, or an argument is
+            none of its kind.
+    """
+    engine()
+    physics = Physics() if physics is None else instance(physics, Physics, "physics")
+    if grasp not in GRASPS:
+        problem = "hands hold by welds so far, not by the friction of their fingers" if grasp == "friction" else "unknown"
+        raise InputError(problem, field="grasp", expected=", ".join(GRASPS), got=grasp)
+    steps, here = as_list(steps), scene if actual is None else instance(actual, Scene, "actual")
+    for name, placed in scene.objects.items():
+        if name not in here.objects or here.objects[name].object.coordinates.names != placed.object.coordinates.names:
+            raise InputError(
+                "an object of the plan's scene is not there", field="actual", expected=name, got=", ".join(here.objects)
+            )
+    if here.robot.coordinates.names != scene.robot.coordinates.names:
+        raise InputError("another robot", field="actual", expected=scene.robot.name, got=here.robot.name)
+    run = _Run(here, trajectory, physics)
+    run.go()
+    return run.result(scene, steps)
+
+
+@dataclass(eq=False)
+class _Run:
+    """One execution.
+
+    Attributes:
+        scene: Where it happens.
+        trajectory: What the robot follows.
+        physics: What is assumed.
+    """
+
+    scene: Scene
+    trajectory: Trajectory
+    physics: Physics
+
+    def __post_init__(self) -> None:
+        trajectory, physics = self.trajectory, self.physics
+        self.mj, self.tree = engine(), World(self.scene)
+        self.notes = weigh(self.tree, physics)
+        self.planned = self.tree.positions(trajectory)
+        self.servos: tuple[Servo, ...] = servos(self.tree, self.planned, physics)
+        schedule = spans(self.scene, trajectory)
+        holds: list[Hold] = list(dict.fromkeys(hold for hold, _, _ in schedule))
+        self.pairs: Pairs = touching_pairs(self.tree, holds)
+        latches = latched(self.scene)
+        shut = [(joint, at) for joint, at, _, _ in latches]
+        self.physical: PhysicalWorld = Builder(self.tree, physics).built(self.pairs, self.servos, holds, shut)
+        self.grips = Grips(self.physical, holds, schedule, self.pairs, trajectory, physics)
+        self.latches = Latches(self.physical, latches, len(holds), physics)
+        start, end = float(trajectory.times[0]) - physics.settle, float(trajectory.times[-1]) + physics.settle
+        steps = np.arange(int(np.ceil((end - start) / physics.timestep - 1e-9)) + 1)
+        self.times: Floats = np.asarray(start + physics.timestep * steps, float)
+        self.seen: dict[tuple[str, str], list[tuple[float, float]]] = {}
+
+    def go(self) -> None:
+        """Execute."""
+        mj, model, physics = self.mj, self.physical.model, self.physics
+        data = mj.MjData(model)
+        data.qpos[:] = self.physical.qpos(self.tree.start)
+        mj.mj_forward(model, data)
+        positions, velocities = reference(self.trajectory, self.times)
+        fingers = finger_rows(self.tree, self.planned, self.trajectory.times, self.times)
+        wanted = np.column_stack([positions, fingers])
+        gains = np.array([[servo.damping / servo.stiffness] for servo in self.servos])[:, 0]
+        commands = wanted + gains * np.column_stack([velocities, np.zeros_like(fingers)])
+        driven, dofs = (where[: len(self.servos)] for where in (self.physical.columns, self.physical.dofs))
+        labels = np.zeros(model.ngeom, int)
+        labels[self.physical.geoms] = np.arange(len(self.physical.geoms))
+        look, frame = (max(1, round(span / physics.timestep)) for span in (_LOOK, _FRAME))
+        self.errors, self.efforts = np.zeros((2, len(self.times), len(self.servos)))
+        records, clocks = [], []
+        for k, clock in enumerate(self.times.tolist()):
+            self.grips.follow(data, clock)
+            self.latches.follow(data)
+            if k % frame == 0 or k == len(self.times) - 1:
+                records.append(data.qpos.copy())
+                clocks.append(clock)
+            self.errors[k] = wanted[k] - data.qpos[driven]
+            data.ctrl[:] = commands[k]
+            mj.mj_step(model, data)
+            self.efforts[k] = data.qfrc_actuator[dofs]
+            self.grips.measure(data, clock)
+            if k % look == 0 and data.ncon:
+                self._look(data, labels, clock)
+            if not np.isfinite(data.qpos).all() or np.any(data.warning[mj.mjtWarning.mjWARN_BADQACC].number):
+                self.times, self.errors, self.efforts = self.times[: k + 1], self.errors[: k + 1], self.efforts[: k + 1]
+                self.diverged: float | None = clock
+                break
+        else:
+            self.diverged = None
+        self.clocks, self.states = np.array(clocks), np.array(records)
+
+    def _look(self, data: Any, labels: Any, clock: float) -> None:
+        """Note what touches."""
+        names, contacts = self.tree.collision_labels, data.contact
+        depths = -np.asarray(contacts.dist)
+        deepest: dict[tuple[str, str], float] = {}
+        for i in np.flatnonzero(depths > CONTACT).tolist():
+            one, other = (names[labels[geom]] for geom in np.asarray(contacts.geom)[i])
+            pair = (min(one, other), max(one, other))
+            deepest[pair] = max(deepest.get(pair, 0.0), float(depths[i]))
+        for pair, depth in deepest.items():
+            self.seen.setdefault(pair, []).append((clock, depth))
+
+    def result(self, scene: Scene, steps: Sequence[Step]) -> SimulationResult:
+        """Return what came of it.
+
+        Args:
+            scene: What was planned in.
+            steps: What was asked for.
+        """
+        rows = self.physical.row(self.states)
+        contacts: tuple[Contact, ...] = unwanted(scene, self.trajectory, self.seen, _LOOK)
+        notes = list(self.notes)
+        if self.pairs.overlapping:
+            told = "; ".join(" – ".join(pair) for pair in self.pairs.overlapping)
+            notes.append(f"overlap at the start, and go through each other: {told}")
+        executed = self._executed(rows)
+        misses = missed(scene, steps, self.trajectory, self.tree, executed.times, rows)
+        return SimulationResult(
+            scene=self.scene,
+            steps=tuple(steps),
+            planned=self.trajectory,
+            trajectory=executed,
+            rows=rows,
+            misses=misses,
+            tracking=Tracking.of(self.times, self.errors, self.efforts, self.servos, self.trajectory.robot_size),
+            grips=tuple(self.grips.grips),
+            contacts=contacts,
+            physics=self.physics,
+            notes=tuple(notes),
+            diverged=self.diverged,
+        )
+
+    def _executed(self, rows: Floats) -> Trajectory:
+        """Return what happened as a trajectory of the plan's coordinates; freedoms of grasps are as planned."""
+        names, own = self.trajectory.names, self.tree.coordinates.names
+        positions = self.trajectory.at(self.clocks)
+        for column, name in enumerate(names):
+            if name in own:
+                positions[:, column] = rows[:, own.index(name)]
+        ends = np.searchsorted(self.clocks, [self.trajectory.times[phase.last] for phase in self.trajectory.phases])
+        last, before, phases = len(self.clocks) - 1, 0, []
+        for number, (phase, end) in enumerate(zip(self.trajectory.phases, ends.tolist(), strict=True)):
+            left = len(self.trajectory.phases) - 1 - number
+            end = last if left == 0 else min(max(end, before + 1), last - left)
+            phases.append(replace(phase, first=before, last=end))
+            before = end
+        return Trajectory(names, self.clocks, positions, tuple(phases), self.trajectory.robot_size)

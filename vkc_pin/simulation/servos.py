@@ -1,0 +1,86 @@
+"""The position servos of base, arm and fingers, and what they follow."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.arrays import Floats
+from vkc_pin.motion.trajectory import Trajectory
+from vkc_pin.motion.world import World
+from vkc_pin.simulation.physics import Physics
+
+__all__ = ["Servo", "finger_rows", "reference", "servos"]
+
+_UNLIMITED = 1e300  # Pinocchio's efforts above this are none
+_SPIN_UP = 1.0 / 1500.0  # [s²] full effort would accelerate a joint's own rotor by 1500 rad/s²: 0.1 kg·m² at 150 N·m
+_SAG = {"rad": 0.05, "m": 0.005}  # a load that needs full effort moves a joint by so much, at most
+_ROTOR = 0.05  # of the inertia that it moves, for joints without a stated effort
+_POSTURES = 40  # along the plan, at which inertias are looked at
+_SPAN = 0.01  # [s] over which velocities are taken
+
+
+@dataclass(frozen=True)
+class Servo:
+    """A position servo with velocity feed-forward: stiffness · (z − actual) + damping · (ż − actual velocity).
+
+    Attributes:
+        coordinate: What it drives, by its name in the world.
+        stiffness: [N·m/rad] or [N/m].
+        damping: [N·m·s/rad] or [N·s/m].
+        armature: Inertia of the rotor, seen at the joint [kg·m²] or [kg].
+        limit: Of its force, what it carries of the robot's own weight included [N·m] or [N]; infinite if nobody states one.
+    """
+
+    coordinate: str
+    stiffness: float
+    damping: float
+    armature: float
+    limit: float
+
+
+def servos(world: World, rows: Floats, physics: Physics) -> tuple[Servo, ...]:
+    """Return the servos of a robot, in the order of the world's coordinates: base, arm, fingers.
+
+    Args:
+        world: The scene.
+        rows: The world along the plan, shape (K, n): each servo is made for the largest inertia that it moves there.
+        physics: Bandwidths and damping.
+    """
+    model, data, robot = world.model, world.model.createData(), world.scene.robot
+    count = len(world.scene.start) + (0 if robot.gripper is None else len(robot.gripper.names))
+    inertias = np.zeros(model.nv)
+    for q in world.coordinates.q(rows[:: max(1, len(rows) // _POSTURES)]):
+        inertias = np.maximum(inertias, np.diag(pin.crba(model, data, q)))
+    found = []
+    for k, name in enumerate(world.coordinates.names[:count]):
+        velocity = model.joints[world.coordinates.joints[k]].idx_v + (k if k < 3 else 0)
+        stated, moved = float(model.effortLimit[velocity]), float(inertias[velocity])
+        limit = stated if 0.0 < stated < _UNLIMITED and k > 2 else np.inf
+        armature = 0.0 if k < 3 else limit * _SPIN_UP if np.isfinite(limit) else _ROTOR * moved
+        inertia = moved + armature
+        bandwidth = physics.base_bandwidth if k < 3 else physics.arm_bandwidth
+        stiffness = inertia * bandwidth**2
+        if np.isfinite(limit):
+            stiffness = max(stiffness, limit / _SAG[world.coordinates.units[k]])
+        damping = 2.0 * physics.damping_ratio * float(np.sqrt(stiffness * inertia))
+        found.append(Servo(name, stiffness, damping, armature, limit))
+    return tuple(found)
+
+
+def reference(trajectory: Trajectory, times: Floats) -> tuple[Floats, Floats]:
+    """Return what the robot is to follow: positions and velocities at times [s], shape (K,): shape (K, robot's) each."""
+    robot = slice(0, trajectory.robot_size)
+    ahead, behind = (trajectory.at(times + shift)[:, robot] for shift in (_SPAN / 2.0, -_SPAN / 2.0))
+    return trajectory.at(times)[:, robot], (ahead - behind) / _SPAN
+
+
+def finger_rows(world: World, rows: Floats, known: Floats, times: Floats) -> Floats:
+    """Return where the fingers are at times [s], shape (K,), of rows of the world at `known` times, shape (K, fingers)."""
+    first = len(world.scene.start)
+    gripper = world.scene.robot.gripper
+    columns: Sequence[int] = range(first, first + (0 if gripper is None else len(gripper.names)))
+    return np.column_stack([np.zeros((len(times), 0)), *(np.interp(times, known, rows[:, k]) for k in columns)])

@@ -84,6 +84,15 @@ def add_bench(commands: Any) -> None:
     choices = "names of example-robot-data, paths of URDF, xacro and MJCF files (default: all arms and mobile manipulators there)"
     _add_choice(robots, "robots", choices)
 
+    about = (
+        "Plan the experiments' tasks from random starts, execute the plans in MuJoCo, and say how often they do what they say."
+    )
+    shown = "plans executed in physics (needs the extra `sim`)"
+    execution = _add_experiment(benches, "execution", shown, about, default=10, jobs=1)
+    execution.set_defaults(benchmark="executing.execution")
+    choices = "door corridor_door drawer household_refrigerator household_dishwasher household_cabinet household_cup init_1"
+    _add_choice(execution, "tasks", f"{choices} (default: all)")
+
     _add_problems(benches)
 
 

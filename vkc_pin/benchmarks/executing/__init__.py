@@ -1,0 +1,1 @@
+"""Plans of the experiments' tasks, executed in physics."""

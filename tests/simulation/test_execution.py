@@ -85,6 +85,20 @@ def test_what_was_moved_into_the_way_is_named() -> None:
     assert "crate" in result.report()
 
 
+@pytest.mark.filterwarnings("ignore")
+def test_a_computation_that_breaks_down_is_no_success(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    wild = vkc.Physics(timestep=0.01, base_bandwidth=1e7, arm_bandwidth=1e7)
+    result = drawer_plan().simulate(physics=wild)
+    assert result.diverged is not None
+    assert result.diverged < 10.0
+    assert not result.ok
+    assert "the computation broke down" in result.report()
+    assert len(result.rows) == len(result.trajectory.times)
+    assert np.isfinite(result.rows).all()
+    assert list(tmp_path.iterdir()) == []  # MuJoCo would log it here
+
+
 def test_the_same_again_is_the_same() -> None:
     one, other = drawer_plan().simulate(), drawer_plan().simulate()
     np.testing.assert_array_equal(one.rows, other.rows)

@@ -58,7 +58,7 @@ def simulate(
         InputError: MuJoCo is not installed, `actual` has another robot or lacks objects, or an argument is
             none of its kind.
     """
-    engine()
+    mujoco = engine()
     physics = Physics() if physics is None else instance(physics, Physics, "physics")
     if grasp not in GRASPS:
         problem = "hands hold by welds so far, not by the friction of their fingers" if grasp == "friction" else "unknown"
@@ -72,7 +72,11 @@ def simulate(
     if here.robot.coordinates.names != scene.robot.coordinates.names:
         raise InputError("another robot", field="actual", expected=scene.robot.name, got=here.robot.name)
     run = _Run(here, trajectory, physics)
-    run.go()
+    mujoco.set_mju_user_warning(lambda text: None)  # it would write a file into the working directory; see `diverged`
+    try:
+        run.go()
+    finally:
+        mujoco.set_mju_user_warning(None)
     return run.result(scene, steps)
 
 
@@ -107,6 +111,7 @@ class _Run:
         start, end = float(trajectory.times[0]) - physics.settle, float(trajectory.times[-1]) + physics.settle
         steps = np.arange(int(np.ceil((end - start) / physics.timestep - 1e-9)) + 1)
         self.times: Floats = np.asarray(start + physics.timestep * steps, float)
+        self.diverged: float | None = None
         self.seen: dict[tuple[str, str], list[tuple[float, float]]] = {}
 
     def go(self) -> None:
@@ -125,13 +130,13 @@ class _Run:
         labels[self.physical.geoms] = np.arange(len(self.physical.geoms))
         look, frame = (max(1, round(span / physics.timestep)) for span in (_LOOK, _FRAME))
         self.errors, self.efforts = np.zeros((2, len(self.times), len(self.servos)))
-        records, clocks = [], []
+        kept = [k for k in range(len(self.times)) if k % frame == 0 or k == len(self.times) - 1]
+        self.clocks, records = self.times[kept], list[Floats]()
         for k, clock in enumerate(self.times.tolist()):
             self.grips.follow(data, clock)
             self.latches.follow(data)
-            if k % frame == 0 or k == len(self.times) - 1:
-                records.append(data.qpos.copy())
-                clocks.append(clock)
+            if k == kept[len(records)]:
+                records.append(np.array(data.qpos))
             self.errors[k] = wanted[k] - data.qpos[driven]
             data.ctrl[:] = commands[k]
             mj.mj_step(model, data)
@@ -139,13 +144,12 @@ class _Run:
             self.grips.measure(data, clock)
             if k % look == 0 and data.ncon:
                 self._look(data, labels, clock)
-            if not np.isfinite(data.qpos).all() or np.any(data.warning[mj.mjtWarning.mjWARN_BADQACC].number):
+            if not np.isfinite(data.qpos).all() or data.warning[mj.mjtWarning.mjWARN_BADQACC].number:
                 self.times, self.errors, self.efforts = self.times[: k + 1], self.errors[: k + 1], self.efforts[: k + 1]
-                self.diverged: float | None = clock
+                self.diverged = clock
                 break
-        else:
-            self.diverged = None
-        self.clocks, self.states = np.array(clocks), np.array(records)
+        records += [records[-1]] * (len(kept) - len(records))  # where it broke down, all stays as it was last
+        self.states: Floats = np.array(records)
 
     def _look(self, data: Any, labels: Any, clock: float) -> None:
         """Note what touches."""

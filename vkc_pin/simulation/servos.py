@@ -74,6 +74,8 @@ def servos(world: World, rows: Floats, physics: Physics) -> tuple[Servo, ...]:
 def reference(trajectory: Trajectory, times: Floats) -> tuple[Floats, Floats]:
     """Return what the robot is to follow: positions and velocities at times [s], shape (K,): shape (K, robot's) each."""
     robot = slice(0, trajectory.robot_size)
+    if trajectory.curve is not None:
+        return trajectory.at(times)[:, robot], trajectory.velocity(times)[:, robot]
     ahead, behind = (trajectory.at(times + shift)[:, robot] for shift in (_SPAN / 2.0, -_SPAN / 2.0))
     return trajectory.at(times)[:, robot], (ahead - behind) / _SPAN
 

@@ -172,12 +172,13 @@ def motions_chart(plans: Mapping[str, Plan], path: str | Path | None, *, title: 
             motion = plan.trajectory
             fine = np.unique(np.concatenate([np.linspace(motion.times[0], motion.times[-1], _SAMPLES), motion.times]))
             places, rates = motion(fine), motion.velocity(fine)
+            steps: Any = {"linewidth": 1.2, "drawstyle": "steps-post" if motion.curve is None else "default"}
             for k, joint in enumerate(range(3, motion.robot_size)):
                 colour, label = COLOURS[k % len(COLOURS)], motion.names[joint].removesuffix("_joint")
                 position.plot(fine, places[:, joint], color=colour, label=label)
-                velocity.plot(fine, rates[:, joint], color=colour, linewidth=1.2)
+                velocity.plot(fine, rates[:, joint], color=colour, **steps)
             for k, label in enumerate(_BASE):
-                base.plot(fine, rates[:, k], color=COLOURS[k], linewidth=1.2, label=label)
+                base.plot(fine, rates[:, k], color=COLOURS[k], label=label, **steps)
             for axes in (position, velocity, base):
                 shade_phases(axes, motion)
                 axes.margins(x=0.0)

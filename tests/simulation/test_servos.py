@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from helpers.executions import door_plan
@@ -28,7 +30,10 @@ def test_the_reference_is_the_plan_with_its_velocity() -> None:
     middles = (motion.times[:-1] + motion.times[1:]) / 2.0
     positions, velocities = reference(motion, middles)
     np.testing.assert_allclose(positions, motion.at(middles)[:, : motion.robot_size])
-    np.testing.assert_allclose(velocities, motion.velocities()[:, : motion.robot_size], atol=1e-9)
+    np.testing.assert_allclose(velocities, motion.velocity(middles)[:, : motion.robot_size], atol=1e-9)
+    straight = dataclasses.replace(motion, curve=None)
+    _, steady = reference(straight, middles)
+    np.testing.assert_allclose(steady, motion.velocities()[:, : motion.robot_size], atol=1e-9)
     _, outside = reference(motion, np.array([motion.times[0] - 1.0, motion.times[-1] + 1.0]))
     assert not outside.any()
 

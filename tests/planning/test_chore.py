@@ -136,6 +136,15 @@ def test_where_the_next_cannot_be_done_both_are_planned_anew(monkeypatch: pytest
     assert not problems.asked[-1][1]  # from seeds of its own
 
 
+def test_no_attachment_is_tried_beside_one_that_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The handle, taken as asked, and the face that is pushed move the same hinge: one chain has it once."""
+    problems = Problems(monkeypatch, lambda steps: any(isinstance(step, A) for step in steps))
+    steps, options = [G("door", "handle_free"), A("door", {"hinge": 0.3})], vkc.Options(max_restarts=1)
+    plan = vkc.plan_chore(vkc.load_scene("door"), steps, options=options)
+    assert (plan.success, plan.status) == (False, "not converged")
+    assert [asked for asked, _ in problems.asked] == [tuple(steps)] * len(problems.asked)
+
+
 @pytest.mark.long
 def test_a_decision_that_leads_nowhere_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     """With a window of one nothing is foreseen: only a step back helps."""

@@ -28,13 +28,15 @@ def test_servos_are_made_for_the_inertia_that_they_move() -> None:
 def test_the_reference_is_the_plan_with_its_velocity() -> None:
     motion = door_plan().trajectory
     middles = (motion.times[:-1] + motion.times[1:]) / 2.0
-    positions, velocities = reference(motion, middles)
+    positions, velocities, accelerations = reference(motion, middles)
+    np.testing.assert_allclose(accelerations, motion.acceleration(middles)[:, : motion.robot_size])
     np.testing.assert_allclose(positions, motion.at(middles)[:, : motion.robot_size])
     np.testing.assert_allclose(velocities, motion.velocity(middles)[:, : motion.robot_size], atol=1e-9)
     straight = dataclasses.replace(motion, curve=None)
-    _, steady = reference(straight, middles)
+    _, steady, none = reference(straight, middles)
+    assert not none.any()
     np.testing.assert_allclose(steady, motion.velocities()[:, : motion.robot_size], atol=1e-9)
-    _, outside = reference(motion, np.array([motion.times[0] - 1.0, motion.times[-1] + 1.0]))
+    _, outside, _ = reference(motion, np.array([motion.times[0] - 1.0, motion.times[-1] + 1.0]))
     assert not outside.any()
 
 

@@ -120,11 +120,13 @@ class _Run:
         data = mj.MjData(model)
         data.qpos[:] = self.physical.qpos(self.tree.start)
         mj.mj_forward(model, data)
-        positions, velocities = reference(self.trajectory, self.times)
+        positions, velocities, accelerations = reference(self.trajectory, self.times)
         fingers = finger_rows(self.tree, self.planned, self.trajectory.times, self.times)
         wanted = np.column_stack([positions, fingers])
-        gains = np.array([[servo.damping / servo.stiffness] for servo in self.servos])[:, 0]
-        commands = wanted + gains * np.column_stack([velocities, np.zeros_like(fingers)])
+        gains = [[servo.damping / servo.stiffness, servo.inertia / servo.stiffness] for servo in self.servos]
+        commands, still = wanted.copy(), np.zeros_like(fingers)
+        for gain, rates in zip(np.transpose(gains), (velocities, accelerations), strict=True):
+            commands += gain * np.column_stack([rates, still])
         driven, dofs = (where[: len(self.servos)] for where in (self.physical.columns, self.physical.dofs))
         labels = np.zeros(model.ngeom, int)
         labels[self.physical.geoms] = np.arange(len(self.physical.geoms))

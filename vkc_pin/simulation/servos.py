@@ -25,12 +25,13 @@ _SPAN = 0.01  # [s] over which velocities are taken
 
 @dataclass(frozen=True)
 class Servo:
-    """A position servo with velocity feed-forward: stiffness · (z − actual) + damping · (ż − actual velocity).
+    """A position servo with feed-forward: stiffness · (z − actual) + damping · (ż − actual velocity) + inertia · z̈.
 
     Attributes:
         coordinate: What it drives, by its name in the world.
         stiffness: [N·m/rad] or [N/m].
         damping: [N·m·s/rad] or [N·s/m].
+        inertia: The largest that it moves, its rotor's included [kg·m²] or [kg].
         armature: Inertia of the rotor, seen at the joint [kg·m²] or [kg].
         limit: Of its force, what it carries of the robot's own weight included [N·m] or [N]; infinite if nobody states one.
     """
@@ -38,6 +39,7 @@ class Servo:
     coordinate: str
     stiffness: float
     damping: float
+    inertia: float
     armature: float
     limit: float
 
@@ -67,17 +69,22 @@ def servos(world: World, rows: Floats, physics: Physics) -> tuple[Servo, ...]:
         if np.isfinite(limit):
             stiffness = max(stiffness, limit / _SAG[world.coordinates.units[k]])
         damping = 2.0 * physics.damping_ratio * float(np.sqrt(stiffness * inertia))
-        found.append(Servo(name, stiffness, damping, armature, limit))
+        found.append(Servo(name, stiffness, damping, inertia, armature, limit))
     return tuple(found)
 
 
-def reference(trajectory: Trajectory, times: Floats) -> tuple[Floats, Floats]:
-    """Return what the robot is to follow: positions and velocities at times [s], shape (K,): shape (K, robot's) each."""
+def reference(trajectory: Trajectory, times: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return what the robot is to follow at times [s], shape (K,): positions, velocities, accelerations, shape (K, robot's) each.
+
+    Without a curve velocities jump, and there are no accelerations.
+    """
     robot = slice(0, trajectory.robot_size)
     if trajectory.curve is not None:
-        return trajectory.at(times)[:, robot], trajectory.velocity(times)[:, robot]
+        read = trajectory.at, trajectory.velocity, trajectory.acceleration
+        positions, velocities, accelerations = (values(times)[:, robot] for values in read)
+        return positions, velocities, accelerations
     ahead, behind = (trajectory.at(times + shift)[:, robot] for shift in (_SPAN / 2.0, -_SPAN / 2.0))
-    return trajectory.at(times)[:, robot], (ahead - behind) / _SPAN
+    return trajectory.at(times)[:, robot], (ahead - behind) / _SPAN, np.zeros_like(ahead)
 
 
 def finger_rows(world: World, rows: Floats, known: Floats, times: Floats) -> Floats:

@@ -48,7 +48,7 @@ class Stage:
         weigh(self._world, Physics())
         none = Pairs(np.zeros((0, 2), int), np.zeros(shapes, int), np.zeros(shapes, int), {}, ())
         count = len(executed.scene.start) + (0 if robot.gripper is None else len(robot.gripper.names))
-        servos = [Servo(name, 1.0, 1.0, 0.0, np.inf) for name in self._world.coordinates.names[:count]]
+        servos = [Servo(name, 1.0, 1.0, 1.0, 0.0, np.inf) for name in self._world.coordinates.names[:count]]
         self._physical = Builder(self._world, Physics()).built(none, servos, (), (), more=_dressed)
 
     def pictures(self, times: Floats, viewpoint: tuple[Floats, Floats]) -> Iterator[NDArray[np.uint8]]:

@@ -13,7 +13,7 @@ from vkc_pin.arguments import numbers
 from vkc_pin.arrays import Floats, Ints
 from vkc_pin.errors import InputError
 
-__all__ = ["SHORTEST", "Curve", "joined"]
+__all__ = ["SHORTEST", "Curve", "evenly", "joined"]
 
 SHORTEST = 1e-9
 """Least time from knot to knot [s]."""
@@ -77,8 +77,7 @@ class Curve:
         s = (np.clip((moments - self.times[k]) / h, 0.0, 1.0))[..., None]
         h, p, c, d, q = (array[..., None] if array.ndim == k.ndim else array for array in (h, *self._control(k)))
         if derivative == 0:
-            r = 1.0 - s
-            return np.asarray(r**3 * p + 3.0 * s * r**2 * c + 3.0 * s**2 * r * d + s**3 * q)
+            return _bernstein(s, p, c, d, q)
         inside = ((moments >= self.times[0]) & (moments <= self.times[-1]))[..., None]
         if derivative == 1:
             r = 1.0 - s
@@ -103,9 +102,7 @@ class Curve:
             at = np.divide(
                 straight, bend, out=np.divide(first, other, out=np.zeros_like(p), where=other != 0.0), where=bend != 0.0
             )
-            at = np.clip(at, 0.0, 1.0)
-            r = 1.0 - at
-            sides.append(r**3 * p + 3.0 * at * r**2 * c + 3.0 * at**2 * r * d + at**3 * q)
+            sides.append(_bernstein(np.clip(at, 0.0, 1.0), p, c, d, q))
         return np.asarray(np.min(sides, axis=0)), np.asarray(np.max(sides, axis=0))
 
     def speeds(self) -> tuple[Floats, Floats]:
@@ -120,11 +117,6 @@ class Curve:
         fastest = np.max(np.abs([first, last, between]), axis=0)
         strongest = np.max(np.abs([2.0 / h * (middle - first), 2.0 / h * (last - middle)]), axis=0)
         return np.asarray(fastest), np.asarray(strongest)
-
-    def lengths(self) -> Floats:
-        """Return how far each coordinate goes at most on each cubic, shape (K − 1, n): its control points' polygon."""
-        p, c, d, q = self._control(np.arange(len(self.times) - 1))
-        return np.asarray(np.abs(c - p) + np.abs(d - c) + np.abs(q - d))
 
     def part(self, begin: float, end: float, columns: Sequence[int] | slice = slice(None)) -> Curve:
         """Return what lies between two of the knots' times [s], of some columns."""
@@ -159,6 +151,18 @@ class Curve:
     def to_dict(self) -> dict[str, Any]:
         """Return plain data of it."""
         return {"times": self.times.tolist(), "positions": self.positions.tolist(), "rates": self.rates.tolist()}
+
+
+def _bernstein(s: Floats, p: Floats, c: Floats, d: Floats, q: Floats) -> Floats:
+    """Return where cubics with these control points are at a share of their time."""
+    r = 1.0 - s
+    return np.asarray(r**3 * p + 3.0 * s * r**2 * c + 3.0 * s**2 * r * d + s**3 * q)
+
+
+def evenly(times: Floats, rate: float) -> Floats:
+    """Return so many moments a second between the first and the last of some times [s], and the last."""
+    duration = times[-1] - times[0]
+    return np.append(times[0] + np.arange(np.ceil(duration * rate - 1e-6)) / rate, times[-1])
 
 
 def joined(pieces: Sequence[Curve]) -> Curve:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from vkc_pin.arguments import instance, items, known, mapping, number, numbers, text, whole
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
-from vkc_pin.motion.curve import Curve
+from vkc_pin.motion.curve import Curve, evenly
 from vkc_pin.motion.formats import ros, tables
 from vkc_pin.motion.spans import PhaseSpan, part_of
 
@@ -130,7 +130,7 @@ class Trajectory:
         duration = float(self.times[-1] - self.times[0])
         if duration * rate > MOST_SAMPLES:
             raise InputError("too many samples", field="rate", expected=f"at most {MOST_SAMPLES / duration:.4g}", got=rate)
-        times = np.append(self.times[0] + np.arange(np.ceil(duration * rate - 1e-6)) / rate, self.times[-1])
+        times = evenly(self.times, rate)
         return times, self.at(times)
 
     def column(self, name: str) -> Floats:

@@ -152,22 +152,24 @@ class _Check:
     def _rates(self) -> None:
         """Velocities and accelerations stay within theirs (eq. 5), and a curve begins and ends at rest."""
         curve, times = self.trajectory.curve, self.trajectory.times
-        rests = np.zeros((2, len(self.trajectory.names))) if curve is None else np.abs(curve.rates[[0, -1]])
-        of_waypoints = self.trajectory.velocities(), self.trajectory.accelerations()
-        velocities, accelerations = of_waypoints if curve is None else curve.speeds()
+        if curve is None:
+            moments, velocities, accelerations = times, self.trajectory.velocities(), self.trajectory.accelerations()
+            rests = np.zeros((2, len(self.trajectory.names)))
+        else:
+            moments, (velocities, accelerations), rests = curve.times, curve.speeds(), np.abs(curve.rates[[0, -1]])
         for i, name in enumerate(self.trajectory.names):
             _, _, fastest, strongest = self.samples.bounds(name)
             unit = self.samples.unit(name)
-            for kind, values, limit, per, moments in (
-                ("velocity", velocities[:, i], fastest, "s", times if curve is None else curve.times),
-                ("acceleration", accelerations[:, i], strongest, "s²", times if curve is None else curve.times),
+            for kind, values, limit, per, when in (
+                ("velocity", velocities[:, i], fastest, "s", moments),
+                ("acceleration", accelerations[:, i], strongest, "s²", moments),
                 ("velocity", rests[:, i], REST_TOLERANCE, "s", times[[0, -1]]),
             ):
                 worst = int(np.argmax(np.abs(values)))
                 value = abs(float(values[worst]))
                 if not value <= limit * (1 + ACCEPTED_RATE_TOLERANCE) + 1e-9:
                     detail = f"{value:.3f} {unit}/{per} is more than {limit:.3f} {unit}/{per}"
-                    at = max(int(np.searchsorted(times, moments[worst], side="right")) - 1, 0)
+                    at = max(int(np.searchsorted(times, when[worst], side="right")) - 1, 0)
                     self._add(kind, name, value - limit, f"{unit}/{per}", detail, waypoint=at)
 
     def _slip(self) -> None:

@@ -6,7 +6,6 @@ base is three coordinates, x, y and yaw in the world frame.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from vkc_pin.arguments import flag, is_number, number, text, whole
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError, shown
 from vkc_pin.files.resources import file_path
-from vkc_pin.motion.curve import Curve
+from vkc_pin.motion.curve import Curve, evenly
 from vkc_pin.motion.formats.tables import chosen_columns, one_phase, read_json, size_of_robot
 
 __all__ = ["along", "from_ros", "rates", "to_ros"]
@@ -38,9 +37,9 @@ def to_ros(
 ) -> dict[str, Any]:
     """Return a motion as plain data with the fields of ROS' `trajectory_msgs/JointTrajectory`, e.g. for JSON.
 
-    Velocities are those of monotone cubics through the waypoints: along these no coordinate leaves the range between two
-    neighbouring waypoints, and what rests between two of them stays at rest. What was validated is the motion that is linear
-    between waypoints; `from_ros` makes one of the points that can be validated as well.
+    Of a motion with a curve, points lie on it, with its velocities: what was validated. Of one without, velocities are those of
+    monotone cubics through the waypoints: along these no coordinate leaves the range between two neighbouring waypoints, and what
+    rests between two of them stays at rest; `from_ros` makes a motion of the points that can be validated.
 
     Args:
         motion: What to convert.
@@ -70,30 +69,24 @@ def to_ros(
     source = motion if curve is None else curve
     times, positions = np.array(source["times"], float), np.array(source["positions"], float)[:, columns]
     times = times - times[0]
-    if curve is None:
-        velocities, accelerations = rates(times, positions)
-    else:
-        velocities = np.array(curve["rates"], float)[:, columns]
-        accelerations = Curve(times, positions, velocities).acceleration(times)
+    cubics = None if curve is None else Curve(times, positions, np.array(curve["rates"], float)[:, columns])
     if rate is not None:
         rate = number(rate, "rate", "points a second, more than 0", low=0.0, above=True)
         most = _MOST // max(len(columns), 1)  # a group may be empty
         if times[-1] * rate > most:
             expected = f"at most {most} points, {most / times[-1]:.4g} a second for this motion of {times[-1]:.4g} s"
             raise InputError("too many points", field="rate", expected=expected, got=rate)
-        moments = np.append(np.arange(math.ceil(times[-1] * rate - 1e-6)) / rate, times[-1])
-        if curve is not None:
-            cubics = Curve(times, positions, velocities)
-            positions, velocities, accelerations = (read(moments) for read in (cubics.at, cubics.velocity, cubics.acceleration))
-        elif smooth:
-            positions, velocities, accelerations = along(times, positions, velocities, moments)
-        else:
-            rows = [np.interp(moments, times, column) for column in positions.T]
-            positions = np.reshape(rows, (len(columns), len(moments))).T
-            velocities, accelerations = rates(moments, positions)
-        times = moments
+    moments = times if rate is None else evenly(times, rate)
+    if cubics is not None:
+        positions, velocities, accelerations = (read(moments) for read in (cubics.at, cubics.velocity, cubics.acceleration))
+    elif smooth and rate is not None:
+        positions, velocities, accelerations = along(times, positions, rates(times, positions)[0], moments)
+    else:
+        rows = [np.interp(moments, times, column) for column in positions.T]
+        positions = np.reshape(rows, (len(columns), len(moments))).T
+        velocities, accelerations = rates(moments, positions)
     parts = [positions, *(rows[:, : len(columns) * (derivatives > k)] for k, rows in enumerate((velocities, accelerations)))]
-    points = zip(times.tolist(), *(part.tolist() for part in parts), strict=True)
+    points = zip(moments.tolist(), *(part.tolist() for part in parts), strict=True)
     return {
         "header": {"stamp": _duration(stamp), "frame_id": frame},
         "joint_names": [motion["names"][k] for k in columns],

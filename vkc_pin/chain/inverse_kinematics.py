@@ -30,23 +30,23 @@ class PoseSolver:
         self.size = model.nv
         z, target = ca.SX.sym("z", self.size), ca.SX.sym("W", 12)
         placements = kinematics_of(model, cache or Cache()).symbolic(z)
-        residual = pose_residual(pose.kind, *pose.placement(placements), target)
+        residual = ca.densify(pose_residual(pose.kind, *pose.placement(placements), target))
         self.rows = int(residual.numel())
         jacobian = ca.densify(ca.jacobian(residual, z))
-        self._function = BatchFunction(ca.Function("pose", [z, target], [ca.densify(residual), jacobian], {"cse": True}))
+        self._function = BatchFunction(ca.Function("pose", [z, target], [residual, jacobian], {"cse": True}))
+        lower, upper, weights = (ca.SX.sym(name, self.size) for name in ("lower", "upper", "weights"))
+        step = _step(z, residual, jacobian, weights, (lower, upper))
+        moved = [ca.mmax(ca.fabs(residual)), ca.fmin(ca.fmax(z + step, lower), upper)]
+        self._moved = BatchFunction(ca.Function("moved", [z, target, lower, upper, weights], moved, {"cse": True}))
 
     @property
     def nbytes(self) -> int:
         """Its size in memory, estimated [bytes]."""
-        return self._function.nbytes
+        return self._function.nbytes + self._moved.nbytes
 
     def evaluate(self, z: Floats, target: pin.SE3) -> tuple[Floats, Floats]:
         """Return residuals, shape (B, m) ([m], [rad]), and their Jacobians, shape (B, m, n), at `z`, shape (B, n)."""
-        return self._evaluate(z, target_vector(target))
-
-    def _evaluate(self, z: Floats, target: Floats) -> tuple[Floats, Floats]:
-        spend(len(z))
-        residual, jacobian = self._function(z, target)
+        residual, jacobian = self._function(z, target_vector(target))
         return residual, jacobian.reshape(len(z), self.size, self.rows).swapaxes(1, 2)
 
     def solve(
@@ -79,32 +79,29 @@ class PoseSolver:
         errors = np.empty(len(z))
         at, rows = np.arange(len(z)), z  # what is not solved yet, with its limits
         for remaining in range(iterations, -1, -1):
-            residual, jacobian = self._evaluate(rows, goal)
-            errors[at] = error = np.abs(residual).max(axis=1)
-            still = error >= tolerance
+            spend(len(rows))
+            error, moved = self._moved(rows, goal, lower, upper, weights)
+            errors[at] = error[:, 0]
+            still = error[:, 0] >= tolerance
             if not still.all():
-                at, rows, lower, upper, residual, jacobian = (a[still] for a in (at, rows, lower, upper, residual, jacobian))
+                at, moved, lower, upper = (values[still] for values in (at, moved, lower, upper))
             if not len(at) or not remaining:
                 break
-            rows = np.clip(rows + _step(rows, residual, jacobian, weights, (lower, upper)), lower, upper)
-            z[at] = rows
+            z[at] = rows = moved
         return z, errors < tolerance
 
 
-def _step(z: Floats, residual: Floats, jacobian: Floats, weights: Floats, limits: tuple[Floats, Floats]) -> Floats:
-    """Return damped Gauss-Newton steps, shape (B, n); a coordinate that one pushes beyond its limit is taken out, once."""
+def _step(z: ca.SX, residual: ca.SX, jacobian: ca.SX, weights: ca.SX, limits: tuple[ca.SX, ca.SX]) -> ca.SX:
+    """Return the damped Gauss-Newton step, shape (n,); a coordinate that it pushes beyond its limit is taken out, once."""
     lower, upper = limits
     free = upper - lower > 1e-9
-    damping = 1e-8 + 1e-3 * np.minimum(1.0, np.sum(residual**2, axis=1))
-    damped = damping[:, None, None] * np.eye(residual.shape[1])
-    step = np.zeros_like(z)
+    damping = 1e-8 + 1e-3 * ca.fmin(1.0, ca.sumsqr(residual))
+    step = ca.SX.zeros(z.numel())
     for _ in range(2):
-        scaled = jacobian * (free / weights)[:, None, :]
-        system = scaled @ jacobian.transpose(0, 2, 1) + damped
-        step = -np.einsum("bij,bi->bj", scaled, np.linalg.solve(system, residual[..., None])[..., 0])
-        step *= np.minimum(1.0, LONGEST_STEP / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12))
-        blocked = free & ((z + step < lower - 1e-12) | (z + step > upper + 1e-12))
-        if not blocked.any():
-            break
-        free &= ~blocked
+        scaled = jacobian @ ca.diag(free / weights)
+        system = scaled @ jacobian.T + damping * ca.SX.eye(residual.numel())
+        step = -scaled.T @ ca.ldl_solve(residual, *ca.ldl(system))
+        step *= ca.fmin(1.0, LONGEST_STEP / ca.fmax(ca.mmax(ca.fabs(step)), 1e-12))
+        blocked = ca.logic_or(z + step < lower - 1e-12, z + step > upper + 1e-12)
+        free = ca.logic_and(free, ca.logic_not(blocked))
     return step

@@ -84,7 +84,7 @@ class PoseSolver:
             errors[at] = error[:, 0]
             still = error[:, 0] >= tolerance
             if not still.all():
-                at, moved, lower, upper = (values[still] for values in (at, moved, lower, upper))
+                at, moved, lower, upper = at[still], moved[still], lower[still], upper[still]
             if not len(at) or not remaining:
                 break
             z[at] = rows = moved

@@ -28,6 +28,7 @@ REPORTS = {  # name of a record → whose report it is
     **{name: name for name in ("baselines", "household", "initialization", "chores", "scale", "gap")},
     **{"segments": "scale", "sixty": "problems.ablation", "tradeoff": "problems.ablation"},
     **{"spread": "problems.spread", "first_seed": "problems.first_seed", "robots": "anything.robots"},
+    **{"anything": "anything.matrix", "cluttered": "chores"},
     **{"robots_rest": "anything.robots", "robots_packages": "anything.robots", "execution": "executing.execution"},
 }
 DOOR = ("door_seed_0", "door_seed_1")

@@ -8,7 +8,7 @@ from pathlib import Path
 from helpers.grippers import between_cheeks
 from vkc_pin.scene.scene import Scene
 
-__all__ = ["FOLLOWERS", "SEGMENT", "coupled_scene", "joint", "link", "write_telescope"]
+__all__ = ["FOLLOWERS", "SEGMENT", "coupled_scene", "joint", "link", "telescope_scene", "write_telescope"]
 
 SEGMENT = 0.15  # [m] that each segment comes out
 FOLLOWERS = {f"out_{k}": "out_1" for k in (2, 3, 4)}
@@ -101,16 +101,30 @@ def write_telescope(folder: Path, *, couplings: str | None = None, mimics: str =
     return folder / "robot.yaml"
 
 
-def coupled_scene(folder: Path, *, base: str = "omni") -> Scene:
-    """Return a scene with a drawer and a robot whose joints follow each other backwards, faster, and turn as others slide.
+def telescope_scene(folder: Path, *, base: str = "omni") -> Scene:
+    """Return a scene: the robot in front of a drawer that it reaches from where it stands.
 
     Args:
         folder: Where to write the robot.
         base: How it moves.
     """
+    robot = write_telescope(folder, more="home: {out_1: 0.05, lift: 0.4}\n")
+    document = between_cheeks(robot, height=0.9, gap=0.1).document
+    document |= {"robot": {"name": robot.name, "base": base}, "start": {"base": [0.1, 0.0, 0.0]}}
+    return Scene.from_document(document, folder)
+
+
+def coupled_scene(folder: Path, *, base: str = "omni", more: str = "") -> Scene:
+    """Return a scene with a drawer and a robot whose joints follow each other backwards, faster, and turn as others slide.
+
+    Args:
+        folder: Where to write the robot.
+        base: How it moves.
+        more: Lines of its robot.yaml.
+    """
     said = "out_2: {joint: out_1, multiplier: 0.5}, out_3: {joint: out_1, multiplier: -0.5, offset: 0.15}, out_4: {joint: out_2}"
     said += ", pitch_joint: {joint: lift, multiplier: 1.5, offset: -0.6}, roll_joint: {joint: yaw_joint, multiplier: -3.0}"
-    robot = write_telescope(folder, couplings=said)
+    robot = write_telescope(folder, couplings=said, more=more)
     document = between_cheeks(robot, height=0.9, gap=0.1).document
     document["robot"] = {"name": robot.name, "base": base}
     return Scene.from_document(document, folder)

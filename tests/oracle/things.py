@@ -262,7 +262,9 @@ def load_robot(item: Mapping[str, Any] | str, folder: Path, arm: list[str]) -> R
             low, high, said = max(low, min(ends)), min(high, max(ends)), joints.get(name, {})
             fast = said.get("velocity", fast if 0.0 < fast < 1e3 else np.inf)
             fastest, strongest = min(fastest, fast / abs(factor)), min(strongest, said.get("acceleration", np.inf) / abs(factor))
-        limits[joint] = (low, high, fastest if fastest < np.inf else np.pi, strongest if strongest < np.inf else 1.4)
+        most = max(abs(factor) for _, factor, _ in members.values())
+        fastest, strongest = (said if said < np.inf else unsaid / most for said, unsaid in ((fastest, np.pi), (strongest, 1.4)))
+        limits[joint] = (low, high, fastest, strongest)
     gripper = {joint: (said["closed"], said["open"]) for joint, said in (own.get("gripper") or {}).items()}
     wide = {joint: opened for joint, (_, opened) in gripper.items()}
     locked = {**own.get("home", {}), **wide, **own.get("locked_joints", {})}

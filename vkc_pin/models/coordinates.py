@@ -112,6 +112,11 @@ class Coordinates:
         self._angle_q, self._angle_z = np.array(angles, int).reshape(-1, 2).T
         self._quaternions = quaternions
 
+    @property
+    def followers(self) -> tuple[Moved, ...]:
+        """Those of `moves` whose joint follows another one."""
+        return tuple(move for move in self.moves if move.joint != self.joints[move.coordinate])
+
     def _moves(self, model: pin.Model, followers: list[int]) -> tuple[Moved, ...]:
         """Return `moves`."""
         moves = [Moved(k, joint, 1.0, 0.0, self.units[k] == "m") for k, joint in enumerate(self.joints)]
@@ -123,7 +128,7 @@ class Coordinates:
                 following, axis = model.joints[joint].extract(), np.asarray(data.joints[joint].S, float).ravel()
                 factor, offset = float(following.scaling), float(following.offset)
                 moves.append(Moved(at[model.joints[joint].idx_q], joint, factor, offset, not axis[3:].any()))
-        return tuple(sorted(moves, key=lambda move: move.coordinate))
+        return tuple(sorted(moves))
 
     def moved(self, changed: ArrayLike) -> Bools:
         """Return which joints of the model some coordinates move, shape (J,), the universe among them.
@@ -133,6 +138,19 @@ class Coordinates:
         """
         changed, found = np.asarray(changed, bool), np.zeros(self._joint_count, bool)
         found[[move.joint for move in self.moves if changed[move.coordinate]]] = True
+        return found
+
+    def strides(self, length: float, angle: float) -> Floats:
+        """Return how far each coordinate can go so that no joint goes further than that, shape (n,) [m] or [rad].
+
+        Args:
+            length: How far joints may slide [m].
+            angle: How far they may turn [rad].
+        """
+        found = np.full(self.size, np.inf)
+        for move in self.moves:
+            stride = (length if move.slides else angle) / abs(move.factor)
+            found[move.coordinate] = min(found[move.coordinate], stride)
         return found
 
     def q(self, z: ArrayLike) -> Floats:

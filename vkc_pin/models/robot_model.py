@@ -13,7 +13,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.files.meshes import load_parts, to_bvh
 from vkc_pin.files.urdf import UrdfFile, UrdfShape, tree_model
 from vkc_pin.models.couplings.following import Following, coupled_groups, followers, path_to
-from vkc_pin.models.couplings.mimicking import following, in_order
+from vkc_pin.models.couplings.mimicking import in_order, with_mimics
 from vkc_pin.models.grafting import add_joint, clean
 
 __all__ = [
@@ -200,12 +200,12 @@ def configuration(model: pin.Model, positions: Mapping[str, float]) -> Floats:
 
 def default_tool_frame(full: pin.Model, file: UrdfFile) -> str:
     """Return the last frame of the longest chain of joints, before it branches into fingers."""
-    following = followers(file.root)
+    follows = followers(file.root)
     children: dict[int, list[int]] = {j: [] for j in range(full.njoints)}
     depth = np.zeros(full.njoints, int)
     for j in range(full.njoints - 1, 1, -1):
         children[full.parents[j]].insert(0, j)
-        counts = full.joints[j].nv == 1 and full.names[j] not in following
+        counts = full.joints[j].nv == 1 and full.names[j] not in follows
         depth[full.parents[j]] = max(depth[full.parents[j]], depth[j] + counts)
     joint, above = 1, 0
     while children[joint]:
@@ -285,7 +285,7 @@ def _reduced(
         if frame.type == pin.FrameType.BODY or frame.name not in links:
             parent, placement = placed[frame.parentJoint]
             model.addFrame(pin.Frame(frame.name, parent, 0, clean(placement * frame.placement), frame.type))
-    return following(model, [coupled[j] for j in coupled], [placed[j][0] for j in coupled])
+    return with_mimics(model, [coupled[j] for j in coupled], [placed[j][0] for j in coupled])
 
 
 def _geometry_object(

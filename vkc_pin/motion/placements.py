@@ -47,18 +47,18 @@ class Motion:
         return np.asarray((0.5 * turned.max(axis=(1, 2, 3)) > 0.15) | (shifted.max(axis=(1, 2)) > 0.15))
 
 
-def key_times(trajectory: Trajectory, gains: Mapping[str, float] | None = None) -> Floats:
+def key_times(trajectory: Trajectory, strides: Mapping[str, float] | None = None) -> Floats:
     """Return the waypoints' times and as many in between that no joint moves by more than 1 rad or m, shape (K,) [s].
 
     Between these a viewer's own interpolation of positions and quaternions, joint by joint, is exact.
 
     Args:
         trajectory: The motion.
-        gains: Coordinate → how far the fastest joint that it moves goes for a unit of it; 1 otherwise.
+        strides: Coordinate → by how much it changes then; 1 otherwise.
     """
-    fastest = [(gains or {}).get(name, 1.0) for name in trajectory.names]
-    steps = np.abs(np.diff(trajectory.positions, axis=0) * fastest).max(axis=1)
-    counts = np.maximum(1, np.ceil(steps / _TURN)).astype(int)
+    most = [(strides or {}).get(name, _TURN) for name in trajectory.names]
+    steps = np.abs(np.diff(trajectory.positions, axis=0) / most).max(axis=1)
+    counts = np.maximum(1, np.ceil(steps)).astype(int)
     edges = zip(trajectory.times[:-1], trajectory.times[1:], counts, strict=True)
     return np.concatenate([*(np.linspace(a, b, n, endpoint=False) for a, b, n in edges), trajectory.times[-1:]])
 
@@ -68,11 +68,8 @@ def sample_motion(world: World, trajectory: Trajectory | None, times: Floats | N
     if trajectory is None:
         times, rows = np.zeros(1), world.start[None]
     else:
-        gains = {world.coordinates.names[move.coordinate]: 0.0 for move in world.coordinates.moves}
-        for move in world.coordinates.moves:
-            name = world.coordinates.names[move.coordinate]
-            gains[name] = max(gains[name], abs(move.factor))
-        times = key_times(trajectory, gains) if times is None else np.asarray(times, float)
+        strides = dict(zip(world.coordinates.names, world.coordinates.strides(_TURN, _TURN).tolist(), strict=True))
+        times = key_times(trajectory, strides) if times is None else np.asarray(times, float)
         rows = world.positions(trajectory, times)
     model, data = world.model, world.model.createData()
     tool = model.getFrameId(world.scene.robot.tool_frame)

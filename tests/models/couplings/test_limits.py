@@ -73,6 +73,14 @@ def test_where_no_file_says_how_fast(tmp_path: Path) -> None:
     assert (robot.velocity[4], robot.acceleration[4]) == (np.pi, 1.4)
 
 
+def test_without_limits_the_fastest_joint_has_the_usual_ones(tmp_path: Path) -> None:
+    said = "out_2: {joint: out_1, multiplier: 0.5}, out_3: {joint: out_1, multiplier: -2.0, offset: 0.15}"
+    file = write_telescope(tmp_path, couplings=said).parent / "robot.urdf"
+    file.write_text(file.read_text().replace('velocity="0.5" ', ""))
+    robot = vkc.load_robot(tmp_path)
+    assert (robot.velocity[4], robot.acceleration[4]) == (np.pi / 2.0, 0.7)
+
+
 @pytest.mark.parametrize(
     ("kinds", "limits"), [(("continuous", "revolute"), (-0.5, 0.5)), (("continuous", "continuous"), (-np.inf, np.inf))]
 )

@@ -73,6 +73,7 @@ def robot_limits(
     velocity, acceleration = np.full(model.nv, np.inf), np.full(model.nv, np.inf)
     velocity[:3], acceleration[:3] = settings.base.velocity, settings.base.acceleration
     coordinates = Coordinates(model)
+    unsaid = coordinates.strides(1.0, 1.0)  # at which rate of a coordinate its fastest joint has one of 1
     for move in coordinates.moves[3:]:
         name, k, share = model.names[move.joint], move.coordinate, abs(move.factor)
         named, own = settings.joints.get(name), float(full.velocityLimit[full.joints[full.getJointId(name)].idx_v])
@@ -82,7 +83,8 @@ def robot_limits(
             velocity[k] = min(velocity[k], own / share)
         if named is not None and named.acceleration is not None:
             acceleration[k] = min(acceleration[k], named.acceleration / share)
-    velocity[np.isinf(velocity)], acceleration[np.isinf(acceleration)] = _VELOCITY, _ACCELERATION
+    velocity = np.where(np.isinf(velocity), _VELOCITY * unsaid, velocity)
+    acceleration = np.where(np.isinf(acceleration), _ACCELERATION * unsaid, acceleration)
     model.velocityLimit = velocity
     lower, upper = coordinates.lower.copy(), coordinates.upper.copy()
     if base == "fixed":

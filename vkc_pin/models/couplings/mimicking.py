@@ -9,10 +9,10 @@ import pinocchio as pin
 from vkc_pin.errors import InputError
 from vkc_pin.models.couplings.following import Following
 
-__all__ = ["following", "in_order"]
+__all__ = ["in_order", "with_mimics"]
 
 
-def following(model: pin.Model, couplings: Sequence[Following], joints: Sequence[int]) -> pin.Model:
+def with_mimics(model: pin.Model, couplings: Sequence[Following], joints: Sequence[int]) -> pin.Model:
     """Return a model in which some joints follow others.
 
     Args:

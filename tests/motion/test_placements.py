@@ -32,6 +32,14 @@ def test_key_frames_are_the_waypoints_and_more_where_it_turns_far(plan: Plan) ->
     assert (np.diff(times) > 0).all()
 
 
+def test_where_joints_are_faster_than_what_moves_them_there_are_more(plan: Plan) -> None:
+    names = plan.trajectory.names
+    times = key_times(plan.trajectory, {names[0]: 2.0, names[3]: 0.0125})
+    moved = np.abs(np.diff(plan.trajectory.at(times), axis=0))
+    assert moved[:, 3].max() <= 0.0125 + 1e-9
+    assert len(times) > len(key_times(plan.trajectory))
+
+
 def test_placements_are_those_of_the_world(motion: Motion, world: World, plan: Plan) -> None:
     data, k = world.model.createData(), 5
     (row,) = world.positions(plan.trajectory, [motion.times[k]])

@@ -110,7 +110,11 @@ def touched(world: World, stage: Stage) -> Iterator[tuple[set[str], set[str]]]:
         if owner not in world.things:
             owner, tree = "robot", world.robot.tree
             above = {tree.model.names[joint] for joint in tree.model.supports[tree.frame(step["frame"]).parentJoint]}
-            links = {link for link, joints in world.robot.moved_by.items() if set(joints) == above & set(world.robot.arm)}
+            links = {
+                link
+                for link, joints in world.robot.moved_by.items()
+                if set(joints) == above & {*world.robot.arm, *world.robot.coupled}
+            }
         safe = world.plan.options["dist_safe"]
         others = [part for part in stage.solids if part.owner not in (owner, "robot")]
         near = {part.label for part in others if distance(POINT, target, part.shape.solid, part.at, row) < safe}

@@ -168,6 +168,9 @@ class World:
             parts = np.stack([plan.at(a + (b - a) * np.linspace(0.0, 1.0, _PARTS + 1)) for a, b in itertools.pairwise(t)])
             steps = _PARTS * np.abs(np.diff(parts, axis=1)).max(axis=1)
         units = np.array([LENGTH if self.slides(name) else ANGLE for name in plan.names])
+        for joint, (by, factor, _) in self.robot.coupled.items():
+            k, unit = 3 + self.robot.arm.index(by), LENGTH if self.robot.tree.urdf.kind(joint) == "prismatic" else ANGLE
+            units[k] = min(units[k], unit / abs(factor))
         ratio = np.maximum((steps / units).max(axis=1), np.linalg.norm(steps[:, :2], axis=1) / LENGTH)
         if self.fingers.joints:
             own = np.array([LENGTH if self.slides(joint) else ANGLE for joint in self.fingers.joints])
@@ -188,7 +191,7 @@ class World:
         for number, phase in enumerate(plan.phases):
             times, columns, hand, rows = self.samples(number)
             arm = {name: columns[:, 3 + k] for k, name in enumerate(robot.arm)}
-            frames = robot.tree.links({**robot.locked, **hand, **arm}, columns[:, :3], wanted)
+            frames = robot.tree.links({**robot.locked, **hand, **robot.moved(arm)}, columns[:, :3], wanted)
             if number == 0:
                 first = {name: frame.row(0) for name, frame in frames.items()}
                 free |= self._in_hand(first[robot.tool], free)

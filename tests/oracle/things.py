@@ -121,7 +121,10 @@ class Thing:
 
 @dataclass(frozen=True)
 class Robot:
-    """A robot: `arm` are its planned joints; `exempt` pairs of links that need no check; `gripper` where fingers close, open."""
+    """A robot: `arm` are its planned joints; `exempt` pairs of links that need no check; `gripper` where fingers close, open.
+
+    `coupled` joints move with one of `arm`: joint → (that one, factor, offset).
+    """
 
     tree: Tree
     base: str
@@ -133,12 +136,20 @@ class Robot:
     home: dict[str, float]
     exempt: set[frozenset[str]]
     gripper: dict[str, tuple[float, float]]
+    coupled: dict[str, tuple[str, float, float]]
+
+    def moved(self, arm: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Return where all joints are that move with the arm, of values of its planned ones."""
+        return {**arm, **{joint: factor * arm[by] + offset for joint, (by, factor, offset) in self.coupled.items()}}
 
     @cached_property
     def moved_by(self) -> dict[str, tuple[str, ...]]:
         """Link → the planned joints between it and the base."""
         urdf = self.tree.urdf
-        return {link: tuple(joint for joint in urdf.path_to(link) if joint in self.arm) for link in urdf.links}
+        return {
+            link: tuple(joint for joint in urdf.path_to(link) if joint in self.arm or joint in self.coupled)
+            for link in urdf.links
+        }
 
     def apart(self, one: str, other: str) -> bool:
         """Whether two of its links move against each other and are to stay apart."""
@@ -241,16 +252,24 @@ def load_robot(item: Mapping[str, Any] | str, folder: Path, arm: list[str]) -> R
     (x, y) = base.get("position", ((-20.0, 20.0), (-20.0, 20.0)))
     spans = (x, y, (-np.inf, np.inf))
     limits = {f"base_{k}": (*span, v, a) for k, span, v, a in zip(("x", "y", "yaw"), spans, speeds, strengths, strict=True)}
+    coupled = _coupled(urdf, own.get("couplings") or {}, arm)
     for joint in arm:
-        low, high, fastest = urdf.limits(joint)
-        said = joints.get(joint, {})
-        fastest = said.get("velocity", fastest if 0.0 < fastest < 1e3 else np.pi)
-        limits[joint] = (low, high, float(fastest), float(said.get("acceleration", 1.4)))
+        members = {joint: (joint, 1.0, 0.0)} | {name: how for name, how in coupled.items() if how[0] == joint}
+        low, high, fastest, strongest = -np.inf, np.inf, np.inf, np.inf
+        for name, (_, factor, offset) in members.items():
+            least, most, fast = urdf.limits(name)
+            ends = [(end - offset) / factor for end in (least, most)]
+            low, high, said = max(low, min(ends)), min(high, max(ends)), joints.get(name, {})
+            fast = said.get("velocity", fast if 0.0 < fast < 1e3 else np.inf)
+            fastest, strongest = min(fastest, fast / abs(factor)), min(strongest, said.get("acceleration", np.inf) / abs(factor))
+        most = max(abs(factor) for _, factor, _ in members.values())
+        fastest, strongest = (said if said < np.inf else unsaid / most for said, unsaid in ((fastest, np.pi), (strongest, 1.4)))
+        limits[joint] = (low, high, fastest, strongest)
     gripper = {joint: (said["closed"], said["open"]) for joint, said in (own.get("gripper") or {}).items()}
     wide = {joint: opened for joint, (_, opened) in gripper.items()}
     locked = {**own.get("home", {}), **wide, **own.get("locked_joints", {})}
     rest = {}
-    for joint in (name for name in urdf.joints if urdf.moves(name) and name not in arm):
+    for joint in (name for name in urdf.joints if urdf.moves(name) and name not in arm and name not in coupled):
         low, high, _ = urdf.limits(joint)
         rest[joint] = locked.get(joint, 0.0 if low <= 0.0 <= high else (low + high) / 2)
     for joint in rest:
@@ -271,7 +290,32 @@ def load_robot(item: Mapping[str, Any] | str, folder: Path, arm: list[str]) -> R
         home={**_home(semantics, arm), **{joint: value for joint, value in own.get("home", {}).items() if joint in arm}},
         exempt={frozenset((pair.get("link1", ""), pair.get("link2", ""))) for pair in semantics.findall("disable_collisions")},
         gripper=gripper,
+        coupled=coupled,
     )
+
+
+def _coupled(urdf: Urdf, stated: Mapping[str, Any], arm: list[str]) -> dict[str, tuple[str, float, float]]:
+    """Return the joints that move with a planned one, and how: what leads both may be either, or a third."""
+    follows = {joint: how for joint in urdf.joints if (how := urdf.mimics(joint)) is not None}
+    for joint, said in stated.items():
+        about = {"joint": said} if isinstance(said, str) else said
+        follows[joint] = about["joint"], float(about.get("multiplier", 1.0)), float(about.get("offset", 0.0))
+    of_leader: dict[str, tuple[str, float, float]] = {}
+    for joint in (name for name in urdf.joints if urdf.moves(name)):
+        leader, factor, offset = joint, 1.0, 0.0
+        for _ in follows:  # more often than once each would be a circle
+            if leader in follows:
+                above, multiplier, shift = follows[leader]
+                leader, factor, offset = above, factor * multiplier, offset + factor * shift
+        of_leader[joint] = leader, factor, offset
+    planned = {of_leader[joint][0]: joint for joint in arm}
+    found = {}
+    for joint, (leader, factor, offset) in of_leader.items():
+        if leader in planned and joint not in arm and factor:
+            by = planned[leader]
+            share = factor / of_leader[by][1]
+            found[joint] = by, share, offset - share * of_leader[by][2]
+    return found
 
 
 def _robot_file(name: str, folder: Path) -> Path:

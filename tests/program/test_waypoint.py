@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -10,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.small_problems import door_scene, full_scene, random_configurations
+from helpers.telescopes import coupled_scene
 
 from vkc_pin.cache import Cache
 from vkc_pin.chain.chain import VirtualKinematicChain, consolidate
@@ -113,6 +115,13 @@ def test_rows_and_their_derivatives(chain: VirtualKinematicChain, seed: int) -> 
     assert upper[:, -1].any(), "shares bend what they turn"
     curvature = [numbers.multipliers @ (jacobian(x + e) - jacobian(x - e)) / (2 * h) for e in steps]
     np.testing.assert_allclose(upper + np.triu(upper, 1).T, np.array(curvature), atol=1e-6)
+
+
+def test_rows_of_a_chain_whose_joints_follow_others(tmp_path: Path) -> None:
+    """A coordinate that moves several joints, one after the other, adds up what each does."""
+    chain = consolidate(coupled_scene(tmp_path), {"drawer": "grip"})
+    assert (chain.size, chain.model.njoints) == (7, 11)
+    test_rows_and_their_derivatives(chain, 7)
 
 
 def test_without_poses_only_slacks_help(chain: VirtualKinematicChain) -> None:

@@ -2,12 +2,14 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.small_problems import door_scene, program_of
+from helpers.telescopes import coupled_scene
 
 import vkc_pin as vkc
 from vkc_pin.chain.inverse_kinematics import LONGEST_STEP
@@ -22,9 +24,14 @@ def drawn(steps: list[vkc.Grasp | vkc.Actuate | vkc.Touch], scene: vkc.Scene) ->
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_points_move_as_finite_differences_say(seed: int) -> None:
-    """Against Pinocchio's own placements: a point fixed in a joint's frame, for every joint of a chain with a held door."""
-    chain = vkc.consolidate(door_scene(), {"door": "handle_free"})
+@pytest.mark.parametrize("coupled", [False, True])
+def test_points_move_as_finite_differences_say(seed: int, coupled: bool, tmp_path: Path) -> None:
+    """Against Pinocchio's own placements: a point fixed in a joint's frame, for every joint of a chain with a held door.
+
+    Or a drawer, held by a robot whose joints follow others.
+    """
+    held, scene = ({"drawer": "grip"}, coupled_scene(tmp_path)) if coupled else ({"door": "handle_free"}, door_scene())
+    chain = vkc.consolidate(scene, held)
     rng, step = np.random.default_rng(seed), 1e-6
     z = rng.uniform(-1.0, 1.0, (2, chain.size))
     joints = np.tile(np.arange(chain.model.njoints), 2)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.executions import door_plan, drawer_plan, holding, still, with_mass
+from helpers.telescopes import telescope_scene
 
 import vkc_pin as vkc
 from vkc_pin.scene.scene import Scene
@@ -31,6 +32,19 @@ def test_a_drawer_is_pulled() -> None:
     column = plan.names.index("drawer.slide")
     assert grip.force > 0.3 * 5.0 * np.abs(plan.accelerations()[:, column]).max()
     assert result.contacts == ()
+
+
+def test_one_motor_pulls_with_all_segments_of_a_telescope(tmp_path: Path) -> None:
+    scene = telescope_scene(tmp_path, base="fixed")
+    file = tmp_path / "robot.urdf"
+    file.write_text(file.read_text().replace('effort="10"', 'effort="300"'))  # the lift carries all that is on it
+    plan = vkc.plan(vkc.Scene.from_document(scene.document, tmp_path), [vkc.Actuate("drawer", {"slide": 0.15})], seed=0)
+    assert plan.success, plan.report()
+    result = plan.simulate()
+    assert result.ok, result.report()
+    assert result.tracking.arm[0] < np.radians(1.0)
+    assert np.abs(result.trajectory.column("out_1") - plan.trajectory.at(result.trajectory.times)[:, 4]).max() < 1e-3
+    assert {*result.tracking.shares} == {*scene.robot.coordinates.names[3:]}
 
 
 def test_a_latched_door_is_opened_with_its_lever() -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.executions import still
+from helpers.telescopes import coupled_scene
 
 import vkc_pin as vkc
 from vkc_pin.models.shapes import triangles
@@ -19,9 +22,9 @@ from vkc_pin.simulation.physics import Physics, weigh
 from vkc_pin.simulation.servos import servos
 
 
-def built(scene: Scene) -> PhysicalWorld:
+def built(scene: Scene, *, guessed: bool = False) -> PhysicalWorld:
     physics, world, holds = Physics(), World(scene), scene.holds
-    assert weigh(world, physics) == []
+    assert bool(weigh(world, physics)) == guessed
     driven = servos(world, world.positions(still(scene)), physics)
     latches = [(joint, at) for joint, at, _, _ in latched(scene)]
     return Builder(world, physics).built(touching_pairs(world, holds), driven, holds, latches)
@@ -37,10 +40,11 @@ def random_rows(world: World, count: int) -> np.ndarray:
     return rows
 
 
-@pytest.mark.parametrize("name", ["door", "drawer", "household", "init_1", "tray"])
-def test_bodies_and_shapes_are_where_pinocchio_has_them(name: str) -> None:
-    scene = vkc.load_scene(name)
-    physical = built(scene)
+@pytest.mark.parametrize("name", ["door", "drawer", "household", "init_1", "tray", "coupled"])
+def test_bodies_and_shapes_are_where_pinocchio_has_them(name: str, tmp_path: Path) -> None:
+    coupled = name == "coupled"
+    scene = coupled_scene(tmp_path) if coupled else vkc.load_scene(name)
+    physical = built(scene, guessed=coupled)
     world, model = physical.world, physical.model
     data, tree = mujoco.MjData(model), world.model.createData()
     for row in random_rows(world, 5):
@@ -78,3 +82,27 @@ def test_masses_agree(name: str) -> None:
         principal = np.sort(np.linalg.eigvalsh(np.asarray(inertia.inertia)))
         principal += max(0.0, principal[2] - principal[0] - principal[1])  # the cabinet's are rounded
         np.testing.assert_allclose(np.sort(physical.model.body_inertia[body]), principal, rtol=1e-3)
+
+
+def test_a_coordinate_moves_the_masses_of_all_its_joints(tmp_path: Path) -> None:
+    """By MuJoCo's inertia of independent joints, of which the motor of one moves several; and nothing weighs on any of them."""
+    physical = built(coupled_scene(tmp_path), guessed=True)
+    world, model = physical.world, physical.model
+    data, robot = mujoco.MjData(model), world.scene.robot.coordinates
+    slopes = np.zeros((model.nv, robot.size))
+    for move in robot.moves:
+        own = model.body_dofadr[physical.bodies[move.joint]] + (move.coordinate if move.coordinate < 3 else 0)
+        slopes[own, move.coordinate] = move.factor
+    for row in random_rows(world, 5):
+        data.qpos[:] = physical.qpos(row)
+        mujoco.mj_forward(model, data)
+        assert np.abs(data.efc_pos[: data.ne]).max() < 1e-9
+        masses = np.zeros((model.nv, model.nv))
+        mujoco.mj_fullM(model, data, masses)
+        masses -= np.diag(model.dof_armature)
+        theirs = pin.crba(world.model, world.model.createData(), world.coordinates.q(row))
+        theirs = np.triu(theirs) + np.triu(theirs, 1).T
+        turned = np.eye(robot.size)  # the base's velocity is in its own frame there
+        turned[:2, :2] = [[np.cos(row[2]), np.sin(row[2])], [-np.sin(row[2]), np.cos(row[2])]]
+        expected = turned.T @ theirs[: robot.size, : robot.size] @ turned
+        np.testing.assert_allclose(slopes.T @ masses @ slopes, expected, atol=1e-9)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.small_problems import full_scene, with_objects
+from helpers.telescopes import coupled_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -36,6 +38,20 @@ def motion(scene: Scene, seed: int, *, grasp: str = "grip", number: int = 5) -> 
     positions = rng.uniform(-1.0, 1.0, (number, len(names))) * rng.choice([0.0, 0.01, 1.0], len(names))
     phases = (PhaseSpan("all", 0, number - 1, (Hold("cabinet", grasp),)),)
     return Trajectory(names, np.cumsum(rng.uniform(0.1, 2.0, number)), positions, phases, len(scene.start))
+
+
+def test_joints_that_follow_others_are_seen_as_often(tmp_path: Path) -> None:
+    """One of them turns by 3 rad as another turns by 1."""
+    scene = coupled_scene(tmp_path)
+    rows = np.tile(scene.start, (3, 1))
+    rows[1:, 3:] += [[0.4, 0.0, 0.0], [0.4, 0.1, 0.9]]
+    names, phases = scene.robot.coordinates.names, (PhaseSpan("all", 0, 2, ()),)
+    samples = Samples(scene, Trajectory(names, np.array([0.0, 1.0, 2.0]), rows, phases, len(scene.start)))
+    steps = np.abs(np.diff(samples.z, axis=0)).max(axis=0)
+    goes = {str(samples.world.model.names[m.joint]): abs(m.factor) * steps[m.coordinate] for m in samples.world.coordinates.moves}
+    assert goes["roll_joint"] == pytest.approx(ANGLE_STEP, rel=0.05)
+    assert goes["pitch_joint"] <= ANGLE_STEP
+    assert goes["lift"] == pytest.approx(LENGTH_STEP, rel=0.05)
 
 
 @pytest.mark.parametrize("jump", [1e4, 1e9])

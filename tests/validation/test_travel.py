@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import itertools
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
+import pytest
 from helpers.motions import wander, whirl
 from helpers.small_problems import door_scene, full_scene
+from helpers.telescopes import coupled_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -43,6 +46,25 @@ def test_no_point_moves_further_than_the_bound(seed: int, size: float) -> None:
             before = now
         assert (path <= bounds[t] + 1e-9).all()
         assert (bounds[t][path == 0] == 0).all()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_no_point_of_a_robot_whose_joints_follow_others_moves_further(seed: int, tmp_path: Path) -> None:
+    world, rng = World(coupled_scene(tmp_path)), np.random.default_rng(seed)
+    low, high = (np.nan_to_num(bound, posinf=1.0, neginf=-1.0) for bound in (world.coordinates.lower, world.coordinates.upper))
+    z = rng.uniform(low, high, (4, world.coordinates.size))
+    z[:, :2] = rng.uniform(-1.0, 1.0, (4, 2))
+    bounds = np.diff(travelled(Solids(world), z), axis=0)
+    data, shapes = world.model.createData(), pin.GeometryData(world.collision)
+    corners = [np.array(box_corners(shape)) for shape in world.shapes]
+    for t in range(len(z) - 1):
+        places = []
+        for share in np.linspace(0.0, 1.0, 100):
+            q = world.coordinates.q((1 - share) * z[t] + share * z[t + 1])
+            pin.updateGeometryPlacements(world.model, data, world.collision, shapes, q)
+            places.append([p @ where.rotation.T + where.translation for p, where in zip(corners, shapes.oMg, strict=True)])
+        steps = np.linalg.norm(np.diff(np.array(places), axis=0), axis=-1)
+        assert (steps.max(axis=-1).sum(axis=0) <= bounds[t] + 1e-9).all()
 
 
 def box_corners(shape: pin.GeometryObject) -> list[list[float]]:

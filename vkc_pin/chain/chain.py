@@ -93,9 +93,9 @@ class VirtualKinematicChain:
     def metric(self) -> Floats:
         """What a change of each coordinate counts as in searches, shape (n,), [rad/m] and 1: as a turn by so many radians.
 
-        A metre is worth as many as move the hand by a metre, see `Robot.lever`.
+        A metre is worth as many as move the hand by a metre, see `Robot.lever`; of joints that move together, all ways count.
         """
-        return np.where(np.array(self.coordinates.units) == "m", 1.0 / self.robot.lever, 1.0)
+        return self.coordinates.turns + self.coordinates.lengths / self.robot.lever
 
     @cached_property
     def _kinematics(self) -> Kinematics:
@@ -124,24 +124,24 @@ class VirtualKinematicChain:
         return np.array([[k in self.model.supports[j] for k in joints] for j in joints])
 
     @cached_property
-    def motions(self) -> tuple[Ints, Floats, Floats, Bools]:
-        """How joints move: for each coordinate its joint, and how that moves linearly and about which axis, in its frame.
+    def motions(self) -> tuple[Ints, Ints, Floats, Floats, Bools]:
+        """How joints move: for each of `Coordinates.moves` coordinate and joint, how that moves linearly and about which axis.
 
-        Shapes (n,), (n, 3) and (n, 3). The last array, shape (n,), says where the linear motion is along the world's axes: x and
-        y of a planar joint.
+        Shapes (m,), (m,), (m, 3) and (m, 3), the last two in the joint's frame. The last array, shape (m,), says where the linear
+        motion is along the world's axes: x and y of a planar joint.
         """
-        data, owner = self.model.createData(), np.array(self.coordinates.joints)
+        data, moves = self.model.createData(), self.coordinates.moves
         pin.forwardKinematics(self.model, data, pin.neutral(self.model))
-        linear, angular, fixed = np.zeros((len(owner), 3)), np.zeros((len(owner), 3)), np.zeros(len(owner), bool)
-        for column, joint in enumerate(self.coordinates.joints):
-            if str(self.model.joints[joint].shortname()) == "JointModelPlanar":
-                part = column - self.coordinates.joints.index(joint)
-                fixed[column] = part < 2
-                (linear if part < 2 else angular)[column, part] = 1.0
+        linear, angular, fixed = np.zeros((len(moves), 3)), np.zeros((len(moves), 3)), np.zeros(len(moves), bool)
+        for row, move in enumerate(moves):
+            if str(self.model.joints[move.joint].shortname()) == "JointModelPlanar":
+                part = move.coordinate - self.coordinates.joints.index(move.joint)
+                fixed[row] = part < 2
+                (linear if part < 2 else angular)[row, part] = 1.0
             else:
-                motion = np.asarray(data.joints[joint].S, float).ravel()
-                linear[column], angular[column] = motion[:3], motion[3:]
-        return owner, linear, angular, fixed
+                motion = np.asarray(data.joints[move.joint].S, float).ravel()
+                linear[row], angular[row] = motion[:3], motion[3:]
+        return np.array([m.coordinate for m in moves]), np.array([m.joint for m in moves]), linear, angular, fixed
 
     def point_jacobians(self, z: Floats, which: Ints, joint: Ints, point: Floats) -> Floats:
         """Return how points that are fixed in joints' frames move, shape (C, 3, n).
@@ -152,13 +152,14 @@ class VirtualKinematicChain:
             joint: The joint that carries it, shape (C,); 0 stands still.
             point: Where it is in the world, shape (C, 3) [m].
         """
-        owner, linear, angular, fixed = self.motions
+        coordinate, owner, linear, angular, fixed = self.motions
         rotations, translations = self.joint_placements(z)
         axes = rotations[:, owner]
         turned = np.where(fixed[:, None], linear, np.einsum("bnij,nj->bni", axes, linear))[which]
         about = np.einsum("bnij,nj->bni", axes, angular)[which]
         moved = turned + np.cross(about, point[:, None] - translations[:, owner][which])
-        return np.asarray((moved * self.carries[joint][:, owner, None]).swapaxes(1, 2))
+        moved = moved * self.carries[joint][:, owner, None]
+        return np.asarray(np.add.reduceat(moved, np.searchsorted(coordinate, np.arange(self.size)), axis=1).swapaxes(1, 2))
 
     def opened(self, opening: float | None) -> pin.GeometryModel:
         """Return its collision geometry with the robot's gripper so far open [m]; None: as the robot rests."""

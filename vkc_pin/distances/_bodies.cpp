@@ -57,7 +57,11 @@ Bodies::Bodies(const std::string & model, std::size_t shapes, const std::int64_t
 {
   boost::asio::streambuf buffer;
   buffer.commit(boost::asio::buffer_copy(buffer.prepare(model.size()), boost::asio::buffer(model)));
-  known_->model.loadFromBinary(buffer);
+  pinocchio::Model loaded;
+  loaded.loadFromBinary(buffer);
+  // Pinocchio 4.1 forgets on the way how many numbers a joint takes from the one that it follows (`m_nqExtended`), and reads
+  // what is not there; to cast it makes it anew.
+  known_->model = loaded.cast<double>();
   for (std::size_t k = 0; k < shapes; ++k)
   {
     if (joints[k] < 0 || joints[k] >= known_->model.njoints)

@@ -6,24 +6,43 @@ optimiser work with (x, y, θ) and θ; this module maps one to the other, for nu
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from vkc_pin.arguments import known, numbers
-from vkc_pin.arrays import Floats
+from vkc_pin.arrays import Bools, Floats
 from vkc_pin.errors import InputError
 
-__all__ = ["Coordinates", "wrapped"]
+__all__ = ["Coordinates", "Moved", "wrapped"]
 
 _SLIDING = ("JointModelPX", "JointModelPY", "JointModelPZ", "JointModelPrismaticUnaligned")
 _UNBOUNDED = ("JointModelRUBX", "JointModelRUBY", "JointModelRUBZ", "JointModelRevoluteUnboundedUnaligned")
 
 
+class Moved(NamedTuple):
+    """A joint that a coordinate moves: to factor · coordinate + offset, [m] or [rad].
+
+    Attributes:
+        coordinate: Its index.
+        joint: The joint's.
+        factor, offset: 1 and 0, but of a joint that follows another one.
+        slides: Whether the coordinate slides it, rather than turns it.
+    """
+
+    coordinate: int
+    joint: int
+    factor: float
+    offset: float
+    slides: bool
+
+
 class Coordinates:
     """The minimal coordinates of `model`.
+
+    A joint that follows another one (`pinocchio.JointModelMimic`) has none: the other one's coordinate moves both.
 
     Attributes:
         names: One name per coordinate: the joint's, and for a planar joint `<joint>_x`, `<joint>_y`, `<joint>_yaw`; a free
@@ -31,6 +50,9 @@ class Coordinates:
             so that it interpolates anywhere.
         units: For each coordinate "m" or "rad", and "1" for the parts of a quaternion.
         joints: For each coordinate, the index of the joint it belongs to.
+        moves: What each coordinate moves: that joint first, then those that follow it; ordered by coordinate.
+        lengths, turns: How far the joints that a coordinate moves go together, slide [m] and turn [rad] each, for a unit of it,
+            shape (n,): 1 and 0, or 0 and 1, but of joints that others follow.
         size: Their number n (equal to `model.nv`, without free joints).
         lower, upper: Position limits, shape (n,), [m] or [rad]; infinite for continuous joints and the planar yaw.
         velocity: Velocity limits, shape (n,), [m/s] or [rad/s].
@@ -47,8 +69,11 @@ class Coordinates:
         angles: list[tuple[int, int]] = []  # q[i] = cos z[j], q[i + 1] = sin z[j]
         quaternions: list[tuple[int, int]] = []  # q[i:i + 4] = z[j:j + 4], made a unit
         lower, upper = [], []
+        followers = [int(index) for index in model.mimicking_joints]
         for index in range(1, model.njoints):
             joint, name, i, j = model.joints[index], model.names[index], model.joints[index].idx_q, len(names)
+            if joint.nv == 0 and index in followers:
+                continue
             kind, limited, straight = joint.shortname(), 0, 0  # coordinates with limits, and those that are Pinocchio's own
             if kind == "JointModelPlanar":
                 parts, limited, straight = {"_x": "m", "_y": "m", "_yaw": "rad"}, 2, 2
@@ -78,9 +103,55 @@ class Coordinates:
         self.upper: Floats = np.array(upper, float)
         self.velocity: Floats = np.array(model.velocityLimit, float)
         self.nq = int(model.nq)
+        self.moves: tuple[Moved, ...] = self._moves(model, followers)
+        self.lengths, self.turns = np.zeros(self.size), np.zeros(self.size)
+        for move in self.moves:
+            (self.lengths if move.slides else self.turns)[move.coordinate] += abs(move.factor)
+        self._joint_count = int(model.njoints)
         self._plain_q, self._plain_z = np.array(plain, int).reshape(-1, 2).T
         self._angle_q, self._angle_z = np.array(angles, int).reshape(-1, 2).T
         self._quaternions = quaternions
+
+    @property
+    def followers(self) -> tuple[Moved, ...]:
+        """Those of `moves` whose joint follows another one."""
+        return tuple(move for move in self.moves if move.joint != self.joints[move.coordinate])
+
+    def _moves(self, model: pin.Model, followers: list[int]) -> tuple[Moved, ...]:
+        """Return `moves`."""
+        moves = [Moved(k, joint, 1.0, 0.0, self.units[k] == "m") for k, joint in enumerate(self.joints)]
+        if followers:
+            data = model.createData()
+            pin.forwardKinematics(model, data, pin.neutral(model))
+            at = {model.joints[joint].idx_q: k for k, joint in enumerate(self.joints)}
+            for joint in followers:  # `mimicked_joints` of Pinocchio 4.1 are not always in the order of `mimicking_joints`
+                following, axis = model.joints[joint].extract(), np.asarray(data.joints[joint].S, float).ravel()
+                factor, offset = float(following.scaling), float(following.offset)
+                moves.append(Moved(at[model.joints[joint].idx_q], joint, factor, offset, not axis[3:].any()))
+        return tuple(sorted(moves))
+
+    def moved(self, changed: ArrayLike) -> Bools:
+        """Return which joints of the model some coordinates move, shape (J,), the universe among them.
+
+        Args:
+            changed: Which coordinates change, shape (n,).
+        """
+        changed, found = np.asarray(changed, bool), np.zeros(self._joint_count, bool)
+        found[[move.joint for move in self.moves if changed[move.coordinate]]] = True
+        return found
+
+    def strides(self, length: float, angle: float) -> Floats:
+        """Return how far each coordinate can go so that no joint goes further than that, shape (n,) [m] or [rad].
+
+        Args:
+            length: How far joints may slide [m].
+            angle: How far they may turn [rad].
+        """
+        found = np.full(self.size, np.inf)
+        for move in self.moves:
+            stride = (length if move.slides else angle) / abs(move.factor)
+            found[move.coordinate] = min(found[move.coordinate], stride)
+        return found
 
     def q(self, z: ArrayLike) -> Floats:
         """Return Pinocchio's configuration(s), shape (..., nq), of minimal coordinates `z`, shape (..., n)."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -12,7 +12,6 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.arguments import mapping, quantity, text
-from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError, UnknownNameError, shown
 from vkc_pin.files import resources
 from vkc_pin.files.documents import Document
@@ -20,6 +19,8 @@ from vkc_pin.files.resources import file_path
 from vkc_pin.files.srdf import Srdf, group_tip, read_srdf
 from vkc_pin.files.urdf import UrdfFile, read_urdf
 from vkc_pin.models.coordinates import Coordinates
+from vkc_pin.models.couplings.following import couple
+from vkc_pin.models.couplings.limits import limited_together, robot_limits
 from vkc_pin.models.hands.gripper import described_gripper
 from vkc_pin.models.robot import Base, Robot
 from vkc_pin.models.robot_model import (
@@ -39,7 +40,6 @@ __all__ = ["find_robot", "known_robots", "load_robot"]
 
 _BASES = ("omni", "differential", "fixed")
 _PAIRS = ("srdf", "sampled", "all")
-_VELOCITY, _ACCELERATION = np.pi, 1.4  # of joints for which no file names one, [rad/s] and [rad/s²], or [m/s] and [m/s²]
 _SAMPLES = 1000  # to find allowed pairs when a robot without an SRDF is loaded
 # Names under which example-robot-data loads URDF files called otherwise.
 _ALIASES = {"anymal_kinova": "anymal-kinova", "asr_twodof": "TwoDofs", "b1_z1": "b1-z1", "hyq": "hyq_no_sensors", "solo8": "solo"}
@@ -98,7 +98,8 @@ def load_robot(
     """Load a robot and put it on a planar virtual base.
 
     The joints between the root and the tool frame are planned. All others (wheels, heads, other arms, fingers) are
-    locked, as are joints that mimic others and joints of a type other than revolute, continuous and prismatic.
+    locked, as are joints of a type other than revolute, continuous and prismatic. Joints that follow one of these (<mimic>, or
+    `couplings` in robot.yaml) move with it, wherever they are: together they have one coordinate, that of the joint they follow.
 
     Limits come from the URDF and from a `robot.yaml` beside it. Where neither names a velocity or an acceleration they
     are π rad/s (m/s) and 1.4 rad/s² (m/s²) for joints, 1 m/s, 2 rad/s, 3 m/s² and 6 rad/s² for the base, ±20 m.
@@ -152,6 +153,7 @@ def load_robot(
     tool = tool_frame if tool_frame is not None else files.tool_frame(arm, beside) or default_tool_frame(full, urdf)
     if tool not in (frames := dict.fromkeys(frame.name for frame in full.frames)):
         raise UnknownNameError("frame", tool, frames, file=urdf.path, field="tool_frame")
+    full = limited_together(full, urdf, tool)
     replaced = own_base(full, urdf) if base != "fixed" else ()
     fingers = {joint: finger.open for joint, finger in settings.gripper.items()}
     said = {**settings.locked_joints, **locked_joints}
@@ -170,8 +172,9 @@ def load_robot(
         warnings.warn(f"{urdf.path}: {problem}: {unsaid}", stacklevel=2)
     raised, rest = settings.base.height if raised is None else raised, {**rest, **locked}
     model = planned_model(full, urdf, tool, rest, locked, height=raised)
-    coordinates, lower, upper, velocity, acceleration = _limits(model, settings, base)
-    state = _state(model, semantics, given)
+    coordinates, lower, upper, velocity, acceleration = robot_limits(full, model, settings, base)
+    files.check_followers(model, rest, given)
+    state = _state(model, coordinates.names[3:], semantics, given)
     collision = collision_geometry(model, urdf)
     robot = Robot(
         name=files.name,
@@ -253,6 +256,19 @@ class _Files:
                         raise self.document.error((key, joint), problem, expected=expected, got=position)
                 raise InputError(problem, file=self.urdf.path, field=f"{field}.{joint}", expected=expected, got=position)
 
+    def check_followers(self, model: pin.Model, rest: Mapping[str, float], given: Collection[str]) -> None:
+        """Check that joints `given` a place to rest at follow those that they follow. Raises `InputError` if one does not."""
+        coordinates = Coordinates(model)
+        for move in coordinates.moves[3:]:
+            joint, leader = str(model.names[move.joint]), coordinates.names[move.coordinate]
+            if joint != leader and joint in given:
+                follows = move.factor * rest[leader] + move.offset
+                if abs(rest[joint] - follows) > LIMIT_SLACK:
+                    problem, expected = f"this joint follows '{leader}'", f"{follows:g}, or nothing"
+                    if joint in self.settings.home:
+                        raise self.document.error(("home", joint), problem, expected=expected, got=rest[joint])
+                    raise InputError(problem, file=self.urdf.path, field=f"home.{joint}", expected=expected, got=rest[joint])
+
 
 def _read(name: str | Path, packages: Mapping[str, str | Path]) -> _Files:
     """Find and read a robot's URDF, and the robot.yaml that belongs to it if there is one."""
@@ -266,34 +282,12 @@ def _read(name: str | Path, packages: Mapping[str, str | Path]) -> _Files:
         settings, document = read_robot(source)
     folders = {key: file_path(folder, f"packages.{key}", "a folder") for key, folder in packages.items()}
     folders = {**python_packages(tuple(p for p in settings.packages if p not in folders), document), **folders}
-    return _Files(source, settings, document, read_urdf(source.parent / settings.urdf, folders))
+    urdf = read_urdf(source.parent / settings.urdf, folders)
+    couple(urdf, settings.couplings, document)
+    return _Files(source, settings, document, urdf)
 
 
-def _state(model: pin.Model, semantics: Srdf | None, given: Collection[str]) -> dict[str, float]:
-    """Return where an SRDF says that planned joints rest, those `given` otherwise left out."""
-    arm = list(model.names)[2:]
+def _state(model: pin.Model, arm: Sequence[str], semantics: Srdf | None, given: Collection[str]) -> dict[str, float]:
+    """Return where an SRDF says that the joints of an arm rest, those `given` otherwise left out."""
     state = {} if semantics is None else semantics.state(arm)
     return {joint: nearest_position(model, joint, state[joint]) for joint in arm if joint in state and joint not in given}
-
-
-def _limits(model: pin.Model, settings: RobotSchema, base: Base) -> tuple[Coordinates, Floats, Floats, Floats, Floats]:
-    """Write the limits into `model` and return its coordinates with (lower, upper, velocity, acceleration), shape (n,) each."""
-    low, high = np.array(settings.base.position).T if base != "fixed" else (np.zeros(2), np.zeros(2))
-    position_low, position_high, velocity = model.lowerPositionLimit, model.upperPositionLimit, model.velocityLimit
-    position_low[:2], position_high[:2], velocity[:3] = low, high, settings.base.velocity
-    acceleration = np.full(model.nv, _ACCELERATION)
-    acceleration[:3] = settings.base.acceleration
-    for j in range(2, model.njoints):
-        v, named = model.joints[j].idx_v, settings.joints.get(model.names[j])
-        if named is not None and named.velocity is not None:
-            velocity[v] = named.velocity
-        elif not 0.0 < velocity[v] < 1e3:  # Pinocchio's value for a joint without limit is the largest number
-            velocity[v] = _VELOCITY
-        if named is not None and named.acceleration is not None:
-            acceleration[v] = named.acceleration
-    model.lowerPositionLimit, model.upperPositionLimit, model.velocityLimit = position_low, position_high, velocity
-    coordinates = Coordinates(model)
-    lower, upper = coordinates.lower.copy(), coordinates.upper.copy()
-    if base == "fixed":
-        lower[:3] = upper[:3] = 0.0
-    return coordinates, lower, upper, coordinates.velocity.copy(), acceleration

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Mapping, Set
 
 import coal
@@ -13,13 +12,14 @@ from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
 from vkc_pin.files.meshes import load_parts, to_bvh
 from vkc_pin.files.urdf import UrdfFile, UrdfShape, tree_model
+from vkc_pin.models.couplings.following import Following, coupled_groups, followers, path_to
+from vkc_pin.models.couplings.mimicking import in_order, with_mimics
 from vkc_pin.models.grafting import add_joint, clean
 
 __all__ = [
     "collision_geometry",
     "default_tool_frame",
     "full_model",
-    "mimics",
     "nearest_position",
     "neighbours",
     "own_base",
@@ -56,7 +56,9 @@ def planned_model(
     *,
     height: float = 0.0,
 ) -> pin.Model:
-    """Return `full` with all joints locked but those between the base and `tool_frame`.
+    """Return `full` with all joints locked but those between the base and `tool_frame`, and those that move with them.
+
+    Joints that follow others are `pinocchio.JointModelMimic`: the model has no coordinate of theirs.
 
     Args:
         full: See `full_model`.
@@ -67,40 +69,44 @@ def planned_model(
         height: Of the root link above the base's joint, which moves on the floor [m].
 
     Raises:
-        InputError: No joint is left.
+        InputError: No joint is left, or one is locked that follows one that is not.
     """
-    named = [frame for frame in full.frames if frame.name == tool_frame]
-    frame = next((frame for frame in named if frame.type == pin.FrameType.BODY), named[0])  # a link before a joint
-    path = full.supports[frame.parentJoint]  # from the world on
-    fixed = {*locked, *mimics(file.root)}
-    planned = [j for j in path if j > 1 and full.names[j] in rest and full.names[j] not in fixed]
+    follows, groups = followers(file.root), coupled_groups(full, file, tool_frame)
+    groups = {leader: group for leader, group in groups.items() if leader not in locked}
+    if stuck := [(joint, led.leader) for group in groups.values() for joint, led in group.items() if joint in locked]:
+        problem, (joint, leader), expected = "a locked joint follows one that moves", stuck[0], "the joint locked that it follows"
+        raise InputError(problem, file=file.path, field=f"locked_joints.{joint}", expected=expected, got=f"'{leader}' moves")
+    alone = {str(full.names[j]) for j in path_to(full, tool_frame) if j > 1} - {*locked, *follows}
+    moving = alone.union(groups, *groups.values())
+    planned = [j for j in range(2, full.njoints) if full.names[j] in moving and full.names[j] in rest]
     if not planned:
         expected = "a frame at the end of an arm"
         raise InputError("no joint moves this frame", file=file.path, field="tool_frame", expected=expected, got=tool_frame)
-    return _reduced(full, {1, *planned}, configuration(full, {**rest, **locked}), height)
+    return _reduced(full, {1, *planned}, configuration(full, {**rest, **locked}), height, follows)
 
 
 def unlocked_model(
-    full: pin.Model, model: pin.Model, joints: Collection[str], rest: Mapping[str, float], height: float
+    full: pin.Model, file: UrdfFile, model: pin.Model, joints: Collection[str], rest: Mapping[str, float], height: float
 ) -> pin.Model:
     """Return `model`, which `planned_model` made of `full`, with more `joints` that are not locked, all of them after its own.
 
     Args:
         full: See `full_model`.
+        file: Its file.
         model: The planned joints.
-        joints: The others.
+        joints: The others, each of which moves on its own.
         rest: Where the rest is locked, [m] or [rad].
         height: As for `planned_model` [m].
     """
-    free = {full.getJointId(str(name)) for name in [*list(model.names)[1:], *joints]}
-    return _reduced(full, free, configuration(full, rest), height)
+    own, last = ([full.getJointId(str(name)) for name in names] for names in (list(model.names)[1:], joints))
+    follows = {joint: led for joint, led in followers(file.root).items() if joint not in joints}
+    return _reduced(full, {*own, *last}, configuration(full, rest), height, follows, last)
 
 
 def rest_positions(full: pin.Model, file: UrdfFile, given: Mapping[str, float]) -> dict[str, float]:
     """Return for each joint of 1 degree of freedom where it rests, [m] or [rad].
 
-    That is what `given` says, else 0, or the middle of the limits where 0 lies outside them. A joint that mimics another
-    follows it.
+    That is what `given` says, else where the joint that it follows has it, else 0, or the middle of limits without 0.
     """
     rest = {}
     for j in range(2, full.njoints):
@@ -108,9 +114,9 @@ def rest_positions(full: pin.Model, file: UrdfFile, given: Mapping[str, float]) 
             i = full.joints[j].idx_q
             low, high = (-np.inf, np.inf) if full.joints[j].nq == 2 else (full.lowerPositionLimit[i], full.upperPositionLimit[i])
             rest[full.names[j]] = float(given.get(full.names[j], 0.0 if low <= 0.0 <= high else 0.5 * (low + high)))
-    for name, (master, factor, offset) in mimics(file.root).items():
-        if name in rest and master in rest and name not in given:
-            rest[name] = factor * rest[master] + offset
+    for name, led in followers(file.root).items():
+        if name in rest and led.leader in rest and name not in given:
+            rest[name] = led.factor * rest[led.leader] + led.offset
     return rest
 
 
@@ -194,12 +200,12 @@ def configuration(model: pin.Model, positions: Mapping[str, float]) -> Floats:
 
 def default_tool_frame(full: pin.Model, file: UrdfFile) -> str:
     """Return the last frame of the longest chain of joints, before it branches into fingers."""
-    following = mimics(file.root)
+    follows = followers(file.root)
     children: dict[int, list[int]] = {j: [] for j in range(full.njoints)}
     depth = np.zeros(full.njoints, int)
     for j in range(full.njoints - 1, 1, -1):
         children[full.parents[j]].insert(0, j)
-        counts = full.joints[j].nv == 1 and full.names[j] not in following
+        counts = full.joints[j].nv == 1 and full.names[j] not in follows
         depth[full.parents[j]] = max(depth[full.parents[j]], depth[j] + counts)
     joint, above = 1, 0
     while children[joint]:
@@ -246,18 +252,27 @@ def visual_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
     return geometry
 
 
-def _reduced(full: pin.Model, planned: Collection[int], q: Floats, height: float) -> pin.Model:
+def _reduced(
+    full: pin.Model,
+    planned: Collection[int],
+    q: Floats,
+    height: float,
+    follows: Mapping[str, Following],
+    last: Collection[int] = (),
+) -> pin.Model:
     """Return `full` with the joints that are not `planned` locked at `q`, and all on joint 1 higher by `height`.
 
     `pinocchio.buildReducedModel` refuses models in which a link is called like a joint, as many are. Here, the frame of
-    such a joint is left out, so that every frame's name is the only one.
+    such a joint is left out, so that every frame's name is the only one. Joints come after those they follow, `last` ones last.
     """
     data = full.createData()
     pin.forwardKinematics(full, data, q)
     model = pin.Model()
     model.name = full.name
     placed = {0: (0, pin.SE3.Identity())}
-    for j in range(1, full.njoints):
+    coupled = {j: led for j in sorted(planned) if (led := follows.get(full.names[j])) and full.getJointId(led.leader) in planned}
+    before = {j: {full.getJointId(led.leader)} for j, led in coupled.items()} | {j: {*planned} - {*last} for j in last}
+    for j in in_order(full, before):
         joint, (parent, placement) = full.joints[j], placed[full.parents[j]]
         if j in planned:
             index = add_joint(model, parent, joint, clean(placement * full.jointPlacements[j], _ROUNDING), like=(full, j))
@@ -270,18 +285,7 @@ def _reduced(full: pin.Model, planned: Collection[int], q: Floats, height: float
         if frame.type == pin.FrameType.BODY or frame.name not in links:
             parent, placement = placed[frame.parentJoint]
             model.addFrame(pin.Frame(frame.name, parent, 0, clean(placement * frame.placement), frame.type))
-    return model
-
-
-def mimics(root: ElementTree.Element) -> dict[str, tuple[str, float, float]]:
-    """Return joint → (the joint it follows, factor, offset)."""
-    found = {}
-    for joint in root.findall("joint"):
-        mimic = joint.find("mimic")
-        if mimic is not None:
-            factor, offset = float(mimic.get("multiplier", "1")), float(mimic.get("offset", "0"))
-            found[joint.get("name", "")] = (mimic.get("joint", ""), factor, offset)
-    return found
+    return with_mimics(model, [coupled[j] for j in coupled], [placed[j][0] for j in coupled])
 
 
 def _geometry_object(

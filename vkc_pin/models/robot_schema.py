@@ -10,9 +10,9 @@ from pydantic import Field
 
 from vkc_pin.errors import InputError
 from vkc_pin.files.documents import Document, check, read_yaml
-from vkc_pin.files.fields import JointSchema, Number, Positive, Schema, require
+from vkc_pin.files.fields import JointSchema, Number, Positive, Schema, require, text_for
 
-__all__ = ["BaseSchema", "FingerSchema", "RobotSchema", "python_packages", "read_robot"]
+__all__ = ["BaseSchema", "CouplingSchema", "FingerSchema", "RobotSchema", "python_packages", "read_robot"]
 
 
 Limits = Annotated[
@@ -36,6 +36,14 @@ class FingerSchema(Schema):
     open: Number
 
 
+class CouplingSchema(Schema):
+    """A joint that follows `joint`: it is at multiplier · position + offset, [m] or [rad], as <mimic> in a URDF says."""
+
+    joint: str
+    multiplier: Annotated[Number, require(bool, "a joint that stands still", "a number but 0, or `locked_joints`")] = 1.0
+    offset: Number = 0.0
+
+
 class RobotSchema(Schema):
     """A robot.yaml beside a URDF; every field but `urdf` may be left out."""
 
@@ -49,6 +57,7 @@ class RobotSchema(Schema):
     home: dict[str, Number] = Field(default_factory=dict)
     locked_joints: dict[str, Number] = Field(default_factory=dict)
     gripper: dict[str, FingerSchema] = Field(default_factory=dict)
+    couplings: dict[str, Annotated[CouplingSchema, text_for("joint")]] = Field(default_factory=dict)
     joints: dict[str, JointSchema] = Field(default_factory=dict)
 
 

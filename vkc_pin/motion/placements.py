@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,13 +47,18 @@ class Motion:
         return np.asarray((0.5 * turned.max(axis=(1, 2, 3)) > 0.15) | (shifted.max(axis=(1, 2)) > 0.15))
 
 
-def key_times(trajectory: Trajectory) -> Floats:
-    """Return the waypoints' times and as many in between that no coordinate changes by more than 1 rad or m, shape (K,) [s].
+def key_times(trajectory: Trajectory, strides: Mapping[str, float] | None = None) -> Floats:
+    """Return the waypoints' times and as many in between that no joint moves by more than 1 rad or m, shape (K,) [s].
 
     Between these a viewer's own interpolation of positions and quaternions, joint by joint, is exact.
+
+    Args:
+        trajectory: The motion.
+        strides: Coordinate → by how much it changes then; 1 otherwise.
     """
-    steps = np.abs(np.diff(trajectory.positions, axis=0)).max(axis=1)
-    counts = np.maximum(1, np.ceil(steps / _TURN)).astype(int)
+    most = [(strides or {}).get(name, _TURN) for name in trajectory.names]
+    steps = np.abs(np.diff(trajectory.positions, axis=0) / most).max(axis=1)
+    counts = np.maximum(1, np.ceil(steps)).astype(int)
     edges = zip(trajectory.times[:-1], trajectory.times[1:], counts, strict=True)
     return np.concatenate([*(np.linspace(a, b, n, endpoint=False) for a, b, n in edges), trajectory.times[-1:]])
 
@@ -62,7 +68,8 @@ def sample_motion(world: World, trajectory: Trajectory | None, times: Floats | N
     if trajectory is None:
         times, rows = np.zeros(1), world.start[None]
     else:
-        times = key_times(trajectory) if times is None else np.asarray(times, float)
+        strides = dict(zip(world.coordinates.names, world.coordinates.strides(_TURN, _TURN).tolist(), strict=True))
+        times = key_times(trajectory, strides) if times is None else np.asarray(times, float)
         rows = world.positions(trajectory, times)
     model, data = world.model, world.model.createData()
     tool = model.getFrameId(world.scene.robot.tool_frame)
@@ -75,7 +82,5 @@ def sample_motion(world: World, trajectory: Trajectory | None, times: Floats | N
             local[j].append(data.liMi[j].copy())
             placements[k, j] = data.oMi[j].homogeneous
         tools[k] = pin.updateFramePlacement(model, data, tool).translation
-    spread = np.abs(rows - rows[0]).max(axis=0) > 1e-9
-    moving = np.zeros(model.njoints, bool)
-    moving[list(np.asarray(world.coordinates.joints)[spread])] = True
+    moving = world.coordinates.moved(np.abs(rows - rows[0]).max(axis=0) > 1e-9)
     return Motion(np.asarray(times), local, placements, tools, placements[:, 1, :3, 3].copy(), moving)

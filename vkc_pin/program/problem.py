@@ -114,7 +114,8 @@ class TrajectoryProblem:
         o, robot = self.options, self.chain.robot.coordinates.size
         metric = np.full(self.chain.size, o.velocity_weight_object)
         metric[2], metric[3:robot] = o.velocity_weight_heading, o.velocity_weight_arm
-        metric[np.array(self.chain.coordinates.units) == "m"] = o.velocity_weight_base
+        of = self.chain.coordinates  # of joints that move together, all ways count
+        metric = metric * of.turns**2 + o.velocity_weight_base * of.lengths**2
         metric[[column for column, _, _ in self.choices]] *= _CHOICE_WEIGHT
         stops = self.transcription.structure.stops
         return Effort(metric, o.acceleration_weight / o.dt**2, self.ends, stops, length=o.effort == "length")

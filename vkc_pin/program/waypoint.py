@@ -130,7 +130,8 @@ def _slopes(model: pin.Model, coordinates: Coordinates, z: Any, placements: Any,
 
     A coordinate of a joint turns and shifts all that this joint carries by one twist (ω, v): dR = ω × R, dt = ω × t + v. So a
     plane's derivative is m·ω + f·v, where m = Σ (Σ_c R_c × C_c + t × C_t) and f = Σ C_t add up over what the joint carries: a
-    fraction of the work of multiplying with the derivatives of all placements.
+    fraction of the work of multiplying with the derivatives of all placements. Where it moves several joints, each adds its own
+    twist to that of those before it, and these add up.
     """
     forces: list[Any] = []
     moments: list[Any] = []
@@ -144,14 +145,16 @@ def _slopes(model: pin.Model, coordinates: Coordinates, z: Any, placements: Any,
         if parent >= 0:
             forces[parent] += forces[joint]
             moments[parent] += moments[joint]
-    slopes = []
-    for column, joint in enumerate(coordinates.joints):
+    slopes, twists = [ca.SX(planes.shape[0], 1)] * coordinates.size, dict[tuple[int, int], Any]()
+    for column, joint, *_ in coordinates.moves:
         placement = placements[:, joint - 1]
         change = ca.jacobian(placement, z[column])
         turns = [ca.cross(placement[3 * c : 3 * c + 3], change[3 * c : 3 * c + 3]) for c in range(3)]
         omega = sum(turns, ca.SX(3, 1)) / 2
-        speed = change[9:] - ca.cross(omega, placement[9:])
-        slopes.append(moments[joint - 1] @ omega + forces[joint - 1] @ speed)
+        twist = twists[column, joint] = ca.vertcat(omega, change[9:] - ca.cross(omega, placement[9:]))
+        above = [k for k in model.supports[joint] if (column, k) in twists and k != joint]
+        own = twist - twists[column, above[-1]] if above else twist
+        slopes[column] = slopes[column] + (moments[joint - 1] @ own[:3] + forces[joint - 1] @ own[3:])
     return ca.horzcat(*slopes)
 
 

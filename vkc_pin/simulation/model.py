@@ -1,7 +1,8 @@
 """A scene as a MuJoCo model: the plain tree of robot and objects that validation and pictures use, with its masses.
 
 Bodies are the joints of `World.model` with their inertias, geoms the convex shapes that the planner avoids. What may touch
-what is listed pair by pair, see `contacts`; MuJoCo's own rules by bodies play no part.
+what is listed pair by pair, see `contacts`; MuJoCo's own rules by bodies play no part. Joints that follow others are held to
+them by equalities: the motor of what leads moves all.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import pinocchio as pin
 
 from vkc_pin.arrays import Floats, Ints
 from vkc_pin.errors import InputError
+from vkc_pin.models.coordinates import Moved
 from vkc_pin.models.shapes import triangles
 from vkc_pin.motion.world import World
 from vkc_pin.scene.contact import moves_as_one
@@ -57,6 +59,9 @@ class PhysicalWorld:
         """Return MuJoCo's configuration, shape (nq,), of coordinates of the world, shape (n,); freedoms of grasps are at 0."""
         found = np.array(self.model.qpos0, float)
         found[self.columns] = row
+        for move in self.world.coordinates.followers:
+            joint = self.model.body_jntadr[self.bodies[move.joint]]
+            found[self.model.jnt_qposadr[joint]] = move.factor * row[move.coordinate] + move.offset
         return found
 
     def row(self, qpos: Floats) -> Floats:
@@ -121,6 +126,8 @@ class Builder:
             actuator = spec.add_actuator(name=servo.coordinate, target=servo.coordinate, trntype=mj.mjtTrn.mjTRN_JOINT)
             actuator.gaintype, actuator.biastype = mj.mjtGain.mjGAIN_FIXED, mj.mjtBias.mjBIAS_AFFINE
             actuator.gainprm[0], actuator.biasprm[:3] = servo.stiffness, [0.0, -servo.stiffness, -servo.damping]
+        for move in self.world.coordinates.followers:
+            self._follow(move)
         if more is not None:
             more(self)
         try:
@@ -129,8 +136,7 @@ class Builder:
             raise InputError("MuJoCo refuses the scene", field="scene", got=str(error)) from error
         bodies = np.array([0, *(int(model.body(f"body {j}").id) for j in range(1, self.world.model.njoints))])
         geoms = np.array([int(model.geom(f"shape {k}").id) for k in range(len(self.world.shapes))])
-        carriers = self._carriers(model)
-        return PhysicalWorld(self.world, model, bodies, geoms, *self._addresses(model), carriers)
+        return PhysicalWorld(self.world, model, bodies, geoms, *self._addresses(model), self._carriers(model))
 
     def _bodies(self, servos: Sequence[Servo]) -> None:
         """Add a body for every joint of the tree, with its inertia."""
@@ -141,6 +147,8 @@ class Builder:
         names: dict[int, list[str]] = {}
         for name, joint in zip(self.world.coordinates.names, self.world.coordinates.joints, strict=True):
             names.setdefault(joint, []).append(name)
+        follows = {move.joint: move for move in self.world.coordinates.followers}
+        names |= {joint: [self.world.coordinates.names[move.coordinate]] for joint, move in follows.items()}
         for j in range(1, tree.njoints):
             place = tree.jointPlacements[j]
             body = self.bodies[tree.parents[j]].add_body(name=f"body {j}", pos=place.translation, quat=quaternion(place))
@@ -149,18 +157,20 @@ class Builder:
             body.fullinertia = np.asarray(inertia.inertia)[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
             body.gravcomp = float(names[j][0] in driven or self._balanced(j))  # controllers of arms carry what these weigh
             self.bodies.append(body)
-            self._joints(body, j, names[j], np.asarray(data.joints[j].S).reshape(6, -1), driven)
+            axes = np.asarray(data.joints[j].S).reshape(6, -1)
+            if j in follows:  # Pinocchio's axis is for a unit of what leads it
+                self._joint(body, str(tree.names[j]), axes[:, 0] / follows[j].factor)
+            else:
+                self._joints(body, j, names[j], axes, driven)
 
     def _joints(self, body: Any, j: int, names: Sequence[str], axes: Floats, driven: Mapping[str, Servo]) -> None:
         """Add what moves a body."""
-        kind, tree = self.mj.mjtJoint, self.world.model
+        tree = self.world.model
         if tree.joints[j].shortname() == "JointModelFreeFlyer":
             body.add_freejoint(name=str(tree.names[j]))
             return
         for k, name in enumerate(names):
-            slides = np.linalg.norm(axes[:3, k]) > 0.5
-            axis = axes[:3, k] if slides else axes[3:, k]
-            joint = body.add_joint(name=name, axis=axis, type=kind.mjJNT_SLIDE if slides else kind.mjJNT_HINGE)
+            joint, slides = self._joint(body, name, axes[:, k])
             servo, column = driven.get(name), self.world.coordinates.index(name)
             if servo is not None:
                 joint.armature, joint.actgravcomp = servo.armature, True
@@ -173,6 +183,12 @@ class Builder:
             lower, upper = self.world.coordinates.lower[column], self.world.coordinates.upper[column]
             if np.isfinite([lower, upper]).all():
                 joint.limited, joint.range = self.mj.mjtLimited.mjLIMITED_TRUE, [lower, upper]
+
+    def _joint(self, body: Any, name: str, twist: Floats) -> tuple[Any, bool]:
+        """Add a joint along or about an axis, of a twist, shape (6,); return it, and whether it slides."""
+        kind, slides = self.mj.mjtJoint, bool(np.linalg.norm(twist[:3]) > 0.5)
+        axis = twist[:3] if slides else twist[3:]
+        return body.add_joint(name=name, axis=axis, type=kind.mjJNT_SLIDE if slides else kind.mjJNT_HINGE), slides
 
     def _balanced(self, joint: int) -> bool:
         """Return whether springs carry what a joint of an object carries."""
@@ -251,6 +267,13 @@ class Builder:
         """Add an equality that holds a coordinate at a value."""
         kind, of = self.mj.mjtEq.mjEQ_JOINT, self.mj.mjtObj.mjOBJ_JOINT
         self.spec.add_equality(type=kind, objtype=of, name1=coordinate, active=active).data[0] = value
+
+    def _follow(self, move: Moved) -> None:
+        """Add an equality that holds a joint where the one that it follows has it."""
+        equality = self.spec.add_equality(type=self.mj.mjtEq.mjEQ_JOINT, objtype=self.mj.mjtObj.mjOBJ_JOINT, active=True)
+        equality.name1, equality.name2 = str(self.world.model.names[move.joint]), self.world.coordinates.names[move.coordinate]
+        equality.data[:2] = [move.offset, move.factor]
+        equality.solref = [2.0 * self.physics.timestep, 1.0]  # as hard as can be integrated
 
     def _addresses(self, model: Any) -> tuple[Ints, Ints]:
         """Return where the coordinates of the world are in MuJoCo's positions and velocities."""

@@ -15,6 +15,7 @@ import pinocchio as pin
 from vkc_pin.arrays import Floats, Ints
 from vkc_pin.distances.placements import ShapePlacements, columns_of
 from vkc_pin.distances.shapes import Shapes
+from vkc_pin.models.coordinates import Moved
 from vkc_pin.models.shapes import bounding_box, shape_distance
 from vkc_pin.motion.world import World
 
@@ -148,27 +149,27 @@ def travelled(solids: Solids, samples: Floats) -> Floats:
     world = solids.world
     model, steps = world.model, np.abs(np.diff(samples, axis=0))
     spans = np.linalg.norm(steps[:, :2], axis=1)
-    offset = [float(np.linalg.norm(placement.translation)) for placement in model.jointPlacements]
-    of_joint: dict[int, list[int]] = {}
-    for index, joint in enumerate(world.coordinates.joints):
-        of_joint.setdefault(joint, []).append(index)
-    prismatic = {j: model.joints[j].shortname().startswith("JointModelP") and j > 1 for j in of_joint}
+    offsets = [float(np.linalg.norm(placement.translation)) for placement in model.jointPlacements]
+    of_joint: dict[int, list[Moved]] = {}
+    for move in world.coordinates.moves:
+        of_joint.setdefault(move.joint, []).append(move)
     found = np.zeros((len(samples), len(world.shapes)))
     for g, shape in enumerate(world.shapes[: solids.bodies]):
         reach = float(np.linalg.norm(solids.half[g])) + float(np.linalg.norm(shape.placement.act(solids.center[g])))
         joint, moved = shape.parentJoint, np.zeros(len(steps))
         while joint:
-            columns = of_joint[joint]
-            if len(columns) == 7:  # the free joint of what can be carried
-                moved += _free(samples[:, columns], reach)
-            elif len(columns) == 3:  # the planar base
-                moved += spans + steps[:, columns[2]] * reach
-            elif prismatic[joint]:
-                moved += steps[:, columns[0]]
-                reach += float(np.abs(samples[:, columns[0]]).max())
+            moves = of_joint[joint]
+            column, share, offset = moves[0].coordinate, abs(moves[0].factor), moves[0].offset
+            if len(moves) == 7:  # the free joint of what can be carried
+                moved += _free(samples[:, [move.coordinate for move in moves]], reach)
+            elif len(moves) == 3:  # the planar base
+                moved += spans + steps[:, moves[2].coordinate] * reach
+            elif moves[0].slides:
+                moved += share * steps[:, column]
+                reach += float(np.abs(moves[0].factor * samples[:, column] + offset).max())
             else:
-                moved += steps[:, columns[0]] * reach
-            reach += offset[joint]
+                moved += share * steps[:, column] * reach
+            reach += offsets[joint]
             joint = model.parents[joint]
         np.cumsum(moved, out=found[1:, g])
     return found

@@ -73,8 +73,7 @@ class PairTable:
     def _moved(self, rows: Floats) -> Bools:
         """Return whether each shape moves while the world goes through some configurations, shape (K, n): shape (G,)."""
         world = self.world
-        moved = np.zeros(world.model.njoints, bool)
-        np.logical_or.at(moved, np.array(world.coordinates.joints), np.ptp(rows, axis=0) > _STILL)
+        moved = world.coordinates.moved(np.ptp(rows, axis=0) > _STILL)
         for joint in range(1, len(moved)):
             moved[joint] |= moved[world.model.parents[joint]]
         robots = len(self.scene.robot.collision.geometryObjects)

@@ -122,7 +122,8 @@ class Samples:
             steps = np.abs(np.diff(self.trajectory.positions, axis=0))
         else:  # as far as it would go at the largest speed on each cubic
             steps, edges = curve.speeds()[0] * np.diff(curve.times)[:, None], curve.times
-        units = np.array([LENGTH_STEP if self.unit(name) == "m" else ANGLE_STEP for name in self.trajectory.names])
+        known = dict(zip(self.world.coordinates.names, self.world.coordinates.strides(LENGTH_STEP, ANGLE_STEP), strict=True))
+        units = np.array([known.get(n, LENGTH_STEP if self.unit(n) == "m" else ANGLE_STEP) for n in self.trajectory.names])
         planar = np.linalg.norm(steps[:, :2], axis=1) / LENGTH_STEP
         counts = np.maximum(1, np.ceil(np.maximum(planar, (steps / units).max(axis=1)) - 1e-9))
         self.needed = float(counts.sum())

@@ -4,11 +4,13 @@ from pathlib import Path
 
 import pytest
 from helpers.arm_urdf import write_arms
+from helpers.telescopes import write_telescope
 
 import vkc_pin as vkc
 from vkc_pin.files import resources
 from vkc_pin.files.urdf import UrdfFile, read_urdf
-from vkc_pin.importing.robots.arms import Arm, base_kind, bodies, choose, find_arms, own_base
+from vkc_pin.importing.robots.arms import Arm, base_kind, bodies, choose, find_arms, own_base, telescopes
+from vkc_pin.models.robot_model import full_model
 
 
 def arms_of(file: UrdfFile) -> list[Arm]:
@@ -91,3 +93,23 @@ def test_wheels_say_how_the_base_moves(tmp_path: Path) -> None:
     assert base_kind(read_urdf(robots("**/tiago.urdf")).root)[0] == "differential"
     assert base_kind(read_urdf(robots("**/pr2.urdf")).root)[0] == "omni"
     assert base_kind(read_urdf(write_arms(tmp_path)).root)[0] == "omni"
+
+
+@pytest.mark.parametrize(
+    ("changed", "groups"),
+    [
+        ({}, [("out_1", "out_2", "out_3", "out_4")]),
+        ({'name="out_3" type="prismatic"': 'name="out_3" type="revolute"'}, [("out_1", "out_2")]),
+        ({'<child link="segment_3"/><axis xyz="1 0 0"/>': '<child link="segment_3"/><axis xyz="-1 0 0"/>'}, [("out_1", "out_2")]),
+        ({'upper="0.15"': 'upper="0.16"'}, [("out_2", "out_3", "out_4")]),
+    ],
+)
+def test_segments_of_a_telescope(tmp_path: Path, changed: dict[str, str], groups: list[tuple[str, ...]]) -> None:
+    """They slide alike, one on the other, and equally far; the lift before them slides elsewhere."""
+    file = write_telescope(tmp_path).parent / "robot.urdf"
+    text = file.read_text()
+    for old, new in changed.items():
+        text = text.replace(old, new, 1)
+    urdf = read_urdf(file, text=text)
+    names = ("lift", "out_1", "out_2", "out_3", "out_4", "yaw_joint", "pitch_joint", "roll_joint")
+    assert telescopes(full_model(urdf), names) == groups

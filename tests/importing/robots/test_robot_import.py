@@ -9,6 +9,7 @@ import pytest
 import trimesh
 import yaml
 from helpers.arm_urdf import HEIGHT, write_arms
+from helpers.telescopes import FOLLOWERS, write_telescope
 
 import vkc_pin as vkc
 from vkc_pin.files.writing import write_atomically
@@ -173,3 +174,15 @@ def test_what_is_no_robot_is_named(tmp_path: Path, text: str, said: str) -> None
     with pytest.raises(vkc.InputError, match=said):
         vkc.import_robot(file, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_telescope_is_proposed_as_one_coordinate(tmp_path: Path) -> None:
+    """Where the file does not say so, with what to do if it is none; where it does, nothing is proposed."""
+    for mimics, told in (("", True), ("first", False), ("chain", False)):
+        file = write_telescope(tmp_path / f"given{mimics}", couplings="", mimics=mimics).parent / "robot.urdf"
+        made = vkc.import_robot(file, tmp_path / f"mine{mimics}", samples=SAMPLES)
+        assert made.robot.coordinates.names[3:] == ("lift", "out_1", "yaw_joint", "pitch_joint", "roll_joint")
+        said = yaml.safe_load((made.folder / "robot.yaml").read_text())
+        assert said.get("couplings", {}) == (FOLLOWERS if told else {})
+        assert ("out_2, out_3, out_4 slide along with out_1, as a telescope" in str(made)) == told
+        assert set(said["home"]) == {*made.robot.coordinates.names[3:]}

@@ -7,14 +7,18 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 
+import numpy as np
+import pinocchio as pin
+
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.files.urdf import UrdfFile
 
-__all__ = ["Arm", "Body", "base_kind", "bodies", "choose", "find_arms", "own_base"]
+__all__ = ["Arm", "Body", "base_kind", "bodies", "choose", "find_arms", "own_base", "telescopes"]
 
 _MOVING = ("revolute", "continuous", "prismatic")
 _FINGER = 7  # joints in the longest finger of a hand
 _ARM = 3  # joints, at least, that carry a hand; one more without a hand
+_PARALLEL = 1.0 - 1e-6  # cosine between axes along which the segments of a telescope slide
 _HAND_WORDS = re.compile(r"finger|thumb|gripper|jaw|knuckle|claw|fngr|grip", re.IGNORECASE)
 _ARM_WORDS = re.compile(r"arm|shoulder|elbow|wrist|hand|gripper|ur\d|panda|lift|flange", re.IGNORECASE)
 _TRUNK_WORDS = re.compile(r"shoulder|elbow|arm(?!ature)|neck|head|hip", re.IGNORECASE)
@@ -211,6 +215,34 @@ def choose(arms: Sequence[Arm], name: str | None, file: UrdfFile, groups: Mappin
         also = [group for group, joints in groups.items() if any(_last(arm.joints) <= set(joints) for arm in arms)]
         raise UnknownNameError("arm", name, dict.fromkeys([*(arm.name for arm in arms), *also]), file=file.path, field="arm")
     return fitting[0]
+
+
+def telescopes(full: pin.Model, joints: Sequence[str]) -> list[tuple[str, ...]]:
+    """Return joints of an arm, one right after the other, that slide alike along one direction and equally far.
+
+    Nothing but a telescope has a use for them, and one motor moves all its segments.
+
+    Args:
+        full: The robot with all its joints.
+        joints: The arm's, from the root on.
+    """
+    data, found = full.createData(), list[list[str]]()
+    pin.forwardKinematics(full, data, pin.neutral(full))
+    before, along = 0, np.zeros(3)
+    for name in joints:
+        number = full.getJointId(name)
+        axis = data.oMi[number].rotation @ np.asarray(data.joints[number].S, float).ravel()[:3]  # 0 of one that turns
+        bounds = (full.lowerPositionLimit, full.upperPositionLimit)
+        if (
+            full.parents[number] == before
+            and axis @ along > _PARALLEL
+            and all(np.isclose(bound[full.joints[number].idx_q], bound[full.joints[before].idx_q]) for bound in bounds)
+        ):
+            found[-1].append(name)
+        else:
+            found.append([name])
+        before, along = number, axis
+    return [tuple(group) for group in found if len(group) > 1]
 
 
 def _last(joints: Sequence[str]) -> set[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,9 +10,10 @@ import pinocchio as pin
 
 from vkc_pin.arrays import Floats
 from vkc_pin.models.robot import Robot
+from vkc_pin.models.robot_model import nearest_position
 from vkc_pin.models.shapes import LinkDistances, ShapeDistances
 
-__all__ = ["HOME_ROOM", "Clearances", "Home", "find_home", "never_apart", "standing"]
+__all__ = ["HOME_ROOM", "Clearances", "Home", "arm_at", "find_home", "never_apart", "standing"]
 
 HOME_ROOM = 0.03
 """Between links at home, and to the floor, if there can be so much [m]: more than the usual margin."""
@@ -90,6 +91,11 @@ class Clearances:
         for one, other in self.pairs:
             groups.setdefault((self._names[one], self._names[other]), []).append((one, other))
         return LinkDistances(self._distances, groups)
+
+
+def arm_at(robot: Robot, state: Mapping[str, float]) -> Floats:
+    """Return where an arm is in a state of its joints, turned by 2π or else moved to the nearest limits, shape (n − 3,)."""
+    return np.array([nearest_position(robot.model, joint, state[joint]) for joint in robot.coordinates.names[3:]])
 
 
 def find_home(robot: Robot, named: Iterable[tuple[str, Floats]], *, seed: int = 0) -> Home:

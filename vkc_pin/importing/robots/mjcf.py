@@ -211,15 +211,26 @@ class _Converter:
         return file
 
     def _couplings(self) -> None:
-        """Write couplings of two joints as <mimic>."""
-        model, joints = self._model, {joint.get("name"): joint for joint in self._result.root.findall("joint")}
-        for k in np.flatnonzero(model.eq_type == int(self._mujoco.mjtEq.mjEQ_JOINT)):
+        """Write couplings of two joints as <mimic>: the first follows the second; if it does already, the other way round."""
+        model, joints = self._model, {joint.get("name", ""): joint for joint in self._result.root.findall("joint")}
+        leads: dict[str, str] = {}
+        for k in np.flatnonzero((model.eq_type == int(self._mujoco.mjtEq.mjEQ_JOINT)) & (model.eq_active0 > 0)):
             names = [self._name("joint", int(ids[k])) for ids in (model.eq_obj1id, model.eq_obj2id) if ids[k] >= 0]
-            if len(names) == 2 and names[0] in joints and names[1] in joints and joints[names[0]].find("mimic") is None:
-                offset, factor = model.eq_data[k, :2]
-                ElementTree.SubElement(
-                    joints[names[0]], "mimic", joint=names[1], multiplier=f"{factor:.9g}", offset=f"{offset:.9g}"
-                )
+            if len(names) < 2 or not joints.keys() >= {*names}:
+                continue
+            (joint, leader), (offset, factor) = names, (float(value) for value in model.eq_data[k, :2])
+            if model.eq_data[k, 2:5].any():
+                self._result.notes.append(f"joint {joint} follows {leader} along a curve: it is taken as a line")
+            if joint in leads and leader not in leads and factor:
+                (joint, leader), (offset, factor) = (leader, joint), (-offset / factor, 1.0 / factor)
+            last = leader
+            while last in leads:
+                last = leads[last]
+            if joint in leads or last == joint:
+                self._result.notes.append(f"joint {joint} follows {leads.get(joint, leader)}; another coupling of it is left out")
+                continue
+            leads[joint] = leader
+            ElementTree.SubElement(joints[joint], "mimic", joint=leader, multiplier=f"{factor:.9g}", offset=f"{offset:.9g}")
 
 
 def _rotation(quaternion: Floats) -> Floats:

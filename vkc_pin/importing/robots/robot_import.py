@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pinocchio as pin
 import yaml
 
@@ -20,16 +19,16 @@ from vkc_pin.errors import InputError
 from vkc_pin.files.resources import file_path
 from vkc_pin.files.urdf import UrdfFile
 from vkc_pin.files.writing import folder_at_once
-from vkc_pin.importing.robots.arms import Arm, base_kind, bodies, choose, find_arms, own_base
+from vkc_pin.importing.robots.arms import Arm, base_kind, bodies, choose, find_arms, own_base, telescopes
 from vkc_pin.importing.robots.doctor import Diagnosis, Finding, doctor
 from vkc_pin.importing.robots.envelopes import envelopes, leave_out
 from vkc_pin.importing.robots.hands import Hand, look_at
-from vkc_pin.importing.robots.homes import HOME_ROOM, Home, find_home, never_apart, standing
+from vkc_pin.importing.robots.homes import HOME_ROOM, Home, arm_at, find_home, never_apart, standing
 from vkc_pin.importing.robots.pieces import Piece, own_meshes
 from vkc_pin.importing.robots.sources import Source, read_source
 from vkc_pin.models.robot import Robot
 from vkc_pin.models.robot_file import load_robot
-from vkc_pin.models.robot_model import full_model, nearest_position
+from vkc_pin.models.robot_model import full_model
 from vkc_pin.models.self_collisions import sample_allowed_pairs, with_collision_pairs
 from vkc_pin.options import Options
 
@@ -174,6 +173,10 @@ class _Importer:
         sure = "likely" if kind != "omni" else "guess"
         self._guess(sure, f"base: {kind} ({why})", "scenes and `load_robot` choose it: `base: ...`")
         if chosen is not None:
+            for leader, *others in telescopes(full_model(self._file), chosen.joints):
+                self._settings.setdefault("couplings", {}).update(dict.fromkeys(others, leader))
+                told = f"{', '.join(others)} slide along with {leader}, as a telescope: one coordinate"
+                self._guess("likely", told, "if each has a motor of its own: remove `couplings` from robot.yaml")
             others = [other.name for other in arms if other is not chosen]
             also = f"; others: {', '.join(others)}" if others else ""
             self._guess(chosen.sure, f"arm: {chosen.name}, {chosen.why}{also}", "another one: arm=..., `--arm`" if others else "")
@@ -263,7 +266,7 @@ class _Importer:
             allowed[min(one, other), max(one, other)] = "Near"
         apart, arm = with_collision_pairs(robot, allowed), robot.coordinates.names[3:]
         states = [(name, state) for name, state in self._source.srdf.states.items() if set(arm) <= set(state)]
-        named = [(f"the state '{name}' of the file", _state(robot, state)) for name, state in states]
+        named = [(f"the state '{name}' of the file", arm_at(robot, state)) for name, state in states]
         home = find_home(apart, [*named, ("joints at 0, or in the middle", robot.home)], seed=seed)
         self._settings["home"] = {joint: round(float(value), 6) for joint, value in zip(arm, home.positions, strict=True)}
         self._write_srdf(self._folder / f"{self._name}.srdf", robot, home.positions, allowed)
@@ -290,10 +293,6 @@ class _Importer:
             what = f"{piece.mesh} in {piece.count} pieces, {100.0 * piece.overhead:.0f} % more than its volume"
             hull = f"its hull: {100.0 * piece.hull:.0f} %"
             self._findings.append(Finding("note", "shapes", f"{piece.link}: {what} ({hull}), off by {1e3 * piece.error:.0f} mm"))
-
-
-def _state(robot: Robot, state: Mapping[str, float]) -> Floats:
-    return np.array([nearest_position(robot.model, joint, state[joint]) for joint in robot.coordinates.names[3:]])
 
 
 def _free_name(name: str, taken: set[str]) -> str:

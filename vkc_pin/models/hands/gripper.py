@@ -19,8 +19,9 @@ from vkc_pin.errors import InputError
 from vkc_pin.files.documents import Document
 from vkc_pin.files.urdf import UrdfFile
 from vkc_pin.models.coordinates import Coordinates
+from vkc_pin.models.couplings.following import followers
 from vkc_pin.models.hands.bars import EXACT, Placed, bar_fits, widest_bar
-from vkc_pin.models.robot_model import mimics, unlocked_model
+from vkc_pin.models.robot_model import unlocked_model
 from vkc_pin.models.robot_schema import FingerSchema
 from vkc_pin.models.shapes import LIMIT_SLACK
 
@@ -180,16 +181,16 @@ def described_gripper(
     """
     if not stated:
         return None
-    follows, arm = mimics(file.root), full.getJointId(str(model.names[-1]))
-    palm = list(full.supports[full.frames[full.getFrameId(tool_frame)].parentJoint])
+    follows, palm = followers(file.root), list(full.supports[full.frames[full.getFrameId(tool_frame)].parentJoint])
+    arm = max(j for j in palm if full.names[j] in list(model.names))
     for joint, finger in stated.items():
         where = ("gripper", joint)
         if joint in follows:
-            problem, (master, _, _) = "this joint follows another one", follows[joint]
-            raise document.error(where, problem, expected=f"'{master}', which it follows", got=joint)
+            problem, leader = "this joint follows another one", follows[joint].leader
+            raise document.error(where, problem, expected=f"'{leader}', which it follows", got=joint)
         number = full.getJointId(joint)
         if number in palm or arm not in list(full.supports[number]):
-            expected = f"a joint of the hand, beyond '{model.names[-1]}'"
+            expected = f"a joint of the hand, beyond '{full.names[arm]}'"
             raise document.error(where, "this joint is none of a finger", expected=expected, got=joint)
         moving = full.joints[number]
         low, high = (-np.inf, np.inf)
@@ -201,15 +202,15 @@ def described_gripper(
                 raise document.error((*where, key), problem, expected=f"between {low:g} and {high:g}", got=value)
         if finger.closed == finger.open:
             raise document.error(where, "a finger that does not move", expected="two positions, closed and open", got=finger.open)
-    moved = [name for name in rest if name in stated or follows.get(name, ("",))[0] in stated]
+    moved = [name for name in rest if name in stated or (name in follows and follows[name].leader in stated)]
     names = tuple(sorted(moved, key=full.getJointId))
-    unlocked, shapes = unlocked_model(full, model, names, rest, height), pin.GeometryModel()
+    unlocked, shapes = unlocked_model(full, file, model, names, rest, height), pin.GeometryModel()
     for shape in _carried(list(collision.geometryObjects), model, unlocked):
         shapes.addGeometryObject(shape)
 
     def at(position: str) -> Floats:
         own = {joint: float(getattr(finger, position)) for joint, finger in stated.items()}
-        own |= {name: factor * own[master] + offset for name, (master, factor, offset) in follows.items() if master in own}
+        own |= {name: led.factor * own[led.leader] + led.offset for name, led in follows.items() if led.leader in own}
         return np.array([own[name] for name in names])
 
     gripper = Gripper(

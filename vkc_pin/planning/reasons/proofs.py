@@ -128,9 +128,9 @@ def _arm(problem: TrajectoryProblem, joint: int, local: Floats) -> tuple[Floats,
         return np.asarray(local), _LEEWAY
     length = float(np.linalg.norm(local)) + _LEEWAY
     length += sum(float(np.linalg.norm(model.jointPlacements[k].translation)) for k in along[1:])
-    for column, owner in enumerate(chain.coordinates.joints):
-        if owner in along and chain.coordinates.units[column] == "m":
-            length += float(max(abs(chain.lower[column]), abs(chain.upper[column]))) + _LEEWAY
+    for column, owner, factor, offset, slides in chain.coordinates.moves:
+        if owner in along and slides:
+            length += float(max(abs(factor * bound + offset) for bound in (chain.lower[column], chain.upper[column]))) + _LEEWAY
     return np.asarray(model.jointPlacements[along[0]].translation), length
 
 

@@ -1,0 +1,1 @@
+"""Joints that follow others, as in a telescope: one coordinate moves all of them."""

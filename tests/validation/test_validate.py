@@ -16,10 +16,10 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.motion.spans import PhaseSpan
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.options import Options
+from vkc_pin.plotting.clearance import clearance_curves
 from vkc_pin.scene.hold import holds_of
 from vkc_pin.scene.placed import PlacedObject
 from vkc_pin.scene.scene import Scene
-from vkc_pin.validation.clearance import clearance_curves
 from vkc_pin.validation.validate import validate
 
 WRIST = "wrist_3_joint"

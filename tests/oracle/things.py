@@ -133,6 +133,8 @@ class Robot:
     home: dict[str, float]
     exempt: set[frozenset[str]]
     gripper: dict[str, tuple[float, float]]
+    wheels: dict[str, float] | None
+    turning_radius: float
 
     @cached_property
     def moved_by(self) -> dict[str, tuple[str, ...]]:
@@ -229,7 +231,7 @@ def load_robot(item: Mapping[str, Any] | str, folder: Path, arm: list[str]) -> R
     tool = about.get("tool_frame") or own.get("tool_frame")
     if tool is None:
         raise NotJudged("no file names the robot's tool frame")
-    if about.get("base", "omni") not in ("omni", "differential", "fixed"):
+    if about.get("base", "omni") not in ("omni", "differential", "ackermann", "fixed"):
         raise NotJudged(f"base {about['base']}")
     semantics = _srdf(urdf.path, file.parent, own.get("srdf"))
     if semantics is None:
@@ -271,6 +273,8 @@ def load_robot(item: Mapping[str, Any] | str, folder: Path, arm: list[str]) -> R
         home={**_home(semantics, arm), **{joint: value for joint, value in own.get("home", {}).items() if joint in arm}},
         exempt={frozenset((pair.get("link1", ""), pair.get("link2", ""))) for pair in semantics.findall("disable_collisions")},
         gripper=gripper,
+        wheels=base.get("wheels"),
+        turning_radius=float(about.get("turning_radius") or base.get("turning_radius") or 0.0),
     )
 
 

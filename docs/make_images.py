@@ -208,6 +208,20 @@ def push_picture() -> None:
     picture(vkc.plan(scene, [vkc.Actuate("door", {"hinge": 0.0}, "push")]), "pushing", SMALL, PUSHING)
 
 
+def bases_picture() -> None:
+    """Write a picture of the door from above, opened by a robot that drives as a tank, and by one that is steered."""
+    scene, shown = vkc.load_scene("door"), ({"base": "differential"}, {"base": "ackermann", "turning_radius": 0.8})
+    with styled():
+        figure = new_figure(11.0, 3.5)
+        parts = figure.subfigures(1, 2)
+        for part, robot in zip(parts, shown, strict=True):
+            document = {**scene.document, "robot": {"name": "husky_ur5e", **robot}}
+            plan = vkc.plan(vkc.Scene.from_document(document, scene.folder), [vkc.Actuate("door", {"hinge": 1.2})])
+            sys.stdout.write(plan.report() + "\n")
+            draw_top_view(part, World(plan.scene), plan.trajectory)
+        save_figure(figure, IMAGES / "bases.png")
+
+
 def opening_picture() -> None:
     """Write a picture of fingers between two cheeks, from above: fully open, and as far as the attachment says."""
     from scipy.spatial import ConvexHull
@@ -279,6 +293,7 @@ def main() -> int:
     gap_picture(through)
     tray_picture()
     push_picture()
+    bases_picture()
     opening_picture()
     return 0
 

@@ -79,9 +79,12 @@ def test_yaml_examples_fit_their_schemas(tmp_path: Path) -> None:
     (tmp_path / "hatch.yaml").write_text(whole, encoding="utf-8")
     assert vkc.load_scene(tmp_path / "hatch.yaml").objects["hatch"].object.name == "hatch"
     assert check(Document(yaml.safe_load(described)), ObjectSchema).urdf == "door.urdf"
-    robot, telescope = blocks(ROOT / "docs/robots.md", "yaml")
+    robot, telescope, wheels = blocks(ROOT / "docs/robots.md", "yaml")
     followed = check(Document(yaml.safe_load(telescope)), RobotSchema).couplings
     assert [coupling.joint for coupling in followed.values()] == ["joint_arm_l3"] * 3
+    rolls = check(Document(yaml.safe_load(wheels)), RobotSchema).base
+    assert rolls.wheels is not None
+    assert (round(rolls.wheels.rim, 3), rolls.turning_radius) == (1.0, 1.2)
     assert check(Document(yaml.safe_load(robot)), RobotSchema).tool_frame == "tool"
 
 

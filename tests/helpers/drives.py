@@ -16,11 +16,11 @@ from vkc_pin.scene.scene import Scene
 DT = 0.25  # [s]
 
 
-def hall(*, base: str = "omni", obstacles: Sequence[Mapping[str, Any]] = ()) -> Scene:
-    """Return a hall of 12 m x 12 m with the Husky in its middle, heading along x."""
+def hall(*, base: str = "omni", obstacles: Sequence[Mapping[str, Any]] = (), **robot: Any) -> Scene:
+    """Return a hall of 12 m x 12 m with the Husky in its middle, heading along x; `robot` is said of it, too."""
     return Scene.from_document(
         {
-            "robot": {"name": "husky_ur5e", "base": base},
+            "robot": {"name": "husky_ur5e", "base": base, **robot},
             "start": {"base": [0.0, 0.0, 0.0], "arm": "home"},
             "arena": {"x": [-6.0, 6.0], "y": [-6.0, 6.0]},
             "obstacles": list(obstacles),

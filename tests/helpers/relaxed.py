@@ -32,6 +32,7 @@ class Relaxed:
     def _parameters(self, *, relaxed: bool) -> np.ndarray:
         p, f = self.problem, self.found
         given = {"weights": p.effort.weights(*p.rates(self.z)), "penalty": CLEARANCE, "dt": self.timing.dt}
+        given["gears"] = p.rolling.gears(p.waypoints(self.z))
         if not relaxed:
             vector = p.transcription.parameter_vector(p.start, *self._planes, p.target_matrix(), **given)
             return np.concatenate([vector, np.zeros(len(f.rate_excess))])

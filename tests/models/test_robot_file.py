@@ -32,6 +32,33 @@ def test_bases() -> None:
         load_robot("husky_ur5e", base="wheels")  # type: ignore[arg-type]
 
 
+def test_wheels_and_the_least_radius_of_a_turn(tmp_path: Path) -> None:
+    husky = load_robot("husky_ur5e", base="ackermann", turning_radius=0.8)
+    assert (husky.turning_radius, load_robot("husky_ur5e", base="differential").turning_radius) == (0.8, 0.0)
+    assert husky.wheels is not None
+    assert husky.wheels.rim == pytest.approx(husky.wheels.radius * husky.wheels.speed)
+    source = (FOLDER / "husky_ur5e.urdf").as_posix()
+    text = f"urdf: {source}\npackages: [airo_models]\ntool_frame: tool\nsrdf: {(FOLDER / 'husky_ur5e.srdf').as_posix()}\n"
+    file = tmp_path / "robot.yaml"
+    file.write_text(text + "base: {turning_radius: 1.2}\n")
+    assert load_robot(file, base="ackermann").turning_radius == 1.2
+    assert load_robot(file, base="ackermann", turning_radius=0.7).turning_radius == 0.7
+    assert load_robot(file, base="ackermann").wheels is None
+    file.write_text(text)
+    for given, expected in (
+        ({"base": "ackermann"}, "turning_radius"),
+        ({"base": "ackermann", "turning_radius": -1.0}, "> 0"),
+        ({"base": "differential", "turning_radius": 1.0}, "unless the base is ackermann"),
+    ):
+        with pytest.raises(InputError, match=expected) as caught:
+            load_robot(file, **given)  # type: ignore[arg-type]
+        assert caught.value.field == "turning_radius"
+    for wheels, field in (("{track: 0.5, radius: 0.1}", "speed"), ("{track: -1, radius: 0.1, speed: 3}", "track")):
+        file.write_text(text + f"base: {{wheels: {wheels}}}\n")
+        with pytest.raises(InputError, match=field):
+            load_robot(file)
+
+
 def test_locked_joints_and_another_tool_frame() -> None:
     robot = load_robot("husky_ur5e", tool_frame="wrist_2_link", locked_joints={"elbow_joint": -1.5})
     assert robot.coordinates.names[3:] == ("shoulder_pan_joint", "shoulder_lift_joint", "wrist_1_joint", "wrist_2_joint")

@@ -46,13 +46,37 @@ def check_motion(world: World) -> Iterator[Violation]:
             yield from _worst("velocity", name, np.abs(plan.curve.rates[[0, -1], k]) - 1e-6, plan.times[[0, -1]], "no rest")
         yield from _worst("velocity", name, np.abs(speed) - 1.001 * fastest - 1e-9, moments, f"limit {fastest:g}")
         yield from _worst("acceleration", name, strength - 1.001 * strongest - 1e-9, when, f"limit {strongest:g}")
-    if world.robot.base == "differential":
-        step = np.diff(plan.positions[:, :3], axis=0)
-        heading = plan.positions[:-1, 2] + step[:, 2] / 2
-        slip = np.abs(np.cos(heading) * step[:, 1] - np.sin(heading) * step[:, 0])
-        yield from _worst("slip", "base", slip - 1e-4, plan.times, "moves sideways")
+    if world.robot.base in ("differential", "ackermann"):
+        yield from _rolling(world)
     yield from _dwell(world)
     yield from check_openings(world)
+
+
+def _rolling(world: World) -> Iterator[Violation]:
+    """Wheels do not go sideways; one that is steered lies on a circle that is wide enough; none is too fast.
+
+    Along a curve that is asked of velocities [m/s], at moments inside every cubic; otherwise of steps [m], of whose arc the chord
+    points where the base heads half-way.
+    """
+    plan, robot = world.plan, world.robot
+    if plan.curve is None:
+        change, times, spans, much = np.diff(plan.positions[:, :3], axis=0), plan.times, np.diff(plan.times), 1e-4
+        heading = plan.positions[:-1, 2] + change[:, 2] / 2
+    else:
+        inside = plan.curve.inside(24)
+        number, times = np.repeat(np.arange(len(inside)), inside.shape[1]), inside.ravel()
+        change, spans, much = plan.curve.derivative(times, 1, number)[:, :3], 1.0, 1e-3
+        heading = plan.curve.derivative(times, 0, number)[:, 2]
+    seen = np.exp(-1j * heading) * (change[:, 0] + 1j * change[:, 1])  # as the base sees it
+    turn = np.abs(change[:, 2])
+    yield from _worst("slip", "base", np.abs(seen.imag) - much, times, "moves sideways")
+    if robot.base == "ackermann":
+        short = robot.turning_radius * turn - np.abs(seen.real)
+        yield from _worst("turning", "base", short - much, times, f"turns tighter than {robot.turning_radius:g} m")
+    if robot.wheels is not None:
+        track, fastest = robot.wheels["track"], robot.wheels["radius"] * robot.wheels["speed"]
+        rims = [np.abs(seen.real + side * track / 2 * turn) / spans for side in (-1, 1)]
+        yield from _worst("wheels", "base", np.max(rims, axis=0) - 1.001 * fastest, times, f"limit {fastest:g} m/s")
 
 
 def _worst(rule: str, subject: str, excess: np.ndarray, times: np.ndarray, detail: str) -> Iterator[Violation]:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.drives import hall
 
 import vkc_pin as vkc
 from oracle.__main__ import main
@@ -158,6 +159,36 @@ def test_changes_are_found(
     verdict = judge(changed(plans[name], tmp_path / "changed.npz", change))
     assert verdict.success  # by its own word, which nobody changed
     assert any(one.rule == rule and one.subject.startswith(subject) for one in verdict.found), list(map(str, verdict.found))
+
+
+@pytest.mark.parametrize("base", ["differential", "ackermann"])
+def test_bases_on_wheels(base: str, tmp_path: Path) -> None:
+    """Good plans pass; one on which the base slips, turns in place where it cannot, or whose wheels are too fast, does not."""
+    robot = {"base": base, **({"turning_radius": 0.8} if base == "ackermann" else {})}
+    plan = vkc.plan(hall(**robot), [vkc.GoTo(1.5, 0.8, 0.3)])
+    assert plan.success, plan.report()
+    path = plan.save(tmp_path / "plan.npz")
+    assert judge(path).agrees
+
+    def rules(change: Callable[[Content], None]) -> set[str]:
+        return {one.rule for one in judge(changed(path, tmp_path / "changed.npz", change)).found}
+
+    def aside(c: Content) -> None:
+        yaw, share = c["column"]("base_yaw"), np.linspace(0.0, 0.05, len(c["times"]))
+        c["column"]("base_x")[:] -= share * np.sin(yaw)
+        c["column"]("base_y")[:] += share * np.cos(yaw)
+
+    def round_in_place(c: Content) -> None:
+        for name in ("base_x", "base_y"):
+            c["column"](name)[:] = c["column"](name)[0]
+
+    def hurry(c: Content) -> None:
+        c["times"][:] *= 0.1
+
+    assert "slip" in rules(aside)
+    assert ("turning" in rules(round_in_place)) == (base == "ackermann")
+    assert "slip" not in rules(round_in_place)
+    assert "wheels" in rules(hurry)
 
 
 def test_clearance_is_measured(plans: dict[str, Path], tmp_path: Path) -> None:

@@ -137,6 +137,8 @@ class Robot:
     exempt: set[frozenset[str]]
     gripper: dict[str, tuple[float, float]]
     coupled: dict[str, tuple[str, float, float]]
+    wheels: dict[str, float] | None
+    turning_radius: float
 
     def moved(self, arm: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return where all joints are that move with the arm, of values of its planned ones."""
@@ -240,7 +242,7 @@ def load_robot(item: Mapping[str, Any] | str, folder: Path, arm: list[str]) -> R
     tool = about.get("tool_frame") or own.get("tool_frame")
     if tool is None:
         raise NotJudged("no file names the robot's tool frame")
-    if about.get("base", "omni") not in ("omni", "differential", "fixed"):
+    if about.get("base", "omni") not in ("omni", "differential", "ackermann", "fixed"):
         raise NotJudged(f"base {about['base']}")
     semantics = _srdf(urdf.path, file.parent, own.get("srdf"))
     if semantics is None:
@@ -291,6 +293,8 @@ def load_robot(item: Mapping[str, Any] | str, folder: Path, arm: list[str]) -> R
         exempt={frozenset((pair.get("link1", ""), pair.get("link2", ""))) for pair in semantics.findall("disable_collisions")},
         gripper=gripper,
         coupled=coupled,
+        wheels=base.get("wheels"),
+        turning_radius=float(about.get("turning_radius") or base.get("turning_radius") or 0.0),
     )
 
 

@@ -30,12 +30,12 @@ from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.motion.world import World
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
+from vkc_pin.plotting.clearance import clearance_curves
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.placed import standing_geometry
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step
-from vkc_pin.validation.clearance import clearance_curves
 from vkc_pin.validation.distances import Placed, Solids, travelled
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.samples import Samples

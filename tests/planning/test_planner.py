@@ -20,6 +20,7 @@ from helpers.drives import hall
 
 import vkc_pin as vkc
 from vkc_pin.files.resources import folder
+from vkc_pin.motion.rolling import rolling_of
 from vkc_pin.motion.world import World
 from vkc_pin.validation.validate import validate
 
@@ -392,6 +393,38 @@ def test_a_differential_base_does_not_slip(step: Any) -> None:
     x, y, yaw = slipping.trajectory.positions[:, :3].T
     heading = (yaw[1:] + yaw[:-1]) / 2
     assert np.abs(np.cos(heading) * np.diff(y) - np.sin(heading) * np.diff(x)).max() > 1e-3
+
+
+@pytest.mark.parametrize(
+    "step", [vkc.Reach((1.5, 1.0, 0.9, 0.0, np.pi / 2, 0.0)), vkc.GoTo(0.0, 1.0, 0.0), vkc.GoTo(-1.0, 1.0)], ids=repr
+)
+def test_a_steered_base_drives_as_a_car(step: Any) -> None:
+    plan = vkc.plan(hall(base="ackermann", turning_radius=0.8), [step])
+    confirm(plan)
+    along, aside, turn = rolling_of(plan.scene.robot).steps(plan.trajectory.positions)
+    assert np.abs(aside).max() < 1e-4
+    assert (0.8 * np.abs(turn) - np.abs(along)).max() < 1e-4
+    assert plan.metrics["base_effort"] > 0.3
+
+
+def test_wheels_make_a_motion_slow(tmp_path: Path) -> None:
+    """Wheels that go 0.2 m/s, where those of the robot as it is go faster."""
+    files = folder("robots") / "husky_ur5e"
+    text = (files / "robot.yaml").read_text(encoding="utf-8").replace("speed: 6.057", "speed: 1.2114")
+    for file in files.iterdir():
+        if file.name != "robot.yaml":
+            (tmp_path / file.name).symlink_to(file)
+    (tmp_path / "robot.yaml").write_text(text, encoding="utf-8")
+    quick = hall(base="differential")
+    slow = dataclasses.replace(quick, robot=vkc.load_robot(tmp_path, base="differential"))
+    rims = []
+    for scene in (quick, slow):
+        plan = vkc.plan(scene, [vkc.GoTo(4.0, 1.0, 1.0)])
+        confirm(plan)
+        along, _, turn = rolling_of(scene.robot).steps(plan.trajectory.positions)
+        rims.append((np.abs(along) + scene.robot.wheels.track / 2 * np.abs(turn)) / np.diff(plan.trajectory.times))
+    assert rims[0].max() > 0.3
+    assert 0.1 < rims[1].max() <= 0.2 * 1.001
 
 
 def test_a_fixed_base_stays() -> None:

@@ -384,12 +384,17 @@ def test_excess_is_how_far_rows_are_outside_their_bounds(carrying: TrajectoryPro
     dt = np.random.default_rng(1).uniform(0.1, 0.4, p.segments)
     for seed, scale in ((0, 1.0), (1, 0.1), (2, 5.0)):
         z = random_path(p, seed, scale)
-        found, lower, upper = p.excess(z, dt), *(bound[t.firm_rows :] for bound in p.row_bounds(None))
+        timing = dataclasses.replace(p.timing_for(z), dt=dt)
+        rates = seed == 0  # then the wheels have limits, too
+        bounds = p.row_bounds(timing if rates else None)
+        found, lower, upper = p.excess(z, timing, rates=rates), *(bound[t.firm_rows : t.rows] for bound in bounds)
         assert found.shape == (t.rows - t.firm_rows,)
         values = np.full(t.rows, np.nan)
         path = p.waypoints(z)
         step, heading = np.diff(path[:, :2], axis=0), (path[1:, 2] + path[:-1, 2]) / 2
-        values[t.base_rows] = np.cos(heading) * step[:, 1] - np.sin(heading) * step[:, 0]
+        along, aside = (np.exp(-1j * heading) * (step[:, 0] + 1j * step[:, 1])).view(float).reshape(-1, 2).T
+        arm, turn = p.chain.robot.wheels.track / 2, np.diff(path[:, 2])
+        values[t.base_rows] = np.column_stack([aside, along - arm * turn, along + arm * turn]).ravel()
         steps = [(column, k) for column, first, last in t.structure.clamped for k in range(first + 1, last + 1)]
         clamped = np.flatnonzero(p.row_kinds["clamped"]) + t.firm_rows
         values[clamped] = [path[k, column] - path[k - 1, column] for column, k in steps]
@@ -412,7 +417,7 @@ def test_excess_is_how_far_rows_are_outside_their_bounds(carrying: TrajectoryPro
 
 def test_what_has_only_rows_of_waypoints_has_no_excess(opened: TrajectoryProblem) -> None:
     z = random_path(opened)
-    assert opened.excess(z, opened.timing_for(z).dt).shape == (0,)
+    assert opened.excess(z, opened.timing_for(z)).shape == (0,)
     assert all(of.shape == (0,) for of in opened.row_kinds.values())
 
 
@@ -422,7 +427,7 @@ def test_every_row_of_several_waypoints_is_of_one_kind(carrying: TrajectoryProbl
     assert all(of.shape == (count,) and (of >= 0.0).all() for of in p.row_kinds.values())
     np.testing.assert_array_equal(sum((of > 0.0).astype(int) for of in p.row_kinds.values()), np.ones(count, int))
     np.testing.assert_array_equal(np.flatnonzero(p.row_kinds["rolling"]) + t.firm_rows, t.base_rows)
-    assert len(t.base_rows) == p.segments
+    assert len(t.base_rows) == 3 * p.segments, "not aside, and no faster than either wheel"
     clamped = sum(last - first for _, first, last in t.structure.clamped)
     assert np.count_nonzero(p.row_kinds["clamped"]) == clamped > 0
     np.testing.assert_array_equal(np.flatnonzero(p.row_kinds["terms"]) + t.firm_rows, p.term_numbers.rows)
@@ -438,7 +443,7 @@ def test_every_row_of_several_waypoints_is_of_one_kind(carrying: TrajectoryProbl
 def test_rows_of_several_waypoints_belong_to_the_last_of_them(carrying: TrajectoryProblem) -> None:
     p, t = carrying, carrying.transcription
     owner = np.full(t.rows, -1)
-    owner[t.base_rows] = np.arange(p.segments)
+    owner[t.base_rows] = np.repeat(np.arange(p.segments), 3)
     steps = [k for _, first, last in t.structure.clamped for k in range(first + 1, last + 1)]
     owner[np.flatnonzero(p.row_kinds["clamped"]) + t.firm_rows] = np.array(steps) - 1
     for at in t.term_rows:

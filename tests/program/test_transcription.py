@@ -36,14 +36,20 @@ def differential_scene() -> Scene:
 
 
 @cache
+def car_scene() -> Scene:
+    return dataclasses.replace(door_scene(), robot=load_robot("husky_ur5e", base="ackermann", turning_radius=0.8))
+
+
+@cache
 def problem(name: str) -> TrajectoryProblem:
     pose = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array([0.4, 0.2, 0.9]))
     if name == "reach":
         return program_of(door_scene(), [Reach(pose)], options=OPTIONS)
     if name == "door":
         return program_of(door_scene(), [Actuate("door", {"hinge": 1.2})], options=OPTIONS)
-    if name == "differential":
-        return program_of(differential_scene(), [Reach(pose), GoTo(0.0, 0.0, 1.0)], options=OPTIONS)
+    if name in ("differential", "ackermann"):
+        scene = differential_scene() if name == "differential" else car_scene()
+        return program_of(scene, [Reach(pose), GoTo(0.0, 0.0, 1.0)], options=OPTIONS)
     if name == "stick":  # chosen where to grasp, clamped from then on; a point, and an upright place
         return program_of(room(table()), [Touch("stick.tip", (0.8, 0.9, 0.7)), Place("stick", (0.8, 0.5, 0.56))], options=OPTIONS)
     if name == "fetch":  # a ball with the stick that is held at the start, then the stick itself is put away
@@ -58,7 +64,7 @@ def problem(name: str) -> TrajectoryProblem:
     return program_of(full_scene(), steps, options=OPTIONS)
 
 
-NAMES = ["reach", "door", "differential", "two grasps", "stick", "fetch", "push"]
+NAMES = ["reach", "door", "differential", "ackermann", "two grasps", "stick", "fetch", "push"]
 
 
 @dataclass
@@ -77,6 +83,7 @@ class Point:
     prices: np.ndarray  # (N,)
     weights: tuple[np.ndarray, np.ndarray]  # of squared steps (N, n), and of their squared changes
     dt: np.ndarray  # (N,)
+    gears: np.ndarray  # (N,)
 
     @property
     def x(self) -> np.ndarray:
@@ -100,6 +107,7 @@ class Point:
             away=self.away,
             excess=self.excess,
             prices=self.prices,
+            gears=self.gears,
         )
         return np.concatenate([vector, self.rate_excess]) if rates else vector
 
@@ -134,6 +142,7 @@ def random_point(p: TrajectoryProblem, seed: int = 0) -> Point:
         prices=rng.uniform(0.0, 50.0, N),
         weights=tuple(rng.uniform(0.1, 3.0, part.shape) for part in p.rates(p.still)),
         dt=rng.uniform(0.1, 0.4, N),
+        gears=np.where(np.arange(N) % 2, 1.0, -1.0),
     )
 
 
@@ -214,7 +223,7 @@ def test_the_objective_is_of_weighted_squares_of_steps_and_their_changes(name: s
 
 
 def test_there_are_rests_where_a_hand_closes_or_opens() -> None:
-    assert [len(stretches(problem(name))) for name in NAMES] == [1, 2, 1, 4, 2, 3, 2]
+    assert [len(stretches(problem(name))) for name in NAMES] == [1, 2, 1, 1, 4, 2, 3, 2]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -300,15 +309,31 @@ def test_what_is_pushed_goes_one_way() -> None:
     np.testing.assert_allclose(rows(there)[other.transcription.pushed_rows], moved, rtol=0.0, atol=1e-12)
 
 
-def test_slip_rows_are_the_sideways_motion_at_the_middle_heading() -> None:
-    p = problem("differential")
-    point = random_point(p)
-    path = p.waypoints(point.z)
-    step, heading = np.diff(path[:, :2], axis=0), (path[1:, 2] + path[:-1, 2]) / 2
-    expected = np.cos(heading) * step[:, 1] - np.sin(heading) * step[:, 0]
-    expected -= taken_away(point, list(range(1, p.segments + 1)), excess_at(point, p.transcription.base_rows))
-    np.testing.assert_allclose(rows(point)[p.transcription.base_rows], expected, rtol=0.0, atol=1e-12)
-    for name in set(NAMES) - {"differential"}:
+def test_rows_of_a_base_on_wheels() -> None:
+    """How far it goes aside of the heading at the middle; of a car what a turn leaves of the way; what the wheels go."""
+    for name in ("differential", "ackermann"):
+        p = problem(name)
+        point = random_point(p)
+        path, gears, robot = p.waypoints(point.z), point.gears, p.chain.robot
+        assert set(gears) == {-1.0, 1.0}
+        step, heading, turn = np.diff(path[:, :2], axis=0), (path[1:, 2] + path[:-1, 2]) / 2, np.diff(path[:, 2])
+        aside = np.cos(heading) * step[:, 1] - np.sin(heading) * step[:, 0]
+        along = np.cos(heading) * step[:, 0] + np.sin(heading) * step[:, 1]
+        steered = [gears * along - 0.8 * turn, gears * along + 0.8 * turn] if name == "ackermann" else []
+        wheels = [along - robot.wheels.track / 2 * turn, along + robot.wheels.track / 2 * turn]
+        expected = np.column_stack([aside, *steered, *wheels])
+        owners = np.repeat(np.arange(1, p.segments + 1), expected.shape[1]).tolist()
+        expected = expected.ravel() - taken_away(point, owners, excess_at(point, p.transcription.base_rows))
+        np.testing.assert_allclose(rows(point)[p.transcription.base_rows], expected, rtol=0.0, atol=1e-12)
+        lower, upper = (bound[p.transcription.base_rows].reshape(p.segments, -1) for bound in p.row_bounds(p.timing_for(p.still)))
+        assert not lower[:, 0].any()
+        assert not upper[:, 0].any()
+        np.testing.assert_allclose(upper[:, -2:], 1.0 * OPTIONS.dt, rtol=1e-4)
+        np.testing.assert_array_equal(lower[:, -2:], -upper[:, -2:])
+        np.testing.assert_array_equal(lower[:, 1:-2], 0.0)
+        assert np.isinf(upper[:, 1:-2]).all()
+        assert np.isinf(p.row_bounds(None)[1][p.transcription.base_rows].reshape(p.segments, -1)[:, -2:]).all()
+    for name in set(NAMES) - {"differential", "ackermann"}:
         assert problem(name).transcription.base_rows.size == 0
 
 
@@ -437,7 +462,8 @@ def test_wherever_it_is_set_up_it_is_feasible_there_with_shares_of_one(name: str
             missing[kind] = max(missing.get(kind, 0.0), amount)
     there = {kind for kind, amount in missing.items() if amount > 0.1}
     expected = {"poses", "clearance", "rates"}
-    expected |= {"differential": {"rolling"}, "stick": {"clamped"}, "fetch": {"clamped"}, "push": {"clamped"}}.get(name, set())
+    expected |= {"rolling"} if name in ("differential", "ackermann") else set()
+    expected |= {"clamped"} if name in ("stick", "fetch", "push") else set()
     assert there == expected, "a test in which nothing is missing says nothing"
 
 

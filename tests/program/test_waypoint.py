@@ -16,6 +16,7 @@ from helpers.telescopes import coupled_scene
 from vkc_pin.cache import Cache
 from vkc_pin.chain.chain import VirtualKinematicChain, consolidate
 from vkc_pin.chain.pose import AWAY, PoseRow, target_vector
+from vkc_pin.motion.rolling import Rolling
 from vkc_pin.options import Options
 from vkc_pin.program.waypoint import Structure, WaypointFunctions, waypoint_functions
 from vkc_pin.task.compiler import compile_task
@@ -165,7 +166,9 @@ def test_programs_are_shared_by_structures_that_are_equal(chain: VirtualKinemati
         {"slots": 2},
         {"poses": some_poses(chain)[:2]},
         {"stops": (2,)},
-        {"differential": True},
+        {"rolling": Rolling()},
+        {"rolling": Rolling(radius=0.8)},
+        {"rolling": Rolling(track=0.5, rim=1.0)},
         {"clamped": ((3, 1, 4),)},
         {"pushed": ((3, 1, 4, 1),)},
         {"pushed": ((3, 1, 4, -1),)},

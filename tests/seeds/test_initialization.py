@@ -54,6 +54,24 @@ def test_interpolated_seeds_hold_the_handle(seed: int) -> None:
         assert problem().pose_error(z) < 1e-3
 
 
+@pytest.mark.parametrize("method", ["interpolated", "astar"])
+@pytest.mark.parametrize("robot", [{"base": "differential"}, {"base": "ackermann", "turning_radius": 0.8}], ids=["tank", "car"])
+@pytest.mark.parametrize(("name", "goal"), [("door", {"hinge": 1.2}), ("drawer", {"slide": 0.35})])
+def test_seeds_of_bases_on_wheels_can_be_driven(name: str, goal: dict[str, float], robot: dict[str, Any], method: str) -> None:
+    """They roll, turn no tighter than they can, and hold what they hold."""
+    scene = vkc.load_scene(name)
+    document, rng = {**scene.document, "robot": {"name": "husky_ur5e", **robot}}, np.random.default_rng(5)
+    scene = vkc.Scene.from_document(document, scene.folder)
+    for _ in range(2):
+        p = program_of(scene.sample_start(rng), [vkc.Actuate(name, goal)], options=vkc.Options())
+        seed = next(initialize(p, method, 0))
+        along, aside, turn = p.rolling.steps(p.waypoints(seed.z))
+        np.testing.assert_allclose(aside, 0.0, atol=1e-4)
+        assert (np.abs(along) >= robot.get("turning_radius", 0.0) * np.abs(turn) - 1e-4).all()
+        assert np.abs(along).sum() > 0.5
+        assert p.pose_error(seed.z) < 1e-2
+
+
 def test_a_seed_opens_the_door() -> None:
     (z,) = seeds()
     hinge, knob = (z[:, problem().chain.index(name)] for name in ("door.hinge", "door.knob"))

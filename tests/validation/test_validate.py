@@ -16,10 +16,10 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.motion.spans import PhaseSpan
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.options import Options
+from vkc_pin.plotting.clearance import clearance_curves
 from vkc_pin.scene.hold import holds_of
 from vkc_pin.scene.placed import PlacedObject
 from vkc_pin.scene.scene import Scene
-from vkc_pin.validation.clearance import clearance_curves
 from vkc_pin.validation.validate import validate
 
 WRIST = "wrist_3_joint"
@@ -171,21 +171,6 @@ def test_an_object_has_limits_and_rates_too(door_plan: vkc.Plan) -> None:
     found = only(check(door_plan, scene=scene))
     assert (found.constraint, found.subject, found.unit) == ("velocity", "door.hinge", "rad/s")
     assert found.amount == pytest.approx(0.5 * fastest)
-
-
-def test_a_differential_base_does_not_slip() -> None:
-    scene = hall(base="differential")
-    ahead = through(scene, scene.start, moved(scene.start, x=2.0), moved(scene.start, x=2.0, yaw=1.0))
-    assert validate(scene, [vkc.GoTo(2.0, 0.0, 1.0)], ahead).ok
-    heading = np.linspace(0.0, 1.5, 41)
-    curve = np.tile(scene.start, (41, 1))  # a circle of 1 m to the left, the chords at the headings in the middle of each step
-    curve[:, 0], curve[:, 1], curve[:, 2] = np.sin(heading), 1.0 - np.cos(heading), heading
-    assert "slip" not in {v.constraint for v in validate(scene, [vkc.GoTo(1.0, 1.0)], of_rows(scene, curve)).violations}
-    sideways = through(scene, scene.start, moved(scene.start, x=2.0, y=0.1))
-    found = only(validate(scene, [vkc.GoTo(2.0, 0.1, 0.0)], sideways))
-    assert (found.constraint, found.subject, found.unit) == ("slip", "base", "m")
-    assert found.amount == pytest.approx(np.diff(sideways.positions[:, 1]).max())
-    assert validate(hall(), [vkc.GoTo(2.0, 0.1, 0.0)], sideways).ok
 
 
 # --- closure, latch, what nobody holds ----------------------------------------------------------------------------

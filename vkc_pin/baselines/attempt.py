@@ -207,11 +207,11 @@ class Attempt:
                 continue
             began = time.perf_counter()
             followed = follow(problem, base, self.rng, refine=self.refine)
-            rates = problem.rates(followed.z)
-            timing = problem.timing_for(followed.z).stretched(*rates)
+            pace = problem.pace(followed.z)
+            timing = problem.timing_for(followed.z).stretched(*pace)
             self.times["following"] += time.perf_counter() - began
             cause = followed.cause
-            if not cause and timing.violation(*rates) > TOLERANCE:
+            if not cause and timing.violation(*pace) > TOLERANCE:
                 cause = "too fast"
             if not cause and problem.drift(followed.z) > 1.0:
                 cause = "closure"

@@ -64,6 +64,13 @@ def add_bench(commands: Any) -> None:
     numbers = "how many (default: 10 30 100 300 1000 obstacles, 20 40 80 160 320 segments)"
     scale.add_argument("--counts", nargs="+", type=positive, metavar="N", help=numbers)
 
+    about = "Open a door and a drawer with every kind of base that drives, from the same random starts."
+    shown = "a door and a drawer with every kind of base that drives"
+    bases = _add_experiment(benches, "bases", shown, about, jobs=1, what="random starts for each task and base")
+    bases.set_defaults(benchmark="driving.bases")
+    _add_choice(bases, "tasks", "door drawer (default: both)")
+    _add_choice(bases, "bases", "omni differential ackermann (default: all)")
+
     about = "Plan to drive through a gap of 0.85 m and to reach over a table beyond it, from random starts of base and arm."
     _add_experiment(benches, "gap", "reach over a table beyond a gap of 0.85 m", about, jobs=1)
 

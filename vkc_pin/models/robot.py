@@ -22,6 +22,7 @@ from vkc_pin.models.coordinates import Coordinates
 from vkc_pin.models.grafting import clean
 from vkc_pin.models.hands.gripper import Gripper
 from vkc_pin.models.robot_model import visual_geometry
+from vkc_pin.models.robot_schema import Wheels
 from vkc_pin.models.shapes import link_name, shape_distance, triangles
 
 __all__ = ["Base", "Robot"]
@@ -31,7 +32,7 @@ _AHEAD = 10.0  # [m] further than any hand reaches
 _POSTURES = 200  # random ones over which the lever is averaged
 _TIGHT_SHARE = 0.5  # margin of links that are always close, as a share of what they can have
 
-Base = Literal["omni", "differential", "fixed"]
+Base = Literal["omni", "differential", "ackermann", "fixed"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -50,10 +51,13 @@ class Robot:
         velocity, acceleration: Limits, shape (n,).
         home: Where the arm rests, shape (n − 3,).
         tool_frame: The frame of `model` that grasps: z is the approach direction, x the one in which fingers close.
-        base: How the base moves: "omni" in any direction, "differential" forwards and round, "fixed" not at all.
+        base: How the base moves: "omni" in any direction, "differential" along its x axis and round, "ackermann" along its x axis
+            and in turns no tighter than `turning_radius`, "fixed" not at all.
         touch_links: The links that may touch what is grasped.
         height: Of its root link above the floor [m].
         gripper: How its fingers open, if its description says so; otherwise they stand still.
+        wheels: The wheels of its base, if its description says; they limit bases that are "differential" or "ackermann".
+        turning_radius: The least radius on which the base's origin turns if it is "ackermann" [m].
         tight: Pairs of links, each sorted, that are never, or not at home, 50 mm apart: how far they are at most, or there [m].
     """
 
@@ -72,6 +76,8 @@ class Robot:
     touch_links: tuple[str, ...] = ()
     height: float = 0.0
     gripper: Gripper | None = field(default=None, repr=False)
+    wheels: Wheels | None = None
+    turning_radius: float = 0.0
     tight: Mapping[tuple[str, str], float] = field(default_factory=dict, repr=False)
     file: UrdfFile = field(repr=False)
     _opened: dict[float, Robot] = field(default_factory=dict, repr=False)

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import pinocchio as pin
@@ -32,13 +32,13 @@ from vkc_pin.models.robot_model import (
     planned_model,
     rest_positions,
 )
-from vkc_pin.models.robot_schema import RobotSchema, python_packages, read_robot
+from vkc_pin.models.robot_schema import RobotSchema, python_packages, read_robot, wheels_of
 from vkc_pin.models.self_collisions import surveyed, with_collision_pairs
 from vkc_pin.models.shapes import LIMIT_SLACK
 
 __all__ = ["find_robot", "known_robots", "load_robot"]
 
-_BASES = ("omni", "differential", "fixed")
+_BASES = get_args(Base)
 _PAIRS = ("srdf", "sampled", "all")
 _SAMPLES = 1000  # to find allowed pairs when a robot without an SRDF is loaded
 # Names under which example-robot-data loads URDF files called otherwise.
@@ -94,6 +94,7 @@ def load_robot(
     pairs: Literal["srdf", "sampled", "all"] = "srdf",
     packages: Mapping[str, str | Path] | None = None,
     height: float | None = None,
+    turning_radius: float | None = None,
 ) -> Robot:
     """Load a robot and put it on a planar virtual base.
 
@@ -113,7 +114,7 @@ def load_robot(
 
     Args:
         name: A robot in robots/, one of example-robot-data ("panda", "tiago", "ur5"), or the path of a URDF.
-        base: "omni", "differential" (the planner keeps it from moving sideways) or "fixed" (its limits are 0).
+        base: "omni", "differential" (not sideways), "ackermann" (nor tighter than `turning_radius`) or "fixed" (limits of 0).
         tool_frame: The frame that grasps; by default that of robot.yaml, else the last frame of the longest chain.
         arm: A group of the SRDF, instead of `tool_frame`: the link at its end grasps.
         locked_joints: More joints to lock, and where, [m] or [rad]; joints locked anyway rest at 0 or the nearest limit.
@@ -125,6 +126,7 @@ def load_robot(
             of links that move against each other a collision pair, even adjacent ones, to look at the geometry itself.
         packages: Folders for `package://` addresses; others are looked for around the file.
         height: Of the root link above the floor [m]; by default what robot.yaml says, else 0.
+        turning_radius: Of an "ackermann" base, the least radius on which its root link turns [m]; by default robot.yaml's.
 
     Raises:
         UnknownNameError: There is no such robot, frame, joint or link; the error names the nearest one.
@@ -143,12 +145,10 @@ def load_robot(
         named = mapping({} if values is None else values, field, "joints, each with its position")
         positions[field] = {joint: quantity(value, f"{field}.{joint}") for joint, value in named.items()}
     home, locked_joints = positions["home"], positions["locked_joints"]
-    raised = None if height is None else quantity(height, "height")
     files = _read(name, mapping({} if packages is None else packages, "packages", "packages, each with its folder"))
     urdf, settings = files.urdf, files.settings
     beside = file_path(srdf, "srdf") if srdf is not None else files.srdf()
     semantics = read_srdf(beside, links=urdf.links) if beside is not None and pairs == "srdf" else None
-
     full = full_model(urdf)
     tool = tool_frame if tool_frame is not None else files.tool_frame(arm, beside) or default_tool_frame(full, urdf)
     if tool not in (frames := dict.fromkeys(frame.name for frame in full.frames)):
@@ -170,7 +170,7 @@ def load_robot(
     if unsaid := ", ".join(joint for joint in replaced if joint not in said):
         problem = "the virtual base moves the robot; joints of its own that do are locked"
         warnings.warn(f"{urdf.path}: {problem}: {unsaid}", stacklevel=2)
-    raised, rest = settings.base.height if raised is None else raised, {**rest, **locked}
+    raised, rest = settings.base.height if height is None else quantity(height, "height"), {**rest, **locked}
     model = planned_model(full, urdf, tool, rest, locked, height=raised)
     coordinates, lower, upper, velocity, acceleration = robot_limits(full, model, settings, base)
     files.check_followers(model, rest, given)
@@ -191,6 +191,7 @@ def load_robot(
         base=base,
         touch_links=settings.touch_links,
         height=raised,
+        **wheels_of(base, turning_radius, settings, files.source),
         gripper=described_gripper(full, urdf, model, collision, tool, rest, settings.gripper, files.document, height=raised),
         file=urdf,
     )

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import importlib.util
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import Field
 
+from vkc_pin.arguments import quantity
 from vkc_pin.errors import InputError
 from vkc_pin.files.documents import Document, check, read_yaml
 from vkc_pin.files.fields import JointSchema, Number, Positive, Schema, require, text_for
 
-__all__ = ["BaseSchema", "CouplingSchema", "FingerSchema", "RobotSchema", "python_packages", "read_robot"]
+__all__ = ["BaseSchema", "CouplingSchema", "FingerSchema", "RobotSchema", "Wheels", "python_packages", "read_robot", "wheels_of"]
 
 
 Limits = Annotated[
@@ -20,13 +21,37 @@ Limits = Annotated[
 ]
 
 
+class Wheels(Schema):
+    """The driven wheels of a base, half of them left, half right.
+
+    Attributes:
+        track: How far left is from right, as far as turning is concerned [m]: where wheels skid in turns, more than it measures.
+        radius: Of a wheel [m].
+        speed: How fast one turns at most [rad/s].
+    """
+
+    track: Positive
+    radius: Positive
+    speed: Positive
+
+    @property
+    def rim(self) -> float:
+        """How fast a wheel goes over the floor at most [m/s]."""
+        return self.radius * self.speed
+
+
 class BaseSchema(Schema):
-    """The planar base: x and y in [m], yaw in [rad]; velocities and accelerations per x, y, yaw; height of the root link [m]."""
+    """The planar base: x and y in [m], yaw in [rad]; velocities and accelerations per x, y, yaw; height of the root link [m].
+
+    Of wheels, and of the least radius of a turn [m], nothing is assumed.
+    """
 
     position: tuple[Limits, Limits] = ((-20.0, 20.0), (-20.0, 20.0))
     velocity: tuple[Positive, Positive, Positive] = (1.0, 1.0, 2.0)
     acceleration: tuple[Positive, Positive, Positive] = (3.0, 3.0, 6.0)
     height: Number = 0.0
+    wheels: Wheels | None = None
+    turning_radius: Positive | None = None
 
 
 class FingerSchema(Schema):
@@ -74,6 +99,33 @@ def read_robot(file: Path) -> tuple[RobotSchema, Document]:
     if settings.arm is not None and settings.tool_frame is not None:
         raise document.error(("arm",), "tool_frame says what grasps, too", expected="one of them", got=settings.arm)
     return settings, document
+
+
+def wheels_of(base: str, least: float | None, settings: RobotSchema, source: Path) -> dict[str, Any]:
+    """Return the fields of a `Robot` that its wheels are about.
+
+    Args:
+        base: How it moves.
+        least: The least radius of a turn [m]; None: what robot.yaml says. Only "ackermann" has one.
+        settings: What robot.yaml says.
+        source: Where that is.
+
+    Raises:
+        InputError: The radius is none, the base has none, or it needs one and nobody says.
+    """
+    wheels = settings.base.wheels
+    if base != "ackermann":
+        if least is not None:
+            expected = "none, unless the base is ackermann"
+            raise InputError(f"a base that is {base} has no turning radius", field="turning_radius", expected=expected, got=least)
+        return {"wheels": wheels}
+    radius = settings.base.turning_radius if least is None else quantity(least, "turning_radius")
+    if radius is None:
+        expected = "turning_radius [m], beside the base, or under `base` in its robot.yaml"
+        raise InputError("nothing says how tightly it turns", file=source, field="turning_radius", expected=expected, got="none")
+    if radius <= 0.0:
+        raise InputError("out of range", field="turning_radius", expected="a number > 0 [m]", got=radius)
+    return {"wheels": wheels, "turning_radius": radius}
 
 
 def python_packages(names: tuple[str, ...], document: Document) -> dict[str, Path]:

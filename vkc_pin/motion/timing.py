@@ -46,13 +46,21 @@ class Timing:
         of_rows = np.concatenate([np.full(last - first + 1, self.dt[first]) for first, last in self.runs])
         return np.asarray(self.limits[1] * of_rows[:, None] ** 2)
 
-    def violation(self, first: Floats, second: Floats) -> float:
-        """Return the largest excess of steps and their differences over their bounds, relative to these; see `rates`."""
-        return float(max(np.max(np.abs(first) / self.velocity), np.max(np.abs(second) / self.acceleration)) - 1.0)
+    def violation(self, first: Floats, second: Floats, needed: Floats | float = 0.0) -> float:
+        """Return the largest excess of steps and their differences over their bounds, relative to these; see `pace`.
 
-    def stretched(self, first: Floats, second: Floats) -> Timing:
-        """Return a timing that gives runs up to `_PATIENCE` times the least time where steps or differences exceed a bound."""
-        fast, strong = np.max(np.abs(first) / self.velocity, axis=1), np.max(np.abs(second) / self.acceleration, axis=1)
+        Args:
+            first: Steps δz, shape (N, n).
+            second: Their differences, shape (N + 1 + stops, n).
+            needed: How long each step takes at least for other reasons, shape (N,) [s].
+        """
+        fast, strong = np.max(np.abs(first) / self.velocity), np.max(np.abs(second) / self.acceleration)
+        return float(max(fast, strong, np.max(needed / self.dt)) - 1.0)
+
+    def stretched(self, first: Floats, second: Floats, needed: Floats | float = 0.0) -> Timing:
+        """Return a timing that gives runs up to `_PATIENCE` times the least time where a bound is exceeded; see `violation`."""
+        fast = np.maximum(np.max(np.abs(first) / self.velocity, axis=1), needed / self.dt)
+        strong = np.max(np.abs(second) / self.acceleration, axis=1)
         dt = self.dt.copy()
         for number, (begin, end) in enumerate(self.runs):
             excess = max(float(fast[begin:end].max()), float(np.sqrt(strong[begin + number : end + number + 1].max())))
@@ -65,7 +73,7 @@ def runs_between(stops: Sequence[int], segments: int) -> Runs:
     return tuple(itertools.pairwise([0, *stops, segments]))
 
 
-def time_for(path: Floats, dt: float, runs: Runs, limits: tuple[Floats, Floats]) -> Floats:
+def time_for(path: Floats, dt: float, runs: Runs, limits: tuple[Floats, Floats], least: Floats | None = None) -> Floats:
     """Return the time of every step, shape (N,) [s]: `dt`, or more in runs where z_0..z_N, shape (N + 1, n), is too long for it.
 
     The measure is the profile 3s² − 2s³ over the distance that each coordinate moves between two stops: its speed is at most 1.5
@@ -76,12 +84,14 @@ def time_for(path: Floats, dt: float, runs: Runs, limits: tuple[Floats, Floats])
         dt: The shortest time of a step [s].
         runs: See `runs_between`.
         limits: Of velocity and acceleration (eq. 5), shape (n,) each, SI units.
+        least: How long each step takes at least for other reasons, shape (N,) [s].
     """
     velocity, acceleration = limits
     steps = np.abs(np.diff(path, axis=0))
-    times = np.full(len(steps), dt)
+    times, least = np.full(len(steps), dt), np.zeros(len(steps)) if least is None else least
     for first, last in runs:
         distance = steps[first:last].sum(axis=0)
-        needed = max(np.max(1.5 * distance / velocity), np.sqrt(np.max(6.0 * distance / acceleration)))
+        fastest, strongest = np.max(1.5 * distance / velocity), np.sqrt(np.max(6.0 * distance / acceleration))
+        needed = max(fastest, strongest, 1.5 * least[first:last].sum())
         times[first:last] = np.maximum(times[first:last], _SLACK * needed / (last - first))
     return times

@@ -13,9 +13,9 @@ import numpy as np
 from vkc_pin.errors import InputError
 from vkc_pin.files.resources import file_path
 from vkc_pin.motion.world import World
+from vkc_pin.plotting.clearance import clearance_curves
 from vkc_pin.plotting.style import COLOURS, new_figure, save_figure, shade_phases, styled
 from vkc_pin.plotting.top_view import draw_top_view
-from vkc_pin.validation.clearance import clearance_curves
 from vkc_pin.validation.report import Judged
 
 if TYPE_CHECKING:

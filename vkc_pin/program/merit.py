@@ -77,7 +77,7 @@ def infeasibility(problem: TrajectoryProblem, z: Floats, timing: Timing, contact
             at = np.array(goal.row.waypoints) - 1
             away[at, k] = away_from(goal.row.kind, *goal.row.placed(rotations[at], translations[at]), goal.target)
     amounts["poses"] = np.linalg.norm(away[:, :, :3], axis=2).sum(axis=1) + away[:, :, 6].sum(axis=1)
-    excess = problem.excess(z, timing.dt)
+    excess = problem.excess(z, timing, rates=rates)
     for kind, scale in problem.row_kinds.items():
         np.add.at(amounts[kind], t.owners, scale * np.abs(excess))
     rate_excess = np.zeros(0)

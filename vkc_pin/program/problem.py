@@ -15,6 +15,7 @@ from vkc_pin.chain.contacts import ContactModel, Contacts
 from vkc_pin.chain.pose import ROW_BOUNDS, target_vector
 from vkc_pin.models.coordinates import wrapped
 from vkc_pin.motion.effort import Effort
+from vkc_pin.motion.rolling import rolling_of
 from vkc_pin.motion.timing import Timing, runs_between, time_for
 from vkc_pin.options import Options
 from vkc_pin.program.pose_goals import approach_at, chosen_freedoms, pose_goals, pushed_steps
@@ -38,6 +39,7 @@ class TrajectoryProblem:
     Attributes:
         scene, task, options: What it was made of.
         chain: The virtual kinematic chain, n coordinates.
+        rolling: How its base may move.
         contacts: What can collide with what.
         transcription: The symbolic program, shared between problems of one structure.
         effort: What the way costs.
@@ -56,6 +58,7 @@ class TrajectoryProblem:
     ) -> None:
         self.scene, self.task, self.options, self.cache = scene, task, options, cache or Cache()
         self.chain: VirtualKinematicChain = consolidate(scene, task.holds, rides=task.rides, cache=self.cache)
+        self.rolling = rolling_of(self.chain.robot)
         self.contacts = ContactModel(scene, self.chain, task, options)
         self.ends = np.cumsum([phase.segments for phase in task.phases])
         self.pose_goals = pose_goals(scene, self.chain, task, options)
@@ -103,7 +106,7 @@ class TrajectoryProblem:
             poses=tuple(goal.row for goal in self.pose_goals),
             slots=o.contact_slots,
             stops=stops,
-            differential=self.chain.robot.base == "differential",
+            rolling=self.rolling,
             clamped=clamped,
             pushed=pushed_steps(self.chain, self.task),
             terms=terms,
@@ -169,7 +172,8 @@ class TrajectoryProblem:
         """Return how long steps take where z_1..z_N, shape (N, n), is the seed; see `time_for`. Terms may ask for more time."""
         structure, limits = self.transcription.structure, (self.chain.velocity, self.chain.acceleration)
         runs = runs_between(structure.stops, self.segments)
-        dt = time_for(self.waypoints(z), self.options.dt, runs, limits)
+        path = self.waypoints(z)
+        dt = time_for(path, self.options.dt, runs, limits, self.rolling.times(path))
         if structure.timed:
             dt = self.term_numbers.slower(z, dt, runs)
         return Timing(dt, dt, runs, limits)
@@ -210,6 +214,10 @@ class TrajectoryProblem:
         first = t.first @ z + np.outer(t.start_first, self.start)
         return first, t.second @ z + np.outer(t.start_second, self.start)
 
+    def pace(self, z: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return `rates`, and how long steps take the wheels of the base at least, shape (N,) [s]; see `Timing.violation`."""
+        return *self.rates(z), self.rolling.times(self.waypoints(z))
+
     def objective(self, z: Floats, dt: Floats) -> float:
         """Return what the way and the user's own terms cost at z_1..z_N, shape (N, n), in steps that take dt, shape (N,) [s]."""
         return self.effort.value(*self.rates(z)) + self.term_numbers.cost(z, dt)
@@ -221,19 +229,19 @@ class TrajectoryProblem:
             if goal.row.waypoints:
                 residual, _ = solver.evaluate(z[np.array(goal.row.waypoints) - 1], goal.target)
                 errors.append(float(np.abs(residual).max()))
-        return max(*errors, self.slip(z))
+        return max(*errors, self.rolling.error(self.waypoints(z)))
 
     def row_error(self, z: Floats, dt: Floats) -> float:
         """Return `pose_error`, or how much the user's own constraints are violated if that is more; see `TermNumbers.error`."""
         return max(self.pose_error(z), self.term_numbers.error(z, dt))
 
-    def excess(self, z: Floats, dt: Floats) -> Floats:
+    def excess(self, z: Floats, timing: Timing, *, rates: bool = False) -> Floats:
         """Return by how much rolling, clamping and own constraints are out of their bounds, with a sign; see `Transcription`."""
         t = self.transcription
         if t.rows == t.firm_rows:
             return np.zeros(0)
-        values = np.asarray(t.other_values(t.pack(z), self.start, dt)).ravel()
-        lower, upper = (bound[t.firm_rows :] for bound in self.row_bounds(None))
+        values = np.asarray(t.other_values(t.pack(z), self.start, timing.dt, self.rolling.gears(self.waypoints(z)))).ravel()
+        lower, upper = (bound[t.firm_rows : t.rows] for bound in self.row_bounds(timing if rates else None))
         return np.asarray(values - np.clip(values, lower, upper))
 
     @cached_property
@@ -245,15 +253,6 @@ class TrajectoryProblem:
         terms[self.term_numbers.rows] = self.term_numbers.scale
         clamped = np.where((rolling == 0.0) & (terms == 0.0), 1.0, 0.0)
         return {kind: own[t.firm_rows :] for kind, own in (("rolling", rolling), ("clamped", clamped), ("terms", terms))}
-
-    def slip(self, z: Floats) -> float:
-        """Return how far a differential base slips sideways in the worst step of z_1..z_N, shape (N, n) [m]; 0 for others."""
-        if not self.transcription.structure.differential:
-            return 0.0
-        path = self.waypoints(z)[:, :3]
-        step = np.diff(path, axis=0)
-        heading = path[:-1, 2] + step[:, 2] / 2
-        return float(np.abs(np.cos(heading) * step[:, 1] - np.sin(heading) * step[:, 0]).max())
 
     def drift(self, z: Floats) -> float:
         """Return how far grasps drift half-way between waypoints at most, relative to what `Options` allow."""
@@ -277,6 +276,8 @@ class TrajectoryProblem:
             for rows in at.values():
                 lower[rows], upper[rows] = ROW_BOUNDS[pose.kind]
         lower[terms.rows], upper[terms.rows] = terms.lower, terms.upper
+        if not self.rolling.aside:
+            lower[t.base_rows], upper[t.base_rows] = t.steps.bounds(None if timing is None else timing.dt)
         if timing is not None:
             rates = np.concatenate([timing.velocity.ravel(), timing.acceleration.ravel()])
             lower, upper = np.concatenate([lower, -rates]), np.concatenate([upper, rates])

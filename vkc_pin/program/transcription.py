@@ -23,10 +23,11 @@ from vkc_pin.chain.pose import AWAY
 from vkc_pin.cpin.machine_code import MachineCode
 from vkc_pin.models.coordinates import Coordinates
 from vkc_pin.motion.effort import changed_at
+from vkc_pin.motion.rolling import Rolling
 from vkc_pin.program.ipopt import ENTRY, Ipopt, ipopt
 from vkc_pin.program.sparse import assemble, curvature, differences, sparse
 from vkc_pin.program.term_rows import TermProgram
-from vkc_pin.program.waypoint import Structure, waypoint_functions
+from vkc_pin.program.waypoint import StepRows, Structure, waypoint_functions
 
 __all__ = ["Transcription", "transcribe"]
 
@@ -41,13 +42,13 @@ class Transcription:
         rows: Number of constraint rows without the rate rows.
         slot_rows: Rows of the witness planes, shape (N, K).
         pose_rows: For each pose, waypoint → its rows; see `pose.pose_rows`.
-        base_rows: Rows that keep a differential base from slipping, shape (N,); empty for others.
+        base_rows: Rows that let a base on wheels roll, see `StepRows`, shape (N·rows of a step,); empty for others.
         term_rows: For each of the user's own constraints, waypoint → its rows; costs have none. They are the last rows.
         term_values: x, z_0 and times of all steps → values of these rows, their Jacobian, and the sum and slope of the costs.
         pose_solvers: Inverse kinematics of each pose.
         firm_rows: Where the rows begin that are not of one waypoint's functions: of rolling, clamping and own constraints.
         owners, rate_owners: The waypoints, counted from 0, whose shares lengthen the bounds of these and of the rate rows.
-        other_values: x, z_0 and times of all steps → their values.
+        other_values: x, z_0, times and gears of all steps → their values.
         interpreted: Functions of waypoints that were not yet machine code when it was built.
         rate_matrix, rate_start: Velocities and accelerations per step are rate_matrix·x + rate_start·z_0.
     """
@@ -77,7 +78,7 @@ class Transcription:
         self.z, self.start, self.dt = self.own[:n, :], ca.MX.sym("z0", n), ca.MX.sym("dt", N)
         self.planes, self.offsets = ca.MX.sym("C", K * 12 * joints, N), ca.MX.sym("R", K, N)
         self.targets, self.away = ca.MX.sym("W", 12, poses), ca.MX.sym("D", AWAY * poses, N)
-        self.penalty, self.prices = ca.MX.sym("rho"), ca.MX.sym("p", N)
+        self.penalty, self.prices, self.gears = ca.MX.sym("rho"), ca.MX.sym("p", N), ca.MX.sym("gear", N)
 
     def parameter_vector(
         self,
@@ -92,6 +93,7 @@ class Transcription:
         away: Floats | None = None,
         excess: Floats | None = None,
         prices: Floats | None = None,
+        gears: Floats | None = None,
     ) -> Floats:
         """Return the parameters. The times of the steps only count where a term needs them.
 
@@ -106,6 +108,7 @@ class Transcription:
             away: How far frames are from these at the iterate, shape (N, poses, 7), see `pose.away_from`; None: not at all.
             excess: By how much other rows are out of their bounds there, shape (rows after those of poses,); None: not at all.
             prices: What all of that costs at a waypoint, shape (N,).
+            gears: Of the steps of a base on wheels, shape (N,); None: ahead.
         """
         columns = planes.transpose(0, 2, 1).ravel()  # the K × 12J matrix of a waypoint, column by column
         padded = targets.ravel() if len(targets) else np.zeros(12)
@@ -113,8 +116,9 @@ class Transcription:
         excess = np.zeros(self.excess.numel()) if excess is None else excess
         prices = np.zeros(self.segments) if prices is None else prices
         times = dt if self.structure.timed and dt is not None else np.zeros(0)
+        gears = np.zeros(0) if self.structure.rolling.aside else np.ones(self.segments) if gears is None else gears
         before = (start, columns, offsets.ravel(), padded, *(part.T.ravel() for part in weights))
-        return np.concatenate([*before, [penalty], away, prices, excess, times])
+        return np.concatenate([*before, [penalty], away, prices, excess, gears, times])
 
     def pack(self, z: Floats, slack: Floats | float = 0.0, shares: Floats | float = 0.0) -> Floats:
         """Return x of waypoints, shape (N, n), their slacks, shape (N, K), and their shares, shape (N,); or the same for all."""
@@ -183,8 +187,8 @@ class Transcription:
         self.base_rows = np.zeros(0, int)
         self.firm_rows = self.rows  # those after it are not of one waypoint's functions
         self.owners, self.others = np.zeros(0, int), ca.MX(0, 1)
-        if self.structure.differential:
-            self._differential()
+        if not self.structure.rolling.aside:
+            self._roll(self.structure.rolling)
         self._clamp()
         self.term_rows: list[dict[int, Ints]] = []
         if self.structure.terms:
@@ -201,16 +205,12 @@ class Transcription:
         self.multipliers = multipliers
         return multipliers[rows:]
 
-    def _differential(self) -> None:
-        """Append −sin θ̄·δx + cos θ̄·δy at every segment's mid-heading: the base rolls, it does not slip."""
-        z = ca.horzcat(self.start, self.z)
-        heading, step = (z[2, 1:] + z[2, :-1]) / 2, z[:2, 1:] - z[:2, :-1]
-        slip = (-ca.sin(heading) * step[0, :] + ca.cos(heading) * step[1, :]).T
-        self.base_rows = self.rows + np.arange(self.segments)
-        multipliers = self._append(slip, ca.jacobian(slip, self.x), np.arange(self.segments))
-        extra = ca.MX.sym("lam_slip", self.segments)
-        (curvature,) = ca.substitute([ca.triu(ca.hessian(ca.dot(extra, slip), self.x)[0])], [extra], [multipliers])
-        self.hessian = self.hessian + curvature
+    def _roll(self, rolling: Rolling) -> None:
+        """Append the rows of every step of a base on wheels, step by step."""
+        self.steps = StepRows(rolling, ca.horzcat(self.start, self.z), self.gears, width=self.width)
+        self.base_rows = self.rows + np.arange(len(self.steps.owners))
+        multipliers = self._append(self.steps.values, self.steps.jacobian, self.steps.owners)
+        self.hessian = self.hessian + self.steps.hessian(multipliers)
 
     def _clamp(self) -> None:
         """Append z_t − z_{t−1} = 0 for what a clamping hand does not let slide, and ±(z_t − z_{t−1}) ≥ 0 for what is pushed."""
@@ -241,12 +241,13 @@ class Transcription:
     def _relax(self) -> None:
         """Let the shares of their waypoints lengthen the bounds of the rows that are not of one waypoint's functions."""
         self.excess = ca.MX.sym("r", self.rows - self.firm_rows)
-        self.other_values = ca.Function("others", [self.x, self.start, self.dt], [self.others])
+        self.other_values = ca.Function("others", [self.x, self.start, self.dt, self.gears], [self.others])
         if len(self.owners):
             rows = np.arange(self.firm_rows, self.rows)
             self.g, self.jacobian = self._relaxed(self.g, self.jacobian, rows, self.owners, self.excess)
         given = [self.start, self.planes, self.offsets, self.targets, self.of_steps, self.of_changes, self.penalty]
         given += [self.away, self.prices, self.excess]
+        given += [] if self.structure.rolling.aside else [self.gears]
         self.parameters = ca.veccat(*given, *([self.dt] if self.structure.timed else []))
 
     def _relaxed(self, g: ca.MX, jacobian: ca.MX, rows: Ints, owners: Ints, excess: ca.MX) -> tuple[ca.MX, ca.MX]:

@@ -1,4 +1,7 @@
-"""The constraint rows of one waypoint (eqs. 2, 3, 6 and 7): SX functions, small, exact to second order, mapped over waypoints."""
+"""The constraint rows of one waypoint (eqs. 2, 3, 6 and 7), and of one step of a base on wheels.
+
+They are SX functions, small, exact to second order, mapped over waypoints or steps.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +10,10 @@ from functools import cached_property
 from typing import Any
 
 import casadi as ca
+import numpy as np
 import pinocchio as pin
 
+from vkc_pin.arrays import Floats, Ints
 from vkc_pin.budget import spend
 from vkc_pin.cache import Cache
 from vkc_pin.chain.kinematics import kinematics_of
@@ -16,9 +21,11 @@ from vkc_pin.chain.pose import AWAY, PoseRow, pose_rows, receded
 from vkc_pin.cpin.batch import size_of
 from vkc_pin.cpin.machine_code import MachineCode
 from vkc_pin.models.coordinates import Coordinates
+from vkc_pin.motion.rolling import ANYWHERE, Rolling
+from vkc_pin.program.sparse import assemble
 from vkc_pin.program.term_rows import TermRow
 
-__all__ = ["Structure", "WaypointFunctions", "waypoint_functions"]
+__all__ = ["StepRows", "Structure", "WaypointFunctions", "waypoint_functions"]
 
 _WORTH = 4  # waypoints of one kind from which on it is compiled: most kinds have one, at a grasp, or some thirty
 
@@ -33,7 +40,7 @@ class Structure:
         poses: Frames that must be somewhere.
         slots: K, witness planes per waypoint.
         stops: Waypoints inside the motion at which it comes to rest, as it does at start and end.
-        differential: Whether the base must not slip sideways.
+        rolling: How the base may move.
         clamped: (column, first, last): coordinates that keep their value from waypoint `first` to `last`, as a hand does
             that clamps.
         pushed: (column, first, last, way): coordinates that only go up (way 1) or down (-1) from waypoint `first` to `last`.
@@ -45,7 +52,7 @@ class Structure:
     poses: tuple[PoseRow, ...]
     slots: int
     stops: tuple[int, ...] = ()
-    differential: bool = False
+    rolling: Rolling = ANYWHERE
     clamped: tuple[tuple[int, int, int], ...] = ()
     pushed: tuple[tuple[int, int, int, int], ...] = ()
     terms: tuple[TermRow, ...] = ()
@@ -59,7 +66,7 @@ class Structure:
     def key(self) -> tuple[Any, ...]:
         """Equal for structures that share one program."""
         poses = tuple((*_key(pose), pose.waypoints) for pose in self.poses)
-        others = (self.stops, self.differential, self.clamped, self.pushed, self.terms)
+        others = (self.stops, self.rolling, self.clamped, self.pushed, self.terms)
         return (self.model.saveToString(), self.segments, poses, self.slots, *others)
 
 
@@ -123,6 +130,77 @@ class WaypointFunctions:
         self.code.look()
         self.value, self.jacobian, self.hessian = self.code.functions
         return [] if self.code.compiled else [self.code]
+
+
+class StepRows:
+    """The rows of all steps of a base on wheels, from one pose (x, y, yaw) to the next, in gears, 1 ahead or -1 back.
+
+    Those of a step, all in metres, with c along, s aside and δθ turned (see `Rolling.steps`), are s, which must be 0; of bases
+    that are steered gear·c ∓ radius·δθ, which must not be negative; and c ∓ track/2·δθ, what wheels go, if they have a limit.
+
+    Args:
+        rolling: The limits of the base.
+        path: z_0..z_N, shape (n, N + 1), of which z_1..z_N are variables.
+        gears: Shape (N,).
+        width: How many variables a waypoint has; the first three are the base's.
+
+    Attributes:
+        values, jacobian: Of the rows, step by step.
+        owners: The waypoints at which steps end, counted from 0, one for each row.
+    """
+
+    def __init__(self, rolling: Rolling, path: ca.MX, gears: ca.MX, *, width: int) -> None:
+        self.rolling, self.segments, self.size = rolling, path.shape[1] - 1, width * (path.shape[1] - 1)
+        value, jacobian, self._hessian = _step_functions(rolling)
+        self.rows, every = value.size1_out(0), np.arange(self.segments)
+        self._inputs = [ca.vertcat(path[:3, :-1], path[:3, 1:]), gears.T]
+        before = (every[:, None, None] + [[-1], [0]]) * width + np.arange(3)
+        self._columns = before.reshape(-1, 6)  # of both poses in x, where the start has none
+        self.owners = np.repeat(every, self.rows)
+        self.values = ca.vec(value.map(self.segments)(*self._inputs))
+        row, column = (np.array(part) for part in jacobian.sparsity_out(0).get_triplet())
+        slopes = jacobian.map(self.segments)(*self._inputs)
+        self.jacobian = self._placed(slopes, every[:, None] * self.rows + row, self._columns[:, column], len(self.owners))
+
+    def hessian(self, multipliers: ca.MX) -> ca.MX:
+        """Return the upper half of the Hessian of the rows, times their multipliers."""
+        row, column = (np.array(part) for part in self._hessian.sparsity_out(0).get_triplet())
+        bends = self._hessian.map(self.segments)(*self._inputs, ca.reshape(multipliers, self.rows, self.segments))
+        return self._placed(bends, self._columns[:, row], self._columns[:, column], self.size)
+
+    def _placed(self, parts: ca.MX, row: Ints, column: Ints, height: int) -> ca.MX:
+        """Return the matrix of the nonzeros of every step, without those of the start."""
+        at = np.stack([row.ravel(), column.ravel()])
+        kept = (at >= 0).all(axis=0)
+        nonzeros = ca.vertcat(*(part.nz[:] for part in ca.horzsplit(parts, parts.shape[1] // self.segments)))
+        return assemble([nonzeros[np.flatnonzero(kept).tolist()]], [at[:, kept]], height, self.size)
+
+    def bounds(self, dt: Floats | None) -> tuple[Floats, Floats]:
+        """Return the bounds of the rows; wheels have some only where steps take times dt, shape (N,) [s]."""
+        far = np.full(self.segments, np.inf) if dt is None else self.rolling.rim * dt
+        lower, upper = np.zeros((self.segments, self.rows)), np.zeros((self.segments, self.rows))
+        upper[:, 1:] = np.inf
+        if self.rolling.timed:
+            lower[:, -2:], upper[:, -2:] = -far[:, None], far[:, None]
+        return lower.ravel(), upper.ravel()
+
+
+def _step_functions(rolling: Rolling) -> tuple[ca.Function, ca.Function, ca.Function]:
+    """Return the SX functions of one step: its rows, their Jacobian, and the upper half of their Hessian times multipliers."""
+    poses, gear = ca.SX.sym("b", 6), ca.SX.sym("g")
+    dx, dy, turn = ca.vertsplit(poses[3:] - poses[:3])
+    heading = (poses[2] + poses[5]) / 2
+    along, aside = ca.cos(heading) * dx + ca.sin(heading) * dy, ca.cos(heading) * dy - ca.sin(heading) * dx
+    steered = [gear * along + side * rolling.radius * turn for side in (-1, 1)] if rolling.radius else []
+    wheels = [along + side * rolling.track / 2 * turn for side in (-1, 1)] if rolling.timed else []
+    rows = ca.vertcat(aside, *steered, *wheels)
+    multipliers = ca.SX.sym("lam", rows.numel())
+    hessian = ca.triu(ca.hessian(ca.dot(multipliers, rows), poses)[0])
+    return (
+        ca.Function("roll", [poses, gear], [rows], {"cse": True}),
+        ca.Function("roll_jacobian", [poses, gear], [ca.jacobian(rows, poses)], {"cse": True}),
+        ca.Function("roll_hessian", [poses, gear, multipliers], [hessian], {"cse": True}),
+    )
 
 
 def _slopes(model: pin.Model, coordinates: Coordinates, z: Any, placements: Any, planes: Any) -> Any:

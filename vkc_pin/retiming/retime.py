@@ -5,16 +5,22 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from vkc_pin.arrays import Bools, Floats, Ints
+from vkc_pin.driving.curves import between
 from vkc_pin.motion.curve import SHORTEST, Curve, joined
+from vkc_pin.motion.rolling import Rolling, rolling_of
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.retiming.parametrization import speeds_along
 from vkc_pin.retiming.path import path_through
+from vkc_pin.retiming.rolling import rolling_paths, slip
 from vkc_pin.scene.scene import Scene
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicHermiteSpline
 
 __all__ = ["retimed"]
 
@@ -23,6 +29,8 @@ _STILL = 1e-6  # [m] or [rad] of a step in which a joint of an object stays wher
 _SHORT = 1e-6  # share of a second at full speed that a step takes which is none
 _SHORTEST = 1e-3  # [s] of a step in which nothing moves, unless a hand opens or closes in it
 _ROUNDING = 1e-9  # relative
+_SLIP = 2e-4  # [m/s] aside for which a base on wheels gets no more knots, a fifth of what counts as slipping
+_FINEST = 8  # times as many of them, at most
 
 
 class _Limits(NamedTuple):
@@ -45,6 +53,15 @@ class _Limits(NamedTuple):
             known |= {prefix + name: tuple(row) for name, row in zip(own, np.transpose(values).tolist(), strict=True)}
         return cls(*np.array([known.get(name, (-np.inf, np.inf, np.inf, np.inf)) for name in names]).T)
 
+    def with_wheels(self, rolling: Rolling) -> _Limits:
+        """Return the limits of the wheels of a base, left and right, after the others.
+
+        Nothing is said of their accelerations: what those of the base come to.
+        """
+        strongest = self.acceleration[:2].sum() + rolling.track / 2 * self.acceleration[2]
+        wheel = (-np.inf, np.inf, rolling.rim, strongest)
+        return _Limits(*(np.append(side, [value, value]) for side, value in zip(self, wheel, strict=True)))
+
 
 def retimed(scene: Scene, trajectory: Trajectory, parts: Ints | None = None) -> Trajectory:
     """Return a motion along smooth curves through the same waypoints, from rest to rest, as fast as its limits let it be.
@@ -52,8 +69,9 @@ def retimed(scene: Scene, trajectory: Trajectory, parts: Ints | None = None) -> 
     It rests where it does not move from one waypoint to the next; if a phase begins with that, as where a hand opens or closes,
     for as long as it did. It stops where a joint of an object begins or ceases to move: there, the hand that has it turns a
     corner. Between two rests it goes along one path, see `path_through`, at the speeds of `speeds_along`; where none are known,
-    straight from waypoint to waypoint, with a stop at each. The cubics in time through the places at which speeds are known are
-    slowed down until they keep the limits of velocity and acceleration exactly.
+    straight from waypoint to waypoint, with a stop at each. A base on wheels goes along `rolling_paths`. The cubics in
+    time through the places at which speeds are known are slowed down until they keep the limits of velocity and acceleration
+    exactly.
 
     Args:
         scene: Robot and objects.
@@ -62,23 +80,42 @@ def retimed(scene: Scene, trajectory: Trajectory, parts: Ints | None = None) -> 
             (T − 1,); None: one. The more of them, the less the path leaves the straight line.
     """
     limits, parts = _Limits.of(scene, trajectory.names), np.ones(len(trajectory.times) - 1, int) if parts is None else parts
+    rolling = rolling_of(scene.robot)
     places = np.concatenate([[0], np.cumsum(parts)])  # of the waypoints, among all points that the path passes
-    positions = np.stack([np.interp(np.arange(places[-1] + 1), places, column) for column in trajectory.positions.T], axis=-1)
+    positions = _divided(trajectory.positions, places, rolling)
     scale = 1.0 / np.where(np.isfinite(limits.velocity), limits.velocity, 1.0)
     still = np.linalg.norm(np.diff(positions, axis=0) * scale, axis=1) <= _SHORT
     waits = {int(places[phase.first]): float(np.diff(trajectory.times)[phase.first]) for phase in trajectory.phases}
     pieces, ends = list[Curve](), [0]
     for steps in _runs(still, np.abs(np.diff(positions[:, trajectory.robot_size :], axis=0)) > _STILL):
-        rests = bool(still[steps[0]])
         points = positions[steps[0] : steps[-1] + 2]
-        found = None if rests else _smooth(points, limits, scale)
-        if found is None:
-            least = [waits.get(step, _SHORTEST) if rests else 0.0 for step in steps]
-            found = _straight(points, limits, np.array(least)), np.arange(1, len(points))
-        ends += (ends[-1] + found[1]).tolist()
-        pieces.append(found[0])
+        if still[steps[0]]:
+            least = np.array([waits.get(step, _SHORTEST) for step in steps])
+            found = [(_straight(points, limits, least), np.arange(1, len(points)))]
+        else:
+            found = _along(points, limits, scale, rolling)
+        for piece, at in found:
+            ends += (ends[-1] + at).tolist()
+            pieces.append(piece)
     curve = joined(pieces).shifted(float(trajectory.times[0]))
     return replace(trajectory, times=curve.times[np.array(ends)[places]], curve=curve)
+
+
+def _divided(positions: Floats, places: Ints, rolling: Rolling) -> Floats:
+    """Return waypoints, shape (T, n), and points on the straight lines between them, or, of a base on wheels, on the arcs.
+
+    Args:
+        positions: The waypoints.
+        places: Which of the points they are to be, shape (T,).
+        rolling: How the base moves.
+    """
+    at = np.interp(np.arange(places[-1] + 1), places, np.arange(len(places)))
+    points = np.stack([np.interp(np.arange(places[-1] + 1), places, column) for column in positions.T], axis=-1)
+    if rolling.aside or len(points) == len(positions):
+        return points
+    step = np.minimum(at.astype(int), len(positions) - 2)
+    points[:, :3] = between(positions[step, :3], positions[step + 1, :3], at - step)
+    return points
 
 
 def _runs(still: Bools, moves: Bools) -> Iterator[list[int]]:
@@ -93,19 +130,60 @@ def _runs(still: Bools, moves: Bools) -> Iterator[list[int]]:
     yield from (list(range(first, last)) for first, last in itertools.pairwise(edges))
 
 
-def _smooth(points: Floats, limits: _Limits, scale: Floats) -> tuple[Curve, Ints] | None:
-    """Return a curve through waypoints, shape (m, n), and which of its knots they are but for the first; None: not known."""
-    path = path_through(points, scale, (limits.lower, limits.upper))
-    shares = np.arange(_PARTS) / _PARTS
+def _along(points: Floats, limits: _Limits, scale: Floats, rolling: Rolling) -> list[tuple[Curve, Ints]]:
+    """Return curves through waypoints, shape (m, n), from stop to stop, and which of their knots these are but for the first."""
+    bounds = limits.lower, limits.upper
+    if rolling.aside:
+        found = _smooth(path_through(points, scale, bounds), points, limits)
+        return [(_straight(points, limits, np.zeros(len(points) - 1)), np.arange(1, len(points))) if found is None else found]
+    return list(_rolling(points, limits.with_wheels(rolling), scale, rolling))
+
+
+def _rolling(points: Floats, limits: _Limits, scale: Floats, rolling: Rolling, finer: int = 1) -> Iterator[tuple[Curve, Ints]]:
+    """Yield the same of a base on wheels, with so many times the usual knots, or more where it would slip between them."""
+    bounds = limits.lower[:-2], limits.upper[:-2]
+    for path, own in rolling_paths(points, scale, bounds, rolling, finer):
+        found = _smooth(path, own, limits)
+        if found is None:
+            for k in range(len(own) - 1):
+                ((path, step),) = rolling_paths(own[k : k + 2], scale, bounds, rolling, _FINEST)
+                yield _stepping(path, step, limits)
+        elif finer < _FINEST and slip(found[0]) > _SLIP:
+            yield from _rolling(own, limits, scale, rolling, 2 * finer)
+        else:
+            yield found
+
+
+def _smooth(path: CubicHermiteSpline, points: Floats, limits: _Limits) -> tuple[Curve, Ints] | None:
+    """Return a curve along a path through waypoints, shape (m, n), see `_along`; None: how fast it can be is not known.
+
+    The path, and the limits, may have further columns that are none of the motion's.
+    """
+    knots = (len(path.x) - 1) // (len(points) - 1)  # a step
+    parts = knots * max(_PARTS // knots, 1)
+    shares = np.arange(parts // knots) / (parts // knots)
     places = np.append((path.x[:-1, None] + np.diff(path.x)[:, None] * shares).ravel(), path.x[-1])
     speeds = speeds_along(path, places, limits.velocity, limits.acceleration)
     if speeds is None:
         return None
     times = np.concatenate([[0.0], np.cumsum(2.0 * np.diff(places) / (speeds[1:] + speeds[:-1]))])
-    knots = path(places)
-    knots[::_PARTS] = points  # to the last bit
-    curve = Curve(times, knots, path(places, 1) * speeds[:, None])
-    return _slowed(curve, limits), np.arange(1, len(points)) * _PARTS
+    curve = _slowed(Curve(times, path(places), path(places, 1) * speeds[:, None]), limits)
+    return _through(curve, points), np.arange(1, len(points)) * parts
+
+
+def _stepping(path: CubicHermiteSpline, points: Floats, limits: _Limits) -> tuple[Curve, Ints]:
+    """Return a curve along a path from one waypoint to the next, shape (2, n), between which it is 3s² − 2s³ of the way."""
+    length, share = path.x[-1], np.linspace(0.0, 1.0, len(path.x))
+    places, speeds = length * (3.0 - 2.0 * share) * share**2, length * 6.0 * (share - share**2) / _SHORTEST
+    curve = _slowed(Curve(share * _SHORTEST, path(places), path(places, 1) * speeds[:, None]), limits)
+    return _through(curve, points), np.array([len(share) - 1])
+
+
+def _through(curve: Curve, points: Floats) -> Curve:
+    """Return a curve that passes waypoints, shape (m, n), to the last bit, without what are no coordinates of these."""
+    size, positions = points.shape[1], np.array(curve.positions[:, : points.shape[1]])
+    positions[:: (len(positions) - 1) // (len(points) - 1)] = points
+    return Curve(curve.times, positions, curve.rates[:, :size])
 
 
 def _straight(points: Floats, limits: _Limits, least: Floats) -> Curve:

@@ -130,7 +130,8 @@ def _robot(document: Document, description: schema.SceneSchema, folder: Path) ->
     short = isinstance(document.data["robot"], str)  # robot: husky_ur5e
     with document.at(("robot",) if short else ("robot", "name")):
         name = folder / item.name if by_path else item.name
-        return load_robot(name, base=item.base, tool_frame=item.tool_frame, height=height)
+        turning = item.turning_radius
+        return load_robot(name, base=item.base, tool_frame=item.tool_frame, height=height, turning_radius=turning)
 
 
 def _unique_names(document: Document, description: schema.SceneSchema) -> None:

@@ -10,6 +10,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from vkc_pin.arrays import Floats
 from vkc_pin.files.fields import Name, NotNegative, Number, Positive, Quaternion, Schema, Vector3, count, fail, require, text_for
+from vkc_pin.models.robot import Base
 
 __all__ = [
     "COLOURS",
@@ -184,7 +185,8 @@ class SceneRobotSchema(Schema):
     """A robot by its name, or by the path of its URDF."""
 
     name: str
-    base: Literal["omni", "differential", "fixed"] = "omni"
+    base: Base = "omni"
+    turning_radius: Positive | None = None
     tool_frame: str | None = None
 
 

@@ -29,11 +29,12 @@ class Approach:
 
     Args:
         knots: Of the problem.
-        stands: Whether the base stands still meanwhile, as long as the arm alone can do it: in narrow places it has no room.
+        stands: Whether the base stands still meanwhile, as long as the arm alone can do it: in narrow places it has no room. One
+            on wheels always does.
     """
 
     def __init__(self, knots: Knots, *, stands: bool = False) -> None:
-        self.knots, self.problem, self.chain, self.stands = knots, knots.problem, knots.chain, stands
+        self.knots, self.problem, self.chain, self.stands = knots, knots.problem, knots.chain, stands or knots.curves is not None
         joint, local = self.chain.frame(self.chain.robot.tool_frame)
         self.joint, self.local = joint, local
         model, cache = self.chain.model, self.problem.cache

@@ -176,6 +176,9 @@ class Beam:
         """Return the length of the ways from `first` to `last`, both (B, n), in a phase, in radians of the arm, shape (B,)."""
         cost = np.abs(last - first) * self.metric
         cost[:, 0], cost[:, 1] = np.hypot(cost[:, 0], cost[:, 1]), 0.0
+        if self.knots.curves is not None:
+            lengths, turns = self.knots.curves.lengths(first[:, :3], last[:, :3])
+            cost[:, 0], cost[:, 2] = self.metric[0] * lengths, self.metric[2] * turns
         if self.routes is not None and not self.problem.closed(self.problem.task.phases[phase]):
             distances = self.routes.distances(phase, first[:, :3], last[:, :3], folded=self.careful)
             cost[:, 0] = self.metric[0] * distances

@@ -14,7 +14,7 @@ from vkc_pin.program.merit import Merit, infeasibility
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.approach import Approach
 from vkc_pin.seeds.beam import ALIKE, Beam, Found
-from vkc_pin.seeds.joining import DrivenPaths, Joiner, RrtPaths
+from vkc_pin.seeds.joining import Joiner, RrtPaths, base_paths
 from vkc_pin.seeds.knots import Knots, Known, follow_objects
 from vkc_pin.seeds.routes import Routes
 from vkc_pin.seeds.seed import Seed
@@ -194,8 +194,7 @@ class _SeedSearch:
     def _parts(self, shared: _Shared) -> tuple[Beam, Joiner]:
         """Return what finds knots, and what joins them."""
         knots, routes = shared.knots(), shared.driven if self.method == "astar" else None
-        beam = Beam(knots, routes)
-        return beam, Joiner(knots, Approach(knots), None if routes is None else DrivenPaths(routes))
+        return Beam(knots, routes), Joiner(knots, Approach(knots), base_paths(knots, routes))
 
     def seeds(self, count: int) -> Iterator[Seed | None]:
         """Yield seeds through the cheapest paths of knots: of one quick search if that is any good, then of thorough ones.

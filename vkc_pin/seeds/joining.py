@@ -7,13 +7,14 @@ from collections import Counter
 import numpy as np
 
 from vkc_pin.arrays import Floats
+from vkc_pin.driving.curves import Curves, between, spread_along
 from vkc_pin.seeds.approach import Approach
 from vkc_pin.seeds.knots import Knots, smooth
 from vkc_pin.seeds.routes import Routes
 from vkc_pin.seeds.rrt import TRIES, connect, spread
 from vkc_pin.task.phases import Phase
 
-__all__ = ["DrivenPaths", "Joiner", "Paths", "RrtPaths"]
+__all__ = ["CurvePaths", "DrivenPaths", "Joiner", "Paths", "RrtPaths", "base_paths"]
 
 
 class DrivenPaths:
@@ -35,6 +36,22 @@ class DrivenPaths:
         if path is not None and not turns:
             path[:, 2] -= (path[-1, 2] - last[2]) * np.arange(1, steps + 1) / steps
         return path
+
+
+class CurvePaths:
+    """The base along the curve that leads there if nothing is in the way, where nothing fixed is held; the arm straight."""
+
+    careful = False
+
+    def __init__(self, curves: Curves) -> None:
+        self.curves = curves
+
+    def path(self, phase: int, first: Floats, last: Floats, steps: int, *, turns: bool, reaches: bool) -> Floats:
+        """See `DrivenPaths.path`."""
+        corners = self.curves.corners(first[:3], last[:3])
+        if not turns:
+            corners = np.vstack([corners, last[None, :3]])
+        return spread_along(corners, steps, turning=self.curves.turning)
 
 
 class RrtPaths:
@@ -71,7 +88,14 @@ class RrtPaths:
         return None if path is None else spread(path, steps, self.knots.chain.metric[: path.shape[1]])
 
 
-Paths = DrivenPaths | RrtPaths
+Paths = CurvePaths | DrivenPaths | RrtPaths
+
+
+def base_paths(knots: Knots, routes: Routes | None) -> Paths | None:
+    """Return the paths of the base around what stands there, or, without routes, as if nothing did; None: straight ones."""
+    if routes is not None:
+        return DrivenPaths(routes)
+    return None if knots.curves is None else CurvePaths(knots.curves)
 
 
 class Joiner:
@@ -111,6 +135,10 @@ class Joiner:
         s = np.concatenate([[0.0], smooth(len(z))])
         for column in range(z.shape[1]):
             z[:, column] = np.interp(s[1:], s[when], through[:, column])
+        if self.knots.curves is not None:
+            at = np.interp(s[1:], s[when], np.arange(len(when)))
+            leg = np.minimum(at.astype(int), len(when) - 2)
+            z[:, :3] = between(through[leg, :3], through[leg + 1, :3], at - leg)
 
     def _open(self, z: Floats, knots: Floats, inside: list[int], number: int, previous: Phase | None) -> bool:
         """Fill the rows of a phase in which nothing fixed is held; turn the knots that follow as that ends. False: no path."""
@@ -167,5 +195,7 @@ class Joiner:
                 rows = np.array(row.waypoints) - 1
                 lower, upper = problem.lower[rows].copy(), problem.upper[rows].copy()
                 lower[:, driven] = upper[:, driven] = self.knots.objects[np.ix_(rows, driven)]
+                if self.knots.curves is not None:
+                    lower[:, :3] = upper[:, :3] = z[rows, :3]
                 solver, target = self.knots.solver(pose)
                 z[rows], _ = solver.solve(z[rows], target, lower=lower, upper=upper, weights=self.knots.weights, iterations=6)

@@ -10,6 +10,7 @@ import pinocchio as pin
 
 from vkc_pin.arrays import Bools, Floats
 from vkc_pin.chain.inverse_kinematics import PoseSolver
+from vkc_pin.driving.curves import Curves, nearest_arc
 from vkc_pin.program.merit import TOLERANCE
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.clearing import clear_out
@@ -64,6 +65,7 @@ class Knots:
         driven: Which columns these joints are.
         weights: What moving a coordinate costs, shape (n,).
         robot: Number of the robot's coordinates.
+        curves: By which its base drives; None: it goes in any direction, or stands.
     """
 
     def __init__(self, problem: TrajectoryProblem, rng: np.random.Generator, known: Known | None = None) -> None:
@@ -72,6 +74,7 @@ class Knots:
         self.robot = self.chain.robot.coordinates.size
         self.weights = self.chain.metric.copy()
         self.weights[[column for column, _, _ in problem.choices]] = 1.0  # also where a grasp slides
+        self.curves = None if problem.rolling.aside else Curves(problem.rolling.radius, self.chain.robot.lever)
         self.driven = np.array([self.chain.index(name) for name in problem.task.state], int)
         self.objects = follow_objects(problem, np.tile(problem.start, (problem.segments, 1)))
 
@@ -119,7 +122,22 @@ class Knots:
         z, found = solver.solve(z, target, lower=lower, upper=upper, weights=self.weights, tolerance=TOLERANCE)
         if how == "scatter":
             z = self._unwind(z, before, lower, upper)
+        elif self.curves is not None and self._held_at(waypoint):
+            z, found = self._driven_to(z, found, before, waypoint, pose)
         return z, found
+
+    def _driven_to(self, z: Floats, found: Bools, before: Floats, waypoint: int, pose: int) -> tuple[Floats, Bools]:
+        """Return configurations with the base where an arc leads from what they come from, as far as arms reach from there."""
+        rolling, turning = self.problem.rolling, self.chain.robot.lever
+        there, (solver, target) = z.copy(), self.solver(pose)
+        there[:, :3] = nearest_arc(before[:, :3], z[:, :3], radius=rolling.radius, turning=turning)
+        lower, upper = self._limits(before, waypoint)
+        lower[:, :3] = upper[:, :3] = np.clip(there[:, :3], lower[:, :3], upper[:, :3])
+        there, reached = solver.solve(there, target, lower=lower, upper=upper, weights=self.weights, tolerance=TOLERANCE)
+        return np.where(reached[:, None], there, z), reached
+
+    def _held_at(self, waypoint: int) -> bool:
+        return self.problem.closed(self.problem.task.phases[self.problem.contacts.phase_of(waypoint)])
 
     def clear(self, z: Floats, waypoint: int) -> Floats:
         """Return configurations for a waypoint, shape (B, n), pushed out of collision as far as that goes; see `clearing`."""
@@ -130,6 +148,8 @@ class Knots:
 
     def _clear(self, z: Floats, waypoint: int, pose: int) -> Floats:
         lower, upper = self._limits(z, waypoint)
+        if self.curves is not None and self._held_at(waypoint):
+            lower[:, :3] = upper[:, :3] = z[:, :3]  # where an arc led to
         solver, target = self.solver(pose)
         weights = self.weights
         pushed = clear_out(self.problem, z, waypoint, solver, target, lower=lower, upper=upper, weights=weights)

@@ -9,6 +9,7 @@ import pinocchio as pin
 
 from vkc_pin.arrays import Floats
 from vkc_pin.driving.body import Shape
+from vkc_pin.driving.curves import Curves, spread_along
 from vkc_pin.driving.grid import BaseGrid, fine_cells
 from vkc_pin.driving.path import BasePath, poses_along, shortest_path
 from vkc_pin.program.problem import TrajectoryProblem
@@ -96,7 +97,17 @@ class Routes:
         if key not in self._paths:
             self._paths[key] = shortest_path(self.grid(phase), start.tolist(), goal[None])
         path = self._paths[key]
-        return None if path is None else poses_along(path, steps, turning=self.problem.chain.robot.lever)
+        return None if path is None else self._poses(self.grid(phase), path, steps, self.problem.chain.robot.lever)
+
+    def _poses(self, grid: BaseGrid, path: BasePath, steps: int, turning: float) -> Floats:
+        """Return poses along a path; those of a base on wheels at its corners, too, so that it rolls from each to the next."""
+        rolling = self.problem.rolling
+        if rolling.aside:
+            return poses_along(path, steps, turning=turning)
+        corners = path.poses
+        if rolling.radius > 0.0:
+            corners = Curves(rolling.radius, turning).through(corners, lambda pose: grid.clear(*pose, reaching=True))
+        return spread_along(corners, steps, turning=turning)
 
     def guide(self, phase: int, start: Floats, goal: Floats, steps: int) -> Floats | None:
         """Return poses from a start to a goal, both (3,), on which the base fits, shape (steps, 3).
@@ -107,7 +118,7 @@ class Routes:
             grid = self.grid(phase, folded=folded)  # the fine one only where it is needed
             path = shortest_path(grid, start.tolist(), goal[None])
             if path is not None:
-                return poses_along(path, steps, turning=grid.turning)
+                return self._poses(grid, path, steps, grid.turning)
         return None
 
 

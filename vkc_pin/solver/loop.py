@@ -79,7 +79,7 @@ class _Loop:
             contacts=contacts,
             clear=clear,
             passages=passed,
-            rate=self.timing.violation(*self.problem.rates(z)),
+            rate=self.timing.violation(*self.problem.pace(z)),
             step=np.abs(z - self.z).max(axis=1),
             satisfied=satisfied,
         )
@@ -112,10 +112,10 @@ class _Loop:
             self.look()
         nearly = trial.contacts.violation() < NEARLY
         if nearly and trial.rate > TOLERANCE:  # before, limits on rates only cost time
-            rates = self.problem.rates(trial.z)
-            self.timing = self.timing.stretched(*rates)
+            pace = self.problem.pace(trial.z)
+            self.timing = self.timing.stretched(*pace)
             self.solution.dt = self.timing.dt
-            if not self.rates and self.timing.violation(*rates) > TOLERANCE:
+            if not self.rates and self.timing.violation(*pace) > TOLERANCE:
                 self.rates = True
                 self.subproblem.forget()
             self.look()
@@ -126,7 +126,7 @@ class _Loop:
             trial.satisfied
             and trial.clear
             and self.pose_error < TOLERANCE
-            and self.timing.violation(*self.problem.rates(trial.z)) <= TOLERANCE
+            and self.timing.violation(*self.problem.pace(trial.z)) <= TOLERANCE
         )
 
     def grow(self) -> bool:

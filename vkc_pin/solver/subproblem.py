@@ -117,6 +117,7 @@ class Subproblem:
             away=found.away,
             excess=found.excess,
             prices=prices,
+            gears=problem.rolling.gears(problem.waypoints(z)),
         )
         short = shortfalls(at, t.segments, t.slots)
         room = np.where(short > 0.0, np.inf, 0.0)  # what keeps its margin now must go on keeping it

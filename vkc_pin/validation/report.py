@@ -25,8 +25,8 @@ class Violation:
     """One constraint that does not hold.
 
     Attributes:
-        constraint: "start", "limit", "velocity", "acceleration", "slip", "dwell", "closure", "latch", "unheld", "tips", "slide",
-            "push", "opening", "goal", "order", "clearance", "penetration" or "term", a constraint of the user's own.
+        constraint: "start", "limit", "velocity", "acceleration", "slip", "turning", "wheels", "dwell", "closure", "latch",
+            "unheld", "tips", "slide", "push", "opening", "goal", "order", "clearance", "penetration" or "term", the user's own.
         subject: The coordinate, object, goal, term or pair of links it is about, e.g. "elbow_joint", "forearm_link – sofa".
         waypoint: Counted from 0; between two waypoints the earlier.
         time: [s].

@@ -25,6 +25,7 @@ from vkc_pin.validation.goals import MOTION_TOLERANCE, check_goals, check_steps
 from vkc_pin.validation.own_terms import check_terms
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.report import Report, Violation
+from vkc_pin.validation.rolling import check_rolling
 from vkc_pin.validation.samples import MOST, Samples
 from vkc_pin.validation.sweep import sweep
 from vkc_pin.validation.touching import check_gripper, check_pushes, windows
@@ -38,7 +39,6 @@ ACCEPTED_RATE_TOLERANCE = 1e-3  # excess over a limit, relative to it
 LATCH_TOLERANCE = 1e-4
 WAYPOINT_TOLERANCE = 1e-3  # [m] that clearance at a waypoint may fall short of dist_safe
 REST_TOLERANCE = 1e-6  # [m/s] or [rad/s]
-SLIP_TOLERANCE = 1e-4  # [m] per step
 
 
 def validate(
@@ -54,7 +54,8 @@ def validate(
         terms: The user's own constraints; costs are nothing to check.
 
     Returns:
-        Every violated constraint: start, limits, velocity, acceleration, slip of a differential base, closure, latches,
+        Every violated constraint: start, limits, velocity, acceleration, bases that slip,
+        turn tighter than they can or whose wheels turn too fast, closure, latches,
         rests in which the gripper closes or opens, how far it is open, joints of objects that nobody holds, what tips on what it
         stands on, hands that slide on what they clamp, pushes that would pull, goals and their order, clearance at waypoints and
         penetration anywhere, and own constraints; or that it is longer than can be looked at.
@@ -84,8 +85,9 @@ class _Check:
 
     def report(self) -> Report:
         """Run every check."""
-        for check in (self._start, self._limits, self._rates, self._slip, self._unheld, self._tips, self._latches):
+        for check in (self._start, self._limits, self._rates, self._unheld, self._tips, self._latches):
             check()
+        self.found += check_rolling(self.samples)
         self.found += check_goals(self.samples, self.steps, self.options)
         self.found += check_terms(self.samples, self.terms)
         self.found += [*check_gripper(self.samples, self.options), *check_pushes(self.samples)]
@@ -171,18 +173,6 @@ class _Check:
                     detail = f"{value:.3f} {unit}/{per} is more than {limit:.3f} {unit}/{per}"
                     at = max(int(np.searchsorted(times, when[worst], side="right")) - 1, 0)
                     self._add(kind, name, value - limit, f"{unit}/{per}", detail, waypoint=at)
-
-    def _slip(self) -> None:
-        """A differential base does not move sideways, seen at the middle of each step."""
-        if self.scene.robot.base != "differential":
-            return
-        step = np.diff(self.trajectory.positions[:, :3], axis=0)
-        heading = self.trajectory.positions[:-1, 2] + step[:, 2] / 2
-        slip = np.abs(-np.sin(heading) * step[:, 0] + np.cos(heading) * step[:, 1])
-        worst = int(np.argmax(slip))
-        if not slip[worst] <= SLIP_TOLERANCE:
-            detail = f"the base slips sideways by {1e3 * slip[worst]:.2f} mm in a step"
-            self._add("slip", "base", slip[worst], "m", detail, waypoint=worst)
 
     def _tips(self) -> None:
         """What something stands on stays level while it moves."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Set
-from typing import Literal
 
 import numpy as np
 import pinocchio as pin
@@ -56,7 +55,7 @@ def limited_together(full: pin.Model, file: UrdfFile, tool_frame: str) -> pin.Mo
 
 
 def robot_limits(
-    full: pin.Model, model: pin.Model, settings: RobotSchema, base: Literal["omni", "differential", "fixed"]
+    full: pin.Model, model: pin.Model, settings: RobotSchema, base: str
 ) -> tuple[Coordinates, Floats, Floats, Floats, Floats]:
     """Write the limits into a robot's model; return its coordinates, and lower, upper, velocity, acceleration, shape (n,) each.
 

@@ -8,7 +8,7 @@ from helpers.fake_plan import fake_plan
 
 from vkc_pin.motion.world import World
 from vkc_pin.planning.plan import Plan
-from vkc_pin.validation.clearance import ClearanceCurve, clearance_curves
+from vkc_pin.plotting.clearance import ClearanceCurve, clearance_curves
 
 TIMES = np.linspace(0.0, 6.0, 13)
 

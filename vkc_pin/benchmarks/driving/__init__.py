@@ -1,0 +1,1 @@
+"""How robots drive: kinds of base beside each other."""

@@ -29,6 +29,7 @@ REPORTS = {  # name of a record → whose report it is
     **{"segments": "scale", "sixty": "problems.ablation", "tradeoff": "problems.ablation"},
     **{"spread": "problems.spread", "first_seed": "problems.first_seed", "robots": "anything.robots"},
     **{"robots_rest": "anything.robots", "robots_packages": "anything.robots", "execution": "executing.execution"},
+    "bases": "driving.bases",
 }
 DOOR = ("door_seed_0", "door_seed_1")
 TASKS = ("reach", "push", "push blind", "whole")

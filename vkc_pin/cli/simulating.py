@@ -25,6 +25,8 @@ def add_simulate(commands: Any) -> None:
     simulate.add_argument("plan", metavar="PLAN", help="a plan saved with --save or Plan.save (.npz)")
     shown = "the scene that it happens in (default: the plan's own, where it starts)"
     simulate.add_argument("--actual", metavar="SCENE", help=shown)
+    how = "how the hand holds: weld (default), or friction of fingers that close"
+    simulate.add_argument("--grasp", default="weld", metavar="HOW", help=how)
     simulate.add_argument("--html", metavar="FILE", help="write what happened beside what was planned, one self-contained page")
     simulate.add_argument("--picture", metavar="FILE", help="write snapshots (.png)")
     simulate.add_argument("--json", metavar="FILE", help="write all that came of it")
@@ -41,7 +43,7 @@ def _simulate(arguments: argparse.Namespace) -> int:
     if arguments.actual is not None:
         start = plan.scene.start
         actual = vkc.load_scene(arguments.actual).with_start(base=start[:3], arm=start[3:])
-    result = plan.simulate(actual=actual)
+    result = plan.simulate(actual=actual, grasp=arguments.grasp)
     writers: dict[str, Callable[[str], object]] = {"html": result.to_html, "picture": result.plot, "json": result.to_json}
     for name, path in files.items():
         writers[name](path)

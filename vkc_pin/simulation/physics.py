@@ -42,6 +42,8 @@ class Physics:
         grasp_force: A hand that is pulled harder than this, on average over 20 ms, lets go [N]. A parallel gripper that closes
             with 235 N holds 2 · 0.6 · 235 N by its rubber pads.
         grasp_torque: The same of a torque [N·m].
+        closing_force: Of each finger where hands hold by friction [N]; fingers whose URDF states less effort have that.
+        grip_time: How long fingers take to close or to open there [s].
         balanced: Whether springs carry the weight of doors, lids and levers, as a dishwasher's do and those of a door's handle:
             joints of what stands fixed stay where nobody moves them, as in plans. What is laid on them weighs all the same.
         latch_play: By how much the joint that releases a latch may fall short of where its description says, [rad] or [m].
@@ -61,6 +63,8 @@ class Physics:
     friction: float = 0.8
     grasp_force: float = 280.0
     grasp_torque: float = 30.0
+    closing_force: float = 235.0
+    grip_time: float = 0.6
     balanced: bool = True
     latch_play: float = 0.02
 

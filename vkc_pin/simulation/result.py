@@ -139,7 +139,8 @@ class SimulationResult:
         for grip in self.grips:
             broken = "" if grip.broken is None else f", PULLED OUT OF THE HAND at {grip.broken:.2f} s"
             force = f"{grip.force:.0f} N and {grip.torque:.1f} N·m at most"
-            lines.append(f"  grasp       {grip.what}, {grip.begin:.1f} to {grip.end:.1f} s: {force}{broken}")
+            slip = f", slips by {1e3 * grip.slip:.1f} mm" if grip.slip else ""
+            lines.append(f"  grasp       {grip.what}, {grip.begin:.1f} to {grip.end:.1f} s: {force}{slip}{broken}")
         shares = sorted(t.shares.items(), key=lambda item: -item[1])
         if shares:
             told = ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in shares[:_TOLD])

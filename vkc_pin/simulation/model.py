@@ -16,6 +16,7 @@ import pinocchio as pin
 
 from vkc_pin.arrays import Floats, Ints
 from vkc_pin.errors import InputError
+from vkc_pin.models.dynamics.resistance import Resistance
 from vkc_pin.models.shapes import triangles
 from vkc_pin.motion.world import World
 from vkc_pin.scene.contact import moves_as_one
@@ -172,9 +173,11 @@ class Builder:
             if servo is not None:
                 self.drive_joint(joint, servo)
                 continue
-            stated, friction = self._stated(name)
+            owner, _, own = name.partition(".")
+            stated = self.world.scene.objects[owner].object.resistance.get(own, Resistance())
             usual = self.physics.prismatic_damping if slides else self.physics.revolute_damping
-            joint.damping[0], joint.frictionloss = stated or usual, friction
+            joint.damping[0], joint.frictionloss = stated.damping or usual, stated.friction
+            joint.stiffness[0], joint.springref = stated.stiffness, stated.springref
             lower, upper = self.world.coordinates.lower[column], self.world.coordinates.upper[column]
             if np.isfinite([lower, upper]).all():
                 joint.limited, joint.range = self.mj.mjtLimited.mjLIMITED_TRUE, [lower, upper]
@@ -196,13 +199,6 @@ class Builder:
         """Return whether springs carry what a joint of an object carries."""
         placed = self.world.scene.objects.get(str(self.world.model.names[joint]).partition(".")[0])
         return self.physics.balanced and placed is not None and not placed.object.free
-
-    def _stated(self, coordinate: str) -> tuple[float, float]:
-        """Return damping and friction of an object's joint by its URDF."""
-        owner, _, name = coordinate.partition(".")
-        model = self.world.scene.objects[owner].object.model
-        at = model.joints[model.getJointId(name)].idx_v
-        return float(model.damping[at]), float(model.upperDryFrictionLimit[at])
 
     def _geoms(self, pairs: Pairs) -> None:
         """Add the shapes, and which of them meet."""

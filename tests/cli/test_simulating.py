@@ -37,3 +37,12 @@ def test_outputs_over_the_plan_are_refused(tmp_path: Path, capsys: pytest.Captur
     assert main(["simulate", str(plan), "--json", str(plan)]) == 2
     assert "--json" in capsys.readouterr().err
     assert plan.read_bytes() == before
+
+
+def test_a_hand_may_hold_by_friction(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plan = tmp_path / "plan.npz"
+    drawer_plan().save(plan)
+    assert main(["simulate", str(plan), "--grasp", "friction"]) == 0
+    assert "slips by" in capsys.readouterr().out
+    assert main(["simulate", str(plan), "--grasp", "glue"]) == 2
+    assert "expected weld, friction, got glue" in capsys.readouterr().err

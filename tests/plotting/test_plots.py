@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import subprocess
 import sys
 from pathlib import Path
@@ -9,9 +10,14 @@ import numpy as np
 import pytest
 from helpers.fake_plan import fake_plan
 
+from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
+from vkc_pin.motion.curve import Curve
 from vkc_pin.planning.plan import Plan
+from vkc_pin.plotting import joints
 from vkc_pin.plotting import plots as plotting
+from vkc_pin.plotting.joints import Quantity
+from vkc_pin.validation.report import Judged
 
 
 @pytest.fixture(scope="module")
@@ -43,24 +49,52 @@ def test_pictures_are_not_empty(figures: dict[str, Any], name: str) -> None:
     assert colours(figures["folder"] / f"{name}.png") > 100
 
 
-def test_positions_and_velocities_by_group_with_limits(figures: dict[str, Any], plan: Plan) -> None:
+def test_positions_and_rates_by_group_with_limits(figures: dict[str, Any], plan: Plan) -> None:
     axes = figures["joints"].axes
-    assert len(axes) == 6
     assert [a.get_ylabel().split(" [")[0] for a in axes] == [
-        f"{group} {what}" for group in ("base", "arm", "object") for what in ("position", "velocity")
+        f"{group} {what}" for group in ("base", "arm", "object") for what in ("position", "velocity", "acceleration")
     ]
     assert all("[" in a.get_ylabel() for a in axes)
-    assert [a.get_xlabel() for a in axes[-2:]] == ["time [s]"] * 2
+    assert [a.get_xlabel() for a in axes[-3:]] == ["time [s]"] * 3
     motion = plan.trajectory
-    for shown, name in ((axes[0], "base_yaw"), (axes[4], "door.hinge")):
+    for shown, name in ((axes[0], "base_yaw"), (axes[6], "door.hinge")):
         line = lines(shown)[name]
         assert set(motion.times) <= set(line.get_xdata())
         assert np.allclose(line.get_ydata(), motion(line.get_xdata())[:, motion.names.index(name)])
-    limit = np.pi  # of all the arm's joints
-    assert any(np.allclose(line.get_ydata(), limit, atol=0.01) for line in axes[3].get_lines())
-    speed = axes[1].get_lines()[0]
+    for shown, limit in ((axes[4], np.pi), (axes[5], 1.4)):  # of all the arm's joints
+        assert any(np.allclose(line.get_ydata(), limit, atol=0.01) for line in shown.get_lines())
+    speed, strength = (a.get_lines()[0] for a in axes[1:3])
     assert np.allclose(speed.get_ydata(), motion.velocity(speed.get_xdata())[:, 0])
-    assert all(a.get_legend() is not None for a in axes[1::2])
+    assert np.allclose(strength.get_xdata(), motion.times)  # without a curve, as eq. 5 has it
+    assert np.allclose(strength.get_ydata(), motion.accelerations()[:, 0])
+    assert all(a.get_legend() is not None for a in axes[2::3])
+
+
+def test_rates_are_the_curve_s(plan: Plan) -> None:
+    """Accelerations jump at knots: both values are drawn, and no peak is lost between samples."""
+    motion = plan.trajectory
+    curve = Curve(motion.times, motion.positions, np.gradient(motion.positions, motion.times, axis=0))
+    smooth = dataclasses.replace(plan, trajectory=dataclasses.replace(motion, curve=curve))
+    for number, (shown, peaks) in enumerate(zip(plotting.plot_joints(smooth).axes[1:3], curve.speeds(), strict=True), 1):
+        line = shown.get_lines()[2]
+        read = (curve.velocity, curve.acceleration)[number - 1]
+        assert np.allclose(line.get_ydata(), read(line.get_xdata())[:, 2])
+        assert np.abs(line.get_ydata()).max() == pytest.approx(peaks[:, 2].max(), rel=1e-3)
+
+
+def test_a_quantity_that_only_some_have_leaves_the_others_free(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Torques, say: a column more, without axes where there is none."""
+
+    def torques(plan: Judged, times: Floats) -> tuple[Floats, Floats]:
+        values = np.full((len(times), len(plan.trajectory.names)), np.nan)
+        values[:, 3:9] = 20.0
+        return times, values
+
+    made = Quantity("torque", {"m": "N", "rad": "N·m"}, torques, lambda plan, name: 150.0, lambda motion: {})
+    monkeypatch.setattr(joints, "QUANTITIES", (*joints.QUANTITIES, made))
+    axes = plotting.plot_joints(plan).axes
+    assert [a.get_ylabel() for a in axes[3::4] if a.get_visible()] == ["arm torque [N·m]"]
+    assert len(axes) == 12
 
 
 def test_phases_are_named_and_shaded(figures: dict[str, Any], plan: Plan) -> None:
@@ -103,14 +137,14 @@ def test_one_combined_figure(plan: Plan, tmp_path: Path, suffix: str, head: byte
     file = tmp_path / "deep" / f"all{suffix}"
     figure = plotting.plot(plan, file)
     assert not isinstance(figure, dict)
-    assert len(figure.axes) == 8
+    assert len(figure.axes) == 11
     assert file.read_bytes().startswith(head)
     assert [f.name for f in file.parent.iterdir()] == [file.name], "no temporary file stays"
 
 
 def test_without_a_path_nothing_is_written(plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert len(plotting.plot(plan).axes) == 8  # type: ignore[union-attr]
+    assert len(plotting.plot(plan).axes) == 11  # type: ignore[union-attr]
     assert not list(tmp_path.iterdir())
 
 

@@ -130,7 +130,6 @@ def test_results_are_plain_data(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "field"),
     [
-        ({"grasp": "friction"}, "grasp"),
         ({"grasp": "glue"}, "grasp"),
         ({"physics": 3}, "physics"),
         ({"actual": "drawer"}, "actual"),

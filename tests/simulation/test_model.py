@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.executions import still
+from helpers.executions import drawer_plan, still
 from helpers.telescopes import coupled_scene
 
 import vkc_pin as vkc
+from vkc_pin.models.dynamics.resistance import Resistance
 from vkc_pin.models.shapes import triangles
 from vkc_pin.motion.world import World
 from vkc_pin.scene.scene import Scene
@@ -19,6 +21,7 @@ from vkc_pin.simulation.contacts import touching_pairs
 from vkc_pin.simulation.grips import latched
 from vkc_pin.simulation.model import Builder, PhysicalWorld
 from vkc_pin.simulation.physics import Physics, weigh
+from vkc_pin.simulation.result import SimulationResult
 from vkc_pin.simulation.servos import servos
 
 
@@ -106,3 +109,20 @@ def test_a_coordinate_moves_the_masses_of_all_its_joints(tmp_path: Path) -> None
         turned[:2, :2] = [[np.cos(row[2]), np.sin(row[2])], [-np.sin(row[2]), np.cos(row[2])]]
         expected = turned.T @ theirs[: robot.size, : robot.size] @ turned
         np.testing.assert_allclose(slopes.T @ masses @ slopes, expected, atol=1e-9)
+
+
+def test_joints_of_objects_resist_as_their_description_says() -> None:
+    """A drawer with friction takes so much more force at the same motion, and a spring pulls it back where nobody holds it."""
+    plan = drawer_plan()
+    placed = plan.scene.objects["drawer"]
+
+    def executed(**resistance: float) -> SimulationResult:
+        own = {"slide": Resistance(**resistance)}
+        changed = dataclasses.replace(placed, object=dataclasses.replace(placed.object, resistance=own))
+        actual = dataclasses.replace(plan.scene, objects={**plan.scene.objects, "drawer": changed})
+        return plan.simulate(actual=actual)
+
+    plain, rough = executed(), executed(friction=40.0)
+    assert rough.grips[0].force - plain.grips[0].force == pytest.approx(40.0, rel=0.15)
+    sprung = executed(stiffness=100.0, springref=0.0)
+    assert sprung.grips[0].force > plain.grips[0].force + 10.0

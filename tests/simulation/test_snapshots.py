@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -36,3 +37,29 @@ def test_without_opengl_the_error_says_so(monkeypatch: pytest.MonkeyPatch, tmp_p
     assert not (tmp_path / "strip.png").exists()
     with pytest.raises(vkc.InputError, match="count"):
         result.plot(tmp_path / "strip.png", count=1)
+
+
+def test_a_video_lasts_as_long_as_what_happened(tmp_path: Path) -> None:
+    result = drawer_plan().simulate()
+    try:
+        file = result.to_mp4(tmp_path / "deep" / "film.mp4", rate=5.0)
+    except vkc.VkcError as error:  # no OpenGL or no ffmpeg on this machine
+        pytest.skip(str(error))
+    data = file.read_bytes()
+    assert data[4:8] == b"ftyp"
+    at = data.index(b"mvhd") + 4  # version and flags, created, changed, ticks a second, duration
+    ticks, duration = (int.from_bytes(data[at + k : at + k + 4], "big") for k in (12, 16))
+    times = result.trajectory.times
+    assert duration / ticks == pytest.approx(times[-1] - times[0], abs=0.25)
+
+
+def test_without_ffmpeg_the_error_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    result = drawer_plan().simulate()
+    monkeypatch.setattr(snapshots.shutil, "which", lambda name: None)
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(vkc.InputError, match="ffmpeg") as caught:
+        result.to_mp4(tmp_path / "film.mp4")
+    assert "imageio-ffmpeg" in str(caught.value.expected)
+    with pytest.raises(vkc.InputError, match="rate"):
+        result.to_mp4(tmp_path / "film.mp4", rate=0.0)
+    assert not list(tmp_path.iterdir())

@@ -18,6 +18,7 @@ from vkc_pin.cli.importing import add_importing
 from vkc_pin.cli.simulating import add_simulate
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.files.writing import check_outputs, write_atomically
+from vkc_pin.motion.formats.rosbag import bag_library
 from vkc_pin.motion.formats.tables import GROUPS
 
 __all__ = ["EXIT_MISUSE", "make_parser", "parse_settings", "run"]
@@ -31,6 +32,7 @@ _CODES = """exit codes:
   3    infeasible: the task cannot be done, and the report says why
   130  Ctrl-C"""
 _FILES = ("save", "json", "csv", "ros", "html")
+_FOLDERS = ("rosbag",)
 
 
 def parse_settings(settings: Sequence[str]) -> list[Any]:
@@ -75,7 +77,7 @@ def _plan(arguments: argparse.Namespace) -> int:
         if Path(folder).suffix.lower() in PICTURES:
             raise InputError("this is the name of a picture", field="--plots", expected="a folder", got=folder)
         outputs["--plots"] = Path(folder, "joints.png")
-    check_outputs(outputs, kept={"SCENE": arguments.scene})
+    check_outputs(outputs | _new_folders(arguments), kept={"SCENE": arguments.scene})
     scene = vkc.load_scene(arguments.scene)
     plan = vkc.plan(
         scene,
@@ -92,10 +94,11 @@ def _plan(arguments: argparse.Namespace) -> int:
         "json": plan.to_json,
         "csv": plan.to_csv,
         "ros": ros,
+        "rosbag": plan.to_rosbag,
         "html": plan.to_html,
         "plots": plan.plot,
     }
-    if not _write(_chosen(arguments, (*_FILES, "plots")), writers, plan.report() + "\n"):
+    if not _write(_chosen(arguments, (*_FILES, *_FOLDERS, "plots")), writers, plan.report() + "\n"):
         return EXIT_MISUSE
     return EXIT_OK if plan.success else _FAILURES.get(plan.status, EXIT_FAILED)
 
@@ -103,6 +106,16 @@ def _plan(arguments: argparse.Namespace) -> int:
 def _chosen(arguments: argparse.Namespace, options: Sequence[str]) -> dict[str, str]:
     """Return what options name, of those that are given."""
     return {option: value for option in options if (value := getattr(arguments, option)) is not None}
+
+
+def _new_folders(arguments: argparse.Namespace) -> dict[str, str | Path]:
+    """Return a file in each folder that options have made, by option, if these can be made."""
+    folders = _chosen(arguments, _FOLDERS)
+    for option, path in folders.items():
+        if Path(path).exists():
+            raise InputError("this is there already", file=path, field=f"--{option}", expected="a new folder")
+        bag_library()
+    return {f"--{option}": Path(path, "metadata.yaml") for option, path in folders.items()}
 
 
 def _options(files: Mapping[str, str]) -> dict[str, str | Path]:
@@ -130,18 +143,30 @@ def _write_ros(plan: Any, path: str, **options: Any) -> None:
 def _export(arguments: argparse.Namespace) -> int:
     import vkc_pin as vkc
 
-    files = _chosen(arguments, ("csv", "json", "ros"))
+    files = _chosen(arguments, ("csv", "json", "ros", *_FOLDERS))
     if not files:
-        raise InputError("nothing to write", field="export", expected="--csv FILE, --json FILE or --ros FILE")
-    if arguments.rate is not None and "ros" not in files:
-        raise InputError("only ROS' points can be resampled", field="--rate", expected="--ros FILE as well")
-    check_outputs(_options(files), kept={"PLAN": arguments.plan})
+        expected = "--csv FILE, --json FILE, --ros FILE or --rosbag FOLDER"
+        raise InputError("nothing to write", field="export", expected=expected)
+    if arguments.rate is not None and not {"ros", "rosbag"} & files.keys():
+        expected = "--ros FILE or --rosbag FOLDER as well"
+        raise InputError("only ROS' points can be resampled", field="--rate", expected=expected)
+    if arguments.joints is not None and files.keys() == {"rosbag"}:
+        raise InputError("recordings have all joints", field="--joints", expected="--csv FILE or --ros FILE as well")
+    plain = {option: path for option, path in files.items() if option not in _FOLDERS}
+    check_outputs(_options(plain) | _new_folders(arguments), kept={"PLAN": arguments.plan})
     plan = vkc.Plan.load(arguments.plan)
     names = arguments.joints.split(",") if arguments.joints else None
     joints = names[0] if names is not None and len(names) == 1 and names[0] in GROUPS else names
     chosen = {} if joints is None else {"joints": joints}
     ros = functools.partial(_write_ros, plan, **chosen, rate=arguments.rate)
-    whole = _write(files, {"csv": functools.partial(plan.to_csv, **chosen), "json": plan.to_json, "ros": ros})
+    bag = functools.partial(plan.to_rosbag, rate=arguments.rate)
+    writers: dict[str, Callable[[str], object]] = {
+        "csv": functools.partial(plan.to_csv, **chosen),
+        "json": plan.to_json,
+        "ros": ros,
+        "rosbag": bag,
+    }
+    whole = _write(files, writers)
     return EXIT_OK if whole else EXIT_MISUSE
 
 
@@ -195,6 +220,7 @@ def make_parser() -> argparse.ArgumentParser:
     plan.add_argument("--json", metavar="FILE", help="write trajectory, metrics and report as JSON")
     plan.add_argument("--csv", metavar="FILE", help="write the motion as a table, a line a waypoint")
     plan.add_argument("--ros", metavar="FILE", help="write base and arm with the fields of trajectory_msgs/JointTrajectory")
+    plan.add_argument("--rosbag", metavar="FOLDER", help="write a recording of ROS 2 (rosbag2); needs the extra `ros`")
     plan.add_argument("--plots", metavar="FOLDER", help="write plots")
     plan.add_argument("--initialization", default="auto", metavar="METHOD", help="auto, interpolated, astar, rrt or stationary")
     plan.add_argument("--time-limit", type=float, metavar="SECONDS", help="return the best motion found by then")
@@ -217,6 +243,7 @@ def make_parser() -> argparse.ArgumentParser:
     export.add_argument("--csv", metavar="FILE", help="a table, a line a waypoint")
     export.add_argument("--json", metavar="FILE", help="trajectory, metrics and report as JSON")
     export.add_argument("--ros", metavar="FILE", help="JSON with the fields of trajectory_msgs/JointTrajectory")
+    export.add_argument("--rosbag", metavar="FOLDER", help="a recording of ROS 2 (rosbag2); needs the extra `ros`")
     which = f"{', '.join(GROUPS)}, or names of coordinates with commas between; without it all in a table, robot for ROS"
     export.add_argument("--joints", metavar="WHICH", help=which)
     export.add_argument("--rate", type=float, metavar="HZ", help="points a second for ROS; without it the waypoints")

@@ -12,7 +12,7 @@ from vkc_pin.files.writing import check_outputs
 __all__ = ["add_simulate"]
 
 _OK, _FAILED = 0, 1
-_FILES = ("html", "picture", "json")
+_FILES = ("html", "picture", "video", "json")
 
 
 def add_simulate(commands: Any) -> None:
@@ -25,8 +25,11 @@ def add_simulate(commands: Any) -> None:
     simulate.add_argument("plan", metavar="PLAN", help="a plan saved with --save or Plan.save (.npz)")
     shown = "the scene that it happens in (default: the plan's own, where it starts)"
     simulate.add_argument("--actual", metavar="SCENE", help=shown)
+    how = "how the hand holds: weld (default), or friction of fingers that close"
+    simulate.add_argument("--grasp", default="weld", metavar="HOW", help=how)
     simulate.add_argument("--html", metavar="FILE", help="write what happened beside what was planned, one self-contained page")
     simulate.add_argument("--picture", metavar="FILE", help="write snapshots (.png)")
+    simulate.add_argument("--video", metavar="FILE", help="write a video (.mp4); needs ffmpeg or the package imageio-ffmpeg")
     simulate.add_argument("--json", metavar="FILE", help="write all that came of it")
     simulate.set_defaults(run=_simulate)
 
@@ -41,8 +44,13 @@ def _simulate(arguments: argparse.Namespace) -> int:
     if arguments.actual is not None:
         start = plan.scene.start
         actual = vkc.load_scene(arguments.actual).with_start(base=start[:3], arm=start[3:])
-    result = plan.simulate(actual=actual)
-    writers: dict[str, Callable[[str], object]] = {"html": result.to_html, "picture": result.plot, "json": result.to_json}
+    result = plan.simulate(actual=actual, grasp=arguments.grasp)
+    writers: dict[str, Callable[[str], object]] = {
+        "html": result.to_html,
+        "picture": result.plot,
+        "video": result.to_mp4,
+        "json": result.to_json,
+    }
     for name, path in files.items():
         writers[name](path)
     sys.stdout.write("".join([f"{result.report()}\n", *(f"wrote {path}\n" for path in files.values())]))

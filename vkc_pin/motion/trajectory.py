@@ -15,7 +15,7 @@ from vkc_pin.arguments import instance, items, known, mapping, number, numbers, 
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
 from vkc_pin.motion.curve import Curve, evenly
-from vkc_pin.motion.formats import ros, tables
+from vkc_pin.motion.formats import ros, rosbag, tables
 from vkc_pin.motion.spans import PhaseSpan, part_of
 
 __all__ = ["Trajectory"]
@@ -73,13 +73,8 @@ class Trajectory:
             instance(self.curve, Curve, "Trajectory.curve").check_through(times, positions)
         for array in (times, positions):
             array.setflags(write=False)
-        for key, value in (
-            ("names", names),
-            ("times", times),
-            ("positions", positions),
-            ("phases", phases),
-            ("robot_size", size),
-        ):
+        kept = {"names": names, "times": times, "positions": positions, "phases": phases, "robot_size": size}
+        for key, value in kept.items():
             object.__setattr__(self, key, value)
 
     def at(self, time: ArrayLike) -> Floats:
@@ -244,6 +239,10 @@ class Trajectory:
     def to_ros(self, **options: Any) -> dict[str, Any]:
         """Return plain data with the fields of ROS' `trajectory_msgs/JointTrajectory`; see `ros.to_ros`."""
         return ros.to_ros(self.to_dict(), **options)
+
+    def to_rosbag(self, path: str | Path, **options: Any) -> Path:
+        """Write a recording of ROS 2 into a new folder; see `rosbag.write_rosbag`. Needs the extra `ros`."""
+        return rosbag.write_rosbag(self.to_dict(), path, **options)
 
     @classmethod
     def from_csv(cls, path: str | Path, **options: Any) -> Trajectory:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
@@ -144,6 +143,10 @@ class Plan:
         """Return the motion as plain data with the fields of ROS' `trajectory_msgs/JointTrajectory`; see `ros.to_ros`."""
         return self.trajectory.to_ros(**options)
 
+    def to_rosbag(self, path: str | Path, **options: Any) -> Path:
+        """Write a recording of ROS 2 into a new folder; see `rosbag.write_rosbag`. Needs the extra `ros`."""
+        return self.trajectory.to_rosbag(path, **options)
+
     def __repr__(self) -> str:
         m = self.metrics
         return f"<Plan {self.status}: base {m['base_effort']:.2f} m, arm {m['arm_effort']:.2f} rad, {m['planning_time']:.2f} s>"
@@ -240,7 +243,7 @@ class Plan:
             trajectory=trajectory,
             validation=cast(Report, validation),
             status=cast(str, lambda plan: "success" if plan.validation.ok else "rejected") if status == "success" else status,
-            metrics=cast(Mapping[str, float], partial(_metrics, metrics)),
+            metrics=cast(Mapping[str, float], lambda plan: {**metrics, **_measured(plan.trajectory, plan.validation)}),
             seed=about["seed"],
             initialization=about["initialization"],
             history=tuple(about["history"]),
@@ -261,11 +264,6 @@ def _recalled(plan: Plan) -> Report:
         return report
     report = replace(report, notes=claimed.notes)
     return report.with_reasons(claimed.violations or report.violations) if vars(plan)["status"] == "infeasible" else report
-
-
-def _metrics(taken: Mapping[str, float], plan: Plan) -> Mapping[str, float]:
-    """Return the metrics of a loaded plan, with what its file says of what planning took."""
-    return {**taken, **_measured(plan.trajectory, plan.validation)}
 
 
 def _measured(trajectory: Trajectory, report: Report) -> dict[str, float]:

@@ -14,24 +14,23 @@ from vkc_pin.errors import InputError
 from vkc_pin.files.resources import file_path
 from vkc_pin.motion.world import World
 from vkc_pin.plotting.clearance import clearance_curves
+from vkc_pin.plotting.joints import SAMPLES, draw_joints, groups_of, name_phases
 from vkc_pin.plotting.style import COLOURS, new_figure, save_figure, shade_phases, styled
 from vkc_pin.plotting.top_view import draw_top_view
 from vkc_pin.validation.report import Judged
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure, FigureBase
 
 __all__ = ["PICTURES", "plot", "plot_clearance", "plot_joints", "plot_top_view"]
 
 PICTURES = (".png", ".svg", ".pdf")
 """Ends of the names of files that get all in one figure."""
-_SAMPLES = 240  # of the clearance
 _SHOWN = 0.30  # [m]: clearance above this is of no interest
 
 
 def plot(plan: Judged, path: str | Path | None = None) -> Figure | dict[str, Figure]:
-    """Draw joint positions and velocities, clearance, and a top view.
+    """Draw joint positions, velocities and accelerations, clearance, and a top view.
 
     Args:
         plan: What to draw.
@@ -58,11 +57,11 @@ def plot(plan: Judged, path: str | Path | None = None) -> Figure | dict[str, Fig
 
 
 def plot_joints(plan: Judged) -> Figure:
-    """Return a figure of positions and velocities over time, a row each for base, arm and objects, with velocity limits."""
+    """Return a figure of positions, velocities and accelerations over time, each against its limits; see `joints`."""
     _check(plan)
     with styled():
-        figure = new_figure(12.0, 2.5 * len(_groups(plan)) + 0.4)
-        _draw_joints(figure, plan)
+        figure = new_figure(16.0, 2.5 * len(groups_of(plan.trajectory)) + 0.4)
+        draw_joints(figure, plan)
     return figure
 
 
@@ -92,10 +91,10 @@ def _check(plan: Judged) -> None:
 
 def _combined(plan: Judged) -> Figure:
     with styled():
-        figure = new_figure(14.0, 11.0)
+        figure = new_figure(16.0, 11.0)
         parts: Any = figure.subfigures(2, 1, height_ratios=(1.15, 1.0))
         upper, lower = parts
-        _draw_joints(upper, plan)
+        draw_joints(upper, plan)
         left, right = lower.subfigures(1, 2, width_ratios=(1.0, 1.25))
         _draw_clearance(left, plan)
         draw_top_view(right, World(plan.scene), plan.trajectory)
@@ -103,61 +102,9 @@ def _combined(plan: Judged) -> Figure:
     return figure
 
 
-def _groups(plan: Judged) -> dict[str, list[int]]:
-    """Return the columns of the trajectory by what they belong to."""
-    names, robot = plan.trajectory.names, plan.trajectory.robot_size
-    groups = {"base": list(range(3)), "arm": list(range(3, robot)), "object": list(range(robot, len(names)))}
-    return {name: columns for name, columns in groups.items() if columns}
-
-
-def _limit(plan: Judged, name: str) -> float:
-    """Return a coordinate's velocity limit; infinite for the virtual joints of grasps, which have none."""
-    robot, (owner, _, joint) = plan.scene.robot, name.partition(".")
-    if name in robot.coordinates.names:
-        return float(robot.velocity[robot.coordinates.names.index(name)])
-    placed = plan.scene.objects.get(owner)
-    if placed is None or joint not in placed.object.coordinates.names:
-        return float("inf")
-    return float(placed.object.velocity[placed.object.coordinates.names.index(joint)])
-
-
-def _draw_joints(figure: FigureBase, plan: Judged) -> None:
-    groups, trajectory = _groups(plan), plan.trajectory
-    rows: Any = figure.subplots(len(groups), 2, sharex=True, squeeze=False)
-    fine = np.unique(np.concatenate([np.linspace(trajectory.times[0], trajectory.times[-1], _SAMPLES), trajectory.times]))
-    places, velocities = trajectory(fine), trajectory.velocity(fine)
-    units = {"base": "m, rad", "arm": "rad", "object": "rad, m"}
-    for (position, velocity), (group, columns) in zip(rows, groups.items(), strict=True):
-        limits = []
-        for k, column in enumerate(columns):
-            name, colour = trajectory.names[column], COLOURS[k % len(COLOURS)]
-            position.plot(fine, places[:, column], color=colour, label=name.removesuffix("_joint"))
-            drawn = {"color": colour, "linewidth": 1.3, "drawstyle": "default" if trajectory.curve is not None else "steps-post"}
-            velocity.plot(fine, velocities[:, column], **drawn)
-            limits.append(_limit(plan, name))
-        for limit in sorted(set(filter(np.isfinite, limits))):
-            same = [k for k, other in enumerate(limits) if other == limit]
-            colour = COLOURS[same[0] % len(COLOURS)] if len(same) == 1 else "0.35"
-            for sign in (-1.0, 1.0):
-                velocity.axhline(sign * limit, color=colour, linestyle=(0, (5, 3)), linewidth=0.9)
-        unit = units[group]
-        position.set_ylabel(f"{group} position [{unit}]")
-        velocity.set_ylabel(f"{group} velocity [{', '.join(f'{u}/s' for u in unit.split(', '))}]")
-        velocity.plot([], [], color="0.35", linestyle=(0, (5, 3)), linewidth=0.9, label="limit")
-        handles = [*position.get_legend_handles_labels()[0], *velocity.get_legend_handles_labels()[0][-1:]]
-        velocity.legend(handles=handles, loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7.5)
-    for axes in rows.ravel():
-        shade_phases(axes, plan.trajectory)
-        axes.margins(x=0.0)
-    for axes in rows[0]:
-        _name_phases(axes, plan)
-    for axes in rows[-1]:
-        axes.set_xlabel("time [s]")
-
-
 def _draw_clearance(figure: FigureBase, plan: Judged) -> None:
     axes, trajectory = figure.subplots(), plan.trajectory
-    times = np.unique(np.concatenate([np.linspace(trajectory.times[0], trajectory.times[-1], _SAMPLES), trajectory.times]))
+    times = np.unique(np.concatenate([np.linspace(trajectory.times[0], trajectory.times[-1], SAMPLES), trajectory.times]))
     safe = plan.options.dist_safe
     lowest = 0.0
     for k, curve in enumerate(clearance_curves(plan.scene, trajectory, times)):
@@ -178,14 +125,5 @@ def _draw_clearance(figure: FigureBase, plan: Judged) -> None:
     axes.set_xlabel("time [s]")
     axes.set_ylabel("clearance [mm]")
     shade_phases(axes, plan.trajectory)
-    _name_phases(axes, plan)
+    name_phases(axes, plan)
     figure.legend(loc="outside lower center", fontsize=7.5, title="closest pairs", title_fontsize=8)
-
-
-def _name_phases(axes: Axes, plan: Judged) -> None:
-    """Write the phases' names above, as far as they have room; on two levels, so that neighbours do not meet."""
-    times = plan.trajectory.times
-    for k, phase in enumerate(plan.trajectory.phases):
-        middle = (times[phase.first] + times[phase.last]) / 2.0
-        x = float(np.clip((middle - times[0]) / (times[-1] - times[0]), 0.12, 0.88))
-        axes.text(x, 1.02 + 0.09 * (k % 2), phase.name, transform=axes.transAxes, ha="center", fontsize=7.5, color="0.35")

@@ -17,6 +17,9 @@ from vkc_pin.scene.contact import CONTACT
 from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.scene import Scene
 from vkc_pin.simulation.contacts import Contact, Pairs, touching_pairs, unwanted
+from vkc_pin.simulation.friction.fingers import fingers_of, limited
+from vkc_pin.simulation.friction.pauses import paused
+from vkc_pin.simulation.friction.squeezes import Span, Squeezes, grip_changes, split
 from vkc_pin.simulation.goals import missed
 from vkc_pin.simulation.grips import Grips, Latches, latched, spans
 from vkc_pin.simulation.model import Builder, PhysicalWorld
@@ -27,8 +30,10 @@ from vkc_pin.task.steps import Step, as_list
 
 __all__ = ["GRASPS", "simulate"]
 
-GRASPS = ("weld",)
+GRASPS = ("weld", "friction")
 """How a hand can hold on."""
+_FINE = 5e-4  # [s] the longest step with which fingers hold by friction; see `Builder`
+_CLOSED = 0.2  # [s] for which fingers have closed on what is in the hand at the start, before they carry it
 _FRAME, _LOOK = 0.02, 0.01  # [s] between recorded states, and between two looks at the contacts
 
 
@@ -48,7 +53,8 @@ def simulate(
         steps: What it was to bring about.
         trajectory: The motion.
         actual: The scene that it happens in, if that is another: something stands elsewhere, or is heavier.
-        grasp: "weld": what is held is welded to the hand as long as the motion says, unless it is pulled too hard.
+        grasp: "weld": what is held is welded to the hand as long as the motion says, unless it is pulled too hard. "friction":
+            fingers close on it, and nothing but their friction holds it; the robot waits while they close and open.
         physics: What to assume; `Physics()` if left out.
 
     Returns:
@@ -61,8 +67,7 @@ def simulate(
     mujoco = engine()
     physics = Physics() if physics is None else instance(physics, Physics, "physics")
     if grasp not in GRASPS:
-        problem = "hands hold by welds so far, not by the friction of their fingers" if grasp == "friction" else "unknown"
-        raise InputError(problem, field="grasp", expected=", ".join(GRASPS), got=grasp)
+        raise InputError("unknown", field="grasp", expected=", ".join(GRASPS), got=grasp)
     steps, here = as_list(steps), scene if actual is None else instance(actual, Scene, "actual")
     for name, placed in scene.objects.items():
         if name not in here.objects or here.objects[name].object.coordinates.names != placed.object.coordinates.names:
@@ -71,7 +76,7 @@ def simulate(
             )
     if here.robot.coordinates.names != scene.robot.coordinates.names:
         raise InputError("another robot", field="actual", expected=scene.robot.name, got=here.robot.name)
-    run = _Run(here, trajectory, physics)
+    run = _Run(here, trajectory, physics, friction=grasp == "friction")
     mujoco.set_mju_user_warning(lambda text: None)  # it would write a file into the working directory; see `diverged`
     try:
         run.go()
@@ -88,27 +93,47 @@ class _Run:
         scene: Where it happens.
         trajectory: What the robot follows.
         physics: What is assumed.
+        friction: Whether the hand holds by the friction of its fingers.
     """
 
     scene: Scene
     trajectory: Trajectory
     physics: Physics
+    friction: bool = False
 
     def __post_init__(self) -> None:
-        trajectory, physics = self.trajectory, self.physics
+        if self.friction and self.physics.timestep > _FINE:
+            self.physics = replace(self.physics, timestep=_FINE)
+        physics = self.physics
         self.mj, self.tree = engine(), World(self.scene)
         self.notes = weigh(self.tree, physics)
+        schedule, squeezed = spans(self.scene, self.trajectory), list[Span]()
+        holds: list[Hold] = list(dict.fromkeys(hold for hold, _, _ in schedule))
+        if self.friction:
+            _, squeezed = split(schedule, float(self.trajectory.times[0]))
+            waits = grip_changes(self.trajectory, squeezed)
+            self.trajectory = paused(self.trajectory, waits, physics.grip_time)
+            schedule, squeezed = split(spans(self.scene, self.trajectory), float(self.trajectory.times[0]))
+        trajectory, welded = self.trajectory, list(dict.fromkeys(hold for hold, _, _ in schedule))
         self.planned = self.tree.positions(trajectory)
         self.servos: tuple[Servo, ...] = servos(self.tree, self.planned, physics)
-        schedule = spans(self.scene, trajectory)
-        holds: list[Hold] = list(dict.fromkeys(hold for hold, _, _ in schedule))
-        self.pairs: Pairs = touching_pairs(self.tree, holds)
+        self.fingers = fingers_of(self.tree, physics) if squeezed else None
+        if self.fingers is not None:
+            self.servos = limited(self.servos, self.fingers, self.tree, physics)
+        squeezing = [hold for hold, _, _ in squeezed]
+        self.pairs: Pairs = touching_pairs(self.tree, [hold for hold in holds if hold not in squeezing])
         latches = latched(self.scene)
         shut = [(joint, at) for joint, at, _, _ in latches]
-        self.physical: PhysicalWorld = Builder(self.tree, physics).built(self.pairs, self.servos, holds, shut)
-        self.grips = Grips(self.physical, holds, schedule, self.pairs, trajectory, physics)
-        self.latches = Latches(self.physical, latches, len(holds), physics)
-        start, end = float(trajectory.times[0]) - physics.settle, float(trajectory.times[-1]) + physics.settle
+        builder = Builder(self.tree, physics, gripping=bool(squeezed))
+        more = {} if self.fingers is None else {"before": self.fingers.add_bodies, "more": self.fingers.add_drives}
+        self.physical: PhysicalWorld = builder.built(self.pairs, self.servos, welded, shut, **more)
+        self.grips = Grips(self.physical, welded, schedule, self.pairs, trajectory, physics, touching=squeezing)
+        self.latches = Latches(self.physical, latches, len(welded), physics)
+        self.squeezes: Squeezes | None = None
+        if self.fingers is not None:
+            self.squeezes = Squeezes(self.physical, self.fingers, squeezed, trajectory, physics, _LOOK)
+        settle = max(physics.settle, physics.grip_time + _CLOSED if self.scene.holds and squeezed else 0.0)
+        start, end = float(trajectory.times[0]) - settle, float(trajectory.times[-1]) + physics.settle
         steps = np.arange(int(np.ceil((end - start) / physics.timestep - 1e-9)) + 1)
         self.times: Floats = np.asarray(start + physics.timestep * steps, float)
         self.diverged: float | None = None
@@ -127,6 +152,10 @@ class _Run:
         commands, still = wanted.copy(), np.zeros_like(fingers)
         for gain, rates in zip(np.transpose(gains), (velocities, accelerations), strict=True):
             commands += gain * np.column_stack([rates, still])
+        if self.squeezes is not None and self.fingers is not None:
+            closing, commanded = self.fingers.addresses(self.physical)
+            rest = fingers if self.fingers.sides is None else np.zeros((len(self.times), len(closing)))
+            squeeze = self.squeezes.commands(self.times, rest)
         driven, dofs = (where[: len(self.servos)] for where in (self.physical.columns, self.physical.dofs))
         labels = np.zeros(model.ngeom, int)
         labels[self.physical.geoms] = np.arange(len(self.physical.geoms))
@@ -140,12 +169,16 @@ class _Run:
             if k == kept[len(records)]:
                 records.append(np.array(data.qpos))
             self.errors[k] = wanted[k] - data.qpos[driven]
-            data.ctrl[:] = commands[k]
+            data.ctrl[: len(self.servos)] = commands[k]
+            if self.squeezes is not None:
+                data.ctrl[commanded] = squeeze[k]
             mj.mj_step(model, data)
             self.efforts[k] = data.qfrc_actuator[dofs]
             self.grips.measure(data, clock)
             if k % look == 0 and data.ncon:
                 self._look(data, labels, clock)
+            if k % look == 0 and self.squeezes is not None:
+                self.squeezes.measure(data, clock)
             if not np.isfinite(data.qpos).all() or data.warning[mj.mjtWarning.mjWARN_BADQACC].number:
                 self.times, self.errors, self.efforts = self.times[: k + 1], self.errors[: k + 1], self.efforts[: k + 1]
                 self.diverged = clock
@@ -157,10 +190,13 @@ class _Run:
         """Note what touches."""
         names, contacts = self.tree.collision_labels, data.contact
         depths = -np.asarray(contacts.dist)
+        held = set() if self.squeezes is None else self.squeezes.may_touch(clock)
         deepest: dict[tuple[str, str], float] = {}
         for i in np.flatnonzero(depths > CONTACT).tolist():
             one, other = (names[labels[geom]] for geom in np.asarray(contacts.geom)[i])
             pair = (min(one, other), max(one, other))
+            if pair in held:
+                continue
             deepest[pair] = max(deepest.get(pair, 0.0), float(depths[i]))
         for pair, depth in deepest.items():
             self.seen.setdefault(pair, []).append((clock, depth))
@@ -178,6 +214,10 @@ class _Run:
         if self.pairs.overlapping:
             told = "; ".join(" – ".join(pair) for pair in self.pairs.overlapping)
             notes.append(f"overlap at the start, and go through each other: {told}")
+        if self.fingers is not None and self.fingers.sides is not None:
+            notes.append("the hand's fingers do not move in its description: its two sides slide towards each other")
+        grips = [grip for grip in self.grips.grips if grip.end > grip.begin or grip.broken is not None]
+        grips += [] if self.squeezes is None else self.squeezes.grips
         executed = self._executed(rows)
         misses = missed(scene, steps, self.trajectory, self.tree, executed.times, rows)
         return SimulationResult(
@@ -188,7 +228,7 @@ class _Run:
             rows=rows,
             misses=misses,
             tracking=Tracking.of(self.times, self.errors, self.efforts, self.servos, self.trajectory.robot_size),
-            grips=tuple(self.grips.grips),
+            grips=tuple(grips),
             contacts=contacts,
             physics=self.physics,
             notes=tuple(notes),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -32,6 +32,7 @@ class Grip:
         begin, end: When, by the plan [s].
         force, torque: The largest, averaged over 20 ms [N], [N·m]; at where the hand takes hold.
         broken: When it was pulled off [s]; None: it was not.
+        slip: How far what holds moved at most against what it holds, of holds by friction [m].
     """
 
     what: str
@@ -40,6 +41,7 @@ class Grip:
     force: float = 0.0
     torque: float = 0.0
     broken: float | None = None
+    slip: float = 0.0
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data of it."""
@@ -74,6 +76,7 @@ class Grips:
         pairs: What may touch what.
         trajectory: The plan, for where the freedoms of a grasp are when it begins.
         physics: How hard a hand holds.
+        touching: Holds in which what holds and what it holds meet all the same.
 
     Attributes:
         grips: What has been held so far.
@@ -87,7 +90,10 @@ class Grips:
         pairs: Pairs,
         trajectory: Trajectory,
         physics: Physics,
+        *,
+        touching: Collection[Hold] = (),
     ) -> None:
+        self._touching = touching
         self.physical, self.holds, self.schedule, self.pairs = physical, list(holds), list(schedule), pairs
         self.trajectory, self.physics, self._engine = trajectory, physics, engine()
         self.grips: list[Grip] = []
@@ -156,6 +162,8 @@ class Grips:
 
     def _meet(self, hold: Hold, *, meets: bool) -> None:
         """Let what holds and the link that it holds meet, or not."""
+        if hold in self._touching:
+            return
         bit = self.pairs.bits[hold]
         if any(self.pairs.bits[other] == bit for other in self._active if other != hold):
             return

@@ -18,6 +18,7 @@ import pinocchio as pin
 from vkc_pin.arrays import Floats, Ints
 from vkc_pin.errors import InputError
 from vkc_pin.models.coordinates import Moved
+from vkc_pin.models.dynamics.resistance import Resistance
 from vkc_pin.models.shapes import triangles
 from vkc_pin.motion.world import World
 from vkc_pin.scene.contact import moves_as_one
@@ -76,18 +77,23 @@ class Builder:
     Args:
         world: The tree, all of whose bodies have masses; see `physics.weigh`.
         physics: What to assume.
+        gripping: Whether anything is held by friction. MuJoCo's contacts resist slipping by damping, and leave out centripetal
+            accelerations: what is carried round a bend creeps out of the hand unless friction acts within two time steps.
 
     Attributes:
         mj: The package `mujoco`.
         spec: What is put together, a `mujoco.MjSpec`.
         bodies: For each joint of the tree its body there.
+        moved: Number of a shape → the body that it is on instead of its joint's, and where.
     """
 
     world: World
     physics: Physics
+    gripping: bool = False
 
     def __post_init__(self) -> None:
         self.mj = engine()
+        self.moved: dict[int, tuple[Any, pin.SE3]] = {}
         self.spec = self.mj.MjSpec()
         self._carried: dict[Hold, list[str]] = {}
 
@@ -98,6 +104,7 @@ class Builder:
         holds: Sequence[Hold],
         latches: Sequence[tuple[str, float]],
         *,
+        before: Callable[[Builder], None] | None = None,
         more: Callable[[Builder], None] | None = None,
     ) -> PhysicalWorld:
         """Return the model.
@@ -107,13 +114,16 @@ class Builder:
             servos: Of the coordinates that are driven.
             holds: All that is ever welded, each with a weld of its own, in this order; they are not active.
             latches: Coordinates with where they are held, each with an equality of its own after those; not active.
-            more: What else to add: light, say.
+            before: What to add before the shapes: bodies, say.
+            more: What else to add, at the end: light, say.
         """
         mj, spec, option = self.mj, self.spec, self.spec.option
         option.timestep, option.integrator = self.physics.timestep, mj.mjtIntegrator.mjINT_IMPLICITFAST
         option.cone, option.impratio = mj.mjtCone.mjCONE_ELLIPTIC, 10.0  # what is held by friction hardly creeps
         spec.compiler.degree = False
         self._bodies(servos)
+        if before is not None:
+            before(self)
         self._geoms(pairs)
         for hold in holds:
             self._weld(hold)
@@ -123,9 +133,7 @@ class Builder:
             for coordinate, value in zip(self.world.coordinates.names[:3], self.world.start[:3], strict=True):
                 self._fixed(coordinate, float(value), active=True)
         for servo in servos:
-            actuator = spec.add_actuator(name=servo.coordinate, target=servo.coordinate, trntype=mj.mjtTrn.mjTRN_JOINT)
-            actuator.gaintype, actuator.biastype = mj.mjtGain.mjGAIN_FIXED, mj.mjtBias.mjBIAS_AFFINE
-            actuator.gainprm[0], actuator.biasprm[:3] = servo.stiffness, [0.0, -servo.stiffness, -servo.damping]
+            self.add_actuator(servo)
         for move in self.world.coordinates.followers:
             self._follow(move)
         if more is not None:
@@ -173,13 +181,13 @@ class Builder:
             joint, slides = self._joint(body, name, axes[:, k])
             servo, column = driven.get(name), self.world.coordinates.index(name)
             if servo is not None:
-                joint.armature, joint.actgravcomp = servo.armature, True
-                if np.isfinite(servo.limit):
-                    joint.actfrclimited, joint.actfrcrange = self.mj.mjtLimited.mjLIMITED_TRUE, [-servo.limit, servo.limit]
+                self.drive_joint(joint, servo)
                 continue
-            stated, friction = self._stated(name)
+            owner, _, own = name.partition(".")
+            stated = self.world.scene.objects[owner].object.resistance.get(own, Resistance())
             usual = self.physics.prismatic_damping if slides else self.physics.revolute_damping
-            joint.damping[0], joint.frictionloss = stated or usual, friction
+            joint.damping[0], joint.frictionloss = stated.damping or usual, stated.friction
+            joint.stiffness[0], joint.springref = stated.stiffness, stated.springref
             lower, upper = self.world.coordinates.lower[column], self.world.coordinates.upper[column]
             if np.isfinite([lower, upper]).all():
                 joint.limited, joint.range = self.mj.mjtLimited.mjLIMITED_TRUE, [lower, upper]
@@ -190,28 +198,37 @@ class Builder:
         axis = twist[:3] if slides else twist[3:]
         return body.add_joint(name=name, axis=axis, type=kind.mjJNT_SLIDE if slides else kind.mjJNT_HINGE), slides
 
+    def drive_joint(self, joint: Any, servo: Servo) -> None:
+        """Give a joint what a servo's motor brings along."""
+        joint.armature, joint.actgravcomp = servo.armature, True
+        if np.isfinite(servo.limit):
+            joint.actfrclimited, joint.actfrcrange = self.mj.mjtLimited.mjLIMITED_TRUE, [-servo.limit, servo.limit]
+
+    def add_actuator(self, servo: Servo) -> None:
+        """Add a servo to the joint that it drives."""
+        mj, name = self.mj, servo.coordinate
+        actuator = self.spec.add_actuator(name=name, target=name, trntype=mj.mjtTrn.mjTRN_JOINT)
+        actuator.gaintype, actuator.biastype = mj.mjtGain.mjGAIN_FIXED, mj.mjtBias.mjBIAS_AFFINE
+        actuator.gainprm[0], actuator.biasprm[:3] = servo.stiffness, [0.0, -servo.stiffness, -servo.damping]
+
     def _balanced(self, joint: int) -> bool:
         """Return whether springs carry what a joint of an object carries."""
         placed = self.world.scene.objects.get(str(self.world.model.names[joint]).partition(".")[0])
         return self.physics.balanced and placed is not None and not placed.object.free
 
-    def _stated(self, coordinate: str) -> tuple[float, float]:
-        """Return damping and friction of an object's joint by its URDF."""
-        owner, _, name = coordinate.partition(".")
-        model = self.world.scene.objects[owner].object.model
-        at = model.joints[model.getJointId(name)].idx_v
-        return float(model.damping[at]), float(model.upperDryFrictionLimit[at])
-
     def _geoms(self, pairs: Pairs) -> None:
         """Add the shapes, and which of them meet."""
         for number, shape in enumerate(self.world.shapes):
-            geom = self.geom(self.bodies[shape.parentJoint], f"shape {number}", shape.geometry, shape.placement)
+            body, place = self.moved.get(number, (self.bodies[shape.parentJoint], shape.placement))
+            geom = self.geom(body, f"shape {number}", shape.geometry, place)
             geom.contype, geom.conaffinity = int(pairs.types[number]), int(pairs.affinities[number])
             geom.friction[0], geom.condim, geom.solref, geom.group = self.physics.friction, 4, _CONTACT, 3
             geom.rgba = [*np.asarray(shape.meshColor)[:3], 1.0]
         for first, second in pairs.always.tolist():
             pair = self.spec.add_pair(geomname1=f"shape {first}", geomname2=f"shape {second}")
             pair.condim, pair.friction[:2], pair.solref = 4, [self.physics.friction] * 2, _CONTACT
+            if self.gripping:
+                pair.solreffriction = [2.0 * self.physics.timestep, 1.0]
 
     def geom(self, body: Any, name: str, shape: coal.CollisionGeometry, place: pin.SE3, *, thin: bool = False) -> Any:
         """Add a shape to a body; a `thin` one may have no volume."""

@@ -12,7 +12,7 @@ import pinocchio as pin
 from vkc_pin.arguments import flag, number
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
-from vkc_pin.models.shapes import triangles
+from vkc_pin.models.dynamics.weight import solid_inertia
 from vkc_pin.motion.world import World
 
 __all__ = ["Physics", "engine", "weigh"]
@@ -42,6 +42,8 @@ class Physics:
         grasp_force: A hand that is pulled harder than this, on average over 20 ms, lets go [N]. A parallel gripper that closes
             with 235 N holds 2 · 0.6 · 235 N by its rubber pads.
         grasp_torque: The same of a torque [N·m].
+        closing_force: Of each finger where hands hold by friction [N]; fingers whose URDF states less effort have that.
+        grip_time: How long fingers take to close or to open there [s].
         balanced: Whether springs carry the weight of doors, lids and levers, as a dishwasher's do and those of a door's handle:
             joints of what stands fixed stay where nobody moves them, as in plans. What is laid on them weighs all the same.
         latch_play: By how much the joint that releases a latch may fall short of where its description says, [rad] or [m].
@@ -61,6 +63,8 @@ class Physics:
     friction: float = 0.8
     grasp_force: float = 280.0
     grasp_torque: float = 30.0
+    closing_force: float = 235.0
+    grip_time: float = 0.6
     balanced: bool = True
     latch_play: float = 0.02
 
@@ -104,7 +108,7 @@ def weigh(world: World, physics: Physics) -> list[str]:
             guessed += [name] if solids else []
             inertia = pin.Inertia(_LEAST_MASS, np.zeros(3), 1e3 * _LEAST_INERTIA * _LEAST_MASS * np.eye(3))
             for solid in solids:
-                inertia += solid.placement.act(_of_solid(solid, physics.density))
+                inertia += solid.placement.act(solid_inertia(solid, physics.density))
         tensor, added = _possible(inertia)
         if added > _ROUNDED:
             notes.append(f"no body has the inertia that is stated for {name}: {100.0 * added:.0f} % are added to its moments")
@@ -113,14 +117,6 @@ def weigh(world: World, physics: Physics) -> list[str]:
         density = f"{physics.density:g} kg/m³ in the volume of the collision shapes"
         notes.append(f"no mass is stated for {', '.join(guessed)}: {density}")
     return notes
-
-
-def _of_solid(shape: pin.GeometryObject, density: float) -> pin.Inertia:
-    import trimesh
-
-    solid = trimesh.Trimesh(triangles(shape.geometry)[0]).convex_hull
-    solid.density = density
-    return pin.Inertia(float(solid.mass), np.asarray(solid.center_mass), np.asarray(solid.moment_inertia))
 
 
 def _possible(inertia: pin.Inertia) -> tuple[Floats, float]:

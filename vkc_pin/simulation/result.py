@@ -20,7 +20,7 @@ from vkc_pin.simulation.grips import Grip
 from vkc_pin.simulation.physics import Physics
 from vkc_pin.simulation.replay import page
 from vkc_pin.simulation.servos import Servo
-from vkc_pin.simulation.snapshots import strip
+from vkc_pin.simulation.snapshots import film, strip
 from vkc_pin.task.steps import Step, step_to_dict
 
 __all__ = ["SimulationResult", "Tracking"]
@@ -139,7 +139,8 @@ class SimulationResult:
         for grip in self.grips:
             broken = "" if grip.broken is None else f", PULLED OUT OF THE HAND at {grip.broken:.2f} s"
             force = f"{grip.force:.0f} N and {grip.torque:.1f} N·m at most"
-            lines.append(f"  grasp       {grip.what}, {grip.begin:.1f} to {grip.end:.1f} s: {force}{broken}")
+            slip = f", slips by {1e3 * grip.slip:.1f} mm" if grip.slip else ""
+            lines.append(f"  grasp       {grip.what}, {grip.begin:.1f} to {grip.end:.1f} s: {force}{slip}{broken}")
         shares = sorted(t.shares.items(), key=lambda item: -item[1])
         if shares:
             told = ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in shares[:_TOLD])
@@ -183,6 +184,10 @@ class SimulationResult:
     def plot(self, path: str | Path, *, count: int = 6) -> Path:
         """Write a picture (.png) of `count` snapshots; return its path. See `snapshots.strip`."""
         return strip(self, path, count=count)
+
+    def to_mp4(self, path: str | Path, *, rate: float = 25.0) -> Path:
+        """Write a video of what happened; return its path. Needs ffmpeg; see `snapshots.film`."""
+        return film(self, path, rate=rate)
 
     def __repr__(self) -> str:
         return f"<SimulationResult {self.scene.name}: {'ok' if self.ok else 'FAILED'}, {len(self.contacts)} contacts>"

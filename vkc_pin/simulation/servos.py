@@ -13,7 +13,7 @@ from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.motion.world import World
 from vkc_pin.simulation.physics import Physics
 
-__all__ = ["Servo", "finger_rows", "reference", "servos"]
+__all__ = ["Servo", "finger_rows", "position_servo", "reference", "servos"]
 
 _UNLIMITED = 1e300  # Pinocchio's efforts above this are none
 _SPIN_UP = 1.0 / 1500.0  # [s²] full effort would accelerate a joint's own rotor by 1500 rad/s²: 0.1 kg·m² at 150 N·m
@@ -62,15 +62,32 @@ def servos(world: World, rows: Floats, physics: Physics) -> tuple[Servo, ...]:
         velocity = model.joints[world.coordinates.joints[k]].idx_v + (k if k < 3 else 0)
         stated, moved = float(model.effortLimit[velocity]), float(inertias[velocity])
         limit = stated if 0.0 < stated < _UNLIMITED and k > 2 else np.inf
-        armature = 0.0 if k < 3 else limit * _SPIN_UP if np.isfinite(limit) else _ROTOR * moved
-        inertia = moved + armature
         bandwidth = physics.base_bandwidth if k < 3 else physics.arm_bandwidth
-        stiffness = inertia * bandwidth**2
-        if np.isfinite(limit):
-            stiffness = max(stiffness, limit / _SAG[world.coordinates.units[k]])
-        damping = 2.0 * physics.damping_ratio * float(np.sqrt(stiffness * inertia))
-        found.append(Servo(name, stiffness, damping, inertia, armature, limit))
+        unit = world.coordinates.units[k]
+        found.append(position_servo(name, moved, limit, unit, bandwidth, physics.damping_ratio, rotor=k > 2))
     return tuple(found)
+
+
+def position_servo(
+    coordinate: str, moved: float, limit: float, unit: str, bandwidth: float, damping_ratio: float, *, rotor: bool = True
+) -> Servo:
+    """Return a servo.
+
+    Args:
+        coordinate: What it drives.
+        moved: The largest inertia that it moves [kg·m²] or [kg].
+        limit: Of its force [N·m] or [N]; infinite: none.
+        unit: Of the coordinate, "rad" or "m".
+        bandwidth: Its natural frequency, for that inertia [rad/s].
+        damping_ratio: Its damping ratio.
+        rotor: Whether its motor has a rotor.
+    """
+    armature = 0.0 if not rotor else limit * _SPIN_UP if np.isfinite(limit) else _ROTOR * moved
+    inertia = moved + armature
+    stiffness = inertia * bandwidth**2
+    if np.isfinite(limit):
+        stiffness = max(stiffness, limit / _SAG[unit])
+    return Servo(coordinate, stiffness, 2.0 * damping_ratio * float(np.sqrt(stiffness * inertia)), inertia, armature, limit)
 
 
 def reference(trajectory: Trajectory, times: Floats) -> tuple[Floats, Floats, Floats]:

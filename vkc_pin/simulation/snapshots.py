@@ -1,10 +1,13 @@
-"""Snapshots of what happened in physics, drawn by MuJoCo without a screen."""
+"""Snapshots and videos of what happened in physics, drawn by MuJoCo without a screen."""
 
 from __future__ import annotations
 
 import contextlib
 import importlib
 import io
+import shutil
+import subprocess
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vkc_pin.arguments import whole
+from vkc_pin import arguments
 from vkc_pin.arrays import Floats
-from vkc_pin.errors import VkcError
+from vkc_pin.errors import InputError, VkcError
 from vkc_pin.files.writing import write_atomically
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.simulation.contacts import Pairs
@@ -25,9 +28,10 @@ from vkc_pin.simulation.servos import Servo
 from vkc_pin.visualization.camera import FIELD_OF_VIEW
 from vkc_pin.visualization.room import is_wall
 
-__all__ = ["Stage", "strip"]
+__all__ = ["Stage", "film", "strip"]
 
 _SIZE = (640, 480)  # of a snapshot [pixels]
+_FASTEST = 60.0  # pictures a second in a video
 _MOST = 24  # snapshots in a picture
 _SEEN = 2  # MuJoCo draws geoms of the groups 0 to 2
 _VEIL = 0.12  # opacity of walls
@@ -110,7 +114,7 @@ def strip(executed: Executed, path: str | Path, *, count: int = 6) -> Path:
         InputError: `count` is out of range.
         VkcError: There is no OpenGL without a screen.
     """
-    count = whole(count, "count", low=2, high=_MOST)
+    count = arguments.whole(count, "count", low=2, high=_MOST)
     first, last = float(executed.planned.times[0]), float(executed.planned.times[-1])
     held = [phase for phase in executed.planned.phases if phase.holds]
     begin = float(executed.planned.times[held[0].first]) if held else first
@@ -133,6 +137,45 @@ def strip(executed: Executed, path: str | Path, *, count: int = 6) -> Path:
     data = io.BytesIO()
     figure.savefig(data, format="png")
     return write_atomically(path, data.getvalue())
+
+
+def film(executed: Executed, path: str | Path, *, rate: float = 25.0) -> Path:
+    """Write a video (.mp4, H.264) of what happened, at the speed at which it did.
+
+    Args:
+        executed: What happened.
+        path: The file, written whole or not at all.
+        rate: Pictures a second [Hz].
+
+    Returns:
+        The path.
+
+    Raises:
+        InputError: `rate` is out of range, or there is no ffmpeg.
+        VkcError: There is no OpenGL without a screen, or ffmpeg refuses.
+    """
+    rate, encoder = arguments.number(rate, "rate", "pictures a second", low=1.0, high=_FASTEST), _ffmpeg()
+    times = np.arange(executed.trajectory.times[0], executed.trajectory.times[-1], 1.0 / rate)
+    stage, size = Stage(executed), "x".join(map(str, _SIZE))
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder, "film.mp4")
+        taken = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", str(rate), "-i", "-"]
+        command = [encoder, "-loglevel", "error", *taken, "-c:v", "libx264", "-pix_fmt", "yuv420p", str(file)]
+        pictures = b"".join(picture.tobytes() for picture in stage.pictures(times, stage.viewpoint()))
+        done = subprocess.run(command, input=pictures, capture_output=True, check=False)
+        if done.returncode:
+            raise VkcError(f"ffmpeg writes no video: {done.stderr.decode(errors='replace').strip()}")
+        return write_atomically(path, file.read_bytes())
+
+
+def _ffmpeg() -> str:
+    """Return the program ffmpeg: the machine's own, or that of the package imageio-ffmpeg."""
+    if (own := shutil.which("ffmpeg")) is not None:
+        return own
+    try:
+        return str(importlib.import_module("imageio_ffmpeg").get_ffmpeg_exe())
+    except (ImportError, RuntimeError) as error:
+        raise InputError("videos need ffmpeg", expected="ffmpeg, or pip install imageio-ffmpeg", got="neither") from error
 
 
 def _dressed(builder: Builder) -> None:

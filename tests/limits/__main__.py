@@ -1,0 +1,46 @@
+"""`python -m tests.limits FOLDER_OR_FILE ...`: judges saved plans and the tables beside them; `--make N` has them made first."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from .check import check
+from .files import limits_of, read_csv, read_npz
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Judge; 1 if a limit is not kept."""
+    parser = argparse.ArgumentParser(prog="python -m tests.limits", description=__doc__)
+    parser.add_argument("paths", nargs="+", type=Path, help="saved plans (.npz), or folders with some")
+    parser.add_argument("--make", type=int, default=0, metavar="N", help="plan so many problems first, into the first folder")
+    parser.add_argument("--first", type=int, default=0, help="the number of the first problem")
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args(arguments)
+    if given.make:
+        from .plans import exported
+
+        for _ in exported(given.paths[0], given.make, first=given.first, seed=given.seed):
+            pass
+    plans, moments, wrong, shares = 0, 0, 0, [0.0, 0.0]
+    for path in given.paths:
+        for file in sorted(path.rglob("*.npz")) if path.is_dir() else [path]:
+            motion, about = read_npz(file)
+            tables = [read_csv(table)] if (table := file.with_suffix(".csv")).is_file() else []
+            found = []
+            for one in (motion, *tables):
+                verdict = check(one, limits_of(about, file))
+                found += verdict.found
+                shares = [max(shares[0], verdict.velocity), max(shares[1], verdict.acceleration)]
+                moments += verdict.moments
+            plans += 1
+            wrong += bool(found)
+            sys.stdout.write("".join(f"{file}: {excess}\n" for excess in found))
+    told = f"{plans} plans, {moments} moments, {wrong} plans with an excess; velocities up to {shares[0]:.9f} of their limits"
+    sys.stdout.write(f"{told}, accelerations up to {shares[1]:.9f}\n")
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

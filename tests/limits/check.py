@@ -1,0 +1,89 @@
+"""Samples a motion at 1 kHz and compares positions, velocities and accelerations with limits."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from .files import Limits, Motion
+
+__all__ = ["RATE", "Excess", "Verdict", "check"]
+
+RATE = 1000.0  # [Hz]
+SLACK = 1e-6  # of a rate's limit: rounding
+OUTSIDE = 1e-6  # [m] or [rad] of a position
+REST = 1e-6  # [m/s] or [rad/s] at both ends
+
+
+@dataclass(frozen=True)
+class Excess:
+    """A limit that is not kept: of what, by which coordinate, when [s], and what there is instead."""
+
+    what: str
+    name: str
+    time: float
+    value: float
+    limit: float
+
+    def __str__(self) -> str:
+        return f"{self.what} of {self.name} at {self.time:.3f} s: {self.value:.9g}, limit {self.limit:.9g}"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What came out: how many moments were looked at, what exceeds its limit, and how close rates come to theirs, as shares."""
+
+    moments: int
+    found: list[Excess]
+    velocity: float
+    acceleration: float
+
+
+def check(motion: Motion, limits: Mapping[str, Limits]) -> Verdict:
+    """Compare a motion with limits, which must be known of all its coordinates.
+
+    Velocities and accelerations are looked at twice: as the cubics have them at every moment, and as differences of positions a
+    millisecond apart, which know of no cubics.
+    """
+    count = int(np.floor((motion.times[-1] - motion.times[0]) * RATE + 1e-9))
+    times = motion.times[0] + np.arange(count + 1) / RATE
+    positions, velocities, accelerations = (_sampled(motion, times, order) for order in range(3))
+    first, second = np.diff(positions, axis=0) * RATE, np.diff(positions, 2, axis=0) * RATE**2
+    found, shares = list[Excess](), {"velocity": 0.0, "acceleration": 0.0}
+    for k, name in enumerate(motion.names):
+        own = limits[name]
+        outside = np.maximum(own.low - positions[:, k], positions[:, k] - own.high)
+        found += _worst("position", name, outside - OUTSIDE, times, positions[:, k], own.high)
+        for what, limit, columns in (
+            ("velocity", own.velocity, (velocities[:, k], first[:, k])),
+            ("acceleration", own.acceleration, (accelerations[:, k], second[:, k])),
+        ):
+            for column in columns:
+                found += _worst(what, name, np.abs(column) - (1.0 + SLACK) * limit, times, column, limit)
+                shares[what] = max(shares[what], float(np.abs(column).max() / limit))
+        ends = motion.velocities[[0, -1], k]
+        found += _worst("rest", name, np.abs(ends) - REST, motion.times[[0, -1]], ends, 0.0)
+    return Verdict(len(times), found, **shares)
+
+
+def _worst(what: str, name: str, excess: np.ndarray, times: np.ndarray, values: np.ndarray, limit: float) -> list[Excess]:
+    k = int(np.argmax(excess))
+    return [] if excess[k] <= 0.0 else [Excess(what, name, float(times[k]), float(values[k]), limit)]
+
+
+def _sampled(motion: Motion, times: np.ndarray, order: int) -> np.ndarray:
+    """Return positions (0), velocities (1) or accelerations (2) at some times, shape (K, n), by Hermite's polynomials."""
+    k = np.clip(np.searchsorted(motion.times, times, side="right") - 1, 0, len(motion.times) - 2)
+    span = np.diff(motion.times)[k][:, None]
+    s = (times - motion.times[k])[:, None] / span
+    weights = {
+        0: (2 * s**3 - 3 * s**2 + 1, s**3 - 2 * s**2 + s, 3 * s**2 - 2 * s**3, s**3 - s**2),
+        1: (6 * s**2 - 6 * s, 3 * s**2 - 4 * s + 1, 6 * s - 6 * s**2, 3 * s**2 - 2 * s),
+        2: (12 * s - 6, 6 * s - 4, 6 - 12 * s, 6 * s - 2),
+    }[order]
+    p, v, q, w = motion.positions[k], motion.velocities[k], motion.positions[k + 1], motion.velocities[k + 1]
+    # Differences of positions, not these themselves: rounding is divided by the square of a short span.
+    from_p = weights[0] + weights[2] if order == 0 else 0.0
+    return (from_p * p + weights[2] * (q - p) + span * (weights[1] * v + weights[3] * w)) / span**order

@@ -1,0 +1,40 @@
+"""Has plans made, of all the experiments' tasks and of random rooms, and exports them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import vkc_pin as vkc
+from vkc_pin.benchmarks.problems.problem_set import NUMBER, TASKS, problem, started
+
+__all__ = ["exported"]
+
+_ROOMS = NUMBER - 20  # of the problems, those in random rooms
+
+
+def exported(folder: Path, count: int, *, first: int = 0, seed: int = 0) -> Iterator[Path]:
+    """Plan, and yield the .npz of every plan that succeeds; its table lies beside it. Files that are there are not made again.
+
+    Args:
+        folder: Where to write.
+        count: How many problems.
+        first: The number of the first: every fourth one is in a random room, as long as there are such.
+        seed: Of the starts and of planning.
+    """
+    rooms = range(_ROOMS)
+    for number in range(first, first + count):
+        file = folder / f"{seed}_{number:04d}.npz"
+        if not file.is_file():
+            if number % 4 == 3 and number // 4 in rooms:
+                chosen = problem(number // 4)
+                scene, steps = chosen.scene, chosen.steps
+            else:
+                name = list(TASKS)[number % len(TASKS)]
+                scene, steps = started(name, seed, number), TASKS[name].steps
+            plan = vkc.plan(scene, steps, seed=seed, effort=1_000_000)
+            if not plan.success:
+                continue
+            plan.to_csv(file.with_suffix(".csv"))
+            plan.save(file)
+        yield file

@@ -1,0 +1,89 @@
+"""Exported motions keep every limit at 1 kHz; what does not is found; and what looks shares nothing with the package."""
+
+from __future__ import annotations
+
+import ast
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from limits.__main__ import main
+from limits.check import check
+from limits.files import Motion, limits_of, read_csv, read_npz
+from limits.plans import exported
+
+FOLDER = Path(__file__).parent
+ALLOWED = {"numpy", "yaml", *sys.stdlib_module_names}
+COUNT = 20
+
+
+@pytest.fixture(scope="module")
+def plans(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Plans of fifteen tasks and in five random rooms, with tables."""
+    return list(exported(tmp_path_factory.mktemp("plans"), COUNT))
+
+
+def test_no_limit_is_exceeded(plans: list[Path], capsys: pytest.CaptureFixture[str]) -> None:
+    assert len(plans) == COUNT
+    assert main([str(path) for path in plans]) == 0, capsys.readouterr().out
+    assert f"{COUNT} plans" in capsys.readouterr().out
+
+
+def test_motions_are_as_fast_as_they_may_be(plans: list[Path]) -> None:
+    """Otherwise nothing said about limits means much."""
+    for path in plans:
+        motion, about = read_npz(path)
+        verdict = check(motion, limits_of(about, path))
+        assert max(verdict.velocity, verdict.acceleration) > 0.98
+        assert verdict.moments > 2000
+
+
+def test_tables_say_the_same(plans: list[Path]) -> None:
+    for path in plans:
+        motion, table = read_npz(path)[0], read_csv(path.with_suffix(".csv"))
+        assert table.names == motion.names
+        for one, other in zip(vars(table).values(), vars(motion).values(), strict=True):
+            if isinstance(one, np.ndarray):
+                np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-12)
+
+
+def _faster(motion: Motion) -> Motion:
+    return Motion(motion.names, 0.9 * motion.times, motion.positions, motion.velocities / 0.9)
+
+
+def _too_far(motion: Motion) -> Motion:
+    positions = motion.positions.copy()
+    positions[:, motion.names.index("elbow_joint")] += 6.0
+    return Motion(motion.names, motion.times, positions, motion.velocities)
+
+
+def _kink(motion: Motion) -> Motion:
+    velocities = motion.velocities.copy()
+    velocities[len(velocities) // 2, 0] += 0.05
+    return Motion(motion.names, motion.times, motion.positions, velocities)
+
+
+def _no_rest(motion: Motion) -> Motion:
+    velocities = motion.velocities.copy()
+    velocities[-1, 1] = 0.01
+    return Motion(motion.names, motion.times, motion.positions, velocities)
+
+
+@pytest.mark.parametrize(
+    ("change", "what"), [(_faster, "acceleration"), (_too_far, "position"), (_kink, "acceleration"), (_no_rest, "rest")]
+)
+def test_what_exceeds_a_limit_is_found(plans: list[Path], change: Callable[[Motion], Motion], what: str) -> None:
+    motion, about = read_npz(plans[0])
+    verdict = check(change(motion), limits_of(about, plans[0]))
+    assert what in {excess.what for excess in verdict.found}, [str(excess) for excess in verdict.found]
+
+
+def test_it_shares_nothing_with_the_package() -> None:
+    for name in ("files", "check"):
+        tree = ast.parse((FOLDER / f"{name}.py").read_text(encoding="utf-8"))
+        named = [alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names]
+        named += [str(n.module) for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and not n.level]
+        assert {module.partition(".")[0] for module in named} <= ALLOWED

@@ -133,7 +133,7 @@ class Builder:
             for coordinate, value in zip(self.world.coordinates.names[:3], self.world.start[:3], strict=True):
                 self._fixed(coordinate, float(value), active=True)
         for servo in servos:
-            self.add_actuator(servo)
+            servo.add_to(self.spec, self.mj)
         for move in self.world.coordinates.followers:
             self._follow(move)
         if more is not None:
@@ -144,7 +144,8 @@ class Builder:
             raise InputError("MuJoCo refuses the scene", field="scene", got=str(error)) from error
         bodies = np.array([0, *(int(model.body(f"body {j}").id) for j in range(1, self.world.model.njoints))])
         geoms = np.array([int(model.geom(f"shape {k}").id) for k in range(len(self.world.shapes))])
-        return PhysicalWorld(self.world, model, bodies, geoms, *self._addresses(model), self._carriers(model))
+        columns = {hold: np.array([model.joint(k).qposadr[0] for k in own], int) for hold, own in self._carried.items()}
+        return PhysicalWorld(self.world, model, bodies, geoms, *self._addresses(model), columns)
 
     def _bodies(self, servos: Sequence[Servo]) -> None:
         """Add a body for every joint of the tree, with its inertia."""
@@ -181,7 +182,7 @@ class Builder:
             joint, slides = self._joint(body, name, axes[:, k])
             servo, column = driven.get(name), self.world.coordinates.index(name)
             if servo is not None:
-                self.drive_joint(joint, servo)
+                servo.give_motor(joint, self.mj)
                 continue
             owner, _, own = name.partition(".")
             stated = self.world.scene.objects[owner].object.resistance.get(own, Resistance())
@@ -197,19 +198,6 @@ class Builder:
         kind, slides = self.mj.mjtJoint, bool(np.linalg.norm(twist[:3]) > 0.5)
         axis = twist[:3] if slides else twist[3:]
         return body.add_joint(name=name, axis=axis, type=kind.mjJNT_SLIDE if slides else kind.mjJNT_HINGE), slides
-
-    def drive_joint(self, joint: Any, servo: Servo) -> None:
-        """Give a joint what a servo's motor brings along."""
-        joint.armature, joint.actgravcomp = servo.armature, True
-        if np.isfinite(servo.limit):
-            joint.actfrclimited, joint.actfrcrange = self.mj.mjtLimited.mjLIMITED_TRUE, [-servo.limit, servo.limit]
-
-    def add_actuator(self, servo: Servo) -> None:
-        """Add a servo to the joint that it drives."""
-        mj, name = self.mj, servo.coordinate
-        actuator = self.spec.add_actuator(name=name, target=name, trntype=mj.mjtTrn.mjTRN_JOINT)
-        actuator.gaintype, actuator.biastype = mj.mjtGain.mjGAIN_FIXED, mj.mjtBias.mjBIAS_AFFINE
-        actuator.gainprm[0], actuator.biasprm[:3] = servo.stiffness, [0.0, -servo.stiffness, -servo.damping]
 
     def _balanced(self, joint: int) -> bool:
         """Return whether springs carry what a joint of an object carries."""
@@ -266,10 +254,8 @@ class Builder:
         weld.solref = [2.0 * self.physics.timestep, 1.0]  # as hard as can be integrated
 
     def _carrier(self, hold: Hold, link: Any, place: pin.SE3) -> Any:
-        attachment, name = (
-            self.world.scene.objects[hold.object].object.attachment(hold.attachment),
-            f"carrier {len(self._carried)}",
-        )
+        attachment = self.world.scene.objects[hold.object].object.attachment(hold.attachment)
+        name = f"carrier {len(self._carried)}"
         body = link.add_body(name=name, pos=place.translation, quat=quaternion(place), gravcomp=1.0)
         body.mass, body.inertia, body.explicitinertial = _CARRIER_MASS, np.full(3, _CARRIER_INERTIA), True
         joints = self._carried[hold] = []
@@ -280,16 +266,17 @@ class Builder:
             joints.append(joint.name)
         return body
 
-    def _fixed(self, coordinate: str, value: float, *, active: bool = False) -> None:
-        """Add an equality that holds a coordinate at a value."""
+    def _fixed(self, joint: str, value: float, *, active: bool = False) -> Any:
+        """Return a new equality that holds a joint at a value."""
         kind, of = self.mj.mjtEq.mjEQ_JOINT, self.mj.mjtObj.mjOBJ_JOINT
-        self.spec.add_equality(type=kind, objtype=of, name1=coordinate, active=active).data[0] = value
+        equality = self.spec.add_equality(type=kind, objtype=of, name1=joint, active=active)
+        equality.data[0] = value
+        return equality
 
     def _follow(self, move: Moved) -> None:
         """Add an equality that holds a joint where the one that it follows has it."""
-        equality = self.spec.add_equality(type=self.mj.mjtEq.mjEQ_JOINT, objtype=self.mj.mjtObj.mjOBJ_JOINT, active=True)
-        equality.name1, equality.name2 = str(self.world.model.names[move.joint]), self.world.coordinates.names[move.coordinate]
-        equality.data[:2] = [move.offset, move.factor]
+        equality = self._fixed(str(self.world.model.names[move.joint]), move.offset, active=True)
+        equality.name2, equality.data[1] = self.world.coordinates.names[move.coordinate], move.factor
         equality.solref = [2.0 * self.physics.timestep, 1.0]  # as hard as can be integrated
 
     def _addresses(self, model: Any) -> tuple[Ints, Ints]:
@@ -306,10 +293,6 @@ class Builder:
                 columns += [first + k for k in (0, 1, 2, 4, 5, 6, 3)]  # MuJoCo's quaternions begin with w
                 dofs += [-1] * 7
         return np.array(columns), np.array(dofs)
-
-    def _carriers(self, model: Any) -> dict[Hold, Ints]:
-        columns = {hold: [int(model.joint(name).qposadr[0]) for name in joints] for hold, joints in self._carried.items()}
-        return {hold: np.array(own, int) for hold, own in columns.items()}
 
 
 def quaternion(placement: pin.SE3) -> Floats:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -42,6 +43,18 @@ class Servo:
     inertia: float
     armature: float
     limit: float
+
+    def give_motor(self, joint: Any, mj: Any) -> None:
+        """Give a joint of a `mujoco.MjSpec` what the motor brings along."""
+        joint.armature, joint.actgravcomp = self.armature, True
+        if np.isfinite(self.limit):
+            joint.actfrclimited, joint.actfrcrange = mj.mjtLimited.mjLIMITED_TRUE, [-self.limit, self.limit]
+
+    def add_to(self, spec: Any, mj: Any) -> None:
+        """Add the servo to a `mujoco.MjSpec` that has the joint."""
+        actuator = spec.add_actuator(name=self.coordinate, target=self.coordinate, trntype=mj.mjtTrn.mjTRN_JOINT)
+        actuator.gaintype, actuator.biastype = mj.mjtGain.mjGAIN_FIXED, mj.mjtBias.mjBIAS_AFFINE
+        actuator.gainprm[0], actuator.biasprm[:3] = self.stiffness, [0.0, -self.stiffness, -self.damping]
 
 
 def servos(world: World, rows: Floats, physics: Physics) -> tuple[Servo, ...]:

@@ -75,7 +75,7 @@ class Fingers:
             body = hand.add_body(name=name, pos=tool.translation, quat=quaternion(tool), gravcomp=1.0)
             body.mass, body.inertia, body.explicitinertial = _MASS, np.full(3, 1e-4), True
             joint = body.add_joint(name=name, type=kinds.mjJNT_SLIDE, axis=[-sign, 0.0, 0.0])
-            builder.drive_joint(joint, servo)
+            servo.give_motor(joint, builder.mj)
             joint.limited, joint.range = builder.mj.mjtLimited.mjLIMITED_TRUE, [0.0, self.sides.travel]
             for number in shapes:
                 builder.moved[number] = (body, tool.actInv(builder.world.shapes[number].placement))
@@ -83,7 +83,7 @@ class Fingers:
     def add_drives(self, builder: Builder) -> None:
         """Add the motors of sides that slide, and what couples all fingers."""
         for servo in self.servos:
-            builder.add_actuator(servo)
+            servo.add_to(builder.spec, builder.mj)
         kind, of = builder.mj.mjtEq.mjEQ_JOINT, builder.mj.mjtObj.mjOBJ_JOINT
         for k in range(1, len(self.names)):
             slope = (self.closed[k] - self.open[k]) / (self.closed[0] - self.open[0])

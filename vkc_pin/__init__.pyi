@@ -1,6 +1,11 @@
 from . import baselines, benchmarks, cpin, plotting, simulation, validation, visualization
 from .chain.chain import VirtualKinematicChain, consolidate
 from .chain.inversion import invert
+from .datasets.check import DatasetCheck, check_dataset
+from .datasets.dataset import Dataset
+from .datasets.episode import Episode
+from .datasets.generate import generate
+from .datasets.recipe import Recipe, load_recipe
 from .errors import BuildError, InputError, UnknownNameError, VkcError
 from .importing.homes.home_import import ImportedHome, import_home
 from .importing.objects.object_import import ImportedObject, import_object
@@ -46,7 +51,10 @@ __all__ = [
     "BuildError",
     "Constraint",
     "Cost",
+    "Dataset",
+    "DatasetCheck",
     "Diagnosis",
+    "Episode",
     "Freedom",
     "GoTo",
     "Grasp",
@@ -68,6 +76,7 @@ __all__ = [
     "Proposals",
     "Reach",
     "ReachableAttachment",
+    "Recipe",
     "Release",
     "Report",
     "Robot",
@@ -87,16 +96,19 @@ __all__ = [
     "baselines",
     "benchmarks",
     "build",
+    "check_dataset",
     "check_scene",
     "consolidate",
     "cpin",
     "doctor",
+    "generate",
     "goals",
     "import_home",
     "import_object",
     "import_robot",
     "invert",
     "load_object",
+    "load_recipe",
     "load_robot",
     "load_scene",
     "plan",

@@ -100,6 +100,15 @@ def add_bench(commands: Any) -> None:
     choices = "door corridor_door drawer household_refrigerator household_dishwasher household_cabinet household_cup init_1"
     _add_choice(execution, "tasks", f"{choices} (default: all)")
 
+    about = "Make datasets of one task each, and say how many validated episodes an hour that gives."
+    shown, what = "validated episodes an hour", "episodes of each task"
+    throughput = _add_experiment(benches, "throughput", shown, about, "--episodes", default=200, jobs=1, what=what, seeded=False)
+    throughput.set_defaults(benchmark="datasets.throughput")
+    throughput.add_argument("--recipe", metavar="RECIPE", help="robots, objects and rooms (default: home)")
+    throughput.add_argument(
+        "--scheduler", metavar="ADDRESS", help="a Dask scheduler, tcp://HOST:PORT, whose workers are used instead"
+    )
+
     _add_problems(benches)
 
 
@@ -144,13 +153,15 @@ def _add_experiment(
     default: int = 50,
     jobs: int | None = None,
     what: str | None = None,
+    seeded: bool = True,
 ) -> argparse.ArgumentParser:
     """Add an experiment with what all have, by default `default` starts and `jobs` processes, or one per core.
 
-    Without an option for their `number` the starts are fixed; `what` there are so many of, if not starts.
+    Without an option for their `number` the starts are fixed; `what` there are so many of, if not starts, and whether they have a
+    seed.
     """
     parser: argparse.ArgumentParser = benches.add_parser(name, help=shown, description=about)
-    _add_starts(parser, number, default, what or f"random starts per {'task' if number == '--trials' else 'scene'}")
+    _add_starts(parser, number, default, what or f"random starts per {'task' if number == '--trials' else 'scene'}", seeded)
     processes = f"processes (default: {'one per core' if jobs is None else jobs})"
     parser.add_argument("--jobs", type=positive, default=jobs or os.cpu_count() or 1, metavar="J", help=processes)
     about = "folder for results, table and charts; trials that it has already are not run again"
@@ -160,11 +171,12 @@ def _add_experiment(
     return parser
 
 
-def _add_starts(parser: argparse.ArgumentParser, number: str | None, default: int, about: str) -> None:
+def _add_starts(parser: argparse.ArgumentParser, number: str | None, default: int, about: str, seeded: bool = True) -> None:
     if number is not None:
         parser.add_argument(number, type=positive, default=default, metavar="N", help=f"{about} (default {default})")
     seed = "of planning" if number is None else "of the starts and of planning"
-    parser.add_argument("--seed", type=natural, default=0, metavar="S", help=f"{seed} (default 0)")
+    if seeded:
+        parser.add_argument("--seed", type=natural, default=0, metavar="S", help=f"{seed} (default 0)")
 
 
 def _add_choice(parser: argparse.ArgumentParser, names: str, choices: str) -> None:

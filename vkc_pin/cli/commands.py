@@ -14,6 +14,7 @@ from typing import Any
 
 from vkc_pin.benchmarks.commands import EXIT_INTERRUPTED, EXIT_OK, add_bench, natural, positive
 from vkc_pin.cli.checking import add_check
+from vkc_pin.cli.datasets import add_datasets
 from vkc_pin.cli.importing import add_importing
 from vkc_pin.cli.simulating import add_simulate
 from vkc_pin.errors import InputError, VkcError
@@ -249,6 +250,7 @@ def make_parser() -> argparse.ArgumentParser:
     export.add_argument("--rate", type=float, metavar="HZ", help="points a second for ROS; without it the waypoints")
     export.set_defaults(run=_export)
 
+    add_datasets(commands)
     add_bench(commands)
     add_importing(commands)
 

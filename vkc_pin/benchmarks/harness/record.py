@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import functools
-import os
-import platform
-import resource
 import subprocess
 from collections.abc import Callable, Iterable, Mapping
-from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from vkc_pin.datasets.running.machine import machine, peak_memory, versions
 from vkc_pin.files.resources import package_folder
 from vkc_pin.planning.plan import Plan
 from vkc_pin.scene.scene import Scene
@@ -24,39 +20,11 @@ Record = Mapping[str, Any]
 """What is kept of a trial, by field; see `trial`."""
 Solve = Callable[[Scene, Mapping[str, Any]], Plan]
 """What plans a trial: takes its scene and its specification."""
-PACKAGES = ("vkc-pin", "pin", "coal", "casadi", "numpy")
 
 
 def meta(**settings: Any) -> dict[str, Any]:
     """Return versions, machine and `settings` (seed, trials, ...)."""
-    machine = {
-        "system": platform.system(),
-        "machine": platform.machine(),
-        "processor": _processor(),
-        "cores": os.cpu_count(),
-        "python": platform.python_version(),
-    }
-    return {"versions": versions(), "machine": machine, **settings}
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of the package and of what motions depend on."""
-    found = {}
-    for package in PACKAGES:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = "unknown"
-    return found
-
-
-def _processor() -> str:
-    """Return the processor's name where the system tells it."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return platform.processor()
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.processor())
+    return {"versions": versions(), "machine": machine(), **settings}
 
 
 @functools.cache
@@ -67,11 +35,6 @@ def commit() -> str | None:
         return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip() or None
     except (OSError, subprocess.SubprocessError):
         return None
-
-
-def peak_memory() -> float:
-    """Return the largest memory this process has used so far [MB]."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
 def trial(plan: Plan, *, method: str, seed: int, **more: Any) -> dict[str, Any]:

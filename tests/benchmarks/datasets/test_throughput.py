@@ -1,0 +1,36 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+from helpers.datasets import SMALL
+
+from vkc_pin.benchmarks.datasets.throughput import run
+from vkc_pin.cli import main
+from vkc_pin.datasets.recipe import TASKS
+
+pytest.importorskip("h5py")
+
+
+def test_one_record_a_task(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    recipe = tmp_path / "small.yaml"
+    recipe.write_text(yaml.safe_dump(SMALL))
+    out = tmp_path / "out"
+    assert main(["bench", "throughput", "--episodes", "2", "--out", str(out), "--recipe", str(recipe), "--quiet"]) == 0
+    assert "drive-open" in capsys.readouterr().out
+    result = json.loads((out / "results.json").read_text())
+    records = result["trials"]
+    assert [record["task"] for record in records] == list(TASKS)
+    for record in records:
+        assert {"episodes_per_hour", "attempts", "successes", "workers", "memory_mb"} <= set(record)
+        assert record["workers"] == 1
+        assert record["attempts"] >= record["successes"] >= 2
+        assert record["episodes_per_hour"] > 0.0
+        assert 50.0 < record["memory_mb"] < 2000.0
+        lines = (out / record["task"] / "journal.jsonl").read_text().splitlines()[1:]
+        seconds = [json.loads(line)["seconds"] for line in lines if "session" not in json.loads(line)]
+        assert record["episodes_per_hour"] == pytest.approx(3600.0 * record["successes"] / seconds[-1], rel=1e-2)
+    again = run(out=out, episodes=2, recipe=str(recipe), progress=False)  # nothing is made again
+    assert [r["attempts"] for r in again["trials"]] == [r["attempts"] for r in records]

@@ -1,0 +1,120 @@
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.datasets import SMALL
+
+from vkc_pin.datasets.dataset import Dataset
+from vkc_pin.datasets.episode import attempt, unpacked
+from vkc_pin.datasets.formats.hdf5 import episodes_of, numbers_of, write_shard
+from vkc_pin.datasets.formats.samples import sampled
+from vkc_pin.datasets.generate import generate
+from vkc_pin.errors import InputError
+
+h5py = pytest.importorskip("h5py")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return generate(SMALL, 4, tmp_path_factory.mktemp("made") / "out")
+
+
+def test_the_groups_are_those_of_robomimic(made: Dataset) -> None:
+    (shard,) = made.shards
+    with h5py.File(shard) as file:
+        data = file["data"]
+        assert json.loads(data.attrs["env_args"]).keys() == {"env_name", "env_type", "env_kwargs"}
+        assert sorted(data) == [f"demo_{k}" for k in range(4)]
+        assert data.attrs["total"] == sum(group.attrs["num_samples"] for group in data.values())
+        masks = [name.decode() for mask in file["mask"].values() for name in mask[:]]
+        assert sorted(masks) == sorted(data)
+        for group in data.values():
+            count = group.attrs["num_samples"]
+            assert {"actions", "states", "obs", "rewards", "dones"} <= set(group)
+            for name, values in [
+                *group["obs"].items(),
+                *((name, group[name]) for name in ("actions", "states", "rewards", "dones")),
+            ]:
+                assert len(values) == count, name
+                assert values.dtype in (np.float32, np.uint8), name
+            assert group["dones"][:].tolist() == [0] * (count - 1) + [1]
+            told, there = group["actions"][:], group["obs"]
+            robot = np.hstack([there["base_pose"][:], there["arm_position"][:], there["gripper"][:]])
+            assert np.array_equal(told[:-1], robot[1:])  # what it is told is where it is next
+
+
+def test_read_back_to_1e_9(made: Dataset) -> None:
+    for episode in episodes_of(made.shards[0], made.folder / "scenes"):
+        record, data = attempt(made.recipe.document, episode.number, {})
+        fresh = unpacked(data)
+        assert record["success"]
+        times = np.linspace(fresh.trajectory.times[0], fresh.trajectory.times[-1], 300)
+        assert np.abs(episode.trajectory.at(times) - fresh.trajectory.at(times)).max() <= 1e-9
+        assert episode.trajectory.phases == fresh.trajectory.phases
+        assert (episode.steps, episode.options, episode.about) == (fresh.steps, fresh.options, fresh.about)
+        assert episode.document == fresh.document
+        assert np.array_equal(episode.scene().start, fresh.scene().start)
+
+
+def test_samples_are_the_motion(made: Dataset) -> None:
+    episode = next(made.episodes())
+    robot = episode.scene().robot
+    found = sampled(episode, robot, 25.0)
+    motion = episode.trajectory
+    assert found["time"][-1] == motion.times[-1]
+    assert np.allclose(np.diff(found["time"])[:-1], 0.04)
+    assert np.array_equal(found["states"], motion.at(found["time"]))
+    step = 1e-6
+    middle = found["time"][5]
+    rate = (motion.at(middle + step) - motion.at(middle - step)) / (2 * step)
+    assert np.allclose(found["arm_velocity"][5], rate[3 : motion.robot_size], atol=1e-5)
+    data = robot.model.createData()
+    pin.framesForwardKinematics(robot.model, data, robot.coordinates.q(found["states"][7][: motion.robot_size]))
+    hand = data.oMf[robot.model.getFrameId(robot.tool_frame)]
+    there = pin.XYZQUATToSE3(found["hand_pose"][7])
+    assert np.allclose(there.homogeneous, hand.homogeneous, atol=1e-9)
+    assert (found["holding"] == 1.0).all()  # the grasp is given
+    assert (np.einsum("ij,ij->i", found["hand_pose"][1:, 3:], found["hand_pose"][:-1, 3:]) > 0.0).all()
+
+
+def test_small_enough(made: Dataset) -> None:
+    files = [*made.shards, *(made.folder / "scenes").iterdir()]
+    assert sum(file.stat().st_size for file in files) / len(made.numbers()) <= 40_000
+
+
+def test_the_same_episodes_give_the_same_bytes(made: Dataset, tmp_path: Path) -> None:
+    episodes = list(made.episodes())
+    again = write_shard(tmp_path / "shard.hdf5", episodes, episodes[0].scene().robot, made.recipe.fields.rate, made.recipe.digest)
+    assert again.read_bytes() == made.shards[0].read_bytes()
+    assert numbers_of(again) == made.numbers()
+
+
+def test_damage_is_told(made: Dataset, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(made.folder, copy)
+    shard = Dataset.open(copy).shards[0]
+    with h5py.File(shard, "r+") as file:
+        del file["data/demo_1/motion/knot_rates"]
+    with pytest.raises(InputError, match="not an episode"):
+        list(Dataset.open(copy).episodes())
+    with h5py.File(shard, "r+") as file:
+        file["data/demo_0"].attrs["scene"] = "../../etc/passwd"
+    with pytest.raises(InputError, match="not the name of a scene"):
+        list(Dataset.open(copy).episodes())
+    shard.write_bytes(shard.read_bytes()[:1000])
+    with pytest.raises(InputError, match="not an HDF5 file"):
+        list(Dataset.open(copy).episodes())
+
+
+def test_a_scene_that_is_another(made: Dataset, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(made.folder, copy)
+    for file in (copy / "scenes").iterdir():
+        file.write_text(file.read_text().replace('"floor":true', '"floor":false'))
+    with pytest.raises(InputError, match="not what its name says"):
+        list(Dataset.open(copy).episodes())

@@ -1,0 +1,113 @@
+"""LeRobot's layout, as its own code writes it; and, where it is installed, as it reads it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.datasets import SMALL
+
+from vkc_pin.datasets.dataset import Dataset
+from vkc_pin.datasets.formats.lerobot import sentence
+from vkc_pin.datasets.formats.samples import sampled
+from vkc_pin.datasets.generate import generate
+from vkc_pin.errors import InputError
+
+pytest.importorskip("h5py")
+pq = pytest.importorskip("pyarrow.parquet")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return generate(SMALL, 4, tmp_path_factory.mktemp("made") / "out", lerobot=True)
+
+
+@pytest.fixture(scope="module")
+def root(made: Dataset) -> Path:
+    return made.folder / "lerobot" / "husky_ur5e"
+
+
+def info(root: Path) -> Any:
+    return json.loads((root / "meta/info.json").read_text())
+
+
+def test_info_names_what_there_is(root: Path) -> None:
+    said = info(root)
+    assert said["codebase_version"] == "v3.0"
+    assert (said["total_episodes"], said["fps"], said["robot_type"]) == (4, 10, "husky_ur5e")
+    assert said["splits"] == {"train": "0:4"}
+    assert said["data_path"] == "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+    for name, dtype in (
+        ("timestamp", "float32"),
+        ("frame_index", "int64"),
+        ("episode_index", "int64"),
+        ("index", "int64"),
+        ("task_index", "int64"),
+    ):
+        assert said["features"][name] == {"dtype": dtype, "shape": [1], "names": None}
+    for name in ("observation.state", "action"):
+        assert said["features"][name]["shape"] == [len(said["features"][name]["names"])]
+
+
+def test_frames_are_the_samples(made: Dataset, root: Path) -> None:
+    said = info(root)
+    table = pq.read_table(root / said["data_path"].format(chunk_index=0, file_index=0))
+    assert table.column_names == list(said["features"])
+    assert len(table) == said["total_frames"]
+    assert table["index"].to_pylist() == list(range(len(table)))
+    state = np.array(table["observation.state"].to_pylist())
+    first = 0
+    for number, episode in enumerate(made.episodes()):
+        found = sampled(episode, episode.scene().robot, said["fps"])
+        count = len(found["time"])
+        own = slice(first, first + count)
+        assert set(table["episode_index"].to_pylist()[own]) == {number}
+        assert table["frame_index"].to_pylist()[own] == list(range(count))
+        assert np.allclose(np.array(table["timestamp"].to_pylist()[own]) * said["fps"], np.arange(count), atol=1e-4)
+        assert np.allclose(state[own, :3], found["base_pose"], atol=1e-6)
+        assert np.allclose(np.array(table["action"].to_pylist())[own], found["actions"], atol=1e-6)
+        first += count
+    assert first == len(table)
+    assert pq.ParquetFile(root / "data/chunk-000/file-000.parquet").num_row_groups == 4  # one an episode
+
+
+def test_episodes_and_tasks(made: Dataset, root: Path) -> None:
+    rows = pq.read_table(root / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    frames = info(root)["total_frames"]
+    assert [row["episode_index"] for row in rows] == [0, 1, 2, 3]
+    assert [row["dataset_from_index"] for row in rows] == [0, *(row["dataset_to_index"] for row in rows[:-1])]
+    assert rows[-1]["dataset_to_index"] == frames
+    assert all(row["length"] == row["dataset_to_index"] - row["dataset_from_index"] for row in rows)
+    assert {"data/chunk_index", "data/file_index", "meta/episodes/chunk_index", "stats/action/mean"} <= set(rows[0])
+    tasks = pq.read_table(root / "meta/tasks.parquet").to_pydict()
+    texts = dict(zip(tasks["task"], tasks["task_index"], strict=True))
+    assert [row["tasks"] for row in rows] == [[sentence(episode.about)] for episode in made.episodes()]
+    assert sorted(texts.values()) == list(range(len(texts)))
+
+
+def test_statistics_are_those_of_all_frames(root: Path) -> None:
+    stats = json.loads((root / "meta/stats.json").read_text())
+    table = pq.read_table(root / "data/chunk-000/file-000.parquet")
+    assert set(stats) == set(table.column_names)
+    values = np.array(table["observation.velocity"].to_pylist(), float)
+    own = stats["observation.velocity"]
+    assert np.allclose(own["mean"], values.mean(axis=0), atol=1e-7)
+    assert np.allclose(own["std"], values.std(axis=0), atol=1e-7)
+    assert np.allclose(own["min"], values.min(axis=0))
+    assert np.allclose(own["max"], values.max(axis=0))
+    assert own["count"] == [len(values)]
+
+
+def test_frames_a_second_are_whole(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="whole numbers of frames"):
+        generate({**SMALL, "rate": 12.5}, 1, tmp_path / "out", lerobot=True)
+
+
+def test_lerobot_reads_it(root: Path) -> None:
+    module = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="LeRobot is not installed")
+    found = module.LeRobotDataset("vkc_pin/small", root=root)
+    assert found.num_episodes == 4
+    assert found[0]["observation.state"].shape == (10,)

@@ -1,0 +1,61 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from vkc_pin.datasets.running.journal import Journal
+from vkc_pin.errors import InputError
+
+HEADER = {"settings": {"recipe": "abc"}, "versions": {"pin": "4"}}
+
+
+def opened(path: Path, header: dict[str, dict[str, str]] = HEADER) -> Journal:
+    return Journal(path, path.open("a+b"), header, "episodes")
+
+
+def line(key: int) -> dict[str, object]:
+    return {"key": str(key), "records": [{"number": key}], "memory_mb": 100.0 + key, "seconds": 0.5 * key}
+
+
+def test_what_was_written_is_there_again(tmp_path: Path) -> None:
+    journal = opened(tmp_path / "j")
+    journal.append({"session": {"jobs": 2}})
+    for key in (3, 1, 2):
+        journal.append(line(key))
+    journal._stream.close()
+    again = opened(tmp_path / "j")
+    assert again.lines == {str(key): [{"number": key}] for key in (3, 1, 2)}
+    assert again.memory == 103.0
+    assert again.sessions == [{"jobs": 2, "trials": 3, "seconds": 1.0}]
+
+
+def test_any_cut_leaves_whole_lines(tmp_path: Path) -> None:
+    journal = opened(tmp_path / "j")
+    journal.append({"session": {"jobs": 1}})
+    for key in range(4):
+        journal.append(line(key))
+    journal._stream.close()
+    data = (tmp_path / "j").read_bytes()
+    for cut in range(len(data)):
+        (tmp_path / "cut").write_bytes(data[:cut])
+        again = opened(tmp_path / "cut")
+        whole = data[:cut].count(b"\n")
+        assert len(again.lines) == max(0, whole - 2)
+        again._stream.close()
+        assert (tmp_path / "cut").read_bytes().endswith(b"\n")
+
+
+def test_of_another_recipe(tmp_path: Path) -> None:
+    opened(tmp_path / "j")._stream.close()
+    with pytest.raises(InputError, match=r"the episodes in this folder were run otherwise.*recipe abc.*recipe xyz") as caught:
+        opened(tmp_path / "j", {**HEADER, "settings": {"recipe": "xyz"}})
+    assert caught.value.field == "recipe"
+
+
+def test_one_process_at_a_time(tmp_path: Path) -> None:
+    first = opened(tmp_path / "j")
+    with pytest.raises(InputError, match="another run is writing"):
+        opened(tmp_path / "j")
+    first._stream.close()
+    opened(tmp_path / "j")

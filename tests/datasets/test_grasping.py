@@ -1,0 +1,50 @@
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from vkc_pin.datasets.grasping import grasped
+from vkc_pin.options import Options
+from vkc_pin.planning.planner import Planner, plan
+from vkc_pin.scene.scene import Scene, load_scene
+from vkc_pin.task.steps import Actuate
+
+STEPS = {"drawer": Actuate("drawer", {"slide": 0.2}, "handle"), "door": Actuate("door", {"hinge": 0.6}, "handle")}
+
+
+def off(scene: Scene, name: str) -> float:
+    """Return how far the hand is from what it is said to hold [m] and [rad]."""
+    (hold,) = scene.holds
+    placed = scene.objects[name]
+    grasp = placed.object.attachments[hold.attachment]
+    wanted = placed.link_placement(grasp.link) * grasp.tool(hold.at)
+    return float(np.abs(pin.log6(wanted.actInv(scene.tool_placement())).vector).max())
+
+
+@pytest.mark.parametrize("name", ["drawer", "door"])
+def test_the_hand_is_where_it_holds(name: str) -> None:
+    scene = load_scene(name)
+    step = Actuate(name, STEPS[name].joints, next(iter(scene.objects[name].object.attachments)))
+    rng, planner = np.random.default_rng(0), Planner()
+    bases = []
+    for _ in range(4):
+        found = grasped(scene, step, rng, Options(), planner)
+        assert found is not None
+        assert off(found, name) < 1e-5
+        assert found.held == {name: step.attachment}
+        bases.append(tuple(found.start[:3]))
+    assert len(set(bases)) == 4
+    assert plan(found, [step], planner=planner).success
+
+
+def test_none_where_there_is_none() -> None:
+    scene = load_scene("drawer")
+    document = scene.document
+    attachment, placed = next(iter(scene.objects["drawer"].object.attachments)), scene.objects["drawer"]
+    at = placed.link_placement(placed.object.attachments[attachment].link).translation.tolist()
+    document["obstacles"].append({"name": "block", "type": "box", "size": [1.0, 1.0, 1.0], "position": at})
+    with pytest.warns(UserWarning, match="stand in others"):
+        blocked = Scene.from_document(document, scene.folder)
+    step = Actuate("drawer", {"slide": 0.2}, attachment)
+    assert grasped(blocked, step, np.random.default_rng(0), Options(), Planner()) is None

@@ -1,0 +1,98 @@
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.datasets import SMALL
+
+from vkc_pin.datasets.problems import NoProblemError, problem, robot_name
+from vkc_pin.datasets.recipe import load_recipe
+from vkc_pin.planning.planner import Planner
+from vkc_pin.scene.scene import START_CLEARANCE
+from vkc_pin.task.steps import Actuate, Grasp, Place, step_to_dict
+
+PLANNER = Planner()
+
+
+def drawn(number: int, **changes: Any) -> Any:
+    return problem(load_recipe({**SMALL, **changes}), number, {}, PLANNER)
+
+
+def said(found: Any) -> Any:
+    return found.scene.document, [step_to_dict(step) for step in found.steps], found.about, found.seed
+
+
+@pytest.mark.parametrize("task", ["given-open", "drive-open", "fetch-place"])
+def test_recipe_and_number_determine_it(task: str) -> None:
+    for number in range(3):
+        one = said(drawn(number, tasks=[task]))
+        said(drawn(number + 5, tasks=[task]))  # what was drawn before makes no difference
+        assert said(drawn(number, tasks=[task])) == one
+    assert said(drawn(0, tasks=[task])) != said(drawn(1, tasks=[task]))
+
+
+def test_numbers_in_a_row_share_a_room() -> None:
+    rooms = [drawn(number).about["room"] for number in range(8)]
+    assert rooms == ["room_0", "room_0", "room_1", "room_1"] * 2
+
+
+def test_robots_take_turns() -> None:
+    robots = [{"name": "husky_ur5e"}, {"name": "husky_ur5e", "height": 0.4}]
+    heights = [drawn(number, robots=robots).scene.described.start.z for number in range(0, 8, 2)]
+    assert heights == [None, 0.4, 0.4, None]  # in every room both
+
+
+def test_variants_share_all_but_the_seed() -> None:
+    first, second, other = (drawn(number, variants=2) for number in range(3))
+    assert said(first)[:2] == said(second)[:2]
+    assert [one.seed for one in (first, second, other)] == [0, 1, 0]
+    assert said(first)[:2] != said(other)[:2]
+
+
+def test_what_is_opened() -> None:
+    for number in range(6):
+        found = drawn(number, tasks=["drive-open"], goal={"share": [0.2, 0.3]}, start={"distance": [1.0, 4.0]})
+        (step,) = found.steps
+        assert isinstance(step, Actuate)
+        placed = found.scene.objects[step.object]
+        ((joint, goal),) = step.joints.items()
+        k = placed.object.coordinates.index(joint)
+        share = abs(goal - placed.state[k]) / (placed.object.upper[k] - placed.object.lower[k])
+        assert 0.199 <= share <= 0.301
+        assert 1.0 <= np.linalg.norm(found.scene.start[:2] - placed.placement.translation[:2]) <= 4.0
+        assert found.scene.start_clearance() >= START_CLEARANCE
+        assert found.scene.held == {}
+
+
+def test_what_is_fetched_is_put_on_another_table() -> None:
+    found = drawn(0, tasks=["fetch-place"])
+    grasp, place = found.steps
+    assert isinstance(grasp, Grasp)
+    assert isinstance(place, Place)
+    tops = {name: shape for shape, name in zip(found.scene.obstacles, found.scene.obstacle_labels, strict=True)}
+    top = tops["table_2_top"]
+    local = top.placement.actInv(np.array(found.about["goal"]))
+    assert (np.abs(local[:2]) <= np.asarray(top.geometry.halfSide)[:2]).all()
+    assert local[2] == pytest.approx(top.geometry.halfSide[2] + 0.035 + 0.001, abs=2e-3)  # the ball's radius above it
+
+
+def test_scene_files() -> None:
+    found = drawn(0, tasks=["drive-open"], scenes=["drawer"])
+    assert found.scene.name == "drawer"
+    assert found.about["robot"] == "husky_ur5e"
+
+
+def test_nothing_is_left() -> None:
+    with pytest.raises(NoProblemError, match="no free start in room_0"):
+        drawn(0, tasks=["drive-open"], start={"distance": [50.0, 60.0]})
+    crowded = {"objects": 3, "width": [4.0, 4.0], "front": 3.0, "clutter": [1.0, 1.0]}
+    with pytest.raises(NoProblemError, match="room 0 for husky_ur5e"):
+        drawn(0, tasks=["fetch-place"], objects=["random_door", "random_oven", "random_chest"], rooms=crowded)
+
+
+@pytest.mark.parametrize(
+    ("name", "called"), [("panda", "panda"), ("/a/b/panda/robot.yaml", "panda"), ("/a/arm.urdf", "arm"), ("/a/panda", "panda")]
+)
+def test_what_robots_are_called(name: str, called: str) -> None:
+    assert robot_name(name) == called

@@ -1,0 +1,121 @@
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from vkc_pin.datasets.recipe import GoalSchema, RecipeSchema, RobotEntry, RoomsSchema, StartSchema, load_recipe
+from vkc_pin.errors import InputError, UnknownNameError
+
+SMALL: dict[str, Any] = {"name": "small", "objects": ["random_oven"], "rooms": {"count": 2, "objects": 1}}
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "recipe.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_what_comes_with_the_package() -> None:
+    recipe = load_recipe("home")
+    assert recipe.fields.rooms.count == 50
+    assert set(recipe.fields.tasks) == {"given-open", "drive-open", "fetch-place"}
+    assert len(recipe.fields.objects) >= 6
+    assert len(recipe.fields.robots) >= 3
+
+
+def test_a_document_makes_the_same_recipe(tmp_path: Path) -> None:
+    recipe = load_recipe({**SMALL, "options": {"dist_safe": 0.03}, "goal": {"share": [0.2, 0.3]}})
+    file = write(tmp_path, yaml.safe_dump(recipe.document))
+    again = load_recipe(file)
+    assert again.digest == recipe.digest
+    assert again.document == recipe.document
+    assert again.options.dist_safe == 0.03
+
+
+@pytest.mark.parametrize(
+    ("change", "same"),
+    [
+        ({"name": "other"}, True),
+        ({"license": "MIT"}, True),
+        ({"effort": 7}, False),
+        ({"rate": 12}, False),
+        ({"variants": 2}, False),
+    ],
+)
+def test_the_digest_is_that_of_what_episodes_depend_on(change: dict[str, Any], same: bool) -> None:
+    assert (load_recipe({**SMALL, **change}).digest == load_recipe(SMALL).digest) == same
+
+
+def test_random_numbers_are_those_of_recipe_and_words() -> None:
+    recipe, other = load_recipe(SMALL), load_recipe({**SMALL, "effort": 7})
+    draws = [r.rng(*words).random(4) for r, words in ((recipe, ("a", 1)), (recipe, ("a", 2)), (other, ("a", 1)))]
+    assert np.array_equal(draws[0], load_recipe(dict(SMALL)).rng("a", 1).random(4))
+    assert not np.array_equal(draws[0], draws[1])
+    assert not np.array_equal(draws[0], draws[2])
+
+
+@pytest.mark.parametrize(
+    ("line", "field", "said"),
+    [
+        ("robots: [husky_ur5]", "robots[0]", "did you mean 'husky_ur5e'"),
+        ("objects: [random_ovens]", "objects[0]", "did you mean 'random_oven'"),
+        ("tasks: [drive-opn]", "tasks[0]", "did you mean 'drive-open'"),
+        ("carried: [cups]", "carried[0]", "did you mean 'cup'"),
+        ("scenes: [dor]\ntasks: [drive-open]", "scenes", "did you mean 'door'"),
+        ("efort: 3", "efort", "did you mean 'effort'"),
+        ("options: {dist_saf: 0.1}", "options.dist_saf", "did you mean 'dist_safe'"),
+    ],
+)
+def test_names_that_do_not_exist(tmp_path: Path, line: str, field: str, said: str) -> None:
+    file = write(tmp_path, f"name: small\n{line}\n")
+    with pytest.raises(UnknownNameError) as caught:
+        load_recipe(file)
+    assert caught.value.file == file
+    assert caught.value.line == 2
+    assert caught.value.field == field
+    assert said in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("line", "field"),
+    [
+        ("effort: 0", "effort"),
+        ("variants: -1", "variants"),
+        ("robots: []", "robots"),
+        ("goal: {share: [0.5, 0.4]}", "goal.share"),
+        ("goal: {share: [0.0, 0.4]}", "goal.share"),
+        ("rooms: {clutter: [0.0, 1.5]}", "rooms"),
+        ("rooms: {count: 0}", "rooms.count"),
+        ("options: {dist_safe: -1}", "options.dist_safe"),
+        ("scenes: [door]", "tasks"),
+        ("scenes: [missing.yaml]\ntasks: [drive-open]", "scenes[0]"),
+    ],
+)
+def test_values_that_make_no_sense(tmp_path: Path, line: str, field: str) -> None:
+    file = write(tmp_path, f"name: small\n{line}\n")
+    with pytest.raises(InputError) as caught:
+        load_recipe(file)
+    assert str(caught.value.file) == str(file)
+    assert caught.value.field == field
+
+
+def test_the_documentation_has_every_field(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs/datasets.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"^```yaml\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    assert load_recipe(write(tmp_path, block)).fields.name == "home"
+    for schema in (RecipeSchema, RoomsSchema, StartSchema, GoalSchema, RobotEntry):
+        assert [name for name in schema.model_fields if f"`{name}`" not in page] == [], schema.__name__
+
+
+def test_no_recipe_of_that_name() -> None:
+    with pytest.raises(UnknownNameError, match="did you mean 'home'"):
+        load_recipe("hom")
+
+
+def test_every_field_has_a_default_but_the_name() -> None:
+    assert [name for name, field in RecipeSchema.model_fields.items() if field.is_required()] == ["name"]

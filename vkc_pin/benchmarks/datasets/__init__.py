@@ -1,0 +1,1 @@
+"""Datasets: how fast they are made."""

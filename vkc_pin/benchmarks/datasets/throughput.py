@@ -1,0 +1,160 @@
+"""How many validated episodes an hour a machine makes of each task, of which share of attempts, and with how much memory."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vkc_pin.benchmarks.harness.record import Record, meta
+from vkc_pin.benchmarks.harness.tables import decimal, foot, markdown, to_csv
+from vkc_pin.datasets.dataset import Dataset
+from vkc_pin.datasets.generate import generate
+from vkc_pin.datasets.recipe import TASKS, Recipe, load_recipe
+from vkc_pin.errors import InputError
+from vkc_pin.files.writing import write_atomically
+
+__all__ = ["RECIPE", "record", "report", "run"]
+
+RECIPE = "home"
+"""Of the package: which robots, objects and rooms."""
+
+
+def run(
+    *,
+    out: str | Path,
+    episodes: int = 200,
+    jobs: int = 1,
+    recipe: str = RECIPE,
+    scheduler: str | None = None,
+    progress: bool = True,
+) -> dict[str, Any]:
+    """Make datasets of one task each and write results.json, results.csv and table.md to `out`.
+
+    Args:
+        out: The folder. What it has of the same recipe already is not made again, and not timed.
+        episodes: How many of each task, at least 1.
+        jobs: Number of processes.
+        recipe: Name or path of a recipe; its own tasks make no difference.
+        scheduler: Address of a Dask scheduler; see `generate`.
+        progress: Whether to show a progress bar.
+
+    Returns:
+        {"meta": ..., "trials": [...]}: one record a task with `task`, `episodes_per_hour`, `attempts`, `successes`, `workers`,
+        `memory_mb`, `episodes_per_core_hour` and the medians of what attempts take.
+
+    Raises:
+        InputError: No episodes, or the recipe or `out` is wrong.
+        KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
+    """
+    if episodes < 1:
+        raise InputError("out of range", field="episodes", expected="at least 1", got=episodes)
+    made, folder, records = load_recipe(recipe), Path(out), []
+    for task in TASKS:
+        own = load_recipe({**made.document, "tasks": [task]})
+        records.append(_task(task, own, folder / task, episodes, jobs, scheduler, progress))
+    about = meta(benchmark="throughput", recipe=made.digest, episodes=episodes, jobs=jobs, sessions=[])
+    about |= {"peak_memory_mb": max(record["memory_mb"] for record in records)}
+    result = {"meta": about, "trials": records}
+    write_atomically(folder / "results.csv", to_csv(records).encode())
+    write_atomically(folder / "results.json", (json.dumps(result, indent=1, allow_nan=False) + "\n").encode())
+    write_atomically(folder / "table.md", report(result).encode())
+    return result
+
+
+def _task(
+    task: str, recipe: Recipe, folder: Path, episodes: int, jobs: int, scheduler: str | None, progress: bool
+) -> dict[str, Any]:
+    """Make episodes of one task; return its record."""
+    began = time.perf_counter()
+    dataset = generate(recipe, episodes, folder, jobs=jobs, scheduler=scheduler, progress=progress)
+    wall = time.perf_counter() - began
+    return record(task, dataset, jobs, wall)
+
+
+def record(task: str, dataset: Dataset, jobs: int, wall: float) -> dict[str, Any]:
+    """Return what the journal of a dataset says of how fast it was made.
+
+    Args:
+        task: Which.
+        dataset: The dataset.
+        jobs: Processes of the last session.
+        wall: Time of the call [s], with what starting processes and writing takes.
+    """
+    lines = [json.loads(text) for text in (dataset.folder / "journal.jsonl").read_text(encoding="utf-8").splitlines()[1:]]
+    attempts = [(line["seconds"], line["records"][0], line["memory_mb"]) for line in lines if "session" not in line]
+    sessions, last = 0.0, 0.0
+    for line in lines:  # seconds count from the beginning of each session
+        if "session" in line:
+            sessions, last = sessions + last, 0.0
+        else:
+            last = line["seconds"]
+    seconds = sessions + last
+    good = sum(bool(one["success"]) for _, one, _ in attempts)
+    worked = sum(float(one.get("cpu_time", 0.0)) for _, one, _ in attempts)
+    timed = {
+        name: _median([one for _, one, _ in attempts], name) for name in ("setup_time", "planning_time", "build_time", "seconds")
+    }
+    return {
+        "task": task,
+        "episodes_per_hour": round(3600.0 * good / seconds, 1) if seconds else 0.0,
+        "episodes_per_core_hour": round(3600.0 * good / worked, 1) if worked else 0.0,
+        "attempts": len(attempts),
+        "successes": good,
+        "success": good == len(attempts),
+        "workers": jobs,
+        "memory_mb": round(max((memory for _, _, memory in attempts), default=0.0), 1),
+        "wall_time": round(wall, 2),
+        **{f"{name}_median": value for name, value in timed.items()},
+        "robots": len({one["robot"] for _, one, _ in attempts if "robot" in one}),
+        "kinds": len({one["kind"] for _, one, _ in attempts if "kind" in one}),
+        "rooms": len({one["room"] for _, one, _ in attempts if "room" in one}),
+        "bytes_per_episode": _size(dataset),
+    }
+
+
+def _median(attempts: list[Mapping[str, Any]], name: str) -> float:
+    found = [float(one[name]) for one in attempts if one.get(name) is not None]
+    return round(float(np.median(found)), 4) if found else 0.0
+
+
+def _size(dataset: Dataset) -> int:
+    """Return how much an episode takes on disk, its share of the scenes with it [bytes]."""
+    files = [*dataset.shards, *(dataset.folder / "scenes").glob("*.json")]
+    return round(sum(file.stat().st_size for file in files) / max(1, len(dataset.numbers())))
+
+
+def report(result: Mapping[str, Any]) -> str:
+    """Return the table of a result in Markdown, with versions and machine at the foot."""
+    about, records = result["meta"], result["trials"]
+    head = [
+        "task",
+        "episodes an hour",
+        "an hour of one core",
+        "success of attempts",
+        "workers",
+        "memory [MB]",
+        "an attempt [s]",
+        "setting up [s]",
+        "planning [s]",
+    ]
+    parts = [
+        "# Throughput",
+        f"{about['episodes']} validated episodes of each task, with {about['jobs']} processes, recipe {about['recipe']}. "
+        "The time counts from the first attempt to the last, with starting the processes; an hour of one core is of processor "
+        "time, without what else ran on the machine. Medians of an attempt, of what sets it up (room, start, grasp) and of "
+        "planning it.",
+        markdown(head, [_row(one) for one in records]),
+    ]
+    return "\n\n".join([*parts, foot(about)]) + "\n"
+
+
+def _row(one: Record) -> list[str]:
+    times = (one["seconds_median"], one["setup_time_median"], one["planning_time_median"])
+    rates = (f"{one['episodes_per_hour']:.0f}", f"{one['episodes_per_core_hour']:.0f}")
+    share = f"{one['successes']} of {one['attempts']}"
+    return [one["task"], *rates, share, str(one["workers"]), f"{one['memory_mb']:.0f}", *map(decimal, times)]

@@ -1,0 +1,167 @@
+"""A dataset's folder: what is where, what belongs to it, and shards that are written when they are full."""
+
+from __future__ import annotations
+
+import csv
+import functools
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from vkc_pin.datasets.diversity import Seen
+from vkc_pin.datasets.episode import Episode, unpacked, work_file
+from vkc_pin.datasets.formats.hdf5 import episodes_of, numbers_of, write_scene, write_shard
+from vkc_pin.datasets.recipe import Recipe, load_recipe
+from vkc_pin.errors import InputError
+from vkc_pin.files.resources import file_path
+from vkc_pin.files.writing import write_atomically
+from vkc_pin.models.robot import Robot
+
+__all__ = ["EPISODES_A_SHARD", "Dataset", "Register", "write_table"]
+
+EPISODES_A_SHARD = 100
+"""Episodes in one file; the last of each robot has fewer."""
+_COLUMNS = (
+    *("number", "task", "robot", "room", "object", "kind", "attachment", "joint", "goal", "variant", "status", "reason"),
+    *("duration", "base_effort", "arm_effort", "clearance", "waypoints", "scene", "seconds", "planning_time"),
+)
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A folder of episodes.
+
+    Attributes:
+        folder: Where it is.
+        recipe: What its episodes are like.
+    """
+
+    folder: Path
+    recipe: Recipe
+
+    @classmethod
+    def open(cls, folder: str | Path) -> Dataset:
+        """Return the dataset in a folder.
+
+        Raises:
+            InputError: There is none.
+        """
+        path = file_path(folder, "folder", "a folder that `vkc-pin generate` has written")
+        if not (path / "recipe.yaml").is_file():
+            raise InputError("there is no dataset", file=path, expected="a folder that `vkc-pin generate` has written")
+        return cls(path, load_recipe(path / "recipe.yaml"))
+
+    @property
+    def shards(self) -> list[Path]:
+        """Its shards, by robot and number."""
+        return sorted((self.folder / "shards").glob("*/shard-*.hdf5"))
+
+    def numbers(self) -> list[int]:
+        """Return the numbers of all episodes, shard after shard."""
+        return [number for shard in self.shards for number in numbers_of(shard)]
+
+    def episodes(self) -> Iterator[Episode]:
+        """Yield all episodes, shard after shard, read one at a time.
+
+        Raises:
+            InputError: A file is damaged.
+        """
+        for shard in self.shards:
+            yield from episodes_of(shard, self.folder / "scenes")
+
+
+class Register:
+    """Decides, in the order of their numbers, which attempts are episodes of a dataset, and puts these into shards.
+
+    Attempts end in any order; what they become depends on those of lower numbers alone, so that neither the number of processes
+    nor any stop makes a difference.
+
+    Attributes:
+        accepted: Records of the episodes, in order.
+        failures: Records of attempts that are none, in order; near-duplicates among them.
+    """
+
+    def __init__(self, dataset: Dataset, wanted: int) -> None:
+        self.dataset, self.wanted = dataset, wanted
+        self.accepted: list[Mapping[str, Any]] = []
+        self.failures: list[Mapping[str, Any]] = []
+        self._robots: dict[str, list[int]] = {}
+        self._early: dict[int, Mapping[str, Any]] = {}
+        self._next, self._seen = 0, Seen()
+
+    @property
+    def full(self) -> bool:
+        """Whether there are as many episodes as were asked for."""
+        return len(self.accepted) >= self.wanted
+
+    @property
+    def decided(self) -> int:
+        """How many attempts are decided about."""
+        return self._next
+
+    def add(self, record: Mapping[str, Any]) -> None:
+        """Take note of what came of an attempt."""
+        self._early[int(record["number"])] = record
+        while self._next in self._early and not self.full:
+            self._decide(self._early.pop(self._next))
+            self._next += 1
+
+    def _decide(self, record: Mapping[str, Any]) -> None:
+        if not record["success"]:
+            self.failures.append(record)
+            return
+        twin = self._seen.twin(record)
+        if twin is not None:
+            reason = f"nearly the same motion as that of episode {twin}"
+            self.failures.append({**record, "success": False, "status": "duplicate", "reason": reason})
+            return
+        self.accepted.append(record)
+        own = self._robots.setdefault(str(record["robot"]), [])
+        own.append(int(record["number"]))
+        if len(own) % EPISODES_A_SHARD == 0:
+            self._write(str(record["robot"]), len(own) // EPISODES_A_SHARD - 1)
+
+    def finish(self) -> None:
+        """Write the shards that are not full, and the tables."""
+        for robot, numbers in self._robots.items():
+            if len(numbers) % EPISODES_A_SHARD:
+                self._write(robot, len(numbers) // EPISODES_A_SHARD)
+        write_table(self.dataset.folder / "episodes.csv", self.accepted)
+        write_table(self.dataset.folder / "failures.csv", self.failures)
+
+    def _write(self, robot: str, k: int) -> None:
+        """Write a robot's shard of a number, unless it is there, and forget what it is made of when it is full."""
+        numbers = self._robots[robot][k * EPISODES_A_SHARD : (k + 1) * EPISODES_A_SHARD]
+        path = self.dataset.folder / "shards" / robot / f"shard-{k:05d}.hdf5"
+        files = [work_file(self.dataset.folder, number) for number in numbers]
+        if not path.is_file() or numbers_of(path) != numbers:
+            episodes = [unpacked(file.read_bytes(), self.dataset.folder / "robots") for file in files]
+            for episode in episodes:
+                write_scene(self.dataset.folder / "scenes", episode.document)
+            fields = self.dataset.recipe.fields
+            write_shard(path, episodes, self._robot(episodes[0]), fields.rate, self.dataset.recipe.digest)
+        if len(numbers) == EPISODES_A_SHARD:
+            for file in files:
+                file.unlink(missing_ok=True)
+
+    @functools.cached_property
+    def _loaded(self) -> dict[str, Robot]:
+        return {}
+
+    def _robot(self, episode: Episode) -> Robot:
+        """Return an episode's robot, loaded once."""
+        name = str(episode.about["robot"])
+        if name not in self._loaded:
+            self._loaded[name] = episode.scene().robot
+        return self._loaded[name]
+
+
+def write_table(path: Path, records: Sequence[Mapping[str, Any]]) -> Path:
+    """Write records as a table with a line each; return the path."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(_COLUMNS)
+    writer.writerows([record.get(name, "") for name in _COLUMNS] for record in records)
+    return write_atomically(path, buffer.getvalue().encode())

@@ -1,0 +1,261 @@
+"""One episode: planned, checked and told as plain data; and as it is read back."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import io
+import json
+import time
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vkc_pin.arrays import Floats
+from vkc_pin.datasets.diversity import way
+from vkc_pin.datasets.problems import NoProblemError, problem
+from vkc_pin.datasets.recipe import load_recipe
+from vkc_pin.datasets.running.machine import peak_memory
+from vkc_pin.errors import InputError
+from vkc_pin.files.resources import folder
+from vkc_pin.motion.trajectory import Trajectory
+from vkc_pin.options import Options
+from vkc_pin.planning.plan import Plan
+from vkc_pin.planning.planner import Planner, plan
+from vkc_pin.scene.scene import Scene
+from vkc_pin.simulation.execution import simulate
+from vkc_pin.task.steps import Step, step_from_dict, step_to_dict
+from vkc_pin.validation.report import Report
+from vkc_pin.validation.validate import validate
+
+__all__ = ["Episode", "Made", "attempt", "attempts", "made_of", "packed", "scene_name", "unpacked", "work_file"]
+
+_PLANNER = {"entries": 512, "megabytes": 96.0}
+_DIGITS = 12  # of a scene's name
+_GRID = 2.0**-30  # [m], [rad], [m/s], ...: motions are kept to 0.5e-9; what is below is noise, which does not compress
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """An episode as it is in a dataset, nothing of which is relied on.
+
+    Attributes:
+        number: With the recipe, this determines it.
+        about: What was drawn and what came out: task, robot, room, object, kind, attachment, joint, goal, variant, metrics.
+        document: The scene as plain data, without its start.
+        start: The start, as part of the scene's description.
+        where: The folder that relative paths in the scene start from; None: the package's scenes.
+        robots: The folder in which the dataset has robots, by name.
+        steps: What was asked for.
+        options: How it was planned.
+        trajectory: The motion.
+        claimed: What the validation said of it.
+    """
+
+    number: int
+    about: Mapping[str, Any]
+    document: Mapping[str, Any]
+    start: Mapping[str, Any]
+    where: str | None
+    steps: tuple[Step, ...]
+    options: Options
+    trajectory: Trajectory
+    claimed: Report
+    robots: Path | None = None
+
+    def scene(self) -> Scene:
+        """Return the scene, built anew from its description."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what generating it has said already
+            robot = dict(self.document["robot"])
+            own = None if self.robots is None else self.robots / str(robot["name"])
+            if own is not None and (own / "robot.yaml").is_file():
+                robot["name"] = str(own / "robot.yaml")
+            document = {**self.document, "robot": robot, "start": self.start}
+            return Scene.from_document(document, self.where or folder("scenes"))
+
+    def validate(self) -> Report:
+        """Return what the independent check says of the motion, in the scene built anew."""
+        return validate(self.scene(), self.steps, self.trajectory, self.options)
+
+
+@functools.cache
+def _planner() -> Planner:
+    """Return what this process keeps of planning."""
+    return Planner(entries=int(_PLANNER["entries"]), megabytes=_PLANNER["megabytes"])
+
+
+Made = tuple[dict[str, Any], bytes]
+"""The record of an attempt, as in the journal, and the episode packed, empty if it became none."""
+
+
+def attempts(task: tuple[Mapping[str, Any], Sequence[int], Mapping[str, str]]) -> list[Made]:
+    """Make episodes of a recipe, as plain data, by their numbers; with what to load for which robot. See `attempt`."""
+    said, numbers, robots = task
+    return [attempt(said, number, robots) for number in numbers]
+
+
+def attempt(said: Mapping[str, Any], number: int, robots: Mapping[str, str]) -> Made:
+    """Make one episode; an exception becomes a failure on record."""
+    began, worked = time.perf_counter(), time.process_time()
+    record: dict[str, Any] = {"number": number, "success": False}
+    data = b""
+    try:
+        recipe = load_recipe(said)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what is said of a robot would be said again of every episode
+            asked = problem(recipe, number, robots, _planner())
+            record |= {**asked.about, "setup_time": round(time.perf_counter() - began, 4)}
+            found = plan(
+                asked.scene,
+                asked.steps,
+                options=asked.options,
+                seed=asked.seed,
+                effort=recipe.fields.effort,
+                time_limit=recipe.fields.time_limit,
+                perturbation=0.0 if asked.seed == 0 else _PERTURBED,
+                planner=_planner(),
+            )
+            record |= _outcome(found)
+            if found.success and recipe.fields.simulate:
+                record |= _physics(found)
+            if record["success"]:
+                about = asked.about | {"metrics": _metrics(found)}
+                data, more = packed(number, about, found)
+                record |= more
+    except NoProblemError as error:
+        record |= {"status": "no problem", "reason": str(error)}
+    except Exception as error:  # one episode must not end ten thousand
+        record |= {"success": False, "status": "error", "reason": f"{type(error).__name__}: {error}"}
+    record |= {"seconds": round(time.perf_counter() - began, 4), "cpu_time": round(time.process_time() - worked, 4)}
+    record |= {"memory_mb": round(peak_memory(), 1)}
+    return record, data if record["success"] else b""
+
+
+_PERTURBED = 0.05  # [m], [rad] of noise on the seeds of further variants
+
+
+def _outcome(found: Plan) -> dict[str, Any]:
+    worst = [str(one) for one in found.validation.violations[:1]]
+    reason = "" if found.success else "; ".join([*worst, *found.validation.notes[:2]]) or found.status
+    return {
+        "success": found.success,
+        "status": found.status,
+        "reason": reason,
+        "planning_time": round(found.metrics["planning_time"], 4),
+        "build_time": round(found.metrics["build_time"], 4),
+        "validation_time": round(found.metrics["time_validation"], 4),
+        "effort": int(found.metrics["effort"]),
+        "initialization": found.initialization,
+    }
+
+
+def _physics(found: Plan) -> dict[str, Any]:
+    """Return what physics says otherwise; see `simulation.execution`."""
+    executed = simulate(found.scene, found.steps, found.trajectory)
+    if executed.ok:
+        return {"simulated": True}
+    return {"success": False, "status": "physics", "reason": "; ".join(executed.problems()), "simulated": True}
+
+
+def _metrics(found: Plan) -> dict[str, float]:
+    """Return what does not depend on the machine of a plan's metrics."""
+    names = ("base_effort", "base_effort_l1", "arm_effort", "clearance", "closure_error", "duration", "effort")
+    return {name: float(found.metrics[name]) for name in names if np.isfinite(found.metrics[name])}
+
+
+def scene_name(document: Mapping[str, Any]) -> str:
+    """Return the name of a scene's description, which depends on what it says alone."""
+    return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()[:_DIGITS]
+
+
+def packed(number: int, about: Mapping[str, Any], found: Plan) -> tuple[bytes, dict[str, Any]]:
+    """Return a plan as bytes that `unpacked` reads, and what the journal says of it: scene, start, way and metrics."""
+    document = json.loads(json.dumps(found.scene.document))
+    start = document.pop("start")
+    document["robot"]["name"] = about["robot"]
+    motion = found.trajectory.to_dict()
+    arrays = {name: _coarse(motion.pop(name)) for name in ("positions",)} | {"times": np.array(motion.pop("times"), float)}
+    for name, values in motion.pop("curve", {}).items():
+        arrays[f"knot_{name}"] = np.array(values, float) if name == "times" else _coarse(values)
+    outside = found.scene.folder.resolve() != folder("scenes").resolve()
+    data = {
+        "number": number,
+        "about": dict(about),
+        "scene": document,
+        "start": start,
+        "where": str(found.scene.folder.resolve()) if outside else None,
+        "steps": [step_to_dict(step) for step in found.steps],
+        "options": asdict(found.options),
+        "motion": motion,
+        "validation": {**found.validation.to_dict(), "clearance": _finite(found.validation.clearance)},
+    }
+    data["validation"]["clearances"] = [_finite(value) for value in found.validation.clearances]
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, allow_pickle=False, about=np.array(json.dumps(data)), **arrays)
+    more = {
+        "scene": scene_name(document),
+        "start": np.asarray(found.scene.start).round(4).tolist(),
+        "end": found.trajectory.positions[-1][:2].round(4).tolist(),
+        "waypoints": len(found.trajectory.times),
+        **{name: round(value, 5) for name, value in _metrics(found).items() if name != "effort"},
+        "way": way(found.trajectory),
+    }
+    return buffer.getvalue(), more
+
+
+def _coarse(values: Any) -> Floats:
+    """Return numbers rounded to `_GRID`."""
+    return np.round(np.array(values, float) / _GRID) * _GRID
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def unpacked(data: bytes, robots: Path | None = None) -> Episode:
+    """Return the episode that `packed` made bytes of; `robots` is the folder of the dataset's robots."""
+    with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+        arrays = {name: archive[name] for name in archive.files}
+    about = json.loads(str(arrays.pop("about")))
+    return made_of(about, {name: np.asarray(values, float) for name, values in arrays.items()}, robots)
+
+
+def made_of(data: Mapping[str, Any], arrays: Mapping[str, Floats], robots: Path | None = None) -> Episode:
+    """Return an episode of its description and its arrays; see `packed`.
+
+    Raises:
+        InputError: Something is missing from them or does not fit.
+    """
+    try:
+        motion = {**data["motion"], "times": arrays["times"], "positions": arrays["positions"]}
+        if "knot_times" in arrays:
+            motion["curve"] = {name: arrays[f"knot_{name}"] for name in ("times", "positions", "rates")}
+        report = dict(data["validation"])
+        report["clearance"] = np.inf if report["clearance"] is None else report["clearance"]
+        report["clearances"] = [np.inf if value is None else value for value in report["clearances"]]
+        return Episode(
+            number=int(data["number"]),
+            about=data["about"],
+            document=data["scene"],
+            start=data["start"],
+            where=data["where"],
+            steps=tuple(step_from_dict(step) for step in data["steps"]),
+            options=Options(**data["options"]),
+            trajectory=Trajectory.from_dict(motion),
+            claimed=Report.from_dict(report),
+            robots=robots,
+        )
+    except (LookupError, TypeError, AttributeError) as error:
+        raise InputError(
+            "not an episode", expected="what generating has written", got=f"{type(error).__name__}: {error}"
+        ) from error
+
+
+def work_file(out: Path, number: int) -> Path:
+    """Return where an episode is kept until it is in a shard."""
+    return out / "work" / f"{number:08d}.npz"

@@ -1,0 +1,211 @@
+"""Shards: many episodes in one HDF5 file, in groups as robomimic has them, with the exact motion beside the samples.
+
+The groups are those of robomimic's documentation (`data/demo_<k>` with `actions`, `states`, `obs`, `rewards`, `dones`; the
+attributes `total`, `env_args` and `num_samples`; `mask`). What is sampled is single precision; the motion itself, which is what
+can be validated again, is double precision under `motion`.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vkc_pin.arrays import Floats, Ints
+from vkc_pin.datasets.episode import Episode, made_of, scene_name
+from vkc_pin.datasets.formats.samples import sampled
+from vkc_pin.errors import InputError
+from vkc_pin.files.documents import parse_json, read_text
+from vkc_pin.files.writing import write_atomically
+from vkc_pin.models.robot import Robot
+from vkc_pin.task.steps import step_to_dict
+
+if TYPE_CHECKING:
+    import h5py
+
+__all__ = ["episodes_of", "needed", "numbers_of", "write_scene", "write_shard"]
+
+_OBSERVED = (
+    *("base_pose", "base_velocity", "arm_position", "arm_velocity"),
+    *("hand_pose", "gripper", "holding", "object_position"),
+)
+_ENVIRONMENT = "vkc_pin"
+_HELD_OUT = 10  # every so many an episode is in mask/valid, the others are in mask/train
+
+
+def needed() -> Any:
+    """Return h5py.
+
+    Raises:
+        InputError: It is not installed.
+    """
+    try:
+        import h5py
+    except ImportError:
+        raise InputError("h5py is not installed", field="generate", expected="pip install vkc-pin[data]") from None
+    return h5py
+
+
+def write_scene(folder: Path, document: Mapping[str, Any]) -> Path:
+    """Write a scene's description under the name that its content has, unless it is there; return the path."""
+    path = folder / f"{scene_name(document)}.json"
+    if not path.is_file():
+        write_atomically(path, (json.dumps(document, sort_keys=True, separators=(",", ":")) + "\n").encode())
+    return path
+
+
+def write_shard(path: Path, episodes: Sequence[Episode], robot: Robot, rate: float, recipe: str) -> Path:
+    """Write episodes of one robot to a file, whole or not at all; the same episodes give the same bytes. Return the path.
+
+    Args:
+        path: The file.
+        episodes: In order.
+        robot: Theirs.
+        rate: Samples a second.
+        recipe: The digest of what they were made of.
+    """
+    h5py = needed()
+    buffer = io.BytesIO()
+    with h5py.File(buffer, "w", libver="latest") as file:
+        data = file.create_group("data")
+        masks: dict[str, list[str]] = {"train": [], "valid": []}
+        total = 0
+        for k, episode in enumerate(episodes):
+            name = f"demo_{k}"
+            total += _write(data.create_group(name), episode, robot, rate)
+            masks["valid" if episode.number % _HELD_OUT == _HELD_OUT - 1 else "train"].append(name)
+        data.attrs["total"] = total
+        data.attrs["options"] = json.dumps(asdict(episodes[0].options), sort_keys=True)  # of the recipe, and so of all
+        settings = {"robot": robot.name, "rate": rate, "recipe": recipe, "scenes": "../../scenes/<scene>.json"}
+        data.attrs["env_args"] = json.dumps({"env_name": _ENVIRONMENT, "env_type": -1, "env_kwargs": settings})
+        for mask, names in masks.items():
+            file.create_dataset(f"mask/{mask}", data=np.array(names, dtype="S"))
+    return write_atomically(path, buffer.getvalue())
+
+
+def _write(group: h5py.Group, episode: Episode, robot: Robot, rate: float) -> int:
+    """Write one episode; return how many samples it has."""
+    found, motion = sampled(episode, robot, rate), episode.trajectory.to_dict()
+    count = len(found["time"])
+    for name in _OBSERVED:
+        _array(group, f"obs/{name}", found[name], np.float32)
+    _array(group, "actions", found["actions"], np.float32)
+    _array(group, "states", found["states"], np.float32)
+    done = np.zeros(count, np.uint8)
+    done[-1] = 1
+    group.create_dataset("dones", data=done)
+    group.create_dataset("rewards", data=done.astype(np.float32))
+    curve = {name: np.array(values) for name, values in motion.pop("curve", {}).items()}
+    waypoints = {name: np.array(motion.pop(name)) for name in ("times", "positions")}
+    at = _among(curve, waypoints)
+    if at is None:
+        for name, values in waypoints.items():
+            _array(group, f"motion/{name}", values, np.float64)
+    else:
+        _array(group, "motion/waypoints", at, np.int32)
+    for name, values in curve.items():
+        _array(group, f"motion/knot_{name}", values, np.float64)
+    report = episode.claimed.to_dict()
+    for name in ("clearance", "clearances"):
+        report[name] = _finite(report[name])
+    group.attrs["num_samples"] = count
+    group.attrs["number"] = episode.number
+    group.attrs["scene"] = scene_name(episode.document)
+    group.attrs["task"] = str(episode.about["task"])
+    said = {
+        "about": dict(episode.about),
+        "start": dict(episode.start),
+        "where": episode.where,
+        "steps": [step_to_dict(step) for step in episode.steps],
+        "motion": motion,
+        "validation": report,
+    }
+    group.attrs["episode"] = json.dumps(said, sort_keys=True)
+    return count
+
+
+def _among(curve: Mapping[str, Floats], waypoints: Mapping[str, Floats]) -> Ints | None:
+    """Return which knots of a curve the waypoints are, shape (T,); None if they are not exactly such."""
+    if not curve:
+        return None
+    at = np.minimum(np.searchsorted(curve["times"], waypoints["times"]), len(curve["times"]) - 1)
+    same = all(np.array_equal(curve[name][at], waypoints[name]) for name in ("times", "positions"))
+    return at if same else None
+
+
+def _array(group: h5py.Group, name: str, values: Any, kind: Any) -> None:
+    values = np.asarray(values, kind)
+    squeezed = {"compression": "gzip", "compression_opts": 6, "shuffle": True} if values.nbytes > 512 else {}
+    group.create_dataset(name, data=values, chunks=values.shape if squeezed else None, **squeezed)
+
+
+def _finite(values: Any) -> Any:
+    if isinstance(values, Sequence):
+        return [_finite(value) for value in values]
+    return float(values) if np.isfinite(values) else None
+
+
+def numbers_of(path: Path) -> list[int]:
+    """Return the numbers of a shard's episodes, in order.
+
+    Raises:
+        InputError: It is none.
+    """
+    with _opened(path) as file:
+        return [int(file["data"][f"demo_{k}"].attrs["number"]) for k in range(len(file["data"]))]
+
+
+def episodes_of(path: Path, scenes: Path) -> Iterator[Episode]:
+    """Yield the episodes of a shard, in order.
+
+    Args:
+        path: The shard.
+        scenes: The folder of the dataset's scenes.
+
+    Raises:
+        InputError: The file is damaged or none, or something in it does not fit.
+    """
+    documents: dict[str, Any] = {}
+    with _opened(path) as file:
+        for k in range(len(file["data"])):
+            try:
+                options = parse_json(str(file["data"].attrs["options"]), path)
+                group = file["data"][f"demo_{k}"]
+                name = str(group.attrs["scene"])
+                if name not in documents:
+                    documents[name] = _document(scenes, name)
+                said = parse_json(str(group.attrs["episode"]), path)
+                arrays = {key: np.array(values) for key, values in group["motion"].items()}
+                if (at := arrays.pop("waypoints", None)) is not None:
+                    arrays |= {key: arrays[f"knot_{key}"][at] for key in ("times", "positions")}
+                number = int(group.attrs["number"])
+            except (LookupError, TypeError, OSError, ValueError) as error:
+                if isinstance(error, InputError):
+                    raise
+                raise InputError("not a shard of episodes", file=path, field=f"demo_{k}", got=str(error)) from error
+            yield made_of(
+                {**said, "options": options, "number": number, "scene": documents[name]}, arrays, scenes.parent / "robots"
+            )
+
+
+def _document(scenes: Path, name: str) -> Any:
+    if not name.isalnum():
+        raise InputError("not the name of a scene", file=scenes, got=name)
+    file = scenes / f"{name}.json"
+    document = parse_json(read_text(file, "scene"), file)
+    if scene_name(document) != name:
+        raise InputError("this scene is not what its name says", file=file, expected=name, got=scene_name(document))
+    return document
+
+
+def _opened(path: Path) -> Any:
+    h5py = needed()
+    try:
+        return h5py.File(path, "r")
+    except OSError as error:
+        raise InputError("not an HDF5 file", file=path, expected="a shard of a dataset", got=str(error)) from error

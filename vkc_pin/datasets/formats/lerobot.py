@@ -1,0 +1,229 @@
+"""LeRobot's dataset layout 3.0: many episodes in one parquet file, with tables of episodes and tasks, and statistics.
+
+What each file holds is documented with LeRobot ("LeRobotDataset v3.0", huggingface/lerobot, src/lerobot/datasets). Features
+have one shape in all of a dataset, so that every robot gets a dataset of its own. There are no videos.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vkc_pin.arrays import Floats
+from vkc_pin.datasets.episode import Episode
+from vkc_pin.datasets.formats.samples import sampled
+from vkc_pin.errors import InputError
+from vkc_pin.files.writing import folder_at_once
+from vkc_pin.models.robot import Robot
+
+__all__ = ["VERSION", "needed", "sentence", "write_lerobot"]
+
+VERSION = "v3.0"
+_DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+_EPISODES = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+_CHUNK = 1000  # files of a folder
+_SIZE = 100  # [MB] of a file; files are cut before they get there
+_ROWS = 200_000  # frames of a file
+_KINDS = {"timestamp": "float32", "frame_index": "int64", "episode_index": "int64", "index": "int64", "task_index": "int64"}
+_STATE = ("base_pose", "arm_position", "gripper")
+
+
+def needed() -> Any:
+    """Return pyarrow.
+
+    Raises:
+        InputError: It is not installed.
+    """
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError:
+        raise InputError("pyarrow is not installed", field="lerobot", expected="pip install vkc-pin[data]") from None
+    return pyarrow
+
+
+def sentence(about: Mapping[str, Any]) -> str:
+    """Return what an episode does, in words, as policies that take language are told it."""
+    thing = str(about["kind"]).replace("_", " ")
+    return f"Bring the {thing} from one table to another." if about["task"] == "fetch-place" else f"Open the {thing}."
+
+
+def write_lerobot(path: Path, episodes: Iterable[Episode], robot: Robot, rate: float) -> Path:
+    """Write episodes of one robot as a dataset, whole or not at all, in place of one that is there; return its folder.
+
+    `observation.state` is base pose, arm and gripper, `observation.velocity` their rates but for the gripper's,
+    `observation.environment_state` where the hand is and whether it holds something, `action` the state of the next moment.
+
+    Args:
+        path: The folder.
+        episodes: In order.
+        robot: Theirs.
+        rate: Frames a second, a whole number.
+    """
+    arrow = needed()
+    with folder_at_once(path, force=True) as folder:
+        writer = _Writer(arrow, folder, robot, rate)
+        for episode in episodes:
+            writer.add(episode)
+        writer.close()
+    return path
+
+
+class _Writer:
+    """Writes frames as they come, and at the end all that is about them."""
+
+    def __init__(self, arrow: Any, folder: Path, robot: Robot, rate: float) -> None:
+        if rate != int(rate):
+            raise InputError("LeRobot has whole numbers of frames a second", field="rate", expected="a whole number", got=rate)
+        self.arrow, self.folder, self.robot, self.rate = arrow, folder, robot, int(rate)
+        names = list(robot.coordinates.names)
+        hand = ["hand_x", "hand_y", "hand_z", "hand_qx", "hand_qy", "hand_qz", "hand_qw", "holding"]
+        self.features: dict[str, dict[str, Any]] = {
+            "observation.state": {"dtype": "float32", "shape": [len(names) + 1], "names": [*names, "gripper"]},
+            "observation.velocity": {"dtype": "float32", "shape": [len(names)], "names": names},
+            "observation.environment_state": {"dtype": "float32", "shape": [len(hand)], "names": hand},
+            "action": {"dtype": "float32", "shape": [len(names) + 1], "names": [*names, "gripper"]},
+            **{name: {"dtype": kind, "shape": [1], "names": None} for name, kind in _KINDS.items()},
+        }
+        self.tasks: dict[str, int] = {}
+        self.rows: list[dict[str, Any]] = []
+        self.stats: list[dict[str, dict[str, Floats]]] = []
+        self.frames, self.files = 0, 0
+        self._waiting: list[dict[str, Any]] = []
+        self._held = 0
+
+    def add(self, episode: Episode) -> None:
+        """Add an episode."""
+        found = sampled(episode, self.robot, self.rate)
+        count, number = len(found["time"]), len(self.rows)
+        task = self.tasks.setdefault(sentence(episode.about), len(self.tasks))
+        columns: dict[str, Any] = {
+            "observation.state": np.hstack([found[name] for name in _STATE]).astype(np.float32),
+            "observation.velocity": np.hstack([found["base_velocity"], found["arm_velocity"]]).astype(np.float32),
+            "observation.environment_state": np.hstack([found["hand_pose"], found["holding"]]).astype(np.float32),
+            "action": found["actions"].astype(np.float32),
+            "timestamp": (np.arange(count) / self.rate).astype(np.float32),
+            "frame_index": np.arange(count),
+            "episode_index": np.full(count, number),
+            "index": np.arange(self.frames, self.frames + count),
+            "task_index": np.full(count, task),
+        }
+        if self._held and self._held + count > _ROWS:
+            self._flush()
+        stats = {name: _statistics(values) for name, values in columns.items()}
+        self.stats.append(stats)
+        self.rows.append(
+            {
+                "episode_index": number,
+                "tasks": [sentence(episode.about)],
+                "length": count,
+                "data/chunk_index": self.files // _CHUNK,
+                "data/file_index": self.files % _CHUNK,
+                "dataset_from_index": self.frames,
+                "dataset_to_index": self.frames + count,
+                "meta/episodes/chunk_index": 0,
+                "meta/episodes/file_index": 0,
+                **{f"stats/{name}/{key}": value.tolist() for name, own in stats.items() for key, value in own.items()},
+            }
+        )
+        self._waiting.append(columns)
+        self._held += count
+        self.frames += count
+
+    def _flush(self) -> None:
+        """Write the frames that wait to a file, a row group an episode."""
+        arrow = self.arrow
+        path = self.folder / _DATA.format(chunk_index=self.files // _CHUNK, file_index=self.files % _CHUNK)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        fields = []
+        for name, feature in self.features.items():
+            kind = arrow.float32() if feature["dtype"] == "float32" else arrow.int64()
+            fields.append((name, kind if feature["shape"] == [1] else arrow.list_(kind, feature["shape"][0])))
+        schema = arrow.schema(fields)
+        with arrow.parquet.ParquetWriter(path, schema, compression="snappy") as writer:
+            for columns in self._waiting:
+                arrays = []
+                for name, kind in fields:
+                    values = columns[name]
+                    flat = arrow.array(values.reshape(-1))
+                    arrays.append(flat if values.ndim == 1 else arrow.FixedSizeListArray.from_arrays(flat, type=kind))
+                writer.write_table(arrow.Table.from_arrays(arrays, schema=schema))
+        self._waiting, self._held, self.files = [], 0, self.files + 1
+
+    def close(self) -> None:
+        """Write what is left."""
+        arrow, meta = self.arrow, self.folder / "meta"
+        if self._waiting:
+            self._flush()
+        path = self.folder / _EPISODES.format(chunk_index=0, file_index=0)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        arrow.parquet.write_table(arrow.Table.from_pylist(self.rows), path, compression="snappy")
+        # As pandas writes a table whose index are the tasks' texts: readers ask for the number of a text.
+        columns = {"task_index": arrow.array(list(self.tasks.values()), arrow.int64()), "task": arrow.array(list(self.tasks))}
+        about = {
+            "index_columns": ["task"],
+            "column_indexes": [],
+            "columns": [
+                {
+                    "name": "task_index",
+                    "field_name": "task_index",
+                    "pandas_type": "int64",
+                    "numpy_type": "int64",
+                    "metadata": None,
+                },
+                {"name": "task", "field_name": "task", "pandas_type": "unicode", "numpy_type": "object", "metadata": None},
+            ],
+            "pandas_version": "2.0.0",
+        }
+        table = arrow.table(columns).replace_schema_metadata({"pandas": json.dumps(about)})
+        arrow.parquet.write_table(table, meta / "tasks.parquet")
+        info = {
+            "codebase_version": VERSION,
+            "robot_type": self.robot.name,
+            "total_episodes": len(self.rows),
+            "total_frames": self.frames,
+            "total_tasks": len(self.tasks),
+            "chunks_size": _CHUNK,
+            "data_files_size_in_mb": _SIZE,
+            "video_files_size_in_mb": 2 * _SIZE,
+            "fps": self.rate,
+            "splits": {"train": f"0:{len(self.rows)}"},
+            "data_path": _DATA,
+            "video_path": None,
+            "features": self.features,
+        }
+        (meta / "info.json").write_text(json.dumps(info, indent=4) + "\n", encoding="utf-8")
+        stats = {name: _together([own[name] for own in self.stats]) for name in self.features}
+        (meta / "stats.json").write_text(json.dumps(stats, indent=4) + "\n", encoding="utf-8")
+
+
+def _statistics(values: Any) -> dict[str, Floats]:
+    """Return least, largest, mean and deviation of every column, shape (k,) each, and how many rows there are."""
+    rows = np.asarray(values, float).reshape(len(values), -1)
+    return {
+        "min": rows.min(axis=0),
+        "max": rows.max(axis=0),
+        "mean": rows.mean(axis=0),
+        "std": rows.std(axis=0),
+        "count": np.array([len(rows)]),
+    }
+
+
+def _together(parts: list[dict[str, Floats]]) -> dict[str, list[float]]:
+    """Return the statistics of all rows of those of some parts of them."""
+    counts = np.array([part["count"][0] for part in parts], float)[:, None]
+    means, deviations = (np.array([part[name] for part in parts]) for name in ("mean", "std"))
+    total = counts.sum()
+    mean = (means * counts).sum(axis=0) / total
+    variance = ((deviations**2 + (means - mean) ** 2) * counts).sum(axis=0) / total
+    return {
+        "min": np.min([part["min"] for part in parts], axis=0).tolist(),
+        "max": np.max([part["max"] for part in parts], axis=0).tolist(),
+        "mean": mean.tolist(),
+        "std": np.sqrt(variance).tolist(),
+        "count": [int(total)],
+    }

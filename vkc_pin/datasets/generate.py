@@ -1,0 +1,227 @@
+"""generate(): episodes of a recipe on any number of processes, kept as they come, in a folder that is a dataset at the end."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import sys
+import time
+import warnings
+from collections import deque
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+from tqdm import tqdm
+
+from vkc_pin.arguments import flag, whole
+from vkc_pin.datasets.dataset import Dataset, Register
+from vkc_pin.datasets.episode import Made, attempts, work_file
+from vkc_pin.datasets.formats import hdf5
+from vkc_pin.datasets.formats import lerobot as lerobot_layout
+from vkc_pin.datasets.formats.card import card
+from vkc_pin.datasets.recipe import Recipe, load_recipe
+from vkc_pin.datasets.robots import ready_robots
+from vkc_pin.datasets.running.engine import Died, clustered, results
+from vkc_pin.datasets.running.journal import Journal
+from vkc_pin.datasets.running.machine import versions
+from vkc_pin.errors import InputError, VkcError
+from vkc_pin.files.resources import file_path
+from vkc_pin.files.writing import check_writable, write_atomically
+from vkc_pin.simulation.physics import engine
+
+__all__ = ["generate"]
+
+_PATIENCE = 4  # attempts for each episode that is asked for, before there is no point
+_LEAST = 40  # attempts that are made in any case
+_WATCHED = 3.0  # times the limit of planning by the clock, after which the process is ended
+
+
+def generate(
+    recipe: str | Path | Mapping[str, Any] | Recipe,
+    episodes: int,
+    out: str | Path,
+    *,
+    jobs: int = 1,
+    scheduler: str | None = None,
+    variants: int | None = None,
+    simulate: bool | None = None,
+    lerobot: bool = False,
+    progress: bool = False,
+) -> Dataset:
+    """Make a dataset of episodes, each a scene with a motion that the independent validation accepts; or go on making it.
+
+    The recipe and a number determine an episode; the dataset consists of the first `episodes` numbers, from 0, that become one.
+    The rest is in failures.csv with its reason. Neither `jobs` nor stops make a difference to what is in shards and scenes. Every
+    attempt that ends is in the journal at once; the same call goes on where one was stopped, and with more `episodes` adds some.
+
+    Args:
+        recipe: The name or path of a recipe, or what such a file says.
+        episodes: How many, at least 1.
+        out: The folder, made if need be.
+        jobs: Processes on this machine; more than 1 are Dask's (the extra `cluster`), started anew when they die.
+        scheduler: Address of a Dask scheduler whose workers are used instead, "tcp://host:8786".
+        variants: Motions for each problem, instead of the recipe's number.
+        simulate: Whether only episodes count that physics confirms (the extra `sim`), instead of what the recipe says.
+        lerobot: Write LeRobot's layout as well.
+        progress: Show a progress bar with the time left.
+
+    Raises:
+        UnknownNameError: The recipe names something that does not exist.
+        InputError: The recipe is wrong, `out` holds something else, or what is needed is not installed; nothing is written then.
+        VkcError: Hardly any attempt becomes an episode.
+        KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
+    """
+    wanted, jobs = whole(episodes, "episodes", low=1), whole(jobs, "jobs", low=1, high=4096)
+    made = load_recipe(recipe, variants=variants, simulate=simulate)
+    hdf5.needed()
+    if flag(lerobot, "lerobot"):
+        lerobot_layout.needed()
+    if made.fields.simulate:
+        engine()
+    if (jobs > 1 or scheduler is not None) and not clustered():
+        expected = "pip install vkc-pin[cluster], or one job"
+        raise InputError("Dask is not installed", field="jobs" if scheduler is None else "scheduler", expected=expected)
+    folder = file_path(out, "out", "a folder")
+    with _journal(folder, made) as journal:
+        _at_work(folder, made)
+        dataset = Dataset(folder, made)
+        if (there := len(dataset.numbers())) > wanted:
+            raise InputError(
+                "there are more episodes already", file=folder, field="episodes", expected=f"at least {there}", got=wanted
+            )
+        register = Register(dataset, wanted)
+        for key in sorted(journal.lines, key=int):
+            register.add(_kept(journal, key))
+        if not register.full:
+            _run(dataset, register, journal, jobs, scheduler, progress)
+        register.finish()
+        _describe(dataset, register)
+        if lerobot:
+            _as_lerobot(dataset)
+    return dataset
+
+
+@contextlib.contextmanager
+def _journal(folder: Path, recipe: Recipe) -> Iterator[Journal]:
+    """Lend the journal of a folder; refuse a folder that has something else, before anything is written."""
+    file = folder / "journal.jsonl"
+    if folder.exists() and not folder.is_dir():
+        raise InputError("this is no folder", file=folder, field="out")
+    if folder.is_dir() and not file.is_file() and any(folder.iterdir()):
+        expected = "a new or empty folder, or one with episodes of this recipe"
+        raise InputError("there is something else in this folder", file=folder, field="out", expected=expected)
+    check_writable(file)
+    folder.mkdir(parents=True, exist_ok=True)
+    header = {"settings": {"recipe": recipe.digest}, "versions": versions()}
+    with file.open("a+b") as stream:
+        yield Journal(file, stream, header, "episodes")
+
+
+def _at_work(folder: Path, recipe: Recipe) -> None:
+    """Write what the folder has from the first moment on."""
+    (folder / "work").mkdir(exist_ok=True)
+    write_atomically(folder / "recipe.yaml", yaml.safe_dump(recipe.document, sort_keys=False, allow_unicode=True).encode())
+
+
+def _kept(journal: Journal, key: str) -> dict[str, Any]:
+    (record,) = journal.lines[key]
+    return record
+
+
+def _run(dataset: Dataset, register: Register, journal: Journal, jobs: int, scheduler: str | None, progress: bool) -> None:
+    """Make attempts, lowest numbers first, until there are enough episodes."""
+    document, fields = dataset.recipe.document, dataset.recipe.fields
+    began, most = time.perf_counter(), max(_LEAST, _PATIENCE * register.wanted)
+    size, again = fields.rooms.episodes * fields.variants, deque[int]()
+    robots = ready_robots(dataset.recipe, dataset.folder / "robots")
+
+    def tasks() -> Iterator[tuple[str, Any]]:
+        for block in itertools.count():
+            while again:
+                number = again.popleft()
+                yield str(number), (document, [number], robots)
+            if register.full or register.decided >= most:
+                return
+            numbers = range(block * size, (block + 1) * size)
+            left = [number for number in numbers if str(number) not in journal.lines]
+            if left:
+                yield ",".join(map(str, left)), (document, left, robots)
+
+    journal.append({"session": {"jobs": jobs}})
+    bar = tqdm(total=register.wanted, initial=len(register.accepted), unit="episode", smoothing=0.05, disable=not progress)
+    found = results(
+        attempts,
+        tasks(),
+        jobs=jobs,
+        scheduler=scheduler,
+        dask=True,
+        limit=_WATCHED * size * fields.time_limit,
+        tell=(lambda line: tqdm.write(line, file=sys.stderr)) if progress else None,
+    )
+    try:
+        with bar, contextlib.closing(found) as lines:
+            for key, result in lines:
+                numbers = [int(number) for number in key.split(",")]
+                if isinstance(result, Died) and len(numbers) > 1:  # which of them it was shows when they are alone
+                    again.extend(numbers)
+                    continue
+                for record, data in [_died(numbers[0], result)] if isinstance(result, Died) else result:
+                    if record["status"] == "interrupted":
+                        raise KeyboardInterrupt
+                    _keep(dataset, journal, record, data, time.perf_counter() - began)
+                    register.add(record)
+                bar.update(len(register.accepted) - bar.n)
+                bar.set_postfix(failed=len(register.failures), refresh=False)
+                if register.full:
+                    break
+    except KeyboardInterrupt:
+        text = f"{len(register.accepted)} of {register.wanted} episodes are made and kept in {dataset.folder}"
+        raise KeyboardInterrupt(text) from None
+    if not register.full:
+        reasons = "; ".join(dict.fromkeys(str(record["reason"]) for record in register.failures[-200:]))[:500]
+        problem = f"{register.decided} attempts gave {len(register.accepted)} episodes of {register.wanted}"
+        raise VkcError(f"{problem}, which are kept in {dataset.folder}; the last ones failed because: {reasons}")
+
+
+def _keep(dataset: Dataset, journal: Journal, record: dict[str, Any], data: bytes, seconds: float) -> None:
+    """Write an attempt down: first the episode, then the line that says that it is there."""
+    if data:
+        write_atomically(work_file(dataset.folder, record["number"]), data)
+    memory = record.pop("memory_mb", 0.0)
+    key = str(record["number"])
+    journal.append({"key": key, "records": [record], "memory_mb": memory, "seconds": round(seconds, 3)})
+
+
+def _died(number: int, died: Died) -> Made:
+    return {"number": number, "success": False, "status": "died", "reason": died.reason}, b""
+
+
+def _describe(dataset: Dataset, register: Register) -> None:
+    """Write the data card."""
+    recipe = dataset.recipe
+    about = {
+        "name": recipe.fields.name,
+        "license": recipe.fields.license,
+        "digest": recipe.digest,
+        "rate": recipe.fields.rate,
+        "versions": versions(),
+        "recipe": yaml.safe_dump(recipe.document, sort_keys=False, allow_unicode=True),
+    }
+    write_atomically(dataset.folder / "README.md", card(about, register.accepted, register.failures).encode())
+
+
+def _as_lerobot(dataset: Dataset) -> None:
+    """Write every robot's episodes in LeRobot's layout."""
+    for shards in sorted((dataset.folder / "shards").iterdir()):
+        own = (
+            episode for shard in sorted(shards.glob("*.hdf5")) for episode in hdf5.episodes_of(shard, dataset.folder / "scenes")
+        )
+        first = next(own)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            robot = first.scene().robot
+        lerobot_layout.write_lerobot(
+            dataset.folder / "lerobot" / shards.name, itertools.chain([first], own), robot, dataset.recipe.fields.rate
+        )

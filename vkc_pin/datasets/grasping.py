@@ -1,0 +1,64 @@
+"""Starts at which the hand has hold of something: a base and an arm from which nothing is hit."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vkc_pin.options import Options
+from vkc_pin.planning.planner import Planner
+from vkc_pin.program.merit import TOLERANCE
+from vkc_pin.program.problem import TrajectoryProblem
+from vkc_pin.scene.hold import Hold
+from vkc_pin.scene.scene import Scene
+from vkc_pin.seeds.knots import Knots, depth
+from vkc_pin.task.compiler import compile_task
+from vkc_pin.task.steps import Actuate
+
+__all__ = ["grasped"]
+
+_BATCH = 48  # random configurations that inverse kinematics brings to the grasp at once
+_DRAWS = 6  # batches before there is none
+
+
+def grasped(scene: Scene, step: Actuate, rng: np.random.Generator, options: Options, planner: Planner) -> Scene | None:
+    """Return the scene with the robot at a random free configuration that holds what a step moves; None if none is found.
+
+    The program that is built for it is the one that the step is planned with from there.
+
+    Args:
+        scene: Whose robot and objects they are.
+        step: The step, with its attachment.
+        rng: Random numbers.
+        options: Clearances.
+        planner: Keeps what is built.
+    """
+    name, attachment = step.object, str(step.attachment)
+    holding = scene.with_held({name: attachment})  # wherever the hand is: the chain does not depend on it
+    with planner.lent() as cache:
+        problem = TrajectoryProblem(holding, compile_task(holding, [step], options), options, (), cache=cache)
+        chain, robot = problem.chain, scene.robot.coordinates.size
+        search = Knots(problem, rng)
+        pose = search.pose_at(1)
+        freedoms = [chain.index(f"{name}.{own}") for own in scene.objects[name].object.attachments[attachment].coordinates]
+        if pose is None:
+            return None
+        solver, target = search.solver(pose)
+        for _ in range(_DRAWS):
+            z = np.tile(problem.start, (_BATCH, 1))
+            z[:, freedoms] = rng.uniform(chain.lower[freedoms], chain.upper[freedoms], (_BATCH, len(freedoms)))
+            z, _ = search.knot(z, 1, "scatter")
+            z[:, search.driven] = problem.start[search.driven]  # as it is at the start, not a step later
+            lower, upper = np.tile(chain.lower, (_BATCH, 1)), np.tile(chain.upper, (_BATCH, 1))
+            fixed = [*freedoms, *search.driven.tolist()]
+            lower[:, fixed] = upper[:, fixed] = z[:, fixed]
+            z, found = solver.solve(z, target, lower=lower, upper=upper, weights=search.weights, tolerance=_EXACT)
+            z = z[found]
+            z = z[depth(problem, z, 0) <= 0.0] if len(z) else z
+            if len(z):
+                row = z[int(rng.integers(len(z)))]
+                there = scene.with_start(base=row[:3], arm=row[3:robot])
+                return there.with_held([Hold(name, attachment, at=tuple(row[freedoms].tolist()))])
+    return None
+
+
+_EXACT = 1e-2 * TOLERANCE  # [m], [rad]: how far the hand may be off what it holds

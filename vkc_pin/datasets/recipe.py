@@ -1,0 +1,222 @@
+"""Recipes: what episodes of a dataset are like, as a YAML file; with a number, a recipe determines an episode."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from vkc_pin.arguments import mapping
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.files.documents import Document, check, read_yaml
+from vkc_pin.files.fields import Name, NotNegative, Number, Positive, Schema, count, require, text_for
+from vkc_pin.files.resources import available, located
+from vkc_pin.models.robot_file import find_robot
+from vkc_pin.options import Options
+from vkc_pin.scene.rooms.fixtures import known_objects
+from vkc_pin.scene.rooms.parts import CARRIED
+from vkc_pin.scene.rooms.settings import RoomSettings
+
+__all__ = ["TASKS", "GoalSchema", "Recipe", "RecipeSchema", "RobotEntry", "RoomsSchema", "StartSchema", "load_recipe"]
+
+TASKS = ("given-open", "drive-open", "fetch-place")
+"""What an episode can be: something is opened by a hand that has hold of it, or by a robot that first drives there; something is
+taken from one table to another."""
+
+_increasing = require(lambda value: value[0] <= value[1], "the interval is empty", "[lowest, highest]")
+_share = require(lambda value: value[0] > 0.0 and value[1] <= 1.0, "out of range", "shares above 0 and up to 1")
+Interval = Annotated[tuple[Number, Number], count(2), _increasing]
+Share = Annotated[Interval, _share]
+Whole = Annotated[int, Field(strict=True, ge=1)]
+Names = Annotated[tuple[str, ...], require(lambda value: value, "there is nothing", "at least one")]
+
+
+class RobotEntry(Schema):
+    """A robot by name or path, and how high its root link is, as on a stand [m]; None: as its description has it."""
+
+    name: str
+    height: Number | None = None
+
+
+class RoomsSchema(Schema):
+    """Random rooms: `count` of them, the first of number `first`, or ever new ones, and ranges of what they are like.
+
+    So many `episodes` in a row have a room and a robot in common, which makes them cheap.
+    """
+
+    count: Whole | None = 50
+    first: Annotated[int, Field(strict=True, ge=0)] = 0
+    episodes: Whole = 4
+    objects: Annotated[int, Field(strict=True, ge=1, le=3)] = 2
+    clutter: Interval = (0.0, 0.4)
+    width: Interval = (5.5, 8.0)
+    front: Number = 1.8
+
+
+class StartSchema(Schema):
+    """Where episodes start: how far the base is from what it goes to [m], how far arm joints are from home [rad]."""
+
+    distance: Interval = (0.0, 10.0)
+    arm: NotNegative = 0.0
+
+
+class GoalSchema(Schema):
+    """Where they end: by which share of its range a joint is moved, how far from a table's edge something is put [m]."""
+
+    share: Share = (0.35, 0.65)
+    edge: Interval = (0.1, 0.3)
+
+
+_some = require(lambda value: value, "there is nothing", "at least one")
+Robots = Annotated[tuple[Annotated[RobotEntry, text_for("name")], ...], _some]
+
+
+class RecipeSchema(Schema):
+    """A recipe."""
+
+    name: Name
+    license: str = "CC-BY-4.0"
+    robots: Robots = (RobotEntry(name="husky_ur5e"),)
+    tasks: Annotated[tuple[Literal[TASKS], ...], require(lambda v: v, "there is nothing", "at least one")] = TASKS  # type: ignore[valid-type]
+    objects: Names = (
+        "random_cabinet",
+        "random_drawers",
+        "random_dishwasher",
+        "random_oven",
+        "random_refrigerator",
+        "random_door",
+    )
+    carried: Names = ("ball",)
+    rooms: RoomsSchema = RoomsSchema()
+    scenes: tuple[str, ...] = ()
+    start: StartSchema = StartSchema()
+    goal: GoalSchema = GoalSchema()
+    grasps: Literal["freest", "any"] = "freest"
+    options: dict[str, Any] = Field(default_factory=dict)
+    effort: Whole = 100_000
+    time_limit: Positive = 60.0
+    variants: Whole = 1
+    rate: Positive = 10.0
+    simulate: bool = False
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """A recipe that was read and checked.
+
+    Attributes:
+        fields: What it says, with defaults where it says nothing.
+        options: How to plan.
+    """
+
+    fields: RecipeSchema
+    options: Options
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """All of it as plain data, from which `load_recipe` makes it again."""
+        return self.fields.model_dump(mode="json")
+
+    @property
+    def digest(self) -> str:
+        """A name for what it says: the same for recipes that make the same episodes."""
+        said = {key: value for key, value in self.document.items() if key not in ("name", "license")}
+        return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:16]
+
+    def rng(self, *words: object) -> np.random.Generator:
+        """Return random numbers that depend on the recipe and on some words, such as the number of an episode, alone."""
+        text = "/".join([self.digest, *map(str, words)])
+        return np.random.default_rng(int.from_bytes(hashlib.sha256(text.encode()).digest()[:16], "little"))
+
+
+def load_recipe(recipe: str | Path | Mapping[str, Any] | Recipe, **changes: Any) -> Recipe:
+    """Return a recipe.
+
+    Args:
+        recipe: The name of one that comes with the package, the path of a YAML file, or what such a file says.
+        changes: Fields that are to be otherwise; None leaves them.
+
+    Raises:
+        UnknownNameError: It, or something that it names, does not exist.
+        InputError: Something in it is wrong; the error names file, line and field.
+    """
+    changes = {name: value for name, value in changes.items() if value is not None}
+    if isinstance(recipe, Recipe):
+        document = Document(recipe.document)
+    elif isinstance(recipe, Mapping):
+        document = Document(mapping(recipe, "recipe", "fields of a recipe"))
+    else:
+        document = read_yaml(located(recipe, "scenes", "recipes/*.yaml", what="recipe"))
+    if isinstance(document.data, dict):
+        document = Document({**document.data, **changes}, document.file, document.lines)
+    fields = check(document, RecipeSchema)
+    folder = document.file.parent if document.file else Path()
+    found = {
+        "robots": tuple(_robot(document, k, entry, folder) for k, entry in enumerate(fields.robots)),
+        "objects": tuple(_object(document, k, name, folder) for k, name in enumerate(fields.objects)),
+        "scenes": tuple(_scene(document, k, name, folder) for k, name in enumerate(fields.scenes)),
+    }
+    for k, kind in enumerate(fields.carried):
+        if kind not in CARRIED:
+            raise document.unknown(("carried", k), "object that is carried", kind, CARRIED)
+    if fields.scenes and "fetch-place" in fields.tasks:
+        expected = "random rooms, whose tables are known, or only given-open and drive-open"
+        raise document.error(("tasks",), "nothing says where to put things in scene files", expected=expected, got="fetch-place")
+    with document.at(("rooms",)):
+        RoomSettings(clutter=fields.rooms.clutter[0], width=fields.rooms.width, front=fields.rooms.front)
+        RoomSettings(clutter=fields.rooms.clutter[1])
+    return Recipe(fields.model_copy(update=found), _options(document, fields.options))
+
+
+def _options(document: Document, given: Mapping[str, Any]) -> Options:
+    for name in given:
+        if name not in Options.__dataclass_fields__:
+            raise document.unknown(("options", name), "option", name, Options.__dataclass_fields__)
+    try:
+        return Options(**given)
+    except InputError as error:
+        name = (error.field or "").removeprefix("Options.")
+        raise document.error(("options", name), error.problem, expected=error.expected, got=error.got) from error
+
+
+def _is_path(name: str) -> bool:
+    return name.endswith((".yaml", ".yml", ".urdf")) or "/" in name
+
+
+def _robot(document: Document, place: int, entry: RobotEntry, folder: Path) -> RobotEntry:
+    with document.at(("robots", place)):
+        if not _is_path(entry.name):
+            find_robot(entry.name)
+            return entry
+        return entry.model_copy(update={"name": str(find_robot(str((folder / entry.name).resolve())))})
+
+
+def _object(document: Document, place: int, name: str, folder: Path) -> str:
+    if not _is_path(name):
+        if name not in known_objects():
+            raise document.unknown(("objects", place), "object that opens", name, known_objects())
+        return name
+    return _file(document, ("objects", place), folder / name)
+
+
+def _scene(document: Document, place: int, name: str, folder: Path) -> str:
+    if not _is_path(name):
+        known = available("scenes", "*.yaml")
+        if name not in known:
+            raise UnknownNameError(
+                "scene", name, known, file=document.file, line=document.line(("scenes", place)), field="scenes"
+            )
+        return name
+    return _file(document, ("scenes", place), folder / name)
+
+
+def _file(document: Document, path: tuple[str | int, ...], file: Path) -> str:
+    if not file.is_file():
+        raise document.error(path, "there is no such file", expected="an existing file", got=file)
+    return str(file.resolve())

@@ -20,6 +20,7 @@ import yaml
 import vkc_pin as vkc
 from vkc_pin.cli.commands import make_parser
 from vkc_pin.files.documents import Document, check
+from vkc_pin.models.dynamics.resistance import ObjectJointSchema
 from vkc_pin.models.object_file import AttachmentSchema, LatchSchema, ObjectSchema
 from vkc_pin.models.robot_schema import BaseSchema, RobotSchema
 from vkc_pin.scene.scene_schema import COLOURS, ObstacleSchema, PlacedObjectSchema, SceneRobotSchema, SceneSchema, StartSchema
@@ -73,8 +74,8 @@ def test_yaml_examples_fit_their_schemas(tmp_path: Path) -> None:
         (tmp_path / "room.yaml").write_text(scene, encoding="utf-8")
         loaded = vkc.load_scene(tmp_path / "room.yaml")
         assert (list(loaded.objects), len(loaded.allowed)) == (objects, allowed)
-    described, rim, narrow, push, whole = blocks(ROOT / "docs/objects.md", "yaml")
-    for text, urdf in ((rim, "bowl.urdf"), (narrow, "drawer.urdf"), (push, "drawer.urdf")):
+    described, rim, narrow, push, closer, rollers, whole = blocks(ROOT / "docs/objects.md", "yaml")
+    for text, urdf in ((rim, "bowl.urdf"), *((own, "drawer.urdf") for own in (narrow, push, rollers)), (closer, "door.urdf")):
         assert check(Document(yaml.safe_load(text)), ObjectSchema).urdf == urdf
     (tmp_path / "hatch.yaml").write_text(whole, encoding="utf-8")
     assert vkc.load_scene(tmp_path / "hatch.yaml").objects["hatch"].object.name == "hatch"
@@ -88,7 +89,7 @@ def test_every_field_is_documented() -> None:
     kinds = ObstacleSchema.__origin__.__args__  # type: ignore[attr-defined]
     for text, schemas in (
         (scenes, (SceneSchema, SceneRobotSchema, StartSchema, PlacedObjectSchema, *kinds)),
-        (objects, (ObjectSchema, AttachmentSchema, LatchSchema)),
+        (objects, (ObjectSchema, ObjectJointSchema, AttachmentSchema, LatchSchema)),
         (robots, (RobotSchema,)),
     ):
         for schema in schemas:

@@ -57,7 +57,7 @@ def plain_tree(file: Path, root: ElementTree.Element) -> tuple[str, frozenset[st
     """Return links and joints of a URDF that was checked, as one that parsers understand, without shapes and extensions.
 
     What a limit does not say is 0; joints that say nothing about velocity are named. Mimicking is left to the caller. An
-    <inertial> that is not whole counts as none, with a warning: nothing here is planned with masses.
+    <inertial> that is not whole counts as none, with a warning: kinematics need none.
 
     Args:
         file: The URDF.

@@ -17,6 +17,8 @@ from vkc_pin.arguments import known, number, numbers
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
 from vkc_pin.models.coordinates import Coordinates
+from vkc_pin.models.dynamics.resistance import Resistance
+from vkc_pin.models.dynamics.weight import mass_of
 
 __all__ = ["DEFAULT_ACCELERATION", "DEFAULT_VELOCITY", "ArticulatedObject", "Attachment", "Freedom", "Latch"]
 
@@ -164,6 +166,7 @@ class ArticulatedObject:
         base_link: The name of its base link.
         free: Whether it can be carried away (a stick), instead of standing fixed in the world (a door).
         own_pairs: Pairs of its links that can meet; others are taken to be made so that they cannot.
+        resistance: Joint → friction, damping and spring that it resists with; nothing, where its description says nothing.
     """
 
     name: str
@@ -181,9 +184,15 @@ class ArticulatedObject:
     base_link: str
     free: bool = False
     own_pairs: Set[frozenset[str]] = frozenset()
+    resistance: Mapping[str, Resistance] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"<ArticulatedObject {self.name}: joints {', '.join(self.coordinates.names) or 'none'}>"
+
+    @property
+    def mass(self) -> float:
+        """What all its links weigh together [kg]; 0 if nobody says so."""
+        return mass_of(self.model)
 
     @property
     def links(self) -> tuple[str, ...]:

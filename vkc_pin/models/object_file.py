@@ -15,7 +15,6 @@ from vkc_pin.arguments import mapping
 from vkc_pin.errors import InputError
 from vkc_pin.files.documents import Document, check, read_yaml
 from vkc_pin.files.fields import (
-    JointSchema,
     Name,
     NotNegative,
     Number,
@@ -31,6 +30,8 @@ from vkc_pin.files.resources import file_path, located
 from vkc_pin.files.urdf import load_urdf
 from vkc_pin.models.articulation import DEFAULT_ACCELERATION, DEFAULT_VELOCITY, ArticulatedObject, Attachment, Freedom, Latch
 from vkc_pin.models.coordinates import Coordinates
+from vkc_pin.models.dynamics.resistance import ObjectJointSchema, resistances
+from vkc_pin.models.dynamics.weight import weigh
 from vkc_pin.models.grafting import clean
 
 __all__ = ["AttachmentSchema", "FreedomSchema", "LatchSchema", "ObjectSchema", "described_object", "load_object"]
@@ -127,7 +128,8 @@ class ObjectSchema(Schema):
 
     urdf: str
     free: bool = False
-    joints: Mapping[str, JointSchema] = Field(default_factory=dict)
+    mass: NotNegative | None = None
+    joints: Mapping[str, ObjectJointSchema] = Field(default_factory=dict)
     attachments: tuple[AttachmentSchema, ...]  # none, if it is said so: what no hand can open still stands in rooms
     latches: tuple[LatchSchema, ...] = ()
     own_collisions: tuple[Annotated[tuple[str, ...], count(2)], ...] = ()
@@ -181,6 +183,11 @@ def described_object(document: Document, folder: Path, name: str | None = None) 
         slow = names[int(np.argmin(velocity))]
         problem, field = "a joint without velocity cannot move", f"{slow}.limit.velocity"
         raise InputError(problem, file=urdf, field=field, expected="> 0", got=velocity.min())
+    if schema.mass is not None:
+        if not schema.free:
+            problem, expected = "what stands fixed is not carried", "masses of links in its URDF, or free: true"
+            raise document.error(("mass",), problem, expected=expected, got=schema.mass)
+        weigh(model, collision, schema.mass)
     attachments: dict[str, Attachment] = {}
     for index, item in enumerate(schema.attachments):
         if item.link not in links:
@@ -212,6 +219,7 @@ def described_object(document: Document, folder: Path, name: str | None = None) 
         base_link=links[0],
         free=schema.free,
         own_pairs=_own_pairs(document, schema, links),
+        resistance=MappingProxyType(resistances(document, schema.joints, urdf, text, names)),
     )
 
 

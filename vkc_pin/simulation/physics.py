@@ -12,7 +12,7 @@ import pinocchio as pin
 from vkc_pin.arguments import flag, number
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
-from vkc_pin.models.shapes import triangles
+from vkc_pin.models.dynamics.weight import solid_inertia
 from vkc_pin.motion.world import World
 
 __all__ = ["Physics", "engine", "weigh"]
@@ -104,7 +104,7 @@ def weigh(world: World, physics: Physics) -> list[str]:
             guessed += [name] if solids else []
             inertia = pin.Inertia(_LEAST_MASS, np.zeros(3), 1e3 * _LEAST_INERTIA * _LEAST_MASS * np.eye(3))
             for solid in solids:
-                inertia += solid.placement.act(_of_solid(solid, physics.density))
+                inertia += solid.placement.act(solid_inertia(solid, physics.density))
         tensor, added = _possible(inertia)
         if added > _ROUNDED:
             notes.append(f"no body has the inertia that is stated for {name}: {100.0 * added:.0f} % are added to its moments")
@@ -113,14 +113,6 @@ def weigh(world: World, physics: Physics) -> list[str]:
         density = f"{physics.density:g} kg/m³ in the volume of the collision shapes"
         notes.append(f"no mass is stated for {', '.join(guessed)}: {density}")
     return notes
-
-
-def _of_solid(shape: pin.GeometryObject, density: float) -> pin.Inertia:
-    import trimesh
-
-    solid = trimesh.Trimesh(triangles(shape.geometry)[0]).convex_hull
-    solid.density = density
-    return pin.Inertia(float(solid.mass), np.asarray(solid.center_mass), np.asarray(solid.moment_inertia))
 
 
 def _possible(inertia: pin.Inertia) -> tuple[Floats, float]:

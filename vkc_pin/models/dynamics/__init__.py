@@ -1,0 +1,1 @@
+"""What it takes to move objects: their weight, and friction, damping and springs of their joints."""

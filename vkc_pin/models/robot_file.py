@@ -31,7 +31,7 @@ from vkc_pin.models.robot_model import (
     planned_model,
     rest_positions,
 )
-from vkc_pin.models.robot_schema import RobotSchema, python_packages, read_robot
+from vkc_pin.models.robot_schema import RobotJointSchema, RobotSchema, python_packages, read_robot
 from vkc_pin.models.self_collisions import surveyed, with_collision_pairs
 from vkc_pin.models.shapes import LIMIT_SLACK
 
@@ -279,19 +279,19 @@ def _state(model: pin.Model, semantics: Srdf | None, given: Collection[str]) -> 
 def _limits(model: pin.Model, settings: RobotSchema, base: Base) -> tuple[Coordinates, Floats, Floats, Floats, Floats]:
     """Write the limits into `model` and return its coordinates with (lower, upper, velocity, acceleration), shape (n,) each."""
     low, high = np.array(settings.base.position).T if base != "fixed" else (np.zeros(2), np.zeros(2))
-    position_low, position_high, velocity = model.lowerPositionLimit, model.upperPositionLimit, model.velocityLimit
+    position_low, position_high = model.lowerPositionLimit, model.upperPositionLimit
+    velocity, effort = model.velocityLimit, model.effortLimit
     position_low[:2], position_high[:2], velocity[:3] = low, high, settings.base.velocity
     acceleration = np.full(model.nv, _ACCELERATION)
     acceleration[:3] = settings.base.acceleration
     for j in range(2, model.njoints):
-        v, named = model.joints[j].idx_v, settings.joints.get(model.names[j])
-        if named is not None and named.velocity is not None:
-            velocity[v] = named.velocity
-        elif not 0.0 < velocity[v] < 1e3:  # Pinocchio's value for a joint without limit is the largest number
+        v, named = model.joints[j].idx_v, settings.joints.get(model.names[j], RobotJointSchema())
+        if not 0.0 < velocity[v] < 1e3:  # Pinocchio's value for a joint without limit is the largest number
             velocity[v] = _VELOCITY
-        if named is not None and named.acceleration is not None:
-            acceleration[v] = named.acceleration
-    model.lowerPositionLimit, model.upperPositionLimit, model.velocityLimit = position_low, position_high, velocity
+        for values, said in ((velocity, named.velocity), (acceleration, named.acceleration), (effort, named.effort)):
+            values[v] = values[v] if said is None else said
+    model.lowerPositionLimit, model.upperPositionLimit = position_low, position_high
+    model.velocityLimit, model.effortLimit = velocity, effort
     coordinates = Coordinates(model)
     lower, upper = coordinates.lower.copy(), coordinates.upper.copy()
     if base == "fixed":

@@ -10,9 +10,9 @@ from pydantic import Field
 
 from vkc_pin.errors import InputError
 from vkc_pin.files.documents import Document, check, read_yaml
-from vkc_pin.files.fields import JointSchema, Number, Positive, Schema, require
+from vkc_pin.files.fields import JointSchema, NotNegative, Number, Positive, Schema, require
 
-__all__ = ["BaseSchema", "FingerSchema", "RobotSchema", "python_packages", "read_robot"]
+__all__ = ["BaseSchema", "FingerSchema", "RobotJointSchema", "RobotSchema", "python_packages", "read_robot"]
 
 
 Limits = Annotated[
@@ -27,6 +27,12 @@ class BaseSchema(Schema):
     velocity: tuple[Positive, Positive, Positive] = (1.0, 1.0, 2.0)
     acceleration: tuple[Positive, Positive, Positive] = (3.0, 3.0, 6.0)
     height: Number = 0.0
+
+
+class RobotJointSchema(JointSchema):
+    """What a URDF does not say about a joint of a robot, or says wrong; effort [N·m] or [N], 0: that is not known."""
+
+    effort: NotNegative | None = None
 
 
 class FingerSchema(Schema):
@@ -49,7 +55,7 @@ class RobotSchema(Schema):
     home: dict[str, Number] = Field(default_factory=dict)
     locked_joints: dict[str, Number] = Field(default_factory=dict)
     gripper: dict[str, FingerSchema] = Field(default_factory=dict)
-    joints: dict[str, JointSchema] = Field(default_factory=dict)
+    joints: dict[str, RobotJointSchema] = Field(default_factory=dict)
 
 
 def read_robot(file: Path) -> tuple[RobotSchema, Document]:

@@ -5,20 +5,27 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from functools import partial
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from vkc_pin.arrays import Bools, Floats, Ints
 from vkc_pin.motion.curve import SHORTEST, Curve, joined
+from vkc_pin.motion.dynamics.torques import Torques
 from vkc_pin.motion.trajectory import Trajectory
+from vkc_pin.retiming.loads import Load
 from vkc_pin.retiming.parametrization import speeds_along
 from vkc_pin.retiming.path import path_through
 from vkc_pin.scene.scene import Scene
 
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicHermiteSpline
+
 __all__ = ["retimed"]
 
 _PARTS = 3  # pieces of a step in which the speed along the path changes evenly
+_PASSES, _SETTLED = 4, 0.02  # of the search for speeds that torques allow, and how far apart two are, relative, that end it
 _STILL = 1e-6  # [m] or [rad] of a step in which a joint of an object stays where it is
 _SHORT = 1e-6  # share of a second at full speed that a step takes which is none
 _SHORTEST = 1e-3  # [s] of a step in which nothing moves, unless a hand opens or closes in it
@@ -53,7 +60,7 @@ def retimed(scene: Scene, trajectory: Trajectory, parts: Ints | None = None) -> 
     for as long as it did. It stops where a joint of an object begins or ceases to move: there, the hand that has it turns a
     corner. Between two rests it goes along one path, see `path_through`, at the speeds of `speeds_along`; where none are known,
     straight from waypoint to waypoint, with a stop at each. The cubics in time through the places at which speeds are known are
-    slowed down until they keep the limits of velocity and acceleration exactly.
+    slowed down until they keep the limits of velocity and acceleration exactly, and of torque where these can be kept at all.
 
     Args:
         scene: Robot and objects.
@@ -67,14 +74,17 @@ def retimed(scene: Scene, trajectory: Trajectory, parts: Ints | None = None) -> 
     scale = 1.0 / np.where(np.isfinite(limits.velocity), limits.velocity, 1.0)
     still = np.linalg.norm(np.diff(positions, axis=0) * scale, axis=1) <= _SHORT
     waits = {int(places[phase.first]): float(np.diff(trajectory.times)[phase.first]) for phase in trajectory.phases}
-    pieces, ends = list[Curve](), [0]
+    pieces, ends, torques = list[Curve](), [0], Torques(scene, trajectory)
+    phases = torques.phases_of(np.searchsorted(places, np.arange(places[-1]), side="right") - 1)
     for steps in _runs(still, np.abs(np.diff(positions[:, trajectory.robot_size :], axis=0)) > _STILL):
         rests = bool(still[steps[0]])
         points = positions[steps[0] : steps[-1] + 2]
-        found = None if rests else _smooth(points, limits, scale)
+        known = torques.efforts.known and not rests
+        found = None if rests else _smooth(points, limits, scale, Load(torques, phases[steps], _PARTS) if known else None)
         if found is None:
             least = [waits.get(step, _SHORTEST) if rests else 0.0 for step in steps]
-            found = _straight(points, limits, np.array(least)), np.arange(1, len(points))
+            straight = _straight(points, limits, np.array(least))
+            found = Load(torques, phases[steps], 1).slowed(straight) if known else straight, np.arange(1, len(points))
         ends += (ends[-1] + found[1]).tolist()
         pieces.append(found[0])
     curve = joined(pieces).shifted(float(trajectory.times[0]))
@@ -93,19 +103,38 @@ def _runs(still: Bools, moves: Bools) -> Iterator[list[int]]:
     yield from (list(range(first, last)) for first, last in itertools.pairwise(edges))
 
 
-def _smooth(points: Floats, limits: _Limits, scale: Floats) -> tuple[Curve, Ints] | None:
-    """Return a curve through waypoints, shape (m, n), and which of its knots they are but for the first; None: not known."""
+def _smooth(points: Floats, limits: _Limits, scale: Floats, load: Load | None) -> tuple[Curve, Ints] | None:
+    """Return a curve through waypoints, shape (m, n), and which of its knots they are but for the first; None: not known.
+
+    Torques are looked at when the curve is known that limits of velocity and acceleration allow: hardly any exceeds them.
+    """
     path = path_through(points, scale, (limits.lower, limits.upper))
     shares = np.arange(_PARTS) / _PARTS
     places = np.append((path.x[:-1, None] + np.diff(path.x)[:, None] * shares).ravel(), path.x[-1])
     speeds = speeds_along(path, places, limits.velocity, limits.acceleration)
     if speeds is None:
         return None
+    waypoints = np.arange(1, len(points)) * _PARTS
+    curve = _timed(path, places, points, speeds, limits)
+    if load is None or np.abs(load.of(curve)).max() <= 1.0 or np.abs(load.split(curve)[0]).max() >= 1.0:
+        return curve, waypoints  # or it is too heavy however slow it is
+    for _ in range(_PASSES):  # drag is not linear in the square of the speed: it is taken as it is around the speed before
+        linear = partial(load.linear, path, places, speeds)
+        slower = speeds_along(path, places, limits.velocity, limits.acceleration, linear)
+        if slower is None:
+            break
+        settled, speeds = np.allclose(slower, speeds, rtol=_SETTLED), slower
+        if settled:
+            break
+    return load.slowed(_timed(path, places, points, speeds, limits)), waypoints
+
+
+def _timed(path: CubicHermiteSpline, places: Floats, points: Floats, speeds: Floats, limits: _Limits) -> Curve:
+    """Return a path gone along with speeds at places, shape (K,), every `_PARTS`-th of which is one of its points."""
     times = np.concatenate([[0.0], np.cumsum(2.0 * np.diff(places) / (speeds[1:] + speeds[:-1]))])
     knots = path(places)
     knots[::_PARTS] = points  # to the last bit
-    curve = Curve(times, knots, path(places, 1) * speeds[:, None])
-    return _slowed(curve, limits), np.arange(1, len(points)) * _PARTS
+    return _slowed(Curve(times, knots, path(places, 1) * speeds[:, None]), limits)
 
 
 def _straight(points: Floats, limits: _Limits, least: Floats) -> Curve:

@@ -39,7 +39,17 @@ STATUSES = (
 )
 """What plans end with; those in the second line are the baselines'."""
 METRICS = (
-    *("planning_time", "build_time", "base_effort", "base_effort_l1", "arm_effort", "clearance", "closure_error", "duration"),
+    *(
+        "planning_time",
+        "build_time",
+        "base_effort",
+        "base_effort_l1",
+        "arm_effort",
+        "clearance",
+        "closure_error",
+        "duration",
+        "torque",
+    ),
     *(
         "iterations",
         "rounds",
@@ -124,11 +134,19 @@ class _Others(BaseModel):
         return self
 
 
-_LATER = ("effort", "time_retiming")  # older files do not have it
+_LATER = ("effort", "time_retiming", "torque")  # older files do not have it
 _kinds: dict[str, Any] = {
     name: (Distance if name == "clearance" else Measured, 0.0 if name in _LATER else ...) for name in METRICS
 }
 _Metrics = create_model("_Metrics", __base__=_Others, **_kinds)
+
+
+class _Bound(Schema):
+    subject: Text
+    kind: Text
+    share: Measured
+    begin: Annotated[float, Field(strict=True, allow_inf_nan=False)]
+    end: Annotated[float, Field(strict=True, allow_inf_nan=False)]
 
 
 class _Report(Schema):
@@ -139,6 +157,9 @@ class _Report(Schema):
     clearances: Annotated[tuple[Distance, ...], FailFast()] = ()  # older files do not have it
     states: Count
     notes: Annotated[list[Text], FailFast()]
+    torque: Measured = 0.0  # older files have none of these
+    bounds: Annotated[tuple[_Bound, ...], FailFast()] = ()
+    remarks: Annotated[tuple[Text, ...], FailFast()] = ()
 
 
 class _About(Schema):

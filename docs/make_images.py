@@ -15,6 +15,7 @@ import pinocchio as pin
 import vkc_pin as vkc
 from vkc_pin.benchmarks import chores, gap
 from vkc_pin.models.shapes import triangles
+from vkc_pin.motion.dynamics.torques import Torques
 from vkc_pin.motion.world import World
 from vkc_pin.plotting.style import COLOURS, new_figure, save_figure, styled
 from vkc_pin.plotting.top_view import draw_top_view
@@ -49,6 +50,7 @@ OPENED = {"door": ("hinge", 1.0), "drawer": ("slide", 0.22), "dishwasher": ("rac
 
 sys.path.insert(0, str(ROOT / "tests"))
 from helpers.browser import screenshot  # noqa: E402
+from helpers.closers import closer  # noqa: E402
 from helpers.grippers import between_cheeks, write_gripper  # noqa: E402
 from helpers.homes import home_urdf  # noqa: E402
 
@@ -256,6 +258,27 @@ def opening_picture() -> None:
         save_figure(figure, IMAGES / "opening.png")
 
 
+def torque_picture() -> None:
+    """Write what the motors do while a door with a closer is opened, against what they have, over time."""
+    scenes = vkc.load_scene("door"), closer(damping=400.0, stiffness=5.0, springref=-2.0)
+    plans = [vkc.plan(scene, [vkc.Actuate("door", {"hinge": 1.2}, "handle")]) for scene in scenes]
+    with styled():
+        figure = new_figure(9.0, 3.4)
+        panels = figure.subplots(1, 2, sharey=True)
+        for axes, plan, title in zip(panels, plans, ("as it is", "with a closer that damps by 400 N·m·s/rad"), strict=True):
+            times, _ = plan.trajectory.sample(200.0)
+            torques, limits = Torques(plan.scene, plan.trajectory), plan.scene.robot.efforts.limits[3:]
+            shares = 100.0 * torques.along(times)[:, 3:] / limits
+            for name, column, limit in zip(plan.scene.robot.coordinates.names[3:], shares.T, limits, strict=True):
+                axes.plot(times, column, label=f"{name.removesuffix('_joint')}, {limit:g} N·m")
+            for edge in (-100.0, 100.0):
+                axes.axhline(edge, color="0.3", linestyle="--", linewidth=1.0)
+            axes.set(title=f"a door {title}", xlabel="time [s]", ylim=(-112.0, 112.0))
+        panels[0].set_ylabel("torque [% of what the motor has]")
+        panels[0].legend(fontsize=7, ncols=2, loc="upper left", bbox_to_anchor=(0.0, 0.9))
+        save_figure(figure, IMAGES / "torques.png")
+
+
 def main() -> int:
     """Write the pictures; return 1 if there is no motion to show."""
     saved = [vkc.Plan.load(name) for name in sys.argv[1:]]
@@ -295,6 +318,7 @@ def main() -> int:
     push_picture()
     bases_picture()
     opening_picture()
+    torque_picture()
     return 0
 
 

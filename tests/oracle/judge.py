@@ -8,6 +8,7 @@ from pathlib import Path
 
 from .collisions import check_collisions
 from .goals import check_goals
+from .motors import check_motors
 from .neighbours import Neighbours
 from .plan import NotJudged, SavedPlan, Violation, read_plan
 from .rules import check_motion, check_stage
@@ -60,6 +61,7 @@ def violations(plan: SavedPlan) -> list[Violation]:
     allowed, built = licences(world, stages), Neighbours(world)
     for stage in stages:
         found += check_stage(world, stage)
+        found += check_motors(world, stage)
         found += check_collisions(world, stage, allowed, built)
     worst: dict[tuple[str, str], Violation] = {}
     for one in found:

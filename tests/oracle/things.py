@@ -111,6 +111,8 @@ class Thing:
     limits: dict[str, tuple[float, float, float, float]]
     grasps: dict[str, Grasp]
     latches: list[dict[str, Any]]
+    resists: dict[str, dict[str, float]]
+    mass: float | None
 
     def grasp(self, name: str | None) -> Grasp:
         return next(iter(self.grasps.values())) if name is None else self.grasps[name]
@@ -139,6 +141,7 @@ class Robot:
     coupled: dict[str, tuple[str, float, float]]
     wheels: dict[str, float] | None
     turning_radius: float
+    efforts: dict[str, float]
 
     def moved(self, arm: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return where all joints are that move with the arm, of values of its planned ones."""
@@ -194,7 +197,17 @@ def load_thing(item: Mapping[str, Any], folder: Path) -> Thing:
         limits=limits,
         grasps=grasps,
         latches=[{"held_at": 0.0, **latch} for latch in about.get("latches") or ()],
+        resists={joint: _resists(urdf, joint, (about.get("joints") or {}).get(joint, {})) for joint in joints},
+        mass=about.get("mass"),
     )
+
+
+def _resists(urdf: Urdf, joint: str, said: Mapping[str, Any]) -> dict[str, float]:
+    """Return friction, damping, stiffness and springref of an object's joint."""
+    dynamics = urdf.joints[joint].find("dynamics")
+    found = {"friction": 0.0, "damping": 0.0, "stiffness": 0.0, "springref": 0.0}
+    found |= {} if dynamics is None else {key: float(value) for key, value in dynamics.attrib.items() if key in found}
+    return found | {key: float(said[key]) for key in found if key in said}
 
 
 def _grasp(entry: Mapping[str, Any], free: bool, reversed_ones: Sequence[str]) -> Grasp:
@@ -295,6 +308,7 @@ def load_robot(item: Mapping[str, Any] | str, folder: Path, arm: list[str]) -> R
         coupled=coupled,
         wheels=base.get("wheels"),
         turning_radius=float(about.get("turning_radius") or base.get("turning_radius") or 0.0),
+        efforts={joint: float(joints.get(joint, {}).get("effort", urdf.effort(joint))) for joint in arm},
     )
 
 

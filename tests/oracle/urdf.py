@@ -142,6 +142,23 @@ class Urdf:
     def moves(self, joint: str) -> bool:
         return self.kind(joint) in ("revolute", "continuous", "prismatic")
 
+    def effort(self, joint: str) -> float:
+        """Return what the motor of a joint has; 0: nobody says."""
+        limit = self.joints[joint].find("limit")
+        return 0.0 if limit is None else float(limit.get("effort", 0.0))
+
+    def weight(self, link: str) -> tuple[float, np.ndarray, np.ndarray]:
+        """Return mass [kg], centre of mass [m] and inertia about that [kg·m²] of a link, in its frame."""
+        inertial = next(item for item in self.root.findall("link") if item.get("name") == link).find("inertial")
+        if inertial is None:
+            return 0.0, np.zeros(3), np.zeros((3, 3))
+        origin, about = inertial.find("origin"), inertial.find("inertia").attrib
+        i = {key: float(about[key]) for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")}
+        tensor = np.array([[i["ixx"], i["ixy"], i["ixz"]], [i["ixy"], i["iyy"], i["iyz"]], [i["ixz"], i["iyz"], i["izz"]]])
+        turn = np.eye(3) if origin is None else rpy(*_numbers(origin.get("rpy"), (0.0, 0.0, 0.0)))
+        centre = np.zeros(3) if origin is None else _numbers(origin.get("xyz"), (0.0, 0.0, 0.0))
+        return float(inertial.find("mass").get("value")), centre, turn @ tensor @ turn.T
+
     def limits(self, joint: str) -> tuple[float, float, float]:
         """Return lower, upper and velocity limit; infinite where there are none."""
         limit = self.joints[joint].find("limit")

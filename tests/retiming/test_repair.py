@@ -15,6 +15,7 @@ from vkc_pin.retiming.repair import accepted
 @dataclasses.dataclass(frozen=True)
 class Found:
     waypoint: int
+    constraint: str = "closure"
 
 
 @dataclasses.dataclass(frozen=True)

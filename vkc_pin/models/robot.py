@@ -19,6 +19,7 @@ from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
 from vkc_pin.files.urdf import UrdfFile
 from vkc_pin.models.coordinates import Coordinates
+from vkc_pin.models.dynamics.effort import Efforts, efforts
 from vkc_pin.models.grafting import clean
 from vkc_pin.models.hands.gripper import Gripper
 from vkc_pin.models.robot_model import visual_geometry
@@ -108,6 +109,11 @@ class Robot:
             jacobian = pin.computeFrameJacobian(self.model, data, self.coordinates.q(z), frame, pin.LOCAL_WORLD_ALIGNED)
             squares += (jacobian[:3, turns] ** 2).sum(axis=0)
         return max(float(np.sqrt(squares / _POSTURES).mean()), _LEAST_LEVER)
+
+    @cached_property
+    def efforts(self) -> Efforts:
+        """The torques that its motors have, as far as its description can be relied upon."""
+        return efforts(self.model, self.coordinates, self.lower, self.upper)
 
     @cached_property
     def front(self) -> pin.SE3:

@@ -11,9 +11,19 @@ from pydantic import Field
 from vkc_pin.arguments import quantity
 from vkc_pin.errors import InputError
 from vkc_pin.files.documents import Document, check, read_yaml
-from vkc_pin.files.fields import JointSchema, Number, Positive, Schema, require, text_for
+from vkc_pin.files.fields import JointSchema, NotNegative, Number, Positive, Schema, require, text_for
 
-__all__ = ["BaseSchema", "CouplingSchema", "FingerSchema", "RobotSchema", "Wheels", "python_packages", "read_robot", "wheels_of"]
+__all__ = [
+    "BaseSchema",
+    "CouplingSchema",
+    "FingerSchema",
+    "RobotJointSchema",
+    "RobotSchema",
+    "Wheels",
+    "python_packages",
+    "read_robot",
+    "wheels_of",
+]
 
 
 Limits = Annotated[
@@ -54,6 +64,12 @@ class BaseSchema(Schema):
     turning_radius: Positive | None = None
 
 
+class RobotJointSchema(JointSchema):
+    """What a URDF does not say about a joint of a robot, or says wrong; effort [N·m] or [N], 0: that is not known."""
+
+    effort: NotNegative | None = None
+
+
 class FingerSchema(Schema):
     """A joint of a finger: where it is when the gripper is closed, and when it is fully open, [m] or [rad]."""
 
@@ -83,7 +99,7 @@ class RobotSchema(Schema):
     locked_joints: dict[str, Number] = Field(default_factory=dict)
     gripper: dict[str, FingerSchema] = Field(default_factory=dict)
     couplings: dict[str, Annotated[CouplingSchema, text_for("joint")]] = Field(default_factory=dict)
-    joints: dict[str, JointSchema] = Field(default_factory=dict)
+    joints: dict[str, RobotJointSchema] = Field(default_factory=dict)
 
 
 def read_robot(file: Path) -> tuple[RobotSchema, Document]:

@@ -94,7 +94,7 @@ def outcome(
         history: A row for every round of the solver.
         terms: Own constraints and costs that were asked for.
     """
-    found = {**trajectory.metrics(), "clearance": report.clearance, "closure_error": report.closure_error}
+    found = {**trajectory.metrics(), **report.measures()}
     return Plan(
         scene=scene,
         steps=tuple(steps),

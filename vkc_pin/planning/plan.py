@@ -48,11 +48,10 @@ class Plan:
         options: How it was planned.
         trajectory: The motion; if planning failed, the best there was.
         validation: What the independent check says of it. For a loaded plan it is made when it is first asked for.
-        status: "success", or why not: "infeasible", "not converged", "time limit", "effort spent", "interrupted", "rejected";
-            plans of the baselines name the stage that failed.
+        status: "success", or why not, e.g. "infeasible", "not converged", "effort spent"; of baselines, the stage that failed.
         metrics: planning_time [s], build_time [s], base_effort [m], base_effort_l1 [m], arm_effort [rad], clearance [m],
-            closure_error [m], duration [s], iterations, rounds, effort [units, see `planner.plan`], and the split time_coal,
-            time_casadi, time_ipopt, time_initialization, time_validation [s].
+            closure_error [m], duration [s], torque [share of what a motor has], iterations, rounds, effort [units, see
+            `planner.plan`], and what it was spent on: time_initialization, _coal, _casadi, _ipopt, _retiming, _validation [s].
         seed: Of the random numbers.
         initialization: Which seed trajectory it came from.
         history: One row per round of the solver.
@@ -104,6 +103,7 @@ class Plan:
             f"{self.scene.name}: {'success' if self.success else f'FAILED, {self.status}'} — "
             + ", ".join(p.name for p in self.trajectory.phases),
             f"  motion      {m['duration']:.1f} s, {len(self.trajectory.times)} waypoints",
+            *(f"  {line}" for line in self.validation.timing()),
             f"  effort      base {m['base_effort']:.2f} m (|dx|+|dy| {m['base_effort_l1']:.2f} m), arm {m['arm_effort']:.2f} rad",
             f"  clearance   {1e3 * m['clearance']:.1f} mm at the closest, closure within {1e3 * m['closure_error']:.3f} mm",
             f"  planning    {m['planning_time']:.3f} s after {m['build_time']:.2f} s of symbolic build: "
@@ -128,6 +128,8 @@ class Plan:
             "initialization": self.initialization,
             "violations": [asdict(violation) for violation in self.validation.violations],
             "notes": list(self.validation.notes),
+            "bounds": [asdict(bound) for bound in self.validation.bounds],
+            "remarks": list(self.validation.remarks),
             "trajectory": self.trajectory.to_dict(),
         }
 
@@ -185,7 +187,7 @@ class Plan:
             "trajectory": self.trajectory.to_dict(),
             "validation": self.validation.to_dict(),
             "status": self.status,
-            "metrics": {**self.metrics, **_measured(self.trajectory, self.validation)},
+            "metrics": {**self.metrics, **_measured(self)},
             "seed": self.seed,
             "initialization": self.initialization,
             "history": [dict(row) for row in self.history],
@@ -230,7 +232,7 @@ class Plan:
     ) -> Plan:
         trajectory, status = Trajectory.from_dict({**about["trajectory"], **arrays}), about["status"]
         claimed, metrics = Report.from_dict(about["validation"]), about["metrics"]
-        for name, value in _measured(trajectory, claimed).items():
+        for name, value in {**trajectory.metrics(), **claimed.measures()}.items():
             if metrics[name] != value and not abs(metrics[name] - value) <= 1e-9 * max(1.0, abs(value)):
                 raise InputError("not that of motion and report", field=f"metrics.{name}", expected=value, got=metrics[name])
         for name in about["options"]:
@@ -243,7 +245,7 @@ class Plan:
             trajectory=trajectory,
             validation=cast(Report, validation),
             status=cast(str, lambda plan: "success" if plan.validation.ok else "rejected") if status == "success" else status,
-            metrics=cast(Mapping[str, float], lambda plan: {**metrics, **_measured(plan.trajectory, plan.validation)}),
+            metrics=cast(Mapping[str, float], lambda plan: {**metrics, **_measured(plan)}),
             seed=about["seed"],
             initialization=about["initialization"],
             history=tuple(about["history"]),
@@ -266,9 +268,9 @@ def _recalled(plan: Plan) -> Report:
     return report.with_reasons(claimed.violations or report.violations) if vars(plan)["status"] == "infeasible" else report
 
 
-def _measured(trajectory: Trajectory, report: Report) -> dict[str, float]:
-    """Return what a motion is measured by."""
-    return {**trajectory.metrics(), "clearance": report.clearance, "closure_error": report.closure_error}
+def _measured(plan: Plan) -> dict[str, float]:
+    """Return the metrics of a plan but for what planning took."""
+    return {**plan.trajectory.metrics(), **plan.validation.measures()}
 
 
 class _OnDemand(Generic[T]):

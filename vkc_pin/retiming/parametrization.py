@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,7 +18,13 @@ __all__ = ["speeds_along"]
 _ASIDE = (1e-3, 1e-2)  # share of a segment beside its ends at which accelerations are limited: at the end they jump
 
 
-def speeds_along(path: CubicHermiteSpline, places: Floats, velocity: Floats, acceleration: Floats) -> Floats | None:
+def speeds_along(
+    path: CubicHermiteSpline,
+    places: Floats,
+    velocity: Floats,
+    acceleration: Floats,
+    linear: Callable[[Floats], tuple[Floats, Floats, Floats]] | None = None,
+) -> Floats | None:
     """Return how fast a path can be gone along at some places, from rest to rest, shape (K,) [1/s]; None: it is not known.
 
     Between two places the speed changes evenly in time. It is TOPP-RA's (Pham and Pham, A new approach to time-optimal path
@@ -28,6 +35,8 @@ def speeds_along(path: CubicHermiteSpline, places: Floats, velocity: Floats, acc
         places: Along it, increasing, from its begin to its end, all knots of the path among them, shape (K,).
         velocity: Limits, shape (n,) [m/s], [rad/s]; inf: none.
         acceleration: Limits, shape (n,) [m/s²], [rad/s²]; inf: none.
+        linear: Returns a, b, c at places, shape (K, m) each, with |a u + b w² + c| ≤ 1 for the path's velocity w and acceleration
+            u; None: nothing but limits bounds it.
     """
     from toppra.algorithm import TOPPRA
     from toppra.constraint import DiscretizationType, JointAccelerationConstraint, JointVelocityConstraint
@@ -41,7 +50,8 @@ def speeds_along(path: CubicHermiteSpline, places: Floats, velocity: Floats, acc
     changes = JointAccelerationConstraint(limits, discretization_scheme=DiscretizationType.Interpolation)
     for aside in _ASIDE:
         grid = _beside(path.x, places, aside)
-        found = TOPPRA([rates, changes], _geometric(path, both), gridpoints=grid, solver_wrapper="seidel")
+        bounds = [rates, changes] if linear is None else [rates, changes, _linear(linear, len(both))]
+        found = TOPPRA(bounds, _geometric(path, both), gridpoints=grid, solver_wrapper="seidel")
         _, speeds, _ = found.compute_parameterization(0.0, 0.0)
         if speeds is not None and np.isfinite(speeds).all() and (speeds[1:-1] > 0.0).all():
             return np.sqrt(np.interp(places, grid, np.asarray(speeds) ** 2))
@@ -67,6 +77,26 @@ def _geometric(path: CubicHermiteSpline, columns: Ints) -> Any:
             return path(places, order)[..., columns]
 
     return Path()
+
+
+def _linear(linear: Callable[[Floats], tuple[Floats, Floats, Floats]], size: int) -> Any:
+    """Return what else bounds the speed as `toppra` knows such constraints, at both ends of every piece of its grid."""
+    from toppra.constraint import LinearConstraint
+    from toppra.constraint.linear_constraint import canlinear_colloc_to_interpolate
+
+    class Bound(LinearConstraint):
+        dof, identical = size, True
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.identical = True
+
+        def compute_constraint_params(self, path: Any, gridpoints: Floats, *_: Any, **__: Any) -> Any:
+            a, b, c = linear(gridpoints)
+            both = np.vstack([np.eye(a.shape[1]), -np.eye(a.shape[1])])
+            return canlinear_colloc_to_interpolate(a, b, c, both, np.ones(len(both)), None, None, gridpoints, identical=True)
+
+    return Bound()
 
 
 def _silence() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -12,8 +13,10 @@ import numpy as np
 from vkc_pin.arrays import Bools, Floats, Ints
 from vkc_pin.driving.curves import between
 from vkc_pin.motion.curve import SHORTEST, Curve, joined
+from vkc_pin.motion.dynamics.torques import Torques
 from vkc_pin.motion.rolling import Rolling, rolling_of
 from vkc_pin.motion.trajectory import Trajectory
+from vkc_pin.retiming.loads import Load
 from vkc_pin.retiming.parametrization import speeds_along
 from vkc_pin.retiming.path import path_through
 from vkc_pin.retiming.rolling import rolling_paths, slip
@@ -29,6 +32,7 @@ _STILL = 1e-6  # [m] or [rad] of a step in which a joint of an object stays wher
 _SHORT = 1e-6  # share of a second at full speed that a step takes which is none
 _SHORTEST = 1e-3  # [s] of a step in which nothing moves, unless a hand opens or closes in it
 _ROUNDING = 1e-9  # relative
+_PASSES, _SETTLED = 4, 0.02  # of the search for speeds that torques allow, and how far apart two are, relative, that end it
 _SLIP = 2e-4  # [m/s] aside for which a base on wheels gets no more knots, a fifth of what counts as slipping
 _FINEST = 8  # times as many of them, at most
 
@@ -71,7 +75,7 @@ def retimed(scene: Scene, trajectory: Trajectory, parts: Ints | None = None) -> 
     corner. Between two rests it goes along one path, see `path_through`, at the speeds of `speeds_along`; where none are known,
     straight from waypoint to waypoint, with a stop at each. A base on wheels goes along `rolling_paths`. The cubics in
     time through the places at which speeds are known are slowed down until they keep the limits of velocity and acceleration
-    exactly.
+    exactly, and of torque where these can be kept at all.
 
     Args:
         scene: Robot and objects.
@@ -86,14 +90,15 @@ def retimed(scene: Scene, trajectory: Trajectory, parts: Ints | None = None) -> 
     scale = 1.0 / np.where(np.isfinite(limits.velocity), limits.velocity, 1.0)
     still = np.linalg.norm(np.diff(positions, axis=0) * scale, axis=1) <= _SHORT
     waits = {int(places[phase.first]): float(np.diff(trajectory.times)[phase.first]) for phase in trajectory.phases}
-    pieces, ends = list[Curve](), [0]
+    pieces, ends, torques = list[Curve](), [0], Torques(scene, trajectory)
+    phases = torques.phases_of(np.searchsorted(places, np.arange(places[-1]), side="right") - 1)
     for steps in _runs(still, np.abs(np.diff(positions[:, trajectory.robot_size :], axis=0)) > _STILL):
         points = positions[steps[0] : steps[-1] + 2]
         if still[steps[0]]:
             least = np.array([waits.get(step, _SHORTEST) for step in steps])
             found = [(_straight(points, limits, least), np.arange(1, len(points)))]
         else:
-            found = _along(points, limits, scale, rolling)
+            found = _along(points, limits, scale, rolling, Load(torques, phases[steps]) if torques.efforts.known else None)
         for piece, at in found:
             ends += (ends[-1] + at).tolist()
             pieces.append(piece)
@@ -130,34 +135,43 @@ def _runs(still: Bools, moves: Bools) -> Iterator[list[int]]:
     yield from (list(range(first, last)) for first, last in itertools.pairwise(edges))
 
 
-def _along(points: Floats, limits: _Limits, scale: Floats, rolling: Rolling) -> list[tuple[Curve, Ints]]:
+def _along(points: Floats, limits: _Limits, scale: Floats, rolling: Rolling, load: Load | None) -> list[tuple[Curve, Ints]]:
     """Return curves through waypoints, shape (m, n), from stop to stop, and which of their knots these are but for the first."""
     bounds = limits.lower, limits.upper
-    if rolling.aside:
-        found = _smooth(path_through(points, scale, bounds), points, limits)
-        return [(_straight(points, limits, np.zeros(len(points) - 1)), np.arange(1, len(points))) if found is None else found]
-    return list(_rolling(points, limits.with_wheels(rolling), scale, rolling))
+    if not rolling.aside:
+        return list(_rolling(points, limits.with_wheels(rolling), scale, rolling, load))
+    found = _smooth(path_through(points, scale, bounds), points, limits, load)
+    if found is not None:
+        return [found]
+    straight = _straight(points, limits, np.zeros(len(points) - 1))
+    return [(straight if load is None else load.slowed(straight), np.arange(1, len(points)))]
 
 
-def _rolling(points: Floats, limits: _Limits, scale: Floats, rolling: Rolling, finer: int = 1) -> Iterator[tuple[Curve, Ints]]:
+def _rolling(
+    points: Floats, limits: _Limits, scale: Floats, rolling: Rolling, load: Load | None, finer: int = 1
+) -> Iterator[tuple[Curve, Ints]]:
     """Yield the same of a base on wheels, with so many times the usual knots, or more where it would slip between them."""
-    bounds = limits.lower[:-2], limits.upper[:-2]
+    bounds, begin = (limits.lower[:-2], limits.upper[:-2]), 0
     for path, own in rolling_paths(points, scale, bounds, rolling, finer):
-        found = _smooth(path, own, limits)
+        part = None if load is None else load.part(begin, len(own) - 1)
+        begin += len(own) - 1
+        found = _smooth(path, own, limits, part)
         if found is None:
             for k in range(len(own) - 1):
                 ((path, step),) = rolling_paths(own[k : k + 2], scale, bounds, rolling, _FINEST)
-                yield _stepping(path, step, limits)
+                curve, at = _stepping(path, step, limits)
+                yield curve if part is None else part.part(k, 1).slowed(curve), at
         elif finer < _FINEST and slip(found[0]) > _SLIP:
-            yield from _rolling(own, limits, scale, rolling, 2 * finer)
+            yield from _rolling(own, limits, scale, rolling, part, 2 * finer)
         else:
             yield found
 
 
-def _smooth(path: CubicHermiteSpline, points: Floats, limits: _Limits) -> tuple[Curve, Ints] | None:
+def _smooth(path: CubicHermiteSpline, points: Floats, limits: _Limits, load: Load | None) -> tuple[Curve, Ints] | None:
     """Return a curve along a path through waypoints, shape (m, n), see `_along`; None: how fast it can be is not known.
 
-    The path, and the limits, may have further columns that are none of the motion's.
+    The path, and the limits, may have further columns that are none of the motion's. Torques are looked at when the curve is
+    known that limits of velocity and acceleration allow: hardly any exceeds them.
     """
     knots = (len(path.x) - 1) // (len(points) - 1)  # a step
     parts = knots * max(_PARTS // knots, 1)
@@ -166,9 +180,25 @@ def _smooth(path: CubicHermiteSpline, points: Floats, limits: _Limits) -> tuple[
     speeds = speeds_along(path, places, limits.velocity, limits.acceleration)
     if speeds is None:
         return None
+    waypoints = np.arange(1, len(points)) * parts
+    curve = _timed(path, places, points, speeds, limits)
+    if load is None or np.abs(load.of(curve)).max() <= 1.0 or np.abs(load.split(curve)[0]).max() >= 1.0:
+        return curve, waypoints  # or it is too heavy however slow it is
+    for _ in range(_PASSES):  # drag is not linear in the square of the speed: it is taken as it is around the speed before
+        linear = partial(load.linear, path, places, speeds)
+        slower = speeds_along(path, places, limits.velocity, limits.acceleration, linear)
+        if slower is None:
+            break
+        settled, speeds = np.allclose(slower, speeds, rtol=_SETTLED), slower
+        if settled:
+            break
+    return load.slowed(_timed(path, places, points, speeds, limits)), waypoints
+
+
+def _timed(path: CubicHermiteSpline, places: Floats, points: Floats, speeds: Floats, limits: _Limits) -> Curve:
+    """Return a path through waypoints, shape (m, n), gone along with speeds at places, shape (K,)."""
     times = np.concatenate([[0.0], np.cumsum(2.0 * np.diff(places) / (speeds[1:] + speeds[:-1]))])
-    curve = _slowed(Curve(times, path(places), path(places, 1) * speeds[:, None]), limits)
-    return _through(curve, points), np.arange(1, len(points)) * parts
+    return _through(_slowed(Curve(times, path(places), path(places, 1) * speeds[:, None]), limits), points)
 
 
 def _stepping(path: CubicHermiteSpline, points: Floats, limits: _Limits) -> tuple[Curve, Ints]:

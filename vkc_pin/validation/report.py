@@ -14,9 +14,10 @@ if TYPE_CHECKING:
     from vkc_pin.options import Options
     from vkc_pin.scene.scene import Scene
 
-__all__ = ["Judged", "Report", "Violation"]
+__all__ = ["Bound", "Judged", "Report", "Violation"]
 
 SAME = 1e-5  # [m] or [rad] that two checks of the same motion may differ by, on two machines, say
+TOLD = 4  # bounds that the text names
 LISTED = 12  # violations that the text names; `violations` has them all
 
 
@@ -25,8 +26,9 @@ class Violation:
     """One constraint that does not hold.
 
     Attributes:
-        constraint: "start", "limit", "velocity", "acceleration", "slip", "turning", "wheels", "dwell", "closure", "latch",
-            "unheld", "tips", "slide", "push", "opening", "goal", "order", "clearance", "penetration" or "term", the user's own.
+        constraint: "start", "limit", "velocity", "acceleration", "torque", "slip", "turning", "wheels", "dwell", "closure",
+            "latch", "unheld", "tips", "slide", "push", "opening", "goal", "order", "clearance", "penetration" or "term",
+            the user's own.
         subject: The coordinate, object, goal, term or pair of links it is about, e.g. "elbow_joint", "forearm_link – sofa".
         waypoint: Counted from 0; between two waypoints the earlier.
         time: [s].
@@ -49,6 +51,29 @@ class Violation:
 
 
 @dataclass(frozen=True)
+class Bound:
+    """A limit that bounds how fast a motion is.
+
+    Attributes:
+        subject: The coordinate whose limit it is; empty for a rest.
+        kind: "velocity", "acceleration", "torque", or "rest", where nothing moves.
+        share: Of the duration, in which the motion is nearer to this limit than to any other, from 0 to 1.
+        begin: Of the longest stretch in which that is so [s].
+        end: Of the same [s].
+    """
+
+    subject: str
+    kind: str
+    _: KW_ONLY
+    share: float
+    begin: float
+    end: float
+
+    def __str__(self) -> str:
+        return f"{f'{self.subject} {self.kind}'.strip()} {100.0 * self.share:.0f} % ({self.begin:.1f} to {self.end:.1f} s)"
+
+
+@dataclass(frozen=True)
 class Report:
     """What `validation` says of a motion.
 
@@ -60,6 +85,9 @@ class Report:
         clearances: The smallest distance at the waypoints of each phase, and anywhere in the phase of the smallest of all [m].
         states: How many configurations were looked at.
         notes: What prevents the task as a whole, if planning failed; one line each.
+        torque: The largest torque of a joint of the arm, as a share of what its motor has; 0 if that is not known.
+        bounds: What bounds the duration, the limit that does so for longest first.
+        remarks: What was not looked at, as nobody states it: efforts, masses; one line each.
     """
 
     violations: tuple[Violation, ...] = ()
@@ -70,6 +98,9 @@ class Report:
     clearances: tuple[float, ...] = ()
     states: int = 0
     notes: tuple[str, ...] = ()
+    torque: float = 0.0
+    bounds: tuple[Bound, ...] = ()
+    remarks: tuple[str, ...] = ()
 
     @property
     def ok(self) -> bool:
@@ -86,6 +117,19 @@ class Report:
             *(f"  - {v}" for v in self.violations[:LISTED]),
             *([f"  ... and {len(self.violations) - LISTED} more"] if len(self.violations) > LISTED else []),
             *(f"  because {note}" for note in self.notes),
+        ]
+
+    def measures(self) -> dict[str, float]:
+        """Return what a motion is measured by: clearance and closure_error [m], torque [share of what a motor has]."""
+        return {"clearance": self.clearance, "closure_error": self.closure_error, "torque": self.torque}
+
+    def timing(self) -> list[str]:
+        """Return what bounds the duration and what the motors do, as lines of text."""
+        told = ", ".join(map(str, self.bounds[:TOLD]))
+        return [
+            *([f"bounded by  {told}"] if told else []),
+            *([f"torques     {100.0 * self.torque:.0f} % of what the motors have, at most"] if self.torque > 0.0 else []),
+            *(f"unknown     {remark}" for remark in self.remarks),
         ]
 
     def by_phase(self, trajectory: Trajectory) -> list[str]:
@@ -134,6 +178,11 @@ class Report:
         fields["violations"] = tuple(_violation(one, f"violations[{k}]") for k, one in enumerate(listed))
         notes: tuple[Any, ...] = items(fields.get("notes"), "notes", "a list of texts")
         fields["notes"] = tuple(text(note, f"notes[{k}]") for k, note in enumerate(notes))
+        fields["torque"] = number(fields.get("torque", 0.0), "torque", low=0.0)
+        bounds: tuple[Any, ...] = items(fields.get("bounds", ()), "bounds", "a list of bounds")
+        fields["bounds"] = tuple(_bound(one, f"bounds[{k}]") for k, one in enumerate(bounds))
+        remarks: tuple[Any, ...] = items(fields.get("remarks", ()), "remarks", "a list of texts")
+        fields["remarks"] = tuple(text(remark, f"remarks[{k}]") for k, remark in enumerate(remarks))
         try:
             return cls(**fields)
         except TypeError as error:  # a field that there is not
@@ -157,6 +206,19 @@ def _violation(data: Any, field: str) -> Violation:
         return Violation(**given)
     except TypeError as error:
         raise InputError("not a violation", field=field, expected="what Report.to_dict returns", got=str(error)) from None
+
+
+def _bound(data: Any, field: str) -> Bound:
+    """Return the bound that plain data describe. Raises `InputError` if something is missing or of another kind."""
+    given = mapping(data, field)
+    for name in ("subject", "kind"):
+        given[name] = text(given.get(name), f"{field}.{name}")
+    for name in ("share", "begin", "end"):
+        given[name] = number(given.get(name), f"{field}.{name}")
+    try:
+        return Bound(**given)
+    except TypeError as error:
+        raise InputError("not a bound", field=field, expected="what Report.to_dict returns", got=str(error)) from None
 
 
 @runtime_checkable

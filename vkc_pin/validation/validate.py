@@ -22,6 +22,7 @@ from vkc_pin.task.steps import Step, as_list
 from vkc_pin.task.terms import Term, traced
 from vkc_pin.validation.distances import Solids
 from vkc_pin.validation.goals import MOTION_TOLERANCE, check_goals, check_steps
+from vkc_pin.validation.motors.torques import Motors
 from vkc_pin.validation.own_terms import check_terms
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.report import Report, Violation
@@ -54,7 +55,7 @@ def validate(
         terms: The user's own constraints; costs are nothing to check.
 
     Returns:
-        Every violated constraint: start, limits, velocity, acceleration, bases that slip,
+        Every violated constraint: start, limits, velocity, acceleration, torque, bases that slip,
         turn tighter than they can or whose wheels turn too fast, closure, latches,
         rests in which the gripper closes or opens, how far it is open, joints of objects that nobody holds, what tips on what it
         stands on, hands that slide on what they clamp, pushes that would pull, goals and their order, clearance at waypoints and
@@ -90,7 +91,8 @@ class _Check:
         self.found += check_rolling(self.samples)
         self.found += check_goals(self.samples, self.steps, self.options)
         self.found += check_terms(self.samples, self.terms)
-        self.found += [*check_gripper(self.samples, self.options), *check_pushes(self.samples)]
+        motors = Motors(self.samples)
+        self.found += [*check_gripper(self.samples, self.options), *check_pushes(self.samples), *motors.violations()]
         error, angle = self._closure()
         self._slides()
         nearest = self._clearance() if self._within_reason() else np.full(len(self.trajectory.phases), np.inf)
@@ -103,8 +105,8 @@ class _Check:
             if violation.constraint == "penetration":
                 worst.pop(("clearance", violation.subject, violation.unit), None)
         ordered = tuple(sorted(worst.values(), key=lambda v: (v.time, v.constraint, v.subject, v.unit)))
-        close, states = tuple(nearest.tolist()), len(self.samples.times)
-        return Report(ordered, min(close), closure_error=error, closure_angle=angle, clearances=close, states=states)
+        close, states, facts = tuple(nearest.tolist()), len(self.samples.times), motors.facts()
+        return Report(ordered, min(close), closure_error=error, closure_angle=angle, clearances=close, states=states, **facts)
 
     def _add(
         self, constraint: str, subject: str, amount: float, unit: str, detail: str, *, waypoint: int = 0, row: int | None = None

@@ -84,11 +84,21 @@ def robot_limits(
             acceleration[k] = min(acceleration[k], named.acceleration / share)
     velocity = np.where(np.isinf(velocity), _VELOCITY * unsaid, velocity)
     acceleration = np.where(np.isinf(acceleration), _ACCELERATION * unsaid, acceleration)
-    model.velocityLimit = velocity
+    model.velocityLimit, model.effortLimit = velocity, _efforts(model, coordinates, settings)
     lower, upper = coordinates.lower.copy(), coordinates.upper.copy()
     if base == "fixed":
         lower[:3] = upper[:3] = 0.0
     return Coordinates(model), lower, upper, velocity.copy(), acceleration
+
+
+def _efforts(model: pin.Model, coordinates: Coordinates, settings: RobotSchema) -> Floats:
+    """Return the efforts of the motors, shape (n,): of joints that move together the leading one has it."""
+    effort = model.effortLimit
+    for k, joint in enumerate(coordinates.joints):
+        named = settings.joints.get(model.names[joint])
+        if named is not None and named.effort is not None:
+            effort[k] = named.effort
+    return np.asarray(effort)
 
 
 def _within_limits(full: pin.Model, joints: Set[str]) -> pin.Model:

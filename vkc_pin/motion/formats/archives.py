@@ -41,7 +41,7 @@ STATUSES = (
 METRICS = (
     *("planning_time", "build_time", "base_effort", "base_effort_l1", "arm_effort", "clearance", "closure_error", "duration"),
     *("iterations", "rounds", "effort", "time_initialization", "time_coal", "time_casadi", "time_ipopt", "time_validation"),
-    "time_retiming",
+    *("time_retiming", "torque"),
 )
 """What every plan is measured by; baselines have more."""
 
@@ -115,11 +115,19 @@ class _Others(BaseModel):
         return self
 
 
-_LATER = ("effort", "time_retiming")  # older files do not have it
+_LATER = ("effort", "time_retiming", "torque")  # older files do not have it
 _kinds: dict[str, Any] = {
     name: (Distance if name == "clearance" else Measured, 0.0 if name in _LATER else ...) for name in METRICS
 }
 _Metrics = create_model("_Metrics", __base__=_Others, **_kinds)
+
+
+class _Bound(Schema):
+    subject: Text
+    kind: Text
+    share: Measured
+    begin: Annotated[float, Field(strict=True, allow_inf_nan=False)]
+    end: Annotated[float, Field(strict=True, allow_inf_nan=False)]
 
 
 class _Report(Schema):
@@ -130,6 +138,9 @@ class _Report(Schema):
     clearances: Annotated[tuple[Distance, ...], FailFast()] = ()  # older files do not have it
     states: Count
     notes: Annotated[list[Text], FailFast()]
+    torque: Measured = 0.0  # older files have none of these
+    bounds: Annotated[tuple[_Bound, ...], FailFast()] = ()
+    remarks: Annotated[tuple[Text, ...], FailFast()] = ()
 
 
 class _About(Schema):

@@ -1,0 +1,36 @@
+"""Scenes whose objects resist and weigh something."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import yaml
+
+import vkc_pin as vkc
+
+__all__ = ["changed", "closer", "loaded"]
+
+
+def changed(scene: vkc.Scene, name: str, **fields: Any) -> vkc.Scene:
+    """Return a scene in which the description of an object says something else: fields, or joint → its fields."""
+    document = copy.deepcopy(dict(scene.document))
+    item = next(item for item in document["objects"] if item["name"] == name)
+    file = vkc.load_object(item["type"]).urdf
+    assert file is not None
+    about = yaml.safe_load(file.with_name(f"{item['type']}.yaml").read_text(encoding="utf-8"))
+    joints = {joint: {**said} for joint, said in (about.get("joints") or {}).items()}
+    for joint, said in fields.pop("joints", {}).items():
+        joints[joint] = {**joints.get(joint, {}), **said}
+    item["type"] = {**about, "joints": joints, "urdf": file.read_text(encoding="utf-8"), **fields}
+    return vkc.Scene.from_document(document, scene.folder)
+
+
+def closer(**resistance: float) -> vkc.Scene:
+    """Return the scene with the door, whose hinge resists."""
+    return changed(vkc.load_scene("door"), "door", joints={"hinge": resistance})
+
+
+def loaded(mass: float) -> vkc.Scene:
+    """Return the scene with the tray, which weighs so much [kg]."""
+    return changed(vkc.load_scene("tray"), "tray", mass=mass)

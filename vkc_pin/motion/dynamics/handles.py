@@ -1,0 +1,120 @@
+"""What a hand exerts on an object that stands fixed, to move its joints."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.arrays import Floats
+from vkc_pin.scene.contact import hand_frame
+from vkc_pin.scene.hold import Hold
+from vkc_pin.scene.scene import Scene
+
+__all__ = ["Handle", "Riders"]
+
+Riders = Sequence[tuple[int, pin.Inertia]]
+"""What rides on an object: the joint of its model that carries it, and its inertia in the frame of that."""
+_GRIP = 0.1  # [m] about the size of a hand: it turns what it holds by forces so far apart
+_SINGULAR = 1e-9  # of a joint that the hand cannot move, relative
+_STILL = 1e-6  # [m/s] or [rad/s]: of a joint that rests, and [m] or [rad]: of one that is where it is held
+
+
+class Motion(NamedTuple):
+    """Coordinates of a motion at K moments: name → positions, velocities, accelerations, shape (K,) each."""
+
+    positions: Mapping[str, Floats]
+    velocities: Mapping[str, Floats]
+    accelerations: Mapping[str, Floats]
+
+
+class Handle:
+    """The hand at an attachment of an object that stands fixed.
+
+    Args:
+        scene: Where that is.
+        hold: The hold.
+        riders: What stands on the object.
+    """
+
+    def __init__(self, scene: Scene, hold: Hold, riders: Riders = ()) -> None:
+        self.name, self.placed = hold.object, scene.objects[hold.object]
+        thing = self.placed.object
+        self.attachment = thing.attachment(hold.attachment)
+        self.point = hand_frame(scene.robot, self.attachment)
+        own, loaded = pin.Model(thing.model), pin.Model(thing.model)
+        for joint, inertia in riders:
+            loaded.inertias[joint] += inertia
+        own.gravity.linear = loaded.gravity.linear = self.placed.placement.rotation.T @ thing.model.gravity.linear
+        self._own, self._loaded = own, loaded
+        self._frame = thing.link_frame(self.attachment.link)
+        path = list(own.supports[own.frames[self._frame].parentJoint])
+        self._moved = [k for k, joint in enumerate(thing.coordinates.joints) if joint in path]
+
+    def wrenches(self, motion: Motion) -> Floats:
+        """Return the force and torque that the hand exerts at `point`, in the world's axes, shape (K, 6) [N], [N·m]."""
+        thing, turn = self.placed.object, self.placed.placement.rotation
+        forces, z = self.forces(motion), self._rows(motion.positions, self.placed.state)
+        data, columns = self._own.createData(), [f"{self.name}.{name}" for name in self.attachment.coordinates]
+        values = np.column_stack([np.zeros((len(z), 0)), *(motion.positions[name] for name in columns)])
+        maps, bases, asked = list[Floats](), list[Floats](), list[Floats]()
+        for q, row, force in zip(thing.coordinates.q(z), values, forces, strict=True):
+            pin.computeJointJacobians(self._own, data, q)
+            link = pin.updateFramePlacement(self._own, data, self._frame)
+            jacobian = pin.getFrameJacobian(self._own, data, self._frame, pin.LOCAL_WORLD_ALIGNED).reshape(6, -1)[:, self._moved]
+            point = (link * self.attachment.tool(row)).translation
+            ways = [np.concatenate([way[:3] + np.cross(way[3:], point - link.translation), way[3:]]) for way in jacobian.T]
+            maps.append(np.array([*ways, *self._freedoms(link, row, point)]).reshape(-1, 6))
+            bases.append(self._basis(link))
+            asked.append(np.concatenate([force[self._moved], np.zeros(len(maps[-1]) - len(ways))]))
+        basis = np.array(bases)
+        shares = np.linalg.pinv(np.array(maps) @ basis, rcond=_SINGULAR) @ np.array(asked)[..., None]
+        return np.asarray((basis @ shares)[..., 0] @ np.kron(np.eye(2), turn).T)
+
+    def forces(self, motion: Motion) -> Floats:
+        """Return what must be applied to the object's joints, shape (K, joints) [N], [N·m]; springs carry its own weight."""
+        thing = self.placed.object
+        z = self._rows(motion.positions, self.placed.state)
+        v, a = (self._rows(part, np.zeros(len(self.placed.state))) for part in (motion.velocities, motion.accelerations))
+        data, found = self._own.createData(), np.empty(z.shape)
+        for k, q in enumerate(thing.coordinates.q(z)):
+            carried = pin.computeGeneralizedGravity(self._own, data, q)
+            found[k] = pin.rnea(self._loaded, data, q, v[k], a[k]) - carried
+        held = {latch.joint: latch.held_at for latch in thing.latches}
+        for k, name in enumerate(thing.coordinates.names):
+            resistance, rests = thing.resistance.get(name), np.abs(v[:, k]) <= _STILL
+            if resistance is not None:
+                found[:, k] += resistance.force(z[:, k], np.where(rests, 0.0, v[:, k]))
+            shut = np.abs(z[:, k] - held.get(name, np.inf)) <= _STILL
+            shut |= (z[:, k] <= thing.lower[k] + _STILL) & (found[:, k] > 0.0)  # its stop carries that, or its bolt
+            shut |= (z[:, k] >= thing.upper[k] - _STILL) & (found[:, k] < 0.0)
+            found[rests & shut & (np.abs(a[:, k]) <= _STILL), k] = 0.0
+        return found
+
+    def _rows(self, part: Mapping[str, Floats], otherwise: Floats) -> Floats:
+        """Return the coordinates of the object, shape (K, joints)."""
+        size = len(next(iter(part.values())))
+        names = self.placed.object.coordinates.names
+        columns = (part.get(f"{self.name}.{name}", np.full(size, value)) for name, value in zip(names, otherwise, strict=True))
+        return np.column_stack([np.zeros((size, 0)), *columns])
+
+    def _freedoms(self, link: pin.SE3, values: Floats, point: Floats) -> list[Floats]:
+        """Return how the hand can move at a point in a grasp that does not clamp: it exerts nothing that way, shape (6,) each."""
+        if self.attachment.firm or self.attachment.contact == "push":
+            return []
+        found, frame = list[Floats](), link * self.attachment.placement
+        for freedom, value in zip(self.attachment.freedoms, values.tolist(), strict=True):
+            axis = frame.rotation @ freedom.axis
+            turns = freedom.kind == "revolute"
+            way = np.cross(axis, point - frame * freedom.through) if turns else axis
+            found.append(np.concatenate([way, axis if turns else np.zeros(3)]))
+            frame = frame * freedom.motion(value)
+        return found
+
+    def _basis(self, link: pin.SE3) -> Floats:
+        """Return the wrenches that count alike, shape (6, r): forces, and torques by their lever; of a push that along it."""
+        if self.attachment.contact == "push":
+            return np.concatenate([link.rotation @ self.attachment.placement.rotation[:, 2], np.zeros(3)])[:, None]
+        return np.diag([1.0] * 3 + [_GRIP] * 3)

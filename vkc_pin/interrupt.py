@@ -13,7 +13,7 @@ __all__ = ["deferred", "handled", "raising"]
 
 
 @contextlib.contextmanager
-def handled(handler: Callable[[int, FrameType | None], object]) -> Iterator[Any]:
+def handled(handler: Callable[[int, FrameType | None], object] | signal.Handlers) -> Iterator[Any]:
     """Let `handler` have Ctrl-C, and yield what had it before; where it cannot be had, nothing changes.
 
     Signals reach the main thread only.

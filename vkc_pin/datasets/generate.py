@@ -138,6 +138,8 @@ def _run(dataset: Dataset, register: Register, journal: Journal, jobs: int, sche
     robots = ready_robots(dataset.recipe, dataset.folder / "robots")
 
     def tasks() -> Iterator[tuple[str, Any]]:
+        nonlocal began
+        began = time.perf_counter()  # processes are there now
         for block in itertools.count():
             while again:
                 number = again.popleft()

@@ -145,7 +145,7 @@ def report(result: Mapping[str, Any]) -> str:
     parts = [
         "# Throughput",
         f"{about['episodes']} validated episodes of each task, with {about['jobs']} processes, recipe {about['recipe']}. "
-        "The time counts from the first attempt to the last, with starting the processes; an hour of one core is of processor "
+        "The time counts from when the processes are there to the last attempt; an hour of one core is of processor "
         "time, without what else ran on the machine. Medians of an attempt, of what sets it up (room, start, grasp) and of "
         "planning it.",
         markdown(head, [_row(one) for one in records]),

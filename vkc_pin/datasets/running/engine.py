@@ -18,13 +18,15 @@ from functools import cache
 from typing import Any
 
 from vkc_pin.errors import InputError, VkcError
+from vkc_pin.interrupt import handled
 
 __all__ = ["DEATHS", "Died", "clustered", "results"]
 
-DEATHS = 2
+DEATHS = 4
 """How many processes a task may take with it on a cluster before it is given up."""
 _AHEAD = 2  # tasks that wait for each process, so that none waits for a task
 _CONNECTING = 20.0  # [s] to reach a scheduler
+_LOOKED = 5.0  # [s] without a result after which it is looked whether all processes are there
 
 Function = Callable[[Any], Any]
 
@@ -123,68 +125,86 @@ def _on_cluster(
         raise InputError(
             "Dask is not installed", field="scheduler" if scheduler else "jobs", expected="pip install vkc-pin[cluster]"
         )
-    from distributed import KilledWorker, as_completed
+    from distributed import Future, KilledWorker, wait
 
     left = iter(tasks)
-    with _client(jobs, scheduler) as client:
+    with _client(jobs, scheduler) as (client, cluster), client.as_current():
         if tell is not None:
             tell(f"Dask's dashboard: {client.dashboard_link}")
-        running: dict[str, str] = {}
-        done = as_completed(loop=client.loop)
+        running: dict[str, tuple[str, Any, Future]] = {}
+        suspects: list[tuple[str, Any]] = []  # tried again with nothing beside them: another one may have killed the process
+        alone = False
+
+        def submit(key: str, task: Any) -> None:
+            name = f"vkc-{key}-{secrets.token_hex(4)}"  # results of the same name would be shared among clients
+            running[name] = key, task, client.submit(_watched, function, task, limit, key=name, pure=False)
 
         def feed() -> None:
+            nonlocal alone
+            if running and (alone or suspects):
+                return
+            alone = bool(suspects)
+            if alone:
+                submit(*suspects.pop())
+                return
             room = _AHEAD * max(1, len(client.nthreads()) if scheduler else jobs) - len(running)
             for key, task in itertools.islice(left, max(0, room)):
-                name = f"vkc-{key}-{secrets.token_hex(4)}"  # results of the same name would be shared among clients
-                running[name] = key
-                done.add(client.submit(_watched, function, task, limit, key=name, pure=False))
+                submit(key, task)
 
         feed()
         try:
             while running:
-                future = next(done)
-                key = running.pop(future.key)
+                futures = [future for *_, future in running.values()]
                 try:
-                    result = future.result()
-                except KilledWorker:
-                    result = Died(
-                        f"{DEATHS} processes died with it: out of memory, a crash, or longer than {limit:g} s"
-                        if limit
-                        else f"{DEATHS} processes died with it: out of memory, or a crash"
-                    )
-                future.release()
-                yield key, result
+                    ended = wait(futures, timeout=_LOOKED, return_when="FIRST_COMPLETED").done
+                except TimeoutError:
+                    if cluster is not None:
+                        cluster.scale(jobs)  # a process that was killed while it started is not started anew otherwise
+                    continue
+                for future in ended:
+                    key, task, _ = running.pop(future.key)
+                    try:
+                        result = future.result()
+                    except KilledWorker:
+                        if not alone:
+                            suspects.append((key, task))
+                            continue
+                        late = "" if limit is None else f", or longer than {limit:g} s"
+                        result = Died(f"{DEATHS} processes died with it: out of memory, a crash{late}")
+                    future.release()
+                    yield key, result
                 feed()
         finally:
-            client.cancel(list(done.futures), force=True)
+            client.cancel([future for *_, future in running.values()], force=True)
 
 
 @contextlib.contextmanager
-def _client(jobs: int, scheduler: str | None) -> Generator[Any]:
-    """Lend a client of a scheduler, or of processes of this machine that end with it."""
+def _client(jobs: int, scheduler: str | None) -> Generator[tuple[Any, Any]]:
+    """Lend a client of a scheduler, or of processes of this machine that end with it, and what these are the workers of."""
     import logging
 
     import dask
     from distributed import Client, LocalCluster
 
     settings = {
-        "distributed.scheduler.allowed-failures": DEATHS - 1,
+        "distributed.scheduler.allowed-failures": DEATHS // 2 - 1,  # and as many alone
         "distributed.logging.distributed": "error",
         "distributed.worker.multiprocessing-method": "spawn",
         "distributed.comm.timeouts.connect": f"{_CONNECTING:g}s",
     }
     with dask.config.set(settings), contextlib.ExitStack() as stack:
         if scheduler is None:
-            cluster = stack.enter_context(
-                LocalCluster(
-                    n_workers=jobs,
-                    threads_per_worker=1,
-                    host="127.0.0.1",
-                    dashboard_address="127.0.0.1:0",
-                    silence_logs=logging.CRITICAL,
+            with handled(signal.SIG_IGN):  # which processes inherit: Ctrl-C is this one's
+                cluster = stack.enter_context(
+                    LocalCluster(
+                        n_workers=jobs,
+                        threads_per_worker=1,
+                        host="127.0.0.1",
+                        dashboard_address="127.0.0.1:0",
+                        silence_logs=logging.CRITICAL,
+                    )
                 )
-            )
-            yield stack.enter_context(Client(cluster, set_as_default=False))
+            yield stack.enter_context(Client(cluster, set_as_default=False)), cluster
             return
         try:
             client = Client(scheduler, timeout=_CONNECTING, set_as_default=False)
@@ -192,7 +212,7 @@ def _client(jobs: int, scheduler: str | None) -> Generator[Any]:
             raise InputError(
                 "no scheduler answers there", field="scheduler", expected="tcp://HOST:PORT of a Dask scheduler", got=scheduler
             ) from error
-        yield stack.enter_context(client)
+        yield stack.enter_context(client), None
 
 
 def _watched(function: Function, task: Any, limit: float | None) -> Any:

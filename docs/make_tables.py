@@ -30,6 +30,7 @@ REPORTS = {  # name of a record → whose report it is
     **{"spread": "problems.spread", "first_seed": "problems.first_seed", "robots": "anything.robots"},
     **{"anything": "anything.matrix", "cluttered": "chores"},
     **{"robots_rest": "anything.robots", "robots_packages": "anything.robots", "execution": "executing.execution"},
+    "friction": "executing.execution",
     "bases": "driving.bases",
 }
 DOOR = ("door_seed_0", "door_seed_1")

@@ -34,7 +34,7 @@ def test_a_failed_plan_keeps_its_violations(door_plan: vkc.Plan, tmp_path: Path)
     assert (loaded.validation.violations, loaded.validation.notes) == ((blame,), report.notes)
     late = dataclasses.replace(failed, status="time limit")  # then the violations are those of the motion
     loaded = vkc.Plan.load(late.save(tmp_path / "late.npz"))
-    assert {v.constraint for v in loaded.validation.violations} == {"velocity", "acceleration"}
+    assert {v.constraint for v in loaded.validation.violations} == {"velocity", "acceleration", "torque"}
     assert (loaded.success, loaded.status, loaded.validation.notes) == (False, "time limit", report.notes)
 
 
@@ -87,7 +87,7 @@ def test_what_the_file_says_of_the_task_does_not_matter_when_it_is_checked(door_
     path = said.save(tmp_path / "said.npz")
     assert vkc.Plan.load(path).validation.violations == (blame,)
     checked = vkc.Plan.load(path, check=True).validation
-    assert {v.constraint for v in checked.violations} == {"velocity", "acceleration"}
+    assert {v.constraint for v in checked.violations} == {"velocity", "acceleration", "torque"}
     assert checked.notes == ()
     right = dataclasses.replace(door_plan, status="infeasible", validation=said.validation)
     loaded = vkc.Plan.load(right.save(path))

@@ -452,7 +452,7 @@ def test_velocity_bounds_bind_when_time_is_short(monkeypatch: pytest.MonkeyPatch
     problem = program_of(hall(), [vkc.GoTo(2.4, 0.0, 0.0)], options=options)
     least = problem.timing_for(problem.still)
     monkeypatch.setattr(vkc.TrajectoryProblem, "timing_for", lambda self, z: least)
-    monkeypatch.setattr(Timing, "stretched", lambda self, first, second: self)
+    monkeypatch.setattr(Timing, "stretched", lambda self, *pace: self)
     seed = straight(problem, 2.4)
     assert least.violation(*problem.rates(seed)) > 0.05
     solution = solve(problem, seed)

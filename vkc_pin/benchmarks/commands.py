@@ -99,6 +99,7 @@ def add_bench(commands: Any) -> None:
     execution.set_defaults(benchmark="executing.execution")
     choices = "door corridor_door drawer household_refrigerator household_dishwasher household_cabinet household_cup init_1"
     _add_choice(execution, "tasks", f"{choices} (default: all)")
+    execution.add_argument("--grasp", default="weld", metavar="HOW", help="what holds: weld (default), or friction alone")
 
     about = "Make datasets of one task each, and say how many validated episodes an hour that gives."
     shown, what = "validated episodes an hour", "episodes of each task"

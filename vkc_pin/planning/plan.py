@@ -48,15 +48,15 @@ class Plan:
         options: How it was planned.
         trajectory: The motion; if planning failed, the best there was.
         validation: What the independent check says of it. For a loaded plan it is made when it is first asked for.
-        status: "success", or why not, e.g. "infeasible", "not converged", "effort spent"; of baselines, the stage that failed.
+        status: "success", "infeasible", "not converged", "time limit", "effort spent", "interrupted", "rejected";
+            of baselines that fail, the stage.
         metrics: planning_time [s], build_time [s], base_effort [m], base_effort_l1 [m], arm_effort [rad], clearance [m],
             closure_error [m], duration [s], torque [share of what a motor has], iterations, rounds, effort [units, see
             `planner.plan`], and what it was spent on: time_initialization, _coal, _casadi, _ipopt, _retiming, _validation [s].
-        seed: Of the random numbers.
-        initialization: Which seed trajectory it came from.
+        seed, initialization: Of the random numbers; which seed trajectory it came from.
         history: One row per round of the solver.
         terms: The user's own constraints and costs, with their expressions as data.
-        claimed: What the file says of the motion that a plan was loaded from, which nothing here relies on; else None.
+        claimed: What the file says that a plan was loaded from, on which nothing here relies; else None.
     """
 
     scene: Scene

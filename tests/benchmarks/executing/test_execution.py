@@ -37,6 +37,18 @@ def test_two_tasks_from_one_start(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert (out / "trials.jsonl").read_bytes() == before
 
 
+def test_by_friction(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    command = ["bench", "execution", "--trials", "1", "--tasks", "drawer", "--grasp", "friction", "--quiet", "--out", str(out)]
+    assert main(command) == 0
+    assert "held by friction" in capsys.readouterr().out
+    (trial,) = json.loads((out / "results.json").read_text(encoding="utf-8"))["trials"]
+    assert trial["executed"] is True, trial["problems"]
+    assert 0.0 < trial["slip"] < 0.005
+    assert main([*command[:-1], str(tmp_path / "other"), "--grasp", "glue"]) == 2
+    assert "glue" in capsys.readouterr().err
+
+
 def test_what_goes_wrong_is_counted() -> None:
     fine = {"task": "drawer", "success": True, "executed": True, "arm_error": 0.01, "problems": []}
     bad = {"task": "drawer", "success": True, "executed": False, "arm_error": 0.02, "problems": ["cup – floor: 9 mm deep"]}

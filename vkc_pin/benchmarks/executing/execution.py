@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from vkc_pin.arguments import known
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.limits import LIMITS, allowed
 from vkc_pin.benchmarks.harness.record import Record, trial, values
@@ -19,7 +20,7 @@ from vkc_pin.benchmarks.problems.problem_set import TASKS as ALL
 from vkc_pin.benchmarks.problems.problem_set import started
 from vkc_pin.errors import InputError
 from vkc_pin.planning.planner import plan
-from vkc_pin.simulation.execution import simulate
+from vkc_pin.simulation.execution import GRASPS, simulate
 from vkc_pin.simulation.physics import Physics, engine
 from vkc_pin.simulation.result import SimulationResult
 
@@ -47,6 +48,7 @@ _HEAD = [
     "goal [rad]",
     "grasp [N]",
     "grasp [N·m]",
+    "slip [mm]",
 ]
 
 
@@ -57,6 +59,7 @@ def run(
     seed: int = 0,
     jobs: int = 1,
     tasks: Sequence[str] = tuple(TASKS),
+    grasp: str = "weld",
     progress: bool = True,
 ) -> dict[str, Any]:
     """Run the experiment, or what is left of it, and write results.json, results.csv and table.md to `out`.
@@ -67,13 +70,14 @@ def run(
         seed: Of the starts and of planning.
         jobs: Number of processes.
         tasks: Some of `TASKS`.
+        grasp: What holds, see `simulate`.
         progress: Whether to show a progress bar.
 
     Returns:
         {"meta": ..., "trials": [...]}; see `runner.run`.
 
     Raises:
-        UnknownNameError: There is no such task.
+        UnknownNameError: There is no such task or grasp.
         InputError: No trials or tasks, MuJoCo is not installed, or `out` has trials of other settings.
         KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
     """
@@ -82,9 +86,9 @@ def run(
         raise InputError("out of range", field="trials", expected="at least 1", got=trials)
     names = runner.chosen("task", tasks, TASKS)
     settings = {"benchmark": "execution", "seed": seed, "starts": trials, "tasks": names, "mujoco": version("mujoco"), **LIMITS}
-    settings["physics"] = vars(Physics())
+    settings |= {"physics": vars(Physics()), "grasp": known(grasp, GRASPS, "grasp")}
     specs = [
-        {"key": f"{list(TASKS).index(name):02d}/{number:04d}", "task": name, "number": number, "seed": seed}
+        {"key": f"{list(TASKS).index(name):02d}/{number:04d}", "task": name, "number": number, "seed": seed, "grasp": grasp}
         for name in names
         for number in range(trials)
     ]
@@ -98,11 +102,11 @@ def report(result: Mapping[str, Any]) -> str:
     rows += [_row("all", records)] if len(rows) > 1 else []
     problems = Counter(f"{r.get('task')}: {text}" for r in records for text in r.get("problems", ()))
     parts = [
-        "# Plans in physics",
+        "# Plans in physics" + (", held by friction" if about.get("grasp") == "friction" else ""),
         f"{about['starts']} random starts per task, seed {about['seed']}, {allowed(about)} each. Plans are counted by the "
         "independent validation, and executed if they end within 10 mm and 0.02 rad of the goal, nothing is pulled out of the "
-        "hand, and nothing is touched by more than 1 mm that the plan does not touch; beside it Wilson's interval of 95 % "
-        "confidence. Errors of arm and base, misses of goals, forces and torques are the largest of any moment of any trial.",
+        "hand, and nothing is touched by more than 1 mm that the plan does not touch; beside it Wilson's interval of 95 %. "
+        "Errors of arm and base, misses of goals, forces, torques and slips are the largest of any moment of any trial.",
         markdown(_HEAD, rows),
         "## What went wrong",
         "\n".join(f"- {text}" + (f" ({count} times)" if count > 1 else "") for text, count in problems.items()) or "Nothing.",
@@ -122,6 +126,7 @@ def _row(name: str, records: Sequence[Record]) -> list[str]:
         _largest(planned, "miss_rad", 1.0, 4),
         _largest(planned, "grasp_force", 1.0, 0),
         _largest(planned, "grasp_torque", 1.0, 1),
+        _largest(planned, "slip", 1e3, 1),
     ]
     return [name, f"{len(planned)} of {len(records)}", f"{good} of {len(planned)}", interval, *own]
 
@@ -137,7 +142,7 @@ def _record(spec: dict[str, Any]) -> dict[str, Any]:
     more: dict[str, Any] = {"task": spec["task"], "number": spec["number"], "executed": False}
     if found.success:
         begin = time.perf_counter()
-        executed = simulate(found.scene, found.steps, found.trajectory)
+        executed = simulate(found.scene, found.steps, found.trajectory, grasp=spec["grasp"])
         more |= {"simulation_time": time.perf_counter() - begin, **_figures(executed)}
     return trial(found, method="VKC", seed=spec["seed"], duration=found.metrics["duration"], **more)
 
@@ -157,6 +162,7 @@ def _figures(result: SimulationResult) -> dict[str, Any]:
         "miss_rad": missed["rad"],
         "grasp_force": max((grip.force for grip in result.grips), default=None),
         "grasp_torque": max((grip.torque for grip in result.grips), default=None),
+        "slip": max((grip.slip for grip in result.grips), default=0.0) or None,
         "effort_share": max(result.tracking.shares.values(), default=None),
         "contacts": [str(contact) for contact in result.contacts],
     }

@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from vkc_pin import compiled
+from vkc_pin import needed
 from vkc_pin.distances import solids
 from vkc_pin.distances.shapes import Shapes
 from vkc_pin.distances.solids import solid_of
@@ -99,7 +99,7 @@ def test_a_module_that_does_not_fit_says_so(monkeypatch: pytest.MonkeyPatch) -> 
         raise ImportError(f"no {name}")
 
     with monkeypatch.context() as patch:
-        patch.setattr(compiled, "import_module", missing)
+        patch.setattr(needed, "import_module", missing)
         with pytest.raises(BuildError, match="compiler"):
             solids.compiled()
     solids.compiled.cache_clear()

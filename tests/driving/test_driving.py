@@ -8,8 +8,8 @@ import pytest
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from vkc_pin.compiled import compiled_module
 from vkc_pin.driving.grid import HEADINGS, BaseGrid
+from vkc_pin.needed import compiled_module
 
 MODULE = "vkc_pin.driving._driving"
 CELLS, LIMIT = 9, 2**60

@@ -7,10 +7,10 @@ from helpers.base_scenes import BLINK, HALL, MARGIN, arm, at, between, chassis, 
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from vkc_pin.compiled import compiled_module
 from vkc_pin.driving.body import Shape
 from vkc_pin.driving.grid import HEADINGS, BaseGrid
 from vkc_pin.errors import InputError
+from vkc_pin.needed import compiled_module
 
 STANDING = [*furniture(), *clutter(2, 20)]
 

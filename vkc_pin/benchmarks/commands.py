@@ -9,12 +9,13 @@ import json
 import os
 import shlex
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from vkc_pin.interrupt import raising
 
-__all__ = ["EXIT_INTERRUPTED", "EXIT_OK", "add_bench", "natural", "positive"]
+__all__ = ["EXIT_INTERRUPTED", "EXIT_OK", "add_bench", "natural", "positive", "stopped"]
 
 EXIT_OK, EXIT_INTERRUPTED = 0, 130
 
@@ -208,12 +209,22 @@ def _bench_experiment(arguments: argparse.Namespace) -> int:
         with raising():
             experiment.run(**settings, progress=not arguments.quiet)
     except KeyboardInterrupt as stop:
-        again = shlex.join(["vkc-pin", *arguments.given])
-        sys.stderr.write(f"\nvkc-pin: stopped{f'; {stop}' if str(stop) else ''}. The same command goes on from there:\n{again}\n")
-        return EXIT_INTERRUPTED
+        return stopped(arguments.given, stop)
     sys.stdout.write((Path(arguments.out) / "table.md").read_text(encoding="utf-8"))
     sys.stdout.write(f"\nThis table (table.md), its pictures, results.json and results.csv are in {arguments.out}\n")
     return EXIT_OK
+
+
+def stopped(given: Sequence[str], stop: KeyboardInterrupt) -> int:
+    """Say how a command goes on that Ctrl-C has stopped; return its exit code.
+
+    Args:
+        given: The command's words after `vkc-pin`.
+        stop: What it ended by; its text, if any, is said too.
+    """
+    again = shlex.join(["vkc-pin", *given])
+    sys.stderr.write(f"\nvkc-pin: stopped{f'; {stop}' if str(stop) else ''}. The same command goes on from there:\n{again}\n")
+    return EXIT_INTERRUPTED
 
 
 def natural(text: str, least: int = 0) -> int:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import shlex
 import sys
 from typing import Any
 
-from vkc_pin.benchmarks.commands import EXIT_INTERRUPTED, EXIT_OK, natural, positive
+from vkc_pin.benchmarks.commands import EXIT_OK, natural, positive, stopped
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.interrupt import raising
 
@@ -66,9 +65,7 @@ def _generate(arguments: argparse.Namespace) -> int:
                 progress=not arguments.quiet,
             )
     except KeyboardInterrupt as stop:
-        again = shlex.join(["vkc-pin", *arguments.given])
-        sys.stderr.write(f"\nvkc-pin: stopped{f'; {stop}' if str(stop) else ''}. The same command goes on from there:\n{again}\n")
-        return EXIT_INTERRUPTED
+        return stopped(arguments.given, stop)
     except VkcError as error:
         if isinstance(error, InputError):
             raise

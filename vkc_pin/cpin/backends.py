@@ -11,8 +11,8 @@ from typing import Any
 import casadi
 import pinocchio as pin
 
-from vkc_pin.compiled import REBUILD, compiled_module
 from vkc_pin.errors import BuildError
+from vkc_pin.needed import REBUILD, compiled_module
 
 __all__ = ["check_versions", "compiled", "upstream"]
 

@@ -23,7 +23,7 @@ from vkc_pin.datasets.formats import lerobot as lerobot_layout
 from vkc_pin.datasets.formats.card import card
 from vkc_pin.datasets.recipe import Recipe, load_recipe
 from vkc_pin.datasets.robots import ready_robots
-from vkc_pin.datasets.running.engine import Died, clustered, results
+from vkc_pin.datasets.running.engine import Died, needs_dask, results
 from vkc_pin.datasets.running.journal import Journal
 from vkc_pin.datasets.running.machine import versions
 from vkc_pin.errors import InputError, VkcError
@@ -80,9 +80,8 @@ def generate(
         lerobot_layout.needed()
     if made.fields.simulate:
         engine()
-    if (jobs > 1 or scheduler is not None) and not clustered():
-        expected = "pip install vkc-pin[cluster], or one job"
-        raise InputError("Dask is not installed", field="jobs" if scheduler is None else "scheduler", expected=expected)
+    if jobs > 1 or scheduler is not None:
+        needs_dask(scheduler)
     folder = file_path(out, "out", "a folder")
     with _journal(folder, made) as journal:
         _at_work(folder, made)

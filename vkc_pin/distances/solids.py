@@ -11,9 +11,9 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.arrays import Floats
-from vkc_pin.compiled import REBUILD, compiled_module
 from vkc_pin.errors import BuildError, InputError
 from vkc_pin.files.meshes import indices
+from vkc_pin.needed import REBUILD, compiled_module
 
 __all__ = ["compiled", "solid_of"]
 

@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike
 from vkc_pin.arrays import Bools, Floats, Ints
 from vkc_pin.budget import spend
 from vkc_pin.cache import Cache
-from vkc_pin.compiled import compiled_module
 from vkc_pin.driving.blocked import Lattice, PlanViews, stuck
 from vkc_pin.driving.body import FAN, Body, Shape, Standing
 from vkc_pin.errors import InputError
+from vkc_pin.needed import compiled_module
 
 __all__ = ["HEADINGS", "BaseGrid", "fine_cells"]
 

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from vkc_pin.arrays import Floats
 from vkc_pin.budget import spend
-from vkc_pin.compiled import compiled_module
 from vkc_pin.driving.grid import HEADINGS
 from vkc_pin.driving.ground import BACKWARDS, UNIT, Drive, Ground, wrapped
 from vkc_pin.driving.query import Query
+from vkc_pin.needed import compiled_module
 
 __all__ = ["cheapest"]
 

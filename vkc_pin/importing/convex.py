@@ -22,9 +22,9 @@ from vkc_pin.errors import InputError
 from vkc_pin.files.hulls import outer_hull
 from vkc_pin.files.meshes import MeshPart, coarser, load_mesh, to_bvh
 from vkc_pin.files.resources import file_path
-from vkc_pin.importing.extras import extra
 from vkc_pin.importing.slicing import flat, slices, thickened
 from vkc_pin.kept import record
+from vkc_pin.needed import optional_package
 
 if TYPE_CHECKING:
     import trimesh
@@ -185,7 +185,7 @@ def _cut(mesh: trimesh.Trimesh, most: int, error: float, seed: int, file: Path |
     if not merged.is_volume or len(merged.faces) > _MOST_TRIANGLES:
         coarse = coarser(MeshPart(np.asarray(merged.vertices), np.asarray(merged.faces)), merged.extents.max() / _CELLS)
         return [thickened(part) for part in slices(trimesh.Trimesh(coarse.vertices, coarse.faces), most)]
-    coacd = extra("coacd", what="cutting a concave mesh into convex pieces", file=file)
+    coacd = optional_package("coacd", "import", what="cutting a concave mesh into convex pieces", file=file)
     coacd.set_log_level("off")
     given = coacd.Mesh(merged.vertices, merged.faces)
     parts = coacd.run_coacd(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -11,9 +10,9 @@ import pinocchio as pin
 
 from vkc_pin.arguments import flag, number
 from vkc_pin.arrays import Floats
-from vkc_pin.errors import InputError
 from vkc_pin.models.dynamics.weight import solid_inertia
 from vkc_pin.motion.world import World
+from vkc_pin.needed import optional_package
 
 __all__ = ["Physics", "engine", "weigh"]
 
@@ -85,12 +84,7 @@ def engine() -> Any:
     Raises:
         InputError: It is not installed, or cannot be imported.
     """
-    try:
-        return importlib.import_module("mujoco")
-    except ImportError as error:
-        got = "not installed" if isinstance(error, ModuleNotFoundError) and error.name == "mujoco" else str(error)
-        problem, expected = "simulating needs the Python package mujoco", 'pip install "vkc-pin[sim]"'
-        raise InputError(problem, expected=expected, got=got) from error
+    return optional_package("mujoco", "sim", what="simulating")
 
 
 def weigh(world: World, physics: Physics) -> list[str]:

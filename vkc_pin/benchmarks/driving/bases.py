@@ -11,7 +11,7 @@ import numpy as np
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.record import Record, distribution, trial
 from vkc_pin.benchmarks.harness.tables import foot, markdown
-from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.errors import InputError
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
 from vkc_pin.scene.scene import Scene, load_scene
@@ -76,11 +76,8 @@ def run(
     """
     if trials < 1:
         raise InputError("out of range", field="trials", expected="at least 1", got=trials)
-    tasks, bases = list(TASKS if tasks is None else tasks), list(BASES if bases is None else bases)
-    for kind, names, known in (("task", tasks, TASKS), ("base", bases, BASES)):
-        for name in names:
-            if name not in known:
-                raise UnknownNameError(kind, name, known, field=f"{kind}s")
+    tasks = list(runner.chosen("task", TASKS if tasks is None else tasks, TASKS))
+    bases = list(runner.chosen("base", BASES if bases is None else bases, BASES))
     settings = {"benchmark": "bases", "seed": seed, "starts": trials, "tasks": tasks, "bases": bases, "radius": TURNING_RADIUS}
     specs = [
         {"key": f"{task}-{base}-{number:04d}", "task": task, "base": base, "number": number, "seed": seed}

@@ -23,6 +23,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.files.documents import parse_json, read_text
 from vkc_pin.files.writing import write_atomically
 from vkc_pin.models.robot import Robot
+from vkc_pin.needed import optional_package
 from vkc_pin.task.steps import step_to_dict
 
 if TYPE_CHECKING:
@@ -44,11 +45,7 @@ def needed() -> Any:
     Raises:
         InputError: It is not installed.
     """
-    try:
-        import h5py
-    except ImportError:
-        raise InputError("h5py is not installed", field="generate", expected="pip install vkc-pin[data]") from None
-    return h5py
+    return optional_package("h5py", "data", what="a dataset")
 
 
 def write_scene(folder: Path, document: Mapping[str, Any]) -> Path:

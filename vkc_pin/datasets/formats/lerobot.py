@@ -19,6 +19,7 @@ from vkc_pin.datasets.formats.samples import sampled
 from vkc_pin.errors import InputError
 from vkc_pin.files.writing import folder_at_once
 from vkc_pin.models.robot import Robot
+from vkc_pin.needed import optional_package
 
 __all__ = ["VERSION", "needed", "sentence", "write_lerobot"]
 
@@ -38,12 +39,8 @@ def needed() -> Any:
     Raises:
         InputError: It is not installed.
     """
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError:
-        raise InputError("pyarrow is not installed", field="lerobot", expected="pip install vkc-pin[data]") from None
-    return pyarrow
+    optional_package("pyarrow.parquet", "data", what="LeRobot's layout", field="lerobot")
+    return optional_package("pyarrow", "data", what="LeRobot's layout", field="lerobot")
 
 
 def sentence(about: Mapping[str, Any]) -> str:

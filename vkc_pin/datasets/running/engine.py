@@ -19,8 +19,9 @@ from typing import Any
 
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.interrupt import handled
+from vkc_pin.needed import optional_package
 
-__all__ = ["DEATHS", "Died", "clustered", "results"]
+__all__ = ["DEATHS", "Died", "clustered", "needs_dask", "results"]
 
 DEATHS = 4
 """How many processes a task may take with it on a cluster before it is given up."""
@@ -40,6 +41,19 @@ class Died:
     """
 
     reason: str
+
+
+def needs_dask(scheduler: str | None) -> None:
+    """Look for Dask, which runs tasks in other processes.
+
+    Args:
+        scheduler: Address of the scheduler that is asked for, None for processes of this machine.
+
+    Raises:
+        InputError: It is not installed.
+    """
+    field = "jobs" if scheduler is None else "scheduler"
+    optional_package("distributed", "cluster", what="running in other processes", field=field)
 
 
 def clustered() -> bool:
@@ -121,10 +135,7 @@ def _on_cluster(
     limit: float | None,
     tell: Callable[[str], object] | None,
 ) -> Generator[tuple[str, Any]]:
-    if not clustered():
-        raise InputError(
-            "Dask is not installed", field="scheduler" if scheduler else "jobs", expected="pip install vkc-pin[cluster]"
-        )
+    needs_dask(scheduler)
     from distributed import Future, KilledWorker, wait
 
     left = iter(tasks)

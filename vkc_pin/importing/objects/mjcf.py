@@ -9,8 +9,8 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
-from vkc_pin.importing.extras import extra
 from vkc_pin.importing.objects.description import Description, Joint, Link, Part
+from vkc_pin.needed import optional_package
 
 __all__ = ["read_object_mjcf"]
 
@@ -28,7 +28,7 @@ def read_object_mjcf(file: Path, *, free: bool = False) -> Description:
     Raises:
         InputError: MuJoCo is not installed, or cannot read the file.
     """
-    mujoco = extra("mujoco", what="reading MJCF", file=file)
+    mujoco = optional_package("mujoco", "import", what="reading MJCF", file=file)
     try:
         model = mujoco.MjModel.from_xml_path(str(file))
     except ValueError as error:

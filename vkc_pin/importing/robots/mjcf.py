@@ -15,7 +15,7 @@ import pinocchio as pin
 
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
-from vkc_pin.importing.extras import extra
+from vkc_pin.needed import optional_package
 
 __all__ = ["Converted", "convert"]
 
@@ -46,7 +46,7 @@ def convert(file: Path, folder: Path) -> Converted:
     Raises:
         InputError: MuJoCo is not installed, or does not understand the file; the error says what it says.
     """
-    mujoco = extra("mujoco", what="an MJCF file", file=file)
+    mujoco = optional_package("mujoco", "import", what="an MJCF file", file=file)
     try:
         model = mujoco.MjModel.from_xml_path(str(file.resolve()))
     except (ValueError, RuntimeError) as error:

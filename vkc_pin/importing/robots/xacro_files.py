@@ -10,7 +10,7 @@ from types import ModuleType
 from typing import Any
 
 from vkc_pin.errors import InputError
-from vkc_pin.importing.extras import extra
+from vkc_pin.needed import optional_package
 
 __all__ = ["expand"]
 
@@ -26,8 +26,8 @@ def expand(file: Path, packages: Mapping[str, Path], arguments: Mapping[str, str
     Raises:
         InputError: xacro is not installed, or the file is not understood; the error says what xacro says.
     """
-    xacro = extra("xacro", what="a xacro file", file=file)
-    substitution = extra("xacro.substitution_args", what="a xacro file", file=file)
+    xacro = optional_package("xacro", "import", what="a xacro file", file=file)
+    substitution = optional_package("xacro.substitution_args", "import", what="a xacro file", file=file)
     said = io.StringIO()
     try:
         with _finding(substitution, file, packages), contextlib.redirect_stderr(said):

@@ -5,7 +5,6 @@ A motion is plain data here, of the shape that `Trajectory.to_dict` returns; mes
 
 from __future__ import annotations
 
-import importlib
 import json
 import math
 from collections.abc import Iterator, Mapping
@@ -18,6 +17,7 @@ from vkc_pin.arguments import number, text
 from vkc_pin.errors import InputError
 from vkc_pin.files.writing import folder_at_once
 from vkc_pin.motion.formats.ros import to_ros
+from vkc_pin.needed import optional_package
 
 __all__ = ["TOPICS", "bag_library", "write_rosbag"]
 
@@ -96,12 +96,7 @@ def bag_library() -> Any:
     Raises:
         InputError: It is not installed, or cannot be imported.
     """
-    try:
-        return importlib.import_module("rosbags")
-    except ImportError as error:
-        got = "not installed" if isinstance(error, ModuleNotFoundError) and error.name == "rosbags" else str(error)
-        problem, expected = "recordings of ROS need the Python package rosbags", 'pip install "vkc-pin[ros]"'
-        raise InputError(problem, expected=expected, got=got) from error
+    return optional_package("rosbags", "ros", what="recording for ROS")
 
 
 def _namespace(name: str) -> str:

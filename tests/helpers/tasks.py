@@ -36,3 +36,10 @@ def hanging(task: int) -> int:
 def where(task: int) -> tuple[int, str | None]:
     time.sleep(0.05)
     return os.getpid(), os.environ.get("OPENBLAS_NUM_THREADS")
+
+
+def profiled(_: int) -> bool:
+    """Return whether Dask looks at what this process is doing, ever again."""
+    from distributed import get_worker
+
+    return "profile" in get_worker().periodic_callbacks

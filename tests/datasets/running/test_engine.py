@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.tasks import double, fatal, fatal_once, hanging, where
+from helpers.tasks import double, fatal, fatal_once, hanging, profiled, where
 
 from vkc_pin.datasets.running.engine import DEATHS, Died, results
 from vkc_pin.errors import InputError
@@ -40,6 +40,12 @@ def test_tasks_are_taken_when_they_are_needed(how: dict[str, Any]) -> None:
     for count, _ in enumerate(results(double, tasks(), **how), start=1):
         enough = count >= 5
     assert 5 <= len(taken) <= 5 + 4
+
+
+def test_processes_do_not_watch_their_tasks() -> None:
+    """Dask's own profiler would keep what it saw, more of it every second."""
+    pytest.importorskip("distributed")
+    assert list(results(profiled, numbered(1), jobs=2, dask=True)) == [("0", False)]
 
 
 def test_a_process_that_dies_loses_and_repeats_nothing(tmp_path: Path) -> None:

@@ -201,6 +201,7 @@ def _client(jobs: int, scheduler: str | None) -> Generator[tuple[Any, Any]]:
         "distributed.scheduler.allowed-failures": DEATHS // 2 - 1,  # and as many alone
         "distributed.logging.distributed": "error",
         "distributed.worker.multiprocessing-method": "spawn",
+        "distributed.worker.profile.enabled": False,  # it keeps every second of the last hour, 150 kB each of stacks like ours
         "distributed.comm.timeouts.connect": f"{_CONNECTING:g}s",
     }
     with dask.config.set(settings), contextlib.ExitStack() as stack:

@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.carrying import STICK, Script, above, carried_over, lifted, moved_base, room, table, tool_at
+from helpers.litter import AT, BIN, littered, shelf
 from helpers.small_problems import full_scene, program_of, with_objects
 
 import vkc_pin as vkc
@@ -200,6 +201,21 @@ def test_what_cannot_be_moved_as_it_is_held_is_taken_anew(monkeypatch: pytest.Mo
     assert dict(after.held) == {"drawer": "handle"}
     assert after.objects["drawer"].state[0] == pytest.approx(0.2, abs=1e-3)
     assert validate(scene, plan.steps, plan.trajectory).ok
+
+
+def test_what_cannot_be_put_down_as_it_is_held_is_taken_anew() -> None:
+    """What is taken from under a shelf is held from the side, and goes into a bin only from above."""
+    shelved = littered(shelf(*AT[:2]))
+    taken = vkc.plan(shelved, [vkc.Grasp("litter", "grip")])
+    assert taken.success
+    free = scene_after(littered(), taken.trajectory, taken.end_scene().holds)
+    plan = vkc.plan(free, [vkc.Place("litter", BIN)])
+    assert plan.success
+    assert plan.steps == (vkc.Release("litter"), vkc.Place("litter", BIN, "grip"))
+    assert validate(free, plan.steps, plan.trajectory).ok
+    first = plan.trajectory.phases[0]
+    np.testing.assert_array_equal(np.ptp(plan.trajectory.positions[: first.last + 1, : len(free.start)], axis=0), 0.0)
+    np.testing.assert_allclose(plan.end_scene().objects["litter"].placement.translation, BIN, atol=2e-3)
 
 
 @pytest.mark.made_up

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.litter import AT, BIN, littered
 
 import vkc_pin as vkc
-from vkc_pin.task.actions import actions_of, foresee
+from vkc_pin.task.actions import actions_of, alternatives, foresee
+from vkc_pin.task.compiler import compile_task
 
 A, G, P = vkc.Actuate, vkc.Grasp, vkc.Place
 
@@ -81,3 +83,24 @@ def test_the_first_step_that_cannot_be_done_is_named(steps: list[vkc.Step], fiel
     with pytest.raises(vkc.InputError, match=problem) as caught:
         foresee(vkc.load_scene("household"), steps, vkc.Options())
     assert str(caught.value.field).startswith(field)
+
+
+@pytest.mark.parametrize("stands", [True, False])
+def test_a_free_object_is_taken_anew_where_it_stands_only(stands: bool) -> None:
+    """In the air, it would fall."""
+    x, y, z = littered().with_held({"litter": "grip"}).objects["litter"].placement.translation
+    table = {"name": "table", "type": "box", "size": [0.2, 0.2, 0.02], "position": [x, y, z - AT[2] - 0.01]}
+    scene = littered(*[table] * stands).with_held({"litter": "grip"})
+    place = vkc.Place("litter", BIN)
+    task = compile_task(scene, [place], vkc.Options())
+    again = (vkc.Release("litter"), vkc.Place("litter", BIN, "grip"))
+    assert list(alternatives(scene, task, anew=True)) == [("litter.grip, taken anew", again)] * stands
+    assert not list(alternatives(scene, task)), "only where phases may be more"
+
+
+def test_where_it_stands_is_known_if_nothing_has_moved_before() -> None:
+    """Else only the motion says where it was left, and it cannot be taken again in the same plan."""
+    scene = littered().with_held({"litter": "grip"})
+    compile_task(scene, [vkc.Release("litter"), vkc.Place("litter", BIN)], vkc.Options())
+    with pytest.raises(vkc.InputError, match="known only after planning"):
+        compile_task(scene, [vkc.GoTo(0.0, 1.0), vkc.Release("litter"), vkc.Place("litter", BIN)], vkc.Options())

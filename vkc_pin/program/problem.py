@@ -146,6 +146,9 @@ class TrajectoryProblem:
         begin = 0
         for phase, end in zip(self.task.phases, self.ends, strict=True):
             inside = slice(begin, end)  # row t belongs to waypoint t + 1
+            if phase.kind == "stand" and not self.closed(phase):  # what is let go of then stands where it is
+                own = slice(0, self.chain.robot.coordinates.size)
+                lower[inside, own] = upper[inside, own] = self.start[own]
             for name, value in phase.before.items():
                 column = self.chain.index(name)
                 low, high = phase.ranges.get(name, (value, value))

@@ -241,6 +241,10 @@ def scatter(problem: TrajectoryProblem, waypoint: int, rng: np.random.Generator)
     search = Knots(problem, rng)
     pose, row = search.pose_at(waypoint), waypoint - 1
     z = np.tile(problem.start, (SCATTER, 1))
+    for column, grasp, last in problem.choices:  # how it was grasped is as open as the rest
+        if grasp < waypoint <= last:
+            lower, upper = np.clip([problem.lower[row, column], problem.upper[row, column]], -np.pi, np.pi)
+            z[:, column] = rng.uniform(lower, upper, SCATTER)
     if pose is not None:
         z, found = search.knot(z, waypoint, "scatter")
         pushed = z.copy()

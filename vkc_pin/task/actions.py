@@ -6,8 +6,11 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+import pinocchio as pin
 
 from vkc_pin.options import Options
+from vkc_pin.scene.placed import standing_geometry
+from vkc_pin.scene.resting import supports
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.compiler import compile_task, nothing_to_do
 from vkc_pin.task.handling import driving
@@ -42,18 +45,16 @@ def alternatives(scene: Scene, task: Task, *, anew: bool = False) -> Iterator[tu
     """Yield the steps of a task by attachments that it does not use, each with "<object>.<attachment>".
 
     There are some only where a single one of its steps leaves that open: of several, each is planned alone before. What is held
-    already may have been grasped where it cannot be moved from: then it is let go of, and taken anew.
+    already may have been grasped where it cannot be moved from, or put down: then it is let go of, and taken anew.
 
     Args:
         scene: Where the task begins.
         task: What its steps come to if nobody says otherwise.
         anew: Whether something may be taken anew, which makes more phases.
     """
-    first = task.steps[0]
-    held = scene.held.get(first.object) if isinstance(first, Actuate) else None
-    if anew and isinstance(first, Actuate) and held is not None and first.attachment in (None, held):
-        steps = (Release(first.object), dataclasses.replace(first, attachment=held), *task.steps[1:])
-        yield f"{first.object}.{held}, taken anew", steps
+    if anew and (again := _taken_anew(scene, task.steps[0])):
+        named = again[-1]
+        yield f"{named.object}.{named.attachment}, taken anew", (*again, *task.steps[1:])
     own = [(number, step) for number, step in enumerate(task.steps) if isinstance(step, Actuate) and is_open(scene, step)]
     for number, step in own if len(own) == 1 else ():
         used = {hold.attachment for hold in task.holds if hold.object == step.object}
@@ -62,6 +63,29 @@ def alternatives(scene: Scene, task: Task, *, anew: bool = False) -> Iterator[tu
             if name not in used:
                 changed = dataclasses.replace(step, attachment=name)
                 yield f"{step.object}.{name}", (*task.steps[:number], changed, *task.steps[number + 1 :])
+
+
+def _taken_anew(scene: Scene, step: Step) -> tuple[Release, Actuate | Place] | None:
+    """Return the steps by which what is held is let go of, taken again and moved; None if that cannot be.
+
+    A free object is let go of only where it stands on something.
+    """
+    if not isinstance(step, Actuate | Place):
+        return None
+    held = scene.held.get(step.object)
+    if held is None or step.attachment not in (None, held):
+        return None
+    placed = scene.objects[step.object]
+    if placed.object.free and not supports(placed, _standing(scene)):
+        return None
+    return Release(step.object), dataclasses.replace(step, attachment=held)
+
+
+def _standing(scene: Scene) -> list[tuple[str, pin.GeometryObject]]:
+    """Return label and shape of all that stands somewhere in a scene."""
+    others = [(name, other) for name, other in scene.objects.items() if name not in scene.held]
+    shapes = [(name, shape) for name, other in others for shape in standing_geometry(other)]
+    return [*shapes, *zip(scene.obstacle_labels, scene.obstacles, strict=True)]
 
 
 def foresee(scene: Scene, steps: Sequence[Step], options: Options) -> list[Task]:

@@ -224,11 +224,14 @@ class _Compiler:
         if step.object is not None and self._hold_of(step.object) is None:
             held = [hold.object for hold in self.held]
             raise UnknownNameError("held object", step.object, held, field=f"{where}.object")
-        if not self.phases:
-            self._append("stand", (), self.options.turn_waypoints)
-        for hold in reversed(self.held):
-            if hold in self.held and step.object in (None, hold.object):
-                self._release(hold, self.scene.objects[hold.object].placement)
+        let_go = [hold for hold in reversed(self.held) if step.object in (None, hold.object)]
+        if not (moved := bool(self.phases)):
+            objects = self.scene.objects
+            lowered = {hold: objects[hold.object].placement for hold in let_go if objects[hold.object].object.free}
+            self._append("stand", (), self.options.turn_waypoints, lowered=lowered)
+        for hold in let_go:
+            if hold in self.held:
+                self._release(hold, self.scene.objects[hold.object].placement, nearly=moved)
 
     def _release(self, hold: Hold, where: pin.SE3, *, nearly: bool = True) -> None:
         """Take a hold, and what is held through it, out of the hand; where it stands then, the motion decides, if `nearly`."""

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from helpers.carrying import STICK, TOP, above, box, reaching, room, table, tool_at
 from helpers.drives import hall
+from helpers.litter import BELOW, littered, shelf
 from helpers.small_problems import SHORT, door_scene, program_of
 
 import vkc_pin as vkc
@@ -87,3 +88,10 @@ def test_the_same_seed_says_the_same() -> None:
     crate = problem(hall(obstacles=[CRATE]), vkc.Reach((1.5, 0.0, 0.2, 0.0, np.pi, 0.0)))
     assert explain(crate, 3) == explain(crate, 3)
     assert explain(crate, 3)
+
+
+def test_how_something_is_grasped_is_open_where_it_is_put_down() -> None:
+    """Under a shelf it can be put down from the side only, by a freedom of the grasp that the start knows nothing of."""
+    below = problem(littered(shelf(*BELOW[:2])), vkc.Place("litter", BELOW, "grip"))
+    assert [phase.kind for phase in below.task.phases] == ["grasp", "place"]
+    assert blocked(below, 1, 0) is None

@@ -27,7 +27,9 @@ MODULES = [
 MODULES += ["scene/contact.py", "planning/one_problem.py"]
 TESTS = ["tests/validation", "tests/solver", "tests/oracle", "tests/program/test_merit.py", "tests/program/test_problem.py"]
 TESTS += [f"tests/chain/test_{name}.py" for name in ("contacts", "contacts_carried", "easing", "pose", "inverse_kinematics")]
-TESTS += [f"tests/planning/test_{name}.py" for name in ("one_problem", "pushes", "near_grasps")]
+TESTS += [
+    f"tests/planning/test_{name}.py" for name in ("one_problem", "pushes", "near_grasps", "riding", "plan_loaded", "infeasible")
+]
 
 
 def drawn(modules: list[str], count: int, seed: int) -> list[Mutant]:
@@ -72,7 +74,8 @@ def main() -> int:
     with journal.open("a", encoding="utf-8") as file:
         for mutant in drawn(given.module or every, given.sample, given.seed):
             row = known.get(mutant.name)
-            if row is None or (given.again and row["outcome"] in ("survived", "uncovered")):
+            again = given.again and row is not None and row["outcome"] in ("survived", "uncovered")
+            if row is None or (again and mutant.name not in EQUIVALENT):
                 row = {"name": mutant.name, "line": mutant.line, **outcome(mutant, coverage, folder / "log.txt", given.most)}
                 file.write(json.dumps(row, ensure_ascii=False) + "\n")
                 file.flush()

@@ -89,6 +89,10 @@ def mutants(module: str, source: str) -> Iterator[Mutant]:
 def _users(tree: ast.Module) -> dict[int, tuple[int, ...]]:
     """Return, of lines that define a constant of the module, which lines use it."""
     found: dict[int, tuple[int, ...]] = {}
+    for block in (item for item in ast.walk(tree) if isinstance(item, ast.ClassDef)):
+        for item in block.body:  # fields of a class: nobody knows who uses them
+            if not isinstance(item, ast.FunctionDef):
+                found |= dict.fromkeys(range(item.lineno, (item.end_lineno or item.lineno) + 1), ())
     for item in tree.body:
         if isinstance(item, ast.Assign | ast.AnnAssign):
             targets = item.targets if isinstance(item, ast.Assign) else [item.target]

@@ -58,8 +58,10 @@ class Coverage:
             most: CPU time that they may take together [s]; those that are left out are the last.
         """
         found = {test for line in mutant.lines for test in self.lines.get(f"{mutant.module}:{line}", [])}
-        found = found or set(self.lines.get(f"{mutant.module}:{ALWAYS}", []))
         own = f"tests/{Path(mutant.module).parent}/test_{Path(mutant.module).name}"
+        if mutant.lines != (mutant.line,):  # a constant, which tests may look at themselves
+            own_tests = {test for test in self.seconds if _file(test) == own}
+            found |= own_tests | (set() if found else set(self.lines.get(f"{mutant.module}:{ALWAYS}", [])))
         whole: dict[str, float] = defaultdict(float)
         for test in found:
             whole[_file(test)] += self.seconds[test]

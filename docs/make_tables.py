@@ -2,7 +2,13 @@
 
 In a page, what stands between `<!-- figures: NAME -->` and `<!-- /figures: NAME -->` is of docs/results/NAME.json: each table is
 replaced by the one of the experiment's own report that has the same columns, and lines that begin like one of `LINES` by the
-report's. Other sentences are written by hand.
+report's. Each line of versions and machine says from which commit the trials are.
+
+In a sentence, what stands between `<!-- figure: NAME WHAT FIELD=VALUE ... -->` and `<!-- / -->` is one figure of the trials of
+docs/results/NAME.json whose fields are as said, see `FIGURES`. It keeps as many decimals as it has.
+
+Figures that are on no record stand between `<!-- measured: COMMIT DATE -->` and `<!-- /measured -->`; docs/evidence.md lists
+them. Other sentences are written by hand.
 """
 
 from __future__ import annotations
@@ -14,6 +20,7 @@ import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from vkc_pin.benchmarks.harness.record import distribution
@@ -31,7 +38,7 @@ REPORTS = {  # name of a record → whose report it is
     **{"anything": "anything.matrix", "cluttered": "chores"},
     **{"robots_rest": "anything.robots", "robots_packages": "anything.robots", "execution": "executing.execution"},
     "friction": "executing.execution",
-    "bases": "driving.bases",
+    **{"bases": "driving.bases", "impossible": "problems.impossible"},
 }
 DOOR = ("door_seed_0", "door_seed_1")
 TASKS = ("reach", "push", "push blind", "whole")
@@ -59,6 +66,40 @@ STATUS: list[tuple[str, str, dict[str, str]]] = [
 ]
 
 
+# What is claimed of which record, by the page that shows it, and the command that makes it again.
+EVIDENCE: list[tuple[str, str, str, str]] = [
+    ("ways of initialising", "initialization.md", "initialization", "initialization --starts 50 --seed 101"),
+    ("base and arm together, or one after the other", "baselines.md", "baselines", "baselines --trials 50 --seed 101"),
+    ("six tasks in a home", "household.md", "household", "household --trials 20 --seed 101"),
+    ("chores", "chores.md", "chores", "chores --trials 5 --seed 101 --chores home fetch"),
+    (
+        "chores, full and tight",
+        "chores.md",
+        "cluttered",
+        "chores --chores cluttered --trials 1 --seeds 5 --step-by-step",
+    ),
+    ("the door, seed 0", "benchmarks.md", "door_seed_0", "door --trials 50 --seed 0"),
+    ("the door, seed 1", "benchmarks.md", "door_seed_1", "door --trials 50 --seed 1"),
+    ("many obstacles", "benchmarks.md", "scale", "scale --starts 30 --seed 0"),
+    ("many segments", "benchmarks.md", "segments", "scale --of segments --starts 20 --seed 0"),
+    ("a narrow gap", "benchmarks.md", "gap", "gap --trials 50 --seed 101"),
+    ("bases that drive", "benchmarks.md", "bases", "bases --trials 50 --seed 0"),
+    ("sixty problems", "benchmarks.md", "sixty", "ablation --seed 101"),
+    ("how much hangs on random numbers", "benchmarks.md", "spread", "spread --seeds 5 --seed 101"),
+    ("with the first seed alone", "benchmarks.md", "first_seed", "first-seed --trials 10 --seed 101"),
+    ("random problems", "benchmarks.md", "random", "random --problems 2000 --seed 20261123"),
+    ("random rooms", "benchmarks.md", "rooms", "random --of rooms --problems 1000 --seed 0"),
+    ("impossible problems", "benchmarks.md", "impossible", "impossible --problems 50 --seed 0"),
+    ("robots and objects", "benchmarks.md", "anything", "anything --starts 5 --seed 0"),
+    ("ten robots from their files", "benchmarks.md", "robots", "robots --goals 20 --seed 0"),
+    ("others of the same packages", "benchmarks.md", "robots_rest", "robots --goals 20 --seed 0"),
+    ("and by the path of a file", "benchmarks.md", "robots_packages", "robots --goals 20 --seed 0"),
+    ("in physics", "execution.md", "execution", "execution --trials 20 --seed 0"),
+    ("held by friction", "execution.md", "friction", "execution --trials 20 --seed 0 --grasp friction"),
+    ("what a metre of the base is worth", "decisions.md", "tradeoff", "ablation --seed 101"),
+]
+
+
 def result(name: str) -> dict[str, Any]:
     """Return what is on record in docs/results/NAME.json."""
     found: dict[str, Any] = json.loads((DOCS / "results" / f"{name}.json").read_text(encoding="utf-8"))
@@ -67,7 +108,7 @@ def result(name: str) -> dict[str, Any]:
 
 def of(trials: Iterable[Mapping[str, Any]], wanted: Mapping[str, str]) -> list[Mapping[str, Any]]:
     """Return the trials whose fields are as `wanted`."""
-    return [trial for trial in trials if all(trial[key] == value for key, value in wanted.items())]
+    return [trial for trial in trials if all(str(trial.get(key)) == value for key, value in wanted.items())]
 
 
 def status() -> str:
@@ -130,11 +171,76 @@ def good(trials: Sequence[Mapping[str, Any]]) -> str:
     return f"{sum(trial['success'] for trial in trials)} of {len(trials)}"
 
 
+def commits(trials: Iterable[Mapping[str, Any]]) -> str:
+    """Return which commits trials are of; "none" for records that do not say."""
+    return ", ".join(f"`{commit}`" for commit in sorted({trial["commit"] for trial in trials if trial.get("commit")})) or "none"
+
+
+def evidence() -> str:
+    """Return the table of claims, commands and records, and that of figures without a record."""
+    rows, rest = [], []
+    for claim, page, name, command in EVIDENCE:
+        found = result(name)
+        sessions, trials = found["meta"].get("sessions", ()), found["trials"]
+        jobs = ", ".join(f"{number} at a time" for number in sorted({session["jobs"] for session in sessions}))
+        minutes = sum(session["seconds"] for session in sessions) / 60.0
+        timed = sum(session["trials"] for session in sessions)
+        if not sessions:  # of the door, whose record has no sessions
+            minutes, jobs = sum(trial["planning_time"] + trial["build_time"] for trial in trials) / 60.0, "planning alone"
+        for option in {"friction": ("tasks",), "tradeoff": ("changes",)}.get(
+            name, ("robots",) if command.startswith("robots") else ()
+        ):
+            command += f" --{option} {' '.join(chosen for chosen in found['meta'][option] if chosen != 'unchanged')}"
+        whole = f"`vkc-pin bench {command}" + (f" --json out/{name}.json`" if "door" in name else f" --out out/{name}`")
+        rows.append([f"[{claim}]({page})", whole, f"[{name}](results/{name}.json)", commits(trials), f"{len(trials)}"])
+        part = f", {timed} of them" if timed not in (0, len(trials)) and not command.startswith("robots") else ""
+        rows[-1] += [f"{minutes:.1f} min, {jobs}{part}"]
+    for page in PAGES:
+        for commit, date in dict.fromkeys(re.findall(r"<!-- measured: (\w+) ([\d-]+) -->", page.read_text(encoding="utf-8"))):
+            where = "../README.md" if page.name == "README.md" else page.name
+            rest.append([f"[{page.name}]({where})", f"`{commit}`", date])
+    head = ["claim", "command", "record", "commit", "trials", "took here"]
+    return "\n\n".join([markdown(head, rows, text=4), markdown(["page", "at or after commit", "date"], rest, text=3)])
+
+
+FIGURES: dict[str, Callable[[Sequence[Mapping[str, Any]], str], float | str]] = {
+    "good": lambda trials, field: good(trials),
+    "successes": lambda trials, field: f"{sum(trial['success'] for trial in trials)}",
+    "trials": lambda trials, field: f"{len(trials)}",
+    "count": lambda trials, field: f"{sum(bool(trial.get(field)) for trial in trials)}",
+    "median": lambda trials, field: distribution(trials, field)[0],
+    "late": lambda trials, field: distribution(trials, field)[1],
+    "most": lambda trials, field: max(float(trial[field]) for trial in trials),
+    "least": lambda trials, field: min(float(trial[field]) for trial in trials),
+    "percent": lambda trials, field: 100.0 * sum(bool(trial.get(field)) for trial in trials) / len(trials),
+    "slowdown": lambda trials, field: _slowdown(trials, field),
+}
+"""What may be asked of trials, of a field of theirs after a colon. The 95th percentile is `late`; `slowdown:1000` is the median,
+over the starts, of the ratio of times among so many obstacles and among 30."""
+
+
+def _slowdown(trials: Sequence[Mapping[str, Any]], count: str) -> float:
+    base = {trial["number"]: trial["planning_time"] for trial in of(trials, {"obstacles": "30"})}
+    return median(trial["planning_time"] / base[trial["number"]] for trial in of(trials, {"obstacles": count}))
+
+
+def figure(asked: str, before: str) -> str:
+    """Return one figure, as `asked` for between its marks, with as many decimals as there were before."""
+    name, what, *conditions = asked.split()
+    what, _, field = what.partition(":")
+    trials = of(result(name)["trials"], dict(condition.replace("~", " ").split("=", 1) for condition in conditions))
+    if not trials:
+        raise ValueError(f"no trials of {asked}")
+    value = FIGURES[what](trials, field)
+    return value if isinstance(value, str) else f"{value:.{len(before.partition('.')[2])}f}"
+
+
 def reported(name: str) -> str:
     """Return the tables of a record, as its experiment reports them."""
     own: dict[str, Callable[[], str]] = {
         "status": status,
         "door": door,
+        "evidence": evidence,
         **{name: partial(drawn, name) for name in ("random", "rooms")},
     }
     if name in own:
@@ -167,12 +273,20 @@ def renewed(name: str, section: str) -> str:
         line = re.compile(rf"^{beginning}.*$", re.MULTILINE)
         own = line.search(report)
         if own is not None:
-            section = line.sub(own[0].replace("\\", r"\\"), section)
+            said = own[0] + (f" Commit {commits(trials_of(name))}." if beginning == "Measured on" else "")
+            section = line.sub(said.replace("\\", r"\\"), section)
     return section
 
 
+def trials_of(name: str) -> list[Mapping[str, Any]]:
+    """Return the trials that a section is about."""
+    return [trial for record in (DOOR if name == "door" else (name,)) for trial in result(record)["trials"]]
+
+
 def filled(text: str) -> str:
-    """Return a page with the tables between its marks."""
+    """Return a page with the tables and figures between its marks."""
+    one = r"(<!-- figure: ([^>]+?) -->)(.*?)(<!-- / -->)"
+    text = re.sub(one, lambda m: m[1] + figure(m[2], m[3]) + m[4], text)
     marks = r"(<!-- figures: (\w+) -->)(.*?)(<!-- /figures: \2 -->)"
     return re.sub(marks, lambda m: m[1] + renewed(m[2], m[3]) + m[4], text, flags=re.DOTALL)
 

@@ -6,6 +6,7 @@ import argparse
 import inspect
 import re
 import runpy
+import shlex
 import subprocess
 import sys
 import tomllib
@@ -225,6 +226,55 @@ def test_tables_are_as_the_results_on_record_say() -> None:
         assert text == script["filled"](text), page.name
         for name in re.findall(r"<!-- figures: (\w+) -->", text):
             assert f"<!-- /figures: {name} -->" in text
+
+
+def test_every_record_has_a_claim_and_the_command_that_makes_it_again() -> None:
+    script = runpy.run_path(str(ROOT / "docs/make_tables.py"))
+    rows = {name: command for _, _, name, command in script["EVIDENCE"]}
+    assert len(rows) == len(script["EVIDENCE"])
+    assert set(rows) == {file.stem for file in (ROOT / "docs/results").glob("*.json")}
+    commands = re.findall(r"`(vkc-pin bench [^`]+)`", read("docs/evidence.md"))[: len(rows)]
+    for name, line in zip(rows, commands, strict=True):
+        about, given = script["result"](name)["meta"], make_parser().parse_args(shlex.split(line)[1:])
+        assert line.endswith(f"out/{name}.json" if name.startswith("door") else f"out/{name}")
+        assert given.seed == about["seed"], name
+        counts = {key: getattr(given, key, None) for key in ("starts", "goals", "problems", "trials", "seeds")}
+        for key, value in counts.items():
+            told = about.get("starts" if key == "trials" and "starts" in about else key)
+            if value is not None and isinstance(told, int):
+                assert value == told, (name, key)
+
+
+def test_figures_in_sentences_come_from_records_or_say_when_they_were_measured() -> None:
+    """What looks like a rate or a time that was measured is between marks; `decisions.md` says of itself that it is a diary."""
+    marks = r"<!-- (figures?|measured): (?:.*?)-->.*?<!-- (?:/figures: \w+|/measured|/) -->"
+    claims = r"\b\d+ of \d+\b|\d s in the median|\d s at the 95th|\d times as (?:slow|fast|long)"
+    for page in PAGES:
+        if page.name == "decisions.md":
+            continue
+        text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+        assert re.findall(claims, re.sub(marks, "", text, flags=re.DOTALL)) == [], page.name
+        assert text.count("<!-- measured: ") == text.count("<!-- /measured -->"), page.name
+        assert text.count("<!-- figure: ") == text.count("<!-- / -->"), page.name
+
+
+@pytest.mark.parametrize(
+    ("asked", "before", "after"),
+    [
+        ("good gap", None, None),
+        ("gap good", "", "50 of 50"),
+        ("household successes method=B1 scene=door", "", "16"),
+        ("door_seed_0 median:planning_time task=push~blind", "0.00", "0.11"),
+        ("door_seed_0 median:planning_time task=nothing", "0.0", None),
+    ],
+)
+def test_a_figure_is_asked_of_a_record(asked: str, before: str | None, after: str | None) -> None:
+    figure = runpy.run_path(str(ROOT / "docs/make_tables.py"))["figure"]
+    if after is None:
+        with pytest.raises((ValueError, OSError)):
+            figure(asked, before or "")
+    else:
+        assert figure(asked, before) == after
 
 
 class Links(HTMLParser):

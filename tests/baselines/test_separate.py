@@ -25,6 +25,7 @@ from vkc_pin.baselines import postures as poses
 from vkc_pin.baselines.attempt import FINER
 from vkc_pin.baselines.following import Followed, follow
 from vkc_pin.baselines.paths import BasePaths
+from vkc_pin.benchmarks.household import TASKS
 from vkc_pin.planning.outcome import TIMES
 from vkc_pin.solver.to_trajectory import as_trajectory
 
@@ -382,6 +383,34 @@ def test_tries(answers: list[tuple[str, float]], taken: int, status: str, monkey
     assert plan.metrics["rounds"] == last
     assert plan.metrics["iterations"] == 10.0 * last, "of all tries"
     assert plan.metrics["time_following"] == last
+
+
+def test_a_real_try_that_fails_is_followed_by_one_with_other_random_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is replaced here: what the tries lead to, and what validation says of them, is written down on the way."""
+    seeds, ends = list[list[int]](), list[tuple[vkc.Trajectory, float, str]]()
+
+    class Noted(attempt.Attempt):
+        def __init__(self, *arguments: Any, **named: Any) -> None:
+            seeds.append(list(named["seed"]))
+            super().__init__(*arguments, **named)
+
+        def run(self, steps: Any) -> tuple[vkc.Trajectory, float, str]:
+            ends.append(super().run(steps))
+            return ends[-1]
+
+    monkeypatch.setattr(separate, "Attempt", Noted)
+    scene = vkc.load_scene("household").with_start(base=[0.968827218, -0.761078307, 0.355251978])
+    task = TASKS["door"]
+    plan = plan_separately(scene, task.steps, method="B1", seed=111)
+    tries = int(plan.initialization.removeprefix("B1, try "))
+    assert plan.success, plan.report()
+    assert seeds == [[111, number] for number in range(tries)]
+    assert tries > 1, "the first try sufficed: choose another start"
+    assert plan.metrics["rounds"] == len(ends) == tries
+    assert [cause for _, _, cause in ends][-1] == ""
+    for motion, _, cause in ends[:-1]:
+        assert cause or not vkc.validate(scene, task.steps, motion, plan.options).ok
+    assert vkc.validate(scene, task.steps, plan.trajectory, plan.options).ok
 
 
 def test_after_the_time_limit_there_is_no_other_try(monkeypatch: pytest.MonkeyPatch) -> None:

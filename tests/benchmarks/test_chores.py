@@ -137,6 +137,31 @@ def test_unknown_chores_are_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(
+    ("name", "joints", "things"),
+    [
+        ("home", {"refrigerator": 0.0, "door": 0.0}, {"cold_cup": chores.DESK, "litter": chores.BIN}),
+        ("fetch", {"cabinet": 0.0}, {"ball": chores.SHELF}),
+    ],
+)
+def test_every_chore_is_really_planned(
+    name: str, joints: Mapping[str, float], things: Mapping[str, tuple[float, float, float]]
+) -> None:
+    """As the experiment asks for it, and looked at anew from what the plan has: steps, motion, and the scene at its end."""
+    scene, steps, options = chores.CHORES[name].scene(), chores.CHORES[name].planned(), chores.CHORES[name].options
+    plan = vkc.plan_chore(scene, steps, options=options, seed=7)
+    assert plan.success, plan.report()
+    assert vkc.validate(scene, plan.steps, plan.trajectory, options).ok
+    last = plan.end_scene()
+    for owner, value in joints.items():
+        index = last.objects[owner].object.coordinates.index("hinge")
+        assert last.objects[owner].state[index] == pytest.approx(value, abs=1e-3)
+    for owner, place in things.items():
+        np.testing.assert_allclose(last.objects[owner].placement.translation, place, atol=2e-3)
+
+
+@pytest.mark.long
 def test_ten_steps_in_one_call(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "chores", "--trials", "1", "--chores", "fetch", "--out", str(tmp_path / "out"), "--quiet"]) == 0
     (trial,) = json.loads((tmp_path / "out" / "results.json").read_text(encoding="utf-8"))["trials"]

@@ -106,6 +106,22 @@ def test_every_method_is_asked_for_the_same(monkeypatch: pytest.MonkeyPatch) -> 
     assert asked == [("scene", task.steps, how) for task in TASKS.values() for how in hows]
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("method", COMPARED_PLANNERS)
+@pytest.mark.parametrize("name", TASKS)
+def test_every_task_is_really_planned(name: str, method: str) -> None:
+    """From a start of its own; the planner must succeed, and a baseline that does is as good."""
+    task = TASKS[name]
+    (spec,) = COMPARISON.specify(trials=1, seed=7, tasks=[name], methods=[method])
+    scene = placed(vkc.load_scene(task.scene), spec).with_start(base=spec["base"])
+    plan = household.plan_trial(scene, spec)
+    if method == "VKC":
+        assert plan.success, plan.report()
+    report = vkc.validate(scene, task.steps, plan.trajectory, plan.options)
+    assert report.ok == plan.success
+    assert report.contradictions(plan.validation) == []
+
+
 def test_the_cup_stands_wholly_on_the_coffee_table() -> None:
     scene, rng = vkc.load_scene("household"), np.random.default_rng(0)
     shapes = list(scene.obstacles)

@@ -22,6 +22,7 @@ from helpers.small_problems import (
     with_objects,
 )
 
+from vkc_pin.budget import Budget
 from vkc_pin.chain.contacts import Contacts
 from vkc_pin.errors import InputError
 from vkc_pin.models.shapes import link_name
@@ -497,3 +498,16 @@ def test_margins_follow_the_options(steps: list[Step]) -> None:
     problem = program_of(door_scene(), steps, options=options)
     margins = {margin for found in pairs(problem, 0, waypoint=2).values() for margin in found}
     assert margins == ({0.05, 0.03, 0.01} if isinstance(steps[0], Grasp) else {0.05, 0.03})
+
+
+def test_every_configuration_that_is_looked_at_is_spent() -> None:
+    problem = door_problem()
+    z = np.tile(problem.start, (7, 1))
+    for look in (
+        lambda: problem.contacts.evaluate(z, np.ones(7, int), reach=0.1),
+        lambda: problem.contacts.first_blocked(z, 1, reach=0.0, allowed=1.0),
+    ):
+        budget = Budget()
+        with budget.running():
+            look()
+        assert budget.used == 7

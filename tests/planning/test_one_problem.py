@@ -13,6 +13,7 @@ from helpers.drives import hall
 from helpers.small_problems import door_scene, program_of
 
 import vkc_pin as vkc
+from vkc_pin.benchmarks.problems.problem_set import problem as drawn_problem
 from vkc_pin.budget import spend
 from vkc_pin.cache import Cache
 from vkc_pin.planning import one_problem as module
@@ -123,6 +124,46 @@ def test_seeds_are_tried_in_turn_until_a_motion_is_good(
     assert plan.success == bool(amounts)
 
 
+@pytest.mark.parametrize(("number", "random_seed"), [(39, 101), (38, 105)])
+def test_real_seeds_are_tried_in_turn_until_validation_accepts_a_motion(
+    number: int, random_seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing is replaced here: what is asked for, solved and checked is written down on the way."""
+    given, solved, asked = list[Seed](), list[Solution](), list[str]()
+    search, solver = module.initialize, module.solve
+
+    def noted(*arguments: Any, **named: Any) -> Iterator[Seed]:
+        for seed in search(*arguments, **named):
+            asked.append("seed")
+            given.append(seed)
+            yield seed
+
+    def answered(problem: vkc.TrajectoryProblem, z: np.ndarray, **named: Any) -> Solution:
+        asked.append("solve")
+        np.testing.assert_array_equal(z, given[-1].z)
+        solved.append(solver(problem, z, **named))
+        return solved[-1]
+
+    monkeypatch.setattr(module, "initialize", noted)
+    monkeypatch.setattr(module, "solve", answered)
+    own = drawn_problem(number)
+    plan = vkc.plan(own.scene, own.steps, seed=random_seed)
+    assert plan.success, plan.report()
+    assert asked == ["seed", "solve"] * len(solved)
+    assert len(solved) > 1, "the first seed sufficed: choose another problem"
+    assert plan.initialization == given[-1].name
+    assert plan.metrics["rounds"] == sum(solution.rounds for solution in solved) == len(plan.history)
+    assert plan.metrics["iterations"] == sum(solution.iterations for solution in solved)
+    parts = [value for key, value in plan.metrics.items() if key.startswith("time_")]
+    assert all(plan.metrics[f"time_{part}"] > 0.0 for part in ("initialization", "coal", "ipopt", "retiming", "validation"))
+    assert sum(parts) <= plan.metrics["planning_time"] + plan.metrics["build_time"]
+    assert plan.metrics["time_ipopt"] == pytest.approx(sum(solution.timings["ipopt"] for solution in solved))
+    assert vkc.validate(own.scene, own.steps, plan.trajectory, plan.options).ok
+    for solution in solved[:-1]:  # what was given up was no motion
+        motion = as_trajectory(vkc.build(own.scene, own.steps), solution.z, solution.dt)
+        assert not vkc.validate(own.scene, own.steps, motion, plan.options).ok
+
+
 @pytest.mark.made_up
 def test_rounds_of_all_seeds_count(monkeypatch: pytest.MonkeyPatch) -> None:
     rows: list[Iteration] = []
@@ -134,6 +175,16 @@ def test_rounds_of_all_seeds_count(monkeypatch: pytest.MonkeyPatch) -> None:
     assert set(TIMES) <= {key.removeprefix("time_") for key in plan.metrics}
     assert list(plan.history) == [dataclasses.asdict(ROUND)] * 2
     assert rows == [ROUND] * 2
+
+
+def test_the_ends_of_a_seed_are_free_or_not() -> None:
+    """What it goes through on the way does not count."""
+    post = {"name": "post", "type": "box", "size": [0.3, 0.3, 2.0], "position": [2.0, 0.0, 1.0]}
+    drive = vkc.build(hall(obstacles=[post]), [vkc.GoTo(4.0, 0.0)])
+    for x, free in ((4.0, True), (2.0, False)):
+        z = np.tile(drive.start, (drive.segments, 1))
+        z[:, 0] = np.linspace(drive.start[0], x, drive.segments)
+        assert module._ends_free(drive, Seed("straight", z)) == free
 
 
 def test_a_seed_of_ones_own_is_the_only_one(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -165,6 +165,32 @@ def test_what_is_returned_and_what_it_took(
     assert budgets == ([] if apart is None else [settings.budget]), "what is left of it"
 
 
+def test_where_one_problem_fails_the_steps_are_really_planned_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the whole only the solver's word is withheld; that of each step, the joining and validation are the real ones."""
+    scene = vkc.load_scene("drawer")
+    steps = [vkc.Actuate("drawer", {"slide": 0.2}), vkc.Release("drawer"), vkc.GoTo(*scene.start[:2])]
+    real, lengths, efforts = OneProblem.run, list[int](), list[float]()
+
+    def run(self: OneProblem) -> vkc.Plan:
+        plan = real(self)
+        lengths.append(len(self.task.steps))
+        efforts.append(plan.metrics["effort"])
+        return plan if lengths[-1] == 1 else dataclasses.replace(plan, status="not converged", validation=wrong)
+
+    wrong = vkc.Report((vkc.Violation("goal", "base", waypoint=0, time=0.0, amount=1.0, unit="m", detail=""),))
+    monkeypatch.setattr(OneProblem, "run", run)
+    plan = vkc.plan(scene, steps)
+    assert plan.success, plan.report()
+    assert lengths == [3, 1, 1, 1]
+    assert plan.metrics["effort"] == pytest.approx(sum(efforts))
+    assert plan.steps == tuple(steps)
+    assert validate(scene, steps, plan.trajectory).ok
+    after = plan.end_scene()
+    assert after.objects["drawer"].state[0] == pytest.approx(0.2, abs=1e-3)
+    assert not after.held
+    np.testing.assert_allclose(after.start[:2], scene.start[:2], atol=1e-3)
+
+
 def test_one_step_that_fails_is_not_planned_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "OneProblem", lambda *_: SimpleNamespace(run=lambda: fake("rejected", 10.0)))
     monkeypatch.setattr(module, "step_by_step", lambda *_: pytest.fail("the same again"))

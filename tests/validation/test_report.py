@@ -12,7 +12,7 @@ import pytest
 import vkc_pin as vkc
 from vkc_pin.errors import InputError
 from vkc_pin.plotting.clearance import clearance_curves
-from vkc_pin.validation.report import Report, Violation
+from vkc_pin.validation.report import Bound, Report, Violation
 
 ONE = Violation("limit", "elbow_joint", waypoint=4, time=1.0, amount=0.05, unit="rad", detail="3.2 rad is outside")
 TWO = Violation("penetration", "forearm_link – sofa", waypoint=7, time=1.9, amount=0.01, unit="m", detail="overlap by 10.0 mm")
@@ -25,6 +25,32 @@ def test_text() -> None:
     assert "2 constraint(s) violated" in text
     assert "limit elbow_joint: 3.2 rad is outside (waypoint 4, 1.00 s)" in text
     assert "penetration forearm_link – sofa: overlap by 10.0 mm (waypoint 7, 1.90 s)" in text
+
+
+def test_what_nobody_says_is_nothing() -> None:
+    assert (Report().states, Report().torque, Report().clearance) == (0, 0.0, np.inf)
+    plain = Violation("goal", "base", amount=1.0, unit="m", detail="far")
+    assert (plain.waypoint, plain.time) == (0, 0.0)
+
+
+def test_text_names_four_bounds_and_twelve_violations() -> None:
+    every = tuple(Bound(f"joint_{k}", "velocity", share=0.1, begin=k, end=k + 1.0) for k in range(6))
+    (told,) = Report(bounds=every).timing()
+    assert [f"joint_{k}" in told for k in range(6)] == [True] * 4 + [False] * 2
+    lines = Report((ONE,) * 14).lines()
+    assert sum("limit elbow_joint" in line for line in lines) == 12
+    assert "... and 2 more" in lines[-1]
+
+
+def test_reports_that_say_otherwise() -> None:
+    one = Report((ONE,), 0.01, closure_error=1e-4, closure_angle=0.0)
+    assert one.contradictions(one) == []
+    assert one.contradictions(Report((ONE,), 0.010005, closure_error=1e-4)) == []
+    assert one.contradictions(Report((ONE,), 0.02, closure_error=1e-4)) == ["clearance 0.02 m instead of 0.01 m"]
+    assert one.contradictions(Report((ONE,), 0.01, closure_error=1e-4, closure_angle=0.5)) == [
+        "closure_angle 0.5 rad instead of 0 rad"
+    ]
+    assert one.contradictions(Report((), 0.01, closure_error=1e-4)) == ["every constraint holds"]
 
 
 def test_round_trip() -> None:

@@ -74,6 +74,9 @@ def test_wheels_turn_no_faster_than_they_can(base: str) -> None:
     turn = np.diff(heading).max()
     fastest = (2.0 * np.sin(turn / 2) + turn * wheels.track / 2) / 0.05
     assert found.amount == pytest.approx(fastest - wheels.rim)
+    for excess, right in ((0.5, True), (2.0, False)):  # times what is all right, a thousandth of what the wheels can
+        dt = 0.05 * fastest / (wheels.rim * (1.0 + excess * 1e-3))
+        assert validate(scene, goal, of_rows(scene, rows, dt=dt)).ok == right
     assert validate(scene, goal, of_rows(scene, rows, dt=0.05 * fastest)).ok
     everywhere = hall()
     assert validate(everywhere, goal, of_rows(everywhere, rows, dt=0.05)).ok
@@ -116,6 +119,9 @@ def test_a_curve_may_slip_a_little_at_any_moment() -> None:
     assert "mm/s" in found.detail
     assert validate(scene, *circled(scene, aside=0.9 * SLIP_TOLERANCE)).ok
     assert validate(hall(), goal, motion).ok
+    assert SLIP_TOLERANCE == 1e-3  # [m/s], as the pages say
+    for slip, right in ((0.95e-3, True), (1.1e-3, False)):
+        assert validate(scene, *circled(scene, aside=0.01 * slip / found.amount)).ok == right
 
 
 def circled(scene: Scene, **about: float) -> tuple[list[Any], Trajectory]:

@@ -308,6 +308,18 @@ def latch_shortfall(base: Scene, hinge: list[float], knob: list[float], *, reach
     return sum(violation.amount for violation in found)
 
 
+def test_a_rest_that_is_too_short_for_the_hand(door_plan: vkc.Plan) -> None:
+    """The robot stands still for as long as was asked for when the motion was planned."""
+    rests = door_plan.options.grasp_time
+    assert check(door_plan, grasp_time=rests - 1e-9).ok
+    found = only(check(door_plan, grasp_time=rests + 0.25))
+    grasp = door_plan.trajectory.phases[1].first
+    assert (found.constraint, found.subject, found.unit, found.waypoint) == ("dwell", "door.handle", "s", grasp)
+    assert found.time == pytest.approx(door_plan.trajectory.times[grasp])
+    assert 0.0 < found.amount <= 0.25 + 1e-9
+    assert not check(door_plan, grasp_time=rests + 0.25 - found.amount + 1e-4).ok
+
+
 def test_nobody_holds_what_moves(door_plan: vkc.Plan) -> None:
     let_go = tuple(dataclasses.replace(phase, holds=()) for phase in door_plan.trajectory.phases)
     report = check(door_plan, trajectory=dataclasses.replace(door_plan.trajectory, phases=let_go))

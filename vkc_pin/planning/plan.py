@@ -97,7 +97,7 @@ class Plan:
         return [] if self.claimed is None else self.validation.contradictions(self.claimed)
 
     def report(self) -> str:
-        """Return what came out, for people: success or every violated constraint, efforts, clearance, times."""
+        """Return what came out, for people: success or what is violated (the first twelve), efforts, clearance, times."""
         m = self.metrics
         lines = [
             f"{self.scene.name}: {'success' if self.success else f'FAILED, {self.status}'} — "

@@ -45,6 +45,23 @@ def test_torques_count_as_any_other_limit() -> None:
     assert first.begin == 0.0
 
 
+def test_of_several_stretches_the_longest_is_named() -> None:
+    """Wherever in the motion: at its begin, in between, or at its end."""
+    plan = door_plan()
+    samples, curve = Samples(plan.scene, plan.trajectory), plan.trajectory.curve
+    assert curve is not None
+    moments, pieces = moments_of(curve), len(curve.times) - 1
+    for long in ((0, 30), (20, 50), (pieces - 30, pieces)):
+        parts = [(0, 5), long, (pieces - 5, pieces)]
+        torques = np.zeros((len(moments.times), plan.trajectory.robot_size))
+        for begin, end in parts:
+            torques[(moments.pieces >= begin) & (moments.pieces < end), 4] = 50.0
+        first = next(bound for bound in bounds(samples, moments, torques) if bound.kind == "torque")
+        lengths = {(a, b): curve.times[b] - curve.times[a] for a, b in parts}
+        assert max(lengths, key=lambda part: lengths[part]) == long, "times are uneven: choose other stretches"
+        assert (first.begin, first.end) == (curve.times[long[0]], curve.times[long[1]])
+
+
 def test_without_a_curve_nothing_is_said() -> None:
     plan = drawer_plan()
     bare = dataclasses.replace(plan.trajectory, curve=None)

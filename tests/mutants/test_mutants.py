@@ -1,0 +1,80 @@
+"""The faults that `python -m tests.mutants` makes; the runs themselves take too long for tests."""
+
+from __future__ import annotations
+
+import ast
+
+import pytest
+
+from .equivalent import EQUIVALENT
+from .mutations import mutants
+
+SOURCE = '''"""Docstring 3 < 4."""
+__all__ = ["area"]
+LIMIT = 5.0
+
+
+class Kept:
+    count: int = 2
+
+    def area(self, width: float, height: float) -> float:
+        """Return 1 + 1."""
+        if width < 0 and not height:
+            raise ValueError(f"{width + 1}")
+        detail = f"{2 * width} wide"
+        self.count += 1
+        print(detail)
+        return min(width, LIMIT) * height
+'''
+
+
+def made() -> set[str]:
+    return {mutant.what for mutant in mutants("x.py", SOURCE)}
+
+
+@pytest.mark.parametrize(
+    "what",
+    [
+        "comparison: < → <=",
+        "comparison: < → >=",
+        "boolean: and → or",
+        "sign: not height → (height)",
+        "constant: 5.0 → 10.0",
+        "constant: 0 → 1",
+        "dropped: self.count += 1 → pass",
+        "dropped: print(detail) → pass",
+        "name: min → max",
+        "swapped: width, LIMIT → LIMIT, width",
+        "arithmetic: * → /",
+    ],
+)
+def test_each_kind_of_fault_is_made(what: str) -> None:
+    assert what in made()
+
+
+def test_a_fault_is_one_change_of_a_source_that_can_be_read() -> None:
+    for mutant in mutants("x.py", SOURCE):
+        assert ast.dump(ast.parse(mutant.source)) != ast.dump(ast.parse(SOURCE))
+        before, after = SOURCE.splitlines(), mutant.source.splitlines()
+        assert [k for k, (one, other) in enumerate(zip(before, after, strict=True), 1) if one != other] == [mutant.line]
+        assert mutant.at == before[mutant.line - 1].strip()
+
+
+def test_texts_types_and_what_is_raised_are_left_alone() -> None:
+    changed = {mutant.line for mutant in mutants("x.py", SOURCE)}
+    lines = SOURCE.splitlines()
+    assert not {
+        k for k in changed if any(word in lines[k - 1] for word in ("Docstring", "__all__", "raise", "detail =", "Return 1"))
+    }
+
+
+def test_who_is_asked_about_a_constant() -> None:
+    """Of one of the module, those that execute the lines that use it; of a class's field, nobody in particular."""
+    where = {mutant.what: (mutant.line, mutant.lines) for mutant in mutants("x.py", SOURCE)}
+    assert where["constant: 5.0 → 10.0"] == (3, (16,))
+    assert where["constant: 2 → 3"] == (7, ())
+    assert where["name: min → max"] == (16, (16,))
+
+
+def test_every_equivalent_fault_has_a_reason() -> None:
+    assert all(len(reason) > 20 for reason in EQUIVALENT.values())

@@ -8,7 +8,7 @@ import numpy as np
 
 from vkc_pin.arrays import Bools, Floats
 from vkc_pin.motion.curve import Curve
-from vkc_pin.motion.rolling import Rolling
+from vkc_pin.motion.rolling import Rolling, seen
 from vkc_pin.retiming.path import path_through
 
 if TYPE_CHECKING:
@@ -62,7 +62,8 @@ def slip(curve: Curve) -> float:
     """Return how fast the base moves aside at most [m/s]."""
     moments = (curve.times[:-1, None] + np.diff(curve.times)[:, None] * (np.arange(_LOOKS) / _LOOKS)).ravel()
     (vx, vy), yaw = curve.velocity(moments)[:, :2].T, curve.at(moments)[:, 2]
-    return float(np.abs(np.cos(yaw) * vy - np.sin(yaw) * vx).max())
+    _, aside = seen(vx, vy, yaw)
+    return float(np.abs(aside).max())
 
 
 def _corner(points: Floats, wrong: Bools, rolling: Rolling) -> int:

@@ -14,10 +14,11 @@ from vkc_pin.models.dynamics.effort import Efforts
 from vkc_pin.motion.carrying import FreeObjects
 from vkc_pin.motion.curve import Curve
 from vkc_pin.motion.dynamics.handles import Handle, Motion
+from vkc_pin.motion.rolling import seen
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.scene.scene import Scene
 
-__all__ = ["Moments", "Torques", "moments_of"]
+__all__ = ["Moments", "Torques", "in_base_axes", "moments_of"]
 
 _SHARES = np.array([0.0, 0.5, 1.0])  # of each cubic at which it is looked at: accelerations jump at both ends
 
@@ -117,8 +118,7 @@ class Torques:
 
     def _in_phase(self, load: _Load, positions: Floats, velocities: Floats, accelerations: Floats) -> Floats:
         robot, size = self.scene.robot, self.trajectory.robot_size
-        v, a = velocities[:, :size].copy(), accelerations[:, :size].copy()
-        _to_base(positions[:, 2], v, a)
+        v, a = in_base_axes(positions[:, 2], velocities[:, :size], accelerations[:, :size])
         data, found = load.model.createData(), np.empty((len(positions), size))
         configurations = robot.coordinates.q(positions[:, :size])
         for k, q in enumerate(configurations):
@@ -180,13 +180,14 @@ def _whole(thing: ArticulatedObject, state: Floats) -> pin.Inertia:
     return sum((data.oMi[j].act(inertia) for j, inertia in enumerate(thing.model.inertias)), pin.Inertia.Zero())
 
 
-def _to_base(yaws: Floats, velocities: Floats, accelerations: Floats) -> None:
-    """Turn velocities and accelerations of the base in the world, shape (K, n), into those of Pinocchio's planar joint.
+def in_base_axes(yaws: Floats, velocities: Floats, accelerations: Floats) -> tuple[Floats, Floats]:
+    """Return velocities and accelerations of the base in the world, shape (K, n), as those of Pinocchio's planar joint.
 
     Its velocity is that in its own axes, which turn; its acceleration is the derivative of these numbers.
     """
-    cos, sin = np.cos(yaws), np.sin(yaws)
-    for rows in (velocities, accelerations):
-        rows[:, 0], rows[:, 1] = cos * rows[:, 0] + sin * rows[:, 1], cos * rows[:, 1] - sin * rows[:, 0]
-    accelerations[:, 0] += velocities[:, 2] * velocities[:, 1]
-    accelerations[:, 1] -= velocities[:, 2] * velocities[:, 0]
+    v, a = velocities.copy(), accelerations.copy()
+    for rows in (v, a):
+        rows[:, :2] = np.transpose(seen(rows[:, 0], rows[:, 1], yaws))
+    a[:, 0] += v[:, 2] * v[:, 1]
+    a[:, 1] -= v[:, 2] * v[:, 0]
+    return v, a

@@ -126,11 +126,13 @@ class Torques:
         parts = (dict(zip(self.trajectory.names, part.T, strict=True)) for part in (positions, velocities, accelerations))
         motion, frame = Motion(*parts), load.model.getFrameId(robot.tool_frame)
         for handle in load.handles:
-            for k, (q, wrench) in enumerate(zip(configurations, handle.wrenches(motion), strict=True)):
-                jacobian = pin.computeFrameJacobian(load.model, data, q, frame, pin.LOCAL_WORLD_ALIGNED)
-                lever = data.oMf[frame].rotation @ handle.point.translation
-                wrench[3:] += np.cross(lever, wrench[:3])
-                found[k] += jacobian.T @ wrench
+            jacobians, turns = np.empty((len(positions), 6, load.model.nv)), np.empty((len(positions), 3, 3))
+            for k, q in enumerate(configurations):
+                jacobians[k] = pin.computeFrameJacobian(load.model, data, q, frame, pin.LOCAL_WORLD_ALIGNED)
+                turns[k] = data.oMf[frame].rotation
+            wrenches = handle.wrenches(motion)
+            wrenches[:, 3:] += np.cross(turns @ handle.point.translation, wrenches[:, :3])
+            found += np.einsum("kij,ki->kj", jacobians, wrenches)
         found[:, :3] = 0.0
         return found
 

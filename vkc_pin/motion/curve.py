@@ -118,6 +118,18 @@ class Curve:
         strongest = np.max(np.abs([2.0 / h * (middle - first), 2.0 / h * (last - middle)]), axis=0)
         return np.asarray(fastest), np.asarray(strongest)
 
+    def jerks(self) -> tuple[Floats, Floats]:
+        """Return the |jerk| of each cubic, shape (K − 1, n), and by how much accelerations jump at each knot, shape (K, n).
+
+        Before the first and after the last one, all stands still.
+        """
+        h = np.diff(self.times)[:, None]
+        p, c, d, q = self._control(np.arange(len(h)))
+        begin, end = (6.0 / h**2 * part for part in ((d - c) - (c - p), (q - d) - (d - c)))
+        none = np.zeros((1, self.positions.shape[1]))
+        jumps = np.concatenate([begin, none]) - np.concatenate([none, end])
+        return np.abs(end - begin) / h, np.abs(jumps)
+
     def part(self, begin: float, end: float, columns: Sequence[int] | slice = slice(None)) -> Curve:
         """Return what lies between two of the knots' times [s], of some columns."""
         rows = slice(int(np.searchsorted(self.times, begin)), int(np.searchsorted(self.times, end, side="right")))

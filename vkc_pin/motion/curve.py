@@ -13,7 +13,7 @@ from vkc_pin.arguments import numbers
 from vkc_pin.arrays import Floats, Ints
 from vkc_pin.errors import InputError
 
-__all__ = ["SHORTEST", "Curve", "evenly", "joined"]
+__all__ = ["SHORTEST", "Curve", "evenly", "joined", "moments_at"]
 
 SHORTEST = 1e-9
 """Least time from knot to knot [s]."""
@@ -175,6 +175,18 @@ def evenly(times: Floats, rate: float) -> Floats:
     """Return so many moments a second between the first and the last of some times [s], and the last."""
     duration = times[-1] - times[0]
     return np.append(times[0] + np.arange(np.ceil(duration * rate - 1e-6)) / rate, times[-1])
+
+
+def moments_at(knots: Floats, shares: Floats, *, last: bool = False) -> Floats:
+    """Return moments at some shares of every span between knots, shape (k,), one span after the other, and the last knot.
+
+    Args:
+        knots: Shape (K,).
+        shares: From 0 to 1.
+        last: Whether the last knot comes after them.
+    """
+    inside = (knots[:-1, None] + np.diff(knots)[:, None] * shares).ravel()
+    return np.append(inside, knots[-1]) if last else inside
 
 
 def joined(pieces: Sequence[Curve]) -> Curve:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vkc_pin.arrays import Floats
-from vkc_pin.motion.curve import Curve
+from vkc_pin.motion.curve import Curve, moments_at
 from vkc_pin.retiming.limits import Limits
 
 if TYPE_CHECKING:
@@ -65,8 +65,7 @@ def _averaged(path: CubicHermiteSpline, pace: Curve, steps: int, span: float) ->
         stops[1:-1] -= np.clip((gone(stops) - places) / np.maximum(speed(stops), 1e-12), -span, span)[1:-1]
     stops[0], stops[-1] = 0.0, last + span
     parts = max(_LEAST, int(np.ceil(np.diff(stops).max() / (_SHARE * span))))
-    inside = stops[:-1, None] + np.diff(stops)[:, None] * (np.arange(parts) / parts)
-    times = np.append(inside.ravel(), stops[-1])
+    times = moments_at(stops, np.arange(parts) / parts, last=True)
     rows = path(np.clip(gone(times), 0.0, length))
     rows[::parts] = path(places)
     known = np.delete(np.arange(len(times)), [1, -2])

@@ -12,7 +12,7 @@ import numpy as np
 
 from vkc_pin.arrays import Bools, Floats, Ints
 from vkc_pin.driving.curves import between
-from vkc_pin.motion.curve import SHORTEST, Curve, joined
+from vkc_pin.motion.curve import SHORTEST, Curve, joined, moments_at
 from vkc_pin.motion.dynamics.torques import Torques
 from vkc_pin.motion.rolling import Rolling, rolling_of
 from vkc_pin.motion.trajectory import Trajectory
@@ -155,8 +155,7 @@ def _smooth(path: CubicHermiteSpline, points: Floats, limits: Limits, load: Load
     """
     knots = (len(path.x) - 1) // (len(points) - 1)  # a step
     parts = knots * max(_PARTS // knots, 1)
-    shares = np.arange(parts // knots) / (parts // knots)
-    places = np.append((path.x[:-1, None] + np.diff(path.x)[:, None] * shares).ravel(), path.x[-1])
+    places = moments_at(path.x, np.arange(parts // knots) / (parts // knots), last=True)
     speeds = speeds_along(path, places, limits.velocity, limits.acceleration)
     if speeds is None:
         return None

@@ -12,7 +12,7 @@ from vkc_pin.arrays import Floats, Ints
 from vkc_pin.models.articulation import ArticulatedObject
 from vkc_pin.models.dynamics.effort import Efforts
 from vkc_pin.motion.carrying import FreeObjects
-from vkc_pin.motion.curve import Curve
+from vkc_pin.motion.curve import Curve, moments_at
 from vkc_pin.motion.dynamics.handles import Handle, Motion
 from vkc_pin.motion.rolling import seen
 from vkc_pin.motion.trajectory import Trajectory
@@ -43,7 +43,7 @@ class Moments:
 def moments_of(curve: Curve) -> Moments:
     """Return the ends and the middle of every cubic of a curve, with its own accelerations at its ends."""
     spans, count = np.diff(curve.times), len(curve.times) - 1
-    times = (curve.times[:-1, None] + spans[:, None] * _SHARES).ravel()
+    times = moments_at(curve.times, _SHARES)
     begin, middle = curve.acceleration(curve.times[:-1]), curve.acceleration(curve.times[:-1] + 0.5 * spans)
     accelerations = begin[:, None] + 2.0 * _SHARES[None, :, None] * (middle - begin)[:, None]
     return Moments(

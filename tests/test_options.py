@@ -34,8 +34,14 @@ def test_whole_numbers(name: str, value: Any) -> None:
     assert caught.value.got == repr(value)
 
 
-@pytest.mark.parametrize("name", REAL)
-@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf, True, "0.1", None])
+def test_accelerations_may_grow_at_once() -> None:
+    assert Options(jerk_time=0).jerk_time == Options().jerk_time == 0.0
+
+
+WRONG = [(name, value) for name in REAL for value in (-1.0, np.nan, np.inf, True, "0.1", None)]
+
+
+@pytest.mark.parametrize(("name", "value"), [*WRONG, *((name, 0.0) for name in REAL if name != "jerk_time")])
 def test_real_numbers(name: str, value: Any) -> None:
     with pytest.raises(InputError) as caught:
         Options(**{name: value})

@@ -17,6 +17,7 @@ _RANGES = {
     "grasp_time": (_SMALLEST, 3600.0),
     "approach_time": (_SMALLEST, 3600.0),
     "approach": (_SMALLEST, 10.0),
+    "jerk_time": (0.0, 10.0),
 }
 _MOST = {  # of whole numbers: beyond these, planning takes hours and gigabytes
     **dict.fromkeys(("reach_waypoints", "turn_waypoints", "move_waypoints"), 500),
@@ -31,6 +32,8 @@ class Options:
     Attributes:
         dt: Least time between two waypoints [s]; motions that are too long for it take more.
         grasp_time: How long the robot stands still at a grasp or release, for the gripper to close or open [s].
+        jerk_time: Least time in which an acceleration grows from none to its limit [s]: jerks are limited to that limit over
+            this, and accelerations do not jump. 0: they may.
         reach_waypoints: Segments of a phase that drives or reaches, with or without something in the hand.
         turn_waypoints: Segments of a phase in which a latch is released.
         move_waypoints: Segments of a phase in which a held object is moved.
@@ -59,6 +62,7 @@ class Options:
 
     dt: float = 0.25
     grasp_time: float = 1.0
+    jerk_time: float = 0.0
     reach_waypoints: int = 40
     turn_waypoints: int = 6
     move_waypoints: int = 30
@@ -97,7 +101,7 @@ class Options:
                 object.__setattr__(self, item.name, value)
             else:
                 low, high = _RANGES.get(item.name, (_SMALLEST, _LARGEST))
-                expected = f"a positive finite number, from {low:g} to {high:g}"
+                expected = f"a {'positive ' if low else ''}finite number, from {low:g} to {high:g}"
                 object.__setattr__(self, item.name, number(value, field, expected, low=low, high=high))
 
     @classmethod

@@ -1,4 +1,4 @@
-"""Samples a motion at 1 kHz and compares positions, velocities and accelerations with limits."""
+"""Samples a motion at 1 kHz and compares positions, velocities, accelerations and jerks with limits."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def check(motion: Motion, limits: Mapping[str, Limits]) -> Verdict:
     """Compare a motion with limits, which must be known of all its coordinates.
 
     Velocities and accelerations are looked at twice: as the cubics have them at every moment, and as differences of positions a
-    millisecond apart, which know of no cubics.
+    millisecond apart, which know of no cubics. Jerks are differences of accelerations.
     """
     count = int(np.floor((motion.times[-1] - motion.times[0]) * RATE + 1e-9))
     times = motion.times[0] + np.arange(count + 1) / RATE
@@ -63,6 +63,8 @@ def check(motion: Motion, limits: Mapping[str, Limits]) -> Verdict:
             for column in columns:
                 found += _worst(what, name, np.abs(column) - (1.0 + SLACK) * limit, times, column, limit)
                 shares[what] = max(shares[what], float(np.abs(column).max() / limit))
+        slope = np.diff(accelerations[:, k]) * RATE  # where accelerations jump, it is as steep as can be
+        found += _worst("jerk", name, np.abs(slope) - (1.0 + SLACK) * own.jerk, times, slope, own.jerk)
         ends = motion.velocities[[0, -1], k]
         found += _worst("rest", name, np.abs(ends) - REST, motion.times[[0, -1]], ends, 0.0)
     return Verdict(len(times), found, **shares)

@@ -6,7 +6,7 @@ import csv
 import json
 import math
 import xml.etree.ElementTree as ElementTree
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,7 @@ class Limits:
     high: float = math.inf
     velocity: float = math.inf
     acceleration: float = math.inf
+    jerk: float = math.inf
 
 
 def read_npz(path: Path) -> tuple[Motion, dict[str, Any]]:
@@ -67,7 +68,8 @@ def limits_of(about: dict[str, Any], plan: Path) -> dict[str, Limits]:
     found = _robot(scene, folder)
     for item in scene.get("objects") or ():
         found |= _object(item, folder)
-    return found
+    grows = about["options"].get("jerk_time", 0.0)
+    return {name: replace(own, jerk=own.acceleration / grows) for name, own in found.items()} if grows else found
 
 
 def _robot(scene: dict[str, Any], folder: Path) -> dict[str, Limits]:

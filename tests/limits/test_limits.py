@@ -5,11 +5,13 @@ from __future__ import annotations
 import ast
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import vkc_pin as vkc
 from limits.__main__ import main
 from limits.check import check
 from limits.files import Motion, limits_of, read_csv, read_npz
@@ -79,6 +81,22 @@ def test_what_exceeds_a_limit_is_found(plans: list[Path], change: Callable[[Moti
     motion, about = read_npz(plans[0])
     verdict = check(change(motion), limits_of(about, plans[0]))
     assert what in {excess.what for excess in verdict.found}, [str(excess) for excess in verdict.found]
+
+
+def test_limits_of_jerk_are_kept_and_only_those_motions_keep_them(plans: list[Path], tmp_path: Path) -> None:
+    scene, options = vkc.load_scene("drawer"), vkc.Options(jerk_time=0.1)
+    plan = vkc.plan(scene, [vkc.Actuate("drawer", {"slide": 0.3})], options=options)
+    assert plan.success
+    file = plan.save(tmp_path / "eased.npz")
+    motion, about = read_npz(file)
+    limits = limits_of(about, file)
+    assert limits["elbow_joint"].jerk == pytest.approx(14.0)
+    verdict = check(motion, limits)
+    assert not verdict.found, [str(excess) for excess in verdict.found]
+    assert {excess.what for excess in check(_faster(motion), limits).found} >= {"jerk"}
+    plain, said = read_npz(plans[0])
+    own = {name: replace(limit, jerk=10.0 * limit.acceleration) for name, limit in limits_of(said, plans[0]).items()}
+    assert "jerk" in {excess.what for excess in check(plain, own).found}
 
 
 def test_it_shares_nothing_with_the_package() -> None:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 
 from vkc_pin.errors import InputError
-from vkc_pin.motion.curve import Curve, joined
+from vkc_pin.motion.curve import Curve, joined, moments_at
 
 
 def some(seed: int, knots: int = 7, size: int = 3) -> Curve:
@@ -27,6 +27,12 @@ def test_it_is_scipys(seed: int, knots: int) -> None:
         np.testing.assert_allclose(mine(moments), other(moments, order), rtol=0.0, atol=1e-9)
         np.testing.assert_allclose(mine(moments[3]), other(moments[3], order), rtol=0.0, atol=1e-9)
         assert mine(moments.reshape(8, 5)).shape == (8, 5, 3)
+
+
+def test_moments_are_at_shares_of_every_span() -> None:
+    knots, shares = np.array([0.0, 1.0, 4.0]), np.array([0.0, 0.5, 1.0])
+    np.testing.assert_allclose(moments_at(knots, shares), [0.0, 0.5, 1.0, 1.0, 2.5, 4.0])
+    np.testing.assert_allclose(moments_at(knots, shares[:2], last=True), [0.0, 0.5, 1.0, 2.5, 4.0])
 
 
 def test_outside_all_stands_still() -> None:

@@ -138,7 +138,7 @@ def _timed(
         return validate(scene, steps, motion, options)
 
     if not failed:
-        timed, report = accepted(scene, trajectory, check)
+        timed, report = accepted(scene, trajectory, check, jerk_time=options.jerk_time)
         if report.ok:
             return timed, report
     return trajectory, check(trajectory)

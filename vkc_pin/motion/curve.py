@@ -13,7 +13,7 @@ from vkc_pin.arguments import numbers
 from vkc_pin.arrays import Floats, Ints
 from vkc_pin.errors import InputError
 
-__all__ = ["SHORTEST", "Curve", "evenly", "joined"]
+__all__ = ["SHORTEST", "Curve", "evenly", "joined", "moments_at"]
 
 SHORTEST = 1e-9
 """Least time from knot to knot [s]."""
@@ -118,6 +118,18 @@ class Curve:
         strongest = np.max(np.abs([2.0 / h * (middle - first), 2.0 / h * (last - middle)]), axis=0)
         return np.asarray(fastest), np.asarray(strongest)
 
+    def jerks(self) -> tuple[Floats, Floats]:
+        """Return the |jerk| of each cubic, shape (K − 1, n), and by how much accelerations jump at each knot, shape (K, n).
+
+        Before the first and after the last one, all stands still.
+        """
+        h = np.diff(self.times)[:, None]
+        p, c, d, q = self._control(np.arange(len(h)))
+        begin, end = (6.0 / h**2 * part for part in ((d - c) - (c - p), (q - d) - (d - c)))
+        none = np.zeros((1, self.positions.shape[1]))
+        jumps = np.concatenate([begin, none]) - np.concatenate([none, end])
+        return np.abs(end - begin) / h, np.abs(jumps)
+
     def part(self, begin: float, end: float, columns: Sequence[int] | slice = slice(None)) -> Curve:
         """Return what lies between two of the knots' times [s], of some columns."""
         rows = slice(int(np.searchsorted(self.times, begin)), int(np.searchsorted(self.times, end, side="right")))
@@ -163,6 +175,18 @@ def evenly(times: Floats, rate: float) -> Floats:
     """Return so many moments a second between the first and the last of some times [s], and the last."""
     duration = times[-1] - times[0]
     return np.append(times[0] + np.arange(np.ceil(duration * rate - 1e-6)) / rate, times[-1])
+
+
+def moments_at(knots: Floats, shares: Floats, *, last: bool = False) -> Floats:
+    """Return moments at some shares of every span between knots, shape (k,), one span after the other, and the last knot.
+
+    Args:
+        knots: Shape (K,).
+        shares: From 0 to 1.
+        last: Whether the last knot comes after them.
+    """
+    inside = (knots[:-1, None] + np.diff(knots)[:, None] * shares).ravel()
+    return np.append(inside, knots[-1]) if last else inside
 
 
 def joined(pieces: Sequence[Curve]) -> Curve:

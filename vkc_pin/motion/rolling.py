@@ -14,7 +14,7 @@ import numpy as np
 from vkc_pin.arrays import Floats
 from vkc_pin.models.robot import Robot
 
-__all__ = ["ANYWHERE", "Rolling", "rolling_of"]
+__all__ = ["ANYWHERE", "Rolling", "rolling_of", "seen"]
 
 _STANDS = 1e-4  # [m] along, up to which a step goes neither ahead nor back
 
@@ -44,9 +44,7 @@ class Rolling:
     def steps(path: Floats) -> tuple[Floats, Floats, Floats]:
         """Return how far steps of z_0..z_N, shape (N + 1, ≥ 3), go along and aside [m], and turn [rad], shape (N,) each."""
         dx, dy, turn = np.diff(path[:, :3], axis=0).T
-        heading = path[:-1, 2] + turn / 2
-        cos, sin = np.cos(heading), np.sin(heading)
-        return cos * dx + sin * dy, cos * dy - sin * dx, turn
+        return *seen(dx, dy, path[:-1, 2] + turn / 2), turn
 
     def error(self, path: Floats) -> float:
         """Return how far it goes aside in the worst step, or how much too short a step is for its turn [m]."""
@@ -72,6 +70,12 @@ class Rolling:
             return np.zeros(len(path) - 1)
         along, _, turn = self.steps(path)
         return np.asarray((np.abs(along) + self.track / 2 * np.abs(turn)) / self.rim)
+
+
+def seen(x: Floats, y: Floats, yaws: Floats) -> tuple[Floats, Floats]:
+    """Return vectors (x, y), shape (K,) each, as a base with these headings sees them: along and aside, shape (K,) each."""
+    cos, sin = np.cos(yaws), np.sin(yaws)
+    return cos * x + sin * y, cos * y - sin * x
 
 
 ANYWHERE = Rolling(aside=True)

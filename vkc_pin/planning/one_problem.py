@@ -236,7 +236,8 @@ class OneProblem:
             trajectory, report = waypoints, self._check(waypoints)
         else:
             repairs = {} if solution.converged else {"repairs": 0}  # what is wrong with others is not the curve's fault
-            trajectory, report = accepted(self.scene, waypoints, self._check, **repairs)
+            jerk_time = self.settings.options.jerk_time
+            trajectory, report = accepted(self.scene, waypoints, self._check, jerk_time=jerk_time, **repairs)
         self.times["retiming"] += time.perf_counter() - began - (self.times["validation"] - checked)
         status = "success" if report.ok else "rejected" if solution.converged else "not converged"
         return _Try(name, solution.z, trajectory, report, status)

@@ -90,6 +90,22 @@ QUANTITIES: tuple[Quantity, ...] = (
 """What is drawn, from left to right."""
 
 
+def _jerk() -> Quantity:
+    """Return what is drawn as well where jerks are limited; they are the same all along each of a curve's cubics."""
+
+    def values(plan: Judged, times: Floats) -> tuple[Floats, Floats]:
+        curve = plan.trajectory.curve
+        assert curve is not None
+        edges = curve.acceleration(curve.times[:-1] + 0.5 * np.diff(curve.times)) - curve.acceleration(curve.times[:-1])
+        jerks = 2.0 * edges / np.diff(curve.times)[:, None]
+        return curve.times, np.concatenate([jerks, jerks[-1:]])
+
+    def limit(plan: Judged, name: str) -> float:
+        return _limit("acceleration")(plan, name) / plan.options.jerk_time
+
+    return Quantity("jerk", {"m": "m/s³", "rad": "rad/s³"}, values, limit, lambda motion: {"drawstyle": "steps-post"})
+
+
 def groups_of(trajectory: Trajectory) -> dict[str, list[int]]:
     """Return the columns of a trajectory by what they belong to."""
     names, robot = trajectory.names, trajectory.robot_size
@@ -100,12 +116,14 @@ def groups_of(trajectory: Trajectory) -> dict[str, list[int]]:
 def draw_joints(figure: FigureBase, plan: Judged) -> None:
     """Draw all quantities, a row each for base, arm and objects."""
     groups, motion = groups_of(plan.trajectory), plan.trajectory
-    axes: Any = figure.subplots(len(groups), len(QUANTITIES), sharex=True, squeeze=False)
+    eased = motion.curve is not None and plan.options.jerk_time > 0.0
+    drawn = (*QUANTITIES, _jerk()) if eased else QUANTITIES
+    axes: Any = figure.subplots(len(groups), len(drawn), sharex=True, squeeze=False)
     parts = [np.linspace(motion.times[0], motion.times[-1], SAMPLES), motion.times]
     if motion.curve is not None:
         parts += [motion.curve.times, motion.curve.times[1:] - _BEFORE]
     fine = np.unique(np.concatenate(parts))
-    for quantity, column in zip(QUANTITIES, axes.T, strict=True):
+    for quantity, column in zip(drawn, axes.T, strict=True):
         moments, values = quantity.values(plan, fine)
         for place, (group, own) in zip(column, groups.items(), strict=True):
             _draw(place, plan, quantity, group, own, moments, values)

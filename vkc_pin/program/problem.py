@@ -69,7 +69,8 @@ class TrajectoryProblem:
         self.effort = self._effort()
         self.start = self._start()
         self.lower, self.upper = self._bounds()
-        _freeze(self.start, self.lower, self.upper)
+        for array in (self.start, self.lower, self.upper):
+            array.setflags(write=False)
         self.term_numbers = TermNumbers(self.terms, self.transcription, self.start)
         self.term_numbers.check(self.still, np.full(self.segments, options.dt))
 
@@ -77,7 +78,8 @@ class TrajectoryProblem:
         """Return the same problem with other bounds of z_1..z_N, shape (N, n)."""
         other = copy.copy(self)
         other.lower, other.upper = lower.copy(), upper.copy()
-        _freeze(other.lower, other.upper)
+        for array in (other.lower, other.upper):
+            array.setflags(write=False)
         return other
 
     @property
@@ -296,8 +298,3 @@ class TrajectoryProblem:
             f"<TrajectoryProblem {' → '.join(p.name for p in self.task.phases)}: {self.segments} steps in {time:g} s, "
             f"{t.size} variables, {t.rows} rows, {sum(len(p.pairs) for p in self.contacts.phases)} collision pairs>"
         )
-
-
-def _freeze(*arrays: Floats) -> None:
-    for array in arrays:
-        array.flags.writeable = False

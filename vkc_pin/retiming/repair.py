@@ -40,7 +40,7 @@ R = TypeVar("R", bound=_Report)
 
 
 def accepted(
-    scene: Scene, waypoints: Trajectory, check: Callable[[Trajectory], R], *, repairs: int = _REPAIRS
+    scene: Scene, waypoints: Trajectory, check: Callable[[Trajectory], R], *, repairs: int = _REPAIRS, jerk_time: float = 0.0
 ) -> tuple[Trajectory, R]:
     """Return a motion through waypoints, see `retimed`, and what a check says of it; a last one, if none is accepted.
 
@@ -51,15 +51,16 @@ def accepted(
         waypoints: The waypoints, with as much time as they please.
         check: Looks at a motion.
         repairs: How often it is drawn closer to the straight lines.
+        jerk_time: See `Options.jerk_time`.
     """
     parts = np.ones(len(waypoints.times) - 1, int)
-    trajectory = retimed(scene, waypoints)
+    trajectory = retimed(scene, waypoints, jerk_time=jerk_time)
     report = check(trajectory)
     for _ in range(repairs):
         near = {found.waypoint + k for found in report.violations for k in (-1, 0, 1) if found.constraint != "torque"}
         if not near:  # all is well, or too heavy on whatever curve
             break
         parts[[k for k in near if 0 <= k < len(parts)]] *= 2
-        trajectory = retimed(scene, waypoints, parts)
+        trajectory = retimed(scene, waypoints, parts, jerk_time=jerk_time)
         report = check(trajectory)
     return trajectory, report

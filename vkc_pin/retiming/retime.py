@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vkc_pin.arrays import Bools, Floats, Ints
 from vkc_pin.driving.curves import between
-from vkc_pin.motion.curve import SHORTEST, Curve, joined
+from vkc_pin.motion.curve import SHORTEST, Curve, joined, moments_at
 from vkc_pin.motion.dynamics.torques import Torques
 from vkc_pin.motion.rolling import Rolling, rolling_of
 from vkc_pin.motion.trajectory import Trajectory
+from vkc_pin.retiming.easing import eased
+from vkc_pin.retiming.limits import Limits
 from vkc_pin.retiming.loads import Load
 from vkc_pin.retiming.parametrization import speeds_along
 from vkc_pin.retiming.path import path_through
@@ -32,42 +34,13 @@ _STILL = 1e-6  # [m] or [rad] of a step in which a joint of an object stays wher
 _SHORT = 1e-6  # share of a second at full speed that a step takes which is none
 _SHORTEST = 1e-3  # [s] of a step in which nothing moves, unless a hand opens or closes in it
 _ROUNDING = 1e-9  # relative
+_JUMP = 1e-4  # of an acceleration, as a share of its limit, that is none
 _PASSES, _SETTLED = 4, 0.02  # of the search for speeds that torques allow, and how far apart two are, relative, that end it
 _SLIP = 2e-4  # [m/s] aside for which a base on wheels gets no more knots, a fifth of what counts as slipping
 _FINEST = 8  # times as many of them, at most
 
 
-class _Limits(NamedTuple):
-    """Limits of coordinates, shape (n,) each, SI units."""
-
-    lower: Floats
-    upper: Floats
-    velocity: Floats
-    acceleration: Floats
-
-    @classmethod
-    def of(cls, scene: Scene, names: Sequence[str]) -> _Limits:
-        """Return the limits (eqs. 4 and 5) of the robot's coordinates and "<object>.<joint>"; freedoms of grasps have none."""
-        robot, known = scene.robot, dict[str, tuple[float, ...]]()
-        sources = [("", robot.coordinates.names, (robot.lower, robot.upper, robot.velocity, robot.acceleration))]
-        for owner, placed in scene.objects.items():
-            item = placed.object
-            sources.append((f"{owner}.", item.coordinates.names, (item.lower, item.upper, item.velocity, item.acceleration)))
-        for prefix, own, values in sources:
-            known |= {prefix + name: tuple(row) for name, row in zip(own, np.transpose(values).tolist(), strict=True)}
-        return cls(*np.array([known.get(name, (-np.inf, np.inf, np.inf, np.inf)) for name in names]).T)
-
-    def with_wheels(self, rolling: Rolling) -> _Limits:
-        """Return the limits of the wheels of a base, left and right, after the others.
-
-        Nothing is said of their accelerations: what those of the base come to.
-        """
-        strongest = self.acceleration[:2].sum() + rolling.track / 2 * self.acceleration[2]
-        wheel = (-np.inf, np.inf, rolling.rim, strongest)
-        return _Limits(*(np.append(side, [value, value]) for side, value in zip(self, wheel, strict=True)))
-
-
-def retimed(scene: Scene, trajectory: Trajectory, parts: Ints | None = None) -> Trajectory:
+def retimed(scene: Scene, trajectory: Trajectory, parts: Ints | None = None, *, jerk_time: float = 0.0) -> Trajectory:
     """Return a motion along smooth curves through the same waypoints, from rest to rest, as fast as its limits let it be.
 
     It rests where it does not move from one waypoint to the next; if a phase begins with that, as where a hand opens or closes,
@@ -75,15 +48,19 @@ def retimed(scene: Scene, trajectory: Trajectory, parts: Ints | None = None) -> 
     corner. Between two rests it goes along one path, see `path_through`, at the speeds of `speeds_along`; where none are known,
     straight from waypoint to waypoint, with a stop at each. A base on wheels goes along `rolling_paths`. The cubics in
     time through the places at which speeds are known are slowed down until they keep the limits of velocity and acceleration
-    exactly, and of torque where these can be kept at all.
+    exactly, and of torque where these can be kept at all. With limits of jerk they are `eased`.
 
     Args:
         scene: Robot and objects.
         trajectory: The waypoints, with as much time as they please.
         parts: Into how many parts the straight line between two waypoints is cut, at whose ends the path passes, too, shape
             (T − 1,); None: one. The more of them, the less the path leaves the straight line.
+        jerk_time: See `Options.jerk_time`.
     """
-    limits, parts = _Limits.of(scene, trajectory.names), np.ones(len(trajectory.times) - 1, int) if parts is None else parts
+    limits, parts = (
+        Limits.of(scene, trajectory.names, jerk_time),
+        np.ones(len(trajectory.times) - 1, int) if parts is None else parts,
+    )
     rolling = rolling_of(scene.robot)
     places = np.concatenate([[0], np.cumsum(parts)])  # of the waypoints, among all points that the path passes
     positions = _divided(trajectory.positions, places, rolling)
@@ -135,7 +112,7 @@ def _runs(still: Bools, moves: Bools) -> Iterator[list[int]]:
     yield from (list(range(first, last)) for first, last in itertools.pairwise(edges))
 
 
-def _along(points: Floats, limits: _Limits, scale: Floats, rolling: Rolling, load: Load | None) -> list[tuple[Curve, Ints]]:
+def _along(points: Floats, limits: Limits, scale: Floats, rolling: Rolling, load: Load | None) -> list[tuple[Curve, Ints]]:
     """Return curves through waypoints, shape (m, n), from stop to stop, and which of their knots these are but for the first."""
     bounds = limits.lower, limits.upper
     if not rolling.aside:
@@ -143,12 +120,15 @@ def _along(points: Floats, limits: _Limits, scale: Floats, rolling: Rolling, loa
     found = _smooth(path_through(points, scale, bounds), points, limits, load)
     if found is not None:
         return [found]
+    if not limits.jerky:
+        steps = [_stepping(path_through(step, scale, bounds), step, limits) for step in map(np.array, itertools.pairwise(points))]
+        return [(curve if load is None else load.part(k, 1).slowed(curve), at) for k, (curve, at) in enumerate(steps)]
     straight = _straight(points, limits, np.zeros(len(points) - 1))
     return [(straight if load is None else load.slowed(straight), np.arange(1, len(points)))]
 
 
 def _rolling(
-    points: Floats, limits: _Limits, scale: Floats, rolling: Rolling, load: Load | None, finer: int = 1
+    points: Floats, limits: Limits, scale: Floats, rolling: Rolling, load: Load | None, finer: int = 1
 ) -> Iterator[tuple[Curve, Ints]]:
     """Yield the same of a base on wheels, with so many times the usual knots, or more where it would slip between them."""
     bounds, begin = (limits.lower[:-2], limits.upper[:-2]), 0
@@ -167,7 +147,7 @@ def _rolling(
             yield found
 
 
-def _smooth(path: CubicHermiteSpline, points: Floats, limits: _Limits, load: Load | None) -> tuple[Curve, Ints] | None:
+def _smooth(path: CubicHermiteSpline, points: Floats, limits: Limits, load: Load | None) -> tuple[Curve, Ints] | None:
     """Return a curve along a path through waypoints, shape (m, n), see `_along`; None: how fast it can be is not known.
 
     The path, and the limits, may have further columns that are none of the motion's. Torques are looked at when the curve is
@@ -175,13 +155,11 @@ def _smooth(path: CubicHermiteSpline, points: Floats, limits: _Limits, load: Loa
     """
     knots = (len(path.x) - 1) // (len(points) - 1)  # a step
     parts = knots * max(_PARTS // knots, 1)
-    shares = np.arange(parts // knots) / (parts // knots)
-    places = np.append((path.x[:-1, None] + np.diff(path.x)[:, None] * shares).ravel(), path.x[-1])
+    places = moments_at(path.x, np.arange(parts // knots) / (parts // knots), last=True)
     speeds = speeds_along(path, places, limits.velocity, limits.acceleration)
     if speeds is None:
         return None
-    waypoints = np.arange(1, len(points)) * parts
-    curve = _timed(path, places, points, speeds, limits)
+    curve, waypoints = _timed(path, places, points, speeds, limits)
     if load is None or np.abs(load.of(curve)).max() <= 1.0 or np.abs(load.split(curve)[0]).max() >= 1.0:
         return curve, waypoints  # or it is too heavy however slow it is
     for _ in range(_PASSES):  # drag is not linear in the square of the speed: it is taken as it is around the speed before
@@ -192,47 +170,51 @@ def _smooth(path: CubicHermiteSpline, points: Floats, limits: _Limits, load: Loa
         settled, speeds = np.allclose(slower, speeds, rtol=_SETTLED), slower
         if settled:
             break
-    return load.slowed(_timed(path, places, points, speeds, limits)), waypoints
+    curve, waypoints = _timed(path, places, points, speeds, limits)
+    return load.slowed(curve), waypoints
 
 
-def _timed(path: CubicHermiteSpline, places: Floats, points: Floats, speeds: Floats, limits: _Limits) -> Curve:
-    """Return a path through waypoints, shape (m, n), gone along with speeds at places, shape (K,)."""
+def _timed(path: CubicHermiteSpline, places: Floats, points: Floats, speeds: Floats, limits: Limits) -> tuple[Curve, Ints]:
+    """Return a path through waypoints, shape (m, n), gone along with speeds at places, shape (K,), and the waypoints' knots."""
     times = np.concatenate([[0.0], np.cumsum(2.0 * np.diff(places) / (speeds[1:] + speeds[:-1]))])
-    return _through(_slowed(Curve(times, path(places), path(places, 1) * speeds[:, None]), limits), points)
+    return _paced(path, Curve(times, places[:, None], speeds[:, None]), points, limits)
 
 
-def _stepping(path: CubicHermiteSpline, points: Floats, limits: _Limits) -> tuple[Curve, Ints]:
+def _paced(path: CubicHermiteSpline, pace: Curve, points: Floats, limits: Limits) -> tuple[Curve, Ints]:
+    """Return a path through waypoints, shape (m, n), gone along at a pace, or slower, and the waypoints' knots."""
+    if limits.jerky:
+        places = pace.positions[:, 0]
+        curve = limits.slowed(Curve(pace.times, path(places), path(places, 1) * pace.rates))
+    else:
+        curve = eased(path, pace, len(points) - 1, limits)
+    size, positions = points.shape[1], np.array(curve.positions[:, : points.shape[1]])
+    parts = (len(positions) - 1) // (len(points) - 1)
+    positions[::parts] = points  # to the last bit
+    return Curve(curve.times, positions, curve.rates[:, :size]), np.arange(1, len(points)) * parts
+
+
+def _stepping(path: CubicHermiteSpline, points: Floats, limits: Limits) -> tuple[Curve, Ints]:
     """Return a curve along a path from one waypoint to the next, shape (2, n), between which it is 3s² − 2s³ of the way."""
     length, share = path.x[-1], np.linspace(0.0, 1.0, len(path.x))
     places, speeds = length * (3.0 - 2.0 * share) * share**2, length * 6.0 * (share - share**2) / _SHORTEST
-    curve = _slowed(Curve(share * _SHORTEST, path(places), path(places, 1) * speeds[:, None]), limits)
-    return _through(curve, points), np.array([len(share) - 1])
+    return _paced(path, Curve(share * _SHORTEST, places[:, None], speeds[:, None]), points, limits)
 
 
-def _through(curve: Curve, points: Floats) -> Curve:
-    """Return a curve that passes waypoints, shape (m, n), to the last bit, without what are no coordinates of these."""
-    size, positions = points.shape[1], np.array(curve.positions[:, : points.shape[1]])
-    positions[:: (len(positions) - 1) // (len(points) - 1)] = points
-    return Curve(curve.times, positions, curve.rates[:, :size])
-
-
-def _straight(points: Floats, limits: _Limits, least: Floats) -> Curve:
+def _straight(points: Floats, limits: Limits, least: Floats) -> Curve:
     """Return the straight way through waypoints, shape (m, n), that takes at least so long a step, shape (m − 1,) [s].
 
-    It rests at each: 3s² − 2s³ has a speed of 1.5 at most, and a change of it by 6.
+    It rests at each: 3s² − 2s³ has a speed of 1.5 at most, and a change of it by 6, at once, to which with limits of jerk there
+    is next to nothing.
     """
     ways = np.abs(np.diff(points, axis=0))
+    strongest = limits.acceleration * (1.0 if limits.jerky else _JUMP)
     least = np.maximum.reduce(
-        [least, 1.5 * (ways / limits.velocity).max(axis=1), np.sqrt(6.0 * (ways / limits.acceleration).max(axis=1))]
+        [
+            least,
+            1.5 * (ways / limits.velocity).max(axis=1),
+            np.sqrt(6.0 * (ways / strongest).max(axis=1)),
+            np.cbrt(12.0 * (ways / limits.jerk).max(axis=1)),
+        ]
     )
     times = np.concatenate([[0.0], np.cumsum(np.maximum(least, SHORTEST) * (1.0 + _ROUNDING))])
     return Curve(times, points, np.zeros_like(points))
-
-
-def _slowed(curve: Curve, limits: _Limits) -> Curve:
-    """Return a curve as it is, or slower by the factor that it takes to keep the limits."""
-    fastest, strongest = curve.speeds()
-    factor = max(1.0, float((fastest / limits.velocity).max()), float(np.sqrt((strongest / limits.acceleration).max()))) * (
-        1.0 + _ROUNDING
-    )
-    return Curve(curve.times * factor, curve.positions, curve.rates / factor)

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vkc_pin.arrays import Bools, Floats
-from vkc_pin.motion.curve import Curve
-from vkc_pin.motion.rolling import Rolling
+from vkc_pin.motion.curve import Curve, moments_at
+from vkc_pin.motion.rolling import Rolling, seen
 from vkc_pin.retiming.path import path_through
 
 if TYPE_CHECKING:
@@ -60,9 +60,10 @@ def rolling_paths(
 
 def slip(curve: Curve) -> float:
     """Return how fast the base moves aside at most [m/s]."""
-    moments = (curve.times[:-1, None] + np.diff(curve.times)[:, None] * (np.arange(_LOOKS) / _LOOKS)).ravel()
+    moments = moments_at(curve.times, np.arange(_LOOKS) / _LOOKS)
     (vx, vy), yaw = curve.velocity(moments)[:, :2].T, curve.at(moments)[:, 2]
-    return float(np.abs(np.cos(yaw) * vy - np.sin(yaw) * vx).max())
+    _, aside = seen(vx, vy, yaw)
+    return float(np.abs(aside).max())
 
 
 def _corner(points: Floats, wrong: Bools, rolling: Rolling) -> int:
@@ -87,8 +88,7 @@ def _rolled(
     parts = finer * max(_PARTS, int(np.ceil(np.abs(turn).max() / _TURN)))
     steps = _Steps(points[:, :3], path(path.x, 1)[:, [2, -1]], np.diff(path.x), np.diff(driven), parts)
     left = steps.fit()
-    spans = np.diff(path.x)
-    at = np.append((path.x[:-1, None] + spans[:, None] * (np.arange(parts) / parts)).ravel(), path.x[-1])
+    at = moments_at(path.x, np.arange(parts) / parts, last=True)
     base, slopes, wheels = steps.at_knots(left)
     half = rolling.track / 2 * np.array([-1.0, 1.0])
     values = np.column_stack([base, path(at)[:, 3:-1], wheels[0][:, None] + half * base[:, 2:]])

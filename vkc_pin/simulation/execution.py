@@ -25,7 +25,7 @@ from vkc_pin.simulation.grips import Grips, Latches, latched, spans
 from vkc_pin.simulation.model import Builder, PhysicalWorld
 from vkc_pin.simulation.physics import Physics, engine, weigh
 from vkc_pin.simulation.result import SimulationResult, Tracking
-from vkc_pin.simulation.servos import Servo, finger_rows, reference, servos
+from vkc_pin.simulation.servos import Servo, efforts_for, finger_rows, reference, servos
 from vkc_pin.task.steps import Step, as_list
 
 __all__ = ["GRASPS", "simulate"]
@@ -145,13 +145,12 @@ class _Run:
         data = mj.MjData(model)
         data.qpos[:] = self.physical.qpos(self.tree.start)
         mj.mj_forward(model, data)
-        positions, velocities, accelerations = reference(self.trajectory, self.times)
+        motion = reference(self.trajectory, self.times)
         fingers = finger_rows(self.tree, self.planned, self.trajectory.times, self.times)
-        wanted = np.column_stack([positions, fingers])
-        gains = [[servo.damping / servo.stiffness, servo.inertia / servo.stiffness] for servo in self.servos]
-        commands, still = wanted.copy(), np.zeros_like(fingers)
-        for gain, rates in zip(np.transpose(gains), (velocities, accelerations), strict=True):
-            commands += gain * np.column_stack([rates, still])
+        wanted = np.column_stack([motion[0], fingers])
+        ahead = efforts_for(self.tree, self.servos, wanted, motion)
+        ahead[:, : motion[1].shape[1]] += motion[1] * [servo.damping for servo in self.servos[: motion[1].shape[1]]]
+        commands = wanted + ahead / [servo.stiffness for servo in self.servos]
         if self.squeezes is not None and self.fingers is not None:
             closing, commanded = self.fingers.addresses(self.physical)
             rest = fingers if self.fingers.sides is None else np.zeros((len(self.times), len(closing)))

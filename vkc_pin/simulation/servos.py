@@ -10,11 +10,14 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.arrays import Floats
+from vkc_pin.models.coordinates import Coordinates
+from vkc_pin.motion.dynamics.torques import in_base_axes
+from vkc_pin.motion.rolling import seen
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.motion.world import World
 from vkc_pin.simulation.physics import Physics
 
-__all__ = ["Servo", "finger_rows", "position_servo", "reference", "servos"]
+__all__ = ["Servo", "efforts_for", "finger_rows", "position_servo", "reference", "servos"]
 
 _UNLIMITED = 1e300  # Pinocchio's efforts above this are none
 _SPIN_UP = 1.0 / 1500.0  # [s²] full effort would accelerate a joint's own rotor by 1500 rad/s²: 0.1 kg·m² at 150 N·m
@@ -26,7 +29,7 @@ _SPAN = 0.01  # [s] over which velocities are taken
 
 @dataclass(frozen=True)
 class Servo:
-    """A position servo with feed-forward: stiffness · (z − actual) + damping · (ż − actual velocity) + inertia · z̈.
+    """A position servo with feed-forward: stiffness · (z − actual) + damping · (ż − actual velocity) + what z̈ takes.
 
     Attributes:
         coordinate: What it drives, by its name in the world.
@@ -115,6 +118,32 @@ def reference(trajectory: Trajectory, times: Floats) -> tuple[Floats, Floats, Fl
         return positions, velocities, accelerations
     ahead, behind = (trajectory.at(times + shift)[:, robot] for shift in (_SPAN / 2.0, -_SPAN / 2.0))
     return trajectory.at(times)[:, robot], (ahead - behind) / _SPAN, np.zeros_like(ahead)
+
+
+def efforts_for(world: World, servos: Sequence[Servo], rows: Floats, motion: tuple[Floats, Floats, Floats]) -> Floats:
+    """Return what motors have to do for a motion of base and arm by the robot's own model, shape (K, servos) [N·m], [N].
+
+    That is the inverse dynamics of the whole robot and the rotors, without its weight, which motors carry anyway: what a
+    controller adds that computes torques. Of what the hand holds it knows nothing.
+
+    Args:
+        world: The scene, all of whose bodies have masses.
+        servos: Of base, arm and fingers, as many as the rows have columns.
+        rows: Where these are, shape (K, servos).
+        motion: Positions, velocities and accelerations of base and arm, shape (K, robot's) each.
+    """
+    robot, size = world.scene.robot, motion[0].shape[1]
+    model = pin.Model(robot.model if robot.gripper is None else robot.gripper.model)
+    model.gravity = pin.Motion.Zero()
+    for joint in range(1, model.njoints):
+        model.inertias[joint] = world.model.inertias[joint]
+    velocities, accelerations = (np.pad(part, ((0, 0), (0, rows.shape[1] - size))) for part in motion[1:])
+    found = accelerations * [servo.armature for servo in servos]
+    v, a = in_base_axes(rows[:, 2], velocities, accelerations)
+    data = model.createData()
+    torques = np.array([pin.rnea(model, data, *state) for state in zip(Coordinates(model).q(rows), v, a, strict=True)])
+    torques[:, :2] = np.transpose(seen(torques[:, 0], torques[:, 1], -rows[:, 2]))  # along the floor's axes, as the servos are
+    return found + torques
 
 
 def finger_rows(world: World, rows: Floats, known: Floats, times: Floats) -> Floats:

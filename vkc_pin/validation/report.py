@@ -26,9 +26,9 @@ class Violation:
     """One constraint that does not hold.
 
     Attributes:
-        constraint: "start", "limit", "velocity", "acceleration", "torque", "slip", "turning", "wheels", "dwell", "closure",
-            "latch", "unheld", "tips", "slide", "push", "opening", "goal", "order", "clearance", "penetration" or "term",
-            the user's own.
+        constraint: "start", "limit", "velocity", "acceleration", "jerk", "torque", "slip", "turning", "wheels", "dwell",
+            "closure", "latch", "unheld", "tips", "slide", "push", "opening", "goal", "order", "clearance", "penetration" or
+            "term", the user's own.
         subject: The coordinate, object, goal, term or pair of links it is about, e.g. "elbow_joint", "forearm_link – sofa".
         waypoint: Counted from 0; between two waypoints the earlier.
         time: [s].
@@ -56,7 +56,7 @@ class Bound:
 
     Attributes:
         subject: The coordinate whose limit it is; empty for a rest.
-        kind: "velocity", "acceleration", "torque", or "rest", where nothing moves.
+        kind: "velocity", "acceleration", "jerk", "torque", or "rest", where nothing moves.
         share: Of the duration, in which the motion is nearer to this limit than to any other, from 0 to 1.
         begin: Of the longest stretch in which that is so [s].
         end: Of the same [s].

@@ -8,6 +8,7 @@ import numpy as np
 
 from vkc_pin.arrays import Floats
 from vkc_pin.models.robot import Robot
+from vkc_pin.motion.curve import moments_at
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.samples import Samples
@@ -74,8 +75,7 @@ def _steps(motion: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
 def _along(motion: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
     """Return moments of a curve, how fast the base goes along and aside then [m/s], and turns [rad/s]."""
     assert motion.curve is not None
-    knots, shares = motion.curve.times, np.arange(_LOOKS) / _LOOKS
-    moments = np.append((knots[:-1, None] + np.diff(knots)[:, None] * shares).ravel(), knots[-1])
+    moments = moments_at(motion.curve.times, np.arange(_LOOKS) / _LOOKS, last=True)
     return moments, *_seen(motion.curve.velocity(moments)[:, :3], motion.curve.at(moments)[:, 2])
 
 

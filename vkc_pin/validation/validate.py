@@ -22,6 +22,7 @@ from vkc_pin.task.steps import Step, as_list
 from vkc_pin.task.terms import Term, traced
 from vkc_pin.validation.distances import Solids
 from vkc_pin.validation.goals import MOTION_TOLERANCE, check_goals, check_steps
+from vkc_pin.validation.motors.rates import check_rates
 from vkc_pin.validation.motors.torques import Motors
 from vkc_pin.validation.own_terms import check_terms
 from vkc_pin.validation.pairs import PairTable
@@ -36,10 +37,8 @@ __all__ = ["check_fits", "validate"]
 START_TOLERANCE = 1e-9  # [m] or [rad]
 LIMIT_TOLERANCE = 1e-5  # [m] or [rad]
 START_LIMIT_TOLERANCE = 1e-2  # [m] or [rad]: a start slightly outside its limits is where the robot is
-ACCEPTED_RATE_TOLERANCE = 1e-3  # excess over a limit, relative to it
 LATCH_TOLERANCE = 1e-4
 WAYPOINT_TOLERANCE = 1e-3  # [m] that clearance at a waypoint may fall short of dist_safe
-REST_TOLERANCE = 1e-6  # [m/s] or [rad/s]
 
 
 def validate(
@@ -55,7 +54,7 @@ def validate(
         terms: The user's own constraints; costs are nothing to check.
 
     Returns:
-        Every violated constraint: start, limits, velocity, acceleration, torque, bases that slip,
+        Every violated constraint: start, limits, velocity, acceleration, jerk, torque, bases that slip,
         turn tighter than they can or whose wheels turn too fast, closure, latches,
         rests in which the gripper closes or opens, how far it is open, joints of objects that nobody holds, what tips on what it
         stands on, hands that slide on what they clamp, pushes that would pull, goals and their order, clearance at waypoints and
@@ -86,8 +85,9 @@ class _Check:
 
     def report(self) -> Report:
         """Run every check."""
-        for check in (self._start, self._limits, self._rates, self._unheld, self._tips, self._latches):
+        for check in (self._start, self._limits, self._unheld, self._tips, self._latches):
             check()
+        self.found += check_rates(self.samples, self.options)
         self.found += check_rolling(self.samples)
         self.found += check_goals(self.samples, self.steps, self.options)
         self.found += check_terms(self.samples, self.terms)
@@ -105,7 +105,7 @@ class _Check:
             if violation.constraint == "penetration":
                 worst.pop(("clearance", violation.subject, violation.unit), None)
         ordered = tuple(sorted(worst.values(), key=lambda v: (v.time, v.constraint, v.subject, v.unit)))
-        close, states, facts = tuple(nearest.tolist()), len(self.samples.times), motors.facts()
+        close, states, facts = tuple(nearest.tolist()), len(self.samples.times), motors.facts(self.options.jerk_time)
         return Report(ordered, min(close), closure_error=error, closure_angle=angle, clearances=close, states=states, **facts)
 
     def _add(
@@ -152,29 +152,6 @@ class _Check:
                 out, ends = max(lower - value, value - upper), self.trajectory.column(name)[worst : worst + 2]
                 detail = f"{value:.4f} {unit} is outside {lower:.4f} to {upper:.4f} {unit} by {out:.4f} {unit}"
                 self._add("limit", name, out, unit, detail, waypoint=worst + int(np.argmin(np.abs(ends - value))))
-
-    def _rates(self) -> None:
-        """Velocities and accelerations stay within theirs (eq. 5), and a curve begins and ends at rest."""
-        curve, times = self.trajectory.curve, self.trajectory.times
-        if curve is None:
-            moments, velocities, accelerations = times, self.trajectory.velocities(), self.trajectory.accelerations()
-            rests = np.zeros((2, len(self.trajectory.names)))
-        else:
-            moments, (velocities, accelerations), rests = curve.times, curve.speeds(), np.abs(curve.rates[[0, -1]])
-        for i, name in enumerate(self.trajectory.names):
-            _, _, fastest, strongest = self.samples.bounds(name)
-            unit = self.samples.unit(name)
-            for kind, values, limit, per, when in (
-                ("velocity", velocities[:, i], fastest, "s", moments),
-                ("acceleration", accelerations[:, i], strongest, "s²", moments),
-                ("velocity", rests[:, i], REST_TOLERANCE, "s", times[[0, -1]]),
-            ):
-                worst = int(np.argmax(np.abs(values)))
-                value = abs(float(values[worst]))
-                if not value <= limit * (1 + ACCEPTED_RATE_TOLERANCE) + 1e-9:
-                    detail = f"{value:.3f} {unit}/{per} is more than {limit:.3f} {unit}/{per}"
-                    at = max(int(np.searchsorted(times, when[worst], side="right")) - 1, 0)
-                    self._add(kind, name, value - limit, f"{unit}/{per}", detail, waypoint=at)
 
     def _tips(self) -> None:
         """What something stands on stays level while it moves."""

@@ -49,3 +49,9 @@ def test_what_mujoco_does_not_understand(tmp_path: Path) -> None:
     (tmp_path / "t.xml").write_text('<mujoco><worldbody><geom type="bx" size="1 1 1"/></worldbody></mujoco>')
     with pytest.raises(InputError, match=r"t\.xml"):
         read_object_mjcf(tmp_path / "t.xml")
+
+
+def test_what_joints_resist_with(tmp_path: Path) -> None:
+    (tmp_path / "t.xml").write_text(MJCF.replace('name="hinge"', 'name="hinge" damping="0.4" frictionloss="0.2"'))
+    hinge = read_object_mjcf(tmp_path / "t.xml").joints["door"]
+    assert (hinge.damping, hinge.friction) == (0.4, 0.2)

@@ -54,3 +54,13 @@ def test_what_is_wrong_is_said_with_the_file(tmp_path: Path, old: str, new: str,
     assert old in SDF
     with pytest.raises(error, match=r"t\.sdf"):
         read(tmp_path, SDF.replace(old, new))
+
+
+def test_what_joints_resist_with(tmp_path: Path) -> None:
+    stated = "<dynamics><damping>0.4</damping><friction>0.2</friction></dynamics></axis>"
+    (tmp_path / "t.sdf").write_text(SDF.replace("</axis>", stated))
+    hinge = read_object_sdf(tmp_path / "t.sdf").joints["door"]
+    assert (hinge.damping, hinge.friction) == (0.4, 0.2)
+    (tmp_path / "t.sdf").write_text(SDF)
+    hinge = read_object_sdf(tmp_path / "t.sdf").joints["door"]
+    assert (hinge.damping, hinge.friction) == (0.0, 0.0)

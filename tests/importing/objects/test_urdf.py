@@ -53,3 +53,12 @@ def test_errors_name_file_and_element(tmp_path: Path) -> None:
     file.write_text(f'<robot name="t"><link name="a"><collision>{geometry}</collision></link></robot>')
     with pytest.raises(InputError, match=r"gone\.obj"):
         read_object_urdf(file)
+
+
+def test_what_joints_resist_with(tmp_path: Path) -> None:
+    text = """<robot name="t"><link name="a"/><link name="b"/><link name="c"/>
+    <joint name="j" type="continuous"><parent link="a"/><child link="b"/><dynamics damping="0.4" friction="0.2"/></joint>
+    <joint name="k" type="continuous"><parent link="b"/><child link="c"/><dynamics damping="-1"/></joint></robot>"""
+    (tmp_path / "t.urdf").write_text(text)
+    found = read_object_urdf(tmp_path / "t.urdf").joints
+    assert [(joint.damping, joint.friction) for joint in found.values()] == [(0.4, 0.2), (0.0, 0.0)]

@@ -31,7 +31,16 @@ def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
     )
     axis = np.array([0.6, 0.0, 0.8])
     joint = Joint(
-        name="hinge", kind="revolute", parent="a", child="b", placement=place, axis=axis, limits=(-0.2, 1.1), velocity=0.7
+        name="hinge",
+        kind="revolute",
+        parent="a",
+        child="b",
+        placement=place,
+        axis=axis,
+        limits=(-0.2, 1.1),
+        velocity=0.7,
+        damping=0.5,
+        friction=0.25,
     )
     links = {"a": Link("a", parts[:1], parts[:1]), "b": Link("b", parts, parts)}
     write_urdf(Description(tmp_path / "x", links, {"b": joint}), tmp_path / "thing.urdf")
@@ -40,6 +49,7 @@ def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
     assert yaml.safe_load((tmp_path / "thing.yaml").read_text()) == {"urdf": "thing.urdf", "attachments": []}
     item = vkc.load_object(tmp_path / "thing.yaml")
     assert (item.lower[0], item.upper[0], item.velocity[0]) == (-0.2, 1.1, 0.7)
+    assert (item.resistance["hinge"].damping, item.resistance["hinge"].friction) == (0.5, 0.25)
     turned = place * pin.SE3(pin.exp3(axis * 0.5), np.zeros(3))
     assert np.allclose(item.link_placement("b", [0.5]).homogeneous, turned.homogeneous, atol=1e-8)
     assert [shape.name for shape in item.collision.geometryObjects] == ["a_0", "b_0", "b_1", "b_2"]

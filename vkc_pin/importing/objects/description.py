@@ -93,6 +93,8 @@ class Joint:
         axis: Unit axis in the child's frame, shape (3,).
         limits: Lower and upper, [rad] or [m]; None if the file states none.
         velocity: Its limit, [rad/s] or [m/s]; None if the file states none.
+        damping: [N·m·s/rad] or [N·s/m]; 0 if the file states none.
+        friction: Coulomb's, [N·m] or [N]; 0 if the file states none.
     """
 
     name: str
@@ -103,6 +105,8 @@ class Joint:
     axis: Floats = field(default_factory=lambda: np.array([1.0, 0.0, 0.0]))
     limits: tuple[float, float] | None = None
     velocity: float | None = None
+    damping: float = 0.0
+    friction: float = 0.0
 
     def motion(self, value: float) -> pin.SE3:
         """Return the child's frame at a value, [rad] or [m], in its frame at zero."""

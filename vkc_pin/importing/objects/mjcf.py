@@ -98,6 +98,8 @@ class _Reader:
             placement=frames[parent].inverse() * frames[child],
             axis=np.asarray(frames[child].rotation.T @ self.data.xaxis[number]),
             limits=limits,
+            damping=float(np.ravel(model.dof_damping[model.jnt_dofadr[number]])[0]),
+            friction=float(model.dof_frictionloss[model.jnt_dofadr[number]]),
         )
 
     def _parts(self, body: int, frame: pin.SE3) -> tuple[tuple[Part, ...], tuple[Part, ...]]:

@@ -98,6 +98,7 @@ class _Reader:
     def _joint(self, child: str, joint: ElementTree.Element, frames: dict[str, pin.SE3]) -> Joint:
         name, kind, parent = joint.get("name", ""), joint.get("type", ""), self._text(joint, "parent")
         axis, limits, velocity = np.array([0.0, 0.0, 1.0]), None, None
+        resists = dict.fromkeys(("damping", "friction"), 0.0)
         if kind not in ("fixed", "revolute", "continuous", "prismatic"):
             self.notes.append(f"joint '{name}' is {kind}: taken as fixed")
             kind = "fixed"
@@ -117,6 +118,8 @@ class _Reader:
                 )
                 limits = (min(low, high), max(low, high)) if max(abs(low), abs(high)) < _NO_LIMIT else None
                 velocity = self._numbers(limit, "velocity", 1, "-1", name)[0]
+            if (dynamics := stated.find("dynamics")) is not None:
+                resists = {key: max(0.0, self._numbers(dynamics, key, 1, "0", name)[0]) for key in resists}
         if kind == "revolute" and limits is None:
             kind = "continuous"
         return Joint(
@@ -128,6 +131,7 @@ class _Reader:
             axis=axis,
             limits=None if kind == "continuous" else limits,
             velocity=velocity if velocity is not None and velocity > 0.0 else None,
+            **resists,
         )
 
     def _parts(self, link: str, kind: str, frame: pin.SE3) -> tuple[Part, ...]:

@@ -95,6 +95,11 @@ def _joint(file: Path, element: ElementTree.Element, limits: tuple[float, float]
     if axis is not None and kind not in ("fixed", "floating"):
         direction = np.array(numbers_of(file, axis, "xyz", 3, default="1 0 0", where=name))
     velocity = numbers_of(file, limit, "velocity", 1, default="0", where=name)[0] if limit is not None else 0.0
+    dynamics = element.find("dynamics")
+    resists = {
+        key: 0.0 if dynamics is None else max(0.0, numbers_of(file, dynamics, key, 1, default="0", where=name)[0])
+        for key in ("damping", "friction")
+    }
     ends = [(found.get("link", "") if (found := element.find(key)) is not None else "") for key in ("parent", "child")]
     return Joint(
         name=name,
@@ -105,4 +110,5 @@ def _joint(file: Path, element: ElementTree.Element, limits: tuple[float, float]
         axis=direction / np.linalg.norm(direction),
         limits=None if kind == "continuous" else limits,
         velocity=velocity if velocity > 0.0 else None,
+        **resists,
     )

@@ -130,6 +130,8 @@ def _joint(joint: Joint) -> list[str]:
     ]
     velocity = joint.velocity or DEFAULT_VELOCITY
     ends = "" if joint.limits is None else f'lower="{_numbers(joint.limits[:1])}" upper="{_numbers(joint.limits[1:])}" '
+    if joint.damping or joint.friction:
+        lines.append(f'    <dynamics damping="{_numbers([joint.damping])}" friction="{_numbers([joint.friction])}"/>')
     return [*lines, f'    <limit {ends}velocity="{_numbers([velocity])}" effort="{_numbers([_EFFORT])}"/>', "  </joint>"]
 
 

@@ -56,22 +56,34 @@ class Handle:
     def wrenches(self, motion: Motion) -> Floats:
         """Return the force and torque that the hand exerts at `point`, in the world's axes, shape (K, 6) [N], [N·m]."""
         thing, turn = self.placed.object, self.placed.placement.rotation
-        forces, z = self.forces(motion), self._rows(motion.positions, self.placed.state)
-        data, columns = self._own.createData(), [f"{self.name}.{name}" for name in self.attachment.coordinates]
+        forces, z = self.forces(motion)[:, self._moved], self._rows(motion.positions, self.placed.state)
+        columns = [f"{self.name}.{name}" for name in self.attachment.coordinates]
         values = np.column_stack([np.zeros((len(z), 0)), *(motion.positions[name] for name in columns)])
-        maps, bases, asked = list[Floats](), list[Floats](), list[Floats]()
-        for q, row, force in zip(thing.coordinates.q(z), values, forces, strict=True):
+        data, jacobians, links = self._own.createData(), np.empty((len(z), 6, self._own.nv)), list[pin.SE3]()
+        for k, q in enumerate(thing.coordinates.q(z)):
             pin.computeJointJacobians(self._own, data, q)
-            link = pin.updateFramePlacement(self._own, data, self._frame)
-            jacobian = pin.getFrameJacobian(self._own, data, self._frame, pin.LOCAL_WORLD_ALIGNED).reshape(6, -1)[:, self._moved]
-            point = (link * self.attachment.tool(row)).translation
-            ways = [np.concatenate([way[:3] + np.cross(way[3:], point - link.translation), way[3:]]) for way in jacobian.T]
-            maps.append(np.array([*ways, *self._freedoms(link, row, point)]).reshape(-1, 6))
-            bases.append(self._basis(link))
-            asked.append(np.concatenate([force[self._moved], np.zeros(len(maps[-1]) - len(ways))]))
-        basis = np.array(bases)
-        shares = np.linalg.pinv(np.array(maps) @ basis, rcond=_SINGULAR) @ np.array(asked)[..., None]
+            links.append(pin.updateFramePlacement(self._own, data, self._frame).copy())
+            jacobians[k] = pin.getFrameJacobian(self._own, data, self._frame, pin.LOCAL_WORLD_ALIGNED).reshape(6, -1)
+        turns = np.array([link.rotation for link in links])
+        points = np.array([link.translation for link in links]) + self._levers(turns, values)
+        ways = np.swapaxes(jacobians[:, :, self._moved], 1, 2)
+        ways[..., :3] += np.cross(ways[..., 3:], (points - [link.translation for link in links])[:, None])
+        free = [self._freedoms(*at) for at in zip(links, values, points, strict=True)]
+        maps = np.concatenate([ways, np.array(free).reshape(len(z), -1, 6)], axis=1)
+        asked = np.pad(forces, ((0, 0), (0, maps.shape[1] - forces.shape[1])))
+        basis = self._bases(turns)
+        shares = np.linalg.pinv(maps @ basis, rcond=_SINGULAR) @ asked[..., None]
         return np.asarray((basis @ shares)[..., 0] @ np.kron(np.eye(2), turn).T)
+
+    def _levers(self, turns: Floats, values: Floats) -> Floats:
+        """Return how far the hand is from the link that it holds, in the object's axes, shape (K, 3).
+
+        Args:
+            turns: Of the link, shape (K, 3, 3).
+            values: Of the grasp's freedoms, shape (K, f).
+        """
+        tools = np.array([self.attachment.tool(row).translation for row in (values if values.shape[1] else values[:1])])
+        return np.asarray((turns @ tools[..., None])[..., 0])
 
     def forces(self, motion: Motion) -> Floats:
         """Return what must be applied to the object's joints, shape (K, joints) [N], [N·m]; springs carry its own weight."""
@@ -113,8 +125,12 @@ class Handle:
             frame = frame * freedom.motion(value)
         return found
 
-    def _basis(self, link: pin.SE3) -> Floats:
-        """Return the wrenches that count alike, shape (6, r): forces, and torques by their lever; of a push that along it."""
+    def _bases(self, turns: Floats) -> Floats:
+        """Return the wrenches that count alike, shape (K, 6, r): forces, and torques by their lever; of a push that along it.
+
+        Args:
+            turns: Of the link, shape (K, 3, 3).
+        """
         if self.attachment.contact == "push":
-            return np.concatenate([link.rotation @ self.attachment.placement.rotation[:, 2], np.zeros(3)])[:, None]
-        return np.diag([1.0] * 3 + [_GRIP] * 3)
+            return np.pad(turns @ self.attachment.placement.rotation[:, 2], ((0, 0), (0, 3)))[..., None]
+        return np.tile(np.diag([1.0] * 3 + [_GRIP] * 3), (len(turns), 1, 1))

@@ -12,12 +12,13 @@ from vkc_pin.arrays import Floats, Ints
 from vkc_pin.models.articulation import ArticulatedObject
 from vkc_pin.models.dynamics.effort import Efforts
 from vkc_pin.motion.carrying import FreeObjects
-from vkc_pin.motion.curve import Curve
+from vkc_pin.motion.curve import Curve, moments_at
 from vkc_pin.motion.dynamics.handles import Handle, Motion
+from vkc_pin.motion.rolling import seen
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.scene.scene import Scene
 
-__all__ = ["Moments", "Torques", "moments_of"]
+__all__ = ["Moments", "Torques", "in_base_axes", "moments_of"]
 
 _SHARES = np.array([0.0, 0.5, 1.0])  # of each cubic at which it is looked at: accelerations jump at both ends
 
@@ -42,7 +43,7 @@ class Moments:
 def moments_of(curve: Curve) -> Moments:
     """Return the ends and the middle of every cubic of a curve, with its own accelerations at its ends."""
     spans, count = np.diff(curve.times), len(curve.times) - 1
-    times = (curve.times[:-1, None] + spans[:, None] * _SHARES).ravel()
+    times = moments_at(curve.times, _SHARES)
     begin, middle = curve.acceleration(curve.times[:-1]), curve.acceleration(curve.times[:-1] + 0.5 * spans)
     accelerations = begin[:, None] + 2.0 * _SHARES[None, :, None] * (middle - begin)[:, None]
     return Moments(
@@ -117,8 +118,7 @@ class Torques:
 
     def _in_phase(self, load: _Load, positions: Floats, velocities: Floats, accelerations: Floats) -> Floats:
         robot, size = self.scene.robot, self.trajectory.robot_size
-        v, a = velocities[:, :size].copy(), accelerations[:, :size].copy()
-        _to_base(positions[:, 2], v, a)
+        v, a = in_base_axes(positions[:, 2], velocities[:, :size], accelerations[:, :size])
         data, found = load.model.createData(), np.empty((len(positions), size))
         configurations = robot.coordinates.q(positions[:, :size])
         for k, q in enumerate(configurations):
@@ -126,11 +126,13 @@ class Torques:
         parts = (dict(zip(self.trajectory.names, part.T, strict=True)) for part in (positions, velocities, accelerations))
         motion, frame = Motion(*parts), load.model.getFrameId(robot.tool_frame)
         for handle in load.handles:
-            for k, (q, wrench) in enumerate(zip(configurations, handle.wrenches(motion), strict=True)):
-                jacobian = pin.computeFrameJacobian(load.model, data, q, frame, pin.LOCAL_WORLD_ALIGNED)
-                lever = data.oMf[frame].rotation @ handle.point.translation
-                wrench[3:] += np.cross(lever, wrench[:3])
-                found[k] += jacobian.T @ wrench
+            jacobians, turns = np.empty((len(positions), 6, load.model.nv)), np.empty((len(positions), 3, 3))
+            for k, q in enumerate(configurations):
+                jacobians[k] = pin.computeFrameJacobian(load.model, data, q, frame, pin.LOCAL_WORLD_ALIGNED)
+                turns[k] = data.oMf[frame].rotation
+            wrenches = handle.wrenches(motion)
+            wrenches[:, 3:] += np.cross(turns @ handle.point.translation, wrenches[:, :3])
+            found += np.einsum("kij,ki->kj", jacobians, wrenches)
         found[:, :3] = 0.0
         return found
 
@@ -180,13 +182,14 @@ def _whole(thing: ArticulatedObject, state: Floats) -> pin.Inertia:
     return sum((data.oMi[j].act(inertia) for j, inertia in enumerate(thing.model.inertias)), pin.Inertia.Zero())
 
 
-def _to_base(yaws: Floats, velocities: Floats, accelerations: Floats) -> None:
-    """Turn velocities and accelerations of the base in the world, shape (K, n), into those of Pinocchio's planar joint.
+def in_base_axes(yaws: Floats, velocities: Floats, accelerations: Floats) -> tuple[Floats, Floats]:
+    """Return velocities and accelerations of the base in the world, shape (K, n), as those of Pinocchio's planar joint.
 
     Its velocity is that in its own axes, which turn; its acceleration is the derivative of these numbers.
     """
-    cos, sin = np.cos(yaws), np.sin(yaws)
-    for rows in (velocities, accelerations):
-        rows[:, 0], rows[:, 1] = cos * rows[:, 0] + sin * rows[:, 1], cos * rows[:, 1] - sin * rows[:, 0]
-    accelerations[:, 0] += velocities[:, 2] * velocities[:, 1]
-    accelerations[:, 1] -= velocities[:, 2] * velocities[:, 0]
+    v, a = velocities.copy(), accelerations.copy()
+    for rows in (v, a):
+        rows[:, :2] = np.transpose(seen(rows[:, 0], rows[:, 1], yaws))
+    a[:, 0] += v[:, 2] * v[:, 1]
+    a[:, 1] -= v[:, 2] * v[:, 0]
+    return v, a

@@ -17,23 +17,25 @@ _STILL = 1e-9  # of a limit
 _LEAST = 5e-3  # of the duration: less is not told of
 
 
-def bounds(samples: Samples, moments: Moments, torques: Floats) -> tuple[Bound, ...]:
+def bounds(samples: Samples, moments: Moments, torques: Floats, jerk_time: float = 0.0) -> tuple[Bound, ...]:
     """Return what bounds a motion and for how long, the longest first; nothing without a curve.
 
     Args:
         samples: The motion.
         moments: When torques are known.
         torques: As shares of their limits, shape (K, robot's).
+        jerk_time: See `Options.jerk_time`.
     """
     curve, names = samples.trajectory.curve, samples.trajectory.names
     if curve is None:
         return ()
     limits = np.array([samples.bounds(name)[2:] for name in names]).T
     shares = [rates / limit for rates, limit in zip(curve.speeds(), limits, strict=True)]
+    shares.append(jerk_time * curve.jerks()[0] / limits[1])
     shares.append(np.zeros((len(curve.times) - 1, torques.shape[1])))
-    np.maximum.at(shares[2], moments.pieces, torques)
+    np.maximum.at(shares[-1], moments.pieces, torques)
     every = np.hstack(shares)
-    labels = [(name, kind) for kind in ("velocity", "acceleration") for name in names]
+    labels = [(name, kind) for kind in ("velocity", "acceleration", "jerk") for name in names]
     labels += [(name, "torque") for name in names[: torques.shape[1]]]
     moving = (np.hstack(shares[:2]) > _STILL).any(axis=1)
     nearest = np.where(moving, every.argmax(axis=1), len(labels))

@@ -82,10 +82,10 @@ class Motors:
             )
         return found
 
-    def facts(self) -> dict[str, Any]:
-        """Return what a report says of it."""
+    def facts(self, jerk_time: float = 0.0) -> dict[str, Any]:
+        """Return what a report says of it; `jerk_time` is that of `Options`."""
         notes = [f"torques not checked: {note}" for note in self._torques.efforts.notes]
         if self._torques.weightless:
             notes.append(f"carried as if it weighed nothing, as no mass is stated: {', '.join(self._torques.weightless)}")
-        found = bounds(self.samples, self.moments, self.shares)
+        found = bounds(self.samples, self.moments, self.shares, jerk_time)
         return {"torque": float(self.shares.max(initial=0.0)), "bounds": found, "remarks": tuple(notes)}

@@ -1,0 +1,74 @@
+"""`python -m tests.optimal --starts N --json FILE`: durations of plans beside the least ones along the same paths, as a table."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import vkc_pin as vkc
+from vkc_pin.benchmarks.executing.execution import TASKS
+from vkc_pin.benchmarks.harness.record import commit
+from vkc_pin.benchmarks.harness.tables import foot
+from vkc_pin.benchmarks.problems.problem_set import TASKS as ALL
+from vkc_pin.benchmarks.problems.problem_set import started
+from vkc_pin.datasets.running.machine import machine, peak_memory, versions
+
+from .bound import bound
+
+NAMES = tuple(dict.fromkeys([*TASKS, *(name for name in ALL if name.startswith("household"))]))
+"""The tasks of `bench execution`, and those of the household."""
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Return the table, a line a task, in Markdown."""
+    lines = [
+        "| task | plans | duration [s] | least along its path [s] | worst ratio | bounded by torques |",
+        "| --- | ---: | ---: | ---: | ---: | ---: |",
+    ]
+    for task in dict.fromkeys(row["task"] for row in rows):
+        own = [row for row in rows if row["task"] == task]
+        takes, least = (sum(row[field] for row in own) / len(own) for field in ("duration", "least"))
+        worst, heavy = max(row["duration"] / row["least"] for row in own), sum(row["heavy"] > 0 for row in own)
+        lines.append(f"| {task} | {len(own)} | {takes:.2f} | {least:.2f} | {worst:.3f} | {heavy} |")
+    return "\n".join(lines) + "\n"
+
+
+def report(result: Mapping[str, Any]) -> str:
+    """Return the table of a record in Markdown, with versions and machine at the foot."""
+    return table(result["trials"]) + "\n" + foot(result["meta"]) + "\n"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Plan, and compare; 1 if a motion takes more than 1.15 times as long as it has to."""
+    parser = argparse.ArgumentParser(prog="python -m tests.optimal", description=__doc__)
+    parser.add_argument("--starts", type=int, default=5, help="random starts a task")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--tasks", nargs="+", default=NAMES, choices=NAMES)
+    parser.add_argument("--json", type=Path, help="where to write the figures of each plan")
+    given = parser.parse_args(arguments)
+    rows, began, known = list[dict[str, Any]](), time.perf_counter(), machine()
+    for name in given.tasks:
+        for number in range(given.starts):
+            scene = started(name, given.seed, number)
+            plan = vkc.plan(scene, ALL[name].steps, seed=given.seed, effort=1_000_000)
+            if plan.success:
+                least, heavy = bound(plan.scene, plan.trajectory)
+                duration = float(plan.trajectory.times[-1])
+                row = {"task": name, "number": number, "duration": duration, "least": least, "heavy": heavy}
+                rows.append({**row, "commit": commit()})
+    if given.json is not None:
+        session = {"jobs": 1, "trials": len(rows), "seconds": round(time.perf_counter() - began, 1)}
+        meta = {"versions": versions(), "machine": known, "seed": given.seed, "starts": given.starts, "sessions": [session]}
+        meta["peak_memory_mb"] = round(peak_memory(), 1)
+        given.json.write_text(json.dumps({"meta": meta, "trials": rows}, indent=1) + "\n", encoding="utf-8")
+    sys.stdout.write(table(rows))
+    return int(any(row["duration"] > 1.15 * row["least"] for row in rows))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,39 @@
+"""Motions take hardly longer than the fastest along their paths; the bound is one."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+from helpers.executions import door_plan, drawer_plan
+
+import vkc_pin as vkc
+from optimal.bound import bound
+from vkc_pin.retiming.retime import retimed
+
+
+@pytest.mark.parametrize("made", [door_plan, drawer_plan])
+def test_motions_take_hardly_longer_than_they_have_to(made: object) -> None:
+    plan: vkc.Plan = made()  # type: ignore[operator]
+    least, heavy = bound(plan.scene, plan.trajectory)
+    assert least <= plan.trajectory.times[-1] <= 1.05 * least
+    assert heavy == 0
+
+
+def test_the_bound_is_what_finer_and_finer_grids_come_to() -> None:
+    plan = drawer_plan()
+    coarse, fine, finest = (bound(plan.scene, plan.trajectory, places)[0] for places in (5, 40, 80))
+    assert finest < fine < coarse
+    assert fine - finest < 0.1 * (coarse - fine)
+
+
+def test_the_bound_obeys_limits() -> None:
+    """With a quarter of the acceleration, and twice the time, no velocity is the same share of its limit."""
+    plan = drawer_plan()
+    robot = plan.scene.robot
+    weak = dataclasses.replace(robot, acceleration=robot.acceleration / 4.0, velocity=robot.velocity / 2.0)
+    scene = dataclasses.replace(plan.scene, robot=weak)
+    slow = retimed(scene, plan.trajectory)
+    assert bound(scene, slow)[0] > 1.5 * bound(plan.scene, plan.trajectory)[0]
+    with pytest.raises(AssertionError, match="another one"):
+        bound(scene, plan.trajectory)

@@ -1,0 +1,68 @@
+"""Velocities, accelerations and jerks beyond limits are named, with the amount."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from helpers.executions import drawer_plan
+
+import vkc_pin as vkc
+from vkc_pin.motion.curve import Curve
+from vkc_pin.motion.trajectory import Trajectory
+from vkc_pin.retiming.retime import retimed
+from vkc_pin.validation.motors.rates import check_rates
+from vkc_pin.validation.report import Violation
+from vkc_pin.validation.samples import Samples
+
+
+def found(motion: Trajectory, **options: float) -> dict[tuple[str, str], Violation]:
+    rows = check_rates(Samples(drawer_plan().scene, motion), vkc.Options(**options))  # type: ignore[arg-type]
+    return {(row.constraint, row.unit): row for row in rows if row.subject == "elbow_joint"}
+
+
+def eased() -> Trajectory:
+    plan = drawer_plan()
+    return retimed(plan.scene, plan.trajectory, jerk_time=0.2)
+
+
+def test_jerks_are_looked_at_where_they_are_limited() -> None:
+    motion = eased()
+    assert not found(motion, jerk_time=0.2)
+    assert not found(motion)
+    assert not found(drawer_plan().trajectory)
+    (kind,) = found(motion, jerk_time=0.5)
+    assert kind == ("jerk", "rad/s³")
+    assert motion.curve is not None
+    strongest = motion.curve.jerks()[0][:, motion.names.index("elbow_joint")].max()
+    assert found(motion, jerk_time=0.5)[kind].amount == pytest.approx(strongest - 1.4 / 0.5)
+
+
+def test_accelerations_that_jump_are_named() -> None:
+    motion = drawer_plan().trajectory
+    assert motion.curve is not None
+    jumps = motion.curve.jerks()[1][:, motion.names.index("elbow_joint")]
+    violation = found(motion, jerk_time=1e-3)["jerk", "rad/s² at once"]
+    assert violation.amount == pytest.approx(jumps.max() - 1.4e-3)
+    at = motion.curve.times[int(np.argmax(jumps))]
+    assert motion.times[violation.waypoint] <= at <= motion.times[min(violation.waypoint + 1, len(motion.times) - 1)]
+
+
+def test_what_is_gone_through_faster_is_too_fast_in_all_that_it_does() -> None:
+    motion = eased()
+    assert motion.curve is not None
+    quick = Curve(motion.curve.times / 3.0, motion.curve.positions, motion.curve.rates * 3.0)
+    rows = check_rates(
+        Samples(drawer_plan().scene, dataclasses.replace(motion, times=motion.times / 3.0, curve=quick)),
+        vkc.Options(jerk_time=0.2),
+    )
+    assert {row.constraint for row in rows} == {"velocity", "acceleration", "jerk"}
+
+
+def test_reports_say_where_jerk_bounds_the_duration() -> None:
+    plan = drawer_plan()
+    report = vkc.validate(plan.scene, plan.steps, eased(), vkc.Options(jerk_time=0.2))
+    assert report.ok
+    assert "jerk" in {bound.kind for bound in report.bounds}
+    assert "jerk" not in {bound.kind for bound in plan.validation.bounds}

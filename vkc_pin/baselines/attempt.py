@@ -32,11 +32,11 @@ from vkc_pin.solver.loop import solve
 from vkc_pin.solver.to_trajectory import as_trajectory
 from vkc_pin.solver.trust_region import CLOSE_ENOUGH
 from vkc_pin.task.compiler import compile_task
-from vkc_pin.task.steps import Actuate, GoTo, Grasp, Place, Step
+from vkc_pin.task.steps import Actuate, GoTo, Grasp, Place, Reach, Step
 
 __all__ = ["FINER", "Attempt", "Doable"]
 
-Doable = Actuate | Place | GoTo
+Doable = Actuate | Place | GoTo | Reach
 """The steps that the baselines know."""
 
 FINER = 2
@@ -85,6 +85,8 @@ class Attempt:
                     self._actuate(step)
                 elif isinstance(step, Place):
                     self._place(step)
+                elif isinstance(step, Reach):
+                    self._drive_and_reach([step], self._poses(self._problem([step])), _STANDS)
                 else:  # drive somewhere, at whichever heading is best if none is asked for
                     goals = headings(step, float(self.scene.start[2]))
                     self._withdrawn(functools.partial(self._drive, goals), FailedError("no base path"))

@@ -16,6 +16,8 @@ To put something down (`Place`), it is taken as in 1 to 3, and then:
 6. The base drives there, the arm as it is: A*, then optimisation.
 7. The base stands, the arm puts it down: optimisation.
 
+To bring the tool somewhere (`Reach`) is 1 to 3 with the pose in place of the handle, and nothing more.
+
 To drive somewhere (`GoTo`), the arm stays as it is if that will do, goes back from the handle it let go of, or else home, and the
 base drives as in 6. Neither has anything to follow, so B1 and B2 are the same there.
 
@@ -69,7 +71,7 @@ def plan_separately(
 
     Args:
         scene: Robot, objects and obstacles.
-        steps: What should change: `Actuate`, `Place` and `GoTo`, any number.
+        steps: What should change: `Actuate`, `Place`, `GoTo` and `Reach`, any number.
         method: "B1" or "B2".
         options: As for `planner.plan`.
         seed: Of the random numbers.
@@ -96,7 +98,7 @@ def plan_separately(
     actions: list[Doable] = []
     for number, step in enumerate(task.steps):
         if not isinstance(step, Doable):
-            expected = "Actuate, Place or GoTo"
+            expected = "Actuate, Place, GoTo or Reach"
             raise InputError("the baselines know no such step", field=f"steps[{number}]", expected=expected, got=shown(step))
         actions.append(step)
     with borrowed(planner) as cache, budget.running():

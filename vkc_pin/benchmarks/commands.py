@@ -111,6 +111,14 @@ def add_bench(commands: Any) -> None:
         "--scheduler", metavar="ADDRESS", help="a Dask scheduler, tcp://HOST:PORT, whose workers are used instead"
     )
 
+    about = "Give the same reaches, held doors and held drawers to other planners, to both baselines, and to this package."
+    shown = "beside trajopt, OMPL and roboplan (needs the extra `peers`)"
+    peers = _add_experiment(benches, "peers", shown, about, default=20, jobs=1, what="problems per task")
+    peers.set_defaults(benchmark="peers.run")
+    _add_choice(peers, "tasks", "reach door drawer (default: all)")
+    _add_choice(peers, "methods", "trajopt OMPL roboplan B1 B2 VKC (default: all)")
+    peers.add_argument("--time-limit", type=float, default=60.0, metavar="SECONDS", help="by the clock, for a trial (default 60)")
+
     _add_problems(benches)
 
 

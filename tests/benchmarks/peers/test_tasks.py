@@ -1,0 +1,24 @@
+"""Problems follow from numbers, and begin free."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vkc_pin.benchmarks.peers.tasks import TASKS, ends, given, problem_of
+from vkc_pin.seeds.knots import depth
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_problems_are_drawn_by_number_and_free(task: str) -> None:
+    one, same, other = given(task, 3, 1), given(task, 3, 1), given(task, 3, 2)
+    assert np.array_equal(one.scene.start, same.scene.start)
+    assert not np.array_equal(one.scene.start, other.scene.start)
+    problem = problem_of(one)
+    assert depth(problem, problem.start[None], 1)[0] == 0.0
+    goals = ends(problem, np.random.default_rng(0), 5)
+    assert 1 <= len(goals) <= 5
+    residual, _ = problem.transcription.pose_solvers[0].evaluate(goals, problem.targets[0])
+    assert np.abs(residual).max() < 1e-7
+    far = np.linalg.norm((goals - problem.start) * problem.chain.metric, axis=1)
+    assert np.all(np.diff(far) >= 0.0)

@@ -1,0 +1,129 @@
+"""trajopt (tesseract's): sequential convex optimisation on the same chain, with collisions of casts between waypoints.
+
+The chain goes to it as a URDF whose hand carries, inverted, what is held. That the latter's base stays where it stands is a
+constraint on its pose at every waypoint, as in the paper; the pose to reach is one at the last. It starts from straight lines
+to configurations at the goal, the nearest first, until a motion is accepted.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vkc_pin.arrays import Floats
+from vkc_pin.benchmarks.peers.description import FRAME, GROUP, describe
+from vkc_pin.benchmarks.peers.found import Clock, Found
+from vkc_pin.benchmarks.peers.sampled import ranges
+from vkc_pin.benchmarks.peers.tasks import Given, ends
+from vkc_pin.errors import InputError
+from vkc_pin.program.problem import TrajectoryProblem
+from vkc_pin.seeds.knots import smooth
+
+__all__ = ["plan_by_trajopt"]
+
+_ENDS = 10  # seeds at most
+_SHARE = 0.3  # of the time that is left, for one of them
+_MARGIN = 0.002  # [m] more than what is to be kept, as constraints hold to a tolerance
+_PARAMETERS = {
+    "max_iterations": 200,
+    "initial_trust_box_size": 0.1,
+    "cnt_tolerance": 1e-4,
+    "min_approx_improve": 1e-3,
+    "min_approx_improve_frac": 1e-3,
+    "trust_shrink_ratio": 0.2,
+    "initial_merit_error_coeff": 10.0,
+}
+
+
+def plan_by_trajopt(own: Given, problem: TrajectoryProblem, seed: int, clock: Clock, accept: Callable[[Floats], bool]) -> Found:
+    """Plan with trajopt; see `found.Peer`."""
+    worker = _worker()
+    goals = ends(problem, np.random.default_rng([seed, 1]), _ENDS)
+    if not len(goals):
+        return Found(status="no configuration at the goal")
+    segments, found = problem.segments, Found(status="not converged")
+    lower, upper = ranges(problem)
+    goal = problem.pose_goals[0].row
+    asked = {n.replace(".", "_"): float(problem.lower[-1, k]) for k, n in enumerate(problem.chain.names) if _goal(problem, k)}
+    with tempfile.TemporaryDirectory() as folder:
+        files = describe(problem, Path(folder), inflated=True)
+        for row in goals:
+            if clock.left <= 0.0:
+                found.status = "timed out"
+                break
+            ask = {
+                "urdf": str(files.urdf),
+                "srdf": str(files.srdf),
+                "group": GROUP,
+                "frame": FRAME,
+                "joints": files.joints,
+                "seed": (problem.start + np.append(0.0, smooth(segments))[:, None] * (row - problem.start)).tolist(),
+                "lower": lower.tolist(),
+                "upper": upper.tolist(),
+                "weights": np.sqrt(problem.effort.metric).tolist(),
+                "target": problem.targets[0].homogeneous.tolist(),
+                "at": [int(t) for t in goal.waypoints],
+                "goal": asked,
+                "margin": _MARGIN,
+                "buffer": 0.02,
+                "longest": 0.1,
+                "contacts": 3,
+                "parameters": {**_PARAMETERS, "max_time": max(_SHARE * clock.left, 1.0)},
+            }
+            answer = worker(ask)
+            clock.elsewhere += answer["cpu"]
+            if "error" in answer:
+                found.status, found.about["said"] = "error", answer["error"]
+                continue
+            found.own += answer["own"]
+            found.about.setdefault("said", []).append(answer["status"])
+            path = np.array(answer["z"])
+            path[0] = problem.start
+            found.path, found.status = path, "found" if answer["status"] == "NLP_CONVERGED" else "not converged"
+            if accept(path):
+                found.first = clock.spent
+                break
+    return found
+
+
+def _goal(problem: TrajectoryProblem, column: int) -> bool:
+    """Return whether a coordinate has a value to reach, other than where it may be before."""
+    last, before = (
+        (limits[0][column], limits[1][column])
+        for limits in ((problem.lower[-1], problem.upper[-1]), (problem.lower[0], problem.upper[0]))
+    )
+    return bool(last[0] == last[1] and before[0] != before[1])
+
+
+@cache
+def _worker() -> Callable[[dict[str, Any]], dict[str, Any]]:
+    """Return what sends a request to the other process, begun once, and waits for its answer."""
+    command = [sys.executable, str(Path(__file__).with_name("trajopt_worker.py"))]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+
+    def heard() -> dict[str, Any]:
+        assert process.stdout is not None
+        while line := process.stdout.readline():
+            if line.startswith("{"):
+                return dict(json.loads(line))
+        raise InputError("the process of trajopt has ended", field="method", got=f"exit code {process.wait()}")
+
+    first = heard()
+    if "error" in first:
+        raise InputError("trajopt cannot be run", expected='pip install "vkc-pin[peers]"', got=first["error"])
+
+    def asked(ask: dict[str, Any]) -> dict[str, Any]:
+        assert process.stdin is not None
+        process.stdin.write(json.dumps(ask) + "\n")
+        process.stdin.flush()
+        return heard()
+
+    return asked

@@ -1,0 +1,98 @@
+"""roboplan: RRT-Connect, with its projection where something is held, and its shortcuts where nothing is.
+
+It reads the chain as a URDF, and projects onto poses by itself. It knows of no clearance, so of each pair one shape is thicker by
+what the pair is to keep. Goals are configurations, from this package; the next one is tried until a motion is accepted.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from vkc_pin.arrays import Floats
+from vkc_pin.benchmarks.peers.description import FRAME, GROUP, describe
+from vkc_pin.benchmarks.peers.found import Clock, Found
+from vkc_pin.benchmarks.peers.sampled import dense
+from vkc_pin.benchmarks.peers.tasks import Given, beginning, ends
+from vkc_pin.needed import optional_package
+from vkc_pin.program.problem import TrajectoryProblem
+
+__all__ = ["plan_by_projection"]
+
+_ENDS = 20  # configurations at the goal
+_STEP = 0.05  # [m] and [rad] between configurations that are looked at
+_NODES = 20_000
+_SHARE = 0.2  # of the time that is left, at most, for one configuration at the goal
+
+
+def plan_by_projection(
+    own: Given, problem: TrajectoryProblem, seed: int, clock: Clock, accept: Callable[[Floats], bool]
+) -> Found:
+    """Plan with roboplan; see `found.Peer`."""
+    core = optional_package("roboplan.core", "peers", what="bench peers")
+    rrt = optional_package("roboplan.rrt", "peers", what="bench peers")
+    goals = ends(problem, np.random.default_rng([seed, 1]), _ENDS)
+    if not len(goals):
+        return Found(status="no configuration at the goal")
+    held = problem.closed(problem.task.phases[0])
+    with tempfile.TemporaryDirectory() as folder:
+        files = describe(problem, Path(folder), inflated=True)
+        scene = core.Scene("chain", core.loadUrdfSceneDescription(str(files.urdf)))
+        scene.importSrdf(files.srdf.read_text(encoding="utf-8"))
+    scene.setRngSeed(seed)
+    order = [list(scene.getJointNames()).index(name) for name in files.joints]
+
+    def there(z: Floats) -> Floats:
+        q = np.zeros(len(z))
+        q[order] = z
+        return q
+
+    constraints = []
+    if held:
+        tight = {"position_tolerance": 1e-4, "orientation_tolerance": 1e-4}
+        zeros, target = np.zeros(6), np.asfortranarray(problem.targets[0].homogeneous)
+        pose = rrt.PoseConstraint(scene, GROUP, FRAME, zeros, zeros, target, "", **tight)
+        constraints.append(pose)
+    found = Found(status="no path")
+    names = list(scene.getJointNames())
+    start = core.JointConfiguration(names, there(beginning(problem)))
+    for row in goals:
+        if clock.left <= 0.0:
+            found.status = "timed out"
+            break
+        options = rrt.RRTOptions(
+            group_name=GROUP,
+            max_nodes=_NODES,
+            max_connection_distance=1.0,
+            collision_check_step_size=_STEP,
+            collision_check_use_bisection=True,
+            max_planning_time=max(0.1, _SHARE * clock.left),
+            rrt_connect=True,
+        )
+        options.constraint_projection.path_step_size = 0.1
+        planner = rrt.RRT(scene, options)
+        planner.setRngSeed(seed)
+        began = time.process_time()
+        try:
+            path = planner.plan(start, core.JointConfiguration(names, there(row)), constraints)
+        except RuntimeError as error:
+            found.about["said"] = str(error)
+            continue
+        finally:
+            found.own += time.process_time() - began
+        found.first = clock.spent if found.first is None else found.first
+        if not held:
+            began = time.process_time()
+            shortcuts = core.PathShortcuttingOptions(group_name=GROUP, max_step_size=_STEP, max_iters=1000, seed=seed)
+            path = core.PathShortcutter(scene, shortcuts).shortcut(path)
+            found.own += time.process_time() - began
+        rows = np.array(path.positions)[:, order]
+        rows[0] = problem.start
+        found.path, found.status = dense(rows, problem.chain.metric), "found"
+        if accept(found.path):
+            break
+    return found

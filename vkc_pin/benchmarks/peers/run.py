@@ -1,0 +1,194 @@
+"""`vkc-pin bench peers`: the same reaches, held doors and held drawers for other planners, the baselines, and this package."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from vkc_pin.arrays import Floats
+from vkc_pin.baselines.separate import BASELINES, plan_separately
+from vkc_pin.benchmarks.harness import runner
+from vkc_pin.benchmarks.harness.record import Record, distribution, trial, values
+from vkc_pin.benchmarks.harness.tables import decimal, foot, markdown
+from vkc_pin.benchmarks.peers.found import Clock, Found, Peer, clearances, judged
+from vkc_pin.benchmarks.peers.optimized import plan_by_trajopt
+from vkc_pin.benchmarks.peers.projected import plan_by_projection
+from vkc_pin.benchmarks.peers.sampled import plan_by_sampling
+from vkc_pin.benchmarks.peers.tasks import TASKS, Given, given, problem_of
+from vkc_pin.errors import InputError
+from vkc_pin.needed import optional_package
+from vkc_pin.planning.plan import Plan
+from vkc_pin.planning.planner import plan
+
+__all__ = ["METHODS", "PEERS", "TIME_LIMIT", "report", "run"]
+
+PEERS: Mapping[str, tuple[Peer, str, str]] = {
+    "trajopt": (plan_by_trajopt, "tesseract_robotics", "tesseract-robotics-nanobind"),
+    "OMPL": (plan_by_sampling, "ompl", "ompl"),
+    "roboplan": (plan_by_projection, "roboplan", "roboplan"),
+}
+"""Name → what plans with it, its module, and its package."""
+METHODS = (*PEERS, *BASELINES, "VKC")
+TIME_LIMIT = 60.0
+"""[s] By the clock, for a trial."""
+_HEAD = [
+    "task",
+    "method",
+    "success",
+    "timed out",
+    "first [s]",
+    "final [s]",
+    "95th percentile [s]",
+    "solver alone [s]",
+    "base [m]",
+    "arm [rad]",
+    "at waypoints [mm]",
+    "between [mm]",
+]
+
+
+def run(
+    *,
+    out: str | Path,
+    trials: int = 20,
+    seed: int = 0,
+    jobs: int = 1,
+    tasks: Sequence[str] = tuple(TASKS),
+    methods: Sequence[str] = METHODS,
+    time_limit: float = TIME_LIMIT,
+    progress: bool = True,
+) -> dict[str, Any]:
+    """Run the experiment, or what is left of it, and write results.json, results.csv, table.md and plans/*.npz to `out`.
+
+    Args:
+        out: The folder; if it has trials of the same settings already, they are not run again.
+        trials: Number of problems per task, at least 1.
+        seed: Of the problems and of planning.
+        jobs: Number of processes.
+        tasks: Some of `TASKS`.
+        methods: Some of `METHODS`.
+        time_limit: By the clock, for a trial [s].
+        progress: Whether to show a progress bar.
+
+    Returns:
+        {"meta": ..., "trials": [...]}; see `runner.run`.
+
+    Raises:
+        UnknownNameError: There is no such task or method.
+        InputError: No trials, a peer is not installed, or `out` has trials of other settings.
+        KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
+    """
+    if trials < 1:
+        raise InputError("out of range", field="trials", expected="at least 1", got=trials)
+    names, chosen = runner.chosen("task", tasks, TASKS), runner.chosen("method", methods, METHODS)
+    settings = {"benchmark": "peers", "seed": seed, "starts": trials, "tasks": names, "methods": chosen}
+    settings |= {"time_limit": time_limit, "peers": _installed(chosen)}
+    specs = [
+        {"key": f"{task}/{number:04d}/{method}", "task": task, "number": number, "method": method, "seed": seed}
+        | {"time_limit": time_limit}
+        for task in names
+        for number in range(trials)
+        for method in chosen
+    ]
+    function = functools.partial(_record, folder=str(Path(out) / "plans"))
+    return runner.run(specs, function, out, settings=settings, report=report, jobs=jobs, progress=progress)
+
+
+def report(result: Mapping[str, Any]) -> str:
+    """Return the table of a result in Markdown, with versions and machine at the foot."""
+    about, records = result["meta"], result["trials"]
+    rows = [
+        _row(task, method, own)
+        for task in about["tasks"]
+        for method in about["methods"]
+        if (own := [r for r in records if (r.get("task"), r.get("method")) == (task, method)])
+    ]
+    listed = ", ".join(f"{name} {number}" for name, number in about["peers"].items())
+    parts = [
+        "# Beside other planners",
+        f"{about['starts']} problems per task, seed {about['seed']}, the same for all; at most {about['time_limit']:g} s by the "
+        f"clock. Peers: {listed or 'none'}. Success is the word of the independent validation. Times are CPU time from the call, "
+        "everything included, to the first and to the final motion; medians of all trials that have one, the percentile of the "
+        "final one. Efforts are medians of successes; clearances are the least of all successes.",
+        markdown(_HEAD, rows, text=2),
+    ]
+    return "\n\n".join([*parts, foot(about)]) + "\n"
+
+
+def _row(task: str, method: str, records: Sequence[Record]) -> list[str]:
+    good = [record for record in records if record["success"]]
+    late = sum(record["status"] in ("timed out", "time limit") for record in records)
+    final, percentile = distribution(records, "time_final")
+    times = [distribution(records, "time_first")[0], final, percentile, distribution(records, "time_own")[0]]
+    efforts = [distribution(good, field)[0] for field in ("base_effort", "arm_effort")]
+    least = [min(values(good, f"clearance_{where}"), default=float("nan")) * 1e3 for where in ("at", "between")]
+    shown = [f"{len(good)} of {len(records)}", str(late), *map(decimal, times), *map(decimal, efforts)]
+    return [task, method, *shown, *(f"{value:.1f}" if value == value else "–" for value in least)]
+
+
+def _installed(methods: Sequence[str]) -> dict[str, str]:
+    """Return the versions of the peers' packages.
+
+    Raises:
+        InputError: One is not installed.
+    """
+    found = {}
+    for _, module, package in (PEERS[method] for method in methods if method in PEERS):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            optional_package(module, "peers", what="bench peers")
+            raise
+    return found
+
+
+def _record(spec: dict[str, Any], *, folder: str) -> dict[str, Any]:
+    task, number, method, seed = (spec[name] for name in ("task", "number", "method", "seed"))
+    own = given(task, seed, number)
+    clock = Clock(spec["time_limit"])
+    found = Found()
+    if method in PEERS:
+        plan_of, found = _by_peer(own, method, number, clock)
+    else:
+        plan_of = _by_us(own, method, number, spec["time_limit"])
+        took = plan_of.metrics  # by the clock: their share of the CPU time counts
+        share = (took["time_casadi"] + took["time_ipopt"]) / (took["planning_time"] + took["build_time"])
+        found.own, found.first = share * clock.spent, clock.spent if plan_of.success else None
+    spent, wall = clock.spent, clock.wall
+    if plan_of.status != "interrupted":
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        plan_of.save(Path(folder) / f"{spec['key'].replace('/', '_')}.npz")
+    more: dict[str, Any] = {"task": task, "number": number, "duration": plan_of.metrics["duration"]}
+    more |= {"time_own": found.own, "time_first": found.first, "time_final": spent, "wall": wall, "about": found.about}
+    more |= clearances(problem_of(own), plan_of.trajectory) if plan_of.success else {}
+    return trial(plan_of, method=method, seed=seed, **more)
+
+
+def _by_peer(own: Given, method: str, seed: int, clock: Clock) -> tuple[Plan, Found]:
+    """Return the plan of a peer's path, and what it said."""
+    problem = problem_of(own)
+    judgements: dict[int, Plan] = {}
+
+    def accept(path: Floats) -> bool:
+        judgements[0] = judged(own, problem, path, "rejected", name=method, seed=seed)
+        return judgements[0].success
+
+    found = PEERS[method][0](own, problem, seed, clock, accept)
+    if found.path is None:
+        return judged(own, problem, None, found.status, name=method, seed=seed), found
+    if not judgements:
+        accept(found.path)
+    said = judgements[0]
+    late = not said.success and found.status == "timed out"  # what it has by then may be no motion
+    return dataclasses.replace(said, status="timed out") if late else said, found
+
+
+def _by_us(own: Given, method: str, seed: int, time_limit: float) -> Plan:
+    """Return the plan of a baseline or of this package; each builds its programs anew, as a first call does."""
+    if method == "VKC":
+        return plan(own.scene, own.steps, seed=seed, time_limit=time_limit)
+    return plan_separately(own.scene, own.steps, method=method, seed=seed, time_limit=time_limit)

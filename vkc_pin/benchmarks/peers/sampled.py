@@ -1,0 +1,155 @@
+"""OMPL: RRT-Connect, on the manifold on which a hand stays on its handle where something is held, then its simplifier.
+
+The manifold is an atlas of charts. `ProjectedStateSpace`, the other choice, found nothing here: what it samples is mostly not on
+the manifold, where ways to it break off, and OMPL 2.0.1 then stays where it was.
+
+OMPL knows neither robots nor collisions: kinematics, distances and configurations at the goal are this package's. Coordinates
+are scaled by the chain's metric, so that a turn and a metre count as in the other searches. Where nothing is held, motions are
+checked in batches, as calls from C++ to Python cost more than what they do.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from vkc_pin.arrays import Floats
+from vkc_pin.benchmarks.peers.found import Clock, Found
+from vkc_pin.benchmarks.peers.tasks import Given, beginning, ends
+from vkc_pin.needed import optional_package
+from vkc_pin.program.problem import TrajectoryProblem
+
+__all__ = ["dense", "plan_by_sampling", "ranges"]
+
+_ENDS = 20  # configurations at the goal
+_STEP = 0.05  # [rad] between configurations that are looked at
+_RANGE = 1.0  # [rad] that a tree grows at most at a time
+_TOLERANCE = 1e-5  # of the manifold, [m] and [rad]
+_SIMPLIFYING = 10.0  # [s] at most
+_TURN = 2.0 * np.pi  # [rad] that a joint without limits may turn either way from the start
+
+
+def ranges(problem: TrajectoryProblem) -> tuple[Floats, Floats]:
+    """Return the limits of coordinates from the start to the goal, shape (n,) each, all of them finite."""
+    lower = np.minimum(problem.lower.min(axis=0), problem.start)
+    upper = np.maximum(problem.upper.max(axis=0), problem.start)
+    return np.maximum(lower, problem.start - _TURN - 20.0 * np.isfinite(lower)), np.minimum(
+        upper, problem.start + _TURN + 20.0 * np.isfinite(upper)
+    )
+
+
+def plan_by_sampling(own: Given, problem: TrajectoryProblem, seed: int, clock: Clock, accept: Callable[[Floats], bool]) -> Found:
+    """Plan with OMPL; see `found.Peer`."""
+    ob, og, ou = (optional_package(f"ompl.{part}", "peers", what="bench peers") for part in ("base", "geometric", "util"))
+    ou.setLogLevel(ou.LogLevel.LOG_NONE)
+    ou.RNG.setSeed(seed + 1)
+    goals = ends(problem, np.random.default_rng([seed, 1]), _ENDS)
+    if not len(goals):
+        return Found(status="no configuration at the goal")
+    scale, held = problem.chain.metric, problem.closed(problem.task.phases[0])
+    size, middle = problem.chain.size, 1
+    lower, upper = ranges(problem)
+    space = ob.RealVectorStateSpace(size)
+    bounds = ob.RealVectorBounds(size)
+    for k in range(size):
+        bounds.setLow(k, float(lower[k] * scale[k] - 1e-6))
+        bounds.setHigh(k, float(upper[k] * scale[k] + 1e-6))
+    space.setBounds(bounds)
+
+    def blocked(z: Floats) -> int:
+        return problem.contacts.first_blocked(z, middle, reach=problem.options.largest_margin, allowed=0.0)
+
+    def values(state: Any) -> Floats:
+        return np.array([state[k] for k in range(size)]) / scale
+
+    if held:
+        solver, target = problem.transcription.pose_solvers[0], problem.targets[0]
+
+        class Closure(ob.Constraint):  # type: ignore[name-defined]
+            def __init__(self) -> None:
+                super().__init__(size, solver.rows, _TOLERANCE)
+
+            def function(self, x: Floats, out: Floats) -> None:
+                out[:] = solver.evaluate(np.asarray(x)[None] / scale, target)[0][0]
+
+            def jacobian(self, x: Floats, out: Floats) -> None:
+                out[:] = solver.evaluate(np.asarray(x)[None] / scale, target)[1][0] / scale
+
+        constraint = Closure()
+        used = ob.AtlasStateSpace(space, constraint)
+        information = ob.ConstrainedSpaceInformation(used)
+        used.setDelta(_STEP)
+    else:
+        used, information = space, ob.SpaceInformation(space)
+    information.setStateValidityChecker(lambda state: bool(blocked(values(state)[None]) == 1))
+    if not held:
+
+        class Motions(ob.MotionValidator):  # type: ignore[name-defined]
+            def checkMotion(self, one: Any, other: Any) -> bool:
+                a, b = values(one), values(other)
+                count = max(1, int(np.ceil(np.abs((b - a) * scale).max() / _STEP)))
+                z = a + (np.arange(1, count + 1) / count)[:, None] * (b - a)
+                return bool(blocked(z) == len(z))
+
+        motions = Motions(information)
+        information.setMotionValidator(motions)
+
+    def state_of(z: Floats) -> Any:
+        state = information.allocState()
+        scaled = [float(value) for value in z * scale]
+        if held:
+            state.copy(scaled)
+        else:
+            for k, value in enumerate(scaled):
+                state[k] = value
+        return state
+
+    if held:
+        information.setup()
+    start, states = state_of(beginning(problem)), [state_of(row) for row in goals]
+    if held:
+        for state in (start, *states):
+            used.anchorChart(state)
+    setup = og.SimpleSetup(information)
+    setup.setStartState(start)
+    region = ob.GoalStates(information)
+    for state in states:
+        region.addState(state)
+    setup.setGoal(region)
+    planner = og.RRTConnect(information)
+    planner.setRange(_RANGE)
+    setup.setPlanner(planner)
+    setup.setup()
+    began = time.process_time()
+    setup.solve(float(max(clock.left - _SIMPLIFYING, 1.0)))
+    found = Found(own=time.process_time() - began, status="timed out")
+    if not setup.haveExactSolutionPath():
+        return found
+    path = setup.getSolutionPath()
+    found.first = clock.spent
+    simplifier = og.PathSimplifier(information)
+    began = time.process_time()
+    simplifier.simplify(path, _SIMPLIFYING)
+    found.own += time.process_time() - began
+    if held:
+        path.interpolate()
+    rows = np.array([values(path.getState(k)) for k in range(path.getStateCount())])
+    rows[0] = problem.start
+    found.path, found.status = dense(rows, scale), "found"
+    return found
+
+
+def dense(rows: Floats, scale: Floats, step: float = 0.2) -> Floats:
+    """Return the same straight lines with waypoints at most `step` [rad] apart, so that a curve through them stays near."""
+    parts = [rows[:1]]
+    for a, b in itertools.pairwise(rows):
+        far = np.abs((b - a) * scale).max()
+        if far < 1e-9:
+            continue
+        count = max(1, int(np.ceil(far / step)))
+        parts.append(a + (np.arange(1, count + 1) / count)[:, None] * (b - a))
+    return np.concatenate(parts)

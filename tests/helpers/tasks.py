@@ -43,3 +43,10 @@ def profiled(_: int) -> bool:
     from distributed import get_worker
 
     return "profile" in get_worker().periodic_callbacks
+
+
+def slow(task: int) -> int:
+    """Take up memory for as long as it takes to be noticed."""
+    block = bytearray(100 << 20)
+    time.sleep(1.0)
+    return task * len(block) // (50 << 20)

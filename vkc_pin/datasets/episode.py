@@ -18,7 +18,7 @@ import numpy as np
 from vkc_pin.arrays import Floats
 from vkc_pin.datasets.diversity import way
 from vkc_pin.datasets.problems import NoProblemError, problem
-from vkc_pin.datasets.recipe import load_recipe
+from vkc_pin.datasets.recipe import Recipe, load_recipe
 from vkc_pin.datasets.running.machine import peak_memory
 from vkc_pin.errors import InputError
 from vkc_pin.files.resources import folder
@@ -89,6 +89,11 @@ def _planner() -> Planner:
     return Planner(entries=int(_PLANNER["entries"]), megabytes=_PLANNER["megabytes"])
 
 
+@functools.lru_cache(maxsize=4)
+def _recipe(said: str) -> Recipe:
+    return load_recipe(json.loads(said))
+
+
 Made = tuple[dict[str, Any], bytes]
 """The record of an attempt, as in the journal, and the episode packed, empty if it became none."""
 
@@ -105,7 +110,7 @@ def attempt(said: Mapping[str, Any], number: int, robots: Mapping[str, str]) -> 
     record: dict[str, Any] = {"number": number, "success": False}
     data = b""
     try:
-        recipe = load_recipe(said)
+        recipe = _recipe(json.dumps(said, sort_keys=True))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # what is said of a robot would be said again of every episode
             asked = problem(recipe, number, robots, _planner())

@@ -7,8 +7,10 @@ another package, are read by coal.
 
 from __future__ import annotations
 
+import contextlib
 import warnings
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
 __all__ = ["MeshPart", "coarser", "convex_hull", "indices", "load_convex", "load_mesh", "load_parts", "to_bvh"]
 
 _NEIGHBOURS = 255  # coal's corners have no more
+_HULLS = 512  # that a process keeps: robots are loaded again and again
 _TOLERANCE = 1e-6  # how far, relatively, coal's volume and area may be from trimesh's
 
 
@@ -104,7 +107,21 @@ def load_convex(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0), *, about: 
     Raises:
         InputError: The mesh cannot be read or is empty, or coal does not hold what the file holds.
     """
+    file = file_path(path, "path", "a mesh file")
+    if file.is_file():
+        stat = file.stat()
+        with contextlib.suppress(InputError):  # said below, with what it is a part of
+            kept = _hull(file.absolute(), (stat.st_mtime_ns, stat.st_size), tuple(_factors(file, scale).tolist()))
+            if kept is not None:
+                return kept
     return convex_hull(load_mesh(path, scale).vertices, file=path, about=about)
+
+
+@lru_cache(maxsize=_HULLS)
+def _hull(file: Path, version: tuple[int, int], scale: tuple[float, ...]) -> coal.Convex | None:
+    """Return the hull of a mesh in a version of its file, None if that is flat, of which each use warns."""
+    points = load_mesh(file, scale).vertices
+    return None if thickened(np.asarray(points, float))[1] else convex_hull(points, file=file)
 
 
 def convex_hull(points: ArrayLike, *, file: str | Path | None = None, about: str | None = None) -> coal.Convex:

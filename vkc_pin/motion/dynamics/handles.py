@@ -64,26 +64,44 @@ class Handle:
             pin.computeJointJacobians(self._own, data, q)
             links.append(pin.updateFramePlacement(self._own, data, self._frame).copy())
             jacobians[k] = pin.getFrameJacobian(self._own, data, self._frame, pin.LOCAL_WORLD_ALIGNED).reshape(6, -1)
-        turns = np.array([link.rotation for link in links])
-        points = np.array([link.translation for link in links]) + self._levers(turns, values)
+        turns, origins = np.array([link.rotation for link in links]), np.array([link.translation for link in links])
+        points, free = self._grasp(turns, origins, values)
         ways = np.swapaxes(jacobians[:, :, self._moved], 1, 2)
-        ways[..., :3] += np.cross(ways[..., 3:], (points - [link.translation for link in links])[:, None])
-        free = [self._freedoms(*at) for at in zip(links, values, points, strict=True)]
-        maps = np.concatenate([ways, np.array(free).reshape(len(z), -1, 6)], axis=1)
+        ways[..., :3] += np.cross(ways[..., 3:], (points - origins)[:, None])
+        maps = np.concatenate([ways, free], axis=1)
         asked = np.pad(forces, ((0, 0), (0, maps.shape[1] - forces.shape[1])))
         basis = self._bases(turns)
         shares = np.linalg.pinv(maps @ basis, rcond=_SINGULAR) @ asked[..., None]
         return np.asarray((basis @ shares)[..., 0] @ np.kron(np.eye(2), turn).T)
 
-    def _levers(self, turns: Floats, values: Floats) -> Floats:
-        """Return how far the hand is from the link that it holds, in the object's axes, shape (K, 3).
+    def _grasp(self, turns: Floats, origins: Floats, values: Floats) -> tuple[Floats, Floats]:
+        """Return where the hand is, shape (K, 3), and how it can move there in a grasp that does not clamp, shape (K, f or 0, 6).
+
+        It exerts nothing in the ways that it can move. All is in the object's axes.
 
         Args:
-            turns: Of the link, shape (K, 3, 3).
+            turns: Of the link that it holds, shape (K, 3, 3).
+            origins: Of the same, shape (K, 3).
             values: Of the grasp's freedoms, shape (K, f).
         """
-        tools = np.array([self.attachment.tool(row).translation for row in (values if values.shape[1] else values[:1])])
-        return np.asarray((turns @ tools[..., None])[..., 0])
+        at, axes = self.attachment, list[tuple[Floats, Floats | None]]()
+        rotation, origin = turns @ at.placement.rotation, origins + turns @ at.placement.translation
+        for freedom, value in zip(at.freedoms, values.T, strict=True):
+            axis = rotation @ freedom.axis
+            if freedom.kind == "revolute":
+                through = origin + rotation @ freedom.through
+                rotation = rotation @ np.array([pin.exp3(turn) for turn in np.outer(value, freedom.axis)])
+                origin = through - rotation @ freedom.through
+                axes.append((axis, through))
+            else:
+                origin = origin + axis * value[:, None]
+                axes.append((axis, None))
+        points = origin - at.standoff * rotation[..., 2]
+        ways = np.zeros((len(turns), 0 if at.firm or at.contact == "push" else len(axes), 6))
+        for k, (axis, center) in enumerate(axes[: ways.shape[1]]):
+            ways[:, k, :3] = axis if center is None else np.cross(axis, points - center)
+            ways[:, k, 3:] = 0.0 if center is None else axis
+        return points, ways
 
     def forces(self, motion: Motion) -> Floats:
         """Return what must be applied to the object's joints, shape (K, joints) [N], [N·m]; springs carry its own weight."""
@@ -111,19 +129,6 @@ class Handle:
         names = self.placed.object.coordinates.names
         columns = (part.get(f"{self.name}.{name}", np.full(size, value)) for name, value in zip(names, otherwise, strict=True))
         return np.column_stack([np.zeros((size, 0)), *columns])
-
-    def _freedoms(self, link: pin.SE3, values: Floats, point: Floats) -> list[Floats]:
-        """Return how the hand can move at a point in a grasp that does not clamp: it exerts nothing that way, shape (6,) each."""
-        if self.attachment.firm or self.attachment.contact == "push":
-            return []
-        found, frame = list[Floats](), link * self.attachment.placement
-        for freedom, value in zip(self.attachment.freedoms, values.tolist(), strict=True):
-            axis = frame.rotation @ freedom.axis
-            turns = freedom.kind == "revolute"
-            way = np.cross(axis, point - frame * freedom.through) if turns else axis
-            found.append(np.concatenate([way, axis if turns else np.zeros(3)]))
-            frame = frame * freedom.motion(value)
-        return found
 
     def _bases(self, turns: Floats) -> Floats:
         """Return the wrenches that count alike, shape (K, 6, r): forces, and torques by their lever; of a push that along it.

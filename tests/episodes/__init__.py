@@ -1,0 +1,1 @@
+"""`python -m tests.episodes DATASET`: every episode of a dataset is judged by the oracle."""

@@ -1,0 +1,26 @@
+"""`python -m tests.episodes DATASET --jobs N`: judges all episodes by the oracle, and goes on where it was stopped."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from tests.oracle.agreement import table
+
+from .judged import judged_dataset
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Judge; 1 if the oracle refuses an episode, or cannot say."""
+    parser = argparse.ArgumentParser(prog="python -m tests.episodes", description=__doc__)
+    parser.add_argument("dataset", type=Path, help="folder of a dataset")
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    given = parser.parse_args(arguments)
+    verdicts = judged_dataset(given.dataset, jobs=given.jobs)
+    sys.stdout.write(table(verdicts) + "\n")
+    return int(any(one.found or one.unjudged for one in verdicts))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

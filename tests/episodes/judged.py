@@ -1,0 +1,76 @@
+"""Episodes of a dataset before the oracle, which reads nothing but saved plans."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import warnings
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, replace
+from pathlib import Path
+
+from tests.oracle.judge import Verdict, judge
+from vkc_pin.datasets.dataset import Dataset
+from vkc_pin.datasets.episode import Episode
+from vkc_pin.datasets.formats.hdf5 import episodes_of
+from vkc_pin.planning.plan import Plan
+
+__all__ = ["judged_dataset", "saved"]
+
+VERDICTS = "oracle.jsonl"
+"""In a dataset's folder: a line a shard."""
+
+
+def judged_dataset(folder: Path, *, jobs: int = 1) -> list[Verdict]:
+    """Judge the episodes of a dataset; every shard's verdicts are kept in its folder, and are not found again."""
+    dataset = Dataset.open(folder)
+    kept = _kept(folder / VERDICTS)
+    left = [shard for shard in dataset.shards if _name(dataset, shard) not in kept]
+    with ProcessPoolExecutor(jobs) as pool, (folder / VERDICTS).open("a", encoding="utf-8") as lines:
+        for shard, verdicts in zip(left, pool.map(_shard, [folder] * len(left), left), strict=True):
+            name = _name(dataset, shard)
+            kept[name] = verdicts
+            own = [{**asdict(one), "path": str(one.path)} for one in verdicts]
+            lines.write(json.dumps({"shard": name, "verdicts": own}) + "\n")
+            lines.flush()
+    return [one for shard in dataset.shards for one in kept[_name(dataset, shard)]]
+
+
+def saved(episode: Episode, path: Path) -> Path:
+    """Write an episode as a plan that says of itself what the dataset says of it."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        plan = Plan(
+            scene=episode.scene(),
+            steps=episode.steps,
+            options=episode.options,
+            trajectory=episode.trajectory,
+            validation=episode.claimed,
+            status="success",
+            metrics={},
+        )
+        return plan.save(path)
+
+
+def _shard(folder: Path, shard: Path) -> list[Verdict]:
+    return list(_verdicts(folder, shard))
+
+
+def _verdicts(folder: Path, shard: Path) -> Iterator[Verdict]:
+    with tempfile.TemporaryDirectory() as work:
+        for episode in episodes_of(shard, folder / "scenes"):
+            verdict = judge(saved(episode, Path(work) / f"{episode.number:06d}.npz"))
+            verdict.path.unlink()
+            yield replace(verdict, path=Path(shard.parent.name) / verdict.path.name)
+
+
+def _name(dataset: Dataset, shard: Path) -> str:
+    return shard.relative_to(dataset.folder).as_posix()
+
+
+def _kept(file: Path) -> dict[str, list[Verdict]]:
+    if not file.is_file():
+        return {}
+    said = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
+    return {one["shard"]: [Verdict(**{**verdict, "path": Path(verdict["path"])}) for verdict in one["verdicts"]] for one in said}

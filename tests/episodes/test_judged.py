@@ -1,0 +1,42 @@
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from helpers.datasets import SMALL
+
+from tests.episodes.__main__ import main
+from tests.episodes.judged import VERDICTS, judged_dataset
+from vkc_pin.datasets.dataset import Dataset
+from vkc_pin.datasets.generate import generate
+
+h5py = pytest.importorskip("h5py")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return generate(SMALL, 2, tmp_path_factory.mktemp("judged") / "out")
+
+
+def test_all_are_judged_once(made: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(made.folder)]) == 0
+    assert "2 plans" in capsys.readouterr().out
+    kept = (made.folder / VERDICTS).read_text(encoding="utf-8")
+    assert [len(json.loads(line)["verdicts"]) for line in kept.splitlines()] == [2]
+    assert [one.found for one in judged_dataset(made.folder)] == [[], []]
+    assert (made.folder / VERDICTS).read_text(encoding="utf-8") == kept, "nothing is judged twice"
+
+
+def test_a_motion_that_was_changed_is_refused(made: Dataset, tmp_path: Path) -> None:
+    shutil.copytree(made.folder, tmp_path / "copy")
+    (tmp_path / "copy" / VERDICTS).unlink(missing_ok=True)
+    (shard,) = Dataset.open(tmp_path / "copy").shards
+    with h5py.File(shard, "r+") as file:
+        positions = file["data/demo_1/motion/knot_positions"]
+        positions[len(positions) // 2, 4] += 0.4
+    good, changed = judged_dataset(tmp_path / "copy")
+    assert not good.found
+    assert {one.rule for one in changed.found} & {"velocity", "acceleration", "closure", "collision", "apart", "penetration"}
+    assert main([str(tmp_path / "copy")]) == 1

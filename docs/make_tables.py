@@ -39,6 +39,7 @@ REPORTS = {  # name of a record → whose report it is
     **{"robots_rest": "anything.robots", "robots_packages": "anything.robots", "execution": "executing.execution"},
     "friction": "executing.execution",
     **{"bases": "driving.bases", "impossible": "problems.impossible", "timing": "tests.optimal.__main__"},
+    "peers": "peers.run",
 }
 DOOR = ("door_seed_0", "door_seed_1")
 TASKS = ("reach", "push", "push blind", "whole")
@@ -97,6 +98,7 @@ EVIDENCE: list[tuple[str, str, str, str]] = [
     ("in physics", "execution.md", "execution", "execution --trials 20 --seed 0"),
     ("held by friction", "execution.md", "friction", "execution --trials 20 --seed 0 --grasp friction"),
     ("as fast as the limits allow", "rates_and_limits.md", "timing", "python -m tests.optimal --starts 5"),
+    ("beside other planners", "comparison.md", "peers", "peers --trials 20 --seed 20270110 --time-limit 30"),
     ("what a metre of the base is worth", "decisions.md", "tradeoff", "ablation --seed 101"),
 ]
 

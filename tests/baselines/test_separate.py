@@ -452,8 +452,8 @@ MISUSES: dict[str, tuple[dict[str, Any], str, str]] = {
     "method in small letters": ({"method": "b2"}, "method", "did you mean 'B2'"),
     "no tries": ({"retries": 0}, "retries", "at least 1"),
     "half a try": ({"retries": 1.5}, "retries", "1.5"),
-    "another step": ({"steps": [PULL, vkc.Release()]}, "steps[1]", "expected Actuate, Place or GoTo"),
-    "a grasp": ({"steps": [vkc.Grasp("drawer")]}, "steps[0]", "expected Actuate, Place or GoTo"),
+    "another step": ({"steps": [PULL, vkc.Release()]}, "steps[1]", "expected Actuate, Place, GoTo or Reach"),
+    "a grasp": ({"steps": [vkc.Grasp("drawer")]}, "steps[0]", "expected Actuate, Place, GoTo or Reach"),
     "no steps": ({"steps": []}, "steps", "at least one step"),
     "one step alone": ({"steps": PULL}, "steps", "a list of steps"),
     "unknown object": ({"steps": [vkc.Actuate("drawr", {"slide": 0.3})]}, "steps[0].object", "did you mean 'drawer'"),
@@ -474,6 +474,15 @@ def test_misuse_raises(case: tuple[dict[str, Any], str, str]) -> None:
         plan_separately(drawer_scene(), call.pop("steps"), **call)
     assert caught.value.field == field
     assert text in str(caught.value)
+
+
+@pytest.mark.parametrize("method", ["B1", "B2"])
+def test_a_tool_is_brought_to_a_pose(method: str) -> None:
+    steps = [vkc.Reach((1.2, 0.4, 0.9, 0.0, 1.2, 0.3))]
+    plan = plan_separately(drawer_scene(), steps, method=method, options=OPTIONS)
+    assert plan.success
+    assert vkc.validate(plan.scene, steps, plan.trajectory, OPTIONS).ok
+    assert not plan.trajectory.phases[-1].held
 
 
 def test_one_thing_after_another() -> None:

@@ -154,7 +154,9 @@ def test_releasing_what_is_held_at_the_start() -> None:
     assert (names(task), held(task), task.after) == (["stand still"], [(GRIP,)], ())
     later = phases(Release(), GoTo(0.0, 0.0), of=scene().with_held({"stick": "grip"}))
     assert later.phases[1].leaves == (GRIP,)
-    assert later.phases[1].left == {"stick": (GRIP, 0)}
+    assert not later.phases[1].left, "where it stands is known: it is let go of before anything has moved"
+    moved = phases(GoTo(0.0, 1.0), Release(), GoTo(0.0, 0.0), of=scene().with_held({"stick": "grip"}))
+    assert moved.phases[1].left == {"stick": (GRIP, 0)}
 
 
 def test_what_cannot_be_released() -> None:

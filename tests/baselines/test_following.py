@@ -12,10 +12,13 @@ from helpers.small_problems import program_of
 import vkc_pin as vkc
 from vkc_pin.baselines import following as module
 from vkc_pin.baselines.following import SEEDS, Followed, follow
+from vkc_pin.baselines.refining import CLEAR
+from vkc_pin.program.merit import TOLERANCE
 from vkc_pin.seeds.knots import Knots, smooth
 
 STILL = 0.0
 ROUNDING = 1e-6  # [m]
+CLOSED = np.sqrt(3.0) * TOLERANCE  # [m]: it holds for each coordinate
 GOAL = 0.3  # [m]
 
 
@@ -37,13 +40,13 @@ def followed(problem: vkc.TrajectoryProblem, way: np.ndarray, *, refine: bool = 
     return follow(problem, way, np.random.default_rng(seed), refine=refine)
 
 
-def check(problem: vkc.TrajectoryProblem, rows: np.ndarray, *, closed: float = 3e-6) -> None:
+def check(problem: vkc.TrajectoryProblem, rows: np.ndarray) -> None:
     """The hand is at the handle, and nothing collides."""
     slide = problem.chain.index("drawer.slide")
     for row in rows:
         tilt = row[slide - 1] if len(row) == 11 else 0.0
-        assert off(problem.scene, row, handle(row[slide], tilt=tilt)) < closed
-        assert spare(problem.scene, row, slide=row[slide], held=True) >= -ROUNDING
+        assert off(problem.scene, row, handle(row[slide], tilt=tilt)) < CLOSED
+        assert spare(problem.scene, row, slide=row[slide], held=True) >= -CLEAR - ROUNDING
         assert np.all((row >= problem.lower.min(axis=0) - STILL) & (row <= problem.upper.max(axis=0) + STILL))
 
 
@@ -116,9 +119,9 @@ def test_collision(refine: bool, least: float) -> None:
     assert found.cause == "collision"
     done = round(8 * found.share)
     assert least <= found.share < 1.0
-    check(problem, found.z[:done], closed=2e-5)
+    check(problem, found.z[:done])
     wrong = found.z[done]
-    assert off(problem.scene, wrong, handle(wrong[-1])) < 2e-5, "the chain is closed all the same"
+    assert off(problem.scene, wrong, handle(wrong[-1])) < CLOSED, "the chain is closed all the same"
     assert spare(problem.scene, wrong, slide=wrong[-1], held=True) < -1e-3
     np.testing.assert_array_equal(found.z[done:], np.tile(wrong, (8 - done, 1)))
 
@@ -140,7 +143,7 @@ def test_b2_moves_the_object_off_its_time_law_b1_does_not() -> None:
     plain, refined = (followed(problem, base(problem), refine=refine) for refine in (False, True))
     assert (plain.cause, refined.cause) == ("", "")
     check(problem, plain.z)
-    check(problem, refined.z, closed=2e-5)
+    check(problem, refined.z)
     np.testing.assert_allclose(plain.z[:, -1], law, rtol=0.0, atol=STILL)
     assert np.abs(refined.z[:, -1] - law).max() > 0.005
     assert refined.z[-1, -1] == pytest.approx(GOAL, abs=STILL)

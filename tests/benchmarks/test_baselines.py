@@ -140,8 +140,21 @@ def test_the_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
             baselines.plan_trial("scene", {"scene": task, "method": method, "seed": 8})  # type: ignore[arg-type]
     door, drawer = vkc.Actuate("door", {"hinge": 1.5}), vkc.Actuate("drawer", {"slide": 0.6})
     common = {**LIMITS, "seed": 8}
-    hows = ({**common, "method": "B1"}, {**common, "method": "B2"}, common)
+    hows = ({**common, "method": "B1", "finer": 2}, {**common, "method": "B2", "finer": 2}, common)
     assert asked == [("scene", [step], how) for step in (door, drawer) for how in hows]
+
+
+def test_baselines_in_other_numbers_of_waypoints_and_with_other_budgets(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[dict[str, Any]] = []
+    monkeypatch.setattr(comparison, "plan_separately", lambda scene, steps, **how: asked.append(how))
+    for method in ("B1", "B1x1", "B2x3"):
+        baselines.plan_trial("scene", {"scene": "door", "method": method, "seed": 8, "effort": 7})  # type: ignore[arg-type]
+    common = {**LIMITS, "effort": 7, "seed": 8}
+    assert asked == [
+        {**common, "method": "B1", "finer": 2},
+        {**common, "method": "B1", "finer": 1},
+        {**common, "method": "B2", "finer": 3},
+    ]
 
 
 def test_jobs_make_no_difference(tmp_path: Path, result: dict[str, Any]) -> None:
@@ -204,9 +217,9 @@ def test_tables_against_numbers_by_hand(out: Path, result: dict[str, Any]) -> No
         return cells("\n".join(line for line in sections[title].splitlines() if line.startswith("|")).replace("\\|", "/"))[1:]
 
     assert rows("Success") == [
-        ["door", "B1", "1 of 3", "33", "6–79", "collision (penetration) 2"],
-        ["door", "B2", "2 of 3", "67", "21–94", "collision (penetration) 1"],
-        ["door", "VKC", "3 of 3", "100", "44–100", "none"],
+        ["door", "B1", "1 of 3", "33", "6–79", "0", "collision (penetration) 2"],
+        ["door", "B2", "2 of 3", "67", "21–94", "0", "collision (penetration) 1"],
+        ["door", "VKC", "3 of 3", "100", "44–100", "0", "none"],
     ]
     assert rows("Planning time") == [
         # 1, 2, 3 of B1; 2, 3, 4 of B2; 3, 4, 5 of VKC. 95th percentile of 1, 2, 3: 2 + 0.9 · 1.

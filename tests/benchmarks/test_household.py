@@ -102,7 +102,7 @@ def test_every_method_is_asked_for_the_same(monkeypatch: pytest.MonkeyPatch) -> 
         for method in COMPARED_PLANNERS:
             household.plan_trial("scene", {"scene": task, "method": method, "seed": 8})  # type: ignore[arg-type]
     common = {**LIMITS, "seed": 8}
-    hows = ({**common, "method": "B1"}, {**common, "method": "B2"}, common)
+    hows = ({**common, "method": "B1", "finer": 2}, {**common, "method": "B2", "finer": 2}, common)
     assert asked == [("scene", task.steps, how) for task in TASKS.values() for how in hows]
 
 
@@ -205,15 +205,15 @@ def test_tables_against_numbers_by_hand(out: Path) -> None:
 
     cause = "no inverse kinematics (closure)"
     assert rows("Success") == [
-        ["cup", "B1", "1 of 2", "50", "9–91", f"{cause} 1"],
-        ["cup", "B2", "2 of 2", "100", "34–100", "none"],
-        ["cup", "VKC", "2 of 2", "100", "34–100", "none"],
-        ["door", "B1", "0 of 2", "0", "0–66", f"{cause} 2"],
-        ["door", "B2", "1 of 2", "50", "9–91", f"{cause} 1"],
-        ["door", "VKC", "2 of 2", "100", "34–100", "none"],
-        ["all", "B1", "1 of 4", "25", "5–70", f"{cause} 3"],
-        ["all", "B2", "3 of 4", "75", "30–95", f"{cause} 1"],
-        ["all", "VKC", "4 of 4", "100", "51–100", "none"],
+        ["cup", "B1", "1 of 2", "50", "9–91", "0", f"{cause} 1"],
+        ["cup", "B2", "2 of 2", "100", "34–100", "0", "none"],
+        ["cup", "VKC", "2 of 2", "100", "34–100", "0", "none"],
+        ["door", "B1", "0 of 2", "0", "0–66", "0", f"{cause} 2"],
+        ["door", "B2", "1 of 2", "50", "9–91", "0", f"{cause} 1"],
+        ["door", "VKC", "2 of 2", "100", "34–100", "0", "none"],
+        ["all", "B1", "1 of 4", "25", "5–70", "0", f"{cause} 3"],
+        ["all", "B2", "3 of 4", "75", "30–95", "0", f"{cause} 1"],
+        ["all", "VKC", "4 of 4", "100", "51–100", "0", "none"],
     ]
     shared = rows("Efforts, peaks and durations where all methods succeed")
     assert shared[0] == ["cup", "base [m]", "5.00 ± –; 5.00", "4.00 ± –; 4.00", "3.00 ± –; 3.00"]

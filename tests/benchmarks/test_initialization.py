@@ -31,7 +31,7 @@ def same_sources(monkeypatch: pytest.MonkeyPatch) -> None:
 def solve(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
     """A plan that nobody planned, in place of the task: "stationary" always fails, "interpolated" from odd starts."""
     method, number = spec["method"], spec["number"]
-    good = method in ("astar", "auto", STEPWISE) or (method == "interpolated" and number % 2 == 0)
+    good = method in ("astar", "rrt", "auto", STEPWISE) or (method == "interpolated" and number % 2 == 0)
     times = ("initialization", "coal", "casadi", "ipopt", "validation")
     metrics = {
         "planning_time": 1.0 + number + 0.25 * COMPARED_INITIALIZATIONS.index(method)
@@ -79,7 +79,7 @@ def result(out: Path) -> dict[str, Any]:
 def test_trials(result: dict[str, Any]) -> None:
     trials = result["trials"]
     asked = {(t["method"], t["number"], t["repeat"]) for t in trials}
-    assert len(trials) == len(asked) == 3 * 2 * 4 + 3
+    assert len(trials) == len(asked) == 3 * 2 * 5 + 3
     assert {(n, r) for m, n, r in asked if m == "astar"} == {(n, r) for n in range(3) for r in range(2)}
     assert {(n, r) for m, n, r in asked if m == STEPWISE} == {(n, 0) for n in range(3)}
     for t in trials:
@@ -138,22 +138,23 @@ def test_tables_against_numbers_by_hand(out: Path, result: dict[str, Any]) -> No
     text = (out / "table.md").read_text(encoding="utf-8")
     assert text == initialization.report(result)
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line.startswith("| door")]
-    assert rows[:5] == [
+    assert rows[:6] == [
         # Starts 0, 1, 2, each twice: times 1, 1, 2, 2, 3, 3 and more; 95th percentile at 3.
-        ["door", "stationary", "0 of 6", "2.00", "3.00", "–", "–", "rejected (closure) 6"],
-        ["door", "interpolated", "4 of 6", "2.25", "3.25", "5.00", "7.00", "rejected (closure) 2"],
-        ["door", "astar", "6 of 6", "2.50", "3.50", "5.00", "7.00", "none"],
-        ["door", "auto", "6 of 6", "2.75", "3.75", "5.00", "7.00", "none"],
-        ["door", STEPWISE, "3 of 3", "3.00", "3.00", "6.00", "8.00", "none"],
+        ["door", "stationary", "0 of 6", "2.00", "3.00", "–", "–", "0", "rejected (closure) 6"],
+        ["door", "interpolated", "4 of 6", "2.25", "3.25", "5.00", "7.00", "0", "rejected (closure) 2"],
+        ["door", "astar", "6 of 6", "2.50", "3.50", "5.00", "7.00", "0", "none"],
+        ["door", "rrt", "6 of 6", "2.75", "3.75", "5.00", "7.00", "0", "none"],
+        ["door", "auto", "6 of 6", "3.00", "4.00", "5.00", "7.00", "0", "none"],
+        ["door", STEPWISE, "3 of 3", "3.00", "3.00", "6.00", "8.00", "0", "none"],
     ]
-    compared = [[cell for cell in row if cell] for row in rows[5:]]
+    compared = [[cell for cell in row if cell] for row in rows[6:]]
     assert [row[-3:] for row in compared] == [
         ["5.00 (4.50–5.50)", "6.00 (5.50–6.50)", "3 of 3"],
         ["7.00 (6.50–7.50)", "7.00 (6.50–7.50)", "0 of 3"],
         ["7.00 (7.00–7.00)", "8.00 (7.50–8.50)", "2 of 3"],
     ]
     last = text.splitlines()[-1]
-    for part in ("Measured on", "casadi", "Python", "27 trials, 1 at a time"):
+    for part in ("Measured on", "casadi", "Python", "33 trials, 1 at a time"):
         assert part in last
 
 
@@ -171,7 +172,7 @@ def test_chart_and_csv(out: Path, result: dict[str, Any]) -> None:
 
 
 def test_going_on_after_ctrl_c_gives_the_same_table(tmp_path: Path, result: dict[str, Any], out: Path) -> None:
-    with pytest.raises(KeyboardInterrupt, match="18 of 27 trials are done"):
+    with pytest.raises(KeyboardInterrupt, match="22 of 33 trials are done"):
         run(tmp_path, solve=stopping)
     assert not (tmp_path / "table.md").exists()
     assert run(tmp_path)["trials"] == result["trials"]

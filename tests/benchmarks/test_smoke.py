@@ -23,6 +23,7 @@ FIELDS = {
     *("initialization", "build_time", "failed_constraint", "violations"),
     *(f"time_{part}" for part in ("initialization", "coal", "casadi", "ipopt", "retiming", "validation")),
     "commit",
+    "wall_time",
 }
 
 
@@ -81,7 +82,7 @@ def test_initialization(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert cells[:3] == ["init_1: no obstacle", "astar", "2 of 2"]
     medians = (np.median([trial[name] for trial in result["trials"]]) for name in ("planning_time", "base_effort", "arm_effort"))
     assert [cells[3], cells[5], cells[6]] == [f"{value:.2f}" for value in medians]
-    assert cells[7] == "none"
+    assert cells[7:9] == ["0", "none"]
     assert "step after step" not in table  # that is compared with "auto" only
     picture = (out / "success.png").read_bytes()
     assert picture.startswith(b"\x89PNG\r\n\x1a\n")
@@ -123,7 +124,9 @@ def test_baselines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     trials = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))["trials"]
     assert [t["key"] for t in trials] == [f"drawer/{n:04d}/{method}" for n in (0, 1) for method in ("B1", "VKC")]
     for t in trials:
-        own = {"peak_velocity", "peak_acceleration", "duration"} | ({"time_following"} if t["method"] == "B1" else set())
+        own = {"peak_velocity", "peak_acceleration", "duration", "cold_time", "warm_time"} | (
+            {"time_following"} if t["method"] == "B1" else set()
+        )
         assert set(t) == FIELDS - {"repeat", "perturbation"} | own
         assert t["success"] == (t["status"] == "success") == (not t["violations"])
         assert t["success"] or t["method"] == "B1", t["violations"]
@@ -168,7 +171,7 @@ def test_scale(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     trials = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))["trials"]
     assert [t["key"] for t in trials] == [f"{n:04d}/{count:06d}" for n in (0, 1) for count in (10, 40)]
     for t in trials:
-        assert set(t) == FIELDS - {"repeat", "perturbation"} | {"obstacles"}
+        assert set(t) == FIELDS - {"repeat", "perturbation", "wall_time"} | {"obstacles"}
         assert t["success"] == (t["status"] == "success") == (not t["violations"])
         assert t["success"], t["violations"]
         assert t["base_effort"] > 1.5 - t["start"][0]  # from the start to within reach of the door, which is at x = 2.5

@@ -13,6 +13,7 @@ import pinocchio as pin
 from vkc_pin.arrays import Floats, Ints
 from vkc_pin.budget import spend
 from vkc_pin.chain.inverse_kinematics import LONGEST_STEP
+from vkc_pin.program.merit import TOLERANCE
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.knots import Knots
 
@@ -21,7 +22,6 @@ __all__ = ["QP", "ArmKinematics"]
 QP = "daqp"
 """The solver of quadratic programs, by its name in `qpsolvers`."""
 _ITERATIONS = 30
-_TOLERANCE = 1e-6  # [m] and [rad]
 _FRAME = "what closes the chain"
 
 
@@ -53,7 +53,7 @@ class ArmKinematics:
         configuration = pink.Configuration(model, model.createData(), chain.coordinates.q(box.z))
         for _ in range(_ITERATIONS):
             spend(1)
-            if np.abs(task.compute_error(configuration)).max() < _TOLERANCE:
+            if np.abs(task.compute_error(configuration)).max() < TOLERANCE:
                 return box.z, True
             try:
                 step = pink.solve_ik(configuration, [task], 1.0, QP, damping=1e-9, limits=[box], safety_break=False)

@@ -40,10 +40,9 @@ Doable = Actuate | Place | GoTo | Reach
 """The steps that the baselines know."""
 
 FINER = 2
-"""How many times more waypoints than elsewhere objects are moved in: an arm that only follows needs smaller steps, and time."""
+"""How many times more waypoints than elsewhere objects are moved in, unless told: an arm that only follows needs small steps."""
 _STANDS, _ENDS = 4, 10  # base poses that are tried in turn, the nearest first, at the handle and at the end
 _BASE = slice(3)  # its coordinates
-_ROUNDS = 8  # of the solver: what takes more is mostly in vain
 
 
 class Attempt:
@@ -60,6 +59,7 @@ class Attempt:
         *,
         refine: bool,
         seed: Sequence[int],
+        finer: int = FINER,
         cache: Cache | None = None,
     ) -> None:
         """Prepare a try.
@@ -69,9 +69,10 @@ class Attempt:
             options: How to plan.
             refine: Whether arm and object are moved out of collision at each waypoint (B2).
             seed: Of the random numbers.
+            finer: How many times `Options.move_waypoints` objects are moved in.
             cache: Keeps what is built; None: one of its own.
         """
-        self.scene, self.options, self.refine = scene, options, refine
+        self.scene, self.options, self.refine, self.finer = scene, options, refine, finer
         self.rng = np.random.default_rng(seed)
         self.parts: list[Trajectory] = []
         self.times = dict.fromkeys([*TIMES, "following"], 0.0)
@@ -201,7 +202,7 @@ class Attempt:
 
     def _move(self, step: Actuate) -> None:
         """Move the object's joints: the base goes to the nearest pose to which the arm can follow."""
-        problem = self._problem([step], replace(self.options, move_waypoints=FINER * self.options.move_waypoints))
+        problem = self._problem([step], replace(self.options, move_waypoints=self.finer * self.options.move_waypoints))
         paths, failure = BasePaths(problem), FailedError("no base path")
         for pose in self._poses(problem)[:_ENDS]:
             base = paths.along(problem, pose[:3])
@@ -236,7 +237,7 @@ class Attempt:
         """Return the first solution from a seed: z_1..z_N, shape (N, n), and the time of every step, shape (N,) [s]."""
         failure = FailedError(cause)
         for seed in seeds:
-            solution = solve(problem, seed.z, rounds=_ROUNDS)
+            solution = solve(problem, seed.z)
             self.iterations += solution.iterations
             for key, value in solution.timings.items():
                 self.times[key] += value

@@ -6,13 +6,15 @@ import numpy as np
 
 from vkc_pin.arrays import Floats, Ints
 from vkc_pin.baselines.arm_kinematics import QP
+from vkc_pin.program.merit import TOLERANCE
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.knots import Knots
+from vkc_pin.solver.trust_region import CLOSE_ENOUGH
 
 __all__ = ["CLEAR", "refined"]
 
-CLEAR = 1e-5
-"""By so much [m] a configuration may fall short of its clearances: the programs end at them."""
+CLEAR = CLOSE_ENOUGH
+"""By so much [m] a configuration may fall short of its clearances: as much as one of the solver's."""
 
 _ROUNDS = 12
 _REACH = 0.05  # [m] beyond the clearance: contacts that are looked at
@@ -20,7 +22,6 @@ _LONGEST = 0.2  # [m] and [rad] of one round in one coordinate
 _OBJECT = 10.0  # what moving the object's joints away from their time law costs, beside the arm's away from where it was
 _SLACK = 1e3  # what a metre of clearance costs that there is no room for
 _REGULAR = 1e-6  # makes the program strictly convex in the slack
-_TOLERANCE = 1e-5  # [m] and [rad]
 
 
 def refined(
@@ -52,7 +53,7 @@ def refined(
         residual, jacobian = (part[0] for part in solver.evaluate(z[None], target))
         reach = problem.options.largest_margin + _REACH
         contacts = problem.contacts.evaluate(z[None], np.array([waypoint]), reach=reach, nearest=None)
-        if np.abs(residual).max() < _TOLERANCE and contacts.violation() <= CLEAR:
+        if np.abs(residual).max() < TOLERANCE and contacts.violation() <= CLEAR:
             return z, True
         gradients = problem.contacts.gradients(z[None], contacts)[:, free]
         room = contacts.distance - contacts.margin
@@ -74,4 +75,4 @@ def refined(
         z = z.copy()
         z[free] += step[:-1]
     residual, _ = solver.evaluate(z[None], target)
-    return z, bool(np.abs(residual).max() < _TOLERANCE)
+    return z, bool(np.abs(residual).max() < TOLERANCE)

@@ -33,7 +33,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 from vkc_pin.arguments import known, whole
-from vkc_pin.baselines.attempt import Attempt, Doable
+from vkc_pin.baselines.attempt import FINER, Attempt, Doable
 from vkc_pin.errors import InputError, shown
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.options import Options
@@ -53,6 +53,7 @@ __all__ = ["BASELINES", "RETRIES", "plan_separately"]
 BASELINES = ("B1", "B2")
 RETRIES = 5
 """How often all is tried."""
+LARGEST_FINER = 16  # waypoints beyond those of so fine a motion tell nothing new
 
 
 def plan_separately(
@@ -65,6 +66,7 @@ def plan_separately(
     time_limit: float | None = None,
     effort: int | None = None,
     retries: int = RETRIES,
+    finer: int = FINER,
     planner: Planner | None = None,
 ) -> Plan:
     """Plan as the baselines do.
@@ -78,6 +80,7 @@ def plan_separately(
         time_limit: As for `planner.plan`.
         effort: As for `planner.plan`; an iteration of inverse kinematics of the arm counts 1.
         retries: How often all is tried, with other random numbers, until validation accepts a motion.
+        finer: In how many times `Options.move_waypoints` objects are moved; 1: in as many as by `planner.plan`.
         planner: As for `planner.plan`.
 
     Returns:
@@ -94,6 +97,7 @@ def plan_separately(
     check_arguments(scene, options, seed)
     known(method, BASELINES, "method", "method")
     whole(retries, "retries", low=1)
+    whole(finer, "finer", low=1, high=LARGEST_FINER)
     task = compile_task(scene, steps, options)
     actions: list[Doable] = []
     for number, step in enumerate(task.steps):
@@ -105,12 +109,12 @@ def plan_separately(
         began, times, iterations, before = time.perf_counter(), Counter[str](), 0, cache.building
         best: tuple[float, str, int, Trajectory, Report] | None = None
         for number in range(retries):
-            attempt = Attempt(scene, options, refine=method == "B2", seed=[int(seed), number], cache=cache)
+            attempt = Attempt(scene, options, refine=method == "B2", seed=[int(seed), number], finer=finer, cache=cache)
             trajectory, came, cause = attempt.run(actions)
-            checked = time.perf_counter()
-            trajectory, report = _timed(scene, task.steps, trajectory, options, failed=cause != "")
+            before_checks, checked = attempt.times["validation"], time.perf_counter()
+            trajectory, report = _timed(scene, task.steps, trajectory, options, attempt.times, failed=cause != "")
             budget.checking = time.perf_counter() - checked
-            attempt.times["validation"] += budget.checking
+            attempt.times["retiming"] += budget.checking - (attempt.times["validation"] - before_checks)
             status = "success" if report.ok else cause or "rejected"
             iterations += attempt.iterations
             times.update(attempt.times)
@@ -132,12 +136,18 @@ def plan_separately(
 
 
 def _timed(
-    scene: Scene, steps: Sequence[Step], trajectory: Trajectory, options: Options, *, failed: bool
+    scene: Scene, steps: Sequence[Step], trajectory: Trajectory, options: Options, times: dict[str, float], *, failed: bool
 ) -> tuple[Trajectory, Report]:
-    """Return a motion timed as those of `plan` are, or in its own time if only that is accepted, and what validation says."""
+    """Return a motion timed as those of `plan` are, or in its own time if only that is accepted, and what validation says.
+
+    What the checks take [s] is added to `times`.
+    """
 
     def check(motion: Trajectory) -> Report:
-        return validate(scene, steps, motion, options)
+        began = time.perf_counter()
+        report = validate(scene, steps, motion, options)
+        times["validation"] += time.perf_counter() - began
+        return report
 
     if not failed:
         timed, report = accepted(scene, trajectory, check, jerk_time=options.jerk_time)

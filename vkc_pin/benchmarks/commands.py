@@ -38,7 +38,7 @@ def add_bench(commands: Any) -> None:
     about = "trials per start and method (default 1)"
     initialization.add_argument("--repeats", type=positive, default=1, metavar="R", help=about)
     _add_choice(initialization, "scenes", "init_1 init_2 init_3 (default: all)")
-    _add_choice(initialization, "methods", "stationary interpolated astar auto (default: all)")
+    _add_choice(initialization, "methods", "stationary interpolated astar rrt auto (default: all)")
 
     for name, where, trials, tasks in (
         ("baselines", "at a door and a drawer", 50, "door drawer (default: both)"),
@@ -47,7 +47,9 @@ def add_bench(commands: Any) -> None:
         about = f"Compare planning base and arm together with planning them apart, {where}, from random starts."
         comparison = _add_experiment(benches, name, f"base and arm together or apart, {where}", about, default=trials)
         _add_choice(comparison, "tasks", tasks)
-        _add_choice(comparison, "methods", "B1 B2 VKC (default: all)")
+        others = "B1x1 B2x1 (as many waypoints as VKC, not twice as many) B1x3 B2x3"
+        _add_choice(comparison, "methods", f"B1 B2 VKC (default: these) {others}")
+        comparison.add_argument("--effort", type=positive, metavar="E", help="units of effort a trial may take (default 1000000)")
         comparison.add_argument("--save-failures", action="store_true", help="save the plans of failures, to be viewed")
 
     about = "Plan chores of many steps, each in one call, from random starts."

@@ -6,6 +6,7 @@ The same starts, scenes, limits and validation for all methods.
 from __future__ import annotations
 
 import functools
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,24 +15,30 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from vkc_pin.baselines.attempt import FINER
 from vkc_pin.baselines.separate import BASELINES, RETRIES, plan_separately
 from vkc_pin.benchmarks.comparison_report import report
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.charts import motions_chart
-from vkc_pin.benchmarks.harness.limits import LIMITS
+from vkc_pin.benchmarks.harness.limits import EFFORT, LIMITS
 from vkc_pin.benchmarks.harness.record import Record, Solve, trial
 from vkc_pin.errors import InputError
 from vkc_pin.files.writing import write_atomically
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.planning.plan import Plan
-from vkc_pin.planning.planner import plan
+from vkc_pin.planning.planner import Planner, plan
 from vkc_pin.scene.poses import as_placement
 from vkc_pin.scene.scene import Scene, load_scene
 from vkc_pin.task.steps import Actuate, GoTo, Place, Step
 
-__all__ = ["COMPARED_PLANNERS", "Assignment", "Comparison", "peaks"]
+__all__ = ["COLD", "COMPARED_PLANNERS", "METHODS", "WAYPOINTS", "Assignment", "Comparison", "peaks"]
 
 COMPARED_PLANNERS = (*BASELINES, "VKC")
+WAYPOINTS = {f"{method}x{finer}": (method, finer) for finer in (1, 3) for method in BASELINES}
+"""Baselines with other numbers of waypoints than is best for them: name → method, multiple of VKC's number."""
+METHODS = (*COMPARED_PLANNERS[:-1], *WAYPOINTS, "VKC")  # in the order of the tables
+COLD = 5
+"""Trials of a task and method that are planned twice, cold and warm."""
 
 Draw = Callable[[Sequence[Record], Path, Mapping[str, str], Sequence[str]], list[str]]
 """What draws an experiment's charts: takes records, folder, task → what is done in it, methods; returns them in Markdown."""
@@ -72,13 +79,17 @@ class Comparison:
     draw: Draw
 
     def plan_trial(self, scene: Scene, spec: Mapping[str, Any]) -> Plan:
-        """Plan the task of one trial: `scene` (the task's name), `method` and `seed` say how."""
+        """Plan the task of one trial: `scene` (the task's name), `method`, `seed`, `effort` and `planner` say how."""
         steps = self.tasks[spec["scene"]].steps
+        how: dict[str, Any] = {**LIMITS, **{key: spec[key] for key in ("effort", "planner") if key in spec}, "seed": spec["seed"]}
         if spec["method"] == "VKC":
-            return plan(scene, steps, seed=spec["seed"], **LIMITS)
-        return plan_separately(scene, steps, method=spec["method"], seed=spec["seed"], **LIMITS)
+            return plan(scene, steps, **how)
+        method, finer = WAYPOINTS.get(spec["method"], (spec["method"], FINER))
+        return plan_separately(scene, steps, method=method, finer=finer, **how)
 
-    def specify(self, *, trials: int, seed: int, tasks: Sequence[str], methods: Sequence[str]) -> list[dict[str, Any]]:
+    def specify(
+        self, *, trials: int, seed: int, tasks: Sequence[str], methods: Sequence[str], effort: int = EFFORT
+    ) -> list[dict[str, Any]]:
         """Return the trials: every task, method and start, in this order, in which a process can keep what it has built.
 
         A task's starts, and where its objects stand, depend on the seed and the task alone; start i is planned from with the
@@ -95,7 +106,8 @@ class Comparison:
             for method in methods:
                 for number, start in enumerate(starts):
                     key = f"{name}/{number:04d}/{method}"
-                    specs.append({"key": key, "scene": name, "method": method, "number": number, **start, "seed": seed + number})
+                    spec = {"key": key, "scene": name, "method": method, "number": number, **start, "seed": seed + number}
+                    specs.append({**spec, "effort": effort})
         return specs
 
     def run(
@@ -108,6 +120,7 @@ class Comparison:
         jobs: int = 1,
         tasks: Sequence[str] | None = None,
         methods: Sequence[str] = COMPARED_PLANNERS,
+        effort: int = EFFORT,
         save_failures: bool = False,
         progress: bool = True,
     ) -> dict[str, Any]:
@@ -123,7 +136,8 @@ class Comparison:
             solve: What plans a trial; None: `plan_trial`.
             jobs: Number of processes.
             tasks: Some of the tasks; None: all.
-            methods: Some of `COMPARED_PLANNERS`.
+            methods: Some of `METHODS`.
+            effort: What each trial may take at most, in units of effort.
             save_failures: Save the plan of every failure; those that ran before without this are planned once more.
             progress: Whether to show progress bars.
 
@@ -136,15 +150,15 @@ class Comparison:
             KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
         """
         tasks = runner.chosen("task", self.tasks if tasks is None else tasks, self.tasks)
-        methods = runner.chosen("method", methods, COMPARED_PLANNERS)
+        methods = runner.chosen("method", methods, METHODS)
         if trials < 1:
             raise InputError("out of range", field="trials", expected="at least 1", got=trials)
-        specs, out = self.specify(trials=trials, seed=seed, tasks=tasks, methods=methods), Path(out)
+        specs, out = self.specify(trials=trials, seed=seed, tasks=tasks, methods=methods, effort=effort), Path(out)
         settings = {"benchmark": self.benchmark, "seed": seed, "starts": trials, "tasks": tasks, "methods": methods}
         settings["scenes"] = {name: self.tasks[name].scene for name in tasks}
         settings["goals"] = {name: goals(self.tasks[name].steps) for name in tasks}
-        settings |= {**LIMITS, "retries": RETRIES}
-        trials_of = _Trials(self.tasks, out, solve or self.plan_trial)
+        settings |= {**LIMITS, "effort": effort, "retries": RETRIES}
+        trials_of = _Trials(self.tasks, out, solve or self.plan_trial, timed=solve is None)
         function = functools.partial(trials_of.record, save_failures=save_failures)
         result = runner.run(specs, function, out, settings=settings, jobs=jobs, progress=progress)
         saved = trials_of.saved(result["trials"], specs, again=save_failures, progress=progress)
@@ -195,20 +209,23 @@ class _Trials:
         tasks: Name → task.
         out: The folder.
         solve: What plans a trial.
+        timed: Whether calls are timed by the clock, the first ones cold, too.
     """
 
     tasks: Mapping[str, Assignment]
     out: Path
     solve: Solve
+    timed: bool = False
 
     def record(self, spec: dict[str, Any], *, save_failures: bool) -> dict[str, Any]:
         """Run one trial and return its record; a failure's plan is saved if asked for."""
         import pink  # noqa: F401 - planners import it when they are first called, which is no part of planning
 
-        found = self._plan(spec)
+        found, times = self._timed(spec)
         if save_failures and not found.success and found.status != "interrupted":
             found.save(self._file(spec, "failures"))
         own = {"scene": spec["scene"], "number": spec["number"], "duration": found.metrics["duration"], **peaks(found.trajectory)}
+        own |= times
         own |= {"placed": spec["placed"]} if "placed" in spec else {}
         return trial(found, method=spec["method"], seed=spec["seed"], **own)
 
@@ -246,10 +263,21 @@ class _Trials:
         return found
 
     def _uninterrupted(self, spec: Mapping[str, Any]) -> Plan:
-        found = self._plan(spec)
-        if found.status == "interrupted":
+        if (found := self._plan(spec)).status == "interrupted":
             raise KeyboardInterrupt("all trials are done, but not all of their plans are saved")
         return found
+
+    def _timed(self, spec: Mapping[str, Any]) -> tuple[Plan, dict[str, float]]:
+        """Return a trial's plan and how long that took by the clock; the first ones are planned cold, and again."""
+        if not self.timed:
+            return self._plan(spec), {}
+        times, new = dict[str, float](), {"planner": Planner()} if spec["number"] < COLD else {}
+        for name in ("cold_time", "warm_time") if new else ("wall_time",):
+            began, found = time.perf_counter(), self._plan({**spec, **new})
+            times[name] = time.perf_counter() - began
+            if found.status == "interrupted":
+                break  # what the runner must see
+        return found, {"wall_time": times.get("warm_time", 0.0), **times}
 
     def _plan(self, spec: Mapping[str, Any]) -> Plan:
         scene = placed(_scene(self.tasks[spec["scene"]].scene), spec)

@@ -12,15 +12,15 @@ from vkc_pin.benchmarks.harness.tables import (
     EFFORTS,
     common,
     decimal,
-    failures,
     foot,
     lower,
     markdown,
     mean_and_deviation,
+    timed_out,
     wilson,
 )
 
-__all__ = ["CRITERIA", "report"]
+__all__ = ["BUDGETS", "CRITERIA", "report"]
 
 CRITERIA = {
     **EFFORTS,
@@ -29,6 +29,8 @@ CRITERIA = {
     "duration": "duration [s]",
 }
 """What motions are compared by: field → name."""
+BUDGETS = {"a tenth": 0.1, "a third": 1 / 3, "two thirds": 2 / 3, "all": 1.0}
+"""Shares of the budget that are compared, by name; of the last two the larger one is half as much again."""
 _OWN = "VKC"
 
 
@@ -63,6 +65,8 @@ def report(
         "## Planning time",
         "Without imports and symbolic build. The last column is the median over that of VKC.",
         _times(records, tasks, methods),
+        *_calls(records, tasks, methods),
+        *_budgets(about, records, tasks, methods),
         "## Efforts, peaks and durations where all methods succeed",
         "Mean ± standard deviation; median. Trials in which all methods succeed: " + _numbers(records, tasks, methods) + ".",
         _criteria(records, tasks, methods, shared=True),
@@ -84,8 +88,8 @@ def _success(records: Sequence[Record], tasks: Mapping[str, str], methods: Seque
         good = sum(bool(record["success"]) for record in own)
         low, high = (f"{100.0 * end:.0f}" for end in wilson(good, len(own)))
         rate = f"{100.0 * good / len(own):.0f}" if own else "–"
-        rows.append([task, method, f"{good} of {len(own)}", rate, f"{low}–{high}", failures(own)])
-    head = ["task", "method", "success", "[%]", "95 % interval (Wilson)", "failures: cause (violated first)"]
+        rows.append([task, method, f"{good} of {len(own)}", rate, f"{low}–{high}", *timed_out(own)])
+    head = ["task", "method", "success", "[%]", "95 % interval (Wilson)", "timed out", "failures: cause (violated first)"]
     return markdown(head, rows, text=2)
 
 
@@ -99,6 +103,44 @@ def _times(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequenc
             rows.append([name, task, method, str(len(times)), *map(decimal, cells)])
     head = ["over", "task", "method", "n", "median [s]", "95th percentile [s]", "mean [s]", "deviation [s]", f"to {_OWN}"]
     return markdown(head, rows, text=3)
+
+
+def _calls(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str]) -> list[str]:
+    """Return a section on the time from call to plan, if it is on record."""
+    rows = []
+    for task, method in product(tasks, methods):
+        own = _of(records, task, method)
+        if values(own, "wall_time"):
+            first = [decimal(distribution(own, field)[0]) for field in ("cold_time", "warm_time")]
+            wall = [decimal(value) for value in distribution(own, "wall_time")]
+            rows.append([task, method, str(len(values(own, "cold_time"))), *first, *wall])
+    head = ["task", "method", "calls twice", "cold, median [s]", "warm, median [s]", "all, median [s]", "95th percentile [s]"]
+    text = (
+        "By the clock, with everything. The first trials of a task are planned twice by a planner that has kept nothing: cold, "
+        "with writing down the symbolic programs and loading or compiling them, and warm. All: as they come."
+    )
+    return ["## From call to plan", text, markdown(head, rows, text=2)] if rows else []
+
+
+def _budgets(about: Mapping[str, Any], records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str]) -> list[str]:
+    """Return a section on what less effort would have led to, if effort was limited."""
+    if "effort" not in about or not values(records, "effort"):
+        return []
+    shares = [(name, about["effort"] * share) for name, share in BUDGETS.items()]
+    rows = []
+    for task, method in product(tasks, methods):
+        own = _of(records, task, method)
+        good = values([record for record in own if record["success"]], "effort")
+        within = [sum(effort <= limit for effort in good) for _, limit in shares]
+        gain = 100.0 * (within[-1] - within[-2]) / max(len(own), 1)
+        most = f"{max(good) / about['effort']:.3f}" if good else "–"
+        rows.append([task, method, *(f"{number} of {len(own)}" for number in within), f"{gain:.0f}", most])
+    head = ["task", "method", *(name for name, _ in shares), "half as much again [points]", "most, as a share"]
+    text = (
+        "Successes within shares of the budget. Effort only ends planning, so a success within a share is one with that as the "
+        "budget, too; two thirds and half as much again are all of it."
+    )
+    return ["## Had the budget been smaller", text, markdown(head, rows, text=2)]
 
 
 def _numbers(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str]) -> str:

@@ -7,6 +7,7 @@ the other instead of as one problem.
 from __future__ import annotations
 
 import functools
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ from vkc_pin.task.steps import Grasp, Touch
 __all__ = ["COMPARED_INITIALIZATIONS", "SCENES", "STEPWISE", "TARGET", "plan_trial", "report", "run", "specify"]
 
 SCENES = ("init_1", "init_2", "init_3")
-COMPARED_INITIALIZATIONS = ("stationary", "interpolated", "astar", "auto")
+COMPARED_INITIALIZATIONS = ("stationary", "interpolated", "astar", "rrt", "auto")
 STEPWISE = "step after step"
 """The method that plans the steps one after the other, initialised as by "auto"."""
 TARGET = (-1.0, 3.897, 0.1)
@@ -137,7 +138,11 @@ def report(result: Mapping[str, Any]) -> str:
 def _record(spec: dict[str, Any], solve: Solve) -> dict[str, Any]:
     scene = _scene(spec["scene"]).with_start(base=spec["base"])
     own = {key: spec[key] for key in ("scene", "number", "repeat", "perturbation")}
-    return trial(solve(scene, spec), method=spec["method"], seed=spec["seed"], **own)
+    began = time.perf_counter()
+    found = solve(scene, spec)
+    if solve is plan_trial:
+        own["wall_time"] = time.perf_counter() - began
+    return trial(found, method=spec["method"], seed=spec["seed"], **own)
 
 
 _scene = functools.cache(load_scene)  # once per process

@@ -161,7 +161,7 @@ def test_other_settings_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_other_versions_and_machines_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run(tmp_path)
     real = record.meta()
-    other = {"versions": {**real["versions"], "pin": "9.9"}, "machine": {**real["machine"], "cores": 999}}
+    other = {**real, "versions": {**real["versions"], "pin": "9.9"}, "machine": {**real["machine"], "cores": 999}}
     monkeypatch.setattr(runner, "meta", lambda: json.loads(json.dumps(other)))
     with pytest.raises(InputError, match=r"pin 9\.9, cores 999"):
         run(tmp_path)

@@ -23,8 +23,8 @@ Solve = Callable[[Scene, Mapping[str, Any]], Plan]
 
 
 def meta(**settings: Any) -> dict[str, Any]:
-    """Return versions, machine and `settings` (seed, trials, ...)."""
-    return {"versions": versions(), "machine": machine(), **settings}
+    """Return commit, versions, machine and `settings` (seed, trials, ...)."""
+    return {"commit": commit(), "versions": versions(), "machine": machine(), **settings}
 
 
 @functools.cache

@@ -65,7 +65,7 @@ def run(
         progress: Whether to show a progress bar.
 
     Returns:
-        {"meta": versions, machine, settings, sessions, peak_memory_mb, "trials": records}, as in results.json.
+        {"meta": commit, versions, machine, settings, sessions, peak_memory_mb, "trials": records}, as in results.json.
 
     Raises:
         InputError: `out` has trials of other settings, versions or machines, is no folder, or is in use by another run.
@@ -84,6 +84,7 @@ def run(
         raise InputError("this is no folder", file=out, field="out") from None
     check_writable(out / "trials.jsonl")
     about = meta()
+    made = about.pop("commit")  # what the sources are says more than it about whether trials go together
     about["versions"]["sources"] = _sources()
     described = json.dumps([todo[key] for key in sorted(todo)], sort_keys=True).encode()
     header = {"settings": dict(settings), **about, "specification": hashlib.sha256(described).hexdigest()[:12]}
@@ -99,7 +100,10 @@ def run(
                 raise KeyboardInterrupt(f"{len(journal.lines)} of {len(todo)} trials are done and kept in {out}") from None
         records = [record for key in sorted(todo) for record in journal.lines[key]]
         measured = {"sessions": journal.sessions, "peak_memory_mb": round(journal.memory, 1)}
-    result = {"meta": {**about, **json.loads(json.dumps(dict(settings))), **measured}, "trials": records}
+    result = {
+        "meta": {"commit": _commits(records) or made, **about, **json.loads(json.dumps(dict(settings))), **measured},
+        "trials": records,
+    }
     write_atomically(out / "results.csv", to_csv(records).encode())
     write_atomically(out / "results.json", (json.dumps(result, indent=1, allow_nan=False) + "\n").encode())
     if report is not None:
@@ -164,6 +168,11 @@ def _given_up(key: str, died: Died) -> dict[str, Any]:
     """Return the line of a trial that no process survived."""
     failure = {"key": key, "success": False, "status": "error", "failed_constraint": "error", "violations": [died.reason]}
     return {"key": key, "memory_mb": 0.0, "records": [failure], "traceback": died.reason}
+
+
+def _commits(records: Iterable[Mapping[str, Any]]) -> str:
+    """Return the commits that trials are of: one, or several where a run went on after a change that had no part in it."""
+    return ", ".join(dict.fromkeys(str(record["commit"]) for record in records if record.get("commit")))
 
 
 def _plain(value: Any) -> Any:

@@ -26,6 +26,7 @@ __all__ = [
     "mean_and_deviation",
     "methods_table",
     "quartiles",
+    "timed_out",
     "to_csv",
     "wilson",
 ]
@@ -98,6 +99,13 @@ def failures(records: Iterable[Record]) -> str:
     return ", ".join(f"{kind} {count}" for kind, count in sorted(kinds.items(), key=lambda item: (-item[1], item[0]))) or "none"
 
 
+def timed_out(records: Iterable[Record]) -> list[str]:
+    """Return how many trials the clock ended, of which nobody knows whether the method fails, and the failures of all others."""
+    records = list(records)
+    others = [record for record in records if record["status"] != "time limit"]
+    return [str(len(records) - len(others)), failures(others)]
+
+
 def methods_table(records: Sequence[Record], scenes: Mapping[str, str], methods: Sequence[str]) -> str:
     """Return successes, planning times, efforts and failures per scene and method, and over all scenes if there are several.
 
@@ -117,8 +125,19 @@ def methods_table(records: Sequence[Record], scenes: Mapping[str, str], methods:
             good = [record for record in own if record["success"]]
             time, late = distribution(own, "planning_time")
             efforts = (decimal(distribution(good, field)[0]) for field in ("base_effort", "arm_effort"))
-            rows.append([name, method, f"{len(good)} of {len(own)}", decimal(time), decimal(late), *efforts, failures(own)])
-    head = ["scene", "method", "success", "time, median [s]", "95th percentile [s]", "base [m]", "arm [rad]", "failures"]
+            times = (decimal(time), decimal(late))
+            rows.append([name, method, f"{len(good)} of {len(own)}", *times, *efforts, *timed_out(own)])
+    head = [
+        "scene",
+        "method",
+        "success",
+        "time, median [s]",
+        "95th percentile [s]",
+        "base [m]",
+        "arm [rad]",
+        "timed out",
+        "failures",
+    ]
     return markdown(head, rows, text=2)
 
 

@@ -55,3 +55,22 @@ def test_what_joints_resist_with(tmp_path: Path) -> None:
     (tmp_path / "t.xml").write_text(MJCF.replace('name="hinge"', 'name="hinge" damping="0.4" frictionloss="0.2"'))
     hinge = read_object_mjcf(tmp_path / "t.xml").joints["door"]
     assert (hinge.damping, hinge.friction) == (0.4, 0.2)
+
+
+def test_what_bodies_weigh(tmp_path: Path) -> None:
+    """Masses and moments about the world's origin are MuJoCo's, which infers them from the geoms."""
+    mujoco = pytest.importorskip("mujoco")
+    (tmp_path / "t.xml").write_text(MJCF)
+    model = mujoco.MjModel.from_xml_string(MJCF)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    found = read_object_mjcf(tmp_path / "t.xml", free=True)
+    for name, place in found.placements().items():
+        body = model.body(name).id
+        inertia = place.act(found.links[name].inertia)
+        assert inertia.mass == pytest.approx(model.body_mass[body])
+        if inertia.mass > 0.0:
+            assert np.allclose(inertia.lever, data.xipos[body])
+            axes = data.ximat[body].reshape(3, 3)
+            assert np.allclose(inertia.inertia, axes @ np.diag(model.body_inertia[body]) @ axes.T)
+    assert found.links["door"].inertia.mass > 0.0

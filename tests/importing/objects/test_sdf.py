@@ -64,3 +64,17 @@ def test_what_joints_resist_with(tmp_path: Path) -> None:
     (tmp_path / "t.sdf").write_text(SDF)
     hinge = read_object_sdf(tmp_path / "t.sdf").joints["door"]
     assert (hinge.damping, hinge.friction) == (0.0, 0.0)
+
+
+def test_what_links_weigh(tmp_path: Path) -> None:
+    moments = "<inertia><ixx>0.1</ixx><iyy>0.2</iyy><izz>0.25</izz></inertia>"
+    stated = f"<inertial><pose>0 0 0.1 0 0 0</pose><mass>2</mass>{moments}</inertial>"
+    place = SDF.index(">", SDF.index("<link")) + 1
+    for inertial, mass, half in ((stated, 2.0, False), ("<inertial><mass>2</mass></inertial>", 0.0, True)):
+        (tmp_path / "t.sdf").write_text(SDF[:place] + inertial + SDF[place:])
+        found = read_object_sdf(tmp_path / "t.sdf")
+        weights = [link.inertia for link in found.links.values()]
+        assert [weight.mass for weight in weights if weight.mass > 0.0] == ([mass] if mass else [])
+        assert any("<inertial> counts as none" in note for note in found.notes) == half
+        if not half:
+            assert sum(np.trace(weight.inertia) for weight in weights) == pytest.approx(0.55)

@@ -45,8 +45,14 @@ def test_a_handle_fixed_to_a_door_is_part_of_it_and_keeps_its_name() -> None:
         "handle": Link("handle", (), (box,)),
         "flap": Link("flap", (), (box,)),
     }
+    weights = {name: pin.Inertia(k + 1.0, np.array([0.1, 0.0, 0.0]), 0.01 * np.eye(3)) for k, name in enumerate(links)}
+    links = {name: dataclasses.replace(link, inertia=weights[name]) for name, link in links.items()}
     found = tidied(Description(Path("f"), links, joints))
     assert set(found.links) == {"case", "door"}
+    assert found.links["case"].inertia.mass == 1.0
+    assert found.links["door"].inertia.mass == 2.0 + 3.0 + 4.0
+    middles = [weights["door"].lever, place.act(weights["handle"].lever), 2.0 * place.translation + weights["flap"].lever]
+    assert np.allclose(found.links["door"].inertia.lever, np.average(middles, axis=0, weights=[2.0, 3.0, 4.0]))
     assert [part.name for part in found.links["door"].collision] == ["", "handle", "flap"]
     turned = found.links["door"].collision[2].placement
     assert np.allclose(turned.translation, [0.0, 1.0, 0.0])
@@ -63,6 +69,20 @@ def test_scaling_scales_everything(factor: float, slide: float, tmp_path_factory
     other = bounds(large, surfaces(large), {"joint_0": factor * slide})
     assert np.allclose(factor * np.array(one), other, rtol=1e-9, atol=1e-9)
     assert large.joints["link_0"].limits == pytest.approx((0.0, factor * 0.36))
+
+
+def test_masses_stay_as_stated_when_scaled_and_turn_with_the_root() -> None:
+    weight = pin.Inertia(2.0, np.array([0.1, 0.2, 0.3]), np.diag([0.1, 0.2, 0.25]))
+    one = Description(Path("f"), {"a": Link("a", inertia=weight)}, {})
+    large = scaled(one, 3.0).links["a"].inertia
+    assert large.mass == 2.0
+    assert np.allclose(large.lever, 3.0 * weight.lever)
+    assert np.allclose(large.inertia, 9.0 * weight.inertia)
+    turned = upright(one, "y").links["a"].inertia
+    assert np.allclose(turned.lever, [0.3, 0.1, 0.2]) or np.allclose(turned.lever, [0.1, -0.3, 0.2])
+    assert sorted(np.diag(turned.inertia)) == pytest.approx([0.1, 0.2, 0.25])
+    assert not one.weightless
+    assert Description(Path("f"), {"a": Link("a")}, {}).weightless
 
 
 def test_limits_that_are_missing_open_outwards(cabinet: Description) -> None:

@@ -62,3 +62,24 @@ def test_what_joints_resist_with(tmp_path: Path) -> None:
     (tmp_path / "t.urdf").write_text(text)
     found = read_object_urdf(tmp_path / "t.urdf").joints
     assert [(joint.damping, joint.friction) for joint in found.values()] == [(0.4, 0.2), (0.0, 0.0)]
+
+
+def test_what_links_weigh(tmp_path: Path) -> None:
+    placed = '<origin xyz="0.1 0.2 0.3" rpy="0 0 1.5707963267948966"/>'
+    whole = f'<inertial>{placed}<mass value="2"/><inertia ixx="0.1" iyy="0.2" izz="0.25" ixy="0.01"/></inertial>'
+    text = f"""<robot name="t"><link name="a">{whole}</link><link name="b"/>
+    <link name="c"><inertial><mass value="1"/></inertial></link>
+    <link name="d"><inertial><mass value="-1"/><inertia ixx="1" iyy="1" izz="1"/></inertial></link>
+    <link name="e"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="3"/></inertial></link>
+    <link name="f"><inertial><mass value="heavy"/><inertia ixx="1" iyy="1" izz="1"/></inertial></link>
+    """ + "".join(f'<joint name="{c}" type="fixed"><parent link="a"/><child link="{c}"/></joint>' for c in "bcdef")
+    (tmp_path / "t.urdf").write_text(text + "</robot>")
+    found = read_object_urdf(tmp_path / "t.urdf")
+    stated = found.links["a"].inertia
+    assert (stated.mass, list(stated.lever)) == (2.0, [0.1, 0.2, 0.3])
+    assert np.allclose(stated.inertia, [[0.2, -0.01, 0.0], [-0.01, 0.1, 0.0], [0.0, 0.0, 0.25]])  # along the link's axes
+    assert [found.links[name].inertia.mass for name in "bcdef"] == [0.0] * 5
+    said = [next(note for note in found.notes if f"'{name}'" in note) for name in "cdef"]
+    for note, words in zip(said, ("without <inertia>", "a mass below zero", "moments of inertia", "heavy"), strict=True):
+        assert words in note
+        assert "counts as none" in note

@@ -42,7 +42,8 @@ def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
         damping=0.5,
         friction=0.25,
     )
-    links = {"a": Link("a", parts[:1], parts[:1]), "b": Link("b", parts, parts)}
+    weight = place.act(pin.Inertia(2.5, np.zeros(3), np.diag([0.1, 0.2, 0.25])))
+    links = {"a": Link("a", parts[:1], parts[:1]), "b": Link("b", parts, parts, weight)}
     write_urdf(Description(tmp_path / "x", links, {"b": joint}), tmp_path / "thing.urdf")
     write_description(tmp_path / "thing.yaml", "thing.urdf", (), about=["One.", "Two."])
     assert (tmp_path / "thing.yaml").read_text().startswith("# One.\n# Two.\nurdf: thing.urdf\n")
@@ -50,6 +51,7 @@ def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
     item = vkc.load_object(tmp_path / "thing.yaml")
     assert (item.lower[0], item.upper[0], item.velocity[0]) == (-0.2, 1.1, 0.7)
     assert (item.resistance["hinge"].damping, item.resistance["hinge"].friction) == (0.5, 0.25)
+    assert item.model.inertias[1].isApprox(weight, 1e-6)
     turned = place * pin.SE3(pin.exp3(axis * 0.5), np.zeros(3))
     assert np.allclose(item.link_placement("b", [0.5]).homogeneous, turned.homogeneous, atol=1e-8)
     assert [shape.name for shape in item.collision.geometryObjects] == ["a_0", "b_0", "b_1", "b_2"]

@@ -23,6 +23,7 @@ from vkc_pin.importing.homes.obstacles import write_obstacles
 from vkc_pin.importing.homes.splitting import FLOOR_RISE, Home, split
 from vkc_pin.importing.homes.starting import free_start
 from vkc_pin.importing.homes.things import ImportedThing, write_thing
+from vkc_pin.importing.objects.description import WEIGHTLESS
 from vkc_pin.importing.objects.object_import import read_description
 from vkc_pin.importing.objects.pieces import Known
 from vkc_pin.importing.objects.tidying import bounds, renamed, rooted, surfaces
@@ -147,7 +148,8 @@ def import_home(
             scene, reached = free_start(Scene.from_document(document, made), rng)
         document["start"] = {"base": scene.start[:3].tolist()}
         _write(made / "scene.yaml", path, document)
-    notes = (*home.notes, *_floor_notes(home), *changed, *(note for thing in things for note in thing.notes))
+    weight = (WEIGHTLESS,) if all(thing.description.weightless for thing in home.things) else ()
+    notes = (*home.notes, *weight, *_floor_notes(home), *changed, *(note for thing in things for note in thing.notes))
     return ImportedHome(target / "scene.yaml", load_scene(target / "scene.yaml"), things, _counts(home), reached, notes)
 
 

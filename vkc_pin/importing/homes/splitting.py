@@ -165,7 +165,7 @@ def _placed(link: Link, place: pin.SE3) -> Link:
     def moved(parts: tuple[Part, ...]) -> tuple[Part, ...]:
         return tuple(dataclasses.replace(part, placement=place * part.placement) for part in parts)
 
-    return Link(link.name, moved(link.visual), moved(link.collision))
+    return Link(link.name, moved(link.visual), moved(link.collision), place.act(link.inertia))
 
 
 def _length(link: Link) -> float:

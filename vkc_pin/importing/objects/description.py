@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,14 +11,16 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.arrays import Floats
+from vkc_pin.errors import InputError
 from vkc_pin.files.meshes import load_mesh
 
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["Colour", "Description", "Joint", "Link", "Part"]
+__all__ = ["WEIGHTLESS", "Colour", "Description", "Joint", "Link", "Part", "inertia"]
 
 Colour = tuple[float, float, float, float]
+WEIGHTLESS = "no mass is stated: torques of the arm leave weight and inertia out, physics assumes a density"  # said once
 _SIDES = 48  # of a cylinder as triangles
 
 
@@ -69,11 +71,12 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Link:
-    """A link: what it looks like, and what collides, each in the link's frame."""
+    """A link: what it looks like, what collides, and what it weighs (nothing if no mass is stated), each in the link's frame."""
 
     name: str
     visual: tuple[Part, ...] = ()
     collision: tuple[Part, ...] = ()
+    inertia: pin.Inertia = field(default_factory=pin.Inertia.Zero)
 
     @property
     def solid(self) -> tuple[Part, ...]:
@@ -146,6 +149,11 @@ class Description:
                     found[child] = found[joint.parent] * joint.placement * joint.motion(value)
         return found
 
+    @property
+    def weightless(self) -> bool:
+        """Whether no link has a mass."""
+        return not any(link.inertia.mass > 0.0 for link in self.links.values())
+
     def below(self, link: str) -> set[str]:
         """Return a link and all that hang on it."""
         found, before = {link}, 0
@@ -153,3 +161,23 @@ class Description:
             before = len(found)
             found |= {child for child, joint in self.joints.items() if joint.parent in found}
         return found
+
+
+def inertia(mass: float, moments: Iterable[float], placement: pin.SE3) -> pin.Inertia:
+    """Return what a link weighs, from what URDF and SDF state.
+
+    Args:
+        mass: [kg].
+        moments: ixx, iyy, izz, ixy, ixz, iyz about the centre of mass [kg·m²].
+        placement: Of the centre of mass, and of the axes of the moments, in the link's frame.
+
+    Raises:
+        InputError: The mass or a principal moment is negative.
+    """
+    xx, yy, zz, xy, xz, yz = moments
+    tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    least = float(np.linalg.eigvalsh(tensor)[0])
+    if mass < 0.0 or least < -1e-9 * max(abs(xx), abs(yy), abs(zz)):
+        problem = "a mass below zero" if mass < 0.0 else "moments of inertia that no body has"
+        raise InputError(problem, expected="0 or more", got=mass if mass < 0.0 else least)
+    return placement.act(pin.Inertia(mass, np.zeros(3), tensor))

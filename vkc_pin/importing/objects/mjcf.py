@@ -77,7 +77,7 @@ class _Reader:
                     joints[name] = Joint(
                         name=f"{name}_{kind}", kind=kind, parent=above, child=name, placement=frames[above].inverse() * here
                     )
-            links[name] = Link(name, *self._parts(body, frames[name]))
+            links[name] = Link(name, *self._parts(body, frames[name]), self._inertia(body, frames[name]))
         return Description(self.file, links, joints, tuple(self.notes))
 
     def _joint(self, number: int, parent: str, child: str, frames: dict[str, pin.SE3]) -> Joint:
@@ -101,6 +101,13 @@ class _Reader:
             damping=float(np.ravel(model.dof_damping[model.jnt_dofadr[number]])[0]),
             friction=float(model.dof_frictionloss[model.jnt_dofadr[number]]),
         )
+
+    def _inertia(self, body: int, frame: pin.SE3) -> pin.Inertia:
+        """Return what a body weighs: as stated, or as MuJoCo takes it from its geoms and their densities."""
+        if not self.model.body_mass[body] > 0.0:
+            return pin.Inertia.Zero()
+        principal = pin.Inertia(float(self.model.body_mass[body]), np.zeros(3), np.diag(self.model.body_inertia[body]))
+        return (frame.inverse() * _placement(self.data.xipos[body], self.data.ximat[body])).act(principal)
 
     def _parts(self, body: int, frame: pin.SE3) -> tuple[tuple[Part, ...], tuple[Part, ...]]:
         """Return what a body looks like, and what collides."""

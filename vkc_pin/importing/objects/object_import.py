@@ -19,7 +19,7 @@ from vkc_pin.files.documents import read_text
 from vkc_pin.files.resources import file_path
 from vkc_pin.files.writing import folder_at_once
 from vkc_pin.files.xml import parse_xml
-from vkc_pin.importing.objects.description import Description
+from vkc_pin.importing.objects.description import WEIGHTLESS, Description
 from vkc_pin.importing.objects.mjcf import read_object_mjcf
 from vkc_pin.importing.objects.pieces import with_pieces
 from vkc_pin.importing.objects.sdf import read_object_sdf
@@ -158,6 +158,8 @@ def import_object(
     description, size = _sized(description, height, scale)
     meshes = surfaces(description)
     description = _settled(with_limits(description, meshes))
+    if description.weightless:
+        description = dataclasses.replace(description, notes=(*description.notes, WEIGHTLESS))
     description = with_pieces(description, surfaces(description))
     with folder_at_once(target, force=True) as made:  # what is there is empty
         yaml, urdf, picture = made / f"{name}.yaml", made / f"{name}.urdf", made / "attachments.png"

@@ -67,7 +67,7 @@ def with_pieces(description: Description, meshes: Surfaces, known: Known | None 
             notes.append(f"link '{name}': flat shapes are {1e3 * THICKNESS:g} mm thick now: {', '.join(dict.fromkeys(thick))}")
         if link.visual and not link.collision:
             notes.append(f"link '{name}' has nothing to collide with: it collides as what it looks like")
-        links[name] = Link(name, link.visual or link.collision, tuple(kept))
+        links[name] = Link(name, link.visual or link.collision, tuple(kept), link.inertia)
     return dataclasses.replace(description, links=links, notes=tuple(notes))
 
 

@@ -12,7 +12,7 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.files.documents import read_text
 from vkc_pin.files.kinematic_tree import numbers_of
 from vkc_pin.files.xml import line_of, parse_xml
-from vkc_pin.importing.objects.description import Description, Joint, Link, Part
+from vkc_pin.importing.objects.description import Description, Joint, Link, Part, inertia
 
 __all__ = ["read_object_sdf"]
 
@@ -60,7 +60,10 @@ class _Reader:
             raise InputError("links that nothing connects", file=self.file, field="model", expected="one tree", got=got)
         # A link's frame becomes that of its joint, so that axes go through origins.
         frames = {name: self.pose(joints[name].get("name", "") if name in joints else name) for name in names}
-        links = {name: Link(name, *(self._parts(name, kind, frames[name]) for kind in ("visual", "collision"))) for name in names}
+        links = dict[str, Link]()
+        for name in names:
+            looks, solid = (self._parts(name, kind, frames[name]) for kind in ("visual", "collision"))
+            links[name] = Link(name, looks, solid, self._inertia(name, frames[name]))
         if grounded:
             frames[_BASE], links = pin.SE3.Identity(), {_BASE: Link(_BASE), **links}
         return Description(
@@ -151,6 +154,22 @@ class _Reader:
             else:
                 self.notes.append(f"{kind} '{name}' of link '{link}' is {'empty' if shape is None else shape.tag}: left out")
         return tuple(parts)
+
+    def _inertia(self, link: str, frame: pin.SE3) -> pin.Inertia:
+        """Return what a link weighs; nothing if its <inertial> is not whole, which is noted."""
+        stated = self.elements[link].find("inertial")
+        if stated is None:
+            return pin.Inertia.Zero()
+        moments = stated.find("inertia")
+        try:
+            if stated.find("mass") is None or moments is None:
+                raise InputError("an <inertial> without both <mass> and <inertia>", field=link)
+            (mass,) = self._numbers(stated, "mass", 1, None, link)
+            entries = (self._numbers(moments, key, 1, "0", link)[0] for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
+            return inertia(mass, entries, frame.inverse() * self._own(stated, link))
+        except InputError as error:
+            self.notes.append(f"link '{link}': {error}: its <inertial> counts as none")
+            return pin.Inertia.Zero()
 
     def _colour(self, element: ElementTree.Element, name: str) -> tuple[float, float, float, float] | None:
         material = element.find("material")

@@ -89,8 +89,9 @@ def tidied(description: Description) -> Description:
             moved = (_moved(gone, parts, joint.placement) for parts in (gone.visual, gone.collision))
             visual, collision = moved
             if bool(above.collision) != bool(gone.collision):  # one of them collides as what it looks like
-                above, collision = Link(above.name, above.visual, above.solid), collision or visual
-            links[joint.parent] = Link(above.name, (*above.visual, *visual), (*above.collision, *collision))
+                above, collision = dataclasses.replace(above, collision=above.solid), collision or visual
+            inertia = above.inertia + joint.placement.act(gone.inertia)
+            links[joint.parent] = Link(above.name, (*above.visual, *visual), (*above.collision, *collision), inertia)
             del joints[child]
             for name, other in joints.items():
                 if other.parent == child:
@@ -136,11 +137,12 @@ def closed(description: Description) -> dict[str, float]:
 
 
 def scaled(description: Description, factor: float) -> Description:
-    """Return the object made larger by a factor: shapes, places of joints, and how far they slide."""
-    links = {
-        name: Link(name, tuple(_scaled(p, factor) for p in link.visual), tuple(_scaled(p, factor) for p in link.collision))
-        for name, link in description.links.items()
-    }
+    """Return the object made larger by a factor: shapes, places of joints, and how far they slide; masses stay as stated."""
+    links = {}
+    for name, link in description.links.items():
+        looks, solid = (tuple(_scaled(part, factor) for part in parts) for parts in (link.visual, link.collision))
+        inertia = pin.Inertia(link.inertia.mass, factor * link.inertia.lever, factor**2 * link.inertia.inertia)
+        links[name] = Link(name, looks, solid, inertia)
     joints = {}
     for child, joint in description.joints.items():
         limits = joint.limits
@@ -164,11 +166,12 @@ def upright(description: Description, up: str) -> Description:
 def rooted(description: Description, placement: pin.SE3) -> Description:
     """Return the object with its root's frame where the old one is at `placement`."""
     links, root = dict(description.links), description.root
-    parts = (
+    old = links[root]
+    visual, collision = (
         tuple(dataclasses.replace(part, placement=placement * part.placement) for part in kind)
-        for kind in (links[root].visual, links[root].collision)
+        for kind in (old.visual, old.collision)
     )
-    links[root] = Link(root, *parts)
+    links[root] = Link(root, visual, collision, placement.act(old.inertia))
     joints = {
         child: dataclasses.replace(joint, placement=placement * joint.placement) if joint.parent == root else joint
         for child, joint in description.joints.items()

@@ -9,13 +9,15 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
+from vkc_pin.errors import InputError
 from vkc_pin.files.kinematic_tree import check_tree, numbers_of
 from vkc_pin.files.urdf import UrdfFile
 from vkc_pin.files.xml import read_xml
-from vkc_pin.importing.objects.description import Description, Joint, Link, Part
+from vkc_pin.importing.objects.description import Description, Joint, Link, Part, inertia
 
 __all__ = ["read_object_urdf"]
 
+_MOMENTS = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 _KINDS = ("fixed", "revolute", "continuous", "prismatic")
 
 
@@ -52,7 +54,8 @@ def read_object_urdf(file: Path, *, free: bool = False) -> Description:
             )
             if name and shape.file is not None:  # PartNet-Mobility names what is seen; what collides are the same files
                 names["mesh", str(shape.file)] = name
-    links = {name: Link(name, tuple(parts["visual"][name]), tuple(parts["collision"][name])) for name in urdf.links}
+    weight = {link.get("name", ""): _inertia(file, link, notes) for link in root.findall("link")}
+    links = {name: Link(name, tuple(parts["visual"][name]), tuple(parts["collision"][name]), weight[name]) for name in urdf.links}
     joints = [_joint(file, joint, stated[joint.get("name", "")]) for joint in root.findall("joint")]
     return Description(file, links, {joint.child: joint for joint in joints}, tuple(notes))
 
@@ -82,6 +85,27 @@ def _stated(file: Path, joint: ElementTree.Element, notes: list[str]) -> tuple[f
         limit.set("lower", str(low))
         limit.set("upper", str(high))
     return low, high
+
+
+def _inertia(file: Path, link: ElementTree.Element, notes: list[str]) -> pin.Inertia:
+    """Return what a link weighs; nothing if its <inertial> is not whole, which is noted."""
+    name, stated = link.get("name", ""), link.find("inertial")
+    if stated is None:
+        return pin.Inertia.Zero()
+    mass, moments, origin = (stated.find(key) for key in ("mass", "inertia", "origin"))
+    try:
+        if mass is None or moments is None:
+            raise InputError(f"an <inertial> without <{'mass' if mass is None else 'inertia'}>", field=name)
+        (weight,) = numbers_of(file, mass, "value", 1, default=None, where=name)
+        placement = pin.SE3.Identity()
+        if origin is not None:
+            xyz, rpy = (numbers_of(file, origin, key, 3, default="0 0 0", where=name) for key in ("xyz", "rpy"))
+            placement = pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array(xyz))
+        entries = (numbers_of(file, moments, key, 1, default="0", where=name)[0] for key in _MOMENTS)
+        return inertia(weight, entries, placement)
+    except InputError as error:
+        notes.append(f"link '{name}': {error}: its <inertial> counts as none")
+        return pin.Inertia.Zero()
 
 
 def _joint(file: Path, element: ElementTree.Element, limits: tuple[float, float] | None) -> Joint:

@@ -43,6 +43,7 @@ def write_urdf(description: Description, file: Path) -> None:
         for number, part in enumerate(_plain_shapes(link.collision)):
             piece = None if part.kind != "mesh" else _mesh(file, f"collision/{_plain(link.name)}_{number}.stl", part.mesh())
             lines += _element("collision", part.name, part, piece, None)
+        lines += _inertial(link.inertia)
         lines.append("  </link>")
     for joint in description.joints.values():
         lines += _joint(joint)
@@ -119,6 +120,15 @@ def _element(kind: str, name: str, part: Part | None, address: str | None, colou
         name = "_".join(f"{round(255 * c):02x}" for c in colour)
         lines.append(f'      <material name="{name}"><color rgba="{_numbers(colour)}"/></material>')
     return [*lines, f"    </{kind}>"]
+
+
+def _inertial(inertia: pin.Inertia) -> list[str]:
+    """Return what a link weighs, about its centre of mass along the link's axes; nothing if it has no mass."""
+    if not inertia.mass > 0.0:
+        return []
+    entries = " ".join(f'i{"xyz"[i]}{"xyz"[j]}="{inertia.inertia[i, j]:.9g}"' for i in range(3) for j in range(i, 3))
+    origin, mass = f'<origin xyz="{_numbers(inertia.lever)}"/>', f'<mass value="{inertia.mass:.9g}"/>'
+    return [f"    <inertial>{origin}{mass}<inertia {entries}/></inertial>"]
 
 
 def _joint(joint: Joint) -> list[str]:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from vkc_pin.benchmarks.comparison import COMPARED_PLANNERS, Assignment, Comparison
+from vkc_pin.benchmarks.comparison_report import WAYPOINTS
 from vkc_pin.benchmarks.harness.charts import criteria_chart
 from vkc_pin.benchmarks.harness.record import Record
 from vkc_pin.task.steps import Actuate
@@ -20,11 +21,12 @@ TASKS = {
 
 def _draw(records: Sequence[Record], out: Path, tasks: Mapping[str, str], methods: Sequence[str]) -> list[str]:
     """Draw the criteria of every task as bars, <task>.png: success, efforts and planning time."""
+    compared = [method for method in methods if method not in WAYPOINTS] or methods
     for task, name in tasks.items():
         own = [record for record in records if record["scene"] == task]
         starts = len({record["number"] for record in own})
         title = f"{name.capitalize()}, {starts} random start{'s' * (starts != 1)}"
-        criteria_chart(own, out / f"{task}.png", methods, title=title)
+        criteria_chart(own, out / f"{task}.png", compared, title=title)
     return [f"![Criteria: {name}]({task}.png)" for task, name in tasks.items()]
 
 

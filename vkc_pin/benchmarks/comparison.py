@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from vkc_pin.baselines.attempt import FINER
 from vkc_pin.baselines.separate import BASELINES, RETRIES, plan_separately
-from vkc_pin.benchmarks.comparison_report import report
+from vkc_pin.benchmarks.comparison_report import WAYPOINTS, report
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.charts import motions_chart
 from vkc_pin.benchmarks.harness.limits import EFFORT, LIMITS
@@ -31,11 +31,9 @@ from vkc_pin.scene.poses import as_placement
 from vkc_pin.scene.scene import Scene, load_scene
 from vkc_pin.task.steps import Actuate, GoTo, Place, Step
 
-__all__ = ["COLD", "COMPARED_PLANNERS", "METHODS", "WAYPOINTS", "Assignment", "Comparison", "peaks"]
+__all__ = ["COLD", "COMPARED_PLANNERS", "METHODS", "Assignment", "Comparison", "peaks"]
 
 COMPARED_PLANNERS = (*BASELINES, "VKC")
-WAYPOINTS = {f"{method}x{finer}": (method, finer) for finer in (1, 3) for method in BASELINES}
-"""Baselines with other numbers of waypoints than is best for them: name → method, multiple of VKC's number."""
 METHODS = (*COMPARED_PLANNERS[:-1], *WAYPOINTS, "VKC")  # in the order of the tables
 COLD = 5
 """Trials of a task and method that are planned twice, cold and warm."""

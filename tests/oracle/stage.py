@@ -12,7 +12,7 @@ import coal
 import numpy as np
 
 from .gripper import Fingers, required
-from .plan import Hold, NotJudged, Phase, SavedPlan
+from .plan import Hold, Phase, SavedPlan
 from .poses import IDENTITY, Poses, orientation, pose
 from .riding import distance, riders
 from .things import Thing, Tree, load_robot, load_thing
@@ -67,9 +67,7 @@ class World:
     def __init__(self, plan: SavedPlan) -> None:
         self.plan = plan
         scene = plan.scene
-        if scene["start"].get("z"):
-            raise NotJudged("the robot's root is not on the floor")
-        self.robot = load_robot(scene["robot"], plan.folder, plan.names[3 : plan.robot_size])
+        self.robot = load_robot(scene["robot"], plan.folder, plan.names[3 : plan.robot_size], scene["start"].get("z"))
         self.things = {item["name"]: load_thing(item, plan.folder) for item in scene.get("objects") or ()}
         arena = scene.get("arena") or {}
         self.arena = (*arena.get("x", (-5.0, 5.0)), *arena.get("y", (-5.0, 5.0)))

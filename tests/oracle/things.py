@@ -21,11 +21,13 @@ __all__ = ["Grasp", "Robot", "Thing", "Tree", "load_robot", "load_thing"]
 
 
 class Tree:
-    """The kinematics of a URDF, by Pinocchio, on a planar joint if it drives."""
+    """The kinematics of a URDF, by Pinocchio, on a planar joint if it drives, so high above the floor [m]."""
 
-    def __init__(self, urdf: Urdf, *, drives: bool) -> None:
+    def __init__(self, urdf: Urdf, *, drives: bool, height: float = 0.0) -> None:
         self.urdf = urdf
         self.model = pin.buildModelFromXML(urdf.text, *((pin.JointModelPlanar(), "base") if drives else ()))
+        if drives:
+            self.model.jointPlacements[1] = pin.SE3(np.eye(3), np.array([0.0, 0.0, height]))
         self.data = self.model.createData()
 
     def links(self, values: Mapping[str, np.ndarray | float], base: np.ndarray | None, wanted: list[str]) -> dict[str, Poses]:
@@ -241,7 +243,7 @@ def _grasp(entry: Mapping[str, Any], free: bool, reversed_ones: Sequence[str]) -
     return Grasp(name, entry["link"], place, tuple(freedoms), tuple(through), standoff, firm, *own)
 
 
-def load_robot(item: Mapping[str, Any] | str, folder: Path, arm: list[str]) -> Robot:
+def load_robot(item: Mapping[str, Any] | str, folder: Path, arm: list[str], height: float | None) -> Robot:
     """Return the robot of a scene's `robot`; `arm` are its planned joints, which a saved motion names."""
     about = {"name": item} if isinstance(item, str) else dict(item)
     file = _robot_file(about["name"], folder)
@@ -261,8 +263,7 @@ def load_robot(item: Mapping[str, Any] | str, folder: Path, arm: list[str]) -> R
     if semantics is None:
         raise NotJudged("no SRDF says which links of the robot may touch")
     base, joints = own.get("base") or {}, own.get("joints") or {}
-    if base.get("height"):
-        raise NotJudged("the robot's root is not on the floor")
+    height = float(base.get("height", 0.0)) if height is None else height
     speeds, strengths = base.get("velocity", (1.0, 1.0, 2.0)), base.get("acceleration", (3.0, 3.0, 6.0))
     (x, y) = base.get("position", ((-20.0, 20.0), (-20.0, 20.0)))
     spans = (x, y, (-np.inf, np.inf))
@@ -295,7 +296,7 @@ def load_robot(item: Mapping[str, Any] | str, folder: Path, arm: list[str]) -> R
             closed, opened = (factor * end + offset for end in gripper[master])
             gripper[joint] = (closed, opened)
     return Robot(
-        tree=Tree(urdf, drives=True),
+        tree=Tree(urdf, drives=True, height=height),
         base=about.get("base", "omni"),
         tool=tool,
         touch=set(own.get("touch_links", ())),

@@ -43,6 +43,13 @@ def test_at() -> None:
     assert motion.at(np.zeros((2, 3))).shape == (2, 3, 6)
 
 
+@pytest.mark.parametrize("time", ["soon", float("nan"), [0.0, float("inf")]])
+def test_what_is_no_time(time: Any) -> None:
+    for ask in (example().at, example().velocity, example().acceleration):
+        with pytest.raises(InputError, match="time"):
+            ask(time)
+
+
 def test_columns() -> None:
     column = example().column("door.hinge")
     np.testing.assert_array_equal(column, ROWS[:, 5])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -50,11 +51,14 @@ def rolling_paths(
         Paths, see `path_through`, with as many knots in every step, of the n coordinates, and of how far left and right
         wheels have gone [m], which are none of the motion's, but have a limit of their own.
     """
-    path, wrong = _rolled(points, scale, limits, rolling, finer)
-    if len(points) == 2 or not wrong.any():
-        return [(path, points)]
-    corner = _corner(points, wrong, rolling)
-    pieces = points[: corner + 1], points[corner:]
+    if rolling.radius > 0.0 and (backs := _backs(points, rolling)):
+        pieces = [points[first : last + 1] for first, last in itertools.pairwise([0, *backs, len(points) - 1])]
+    else:
+        path, wrong = _rolled(points, scale, limits, rolling, finer)
+        if len(points) == 2 or not wrong.any():
+            return [(path, points)]
+        corner = _corner(points, wrong, rolling)
+        pieces = [points[: corner + 1], points[corner:]]
     return [found for piece in pieces for found in rolling_paths(piece, scale, limits, rolling, finer)]
 
 
@@ -64,6 +68,12 @@ def slip(curve: Curve) -> float:
     (vx, vy), yaw = curve.velocity(moments)[:, :2].T, curve.at(moments)[:, 2]
     _, aside = seen(vx, vy, yaw)
     return float(np.abs(aside).max())
+
+
+def _backs(points: Floats, rolling: Rolling) -> list[int]:
+    """Return the waypoints at which the base changes between ahead and back, where one that is steered always stops."""
+    ahead = rolling.steps(points)[0] > 0.0
+    return (1 + np.flatnonzero(ahead[1:] != ahead[:-1])).tolist()
 
 
 def _corner(points: Floats, wrong: Bools, rolling: Rolling) -> int:
@@ -87,7 +97,8 @@ def _rolled(
     path = path_through(np.column_stack([points, driven]), np.append(scale, 0.0), bounds)
     parts = finer * max(_PARTS, int(np.ceil(np.abs(turn).max() / _TURN)))
     steps = _Steps(points[:, :3], path(path.x, 1)[:, [2, -1]], np.diff(path.x), np.diff(driven), parts)
-    left = steps.fit()
+    # An arc is where it should be but for rounding, of which bumps would make tight turns where a step is short.
+    left = steps.missing() if len(points) == 2 else steps.fit()
     at = moments_at(path.x, np.arange(parts) / parts, last=True)
     base, slopes, wheels = steps.at_knots(left)
     half = rolling.track / 2 * np.array([-1.0, 1.0])

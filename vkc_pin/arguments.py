@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Collection, Iterator, KeysView, Mapping, Sequence, ValuesView
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -17,6 +18,7 @@ from vkc_pin.arrays import LARGEST, Floats
 from vkc_pin.errors import InputError, UnknownNameError, shown
 
 __all__ = [
+    "finite",
     "flag",
     "instance",
     "is_number",
@@ -113,6 +115,20 @@ def numbers(value: Any, field: str, expected: str = "an array of numbers", *, pr
     if array.dtype.kind not in "iuf" and array.size:
         raise InputError(problem, field=field, expected=expected, got=shown(value))
     return np.array(array, float) if array.size else np.zeros(array.shape)
+
+
+def finite(value: Any, field: str, file: str | Path | None = None) -> Floats:
+    """Return a copy of an array of numbers, as `numbers` does, that are all finite.
+
+    Raises:
+        InputError: As `numbers`; or a number is not finite, with its place in the array.
+    """
+    array = numbers(value, field)
+    if not np.isfinite(array).all():
+        where = np.argwhere(~np.isfinite(array))[0].tolist()
+        got = array[tuple(where)]
+        raise InputError("not finite", file=file, field=f"{field}{where or ''}", expected="finite numbers", got=got)
+    return array
 
 
 def text(value: Any, field: str, expected: str = "text") -> str:

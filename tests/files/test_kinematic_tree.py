@@ -158,8 +158,8 @@ def test_a_robot_without_a_name_is_called_like_its_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("inertial", "message"),
     [
-        ("<inertial/>", "2: a: an <inertial> without <mass> counts as none"),
-        ('<inertial><mass value="1"/></inertial>', "2: a: an <inertial> without <inertia> counts as none"),
+        ("<inertial/>", "2: a: an <inertial> without <mass>.*counts as none"),
+        ('<inertial><mass value="1"/></inertial>', "2: a: an <inertial> without <inertia>.*counts as none"),
         (
             '<inertial><mass value="heavy"/><inertia ixx="1"/></inertial>',
             "a: mass value: wrong numbers .*got heavy.*counts as none",

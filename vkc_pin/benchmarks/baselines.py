@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from vkc_pin.benchmarks.comparison import COMPARED_PLANNERS, Assignment, Comparison
-from vkc_pin.benchmarks.comparison_report import WAYPOINTS
+from vkc_pin.benchmarks.comparison_report import compared_methods
 from vkc_pin.benchmarks.harness.charts import criteria_chart
 from vkc_pin.benchmarks.harness.record import Record
 from vkc_pin.task.steps import Actuate
@@ -21,7 +21,7 @@ TASKS = {
 
 def _draw(records: Sequence[Record], out: Path, tasks: Mapping[str, str], methods: Sequence[str]) -> list[str]:
     """Draw the criteria of every task as bars, <task>.png: success, efforts and planning time."""
-    compared = [method for method in methods if method not in WAYPOINTS] or methods
+    compared = compared_methods(methods)
     for task, name in tasks.items():
         own = [record for record in records if record["scene"] == task]
         starts = len({record["number"] for record in own})

@@ -21,7 +21,7 @@ from vkc_pin.benchmarks.harness.tables import (
     wilson,
 )
 
-__all__ = ["BUDGETS", "CRITERIA", "WAYPOINTS", "report"]
+__all__ = ["BUDGETS", "CRITERIA", "WAYPOINTS", "compared_methods", "report"]
 
 WAYPOINTS = {f"{method}x{finer}": (method, finer) for finer in (1, 3) for method in BASELINES}
 """Baselines with other numbers of waypoints than is best for them: name → method, multiple of VKC's number."""
@@ -36,6 +36,11 @@ CRITERIA = {
 BUDGETS = {"a tenth": 0.1, "a third": 1 / 3, "two thirds": 2 / 3, "all": 1.0}
 """Shares of the budget that are compared, by name; of the last two the larger one is half as much again."""
 _OWN = "VKC"
+
+
+def compared_methods(methods: Sequence[str]) -> Sequence[str]:
+    """Return those whose efforts are compared: without the baselines of other waypoints, unless there are no others."""
+    return [method for method in methods if method not in WAYPOINTS] or methods
 
 
 def report(
@@ -57,7 +62,7 @@ def report(
     """
     about, records = result["meta"], result["trials"]
     methods = about["methods"]
-    compared = [method for method in methods if method not in WAYPOINTS] or methods
+    compared = compared_methods(methods)
     *first, last = (f"`{task}`: {name}" for task, name in tasks.items())
     parts = [
         f"# {title}",

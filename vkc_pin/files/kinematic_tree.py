@@ -17,12 +17,14 @@ from vkc_pin.arrays import LARGEST
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.files.xml import line_of
 
-__all__ = ["check_tree", "numbers_of", "plain_tree"]
+__all__ = ["MOMENTS", "check_tree", "inertial_of", "numbers_of", "origin_of", "plain_tree"]
+
+MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+"""Attributes of <inertia>, along the rows of the upper triangle."""
 
 _KINDS = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 _LIMITED = ("revolute", "prismatic")
 _WITHOUT_AXIS = ("fixed", "floating")
-_INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 _SILENT = ("xacro:arg", "xacro:property")  # of xacro's elements those that put nothing in their place
 
 
@@ -98,22 +100,44 @@ def _add_origin(file: Path, parent: ElementTree.Element, origin: ElementTree.Ele
 
 def _add_inertial(file: Path, link: ElementTree.Element, inertial: ElementTree.Element) -> None:
     """Add mass and inertia to a link, or warn."""
-    name, mass, inertia = link.get("name", ""), inertial.find("mass"), inertial.find("inertia")
+    try:
+        mass, moments, (position, angles) = inertial_of(file, inertial, link.get("name", ""))
+    except InputError as error:
+        warnings.warn(f"{error}: this <inertial> counts as none", stacklevel=2)
+        return
+    added = ElementTree.SubElement(link, "inertial")
+    ElementTree.SubElement(added, "origin", xyz=_written(position), rpy=_written(angles))
+    ElementTree.SubElement(added, "mass", value=_written((mass,)))
+    ElementTree.SubElement(added, "inertia", {key: _written((value,)) for key, value in zip(MOMENTS, moments, strict=True)})
+
+
+def origin_of(file: Path, element: ElementTree.Element, where: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return what the <origin> of an element says, position [m] and roll, pitch and yaw [rad]; zeros if it has none.
+
+    Raises:
+        InputError: A number is wrong, as in `numbers_of`.
+    """
+    if (origin := element.find("origin")) is None:
+        return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    position, angles = (numbers_of(file, origin, key, 3, default="0 0 0", where=where) for key in ("xyz", "rpy"))
+    return position, angles
+
+
+def inertial_of(
+    file: Path, inertial: ElementTree.Element, where: str
+) -> tuple[float, tuple[float, ...], tuple[tuple[float, ...], tuple[float, ...]]]:
+    """Return what an <inertial> says: mass [kg], moments about its centre [kg·m²] as `MOMENTS` names them, and `origin_of` it.
+
+    Raises:
+        InputError: It has no mass or no moments, or a number is wrong, as in `numbers_of`.
+    """
+    mass, inertia = inertial.find("mass"), inertial.find("inertia")
     if mass is None or inertia is None:
         lacks = f"an <inertial> without <{'mass' if mass is None else 'inertia'}>"
-        warnings.warn(f"{file}:{line_of(inertial)}: {name}: {lacks} counts as none", stacklevel=2)
-        return
-    try:
-        weight = _written(numbers_of(file, mass, "value", 1, default=None, where=name))
-        moments = {key: _written(numbers_of(file, inertia, key, 1, default="0", where=name)) for key in _INERTIA}
-        added = ElementTree.Element("inertial")
-        _add_origin(file, added, inertial.find("origin"), name)
-    except InputError as error:
-        warnings.warn(f"{error}; this <inertial> counts as none", stacklevel=2)
-        return
-    ElementTree.SubElement(added, "mass", value=weight)
-    ElementTree.SubElement(added, "inertia", moments)
-    link.append(added)
+        raise InputError(lacks, file=file, line=line_of(inertial), field=where)
+    (weight,) = numbers_of(file, mass, "value", 1, default=None, where=where)
+    moments = tuple(numbers_of(file, inertia, key, 1, default="0", where=where)[0] for key in MOMENTS)
+    return weight, moments, origin_of(file, inertial, where)
 
 
 def _written(values: tuple[float, ...]) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vkc_pin.arguments import instance, items, known, mapping, number, numbers, text, whole
+from vkc_pin.arguments import finite, instance, items, known, mapping, number, text, whole
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
 from vkc_pin.motion.curve import Curve, evenly
@@ -52,7 +52,7 @@ class Trajectory:
         listed: tuple[Any, ...] = items(self.names, "Trajectory.names", "a list of names")
         names = tuple(text(name, f"Trajectory.names[{k}]", "a name") for k, name in enumerate(listed))
         phases = items(self.phases, "Trajectory.phases", "a list of PhaseSpan", PhaseSpan)
-        times, positions = _numbers(self.times, "Trajectory.times"), _numbers(self.positions, "Trajectory.positions")
+        times, positions = finite(self.times, "Trajectory.times"), finite(self.positions, "Trajectory.positions")
         counts = Counter(names)
         if (twice := next((name for name in names if counts[name] > 1), None)) is not None:
             raise InputError("a name occurs twice", field="Trajectory.names", got=twice)
@@ -83,7 +83,7 @@ class Trajectory:
         Raises:
             InputError: `time` is none.
         """
-        time = _numbers(time, "time")
+        time = finite(time, "time")
         if self.curve is not None:
             return self.curve.at(time)
         columns = [np.interp(time, self.times, column) for column in self.positions.T]
@@ -98,7 +98,7 @@ class Trajectory:
 
         Without a curve they jump at waypoints, to those of the segment after. Raises `InputError` for what is no time.
         """
-        time = _numbers(time, "time")
+        time = finite(time, "time")
         if self.curve is not None:
             return self.curve.velocity(time)
         inside = ((time >= self.times[0]) & (time <= self.times[-1]))[..., None]
@@ -110,7 +110,7 @@ class Trajectory:
 
         Without a curve they are 0: velocities jump then. Raises `InputError` for what is no time.
         """
-        time = _numbers(time, "time")
+        time = finite(time, "time")
         if self.curve is not None:
             return self.curve.acceleration(time)
         return np.zeros((*time.shape, len(self.names)))
@@ -286,12 +286,3 @@ class Trajectory:
         except InputError as error:
             field = ".".join(part for part in (inside, error.field) if part) or None
             raise InputError(error.problem, file=file, field=field, expected=error.expected, got=error.got) from error
-
-
-def _numbers(values: Any, field: str) -> Floats:
-    """Return a copy of an array of finite numbers."""
-    array = numbers(values, field)
-    if not np.isfinite(array).all():
-        where = np.argwhere(~np.isfinite(array))[0].tolist()
-        raise InputError("not finite", field=f"{field}{where or ''}", expected="finite numbers", got=array[tuple(where)])
-    return array

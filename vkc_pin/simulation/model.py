@@ -236,7 +236,7 @@ class Builder:
         mesh.inertia = inertias.mjMESH_INERTIA_SHELL if thin else inertias.mjMESH_INERTIA_CONVEX
         return body.add_geom(type=kinds.mjGEOM_MESH, meshname=name, **where)
 
-    def _frame(self, frame: str) -> tuple[Any, pin.SE3]:
+    def frame(self, frame: str) -> tuple[Any, pin.SE3]:
         """Return the body that carries a frame of the tree, and where the frame is in it."""
         found = self.world.model.frames[self.world.model.getFrameId(frame)]
         return self.bodies[found.parentJoint], found.placement
@@ -245,8 +245,8 @@ class Builder:
         """Add what holds on: a weld of what holds with the link; where the grasp leaves freedoms, with a body that has these."""
         scene = self.world.scene
         attachment = scene.objects[hold.object].object.attachment(hold.attachment)
-        holder, _ = self._frame(hold.frame or scene.robot.tool_frame)
-        held, place = self._frame(f"{hold.object}.{attachment.link}")
+        holder, _ = self.frame(hold.frame or scene.robot.tool_frame)
+        held, place = self.frame(f"{hold.object}.{attachment.link}")
         if not moves_as_one(scene, hold):
             held = self._carrier(hold, held, place * attachment.placement)
         weld = self.spec.add_equality(type=self.mj.mjtEq.mjEQ_WELD, objtype=self.mj.mjtObj.mjOBJ_BODY, active=False)

@@ -79,7 +79,7 @@ def test_masses_stay_as_stated_when_scaled_and_turn_with_the_root() -> None:
     assert np.allclose(large.lever, 3.0 * weight.lever)
     assert np.allclose(large.inertia, 9.0 * weight.inertia)
     turned = upright(one, "y").links["a"].inertia
-    assert np.allclose(turned.lever, [0.3, 0.1, 0.2]) or np.allclose(turned.lever, [0.1, -0.3, 0.2])
+    assert np.allclose(turned.lever, [0.1, -0.3, 0.2])
     assert sorted(np.diag(turned.inertia)) == pytest.approx([0.1, 0.2, 0.25])
     assert not one.weightless
     assert Description(Path("f"), {"a": Link("a")}, {}).weightless

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.importing.objects.description import Description, Joint, Link, Part
+from vkc_pin.importing.objects.description import Description, Joint, Link
 from vkc_pin.importing.objects.tidying import bounds, closed, only, rooted, surfaces
 
 __all__ = ["FLOOR_RISE", "Home", "Thing", "split"]
@@ -78,7 +78,7 @@ def split(description: Description) -> Home:
         fixed |= grown
     building, furniture, floor, things = list[Link](), list[Link](), list[str](), list[Thing]()
     for name in (name for name in description.links if name in fixed):
-        link = _placed(description.links[name], places[name])
+        link = description.links[name].placed(places[name])
         moved = [child for child, joint in joints.items() if joint.parent == name and joint.kind in _MOVING]
         large = name == description.root or _length(link) > _BUILDING
         if moved and not large:
@@ -157,15 +157,6 @@ def _thing(name: str, description: Description, place: pin.SE3, *, free: bool = 
     x, y = ((low + high) / 2.0).round(6)[:2].tolist()
     z = float(low[2].round(6)) if free else 0.0
     return Thing(name, rooted(inside, pin.SE3(np.eye(3), -np.array([x, y, z]))), (x, y, z), free)
-
-
-def _placed(link: Link, place: pin.SE3) -> Link:
-    """Return a link with its shapes in the world."""
-
-    def moved(parts: tuple[Part, ...]) -> tuple[Part, ...]:
-        return tuple(dataclasses.replace(part, placement=place * part.placement) for part in parts)
-
-    return Link(link.name, moved(link.visual), moved(link.collision), place.act(link.inertia))
 
 
 def _length(link: Link) -> float:

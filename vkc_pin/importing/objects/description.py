@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -82,6 +82,13 @@ class Link:
     def solid(self) -> tuple[Part, ...]:
         """What collides; what it looks like where the file says nothing about that."""
         return self.collision or self.visual
+
+    def placed(self, placement: pin.SE3) -> Link:
+        """Return the link as seen from a frame in which its own is at `placement`."""
+        visual, collision = (
+            tuple(replace(part, placement=placement * part.placement) for part in kind) for kind in (self.visual, self.collision)
+        )
+        return Link(self.name, visual, collision, placement.act(self.inertia))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -168,13 +175,13 @@ def inertia(mass: float, moments: Iterable[float], placement: pin.SE3) -> pin.In
 
     Args:
         mass: [kg].
-        moments: ixx, iyy, izz, ixy, ixz, iyz about the centre of mass [kg·m²].
+        moments: About the centre of mass [kg·m²], in the order of `vkc_pin.files.kinematic_tree.MOMENTS`.
         placement: Of the centre of mass, and of the axes of the moments, in the link's frame.
 
     Raises:
         InputError: The mass or a principal moment is negative.
     """
-    xx, yy, zz, xy, xz, yz = moments
+    xx, xy, xz, yy, yz, zz = moments
     tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     least = float(np.linalg.eigvalsh(tensor)[0])
     if mass < 0.0 or least < -1e-9 * max(abs(xx), abs(yy), abs(zz)):

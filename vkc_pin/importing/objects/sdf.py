@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.files.documents import read_text
-from vkc_pin.files.kinematic_tree import numbers_of
+from vkc_pin.files.kinematic_tree import MOMENTS, numbers_of
 from vkc_pin.files.xml import line_of, parse_xml
 from vkc_pin.importing.objects.description import Description, Joint, Link, Part, inertia
 
@@ -165,7 +165,7 @@ class _Reader:
             if stated.find("mass") is None or moments is None:
                 raise InputError("an <inertial> without both <mass> and <inertia>", field=link)
             (mass,) = self._numbers(stated, "mass", 1, None, link)
-            entries = (self._numbers(moments, key, 1, "0", link)[0] for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
+            entries = (self._numbers(moments, key, 1, "0", link)[0] for key in MOMENTS)
             return inertia(mass, entries, frame.inverse() * self._own(stated, link))
         except InputError as error:
             self.notes.append(f"link '{link}': {error}: its <inertial> counts as none")

@@ -166,12 +166,7 @@ def upright(description: Description, up: str) -> Description:
 def rooted(description: Description, placement: pin.SE3) -> Description:
     """Return the object with its root's frame where the old one is at `placement`."""
     links, root = dict(description.links), description.root
-    old = links[root]
-    visual, collision = (
-        tuple(dataclasses.replace(part, placement=placement * part.placement) for part in kind)
-        for kind in (old.visual, old.collision)
-    )
-    links[root] = Link(root, visual, collision, placement.act(old.inertia))
+    links[root] = links[root].placed(placement)
     joints = {
         child: dataclasses.replace(joint, placement=placement * joint.placement) if joint.parent == root else joint
         for child, joint in description.joints.items()

@@ -10,14 +10,13 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
-from vkc_pin.files.kinematic_tree import check_tree, numbers_of
+from vkc_pin.files.kinematic_tree import check_tree, inertial_of, numbers_of, origin_of
 from vkc_pin.files.urdf import UrdfFile
 from vkc_pin.files.xml import read_xml
 from vkc_pin.importing.objects.description import Description, Joint, Link, Part, inertia
 
 __all__ = ["read_object_urdf"]
 
-_MOMENTS = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 _KINDS = ("fixed", "revolute", "continuous", "prismatic")
 
 
@@ -92,29 +91,23 @@ def _inertia(file: Path, link: ElementTree.Element, notes: list[str]) -> pin.Ine
     name, stated = link.get("name", ""), link.find("inertial")
     if stated is None:
         return pin.Inertia.Zero()
-    mass, moments, origin = (stated.find(key) for key in ("mass", "inertia", "origin"))
     try:
-        if mass is None or moments is None:
-            raise InputError(f"an <inertial> without <{'mass' if mass is None else 'inertia'}>", field=name)
-        (weight,) = numbers_of(file, mass, "value", 1, default=None, where=name)
-        placement = pin.SE3.Identity()
-        if origin is not None:
-            xyz, rpy = (numbers_of(file, origin, key, 3, default="0 0 0", where=name) for key in ("xyz", "rpy"))
-            placement = pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array(xyz))
-        entries = (numbers_of(file, moments, key, 1, default="0", where=name)[0] for key in _MOMENTS)
-        return inertia(weight, entries, placement)
+        mass, moments, origin = inertial_of(file, stated, name)
+        return inertia(mass, moments, _placed(origin))
     except InputError as error:
         notes.append(f"link '{name}': {error}: its <inertial> counts as none")
         return pin.Inertia.Zero()
 
 
+def _placed(origin: tuple[tuple[float, ...], tuple[float, ...]]) -> pin.SE3:
+    """Return the placement that an <origin> states."""
+    position, angles = origin
+    return pin.SE3(pin.rpy.rpyToMatrix(*angles), np.array(position))
+
+
 def _joint(file: Path, element: ElementTree.Element, limits: tuple[float, float] | None) -> Joint:
     name, kind = element.get("name", ""), element.get("type", "")
-    origin, axis, limit = element.find("origin"), element.find("axis"), element.find("limit")
-    placement = pin.SE3.Identity()
-    if origin is not None:
-        xyz, rpy = (numbers_of(file, origin, key, 3, default="0 0 0", where=name) for key in ("xyz", "rpy"))
-        placement = pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array(xyz))
+    axis, limit = element.find("axis"), element.find("limit")
     direction = np.array([1.0, 0.0, 0.0])
     if axis is not None and kind not in ("fixed", "floating"):
         direction = np.array(numbers_of(file, axis, "xyz", 3, default="1 0 0", where=name))
@@ -130,7 +123,7 @@ def _joint(file: Path, element: ElementTree.Element, limits: tuple[float, float]
         kind=kind,
         parent=ends[0],
         child=ends[1],
-        placement=placement,
+        placement=_placed(origin_of(file, element, name)),
         axis=direction / np.linalg.norm(direction),
         limits=None if kind == "continuous" else limits,
         velocity=velocity if velocity > 0.0 else None,

@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model, model_validator
 from pydantic.types import FailFast
 
-from vkc_pin.arrays import Floats
+from vkc_pin.arguments import finite
 from vkc_pin.errors import InputError
 from vkc_pin.files.documents import MOST_FIELDS, Document, check, parse_json, read_bytes
 from vkc_pin.files.fields import Schema, fail
@@ -199,7 +199,7 @@ def read_archive(file: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     about = parse_json(text, file)
     if isinstance(about, dict) and about.get("format") != FORMAT:
         raise InputError("unknown format", file=file, field="format", expected=FORMAT, got=about.get("format"))
-    found: dict[str, Any] = {name: _finite(file, name, array) for name, array in arrays.items()}
+    found: dict[str, Any] = {name: finite(array, name, file) for name, array in arrays.items()}
     knots = {name.removeprefix("knot_"): found.pop(name) for name in CURVE if name in found}
     return check(Document(about, file), _About).model_dump(), found | ({"curve": knots} if knots else {})
 
@@ -222,13 +222,6 @@ def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Any:
         raise ValueError(f"{name} is an array of {dtype} and shape {shape} in {size - begin} bytes")
     values = np.frombuffer(stream.getbuffer(), dtype, offset=begin)
     return values[0] if kind == "U" else values.reshape(shape, order="F" if columns else "C").astype(float)
-
-
-def _finite(file: Path, name: str, values: Floats) -> Floats:
-    if not np.isfinite(values).all():
-        where = np.argwhere(~np.isfinite(values))[0].tolist()
-        raise InputError("not finite", file=file, field=f"{name}{where}", expected="finite numbers", got=values[tuple(where)])
-    return values
 
 
 def folder_to_data(scene_folder: Path, plan: Path) -> dict[str, str]:

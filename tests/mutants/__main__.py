@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
-import random
 import sys
-from collections import Counter
+from collections import Counter, defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -33,19 +33,24 @@ TESTS += [
 
 
 def drawn(modules: list[str], count: int, seed: int) -> list[Mutant]:
-    """Return faults of modules: one of each at least, no line twice as long as others are left."""
-    rng, found = random.Random(seed), []
-    by_line: dict[tuple[str, int], list[Mutant]] = {}
+    """Return faults of modules: no line gives a second one before every line has given one.
+
+    The order hangs on the seed and on the words of a line alone: what is written elsewhere does not change who else is drawn.
+    """
+    found: list[tuple[int, bytes, Mutant]] = []
     for module in modules:
+        by_line: dict[int, list[Mutant]] = defaultdict(list)
         for mutant in mutants(module, (PACKAGE / module).read_text(encoding="utf-8")):
-            by_line.setdefault((module, mutant.line), []).append(mutant)
-    lines = sorted(by_line)
-    while lines and len(found) < count:
-        rng.shuffle(lines)
-        for line in lines:
-            found.append(by_line[line].pop(rng.randrange(len(by_line[line]))))
-        lines = sorted(line for line in lines if by_line[line])
-    return found[:count]
+            by_line[mutant.line].append(mutant)
+        for own in by_line.values():
+            place = _lot(f"{seed} line {own[0].name}")
+            own.sort(key=lambda mutant: _lot(f"{seed} {mutant.name}"))
+            found += [(turn, place, mutant) for turn, mutant in enumerate(own)]
+    return [mutant for *_, mutant in sorted(found, key=lambda item: item[:2])[:count]]
+
+
+def _lot(text: str) -> bytes:
+    return hashlib.sha256(text.encode()).digest()
 
 
 def main() -> int:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import dataclasses
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -35,6 +37,7 @@ class Mutant:
         at: The line as it stands, without the space around it.
         lines: The lines that behave otherwise: itself, or those that use what it defines outside of functions.
         source: The whole module with the fault.
+        again: How many earlier places of the module have the same words and the same fault.
     """
 
     module: str
@@ -43,11 +46,12 @@ class Mutant:
     at: str
     lines: tuple[int, ...]
     source: str
+    again: int = 0
 
     @property
     def name(self) -> str:
         """What it is known by, wherever the line moves to."""
-        return f"{self.module}: {self.at} | {self.what}"
+        return f"{self.module}: {self.at} | {self.what}" + (f" (the same, {self.again + 1})" if self.again else "")
 
 
 class _Text:
@@ -83,7 +87,10 @@ def mutants(module: str, source: str) -> Iterator[Mutant]:
             line = text.bytes[:begin].count(b"\n") + 1
             what = f"{kind}: {' '.join(before.split())} → {' '.join(piece.split())}"
             found.append((begin, Mutant(module, line, what, lines[line - 1].strip(), users.get(line, (line,)), changed)))
-    yield from (mutant for _, mutant in sorted(found, key=lambda pair: pair[0]))
+    seen: Counter[str] = Counter()
+    for _, mutant in sorted(found, key=lambda pair: pair[0]):
+        yield dataclasses.replace(mutant, again=seen[mutant.name])
+        seen[mutant.name] += 1
 
 
 def _users(tree: ast.Module) -> dict[int, tuple[int, ...]]:

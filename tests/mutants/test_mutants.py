@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import ast
+from pathlib import Path
 
 import pytest
 
+from . import __main__
+from .__main__ import drawn
 from .equivalent import EQUIVALENT
 from .mutations import mutants
 
@@ -78,3 +81,22 @@ def test_who_is_asked_about_a_constant() -> None:
 
 def test_every_equivalent_fault_has_a_reason() -> None:
     assert all(len(reason) > 20 for reason in EQUIVALENT.values())
+
+
+def test_what_is_written_elsewhere_changes_no_other_draw(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(__main__, "PACKAGE", tmp_path)
+    (tmp_path / "x.py").write_text(SOURCE)
+    before = [mutant.name for mutant in drawn(["x.py"], 100, 1)]
+    (tmp_path / "x.py").write_text(
+        SOURCE.replace("class Kept", "MOST = 7\n\n\nclass Kept").replace("        self.count += 1\n", "")
+    )
+    after = [mutant.name for mutant in drawn(["x.py"], 100, 1)]
+    assert [name for name in after if "MOST" not in name] == [name for name in before if "self.count" not in name]
+    assert before != [mutant.name for mutant in drawn(["x.py"], 100, 2)]
+
+
+def test_same_faults_are_known_apart() -> None:
+    source = "def both(a, b):\n    a += b\n    b += 1\n    a += b\n    return a\n"
+    names = [mutant.name for mutant in mutants("x.py", source)]
+    assert len(set(names)) == len(names) == 4
+    assert [mutant.again for mutant in mutants("x.py", source) if mutant.at == "a += b"] == [0, 1]

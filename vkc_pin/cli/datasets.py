@@ -32,6 +32,8 @@ def add_datasets(commands: Any) -> None:
     generate.add_argument("--variants", type=int, metavar="K", help="motions for each problem, instead of the recipe's number")
     shown = "keep only episodes that physics confirms (needs the extra `sim`)"
     generate.add_argument("--simulate", action="store_true", default=None, help=shown)
+    shown = "keep what cameras on the robot see of it, those of the recipe or of the head and the hand (with --simulate)"
+    generate.add_argument("--cameras", action="store_true", help=shown)
     generate.add_argument("--lerobot", action="store_true", help="write LeRobot's layout as well, a dataset for each robot")
     generate.add_argument("--quiet", action="store_true", help="no progress bar")
     generate.set_defaults(run=_generate)
@@ -61,6 +63,7 @@ def _generate(arguments: argparse.Namespace) -> int:
                 scheduler=arguments.scheduler,
                 variants=arguments.variants,
                 simulate=arguments.simulate,
+                cameras=arguments.cameras,
                 lerobot=arguments.lerobot,
                 progress=not arguments.quiet,
             )

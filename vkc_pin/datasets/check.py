@@ -18,11 +18,11 @@ from vkc_pin.datasets.dataset import Dataset
 from vkc_pin.datasets.diversity import Seen, homotopy, way
 from vkc_pin.datasets.episode import Episode, scene_name
 from vkc_pin.datasets.formats.hdf5 import episodes_of, numbers_of
-from vkc_pin.datasets.running.engine import Died, clustered, results
 from vkc_pin.datasets.statistics import statistics_page
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.files.documents import read_text
 from vkc_pin.files.writing import check_writable, write_atomically
+from vkc_pin.running.engine import Died, clustered, results
 
 __all__ = ["DatasetCheck", "check_dataset"]
 

@@ -8,8 +8,8 @@ import io
 import json
 import time
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,20 +19,22 @@ from vkc_pin.arrays import Floats
 from vkc_pin.datasets.diversity import way
 from vkc_pin.datasets.problems import NoProblemError, problem
 from vkc_pin.datasets.recipe import Recipe, load_recipe
-from vkc_pin.datasets.running.machine import peak_memory
 from vkc_pin.errors import InputError
 from vkc_pin.files.resources import folder
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import Planner, plan
+from vkc_pin.running.machine import peak_memory, process_name, resident_memory
 from vkc_pin.scene.scene import Scene
+from vkc_pin.simulation.cameras.images import Images, taken
 from vkc_pin.simulation.execution import simulate
+from vkc_pin.simulation.result import SimulationResult
 from vkc_pin.task.steps import Step, step_from_dict, step_to_dict
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import validate
 
-__all__ = ["Episode", "Made", "attempt", "attempts", "made_of", "packed", "scene_name", "unpacked", "work_file"]
+__all__ = ["Episode", "Made", "attempt", "attempts", "made_of", "moments", "packed", "scene_name", "unpacked", "work_file"]
 
 _PLANNER = {"entries": 512, "megabytes": 96.0}
 _DIGITS = 12  # of a scene's name
@@ -50,6 +52,7 @@ class Episode:
         start: The start, as part of the scene's description.
         where: The folder that relative paths in the scene start from; None: the package's scenes.
         robots: The folder in which the dataset has robots, by name.
+        load_images: Reads what cameras saw; None where there were no cameras.
         steps: What was asked for.
         options: How it was planned.
         trajectory: The motion.
@@ -66,6 +69,11 @@ class Episode:
     trajectory: Trajectory
     claimed: Report
     robots: Path | None = None
+    load_images: Callable[[], Images] | None = None
+
+    def images(self) -> Images | None:
+        """Return what cameras saw at every sample, read when it is asked for; None where there were no cameras."""
+        return None if self.load_images is None else self.load_images()
 
     def scene(self) -> Scene:
         """Return the scene, built anew from its description."""
@@ -108,7 +116,7 @@ def attempt(said: Mapping[str, Any], number: int, robots: Mapping[str, str]) -> 
     """Make one episode; an exception becomes a failure on record."""
     began, worked = time.perf_counter(), time.process_time()
     record: dict[str, Any] = {"number": number, "success": False}
-    data = b""
+    data = images = b""
     try:
         recipe = _recipe(json.dumps(said, sort_keys=True))
         with warnings.catch_warnings():
@@ -127,17 +135,20 @@ def attempt(said: Mapping[str, Any], number: int, robots: Mapping[str, str]) -> 
             )
             record |= _outcome(found)
             if found.success and recipe.fields.simulate:
-                record |= _physics(found)
+                executed = simulate(found.scene, found.steps, found.trajectory)
+                record |= _physics(executed)
+                if executed.ok and recipe.cameras:
+                    images = taken(executed, recipe.cameras, moments(found.trajectory, recipe.fields.rate)).to_bytes()
             if record["success"]:
                 about = asked.about | {"metrics": _metrics(found)}
-                data, more = packed(number, about, found)
+                data, more = packed(number, about, found, images)
                 record |= more
     except NoProblemError as error:
         record |= {"status": "no problem", "reason": str(error)}
     except Exception as error:  # one episode must not end ten thousand
         record |= {"success": False, "status": "error", "reason": f"{type(error).__name__}: {error}"}
     record |= {"seconds": round(time.perf_counter() - began, 4), "cpu_time": round(time.process_time() - worked, 4)}
-    record |= {"memory_mb": round(peak_memory(), 1)}
+    record |= {"memory_mb": round(peak_memory(), 1), "resident_mb": round(resident_memory(), 1), "process": process_name()}
     return record, data if record["success"] else b""
 
 
@@ -159,12 +170,17 @@ def _outcome(found: Plan) -> dict[str, Any]:
     }
 
 
-def _physics(found: Plan) -> dict[str, Any]:
+def _physics(executed: SimulationResult) -> dict[str, Any]:
     """Return what physics says otherwise; see `simulation.execution`."""
-    executed = simulate(found.scene, found.steps, found.trajectory)
     if executed.ok:
         return {"simulated": True}
     return {"success": False, "status": "physics", "reason": "; ".join(executed.problems()), "simulated": True}
+
+
+def moments(motion: Trajectory, rate: float) -> Floats:
+    """Return when a motion is sampled at a rate [Hz], from its start to its end, shape (N,) [s]."""
+    count = int(np.ceil((motion.times[-1] - motion.times[0]) * rate)) + 1
+    return np.minimum(motion.times[0] + np.arange(count) / rate, motion.times[-1])
 
 
 def _metrics(found: Plan) -> dict[str, float]:
@@ -178,8 +194,15 @@ def scene_name(document: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()[:_DIGITS]
 
 
-def packed(number: int, about: Mapping[str, Any], found: Plan) -> tuple[bytes, dict[str, Any]]:
-    """Return a plan as bytes that `unpacked` reads, and what the journal says of it: scene, start, way and metrics."""
+def packed(number: int, about: Mapping[str, Any], found: Plan, images: bytes = b"") -> tuple[bytes, dict[str, Any]]:
+    """Return a plan as bytes that `unpacked` reads, and what the journal says of it: scene, start, way and metrics.
+
+    Args:
+        number: Of the episode.
+        about: See `Episode`.
+        found: The plan.
+        images: What cameras saw, of `Images.to_bytes`, if there were any.
+    """
     document = json.loads(json.dumps(found.scene.document))
     start = document.pop("start")
     document["robot"]["name"] = about["robot"]
@@ -201,7 +224,8 @@ def packed(number: int, about: Mapping[str, Any], found: Plan) -> tuple[bytes, d
     }
     data["validation"]["clearances"] = [_finite(value) for value in found.validation.clearances]
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, allow_pickle=False, about=np.array(json.dumps(data)), **arrays)
+    seen: Any = {"images": np.frombuffer(images, np.uint8)} if images else {}
+    np.savez_compressed(buffer, allow_pickle=False, about=np.array(json.dumps(data)), **arrays, **seen)
     more = {
         "scene": scene_name(document),
         "start": np.asarray(found.scene.start).round(4).tolist(),
@@ -226,8 +250,9 @@ def unpacked(data: bytes, robots: Path | None = None) -> Episode:
     """Return the episode that `packed` made bytes of; `robots` is the folder of the dataset's robots."""
     with np.load(io.BytesIO(data), allow_pickle=False) as archive:
         arrays = {name: archive[name] for name in archive.files}
-    about = json.loads(str(arrays.pop("about")))
-    return made_of(about, {name: np.asarray(values, float) for name, values in arrays.items()}, robots)
+    about, seen = json.loads(str(arrays.pop("about"))), arrays.pop("images", None)
+    found = made_of(about, {name: np.asarray(values, float) for name, values in arrays.items()}, robots)
+    return found if seen is None else replace(found, load_images=functools.partial(Images.from_bytes, seen.tobytes()))
 
 
 def made_of(data: Mapping[str, Any], arrays: Mapping[str, Floats], robots: Path | None = None) -> Episode:

@@ -21,14 +21,14 @@ from vkc_pin.datasets.episode import Made, attempts, work_file
 from vkc_pin.datasets.formats import hdf5
 from vkc_pin.datasets.formats import lerobot as lerobot_layout
 from vkc_pin.datasets.formats.card import card
-from vkc_pin.datasets.recipe import Recipe, load_recipe
-from vkc_pin.datasets.robots import ready_robots
-from vkc_pin.datasets.running.engine import Died, needs_dask, results
-from vkc_pin.datasets.running.journal import Journal
-from vkc_pin.datasets.running.machine import versions
+from vkc_pin.datasets.recipe import CAMERAS, Recipe, load_recipe
+from vkc_pin.datasets.robots import check_cameras, ready_robots
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.files.resources import file_path
 from vkc_pin.files.writing import check_writable, write_atomically
+from vkc_pin.running.engine import Died, needs_dask, results
+from vkc_pin.running.journal import Journal
+from vkc_pin.running.machine import process_name, versions
 from vkc_pin.simulation.physics import engine
 
 __all__ = ["generate"]
@@ -47,6 +47,7 @@ def generate(
     scheduler: str | None = None,
     variants: int | None = None,
     simulate: bool | None = None,
+    cameras: bool = False,
     lerobot: bool = False,
     progress: bool = False,
 ) -> Dataset:
@@ -64,22 +65,27 @@ def generate(
         scheduler: Address of a Dask scheduler whose workers are used instead, "tcp://host:8786".
         variants: Motions for each problem, instead of the recipe's number.
         simulate: Whether only episodes count that physics confirms (the extra `sim`), instead of what the recipe says.
+        cameras: Keep what cameras on the robot see of it as well: those of the recipe, or one above the base and one beside the
+            fingers. Only of what is simulated. Recipes that name cameras need not be asked.
         lerobot: Write LeRobot's layout as well.
         progress: Show a progress bar with the time left.
 
     Raises:
         UnknownNameError: The recipe names something that does not exist.
         InputError: The recipe is wrong, `out` holds something else, or what is needed is not installed; nothing is written then.
-        VkcError: Hardly any attempt becomes an episode.
+        VkcError: Hardly any attempt becomes an episode; or there are cameras, and no OpenGL without a screen.
         KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
     """
     wanted, jobs = whole(episodes, "episodes", low=1), whole(jobs, "jobs", low=1, high=4096)
     made = load_recipe(recipe, variants=variants, simulate=simulate)
+    if flag(cameras, "cameras") and not made.fields.cameras:
+        made = load_recipe(made, cameras=CAMERAS)
     hdf5.needed()
     if flag(lerobot, "lerobot"):
         lerobot_layout.needed()
     if made.fields.simulate:
         engine()
+    check_cameras(made)
     if jobs > 1 or scheduler is not None:
         needs_dask(scheduler)
     folder = file_path(out, "out", "a folder")
@@ -132,13 +138,12 @@ def _kept(journal: Journal, key: str) -> dict[str, Any]:
 def _run(dataset: Dataset, register: Register, journal: Journal, jobs: int, scheduler: str | None, progress: bool) -> None:
     """Make attempts, lowest numbers first, until there are enough episodes."""
     document, fields = dataset.recipe.document, dataset.recipe.fields
-    began, most = time.perf_counter(), max(_LEAST, _PATIENCE * register.wanted)
+    clock, most = _Clock(), max(_LEAST, _PATIENCE * register.wanted)
     size, again = fields.rooms.episodes * fields.variants, deque[int]()
     robots = ready_robots(dataset.recipe, dataset.folder / "robots")
 
     def tasks() -> Iterator[tuple[str, Any]]:
-        nonlocal began
-        began = time.perf_counter()  # processes are there now
+        clock.start()  # processes are there now
         for block in itertools.count():
             while again:
                 number = again.popleft()
@@ -171,7 +176,7 @@ def _run(dataset: Dataset, register: Register, journal: Journal, jobs: int, sche
                 for record, data in [_died(numbers[0], result)] if isinstance(result, Died) else result:
                     if record["status"] == "interrupted":
                         raise KeyboardInterrupt
-                    _keep(dataset, journal, record, data, time.perf_counter() - began)
+                    _keep(dataset, journal, record, data, clock)
                     register.add(record)
                 bar.update(len(register.accepted) - bar.n)
                 bar.set_postfix(failed=len(register.failures), refresh=False)
@@ -186,13 +191,34 @@ def _run(dataset: Dataset, register: Register, journal: Journal, jobs: int, sche
         raise VkcError(f"{problem}, which are kept in {dataset.folder}; the last ones failed because: {reasons}")
 
 
-def _keep(dataset: Dataset, journal: Journal, record: dict[str, Any], data: bytes, seconds: float) -> None:
+class _Clock:
+    """The time since some moment, and what of its processor time this process did not spend on attempts of its own."""
+
+    def __init__(self) -> None:
+        self.start()
+
+    def start(self) -> None:
+        self._began, self._worked = time.perf_counter(), time.process_time()
+
+    def attempted(self, record: Mapping[str, Any]) -> None:
+        """Take note of an attempt, perhaps of this process."""
+        if record.get("process") == process_name():
+            self._worked += float(record["cpu_time"])
+
+    @property
+    def now(self) -> dict[str, float]:
+        """Both times, as the journal has them [s]."""
+        seconds, client = time.perf_counter() - self._began, time.process_time() - self._worked
+        return {"seconds": round(seconds, 3), "client_seconds": round(client, 4)}
+
+
+def _keep(dataset: Dataset, journal: Journal, record: dict[str, Any], data: bytes, clock: _Clock) -> None:
     """Write an attempt down: first the episode, then the line that says that it is there."""
     if data:
         write_atomically(work_file(dataset.folder, record["number"]), data)
-    memory = record.pop("memory_mb", 0.0)
-    key = str(record["number"])
-    journal.append({"key": key, "records": [record], "memory_mb": memory, "seconds": round(seconds, 3)})
+    clock.attempted(record)
+    memory: dict[str, Any] = {name: record.pop(name) for name in ("memory_mb", "resident_mb", "process") if name in record}
+    journal.append({"key": str(record["number"]), "records": [record], "memory_mb": 0.0, **memory, **clock.now})
 
 
 def _died(number: int, died: Died) -> Made:

@@ -15,15 +15,27 @@ from pydantic import Field
 from vkc_pin.arguments import mapping
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.files.documents import Document, check, read_yaml
-from vkc_pin.files.fields import Name, NotNegative, Number, Positive, Schema, count, require, text_for
+from vkc_pin.files.fields import Name, NotNegative, Number, Positive, Schema, Vector3, count, require, text_for
 from vkc_pin.files.resources import available, located
 from vkc_pin.models.robot_file import find_robot
 from vkc_pin.options import Options
 from vkc_pin.scene.rooms.fixtures import known_objects
 from vkc_pin.scene.rooms.parts import CARRIED
 from vkc_pin.scene.rooms.settings import RoomSettings
+from vkc_pin.simulation.cameras.mount import BASE, HAND, Camera
 
-__all__ = ["TASKS", "GoalSchema", "Recipe", "RecipeSchema", "RobotEntry", "RoomsSchema", "StartSchema", "load_recipe"]
+__all__ = [
+    "CAMERAS",
+    "TASKS",
+    "CameraSchema",
+    "GoalSchema",
+    "Recipe",
+    "RecipeSchema",
+    "RobotEntry",
+    "RoomsSchema",
+    "StartSchema",
+    "load_recipe",
+]
 
 TASKS = ("given-open", "drive-open", "fetch-place")
 """What an episode can be: something is opened by a hand that has hold of it, or by a robot that first drives there; something is
@@ -34,6 +46,7 @@ _share = require(lambda value: value[0] > 0.0 and value[1] <= 1.0, "out of range
 Interval = Annotated[tuple[Number, Number], count(2), _increasing]
 Share = Annotated[Interval, _share]
 Whole = Annotated[int, Field(strict=True, ge=1)]
+Pixels = Annotated[int, Field(strict=True, ge=8, le=2048)]
 Names = Annotated[tuple[str, ...], require(lambda value: value, "there is nothing", "at least one")]
 
 
@@ -73,6 +86,32 @@ class GoalSchema(Schema):
     edge: Interval = (0.1, 0.3)
 
 
+class CameraSchema(Schema):
+    """A camera on the robot; see `Camera`."""
+
+    name: Name
+    frame: str = BASE
+    position: Vector3
+    target: Vector3
+    up: Vector3 = (0.0, 0.0, 1.0)
+    width: Pixels = 128
+    height: Pixels = 128
+    fov: Annotated[Positive, Field(lt=180.0)] = 60.0
+
+
+CAMERAS = (
+    {"name": "head", "frame": BASE, "position": [0.0, 0.0, 1.5], "target": [1.2, 0.0, 0.6], "fov": 90.0},
+    {
+        "name": "wrist",
+        "frame": HAND,
+        "position": [0.0, -0.12, -0.12],
+        "target": [0.0, 0.0, 0.1],
+        "up": [0.0, -1.0, 0.0],
+        "fov": 75.0,
+    },
+)
+"""The cameras of recipes that are asked for images and name none: one above the base, one beside the fingers."""
+
 _some = require(lambda value: value, "there is nothing", "at least one")
 Robots = Annotated[tuple[Annotated[RobotEntry, text_for("name")], ...], _some]
 
@@ -104,6 +143,7 @@ class RecipeSchema(Schema):
     variants: Whole = 1
     rate: Positive = 10.0
     simulate: bool = False
+    cameras: tuple[CameraSchema, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -127,7 +167,14 @@ class Recipe:
     def digest(self) -> str:
         """A name for what it says: the same for recipes that make the same episodes."""
         said = {key: value for key, value in self.document.items() if key not in ("name", "license")}
+        if not self.fields.cameras:
+            del said["cameras"]  # datasets without images are gone on with whatever the version
         return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:16]
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """The cameras that take images."""
+        return tuple(Camera(**entry.model_dump()) for entry in self.fields.cameras)
 
     def rng(self, *words: object) -> np.random.Generator:
         """Return random numbers that depend on the recipe and on some words, such as the number of an episode, alone."""
@@ -168,6 +215,14 @@ def load_recipe(recipe: str | Path | Mapping[str, Any] | Recipe, **changes: Any)
     if fields.scenes and "fetch-place" in fields.tasks:
         expected = "random rooms, whose tables are known, or only given-open and drive-open"
         raise document.error(("tasks",), "nothing says where to put things in scene files", expected=expected, got="fetch-place")
+    for k, camera in enumerate(fields.cameras):
+        with document.at(("cameras", k)):
+            Camera(**camera.model_dump())
+        if camera.name in [other.name for other in fields.cameras[:k]]:
+            raise document.error(("cameras", k, "name"), "two cameras of one name", expected="another name", got=camera.name)
+    if fields.cameras and not fields.simulate:
+        expected = "`simulate: true` as well, or --simulate: images are of what happens in physics"
+        raise document.error(("cameras",), "nothing is simulated", expected=expected, got="cameras")
     with document.at(("rooms",)):
         RoomSettings(clutter=fields.rooms.clutter[0], width=fields.rooms.width, front=fields.rooms.front)
         RoomSettings(clutter=fields.rooms.clutter[1])

@@ -9,10 +9,36 @@ from vkc_pin.datasets.problems import robot_name
 from vkc_pin.datasets.recipe import Recipe
 from vkc_pin.importing.robots.robot_import import import_robot
 from vkc_pin.models.robot_file import find_robot, load_robot
+from vkc_pin.scene.scene import load_scene
+from vkc_pin.simulation.cameras.mount import check_frame
+from vkc_pin.simulation.physics import engine
+from vkc_pin.simulation.snapshots import drawing_context
 
-__all__ = ["ready_robots"]
+__all__ = ["check_cameras", "ready_robots"]
 
 _SAMPLES = 1000  # configurations for pairs that need no check, as of robots that are loaded without an SRDF
+
+
+def check_cameras(recipe: Recipe) -> None:
+    """Refuse cameras that cannot take images here, or that a robot of the recipe has no frame for.
+
+    Raises:
+        InputError: MuJoCo is not installed.
+        UnknownNameError: A robot lacks a frame.
+        VkcError: There is no OpenGL without a screen.
+    """
+    if not recipe.cameras:
+        return
+    engine()
+    with drawing_context((8, 8)):
+        pass
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what is said of robots is said when they are made ready
+        fields = recipe.fields
+        for name in fields.scenes or [entry.name for entry in fields.robots]:
+            robot = load_scene(name).robot if fields.scenes else load_robot(name)
+            for camera in recipe.cameras:
+                check_frame(robot, camera.frame)
 
 
 def ready_robots(recipe: Recipe, folder: Path) -> dict[str, str]:

@@ -8,7 +8,7 @@ import io
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ from vkc_pin.simulation.servos import Servo
 from vkc_pin.visualization.camera import FIELD_OF_VIEW
 from vkc_pin.visualization.room import is_wall
 
-__all__ = ["Stage", "film", "strip"]
+__all__ = ["Stage", "drawing_context", "film", "strip"]
 
 _SIZE = (640, 480)  # of a snapshot [pixels]
 _FASTEST = 60.0  # pictures a second in a video
@@ -43,17 +43,59 @@ class Stage:
 
     Args:
         executed: What happened in it.
+        size: Of the largest picture, width and height [pixels].
+        veil: Opacity of walls.
+        more: What else to add to the model: cameras, say.
+
+    Attributes:
+        mj: The package `mujoco`.
     """
 
-    def __init__(self, executed: Executed) -> None:
-        self._mj, self._executed = engine(), executed
+    def __init__(
+        self,
+        executed: Executed,
+        *,
+        size: tuple[int, int] = _SIZE,
+        veil: float = _VEIL,
+        more: Callable[[Builder], None] | None = None,
+    ) -> None:
+        self.mj, self._executed = engine(), executed
         self._world = Replay(executed.scene, executed.trajectory.times, executed.rows)
         shapes, robot = len(self._world.shapes), executed.scene.robot
         weigh(self._world, Physics())
         none = Pairs(np.zeros((0, 2), int), np.zeros(shapes, int), np.zeros(shapes, int), {}, ())
         count = len(executed.scene.start) + (0 if robot.gripper is None else len(robot.gripper.names))
         servos = [Servo(name, 1.0, 1.0, 1.0, 0.0, np.inf) for name in self._world.coordinates.names[:count]]
-        self._physical = Builder(self._world, Physics()).built(none, servos, (), (), more=_dressed)
+
+        def dressed(builder: Builder) -> None:
+            _dress(builder, size, veil)
+            if more is not None:
+                more(builder)
+
+        self._physical = Builder(self._world, Physics()).built(none, servos, (), (), more=dressed)
+
+    @property
+    def model(self) -> Any:
+        """The `mujoco.MjModel`."""
+        return self._physical.model
+
+    @property
+    def drawn(self) -> Iterator[tuple[int, str, bool]]:
+        """What can be seen: a geom, the link or obstacle that it belongs to, and whether that is the robot's."""
+        world, model = self._world, self.model
+        for number, (shape, label) in enumerate(zip(world.visual.geometryObjects, world.visual_labels, strict=True)):
+            yield int(model.geom(f"seen {number}").id), label, shape.parentJoint > 0 and "." not in label
+        for number, label in enumerate(world.collision_labels):
+            if label == FLOOR:
+                yield int(model.geom(f"shape {number}").id), label, False
+
+    def rows(self, times: Floats) -> Floats:
+        """Return where everything was at some times [s], shape (K,): shape (K, n)."""
+        return self._world.positions(self._executed.trajectory, times)
+
+    def qpos(self, row: Floats) -> Floats:
+        """Return MuJoCo's configuration of coordinates of the world, shape (n,)."""
+        return self._physical.qpos(row)
 
     def pictures(self, times: Floats, viewpoint: tuple[Floats, Floats]) -> Iterator[NDArray[np.uint8]]:
         """Yield a picture of what was at each of some times [s], shape (K,): shape (height, width, 3).
@@ -65,7 +107,7 @@ class Stage:
         Raises:
             VkcError: There is no OpenGL without a screen.
         """
-        mj, model = self._mj, self._physical.model
+        mj, model = self.mj, self.model
         data, camera, option = mj.MjData(model), mj.MjvCamera(), mj.MjvOption()
         target, place = viewpoint
         ahead = target - place
@@ -73,11 +115,11 @@ class Stage:
         camera.azimuth = float(np.degrees(np.arctan2(ahead[1], ahead[0])))
         camera.elevation = float(np.degrees(np.arcsin(ahead[2] / camera.distance)))
         window = mj.MjrRect(0, 0, *_SIZE)
-        with _context() as context:
+        with drawing_context(_SIZE):
             stage, render = mj.MjvScene(model, maxgeom=20_000), mj.MjrContext(model, mj.mjtFontScale.mjFONTSCALE_100)
             mj.mjr_setBuffer(mj.mjtFramebuffer.mjFB_OFFSCREEN, render)
-            for row in self._world.positions(self._executed.trajectory, times):
-                data.qpos[:] = self._physical.qpos(row)
+            for row in self.rows(times):
+                data.qpos[:] = self.qpos(row)
                 mj.mj_forward(model, data)
                 mj.mjv_updateScene(model, data, option, mj.MjvPerturb(), camera, mj.mjtCatBit.mjCAT_ALL, stage)
                 mj.mjr_render(window, stage, render)
@@ -85,7 +127,6 @@ class Stage:
                 mj.mjr_readPixels(pixels, None, window, render)
                 yield pixels[::-1]
             render.free()
-            del context
 
     def viewpoint(self) -> tuple[Floats, Floats]:
         """Return from where all that happens is seen; see `Drawing.viewpoint`."""
@@ -178,20 +219,20 @@ def _ffmpeg() -> str:
         raise InputError("videos need ffmpeg", expected="ffmpeg, or pip install imageio-ffmpeg", got="neither") from error
 
 
-def _dressed(builder: Builder) -> None:
-    """Add what is seen: visual meshes instead of collision shapes, walls that can be looked through, light and sky."""
+def _dress(builder: Builder, size: tuple[int, int], veil: float) -> None:
+    """Add what is seen: visual meshes instead of collision shapes, walls that may be looked through, light and sky."""
     mj, spec, world = builder.mj, builder.spec, builder.world
     for number, shape in enumerate(world.visual.geometryObjects):
         geom = builder.geom(builder.bodies[shape.parentJoint], f"seen {number}", shape.geometry, shape.placement, thin=True)
         geom.contype = geom.conaffinity = 0
         geom.density, geom.group, geom.rgba = 0.0, _SEEN, np.asarray(shape.meshColor)
         if shape.parentJoint == 0 and is_wall(shape):
-            geom.rgba[3] = _VEIL
+            geom.rgba[3] = veil
     for number, label in enumerate(world.collision_labels):
         if label == FLOOR:
             spec.geom(f"shape {number}").group = _SEEN
     look = spec.visual
-    look.global_.offwidth, look.global_.offheight, look.global_.fovy = *_SIZE, FIELD_OF_VIEW
+    look.global_.offwidth, look.global_.offheight, look.global_.fovy = *size, FIELD_OF_VIEW
     look.headlight.ambient, look.headlight.diffuse, look.headlight.specular = [0.45] * 3, [0.35] * 3, [0.0] * 3
     sun = mj.mjtLightType.mjLIGHT_DIRECTIONAL
     spec.worldbody.add_light(type=sun, dir=[0.1, 0.15, -1.0], pos=[0.0, 0.0, 6.0], diffuse=[0.5] * 3)
@@ -200,12 +241,16 @@ def _dressed(builder: Builder) -> None:
 
 
 @contextlib.contextmanager
-def _context() -> Iterator[Any]:
-    """Have a context of OpenGL that needs no screen."""
+def drawing_context(size: tuple[int, int]) -> Iterator[None]:
+    """Have a context of OpenGL that needs no screen, for pictures of a size [pixels].
+
+    Raises:
+        VkcError: There is none; the message says what was tried.
+    """
     tried = []
     for name in _CONTEXTS:
         try:
-            context = importlib.import_module(f"mujoco.{name}").GLContext(*_SIZE)
+            context = importlib.import_module(f"mujoco.{name}").GLContext(*size)
             context.make_current()
             break
         except Exception as error:  # whatever a driver that is not there comes up with
@@ -213,6 +258,6 @@ def _context() -> Iterator[Any]:
     else:
         raise VkcError(f"nothing can be drawn without a screen; MuJoCo needs EGL or OSMesa ({'; '.join(tried)})")
     try:
-        yield context
+        yield
     finally:
         context.free()

@@ -7,7 +7,7 @@ import pytest
 import yaml
 from helpers.datasets import SMALL
 
-from vkc_pin.benchmarks.datasets.throughput import run
+from vkc_pin.benchmarks.datasets.throughput import _slope, run
 from vkc_pin.cli import main
 from vkc_pin.datasets.recipe import TASKS
 
@@ -29,8 +29,18 @@ def test_one_record_a_task(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
         assert record["attempts"] >= record["successes"] >= 2
         assert record["episodes_per_hour"] > 0.0
         assert 50.0 < record["memory_mb"] < 2000.0
+        assert record["memory_slope_mb"] is None  # of so few
+        assert 0.0 < record["client_ms"] < 1000.0 * record["wall_time"]
         lines = (out / record["task"] / "journal.jsonl").read_text().splitlines()[1:]
         seconds = [json.loads(line)["seconds"] for line in lines if "session" not in json.loads(line)]
         assert record["episodes_per_hour"] == pytest.approx(3600.0 * record["successes"] / seconds[-1], rel=1e-2)
     again = run(out=out, episodes=2, recipe=str(recipe), progress=False)  # nothing is made again
     assert [r["attempts"] for r in again["trials"]] == [r["attempts"] for r in records]
+
+
+def test_growth_is_that_of_the_process_that_grows_most() -> None:
+    filling = [100.0 + k for k in range(30)]
+    flat, growing = [*filling, *[130.0] * 30], [*filling, *[130.0 + 0.01 * k for k in range(30)]]
+    assert _slope([flat]) == 0.0
+    assert _slope([flat, growing]) == pytest.approx(10.0)
+    assert _slope([filling]) is None

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.datasets.running.machine import machine, peak_memory, versions
 from vkc_pin.files.resources import package_folder
 from vkc_pin.planning.plan import Plan
+from vkc_pin.running.machine import machine, peak_memory, versions
 from vkc_pin.scene.scene import Scene
 
 __all__ = ["Record", "Solve", "commit", "distribution", "meta", "peak_memory", "trial", "values", "versions"]

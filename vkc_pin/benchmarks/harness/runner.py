@@ -18,11 +18,11 @@ from tqdm import tqdm
 
 from vkc_pin.benchmarks.harness.record import meta, peak_memory
 from vkc_pin.benchmarks.harness.tables import to_csv
-from vkc_pin.datasets.running.engine import Died, results
-from vkc_pin.datasets.running.journal import Journal
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.files.resources import folder, package_folder
 from vkc_pin.files.writing import check_writable, write_atomically
+from vkc_pin.running.engine import Died, results
+from vkc_pin.running.journal import Journal
 
 __all__ = ["Function", "chosen", "run"]
 
@@ -30,7 +30,7 @@ Function = Callable[[dict[str, Any]], Mapping[str, Any] | Sequence[Mapping[str, 
 """What runs one trial: takes its specification, returns its record, or several."""
 
 # What shows results has no part in them: a table may be written anew after a change there.
-_NO_PART = ("cli/", "benchmarks/", "datasets/")
+_NO_PART = ("cli/", "benchmarks/", "datasets/", "running/")
 _DESCRIPTIONS = (".yaml", ".urdf", ".srdf")
 
 

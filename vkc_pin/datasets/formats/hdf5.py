@@ -7,10 +7,11 @@ can be validated again, is double precision under `motion`.
 
 from __future__ import annotations
 
+import functools
 import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +25,7 @@ from vkc_pin.files.documents import parse_json, read_text
 from vkc_pin.files.writing import write_atomically
 from vkc_pin.models.robot import Robot
 from vkc_pin.needed import optional_package
+from vkc_pin.simulation.cameras.images import Images
 from vkc_pin.task.steps import step_to_dict
 
 if TYPE_CHECKING:
@@ -93,6 +95,10 @@ def _write(group: h5py.Group, episode: Episode, robot: Robot, rate: float) -> in
         _array(group, f"obs/{name}", found[name], np.float32)
     _array(group, "actions", found["actions"], np.float32)
     _array(group, "states", found["states"], np.float32)
+    images = episode.images()
+    for name, pixels in {} if images is None else images.pictures.items():  # a chunk each: loaders read single moments
+        squeezed = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
+        group.create_dataset(f"obs/{name}", data=pixels, chunks=(1, *pixels.shape[1:]), **squeezed)
     done = np.zeros(count, np.uint8)
     done[-1] = 1
     group.create_dataset("dones", data=done)
@@ -114,7 +120,7 @@ def _write(group: h5py.Group, episode: Episode, robot: Robot, rate: float) -> in
     group.attrs["number"] = episode.number
     group.attrs["scene"] = scene_name(episode.document)
     group.attrs["task"] = str(episode.about["task"])
-    said = {
+    said: dict[str, Any] = {
         "about": dict(episode.about),
         "start": dict(episode.start),
         "where": episode.where,
@@ -122,6 +128,8 @@ def _write(group: h5py.Group, episode: Episode, robot: Robot, rate: float) -> in
         "motion": motion,
         "validation": report,
     }
+    if images is not None:
+        said["images"], said["segments"] = list(images.pictures), images.segments
     group.attrs["episode"] = json.dumps(said, sort_keys=True)
     return count
 
@@ -185,9 +193,25 @@ def episodes_of(path: Path, scenes: Path) -> Iterator[Episode]:
                 if isinstance(error, InputError):
                     raise
                 raise InputError("not a shard of episodes", file=path, field=f"demo_{k}", got=str(error)) from error
-            yield made_of(
+            episode = made_of(
                 {**said, "options": options, "number": number, "scene": documents[name]}, arrays, scenes.parent / "robots"
             )
+            yield replace(episode, load_images=functools.partial(_images, path, k)) if "images" in said else episode
+
+
+def _images(path: Path, k: int) -> Images:
+    """Return what cameras saw in an episode of a shard.
+
+    Raises:
+        InputError: They are not there as the episode says.
+    """
+    with _opened(path) as file:
+        try:
+            group = file["data"][f"demo_{k}"]
+            said = parse_json(str(group.attrs["episode"]), path)
+            return Images({name: group["obs"][name][:] for name in said["images"]}, tuple(said["segments"]))
+        except (LookupError, TypeError, OSError) as error:
+            raise InputError("images are missing or damaged", file=path, field=f"demo_{k}", got=str(error)) from error
 
 
 def _document(scenes: Path, name: str) -> Any:

@@ -1,13 +1,15 @@
 """LeRobot's dataset layout 3.0: many episodes in one parquet file, with tables of episodes and tasks, and statistics.
 
 What each file holds is documented with LeRobot ("LeRobotDataset v3.0", huggingface/lerobot, src/lerobot/datasets). Features
-have one shape in all of a dataset, so that every robot gets a dataset of its own. There are no videos.
+have one shape in all of a dataset, so that every robot gets a dataset of its own. Images are PNG files
+inside of the parquet files, features of the type "image"; there are no videos.
 """
 
 from __future__ import annotations
 
+import io
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +31,8 @@ _EPISODES = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet
 _CHUNK = 1000  # files of a folder
 _SIZE = 100  # [MB] of a file; files are cut before they get there
 _ROWS = 200_000  # frames of a file
+_IMAGES = 90_000_000  # bytes of images in a file, after which the next one is begun
+_SEEN = "_image"  # end of the names of what becomes an image
 _KINDS = {"timestamp": "float32", "frame_index": "int64", "episode_index": "int64", "index": "int64", "task_index": "int64"}
 _STATE = ("base_pose", "arm_position", "gripper")
 
@@ -53,7 +57,8 @@ def write_lerobot(path: Path, episodes: Iterable[Episode], robot: Robot, rate: f
     """Write episodes of one robot as a dataset, whole or not at all, in place of one that is there; return its folder.
 
     `observation.state` is base pose, arm and gripper, `observation.velocity` their rates but for the gripper's,
-    `observation.environment_state` where the hand is and whether it holds something, `action` the state of the next moment.
+    `observation.environment_state` where the hand is and whether it holds something, `action` the state of the next moment,
+    `observation.images.<camera>` what a camera saw; LeRobot has no depths and no segmentation.
 
     Args:
         path: The folder.
@@ -91,7 +96,7 @@ class _Writer:
         self.stats: list[dict[str, dict[str, Floats]]] = []
         self.frames, self.files = 0, 0
         self._waiting: list[dict[str, Any]] = []
-        self._held = 0
+        self._held, self._bytes = 0, 0
 
     def add(self, episode: Episode) -> None:
         """Add an episode."""
@@ -109,9 +114,22 @@ class _Writer:
             "index": np.arange(self.frames, self.frames + count),
             "task_index": np.full(count, task),
         }
-        if self._held and self._held + count > _ROWS:
-            self._flush()
         stats = {name: _statistics(values) for name, values in columns.items()}
+        size = 0
+        for name, pixels in _pictures(episode):
+            if not self.rows:
+                self.features[name] = {
+                    "dtype": "image",
+                    "shape": list(pixels.shape[1:]),
+                    "names": ["height", "width", "channels"],
+                }
+            stats[name] = _statistics(pixels.reshape(-1, 3) / 255.0)
+            stats[name] = {key: value.reshape(3, 1, 1) for key, value in stats[name].items() if key != "count"}
+            stats[name]["count"] = np.array([count])
+            columns[name] = [{"bytes": _png(one), "path": f"frame-{k:06d}.png"} for k, one in enumerate(pixels)]
+            size += sum(len(one["bytes"]) for one in columns[name])
+        if self._held and (self._held + count > _ROWS or self._bytes + size > _IMAGES):
+            self._flush()
         self.stats.append(stats)
         self.rows.append(
             {
@@ -129,6 +147,7 @@ class _Writer:
         )
         self._waiting.append(columns)
         self._held += count
+        self._bytes += size
         self.frames += count
 
     def _flush(self) -> None:
@@ -136,8 +155,11 @@ class _Writer:
         arrow = self.arrow
         path = self.folder / _DATA.format(chunk_index=self.files // _CHUNK, file_index=self.files % _CHUNK)
         path.parent.mkdir(parents=True, exist_ok=True)
-        fields = []
+        fields: list[Any] = []
         for name, feature in self.features.items():
+            if feature["dtype"] == "image":
+                fields.append((name, arrow.struct([("bytes", arrow.binary()), ("path", arrow.string())])))
+                continue
             kind = arrow.float32() if feature["dtype"] == "float32" else arrow.int64()
             fields.append((name, kind if feature["shape"] == [1] else arrow.list_(kind, feature["shape"][0])))
         schema = arrow.schema(fields)
@@ -146,10 +168,13 @@ class _Writer:
                 arrays = []
                 for name, kind in fields:
                     values = columns[name]
+                    if isinstance(values, list):
+                        arrays.append(arrow.array(values, kind))
+                        continue
                     flat = arrow.array(values.reshape(-1))
                     arrays.append(flat if values.ndim == 1 else arrow.FixedSizeListArray.from_arrays(flat, type=kind))
                 writer.write_table(arrow.Table.from_arrays(arrays, schema=schema))
-        self._waiting, self._held, self.files = [], 0, self.files + 1
+        self._waiting, self._held, self._bytes, self.files = [], 0, 0, self.files + 1
 
     def close(self) -> None:
         """Write what is left."""
@@ -198,6 +223,23 @@ class _Writer:
         (meta / "stats.json").write_text(json.dumps(stats, indent=4) + "\n", encoding="utf-8")
 
 
+def _pictures(episode: Episode) -> Iterator[tuple[str, Any]]:
+    """Yield the name of a feature and what a camera saw, shape (N, height, width, 3), camera by camera."""
+    images = episode.images()
+    for name, pixels in {} if images is None else images.pictures.items():
+        if name.endswith(_SEEN):
+            yield f"observation.images.{name.removesuffix(_SEEN)}", pixels
+
+
+def _png(pixels: Any) -> bytes:
+    """Return an image as a PNG file."""
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, format="PNG", compress_level=4)
+    return buffer.getvalue()
+
+
 def _statistics(values: Any) -> dict[str, Floats]:
     """Return least, largest, mean and deviation of every column, shape (k,) each, and how many rows there are."""
     rows = np.asarray(values, float).reshape(len(values), -1)
@@ -212,9 +254,9 @@ def _statistics(values: Any) -> dict[str, Floats]:
 
 def _together(parts: list[dict[str, Floats]]) -> dict[str, list[float]]:
     """Return the statistics of all rows of those of some parts of them."""
-    counts = np.array([part["count"][0] for part in parts], float)[:, None]
+    counts = np.array([part["count"][0] for part in parts], float).reshape(-1, *[1] * parts[0]["mean"].ndim)
     means, deviations = (np.array([part[name] for part in parts]) for name in ("mean", "std"))
-    total = counts.sum()
+    total = counts.sum()  # images of a camera are all equally large: frames weigh as pixels do
     mean = (means * counts).sum(axis=0) / total
     variance = ((deviations**2 + (means - mean) ** 2) * counts).sum(axis=0) / total
     return {

@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.arrays import Floats
-from vkc_pin.datasets.episode import Episode
+from vkc_pin.datasets.episode import Episode, moments
 from vkc_pin.models.robot import Robot
 
 __all__ = ["sampled"]
@@ -30,8 +30,7 @@ def sampled(episode: Episode, robot: Robot, rate: float) -> Mapping[str, Floats]
         next moment (N, n + 1).
     """
     motion = episode.trajectory
-    times = motion.times[0] + np.arange(int(np.ceil((motion.times[-1] - motion.times[0]) * rate)) + 1) / rate
-    times = np.minimum(times, motion.times[-1])
+    times = moments(motion, rate)
     positions, velocities, size = motion.at(times), motion.velocity(times), motion.robot_size
     phase = np.clip(np.searchsorted(motion.times[[p.last for p in motion.phases]], times), 0, len(motion.phases) - 1)
     openings = np.array([np.nan if p.opening is None else p.opening for p in motion.phases])

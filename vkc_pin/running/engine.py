@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
+import queue
 import secrets
 import signal
 import threading
@@ -136,19 +137,22 @@ def _on_cluster(
     tell: Callable[[str], object] | None,
 ) -> Generator[tuple[str, Any]]:
     needs_dask(scheduler)
-    from distributed import Future, KilledWorker, wait
+    from distributed import Future, KilledWorker
 
     left = iter(tasks)
     with _client(jobs, scheduler) as (client, cluster), client.as_current():
         if tell is not None:
             tell(f"Dask's dashboard: {client.dashboard_link}")
         running: dict[str, tuple[str, Any, Future]] = {}
+        ended: queue.SimpleQueue[Future] = queue.SimpleQueue()  # waiting for all that run would cost more the more there are
         suspects: list[tuple[str, Any]] = []  # tried again with nothing beside them: another one may have killed the process
         alone = False
 
         def submit(key: str, task: Any) -> None:
             name = f"vkc-{key}-{secrets.token_hex(4)}"  # results of the same name would be shared among clients
-            running[name] = key, task, client.submit(_watched, function, task, limit, key=name, pure=False)
+            future = client.submit(_watched, function, task, limit, key=name, pure=False)
+            running[name] = key, task, future
+            future.add_done_callback(ended.put)
 
         def feed() -> None:
             nonlocal alone
@@ -165,25 +169,25 @@ def _on_cluster(
         feed()
         try:
             while running:
-                futures = [future for *_, future in running.values()]
                 try:
-                    ended = wait(futures, timeout=_LOOKED, return_when="FIRST_COMPLETED").done
-                except TimeoutError:
+                    future = ended.get(timeout=_LOOKED)
+                except queue.Empty:
                     if cluster is not None:
                         cluster.scale(jobs)  # a process that was killed while it started is not started anew otherwise
                     continue
-                for future in ended:
-                    key, task, _ = running.pop(future.key)
-                    try:
-                        result = future.result()
-                    except KilledWorker:
-                        if not alone:
-                            suspects.append((key, task))
-                            continue
+                key, task, _ = running.pop(future.key)
+                try:
+                    result = future.result()
+                except KilledWorker:
+                    if alone:
                         late = "" if limit is None else f", or longer than {limit:g} s"
                         result = Died(f"{DEATHS} processes died with it: out of memory, a crash{late}")
-                    future.release()
-                    yield key, result
+                    else:
+                        suspects.append((key, task))
+                        feed()
+                        continue
+                future.release()
+                yield key, result
                 feed()
         finally:
             client.cancel([future for *_, future in running.values()], force=True)
@@ -202,6 +206,12 @@ def _client(jobs: int, scheduler: str | None) -> Generator[tuple[Any, Any]]:
         "distributed.logging.distributed": "error",
         "distributed.worker.multiprocessing-method": "spawn",
         "distributed.worker.profile.enabled": False,  # it keeps every second of the last hour, 150 kB each of stacks like ours
+        # Tasks take seconds. At Dask's own intervals, of 20 to 500 ms, looking whether all is well took 4 % of a core.
+        "distributed.admin.tick.interval": "1s",
+        "distributed.admin.tick.cycle": "10s",
+        "distributed.admin.system-monitor.interval": "5s",
+        "distributed.worker.memory.monitor-interval": "1s",
+        "distributed.scheduler.active-memory-manager.start": False,  # results leave the processes at once
         "distributed.comm.timeouts.connect": f"{_CONNECTING:g}s",
     }
     with dask.config.set(settings), contextlib.ExitStack() as stack:

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from vkc_pin.datasets.running.journal import Journal
 from vkc_pin.errors import InputError
+from vkc_pin.running.journal import Journal, Kept
 
 HEADER = {"settings": {"recipe": "abc"}, "versions": {"pin": "4"}}
 
@@ -28,6 +28,37 @@ def test_what_was_written_is_there_again(tmp_path: Path) -> None:
     assert again.lines == {str(key): [{"number": key}] for key in (3, 1, 2)}
     assert again.memory == 103.0
     assert again.sessions == [{"jobs": 2, "trials": 3, "seconds": 1.0}]
+
+
+def test_it_is_read_while_it_is_written(tmp_path: Path) -> None:
+    journal = opened(tmp_path / "j")
+    for jobs, keys in ((1, (0, 4)), (2, (1, 2, 3))):
+        journal.append({"session": {"jobs": jobs}})
+        for key in keys:
+            journal.append(line(key))
+    journal._stream.write(b'{"key": "5", "rec')
+    journal._stream.flush()
+    kept = Kept.read(tmp_path / "j")
+    assert (kept.lines, kept.sessions, kept.memory) == (journal.lines, journal.sessions, journal.memory)
+    assert kept.seconds == 2.0 + 1.5  # of each session, the time until its last task
+    assert (tmp_path / "j").read_bytes().endswith(b'"rec')
+    with pytest.raises(InputError, match="cannot read this"):
+        Kept.read(tmp_path / "nothing")
+    (tmp_path / "bad").write_bytes(b'{}\n{"key": "1"}\n')
+    with pytest.raises(InputError, match="this line is damaged") as caught:
+        Kept.read(tmp_path / "bad")
+    assert caught.value.line == 2
+
+
+def test_memories_and_the_time_of_the_writer(tmp_path: Path) -> None:
+    journal = opened(tmp_path / "j")
+    journal.append({"session": {"jobs": 2}})
+    journal.append(line(0))  # of a version that did not say it
+    for key, process in ((1, "a"), (2, "b"), (3, "a")):
+        journal.append({**line(key), "process": process, "resident_mb": 10.0 * key, "client_seconds": 0.01 * key})
+    kept = Kept.read(tmp_path / "j")
+    assert kept.memories == {"a": [10.0, 30.0], "b": [20.0]}
+    assert kept.sessions == [{"jobs": 2, "trials": 4, "seconds": 1.5, "client_seconds": 0.03}]
 
 
 def test_any_cut_leaves_whole_lines(tmp_path: Path) -> None:

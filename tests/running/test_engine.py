@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 from helpers.tasks import double, fatal, fatal_once, hanging, profiled, where
 
-from vkc_pin.datasets.running.engine import DEATHS, Died, results
 from vkc_pin.errors import InputError
+from vkc_pin.running.engine import DEATHS, Died, results
 
 
 def numbered(count: int) -> list[tuple[str, int]]:
@@ -82,7 +82,7 @@ def test_a_scheduler_of_somebody_else() -> None:
 
 def test_no_scheduler_there(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
-    monkeypatch.setattr("vkc_pin.datasets.running.engine._CONNECTING", 1.0)
+    monkeypatch.setattr("vkc_pin.running.engine._CONNECTING", 1.0)
     with pytest.raises(InputError, match="no scheduler answers") as caught:
         list(results(double, numbered(2), scheduler="tcp://127.0.0.1:9"))
     assert caught.value.field == "scheduler"

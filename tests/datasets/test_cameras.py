@@ -1,0 +1,114 @@
+"""Images in datasets: in HDF5 beside what else is observed, and in LeRobot's layout."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.datasets import SMALL
+
+import vkc_pin as vkc
+from vkc_pin.datasets.check import check_dataset
+from vkc_pin.datasets.dataset import Dataset
+from vkc_pin.datasets.generate import generate
+from vkc_pin.datasets.recipe import CAMERAS, load_recipe
+from vkc_pin.simulation import snapshots
+
+h5py = pytest.importorskip("h5py")
+pq = pytest.importorskip("pyarrow.parquet")
+EYES: list[dict[str, Any]] = [{**camera, "width": 40, "height": 32} for camera in CAMERAS]
+SEEING = {**SMALL, "simulate": True, "cameras": EYES, "rate": 5}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    try:
+        with snapshots.drawing_context((8, 8)):
+            pass
+    except vkc.VkcError as error:  # no OpenGL on this machine
+        pytest.skip(str(error))
+    return generate(SEEING, 2, tmp_path_factory.mktemp("made") / "out", lerobot=True)
+
+
+def test_images_are_observed_at_every_sample(made: Dataset) -> None:
+    with h5py.File(made.shards[0]) as file:
+        for group in file["data"].values():
+            count = group.attrs["num_samples"]
+            for camera in ("head", "wrist"):
+                assert group[f"obs/{camera}_image"].shape == (count, 32, 40, 3)
+                for kind in ("depth", "segmentation"):
+                    assert group[f"obs/{camera}_{kind}"].shape == (count, 32, 40)
+                    assert group[f"obs/{camera}_{kind}"].chunks == (1, 32, 40)
+                assert group[f"obs/{camera}_image"][0].std() > 5.0
+
+
+def test_read_back(made: Dataset) -> None:
+    for episode in made.episodes():
+        images = episode.images()
+        assert images is not None
+        thing = {name for name in images.segments if name.startswith(f"{episode.about['object']}.")}
+        seen = {images.segments[k] for k in np.unique(images.pictures["wrist_segmentation"])}
+        assert seen & thing  # the hand has hold of it
+    assert check_dataset(made.folder).ok
+
+
+def test_lerobots_layout_has_the_colours(made: Dataset) -> None:
+    image = pytest.importorskip("PIL.Image")
+    root = made.folder / "lerobot/husky_ur5e"
+    features = json.loads((root / "meta/info.json").read_text())["features"]
+    stats = json.loads((root / "meta/stats.json").read_text())
+    table = pq.read_table(root / "data/chunk-000/file-000.parquet")
+    for camera in ("head", "wrist"):
+        name = f"observation.images.{camera}"
+        assert features[name] == {"dtype": "image", "shape": [32, 40, 3], "names": ["height", "width", "channels"]}
+        own = [np.asarray(image.open(io.BytesIO(one["bytes"]))) for one in table[name].to_pylist()]
+        told = np.concatenate([episode.images().pictures[f"{camera}_image"] for episode in made.episodes()])  # type: ignore[union-attr]
+        np.testing.assert_array_equal(np.array(own), told)
+        assert np.shape(stats[name]["mean"]) == (3, 1, 1)
+        np.testing.assert_allclose(np.ravel(stats[name]["mean"]), told.mean(axis=(0, 1, 2)) / 255.0, atol=1e-9)
+        np.testing.assert_allclose(np.ravel(stats[name]["std"]), told.std(axis=(0, 1, 2)) / 255.0, atol=1e-9)
+        assert stats[name]["count"] == [len(told)]
+
+
+def test_the_digest_knows_of_cameras_and_is_as_it_was_without() -> None:
+    blind, seeing = load_recipe({**SMALL, "simulate": True}), load_recipe(SEEING)
+    moved = load_recipe({**SEEING, "cameras": [{**EYES[0], "fov": 61.0}, EYES[1]]})
+    assert len({blind.digest, seeing.digest, moved.digest}) == 3
+    assert load_recipe({**SMALL, "simulate": True, "cameras": []}).digest == blind.digest
+    assert load_recipe(seeing).cameras == seeing.cameras
+
+
+@pytest.mark.parametrize(
+    ("cameras", "said"),
+    [
+        ([{**EYES[0], "fov": 180.0}], "fov"),
+        ([{**EYES[0], "target": EYES[0]["position"]}], "no direction"),
+        ([EYES[0], EYES[0]], "two cameras of one name"),
+        ([{**EYES[0], "wdth": 64}], "did you mean 'width'"),
+    ],
+)
+def test_wrong_cameras(cameras: Any, said: str) -> None:
+    with pytest.raises(vkc.InputError, match=said):
+        load_recipe({**SEEING, "cameras": cameras})
+
+
+def test_cameras_need_physics_frames_and_opengl(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(vkc.InputError, match="--simulate"):
+        generate(SMALL, 1, tmp_path / "out", cameras=True)
+    lost = [{**EYES[0], "frame": "hed_link"}]
+    monkeypatch.setattr(snapshots, "_CONTEXTS", ("no_such_context",))
+    with pytest.raises(vkc.VkcError, match="EGL or OSMesa"):
+        generate(SEEING, 1, tmp_path / "out")
+    monkeypatch.undo()
+    try:
+        with snapshots.drawing_context((8, 8)):
+            pass
+    except vkc.VkcError as error:
+        pytest.skip(str(error))
+    with pytest.raises(vkc.UnknownNameError, match="frame of husky_ur5e"):
+        generate({**SEEING, "cameras": lost}, 1, tmp_path / "out")
+    assert not (tmp_path / "out").exists()

@@ -278,25 +278,6 @@ private:
   std::priority_queue<Entry> queue_;
 };
 
-// The shortest paths of a car to goals, (n, 3), in radii: how far each of their pieces leads and how far it turns, (n, 5, 2).
-Array<double> shortest_words(const Numbers<2> & goals)
-{
-  if (goals.shape(1) != 3)
-    throw std::invalid_argument("goals are of shape (n, 3)");
-  std::vector<double> found;
-  found.reserve(goals.shape(0) * reeds_shepp::MOST * 2);
-  for (std::size_t i = 0; i < goals.shape(0); ++i)
-  {
-    const auto word = reeds_shepp::shortest(goals(i, 0), goals(i, 1), goals(i, 2));
-    for (std::size_t k = 0; k < reeds_shepp::MOST; ++k)
-    {
-      found.push_back(word.pieces[k]);
-      found.push_back(word.ways[k] * word.pieces[k]);
-    }
-  }
-  return handed_over(std::move(found), {goals.shape(0), reeds_shepp::MOST, 2});
-}
-
 } // namespace
 
 NB_MODULE(_driving, module)
@@ -312,5 +293,5 @@ NB_MODULE(_driving, module)
   nb::class_<Floor>(module, "Floor")
     .def(nb::init<const Bytes &, const Indices<2> &, const Numbers<1> &>())
     .def("distances", &Floor::distances);
-  module.def("shortest_words", &shortest_words);
+  module.def("shortest_words", &reeds_shepp::shortest_words);
 }

@@ -6,6 +6,10 @@
 #include <array>
 #include <cmath>
 #include <limits>
+#include <utility>
+#include <vector>
+
+#include "lattice.hpp"
 
 namespace reeds_shepp {
 
@@ -173,6 +177,25 @@ inline Word shortest(double x, double y, double phi)
         }
     }
   return best;
+}
+
+// The shortest paths of a car to goals, (n, 3), in radii: how far each of their pieces leads and how far it turns, (n, 5, 2).
+inline Array<double> shortest_words(const Numbers<2> & goals)
+{
+  if (goals.shape(1) != 3)
+    throw std::invalid_argument("goals are of shape (n, 3)");
+  std::vector<double> found;
+  found.reserve(goals.shape(0) * MOST * 2);
+  for (std::size_t i = 0; i < goals.shape(0); ++i)
+  {
+    const auto word = shortest(goals(i, 0), goals(i, 1), goals(i, 2));
+    for (std::size_t k = 0; k < MOST; ++k)
+    {
+      found.push_back(word.pieces[k]);
+      found.push_back(word.ways[k] * word.pieces[k]);
+    }
+  }
+  return handed_over(std::move(found), {goals.shape(0), MOST, 2});
 }
 
 } // namespace reeds_shepp

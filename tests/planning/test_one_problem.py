@@ -164,6 +164,44 @@ def test_real_seeds_are_tried_in_turn_until_validation_accepts_a_motion(
         assert not vkc.validate(own.scene, own.steps, motion, plan.options).ok
 
 
+@pytest.mark.parametrize(("initialization", "all_astray"), [("stationary", False), ("interpolated", True)])
+def test_what_clearly_misses_is_checked_only_if_nothing_else_is_left(
+    initialization: str, all_astray: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A wall from side to side: motions end inside it, or jump through it between two waypoints."""
+    solved, checked, solver, check = list[Solution](), list[vkc.Trajectory](), module.solve, module.validate
+
+    def answered(problem: vkc.TrajectoryProblem, z: np.ndarray, **named: Any) -> Solution:
+        solved.append(solver(problem, z, **named))
+        return solved[-1]
+
+    def noted(scene: vkc.Scene, steps: Any, trajectory: vkc.Trajectory, *more: Any) -> vkc.Report:
+        checked.append(trajectory)
+        return check(scene, steps, trajectory, *more)
+
+    monkeypatch.setattr(module, "solve", answered)
+    monkeypatch.setattr(module, "validate", noted)
+    monkeypatch.setattr(module, "proofs", lambda _: [])  # it would be certain before anything is tried again
+    wall = {"name": "wall", "type": "box", "size": [0.6, 9.0, 2.0], "position": [2.0, 0.0, 1.0]}
+    plan = vkc.plan(hall(obstacles=[wall]), [vkc.GoTo(4.0, 0.0)], initialization=initialization)
+    assert not plan.success
+    astray = [solution for solution in solved if solution.astray]
+    assert astray, "all came near: choose a thicker wall"
+    assert (len(astray) == len(solved)) == all_astray
+    assert len(checked) == max(1, len(solved) - len(astray))
+    problem = vkc.build(plan.scene, plan.steps)
+    for solution in solved:
+        short = problem.evaluate_contacts(solution.z, reach=0.1).violation()
+        assert solution.astray == (pytest.approx(short) if short > 0.01 else 0.0)
+    for solution in astray:
+        motion = as_trajectory(problem, solution.z, solution.dt)
+        assert not check(plan.scene, plan.steps, motion, plan.options).ok
+    if all_astray:
+        nearest = min(astray, key=lambda solution: solution.astray)
+        np.testing.assert_allclose(plan.trajectory.positions[1:, :2], nearest.z[:, :2], atol=1e-9)
+    assert not check(plan.scene, plan.steps, plan.trajectory, plan.options).ok
+
+
 @pytest.mark.made_up
 def test_rounds_of_all_seeds_count(monkeypatch: pytest.MonkeyPatch) -> None:
     rows: list[Iteration] = []

@@ -128,13 +128,14 @@ def test_what_does_not_move_in_a_phase_is_not_looked_at_in_it() -> None:
     found = PairTable(scene, solids, motion, 0.02)
     lies = [k for k in range(len(found.pairs)) if {name.partition(".")[0] for name in pair_names(found, k)} == {"stick", "table"}]
     assert lies
-    everywhere = np.full((1, len(found.group)), np.inf)
+    still = np.zeros((1, len(found.group)))
     placed = solids.at(samples.world.coordinates.q(samples.z[samples.waypoint_rows]))
     for waypoint in range(61):
-        _, pairs = found.close(placed, np.array([waypoint]), everywhere)
+        here = np.array([waypoint])
+        _, pairs = found.near(placed, here, here, still, np.inf)
         assert set(lies) <= set(pairs.tolist()) if 20 < waypoint <= 40 else set(lies).isdisjoint(pairs.tolist())
         if waypoint < 60:  # and on the way to the next
-            _, pairs = found.close(placed, np.array([waypoint]), everywhere, np.array([waypoint + 1]))
+            _, pairs = found.near(placed, here, here + 1, still, np.inf)
             assert set(lies) <= set(pairs.tolist()) if 20 <= waypoint < 40 else set(lies).isdisjoint(pairs.tolist())
 
 

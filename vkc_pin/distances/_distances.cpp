@@ -6,6 +6,7 @@
 
 #include <coal/config.hh>
 
+#include <nanobind/stl/pair.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
@@ -17,6 +18,7 @@
 #include "margins.hpp"
 #include "shapes.hpp"
 #include "solids.hpp"
+#include "world_boxes.hpp"
 
 NB_MODULE(_distances, module)
 {
@@ -54,6 +56,9 @@ NB_MODULE(_distances, module)
     .def("ease", &Margins::ease)
     .def("near", &Margins::near)
     .def("at", &Margins::at_all);
+  nb::class_<WorldBoxes>(module, "WorldBoxes")
+    .def(nb::init<const Numbers<3> &, const Numbers<3> &, const Numbers<2> &, const Numbers<2> &>())
+    .def("near", &WorldBoxes::near);
   module.def("nearest", &nearest);
   module.def("first_blocked", &first_blocked);
 }

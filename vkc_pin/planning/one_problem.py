@@ -95,6 +95,7 @@ class OneProblem:
         self.history: list[dict[str, float]] = []
         self.blocked: list[str] = []  # phases in which there is no way for the base
         self._best: _Try | None = None
+        self._astray: tuple[Solution, str] | None = None  # the nearest of those that nobody need check
         self._explained: dict[int, Blocked | None] = {}
         self._proven: list[str] | None = None
         self.hindered = False
@@ -108,12 +109,12 @@ class OneProblem:
         """
         began = time.perf_counter()
         cache, budget = self.settings.cache, self.settings.budget
-        built, used, self._best = cache.building, budget.used, None
+        built, used, self._best, self._astray = cache.building, budget.used, None, None
         self.settings.progress.begin([phase.name for phase in self.task.phases])
         try:
             best, status = self._planned(seed)
         except SpentError as end:
-            best, status = self._best or self._standing(), str(end)
+            best, status = self._nearest() or self._standing(), str(end)
         self.z, self.initialization = best.z, best.name
         cache.trim()  # a chore has many problems, whose solvers grow while they are used
         build_time, took = cache.building - built, time.perf_counter() - began
@@ -146,13 +147,16 @@ class OneProblem:
         notes: list[Blocked] = []
         for number, seed in enumerate(seeds, start=1):
             solution = self._solve(problem, seed)
-            found = self._judge(problem, solution, seed.name)
-            if self._best is None or found.better(self._best):
-                self._best = found
-            if self._best.status == "success":
-                return self._best, "success"
-            if solution.status in ENDINGS:
-                return self._best, solution.status
+            if solution.astray:
+                self._astray = min(self._astray or (solution, seed.name), (solution, seed.name), key=lambda one: one[0].astray)
+            else:
+                found = self._judge(problem, solution, seed.name)
+                if self._best is None or found.better(self._best):
+                    self._best = found
+                if self._best.status == "success":
+                    return self._best, "success"
+                if solution.status in ENDINGS:
+                    return self._best, solution.status
             spend()
             if searched and self._proofs(problem):
                 break
@@ -165,14 +169,18 @@ class OneProblem:
         spend()
         if searched and self._proofs(problem):
             return self._stationary(problem).noted(self._proofs(problem)), "infeasible"
-        best = self._best or self._stationary(problem)
+        best = (nearest := self._nearest()) or self._stationary(problem)
         lines = [goal.text for goal in notes]
-        status = "infeasible" if lines or (self._best is None and self.blocked) else best.status
-        if self._best is None:
+        status = "infeasible" if lines or (nearest is None and self.blocked) else best.status
+        if nearest is None:
             lines += self.blocked
         elif searched and not lines:
             lines += ways(problem, best.z, best.report, self.blocked)
         return best.noted(lines), status
+
+    def _nearest(self) -> _Try | None:
+        """Return the best try, one that is astray if there is no other; None: there is none."""
+        return self._judge(self.problem, *self._astray) if self._best is None and self._astray else self._best
 
     def _proofs(self, problem: TrajectoryProblem) -> list[str]:
         """Return what is certain, looked for once, and only when something has failed: most tasks can be done."""

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from vkc_pin.arrays import Floats
-from vkc_pin.budget import SpentError, spend
+from vkc_pin.budget import ENDINGS, SpentError, spend
 from vkc_pin.chain.contacts import Contacts
 from vkc_pin.program.merit import TOLERANCE, Infeasibility, Merit, infeasibility
 from vkc_pin.program.problem import TrajectoryProblem
@@ -162,6 +162,9 @@ def solve(
         solution.status = "converged" if solution.converged else str(end)
     if loop.feasible is not None:  # rounds after the first feasible one only made it shorter, or failed to
         solution.z, solution.dt = loop.feasible
+    elif solution.status not in ENDINGS:
+        short = problem.evaluate_contacts(solution.z, reach=problem.options.largest_margin, nearest=1).violation()
+        solution.astray = short if short > NEARLY else 0.0
     solution.radius = region.radius
     return solution
 
@@ -170,7 +173,7 @@ def _iterate(loop: _Loop, region: TrustRegion, callback: Callable[[Iteration], N
     """Run rounds until everything holds or nothing helps any more."""
     solution, started = loop.solution, time.perf_counter()
     missing, since = loop.found.total, 0  # what was missing when rounds were last counted
-    good = float("inf")  # objective of the last motion at which everything held
+    good, nearly = float("inf"), _nearly(loop.found)  # objective of the last motion at which everything held
     for _ in range(rounds):
         spend()
         trial = loop.try_step(region.radius)
@@ -195,9 +198,10 @@ def _iterate(loop: _Loop, region: TrustRegion, callback: Callable[[Iteration], N
             callback(row)
         used = region.radius
         if accepted:
+            last = loop.objective if nearly else good
             loop.accept(trial)
             if done := loop.done(trial):
-                last, good = good, trial.objective
+                good = trial.objective
                 if loop.problem.drift(trial.z) <= 1.0:  # that waypoints are too far apart along an arc no round can help
                     solution.converged, solution.status, loop.feasible = True, "converged", (trial.z, solution.dt)
                 improved = good < (1.0 - WORTHWHILE) * last
@@ -209,11 +213,15 @@ def _iterate(loop: _Loop, region: TrustRegion, callback: Callable[[Iteration], N
             missing, since = loop.found.total, 0
         if since >= PROGRESS_ROUNDS:
             break
-        short = loop.found.amounts["clearance"]
-        nearly = short.max() < NEARLY
-        if accepted and not done and nearly and loop.found.others < TOLERANCE:
+        short, nearly = loop.found.amounts["clearance"], _nearly(loop.found)
+        if accepted and not done and nearly:
             region.settle()
         if region.stuck(trial, short):
-            if not nearly or not loop.grow():
+            if short.max() >= NEARLY or not loop.grow():
                 break
             region.restart()
+
+
+def _nearly(found: Infeasibility) -> bool:
+    """Return whether everything holds but for a little clearance."""
+    return bool(found.amounts["clearance"].max() < NEARLY) and found.others < TOLERANCE

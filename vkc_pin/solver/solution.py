@@ -49,6 +49,8 @@ class Solution:
         dt: Time of every step of it [s], shape (N,).
         converged: Whether the loop ended by its own criteria.
         status: "converged", "not converged", or one of `budget.ENDINGS`.
+        astray: Of one that did not converge, by how much the worst pair at a waypoint falls short of its margin [m], if that is
+            so much that `validation` cannot accept it; otherwise 0.
         radius: How far planes were believed in the end, shape (N,).
         rounds, iterations: Of the outer loop and of Ipopt.
         timings: Seconds in "coal", "casadi" (evaluating functions) and "ipopt" (all the rest of it).
@@ -59,6 +61,7 @@ class Solution:
     dt: Floats
     converged: bool = False
     status: str = "not converged"
+    astray: float = 0.0
     radius: Floats | None = None
     rounds: int = 0
     iterations: int = 0

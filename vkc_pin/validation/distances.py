@@ -15,6 +15,7 @@ import pinocchio as pin
 from vkc_pin.arrays import Floats, Ints
 from vkc_pin.distances.placements import ShapePlacements, columns_of
 from vkc_pin.distances.shapes import Shapes
+from vkc_pin.distances.world_boxes import WorldBoxes
 from vkc_pin.models.coordinates import Moved
 from vkc_pin.models.shapes import bounding_box, shape_distance
 from vkc_pin.motion.world import World
@@ -81,6 +82,15 @@ class Placed:
         obstacles = (np.broadcast_to(part, (len(self._where), *part.shape)) for part in self._solids.obstacle_corners)
         lower, upper = (np.concatenate(parts, axis=1) for parts in zip(bodies, obstacles, strict=True))
         return lower, upper
+
+    @cached_property
+    def boxes(self) -> WorldBoxes:
+        """The same boxes, to ask which of them come near each other."""
+        return WorldBoxes(*self._solids.corners(self._where, slice(self._solids.bodies)), *self._solids.obstacle_corners)
+
+    def __len__(self) -> int:
+        """Return W."""
+        return len(self._where)
 
     def bounds(self, states: Ints, pairs: Ints) -> Floats:
         """Return lower bounds of the distances of pairs, shape (n, 2), at states, shape (n,): shape (n,) [m].

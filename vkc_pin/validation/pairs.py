@@ -18,7 +18,6 @@ from vkc_pin.validation.touching import Window
 __all__ = ["PairTable"]
 
 _STILL = 1e-9  # [m] or [rad]
-_AT_ONCE = 16  # states whose boxes are compared at once
 
 
 class PairTable:
@@ -68,7 +67,6 @@ class PairTable:
         self.margins = np.full(len(self.pairs), float(dist_safe))
         self.margins[: len(own)] = [self._robot_pairs.get(frozenset(pair), dist_safe) for pair in own.tolist()]
         self._windows = _Windows(windows, self.pairs)
-        self._sort()
 
     def _moved(self, rows: Floats) -> Bools:
         """Return whether each shape moves while the world goes through some configurations, shape (K, n): shape (G,)."""
@@ -124,54 +122,19 @@ class PairTable:
             found.append(np.column_stack([np.tile(np.array(ones, int), len(others)), np.repeat(others, len(ones))]))
         return np.concatenate(found).astype(int)
 
-    def _sort(self) -> None:
-        """Part the pairs of which both move from those of which one stands still all along the motion."""
-        moves = self._moving_once
-        both = moves[self.pairs].all(axis=1)
-        self._both, mixed = np.flatnonzero(both), np.flatnonzero(~both)
-        pairs = self.pairs[mixed]
-        pairs = np.where(moves[pairs[:, :1]], pairs, pairs[:, ::-1])  # what moves comes first
-        self._moving, self._still = (np.unique(column) for column in pairs.T)
-        self._number = np.full((len(self._moving), len(self._still)), -1)
-        self._number[np.searchsorted(self._moving, pairs[:, 0]), np.searchsorted(self._still, pairs[:, 1])] = mixed
-
-    def close(self, placed: Placed, states: Ints, reach: Floats, also: Ints | None = None) -> tuple[Ints, Ints]:
-        """Return (k, pair) of all pairs but those of which one stands still and the other is at least `reach` from it.
+    def near(self, placed: Placed, first: Ints, last: Ints, moved: Floats, limit: float) -> tuple[Ints, Ints]:
+        """Return (k, pair) of all pairs but those that boxes prove to stay `limit` [m] apart in a stretch k.
 
         Neither are those among them of which nothing moves then: what stands where it stood is as close as it was.
 
         Args:
-            placed: The world at some states.
-            states: Which of these, shape (K,).
-            reach: Of each geometry, shape (K, G) [m].
-            also: Others, shape (K,): what is close there counts as well.
+            placed: The world at the waypoints.
+            first: Waypoints at which stretches begin, shape (K,).
+            last: Waypoints at which they end, shape (K,).
+            moved: How far any point of each geometry moves in a stretch, shape (K, G) [m].
+            limit: [m].
         """
-        lower, upper = placed.corners
-        lows, highs = (np.ascontiguousarray(corners[0, self._still].T) for corners in (lower, upper))
-        far, moments = reach[:, self._moving, None], (states,) if also is None else (states, also)
-        boxes = [(lower[at][:, self._moving] - far, upper[at][:, self._moving] + far) for at in moments]
-        found = [(np.repeat(np.arange(len(states)), len(self._both)), np.tile(self._both, len(states)))]
-        for k in range(0, len(states), _AT_ONCE) if self._number.size else ():
-            part = slice(k, k + _AT_ONCE)
-            least = np.min([low[part].min(axis=(0, 1)) for low, _ in boxes], axis=0)[:, None]
-            most = np.max([high[part].max(axis=(0, 1)) for _, high in boxes], axis=0)[:, None]
-            (some,) = ((least < highs) & (most > lows)).all(axis=0).nonzero()  # of what stands, all that any may come close to
-            number = self._number[:, some]
-            near = np.zeros((len(states[part]), *number.shape), bool)
-            for low, high in boxes:
-                inside = np.tile(number >= 0, (len(near), 1, 1))
-                for axis in range(3):
-                    inside &= low[part, :, None, axis] < highs[axis, some]
-                    inside &= high[part, :, None, axis] > lows[axis, some]
-                near |= inside
-            at, *which = np.nonzero(near)
-            found.append((at + k, number[tuple(which)]))
-        at, pairs = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        phase = self._phase[(states if also is None else also)[at]]
-        active = (self._moves[phase[:, None], self.pairs[pairs]]).any(axis=1)
-        at, pairs = at[active], pairs[active]
-        order = np.lexsort((pairs, at))
-        return at[order], pairs[order]
+        return placed.boxes.near(first, last, self.pairs, moved=moved, moves=self._moves, phases=self._phase[last], limit=limit)
 
 
 class _Windows:

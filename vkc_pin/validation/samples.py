@@ -177,13 +177,20 @@ class Samples:
 
     def placements(self, rows: Iterable[int], frame: str) -> list[pin.SE3]:
         """Return the placements of a frame in the world at some samples."""
+        turns, origins = self._frames(rows, frame)
+        return [pin.SE3(turn, origin) for turn, origin in zip(turns[:, 0], origins[:, 0], strict=True)]
+
+    def _frames(self, rows: Iterable[int], *names: str) -> tuple[Floats, Floats]:
+        """Return rotations, shape (K, F, 3, 3), and origins, shape (K, F, 3) [m], of F frames in the world at some samples."""
         model, data = self.world.model, self.world.model.createData()
-        index = model.getFrameId(frame)
-        found = []
-        for q in self.world.coordinates.q(self.z[np.asarray(rows)]):
+        configurations, frames = self.world.coordinates.q(self.z[np.asarray(rows)]), [model.getFrameId(name) for name in names]
+        turns, origins = np.empty((len(configurations), len(frames), 3, 3)), np.empty((len(configurations), len(frames), 3))
+        for k, q in enumerate(configurations):
             pin.forwardKinematics(model, data, q)
-            found.append(pin.updateFramePlacement(model, data, index).copy())
-        return found
+            for f, frame in enumerate(frames):
+                placed = pin.updateFramePlacement(model, data, frame)
+                turns[k, f], origins[k, f] = placed.rotation, placed.translation
+        return turns, origins
 
     def grasp_errors(self, owner: str, name: str, rows: Ints, by: str | None = None) -> Floats:
         """Return how far the tool is from where attachment `name` has it, at some samples, shape (K, 2): [m] and [rad].
@@ -195,15 +202,25 @@ class Samples:
             by: The frame that takes the tool's place, "<object>.<link>".
         """
         attachment = self.scene.objects[owner].object.attachments[name]
-        tools, hand = self.placements(rows, by or self.scene.robot.tool_frame), hand_frame(self.scene.robot, attachment)
-        links = self.placements(rows, f"{owner}.{attachment.link}")
+        hand = hand_frame(self.scene.robot, attachment)
+        turns, origins = self._frames(rows, by or self.scene.robot.tool_frame, f"{owner}.{attachment.link}")
         positions, own = self.trajectory.at(self.times[rows]), [f"{owner}.{suffix}" for suffix in attachment.coordinates]
         values = np.zeros((len(rows), len(own)))
         for column, coordinate in enumerate(own):
             if coordinate in self.trajectory.names:
                 values[:, column] = positions[:, self.trajectory.names.index(coordinate)]
-        errors = np.empty((len(rows), 2))
-        for k, (tool, link) in enumerate(zip(tools, links, strict=True)):
-            offset = (link * attachment.tool(values[k])).actInv(tool * hand)
-            errors[k] = np.linalg.norm(offset.translation), np.linalg.norm(pin.log3(offset.rotation))
-        return errors
+        known, which = np.unique(values, axis=0, return_inverse=True)  # most grasps stay as they are
+        held = [attachment.tool(row) for row in known]
+        turn, origin = (np.array([getattr(part, side) for part in held]) for side in ("rotation", "translation"))
+        which = which.reshape(-1)
+        aimed = origins[:, 1] + np.einsum("kij,kj->ki", turns[:, 1], origin[which])
+        off = origins[:, 0] + turns[:, 0] @ hand.translation - aimed
+        rotation = np.swapaxes(turns[:, 1] @ turn[which], 1, 2) @ turns[:, 0] @ hand.rotation
+        return np.column_stack([np.linalg.norm(off, axis=1), _angles(rotation)])
+
+
+def _angles(rotations: Floats) -> Floats:
+    """Return by how much rotations turn, shape (K, 3, 3) → (K,) [rad]; as exact near none as near half a turn."""
+    skew = rotations - np.swapaxes(rotations, 1, 2)
+    sine = 0.5 * np.linalg.norm(skew[:, [2, 0, 1], [1, 2, 0]], axis=1)
+    return np.arctan2(sine, 0.5 * (np.trace(rotations, axis1=1, axis2=2) - 1.0))

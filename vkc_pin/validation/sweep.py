@@ -136,7 +136,7 @@ class _Sweep:
 
     def _nearest(self, placed: Placed) -> tuple[Ints, Ints, Floats]:
         """Return (state, pair), the closest and all that fall short of their margins among them, and their distances [m]."""
-        found = [part for states in _in_parts(len(placed.corners[0])) for part in self._nearest_at(placed, states)]
+        found = [part for states in _in_parts(len(placed)) for part in self._nearest_at(placed, states)]
         states, pairs, distances = (np.concatenate(parts) for parts in zip(*found, strict=True))
         order = np.lexsort((pairs, states))
         return states[order], pairs[order], distances[order]
@@ -145,11 +145,10 @@ class _Sweep:
         """Yield those of some states, in no order."""
         reach = max(self._table.margins.max(), RESOLUTION)
         while len(todo):
-            at, pairs = self._table.close(placed, todo, np.full((len(todo), len(self._table.group)), reach))
-            near = placed.bounds(todo[at], self._table.pairs[pairs]) < reach
-            states, pairs = todo[at[near]], pairs[near]
+            at, pairs = self._table.near(placed, todo, todo, np.zeros((len(todo), len(self._table.group))), reach)
+            states = todo[at]
             distances = placed.distances(states, self._table.pairs[pairs])
-            least, apart = np.full(len(placed.corners[0]), np.inf), self._table.margins_at(pairs, states) > -np.inf
+            least, apart = np.full(len(placed), np.inf), self._table.margins_at(pairs, states) > -np.inf
             np.minimum.at(least, states[apart], distances[apart])
             done = ~(least > reach)  # all others are further apart
             kept = done[states]
@@ -166,15 +165,7 @@ class _Sweep:
             moved: How far any point of each geometry moves from each to the next, shape (T − 1, G) [m].
             smallest: [m].
         """
-        found = []
-        for stretches in _in_parts(len(moved)):
-            at, some = self._table.close(placed, stretches, smallest + moved[stretches] / 2, stretches + 1)
-            at, pairs = stretches[at], self._table.pairs[some]
-            motion = moved[at, pairs[:, 0]] + moved[at, pairs[:, 1]]
-            floor = (placed.bounds(at, pairs) + placed.bounds(at + 1, pairs) - motion) / 2
-            found.append((at[floor < smallest], some[floor < smallest]))
-        at, some = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        return at, some
+        return self._table.near(placed, np.arange(len(moved)), np.arange(1, len(moved) + 1), moved, smallest)
 
     def _stretch(self, rows: Ints) -> Ints:
         """Return the waypoints from which the stretches begin in which samples are, shape (n,)."""

@@ -36,7 +36,7 @@ class Routes:
         self._grids: dict[tuple[int, bool], BaseGrid] = {}
         self._folded: dict[tuple[Hold, ...], Floats] = {}
         self._distances: dict[tuple[int, bool, int, int], Floats] = {}
-        self._paths: dict[tuple[int, bytes, bytes], BasePath | None] = {}
+        self._paths: dict[tuple[int, bool, bytes, bytes], BasePath | None] = {}
 
     def grid(self, phase: int, *, folded: bool = False) -> BaseGrid:
         """Return where the base fits in a phase: near the ends of a path alone, elsewhere with arm and load.
@@ -93,11 +93,15 @@ class Routes:
 
         The heading is continuous from the start's, and ends at one equal to the goal's. None if there is no path.
         """
-        key = (phase, start.tobytes(), goal.tobytes())
-        if key not in self._paths:
-            self._paths[key] = shortest_path(self.grid(phase), start.tolist(), goal[None])
-        path = self._paths[key]
+        path = self._shortest(phase, start, goal)
         return None if path is None else self._poses(self.grid(phase), path, steps, self.problem.chain.robot.lever)
+
+    def _shortest(self, phase: int, start: Floats, goal: Floats, *, folded: bool = False) -> BasePath | None:
+        """Return the shortest path of the base from start to goal, both (3,), if there is one; looked for once."""
+        key = (phase, folded, start.tobytes(), goal.tobytes())
+        if key not in self._paths:
+            self._paths[key] = shortest_path(self.grid(phase, folded=folded), start.tolist(), goal[None])
+        return self._paths[key]
 
     def _poses(self, grid: BaseGrid, path: BasePath, steps: int, turning: float) -> Floats:
         """Return poses along a path; those of a base on wheels at its corners, too, so that it rolls from each to the next."""
@@ -115,9 +119,9 @@ class Routes:
         With the arm at home or, if there is no such path, with the arm folded. None if there is none either.
         """
         for folded in (False, True):
-            grid = self.grid(phase, folded=folded)  # the fine one only where it is needed
-            path = shortest_path(grid, start.tolist(), goal[None])
+            path = self._shortest(phase, start, goal, folded=folded)  # the fine grid only where it is needed
             if path is not None:
+                grid = self.grid(phase, folded=folded)
                 return self._poses(grid, path, steps, grid.turning)
         return None
 

@@ -12,6 +12,7 @@ from vkc_pin.seeds.knots import depth
 __all__ = ["folded_arm"]
 
 _POSTURES = 1000  # random postures: with 192 the arm may stay wider than the base, with 4000 it gets no narrower
+_AT_ONCE = 50  # of these looked at together: one of the first is mostly free
 
 
 def folded_arm(problem: TrajectoryProblem, phase: int, resting: Floats) -> Floats:
@@ -33,8 +34,11 @@ def folded_arm(problem: TrajectoryProblem, phase: int, resting: Floats) -> Float
     z = np.tile(resting, (_POSTURES, 1))
     z[:, arm] = [home, *rng.uniform(lower, upper, (_POSTURES - 1, len(home)))]
     z = z[np.argsort(_size(problem, phase, z), kind="stable")]
-    free = depth(problem, z, problem.contacts.inside(phase), standing=False) <= 0.0
-    return z[np.argmax(free), arm].copy() if free.any() else home.copy()
+    for tried in np.array_split(z, _POSTURES // _AT_ONCE):
+        free = depth(problem, tried, problem.contacts.inside(phase), standing=False) <= 0.0
+        if free.any():
+            return tried[np.argmax(free), arm].copy()
+    return home.copy()
 
 
 def _size(problem: TrajectoryProblem, phase: int, z: Floats) -> Floats:

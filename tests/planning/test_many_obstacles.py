@@ -252,7 +252,7 @@ def test_bounds_are_bounds(seed: int, count: int, size: float) -> None:
     assert (bounds <= distances + COAL).all()
     assert (bounds[np.isfinite(bounds)] >= 0.0).all()
     for reach in (0.02, 0.5):
-        close = table.close(placed, np.arange(len(z)), np.full((len(z), len(table.group)), reach))
+        close = table.near(placed, np.arange(len(z)), np.arange(len(z)), np.zeros((len(z), len(table.group))), reach)
         assert set(map(tuple, np.argwhere((distances < reach - COAL) & moves).tolist())) <= set(
             zip(*map(np.ndarray.tolist, close), strict=True)
         )
@@ -294,9 +294,9 @@ def cull_nothing(patch: pytest.MonkeyPatch) -> None:
         return np.full(len(pairs), -np.inf)
 
     def all_of(
-        table: PairTable, _: Placed, states: np.ndarray, __: np.ndarray, also: np.ndarray | None = None
+        table: PairTable, _: Placed, first: np.ndarray, last: np.ndarray, moved: np.ndarray, limit: float
     ) -> tuple[np.ndarray, ...]:
-        return np.nonzero(table._moves[table._phase[states if also is None else also]][:, table.pairs].any(axis=2))
+        return np.nonzero(table._moves[table._phase[last]][:, table.pairs].any(axis=2))
 
     def everywhere(shape: coal.CollisionGeometry, placement: pin.SE3) -> tuple[np.ndarray, np.ndarray]:
         return np.full(3, -1e3), np.full(3, 1e3)
@@ -304,7 +304,7 @@ def cull_nothing(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Clearances, "nearest", all_of_them)
     patch.setattr(Clearances, "first_blocked", one_by_one)
     patch.setattr(Placed, "bounds", nowhere)
-    patch.setattr(PairTable, "close", all_of)
+    patch.setattr(PairTable, "near", all_of)
     patch.setattr(Body, "_close", lambda body, along: np.arange(len(body.moving)))
     for module in (geometry, easing):
         patch.setattr(module, "world_box", everywhere)

@@ -31,10 +31,16 @@ def test_a_robot_is_imported_and_examined(tmp_path: Path, capsys: pytest.Capture
 
 def test_what_is_wrong_is_said_on_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = write_arms(tmp_path / "given")
+    (tmp_path / "binary").write_bytes(b"<robot>\xff")
     for arguments, part in (
         (["import-robot", str(tmp_path / "none.urdf")], "cannot read the robot"),
         (["import-robot", str(file), "--output", str(tmp_path / "given")], "got other files"),
         (["import-robot", str(file), "--output", str(tmp_path / "new"), "--package", "meshes"], "NAME=FOLDER"),
+        (
+            ["import-home", str(tmp_path / "binary")],
+            "cannot read the URDF or MJCF (expected a URDF or MJCF file in UTF-8, got",
+        ),
+        (["check", "drawer", "--plot", str(tmp_path / "it.xyz")], "--plot: not the name of a picture (expected a name that ends"),
         (["doctor", "husky_ur5"], "did you mean 'husky_ur5e'?"),
     ):
         assert commands.run(arguments) == commands.EXIT_MISUSE

@@ -95,8 +95,9 @@ def test_a_hand_without_room(tmp_path: Path) -> None:
 
 def test_wrong_arguments_are_named() -> None:
     for wrong in ({"samples": 0}, {"margin": -1.0}):
-        with pytest.raises(vkc.InputError):
+        with pytest.raises(vkc.InputError) as refused:
             vkc.doctor("husky_ur5e", **wrong)  # type: ignore[arg-type]
+        assert refused.value.field == next(iter(wrong))
     with pytest.raises(vkc.UnknownNameError) as caught:
         vkc.doctor("husky_ur5")
     assert caught.value.nearest == "husky_ur5e"

@@ -146,12 +146,20 @@ def import_home(
         }
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # all of it is said again when the scene is loaded
-            scene, reached = free_start(Scene.from_document(document, made), rng)
+            scene, reached = _started(Scene.from_document(document, made), path, rng)
         document["start"] = {"base": scene.start[:3].tolist()}
         _write(made / "scene.yaml", path, document)
     weight = (WEIGHTLESS,) if all(thing.description.weightless for thing in home.things) else ()
     notes = (*home.notes, *weight, *_floor_notes(home), *changed, *(note for thing in things for note in thing.notes))
     return ImportedHome(target / "scene.yaml", load_scene(target / "scene.yaml"), things, _counts(home), reached, notes)
+
+
+def _started(scene: Scene, path: Path, rng: np.random.Generator) -> tuple[Scene, int]:
+    """Return what `free_start` does. Raises its error with the file's name."""
+    try:
+        return free_start(scene, rng)
+    except InputError as error:
+        raise InputError(error.problem, file=path, field=error.field, expected=error.expected, got=error.got) from None
 
 
 def _interval(low: float, high: float) -> list[float]:

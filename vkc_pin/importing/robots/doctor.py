@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vkc_pin.arguments import whole
+from vkc_pin.arguments import number, whole
 from vkc_pin.errors import InputError
 from vkc_pin.files.meshes import load_mesh
 from vkc_pin.importing.convex import concavity
@@ -95,10 +95,10 @@ def doctor(robot: str | Path | Robot, *, margin: float | None = None, samples: i
         InputError: The robot cannot be loaded, or an argument is wrong.
     """
     whole(samples, "samples", low=1)
+    kept = Options().dist_safe if margin is None else number(margin, "margin", "a clearance [m]", low=0.0, above=True)
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         examined = robot if isinstance(robot, Robot) else load_robot(robot)
-    kept = Options().dist_safe if margin is None else Options(dist_safe=margin).dist_safe
     findings = [*_home(examined, kept), *_pairs(examined, kept, samples, seed), *_numbers(examined), *_hand(examined)]
     findings += [*_shapes(examined), *(Finding("warning", "loading", str(one.message)) for one in told)]
     return Diagnosis(examined.name, tuple(findings))

@@ -9,12 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.arm_urdf import write_arms
 from helpers.robots import at_rest, placement, small_urdf
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.files import resources
 from vkc_pin.models.robot import Robot
-from vkc_pin.models.robot_file import load_robot
+from vkc_pin.models.robot_file import find_robot, load_robot
 
 FOLDER = resources.folder("robots") / "husky_ur5e"
 
@@ -303,3 +304,16 @@ def test_a_group_of_the_srdf_says_what_grasps(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="tool_frame says what grasps, too") as both:
         load_robot(tmp_path)
     assert (both.value.file, both.value.line) == (tmp_path / "robot.yaml", 3)
+
+
+def test_a_folder_here_is_no_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What has a slash in it is a path, and so is a `Path`, though there is a robot of that name."""
+    folder = write_arms(tmp_path / "husky_ur5e").parent
+    (folder / "robot.yaml").write_text("urdf: robot.urdf\n", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    for path in ("./husky_ur5e", "husky_ur5e/", Path("husky_ur5e"), str(folder)):
+        assert find_robot(path).resolve() == folder / "robot.yaml"
+        assert load_robot(path).urdf.resolve() == folder / "robot.urdf"
+    assert find_robot("husky_ur5e").parent != folder
+    with pytest.raises(InputError, match="there is no such robot"):
+        find_robot("./husky")

@@ -162,6 +162,36 @@ def test_the_gripper_changes_where_it_lets_go_and_takes_hold(robot: Path) -> Non
     assert found.trajectory.times[spans[2].first + 1] - found.trajectory.times[spans[2].first] >= found.options.grasp_time
 
 
+@pytest.mark.parametrize("opening", [None, 0.0, 0.03])
+def test_a_finger_gets_where_it_is_asked_to_with_the_gripper_as_it_is(robot: Path, opening: float | None) -> None:
+    """The frame of a finger is where the finger stands, not where it would be fully open: 20 mm or more from there."""
+    scene, finger = between_cheeks(robot, start=opening), "finger_a"
+    opened = scene.robot.opened(opening)
+    bent = opened.coordinates.q(scene.start + np.array([0.2, 0.1, 0.3, 0.1, 0.2, -0.1, 0.1, 0.1]))
+    data = opened.model.createData()
+    pin.framesForwardKinematics(opened.model, data, bent)
+    place = data.oMf[opened.model.getFrameId(finger)].copy()
+    for step in (vkc.Reach(place, finger), vkc.Touch(finger, place.translation.tolist())):
+        found = vkc.plan(scene, [step])
+        assert found.success, found.report()
+        assert [phase.opening for phase in found.trajectory.phases] == [opening]
+        end = opened.coordinates.q(found.trajectory.positions[-1])
+        pin.framesForwardKinematics(opened.model, data, end)
+        np.testing.assert_allclose(data.oMf[opened.model.getFrameId(finger)].translation, place.translation, atol=2e-3)
+
+
+def test_own_terms_about_a_finger_see_it_where_it_stands(robot: Path) -> None:
+    """It is to stay beside where it is closed; a program that has it fully open would begin 40 mm from there."""
+    scene = between_cheeks(robot, start=0.0)
+    model = scene.robot.opened(0.0).model
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, scene.robot.coordinates.q(scene.start))
+    y = float(data.oMf[model.getFrameId("finger_a")].translation[1])
+    beside = vkc.Constraint("beside", lambda s: s.position("finger_a")[1], lower=y - 5e-3, upper=y + 5e-3)
+    found = vkc.plan(scene, [vkc.GoTo(-0.2, 0.0, 0.0)], terms=[beside])
+    assert found.success, found.report()
+
+
 def test_a_chore_rests_where_its_parts_change_the_opening(robot: Path) -> None:
     """Driving is planned by itself, and without a thought of the drawer: the fingers move before the hand reaches for it."""
     found = vkc.plan_chore(between_cheeks(robot, opening=NARROW), [vkc.GoTo(-0.3, 0.2), PULL[0]], window=1)

@@ -209,6 +209,16 @@ def test_wrong_allowances_are_named(allow: list[Any], field: str, said: str) -> 
     assert said in str(caught.value)
 
 
+def test_a_file_that_is_missing_is_named_with_the_nearest_one(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    for name in ("door.yaml", "door.yml", "oven.yaml"):
+        (tmp_path / "mine" / name).touch()
+    thing = {"name": "door", "type": "mine/dor.yaml", "position": [2.0, 0.0, 0.0]}
+    for missing, said in (("mine/dor.yaml", ", perhaps mine/door.yaml, got"), ("none/dor.yaml", rf"a file in {tmp_path}, got")):
+        with pytest.raises(InputError, match=said):
+            Scene.from_document({**in_wall(-0.03).document, "objects": [{**thing, "type": missing}], "allow": []}, tmp_path)
+
+
 def test_an_srdf_of_other_links_is_refused_by_line(tmp_path: Path) -> None:
     (tmp_path / "home.srdf").write_text('<robot name="home">\n<disable_collisions link1="doro" link2="wall"/>\n</robot>')
     with pytest.raises(UnknownNameError, match=r"home\.srdf:2: .*did you mean 'door'"):

@@ -180,9 +180,19 @@ class VirtualKinematicChain:
         """Return the joint that carries the frame which holds something, and the frame's placement there."""
         return self.frame(self.robot.tool_frame) if hold.by is None else self.frame(str(hold.link), hold.by)
 
-    def frame(self, name: str, hold: Hold | None = None) -> tuple[int, pin.SE3]:
-        """Return the joint that carries a frame, and the frame's placement there: the robot's, or a link of what is held."""
-        frame = self.model.frames[self.model.getFrameId(name if hold is None else self.prefixes[hold] + name)]
+    def frame(self, name: str, hold: Hold | None = None, *, opening: float | None = None) -> tuple[int, pin.SE3]:
+        """Return the joint that carries a frame, and the frame's placement there.
+
+        Args:
+            name: A frame of the robot, or a link of what is held.
+            hold: What holds that; None: it is the robot's.
+            opening: How far the robot's gripper is open [m], which its fingers' frames depend on; None: as the robot rests.
+        """
+        if hold is None:
+            model = self.robot.opened(opening).model  # the chain begins with the robot's joints
+        else:
+            model, name = self.model, self.prefixes[hold] + name
+        frame = model.frames[model.getFrameId(name)]
         return frame.parentJoint, pin.SE3(frame.placement)
 
 

@@ -45,8 +45,12 @@ def _plan(arguments: argparse.Namespace) -> int:
 
 def _scene(arguments: argparse.Namespace) -> int:
     import vkc_pin as vkc
+    from vkc_pin.plotting.plots import PICTURES
 
     if arguments.plot is not None:
+        if not arguments.plot.lower().endswith(PICTURES):
+            expected = f"a name that ends with {', '.join(PICTURES)}"
+            raise InputError("not the name of a picture", field="--plot", expected=expected, got=arguments.plot)
         check_outputs({"--plot": arguments.plot}, kept={"SCENE": arguments.what})
     found = vkc.check_scene(vkc.load_scene(arguments.what), seed=arguments.seed)
     if arguments.plot is not None:

@@ -29,7 +29,7 @@ def add_importing(commands: Any) -> None:
     robot.add_argument("--most-pieces", type=positive, metavar="N", help="convex pieces of a mesh, at most; 1 keeps hulls")
     robot.add_argument("--samples", type=positive, metavar="N", help="configurations to look at for pairs that need no check")
     robot.add_argument("--seed", type=natural, default=0, help="of the random numbers (default 0)")
-    robot.add_argument("--force", action="store_true", help="replace a folder that is there")
+    robot.add_argument("--force", action="store_true", help="replace a folder that import-robot made before")
     robot.set_defaults(run=_import_robot)
 
     about = """Make an object that can be planned with of a URDF, MJCF or SDF file: convex pieces, limits, attachments that are
@@ -44,8 +44,9 @@ def add_importing(commands: Any) -> None:
     size.add_argument("--scale", type=float, metavar="FACTOR", help="by what to multiply the file's lengths")
     item.add_argument("--up", choices=("z", "y"), default="z", help="which axis of the file points up (default z)")
     item.add_argument("--link", metavar="NAME", help="import this link and what hangs on it alone")
-    item.add_argument("--robot", default="husky_ur5e", help="whose hand shall open it: name or file (default husky_ur5e)")
+    item.add_argument("--robot", default="husky_ur5e", help="whose hand shall open it: name, file or folder (default husky_ur5e)")
     item.add_argument("--most", type=positive, default=3, metavar="N", help="attachments for one joint, at most (default 3)")
+    item.add_argument("--force", action="store_true", help="replace a folder that import-object made before")
     item.set_defaults(run=_import_object)
     about = """Make a scene of a URDF or MJCF file of a whole home: what stands fixed becomes obstacles in convex pieces, what has
     joints becomes objects with proposed attachments, what moves freely becomes objects to carry, and the robot starts at a free
@@ -55,7 +56,7 @@ def add_importing(commands: Any) -> None:
     home.add_argument("--output", metavar="FOLDER", help="a new folder for the scene (default: the file's name)")
     home.add_argument("--force", action="store_true", help="replace a folder that import-home made before")
     home.add_argument("--floor", type=float, default=0.0, metavar="METRES", help="height of the floor in the file (default 0)")
-    home.add_argument("--robot", default="husky_ur5e", help="the robot that is there: name or file (default husky_ur5e)")
+    home.add_argument("--robot", default="husky_ur5e", help="the robot that is there: name, file or folder (default husky_ur5e)")
     home.add_argument("--most", type=positive, default=2, metavar="N", help="attachments for one joint, at most (default 2)")
     home.add_argument("--seed", type=natural, default=0, help="of the places where a start is looked for (default 0)")
     home.set_defaults(run=_import_home)
@@ -97,8 +98,9 @@ def _import_object(arguments: argparse.Namespace) -> int:
         scale=arguments.scale,
         up=arguments.up,
         link=arguments.link,
-        robot=arguments.robot,
+        robot=_robot(arguments.robot),
         most=arguments.most,
+        force=arguments.force,
     )
     sys.stdout.write(f"{done.report()}\nwrote {done.file}\nwrote {done.picture}\n")
     return EXIT_OK
@@ -111,7 +113,7 @@ def _import_home(arguments: argparse.Namespace) -> int:
         arguments.file,
         arguments.output,
         floor=arguments.floor,
-        robot=arguments.robot,
+        robot=_robot(arguments.robot),
         most=arguments.most,
         seed=arguments.seed,
         force=arguments.force,
@@ -123,10 +125,14 @@ def _import_home(arguments: argparse.Namespace) -> int:
 def _doctor(arguments: argparse.Namespace) -> int:
     from vkc_pin.importing.robots.doctor import doctor
 
-    name = arguments.robot
-    found = doctor(Path(name) if Path(name).exists() else name, margin=arguments.margin)
+    found = doctor(_robot(arguments.robot), margin=arguments.margin)
     sys.stdout.write(f"{found}\n")
     return EXIT_OK if found.healthy else EXIT_SICK
+
+
+def _robot(name: str) -> str | Path:
+    """Return what is meant by a robot's name: a folder here that import-robot has made, or else what `load_robot` takes."""
+    return Path(name) if name and (Path(name) / "robot.yaml").is_file() else name
 
 
 def _pairs(texts: list[str], field: str, form: str) -> dict[str, str]:

@@ -127,8 +127,8 @@ def read_text(file: str | Path, kind: str, largest: int | None = None) -> str:
     try:
         return read_bytes(file, kind, largest).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        expected = f"an existing {kind} file"
-        raise InputError(f"cannot read the {kind}", file=file, expected=expected, got=error) from error
+        got = f"no text: byte {error.start} is {error.object[error.start]:#04x}"
+        raise InputError(f"cannot read the {kind}", file=file, expected=f"a {kind} file in UTF-8", got=got) from None
 
 
 def parse_json(text: str, file: str | Path) -> Any:

@@ -61,25 +61,27 @@ def known_robots() -> dict[str, Path]:
     return known
 
 
-def find_robot(name: str) -> Path:
+def find_robot(name: str | Path) -> Path:
     """Return the robot.yaml or URDF file of a robot.
 
     Args:
-        name: A name of `known_robots`, or the path of a URDF file, of a robot.yaml, or of a folder that holds one.
+        name: A name of `known_robots`, or the path of a URDF file, of a robot.yaml, or of a folder that holds one. Text is a path
+            if it has the ending of such a file or a slash in it.
 
     Raises:
         UnknownNameError: It is neither.
+        InputError: There is no such file.
     """
     path = Path(name)
-    if path.suffix.lower() in (".urdf", ".yaml", ".yml") or len(path.parts) != 1:
+    if isinstance(name, Path) or path.suffix.lower() in (".urdf", ".yaml", ".yml") or "/" in name:
         file = path / "robot.yaml" if path.is_dir() else path
         if not file.is_file():
             raise InputError("there is no such robot", file=file, expected="a URDF file, a robot.yaml, or a robot's name")
         return file
     known = known_robots()
     if name not in known:
-        raise UnknownNameError("robot", name, known)
-    return known[name]
+        raise UnknownNameError("robot", str(name), known)
+    return known[str(name)]
 
 
 def load_robot(
@@ -273,7 +275,8 @@ class _Files:
 
 def _read(name: str | Path, packages: Mapping[str, str | Path]) -> _Files:
     """Find and read a robot's URDF, and the robot.yaml that belongs to it if there is one."""
-    source = find_robot(str(file_path(name, "name", "a robot's name, or a path")))
+    file_path(name, "name", "a robot's name, or a path")
+    source = find_robot(name)
     document = Document({})
     settings = RobotSchema(urdf=source.name)
     if source.suffix != ".yaml" and (source.parent / "robot.yaml").is_file():

@@ -175,7 +175,8 @@ class OneProblem:
         if nearest is None:
             lines += self.blocked
         elif searched and not lines:
-            lines += ways(problem, best.z, best.report, self.blocked)
+            missing = ways(problem, best.z, best.report, self.blocked, self.settings.random_seed)
+            lines, status = missing.lines, "infeasible" if missing.cut_off else status
         return best.noted(lines), status
 
     def _nearest(self) -> _Try | None:

@@ -83,7 +83,7 @@ def pose_goals(scene: Scene, chain: VirtualKinematicChain, task: Task, options: 
                 row = PoseRow(*chain.frame(thing.base_link, hold), tuple(range(int(first) + 1, int(last) + 1)), "level")
                 goals.append(PoseGoal(row, ride.carrier, "level", hold.object, hold.object))
         for goal in phase.frames:
-            row = PoseRow(*chain.frame(goal.frame, goal.hold), (int(last),), goal.kind)
+            row = PoseRow(*chain.frame(goal.frame, goal.hold, opening=phase.opening), (int(last),), goal.kind)
             goals.append(PoseGoal(row, goal.placement, "goal", str(goal)))
     return tuple(goals)
 

@@ -80,7 +80,7 @@ class _Whereabouts:
         """Return where a frame is at a waypoint of phase `number`."""
         owner, dot, link = frame.partition(".")
         if not dot or owner not in self.scene.objects:
-            return self._on_chain(self.chain.frame(frame), waypoint)
+            return self._on_chain(self.chain.frame(frame, opening=self.phases[number].opening), waypoint)
         placed, phase = self.scene.objects[owner], self.phases[number]
         item = placed.object
         if not item.free:  # the same whether it is held or not; where it is held, the chain is closed

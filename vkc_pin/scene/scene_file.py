@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import itertools
 from collections.abc import Iterable, Mapping
@@ -13,6 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.arrays import Floats
+from vkc_pin.errors import nearest_name
 from vkc_pin.files.documents import Document, check
 from vkc_pin.files.resources import file_path
 from vkc_pin.files.srdf import read_srdf
@@ -229,8 +231,17 @@ def _file(document: Document, path: tuple[str | int, ...], folder: Path, name: s
     with document.at(path):
         file = file_path(folder / name, "file", "the name of a file")
     if not file.is_file():
-        raise document.error(path, "there is no such file", expected=f"a file in {folder}", got=name)
+        near = _nearest(file)
+        expected = f"a file in {folder}" + (f", perhaps {Path(name).with_name(near)}" if near else "")
+        raise document.error(path, "there is no such file", expected=expected, got=name)
     return file
+
+
+def _nearest(file: Path) -> str | None:
+    """Return the name in a missing file's folder that resembles its own most, of files of its kind."""
+    with contextlib.suppress(OSError):
+        return nearest_name(file.name, sorted(one.name for one in file.parent.iterdir() if one.suffix == file.suffix))
+    return None
 
 
 def _object(document: Document, path: tuple[str | int, ...], item: schema.PlacedObjectSchema, folder: Path) -> PlacedObject:

@@ -1,9 +1,12 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 import vkc_pin as vkc
+from vkc_pin.importing.homes.home_import import _started
 from vkc_pin.importing.homes.starting import free_start
 from vkc_pin.scene.scene import START_CLEARANCE
 
@@ -35,3 +38,6 @@ def test_where_no_robot_fits_that_is_said() -> None:
     full = [{"name": "block", "type": "box", "size": [10.0, 4.0, 2.0], "position": [-1.0, 0.0, 1.0]}]
     with pytest.raises(vkc.InputError, match="floor"):
         free_start(_halves(3.0, obstacles=full), np.random.default_rng(0))
+    with pytest.raises(vkc.InputError, match=r"home\.xml: robot, floor: no place") as caught:
+        _started(_halves(3.0, obstacles=full), Path("home.xml"), np.random.default_rng(0))
+    assert caught.value.field == "robot, floor"

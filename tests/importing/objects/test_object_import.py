@@ -104,6 +104,8 @@ def test_what_is_no_object_and_wrong_arguments(tmp_path: Path) -> None:
         ({"up": "x"}, "up"),
         ({"link": "link_9"}, "link_2"),
         ({"folder": tmp_path / "in"}, "something already"),
+        ({"folder": tmp_path / "in", "force": True}, "something already"),
+        ({"most": 0}, "most"),
     ):
         with pytest.raises(vkc.InputError, match=word):
             vkc.import_object(file, **{"folder": tmp_path / "out", **wrong})  # type: ignore[arg-type]
@@ -122,5 +124,10 @@ def test_nothing_is_left_of_what_fails_halfway(tmp_path: Path) -> None:
     assert [path.name for path in out.parent.iterdir()] == ["box"]
     assert done.file == out / "box.yaml"
     assert done.picture.is_file()
+    (out / "old.stl").touch()
+    with pytest.raises(vkc.InputError, match="--force"):
+        vkc.import_object(tmp_path / "box.sdf", out, most=1)
+    assert vkc.import_object(tmp_path / "box.sdf", out, most=1, force=True).file == done.file
+    assert not (out / "old.stl").exists()
     again = vkc.propose_attachments(done.proposals.object, "husky_ur5e", most=1)
     assert [one.attachment.name for one in again.found] == list(done.object.attachments)

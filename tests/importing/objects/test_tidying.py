@@ -12,7 +12,18 @@ from hypothesis import strategies as st
 
 from vkc_pin.errors import UnknownNameError
 from vkc_pin.importing.objects.description import Description, Joint, Link, Part
-from vkc_pin.importing.objects.tidying import bounds, only, renamed, rooted, scaled, surfaces, tidied, upright, with_limits
+from vkc_pin.importing.objects.tidying import (
+    bounds,
+    only,
+    renamed,
+    rooted,
+    scaled,
+    several,
+    surfaces,
+    tidied,
+    upright,
+    with_limits,
+)
 from vkc_pin.importing.objects.urdf import read_object_urdf
 
 
@@ -121,3 +132,20 @@ def test_names_without_dots_and_slashes_that_differ() -> None:
     assert list(found.links) == ["a_b", "a_b_2", "c_d"]
     assert [joint.name for joint in found.joints.values()] == ["j_0", "j_0_2"]
     assert {joint.parent for joint in found.joints.values()} == {"a_b"}
+
+
+def test_a_file_of_several_things_is_told_from_one_with_several_joints(tmp_path: Path) -> None:
+    def box(name: str, parent: str, kind: str) -> str:
+        link = f'<link name="{name}"><collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>'
+        ends = f'<parent link="{parent}"/><child link="{name}"/><axis xyz="0 0 1"/><limit lower="0" upper="1"/>'
+        return f'{link}<joint name="{name}_joint" type="{kind}">{ends}</joint>'
+
+    def said(*parts: str) -> tuple[str, ...]:
+        (tmp_path / "it.urdf").write_text(f'<robot name="it"><link name="world"/>{"".join(parts)}</robot>')
+        return several(read_object_urdf(tmp_path / "it.urdf"))
+
+    oven = box("oven", "world", "fixed") + box("door", "oven", "revolute")
+    (note,) = said(oven, box("chest", "world", "fixed"), box("lid", "chest", "revolute"), box("rack", "chest", "prismatic"))
+    assert "'oven' (1 joint), 'chest' (2 joints)" in note
+    assert said(oven) == said(oven, box("wall", "world", "fixed")) == ()
+    assert said(box("upper", "world", "prismatic"), box("lower", "world", "prismatic")) == ()

@@ -66,10 +66,38 @@ def test_hands_that_look_the_wrong_way(tmp_path: Path) -> None:
     assert "in front of its tool frame back" in said(vkc.doctor(tmp_path, samples=5), "fault", "hand")[0]
 
 
+def test_what_robot_yaml_says_is_known(tmp_path: Path) -> None:
+    path = write_arms(tmp_path)
+    text = path.read_text(encoding="utf-8").replace('effort="10" velocity="1.5"', 'effort="0" velocity="0"', 2)
+    path.write_text(text, encoding="utf-8")
+    named = {"urdf": path.name, "joints": {"arm_1_joint": {"velocity": 2.0, "effort": 30.0}}}
+    (tmp_path / "robot.yaml").write_text(json.dumps(named), encoding="utf-8")
+    found = vkc.doctor(tmp_path, samples=5)
+    assert "no speed in the file: arm_2_joint (taken: 3.14)" in said(found, "warning", "limits")
+    assert "no effort: arm_2_joint (their torques are not limited)" in said(found, "note", "effort")
+
+
+def test_a_hand_without_room(tmp_path: Path) -> None:
+    """Fingers that are shut, 0 apart, take hold of nothing; open they do."""
+    path = write_arms(tmp_path)
+    for where, told in ((0.0, 1), (0.03, 0)):
+        named = {"urdf": path.name, "tool_frame": "hand", "touch_links": ["finger_a", "finger_b"]}
+        tool = path.read_text(encoding="utf-8")
+        if "tool" not in tool:
+            joint = '<link name="tool"/><joint name="tool_joint" type="fixed"><parent link="hand"/><child link="tool"/>'
+            joint += '<origin xyz="0 0 0.125" rpy="0 0 1.5707963267948966"/></joint></robot>'
+            path.write_text(tool.replace("</robot>", joint), encoding="utf-8")
+        named |= {"tool_frame": "tool", "locked_joints": {"finger_a_joint": where, "finger_b_joint": where}}
+        (tmp_path / "robot.yaml").write_text(json.dumps(named), encoding="utf-8")
+        lines = [text for text in said(vkc.doctor(tmp_path, samples=5), "warning", "hand") if "no room" in text]
+        assert len(lines) == told
+
+
 def test_wrong_arguments_are_named() -> None:
     for wrong in ({"samples": 0}, {"margin": -1.0}):
-        with pytest.raises(vkc.InputError):
+        with pytest.raises(vkc.InputError) as refused:
             vkc.doctor("husky_ur5e", **wrong)  # type: ignore[arg-type]
+        assert refused.value.field == next(iter(wrong))
     with pytest.raises(vkc.UnknownNameError) as caught:
         vkc.doctor("husky_ur5")
     assert caught.value.nearest == "husky_ur5e"

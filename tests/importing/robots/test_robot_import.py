@@ -147,12 +147,20 @@ def test_a_folder_is_replaced_only_if_asked_and_left_alone_if_importing_fails(tm
     target = tmp_path / "mine"
     target.mkdir()
     (target / "notes.txt").write_text("dear", encoding="utf-8")
-    with pytest.raises(vkc.InputError, match="there already") as caught:
+    for force in (False, True):
+        with pytest.raises(vkc.InputError, match="something already"):
+            vkc.import_robot(file, target, force=force)
+    assert [path.name for path in target.iterdir()] == ["notes.txt"]
+    (target / "notes.txt").unlink()
+    vkc.import_robot(file, target, samples=SAMPLES)
+    (target / "notes.txt").write_text("dear", encoding="utf-8")
+    with pytest.raises(vkc.InputError, match="--force"):
         vkc.import_robot(file, target)
-    assert "--force" in str(caught.value)
+    with pytest.raises(vkc.UnknownNameError, match=r"given/robot\.urdf: tool_frame: .*did you mean 'right_hand'|'hand'"):
+        vkc.import_robot(file, target, tool_frame="hnd", force=True)
     with pytest.raises(vkc.UnknownNameError):
         vkc.import_robot(file, target, arm="third", force=True)
-    assert [path.name for path in target.iterdir()] == ["notes.txt"]
+    assert (target / "notes.txt").is_file()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["given", "mine"]  # nothing half written
     vkc.import_robot(file, target, samples=SAMPLES, force=True)
     assert not (target / "notes.txt").exists()

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,14 @@ def test_applied_gives_the_object_the_best_one_first(found: vkc.Proposals) -> No
     assert item.attachment().name == found.found[0].attachment.name == "flap_bar"
     assert found.opening("hinge") == found.found
     assert "flap_bar" in repr(found)
+
+
+def test_a_line_names_few_of_the_joints_that_must_be_open(found: vkc.Proposals) -> None:
+    first = found.found[0]
+    ends = {0: "1.5 rad", 2: "1.5 rad, while j0 is at 1, j1 is at 1", 5: "j2 is at 1 and 2 more joints are open"}
+    for count, said in ends.items():
+        one = dataclasses.replace(first, when={f"j{k}": 1.0 for k in range(count)})
+        assert dataclasses.replace(found, found=(one,)).report().splitlines()[1].endswith(said)
 
 
 def test_the_report_says_what_opens_and_how_far(found: vkc.Proposals) -> None:

@@ -48,6 +48,20 @@ def test_a_start_that_touches() -> None:
     assert violation.amount == pytest.approx(0.495 + 0.3 - 0.7, abs=1e-6)
 
 
+def test_links_in_pieces_are_told_once() -> None:
+    """The deepest of their pairs; here many pieces of the base stand in two blocks of one URDF."""
+    wall = "".join(
+        f'<collision><origin xyz="0 {y} 0.4"/><geometry><box size="0.2 0.5 0.8"/></geometry></collision>' for y in (0, 0.3)
+    )
+    urdf = f'<robot name="wall"><link name="wall">{wall}</link></robot>'
+    item = {"name": "wall", "type": {"urdf": urdf, "attachments": []}, "position": [0.4, 0.0, 0.0]}
+    scene = vkc.Scene.from_document({**hall().document, "objects": [item]})
+    found = impossible(problem(scene, vkc.GoTo(-1.0, 0.0)))
+    subjects = [violation.subject for violation in found]
+    assert "base_link – wall.wall" in subjects
+    assert len(subjects) == len(set(subjects))
+
+
 @pytest.mark.parametrize("gap", [1e-3, 1e-17, 0.0, -5e-5, -2e-3])
 def test_what_the_hand_holds_at_the_start_may_lie_on_something(gap: float) -> None:
     down = reaching(tool_at(STICK), above(STICK))

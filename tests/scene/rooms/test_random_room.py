@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from helpers.grippers import write_gripper
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
@@ -18,7 +19,7 @@ from vkc_pin.models.furniture.catalogue import KINDS
 from vkc_pin.models.shapes import clearance, placed_shapes, shape_distance, world_box
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.placed import standing_geometry
-from vkc_pin.scene.rooms.fixtures import OPENED
+from vkc_pin.scene.rooms.fixtures import OPENED, fixture
 from vkc_pin.scene.rooms.random_room import Layout, random_layout
 from vkc_pin.scene.scene import START_CLEARANCE
 
@@ -162,3 +163,21 @@ def test_what_finds_no_place_is_said() -> None:
         vkc.random_room(0, width=(4.0, 4.0), objects=("cabinet",) * 6)
     assert found.value.field == "clutter"
     assert "fewer objects" in str(found.value.expected)
+
+
+def test_things_and_robots_as_imports_write_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Imported objects have their frame in their middle: the floor is free before their face, not from inside of them."""
+    box = '<collision><origin xyz="{} 0 0.2"/><geometry><box size="{} 0.5 0.4"/></geometry></collision>'
+    body, door = box.format(0.03, 0.64), box.format(-0.3, 0.02)
+    ends = '<parent link="body"/><child link="door"/><axis xyz="0 0 1"/><limit lower="0" upper="1"/>'
+    joint = f'<joint name="hinge" type="revolute">{ends}</joint>'
+    urdf = f'<robot name="oven"><link name="body">{body}</link><link name="door">{door}</link>{joint}</robot>'
+    own = fixture({"urdf": urdf, "attachments": []})
+    assert own.face == pytest.approx(-0.29)
+    assert fixture("dishwasher").face == pytest.approx(0.0, abs=0.03)
+    write_gripper(tmp_path / "mine")
+    monkeypatch.chdir(tmp_path)
+    room = vkc.random_room(7, objects=[{"urdf": urdf, "attachments": []}], robot="mine/robot.yaml", clutter=0.0)
+    assert room.robot.name == "mine"
+    assert list(room.objects) == ["oven"]
+    assert vkc.random_room(7, objects=["drawer"], robot=Path("mine"), clutter=0.0).robot.name == "mine"  # type: ignore[arg-type]

@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 import yaml
 
-from vkc_pin.arguments import instance, number, whole
+from vkc_pin.arguments import flag, instance, number, whole
 from vkc_pin.errors import InputError
 from vkc_pin.files.documents import read_text
 from vkc_pin.files.resources import file_path
@@ -27,6 +27,7 @@ from vkc_pin.importing.objects.description import WEIGHTLESS
 from vkc_pin.importing.objects.object_import import read_description
 from vkc_pin.importing.objects.pieces import Known
 from vkc_pin.importing.objects.tidying import bounds, renamed, rooted, surfaces
+from vkc_pin.importing.targets import check_target, made_by
 from vkc_pin.models.robot_file import load_robot
 from vkc_pin.options import Options
 from vkc_pin.scene.obstacles import FLOOR
@@ -34,7 +35,7 @@ from vkc_pin.scene.scene import Scene, load_scene
 
 __all__ = ["ImportedHome", "import_home"]
 
-_MARK = "by vkc-pin import-home."
+_COMMAND = "import-home"
 _LARGEST = 1e3  # [m] above or below zero, where a floor may be
 
 
@@ -117,7 +118,7 @@ def import_home(
     options = Options() if options is None else instance(options, Options, "options")
     hand = load_robot(robot)
     target = file_path(folder, "folder", "a folder") if folder is not None else Path(_name(path))
-    _check_target(target, force)
+    check_target(target, _COMMAND, force=flag(force, "force"))
     if parse_xml(read_text(path, "URDF or MJCF"), path).tag == "sdf":
         raise InputError("homes are read from URDF and MJCF alone", file=path, expected="<robot> or <mujoco>", got="<sdf>")
     description = rooted(renamed(read_description(path, free=True)), pin.SE3(np.eye(3), np.array([0.0, 0.0, -floor])))
@@ -145,7 +146,7 @@ def import_home(
         }
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # all of it is said again when the scene is loaded
-            scene, reached = free_start(Scene.from_document(document, made), rng)
+            scene, reached = _started(Scene.from_document(document, made), path, rng)
         document["start"] = {"base": scene.start[:3].tolist()}
         _write(made / "scene.yaml", path, document)
     weight = (WEIGHTLESS,) if all(thing.description.weightless for thing in home.things) else ()
@@ -153,16 +154,12 @@ def import_home(
     return ImportedHome(target / "scene.yaml", load_scene(target / "scene.yaml"), things, _counts(home), reached, notes)
 
 
-def _check_target(target: Path, force: bool) -> None:
-    """Check that a folder can be written: it is not there, or empty, or was made by an import and may be replaced."""
-    if not target.exists() or (target.is_dir() and not any(target.iterdir())):
-        return
-    scene = target / "scene.yaml"
-    own = scene.is_file() and _MARK in scene.read_text(errors="replace").partition("\n")[0]
-    if force and own:
-        return
-    expected = "a new or an empty folder" + (", or --force to replace it" if own else "")
-    raise InputError("there is something already", file=target, field="folder", expected=expected)
+def _started(scene: Scene, path: Path, rng: np.random.Generator) -> tuple[Scene, int]:
+    """Return what `free_start` does. Raises its error with the file's name."""
+    try:
+        return free_start(scene, rng)
+    except InputError as error:
+        raise InputError(error.problem, file=path, field=error.field, expected=error.expected, got=error.got) from None
 
 
 def _interval(low: float, high: float) -> list[float]:
@@ -176,12 +173,12 @@ def _name(path: Path) -> str:
 
 def _robot(robot: str | Path) -> str:
     """Return a robot as a scene in another folder names it."""
-    by_path = str(robot).endswith((".urdf", ".yaml", ".yml")) or "/" in str(robot)
+    by_path = isinstance(robot, Path) or robot.endswith((".urdf", ".yaml", ".yml")) or "/" in robot
     return str(Path(robot).resolve()) if by_path else str(robot)
 
 
 def _write(file: Path, source: Path, document: Mapping[str, Any]) -> None:
-    head = f"# Made of {source.name} {_MARK}\n"
+    head = f"# Made of {source.name} {made_by(_COMMAND)}.\n"
     write_atomically(file, (head + yaml.safe_dump(document, sort_keys=False, width=130, default_flow_style=None)).encode())
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.arguments import instance, quantity
+from vkc_pin.arguments import flag, instance, quantity, whole
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError, shown
 from vkc_pin.files.documents import read_text
@@ -30,6 +30,7 @@ from vkc_pin.importing.objects.tidying import (
     renamed,
     rooted,
     scaled,
+    several,
     surfaces,
     tidied,
     upright,
@@ -37,6 +38,7 @@ from vkc_pin.importing.objects.tidying import (
 )
 from vkc_pin.importing.objects.urdf import read_object_urdf
 from vkc_pin.importing.objects.writing import write_description, write_urdf
+from vkc_pin.importing.targets import check_target, made_by
 from vkc_pin.models.articulation import ArticulatedObject
 from vkc_pin.models.object_file import load_object
 from vkc_pin.models.proposals.proposal import Proposals
@@ -48,6 +50,7 @@ from vkc_pin.plotting.attachments import plot_attachments
 
 __all__ = ["ImportedObject", "import_object", "read_description"]
 
+_COMMAND = "import-object"
 _GENERAL = ("mobility", "model", "object", "scene", "index", "main")  # names of files that say nothing
 _SMALL, _LARGE = 0.02, 3.5  # [m]: heights of what is opened by hand
 
@@ -114,9 +117,10 @@ def import_object(
     scale: float | None = None,
     up: str = "z",
     link: str | None = None,
-    robot: str | Robot = "husky_ur5e",
+    robot: str | Path | Robot = "husky_ur5e",
     options: Options | None = None,
     most: int = 3,
+    force: bool = False,
 ) -> ImportedObject:
     """Make an object that can be planned with of a URDF, MJCF or SDF file.
 
@@ -133,6 +137,7 @@ def import_object(
         robot: Whose hand the attachments are for.
         options: Which clearances they must have.
         most: How many attachments one joint gets at most.
+        force: Whether to replace a folder that this made before.
 
     Raises:
         InputError: The file cannot be read or is no object, the folder holds something, or an argument is wrong.
@@ -146,25 +151,28 @@ def import_object(
             raise InputError("not a size", field=name, expected="a number above 0", got=value)
     if height is not None and scale is not None:
         raise InputError("both a height and a scale", field="height, scale", expected="one of them")
+    whole(most, "most", low=1, high=100)
     options = Options() if options is None else instance(options, Options, "options")
     clearances = {"dist_safe": options.dist_safe, "grasp_clearance": options.grasp_clearance}
     robot = robot if isinstance(robot, Robot) else load_robot(robot)
     name = _name(path, link)
     target = Path(name) if folder is None else file_path(folder, "folder", "a folder")
-    if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise InputError("there is something already", file=target, field="folder", expected="a new or an empty folder")
+    check_target(target, _COMMAND, force=flag(force, "force"))
     description = read_description(path)
-    description = upright(tidied(renamed(only(description, link) if link else description)), up)
+    description = (
+        only(description, link) if link else dataclasses.replace(description, notes=description.notes + several(description))
+    )
+    description = upright(tidied(renamed(description)), up)
     description, size = _sized(description, height, scale)
     meshes = surfaces(description)
     description = _settled(with_limits(description, meshes))
     if description.weightless:
         description = dataclasses.replace(description, notes=(*description.notes, WEIGHTLESS))
     description = with_pieces(description, surfaces(description))
-    with folder_at_once(target, force=True) as made:  # what is there is empty
+    with folder_at_once(target, force=True) as made:  # what is there may be replaced
         yaml, urdf, picture = made / f"{name}.yaml", made / f"{name}.urdf", made / "attachments.png"
         write_urdf(description, urdf)
-        about = [f"Made of {path.name} by vkc-pin import-object."]
+        about = [f"Made of {path.name} {made_by(_COMMAND)}."]
         write_description(yaml, urdf.name, (), about=about)
         proposals = propose_attachments(load_object(yaml), robot, most=most, **clearances)
         about.append(f"Attachments as proposed for the hand of {proposals.hand.robot}, best first.")

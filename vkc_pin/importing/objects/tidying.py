@@ -17,7 +17,20 @@ from vkc_pin.importing.objects.description import Description, Link, Part
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["Surfaces", "bounds", "closed", "only", "renamed", "rooted", "scaled", "surfaces", "tidied", "upright", "with_limits"]
+__all__ = [
+    "Surfaces",
+    "bounds",
+    "closed",
+    "only",
+    "renamed",
+    "rooted",
+    "scaled",
+    "several",
+    "surfaces",
+    "tidied",
+    "upright",
+    "with_limits",
+]
 
 Surfaces = Mapping[int, "trimesh.Trimesh"]
 """The surfaces of parts in the frame of their link, by `id` of the part."""
@@ -39,6 +52,21 @@ def only(description: Description, link: str) -> Description:
     links = {name: found for name, found in description.links.items() if name in kept}
     joints = {child: joint for child, joint in description.joints.items() if child in kept and child != link}
     return dataclasses.replace(description, links=links, joints=joints)
+
+
+def several(description: Description) -> tuple[str, ...]:
+    """Return a note about a file that holds several things with joints of their own; none if it holds one.
+
+    They stand on a root without shapes, as of a whole scene; drawers that slide on one, all of them, are one chest of drawers.
+    """
+    joints, root = description.joints, description.root
+    hung = [child for child, joint in joints.items() if joint.parent == root]
+    counts = {link: sum(joints[child].kind != "fixed" for child in description.below(link)) for link in hung}
+    things = {link: count for link, count in counts.items() if count}
+    if len(things) < 2 or description.links[root].solid or all(joints[link].kind != "fixed" for link in things):
+        return ()
+    listed = ", ".join(f"'{link}' ({count} joint{'s' * (count != 1)})" for link, count in things.items())
+    return (f"several things hang on its root: {listed}; to import one of them, name it (link, --link)",)
 
 
 def renamed(description: Description) -> Description:
@@ -185,7 +213,8 @@ def with_limits(description: Description, meshes: Surfaces) -> Description:
     for child, joint in description.joints.items():
         if joint.kind == "revolute" and joint.limits is not None and np.ptp(joint.limits) < _HARDLY:
             degrees = float(np.degrees(np.ptp(joint.limits)))
-            notes.append(f"joint '{joint.name}' turns by {degrees:.1g}° only: are its limits in another unit?")
+            unit = "are its limits in another unit (MJCF: `angle` of <compiler>)?"
+            notes.append(f"joint '{joint.name}' turns by {degrees:.1g}° only: {unit}")
         if joint.kind not in ("revolute", "prismatic") or joint.limits is not None:
             continue
         below = description.below(child)

@@ -9,11 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
-from vkc_pin.arguments import whole
+from vkc_pin.arguments import number, whole
+from vkc_pin.errors import InputError
 from vkc_pin.files.meshes import load_mesh
 from vkc_pin.importing.convex import concavity
 from vkc_pin.importing.robots.envelopes import envelopes
 from vkc_pin.importing.robots.homes import Clearances, never_apart
+from vkc_pin.models.couplings.limits import UNSAID_VELOCITY
+from vkc_pin.models.dynamics.effort import UNLIMITED
+from vkc_pin.models.proposals.hand import hand_of
 from vkc_pin.models.robot import Robot
 from vkc_pin.models.robot_file import load_robot
 from vkc_pin.options import Options
@@ -91,10 +95,10 @@ def doctor(robot: str | Path | Robot, *, margin: float | None = None, samples: i
         InputError: The robot cannot be loaded, or an argument is wrong.
     """
     whole(samples, "samples", low=1)
+    kept = Options().dist_safe if margin is None else number(margin, "margin", "a clearance [m]", low=0.0, above=True)
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         examined = robot if isinstance(robot, Robot) else load_robot(robot)
-    kept = Options().dist_safe if margin is None else Options(dist_safe=margin).dist_safe
     findings = [*_home(examined, kept), *_pairs(examined, kept, samples, seed), *_numbers(examined), *_hand(examined)]
     findings += [*_shapes(examined), *(Finding("warning", "loading", str(one.message)) for one in told)]
     return Diagnosis(examined.name, tuple(findings))
@@ -131,32 +135,33 @@ def _pairs(robot: Robot, margin: float, samples: int, seed: int) -> list[Finding
 
 
 def _numbers(robot: Robot) -> list[Finding]:
-    planned, found = set(robot.coordinates.names[3:]), []
+    planned, found = {name: k for k, name in enumerate(robot.coordinates.names) if k > 2}, []
     speed, effort, turning = [], [], []
     for joint in robot.file.root.findall("joint"):
         name, limit = joint.get("name", ""), joint.find("limit")
         if name not in planned:
             continue
         velocity = float(limit.get("velocity", "0")) if limit is not None else 0.0
-        force = float(limit.get("effort", "0")) if limit is not None else 0.0
-        if not 0.0 < velocity < 1e3:
+        if not 0.0 < velocity < 1e3 and robot.velocity[planned[name]] == UNSAID_VELOCITY:
             speed.append(name)
-        if force <= 0.0:
+        if not 0.0 < robot.model.effortLimit[planned[name]] < UNLIMITED:
             effort.append(name)
         if joint.get("type") == "continuous":
             turning.append(name)
     heavy = {link.get("name", "") for link in robot.file.root.findall("link") if _mass(link) > 0.0}
     light = [link for link in robot.links if link not in heavy]
     if speed:
-        used = ", ".join(f"{robot.velocity[3 + k]:.3g}" for k, n in enumerate(robot.coordinates.names[3:]) if n in speed)
+        used = ", ".join(f"{robot.velocity[planned[name]]:.3g}" for name in speed)
         hint = "`joints: {NAME: {velocity: ...}}` in robot.yaml, from the data sheet"
         found.append(Finding("warning", "limits", f"no speed in the file: {_list(speed)} (taken: {used})", hint))
     if turning:
         found.append(Finding("note", "limits", f"turn without end: {_list(turning)}"))
     if effort:
-        found.append(Finding("note", "effort", f"no effort in the file: {_list(effort)} (plans do not ask for it)"))
+        hint = "`joints: {NAME: {effort: ...}}` in robot.yaml"
+        found.append(Finding("note", "effort", f"no effort: {_list(effort)} (their torques are not limited)", hint))
+    found += [Finding("note", "effort", note) for note in robot.efforts.notes if "no effort" not in note]
     if light:
-        found.append(Finding("note", "mass", f"links with a shape but no mass: {_list(light)} (plans do not ask for it)"))
+        found.append(Finding("note", "mass", f"links with a shape but no mass: {_list(light)} (they weigh nothing)"))
     return found
 
 
@@ -170,6 +175,12 @@ def _mass(link: ElementTree.Element) -> float:
 
 def _hand(robot: Robot) -> list[Finding]:
     found = []
+    try:
+        hand_of(robot)
+    except InputError as error:
+        if robot.touch_links:
+            hint = f"attachments are proposed for {error.expected}, see docs/robots.md"
+            found.append(Finding("warning", "hand", f"{error.problem}: it takes hold of nothing", hint))
     for link, share in envelopes(robot).items():
         text = f"{link} is a shape around the hand, {share:.0%} of which is in it: the fingers get at nothing"
         hint = "remove its <collision> from the URDF, as `vkc-pin import-robot` does"

@@ -15,7 +15,7 @@ import yaml
 
 from vkc_pin.arguments import flag, mapping, text, whole
 from vkc_pin.arrays import Floats
-from vkc_pin.errors import InputError
+from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.files.resources import file_path
 from vkc_pin.files.urdf import UrdfFile
 from vkc_pin.files.writing import folder_at_once
@@ -25,7 +25,8 @@ from vkc_pin.importing.robots.envelopes import envelopes, leave_out
 from vkc_pin.importing.robots.hands import Hand, look_at
 from vkc_pin.importing.robots.homes import HOME_ROOM, Home, arm_at, find_home, never_apart, standing
 from vkc_pin.importing.robots.pieces import Piece, own_meshes
-from vkc_pin.importing.robots.sources import Source, read_source
+from vkc_pin.importing.robots.sources import Source, free_name, read_source
+from vkc_pin.importing.targets import check_target, made_by
 from vkc_pin.models.robot import Robot
 from vkc_pin.models.robot_file import load_robot
 from vkc_pin.models.robot_model import full_model
@@ -34,10 +35,9 @@ from vkc_pin.options import Options
 
 __all__ = ["ImportedRobot", "import_robot"]
 
-_SAMPLES = 2000
+_SAMPLES, _PIECES = 2000, 8
 _NEAR, _MOSTLY = 300, 0.75  # of them, to find pairs that so many leave closer than
 _NEIGHBOURS = Options().dist_safe + 0.005  # [m]: neighbours by design, such as the segments of a telescope
-_PIECES = 8
 _STANDING = 0.005  # [m]: a root that is closer to the floor stands on it
 
 
@@ -84,7 +84,7 @@ def import_robot(
 
     Args:
         file: The file; its first element says what it is.
-        folder: Where to write; by default a folder of the file's name in the current one.
+        folder: Where to write, a new or empty folder; by default one of the file's name in the current one.
         arm: Which arm to plan: a name of `ImportedRobot.arms`, or a part of one ("left"), or a group of the SRDF with its joints.
         tool_frame: The frame that grasps, if it is not to be guessed; see docs/robots.md for how it has to lie.
         srdf: An SRDF; by default the one beside the file.
@@ -93,10 +93,10 @@ def import_robot(
         most_pieces: The largest number of convex pieces of a mesh; 1 keeps hulls.
         samples: How many configurations are looked at for pairs that need no check.
         seed: Of the random numbers.
-        force: Replace a folder that is there.
+        force: Whether to replace a folder that this made before.
 
     Raises:
-        InputError: The file cannot be read, no arm was found, the folder is there, or a package of the extra `import` is missing.
+        InputError: The file cannot be read, no arm was found, the folder holds something, or the extra `import` is missing.
         UnknownNameError: There is no such arm or frame; the error names the nearest one.
     """
     path = file_path(file, "file", "a URDF, xacro or MJCF file")
@@ -110,7 +110,8 @@ def import_robot(
     places = {key: file_path(place, f"packages.{key}") for key, place in mapping(packages or {}, "packages").items()}
     given_arguments = {key: str(value) for key, value in mapping(arguments or {}, "arguments").items()}
     beside = None if srdf is None else file_path(srdf, "srdf")
-    with folder_at_once(target, force=flag(force, "force")) as staging:
+    check_target(target, "import-robot", force=flag(force, "force"))
+    with folder_at_once(target, force=True) as staging:  # what is there may be replaced
         source = read_source(path, staging / ".meshes", packages=places, arguments=given_arguments, srdf=beside)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # they name files that are gone soon; loading the whole folder warns of the same
@@ -131,6 +132,8 @@ class _Importer:
         if not solid:
             self._collide_as_seen()
             solid = {shape.link for shape in self._file.shapes("collision")}
+        if tool_frame is not None and tool_frame not in (names := sorted(self._names())):
+            raise UnknownNameError("frame", tool_frame, names, file=self._file.path, field="tool_frame")
         tree = bodies(self._file)
         driving = own_base(tree, solid)
         arms = find_arms(self._file, tree, self._source.groups, solid)
@@ -187,7 +190,7 @@ class _Importer:
         for key, said in hand.settings().items():
             self._settings.setdefault(key, {}).update(said)
         if tool_frame is None:
-            tool = _free_name("tool", self._names())
+            tool = free_name("tool", self._names())
             self._add_link(tool, hand.link, hand.tool)
             self._settings["tool_frame"] = tool
             self._guess(hand.sure, f"hand: frame '{tool}' {hand.why}", "if it is wrong: `tool_frame`, see docs/robots.md")
@@ -222,7 +225,7 @@ class _Importer:
         settings = {key: value for key, value in self._settings.items() if key != "srdf" or (self._folder / value).is_file()}
         ElementTree.indent(self._file.root)
         source = f"{self._source.file.path.name} ({self._source.kind})"
-        said = f"# Written by `vkc-pin import-robot` from {source}. Units: m, rad, s.\n"
+        said = f"# Made of {source} {made_by('import-robot')}. Units: m, rad, s.\n"
         body = yaml.safe_dump(settings, sort_keys=False, default_flow_style=None, width=120)
         (self._folder / "robot.yaml").write_text(said + body, encoding="utf-8")
         urdf = self._folder / f"{self._name}.urdf"
@@ -245,7 +248,7 @@ class _Importer:
         raised = max(0.0, HOME_ROOM - above - lift)
         if lift + raised == 0.0:
             return robot
-        floor, root = _free_name("floor", self._names()), bodies(self._file).links[0]
+        floor, root = free_name("floor", self._names()), bodies(self._file).links[0]
         self._file.root.insert(0, ElementTree.Element("link", name=floor))
         joint = ElementTree.SubElement(self._file.root, "joint", name=f"{floor}_joint", type="fixed")
         ElementTree.SubElement(joint, "origin", xyz=f"0 0 {lift + raised:.6g}", rpy="0 0 0")
@@ -293,7 +296,3 @@ class _Importer:
             what = f"{piece.mesh} in {piece.count} pieces, {100.0 * piece.overhead:.0f} % more than its volume"
             hull = f"its hull: {100.0 * piece.hull:.0f} %"
             self._findings.append(Finding("note", "shapes", f"{piece.link}: {what} ({hull}), off by {1e3 * piece.error:.0f} mm"))
-
-
-def _free_name(name: str, taken: set[str]) -> str:
-    return name if name not in taken and f"{name}_joint" not in taken else _free_name(f"{name}_", taken)

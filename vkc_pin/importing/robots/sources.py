@@ -16,7 +16,7 @@ from vkc_pin.files.xml import parse_xml
 from vkc_pin.importing.robots.mjcf import convert
 from vkc_pin.importing.robots.xacro_files import expand
 
-__all__ = ["Source", "read_source"]
+__all__ = ["Source", "free_name", "read_source"]
 
 _KEPT = ("link", "joint", "material")  # what a URDF consists of; all else belongs to simulators and controllers
 
@@ -84,6 +84,11 @@ def read_source(
         notes.append(f"{beside.name} beside it is of another robot: it names links that are not here")
         return Source(read, kind, Srdf({}, states), {}, tuple(notes))
     return Source(read, kind, Srdf(semantics.allowed, {**states, **semantics.states}), _joints(beside, read), tuple(notes))
+
+
+def free_name(name: str, taken: set[str]) -> str:
+    """Return a name for a link that is none of those taken, nor is that of its joint, `<name>_joint`."""
+    return name if name not in taken and f"{name}_joint" not in taken else free_name(f"{name}_", taken)
 
 
 def _completed(root: ElementTree.Element) -> list[str]:

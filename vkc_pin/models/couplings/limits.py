@@ -16,9 +16,11 @@ from vkc_pin.models.couplings.following import check_followers, coupled_groups
 from vkc_pin.models.robot_schema import RobotSchema
 from vkc_pin.models.shapes import LIMIT_SLACK
 
-__all__ = ["limited_together", "robot_limits"]
+__all__ = ["UNSAID_VELOCITY", "limited_together", "robot_limits"]
 
-_VELOCITY, _ACCELERATION = np.pi, 1.4  # of joints for which no file names one, [rad/s] and [rad/s²], or [m/s] and [m/s²]
+UNSAID_VELOCITY = np.pi
+"""Of joints for which no file names one [rad/s] or [m/s]."""
+_ACCELERATION = 1.4  # the same [rad/s²] or [m/s²]
 
 
 def limited_together(full: pin.Model, file: UrdfFile, tool_frame: str) -> pin.Model:
@@ -82,7 +84,7 @@ def robot_limits(
             velocity[k] = min(velocity[k], own / share)
         if named is not None and named.acceleration is not None:
             acceleration[k] = min(acceleration[k], named.acceleration / share)
-    velocity = np.where(np.isinf(velocity), _VELOCITY * unsaid, velocity)
+    velocity = np.where(np.isinf(velocity), UNSAID_VELOCITY * unsaid, velocity)
     acceleration = np.where(np.isinf(acceleration), _ACCELERATION * unsaid, acceleration)
     model.velocityLimit, model.effortLimit = velocity, _efforts(model, coordinates, settings)
     lower, upper = coordinates.lower.copy(), coordinates.upper.copy()

@@ -10,9 +10,10 @@ import pinocchio as pin
 from vkc_pin.arrays import Floats
 from vkc_pin.models.coordinates import Coordinates
 
-__all__ = ["Efforts", "efforts"]
+__all__ = ["UNLIMITED", "Efforts", "efforts"]
 
-_UNLIMITED = 1e300  # Pinocchio's efforts above this are none
+UNLIMITED = 1e300
+"""Pinocchio's efforts above this are none."""
 _POSTURES = 200  # random ones in which a motor has to hold its own arm
 
 
@@ -50,7 +51,7 @@ def efforts(model: pin.Model, coordinates: Coordinates, lower: Floats, upper: Fl
     limits[:3] = np.inf
     if not sum(inertia.mass for inertia in list(model.inertias)[2:]) > 0.0:
         return Efforts(np.full_like(limits, np.inf), ("the URDF states no masses of the arm",))
-    stated = (limits > 0.0) & (limits < _UNLIMITED)
+    stated = (limits > 0.0) & (limits < UNLIMITED)
     limits[~stated] = np.inf
     names, notes = np.array(coordinates.names), list[str]()
     if len(silent := names[3:][~stated[3:]]):

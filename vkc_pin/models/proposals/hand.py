@@ -46,8 +46,9 @@ def hand_of(robot: Robot) -> Hand:
         InputError: The description names no touch links, or they leave no room around the tool frame's origin.
     """
     if not robot.touch_links:
-        problem, expected = f"the hand of '{robot.name}' is not known", "touch_links in its robot.yaml"
-        raise InputError(problem, field="touch_links", expected=expected, got="none")
+        problem = f"the hand of '{robot.name}' is not known"
+        expected = "touch_links in a robot.yaml, such as `vkc-pin import-robot` writes"
+        raise InputError(problem, file=robot.urdf, field="touch_links", expected=expected, got="none")
     data, frame = robot.model.createData(), robot.model.frames[robot.model.getFrameId(robot.tool_frame)]
     pin.framesForwardKinematics(robot.model, data, robot.coordinates.q(np.concatenate([np.zeros(3), robot.home])))
     tool = data.oMi[frame.parentJoint] * frame.placement
@@ -63,7 +64,8 @@ def hand_of(robot: Robot) -> Hand:
     opening = widest_bar(fingers)
     if opening < 2.0 * THIN:
         problem = f"there is no room between the fingers of '{robot.name}' at its tool frame '{robot.tool_frame}'"
-        raise InputError(problem, field="tool_frame", expected="an open hand around its origin, x the direction of closing")
+        expected = "an open hand around its origin, x the direction of closing"
+        raise InputError(problem, file=robot.urdf, field="tool_frame", expected=expected)
     beside = [
         box for geometry, where in fingers if (box := world_box(geometry, where))[1][2] > 0.0
     ]  # what reaches past the origin

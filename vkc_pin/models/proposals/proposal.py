@@ -15,6 +15,8 @@ from vkc_pin.models.proposals.hand import Hand
 
 __all__ = ["Proposal", "Proposals"]
 
+_MOST = 3  # other joints that a line names
+
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
@@ -101,7 +103,7 @@ class Proposals:
                 slide = next((freedom for freedom in proposal.attachment.freedoms if freedom.kind == "prismatic"), None)
                 free = f", {1e3 * (slide.upper - slide.lower):.0f} mm to slide along" if slide else ""
                 freedom = proposal.attachment.joint
-                when = "".join(f", while {other} is at {value:.3g}" for other, value in proposal.when.items())
+                when = _listed([f"{other} is at {value:.3g}" for other, value in proposal.when.items()])
                 wide = proposal.attachment.opening
                 narrow = "" if wide is None else f", fingers {1e3 * wide:.0f} mm apart"
                 lines.append(
@@ -111,6 +113,14 @@ class Proposals:
             if joint in self.because:
                 lines.append(f"  no hand can open it: {self.because[joint]}")
         return "\n".join(lines)
+
+
+def _listed(conditions: list[str]) -> str:
+    """Return what else must hold, as the end of a line."""
+    if not conditions:
+        return ""
+    more = f" and {len(conditions) - _MOST} more joints are open" if len(conditions) > _MOST else ""
+    return f", while {', '.join(conditions[:_MOST])}{more}"
 
 
 def _plain(vector: Any, digits: int) -> list[float]:

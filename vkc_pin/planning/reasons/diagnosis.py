@@ -39,12 +39,14 @@ class Blocked(NamedTuple):
 def impossible(problem: TrajectoryProblem) -> list[Violation]:
     """Return what is wrong before anything moves: a start in collision, a hand off what it holds, goals beyond limits."""
     found = []
-    contacts = problem.contacts.evaluate(problem.start[None], np.array([0]), reach=0.0)
+    contacts, deepest = problem.contacts.evaluate(problem.start[None], np.array([0]), reach=0.0), dict[str, float]()
     for (first, second), distance, margin in zip(contacts.pair, contacts.distance, contacts.margin, strict=True):
         if distance >= (margin if margin > CONTACT else margin - CONTACT):  # as the scene allows, or in contact where that may be
             continue
         labels = problem.contacts.phases[0].labels
         subject = f"{labels[first]} – {labels[second]}"
+        deepest[subject] = min(float(distance), deepest.get(subject, np.inf))
+    for subject, distance in deepest.items():  # of links in pieces, each once
         detail = f"overlap by {-1e3 * distance:.1f} mm at the start"
         found.append(Violation("start", subject, amount=-distance, unit="m", detail=detail))
     for goal, solver in zip(problem.pose_goals, problem.transcription.pose_solvers, strict=True):

@@ -66,6 +66,7 @@ class Fixture:
         beside: How far to either side of it the floor before it stays free [m].
         lift: How high its frame is above what it stands on [m].
         counter: What it stands on, if not on the floor.
+        face: Where it ends towards the room without what moves and sticks out, in its own frame, along x [m].
     """
 
     type: str | dict[str, Any]
@@ -75,6 +76,7 @@ class Fixture:
     beside: float
     lift: float = 0.0
     counter: Counter | None = None
+    face: float = 0.0
 
 
 def known_objects() -> list[str]:
@@ -130,7 +132,9 @@ def _other(kind: str | dict[str, Any], own: ArticulatedObject) -> Fixture:
     if own.free:
         raise InputError("this is carried, not opened", field="objects", expected="an object that is not free", got=own.name)
     low, high = _extent(own, in_wall=False)
-    return Fixture(kind, low, high, False, _BESIDE, lift=round(float(-low[2]), 4))
+    fixed = [world_box(shape.geometry, shape.placement)[0] for shape in own.collision.geometryObjects if shape.parentJoint == 0]
+    face = min((float(lowest[0]) for lowest in fixed), default=float(low[0]))
+    return Fixture(kind, low, high, False, _BESIDE, lift=round(float(-low[2]), 4), face=round(face, 4))
 
 
 def _random(kind: str, seed: int) -> Fixture:

@@ -116,7 +116,7 @@ def opened(name: str, own: Fixture, floor: Floor, side: int, along: float, front
     edge = -AIR - counter.size[0] if counter else 0.0  # of the counter, along the wall's frame
     inwards = WALL / 2.0 if own.in_wall else edge + counter.setback if counter else -AIR - high[0]
     frame = Frame(*wall.point(inwards, 0.0), wall.yaw)
-    sides, face = (low[1], high[1]), -WALL / 2.0 if own.in_wall else 0.0
+    sides, face = (low[1], high[1]), -WALL / 2.0 if own.in_wall else own.face
     footprint, items, up = frame.rectangle((low[0], high[0]), sides), [], own.lift
     if counter:
         depth, width, height = counter.size

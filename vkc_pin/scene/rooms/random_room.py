@@ -117,8 +117,9 @@ def random_layout(number: int, settings: RoomSettings | None = None, **changes: 
         if found is not None:
             floor, standing, start = found
             return Layout(number, chosen, floor, standing, start, radius)
-    expected = "less clutter, fewer objects or tables, or wider rooms"
-    raise InputError(f"no room in {_ROOMS} had a place for everything", field="clutter", expected=expected, got=chosen.clutter)
+    expected = "less clutter, fewer objects or tables, wider rooms, or a robot whose arm is folded closer at home"
+    got = f"{chosen.clutter:g}, and a robot that turns in a circle of {radius:.2f} m"
+    raise InputError(f"no room in {_ROOMS} had a place for everything", field="clutter", expected=expected, got=got)
 
 
 def _named(kinds: Sequence[str | Mapping[str, Any]], number: int) -> list[tuple[str, Fixture]]:

@@ -34,7 +34,7 @@ class RoomSettings:
         height: Of the walls [m].
         front: Depth of the floor that stays free before what can be opened [m].
         gap: Least distance between what stands there [m].
-        robot: The robot's name.
+        robot: The robot's name, or the path of its file or folder.
     """
 
     clutter: float = 0.5
@@ -64,7 +64,7 @@ class RoomSettings:
             object.__setattr__(self, "objects", tuple(map(_opened, items(self.objects, "objects", "a list of types"))))
         kinds: tuple[Any, ...] = items(self.carried, "carried", "a list of types")
         object.__setattr__(self, "carried", tuple(known(kind, CARRIED, "object that is carried", "carried") for kind in kinds))
-        text(self.robot, "robot", "a robot's name")
+        object.__setattr__(self, "robot", _robot(self.robot))
         if len(self.carried) > _CARRIED:
             raise InputError("too many", field="carried", expected=f"at most {_CARRIED}", got=len(self.carried))
         if self.carried and not self.tables:
@@ -79,6 +79,12 @@ def _opened(kind: Any) -> str | dict[str, Any]:
         return mapping(kind, "objects")
     path = isinstance(kind, Path) or (isinstance(kind, str) and (kind.endswith((".yaml", ".yml")) or "/" in kind))
     return str(file_path(kind, "objects")) if path else known(kind, known_objects(), "object that opens", "objects")
+
+
+def _robot(robot: Any) -> str:
+    """Return a robot's name, or the whole path of its file or folder: a room is written with no folder in mind."""
+    path = isinstance(robot, Path) or (isinstance(robot, str) and (robot.endswith((".urdf", ".yaml", ".yml")) or "/" in robot))
+    return str(file_path(robot, "robot").resolve()) if path else text(robot, "robot", "a robot's name, or the path of its file")
 
 
 def _within(name: str, value: Any, low: float, high: float) -> None:

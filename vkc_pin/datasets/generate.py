@@ -8,7 +8,7 @@ import sys
 import time
 import warnings
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,8 @@ from vkc_pin.datasets.formats import hdf5
 from vkc_pin.datasets.formats import lerobot as lerobot_layout
 from vkc_pin.datasets.formats.card import card
 from vkc_pin.datasets.recipe import CAMERAS, Recipe, load_recipe
-from vkc_pin.datasets.robots import check_cameras, ready_robots
+from vkc_pin.datasets.robots import check_frames, ready_robots
+from vkc_pin.datasets.terms import as_entries
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.files.resources import file_path
 from vkc_pin.files.writing import check_writable, write_atomically
@@ -30,6 +31,7 @@ from vkc_pin.running.engine import Died, needs_dask, results
 from vkc_pin.running.journal import Journal
 from vkc_pin.running.machine import process_name, versions
 from vkc_pin.simulation.physics import engine
+from vkc_pin.task.terms import Term
 
 __all__ = ["generate"]
 
@@ -48,6 +50,7 @@ def generate(
     variants: int | None = None,
     simulate: bool | None = None,
     cameras: bool = False,
+    terms: Sequence[Term] = (),
     lerobot: bool = False,
     progress: bool = False,
 ) -> Dataset:
@@ -67,6 +70,9 @@ def generate(
         simulate: Whether only episodes count that physics confirms (the extra `sim`), instead of what the recipe says.
         cameras: Keep what cameras on the robot see of it as well: those of the recipe, or one above the base and one beside the
             fingers. Only of what is simulated. Recipes that name cameras need not be asked.
+        terms: Own constraints and costs that every motion keeps to, beside those of the recipe, whose part they become. Frames
+            are "base", "hand", "object" (the link that the hand takes hold of), or those of every robot of the recipe;
+            `holding="object"` is while it is held.
         lerobot: Write LeRobot's layout as well.
         progress: Show a progress bar with the time left.
 
@@ -80,12 +86,14 @@ def generate(
     made = load_recipe(recipe, variants=variants, simulate=simulate)
     if flag(cameras, "cameras") and not made.fields.cameras:
         made = load_recipe(made, cameras=CAMERAS)
+    if own := as_entries(terms):
+        made = load_recipe(made, terms=[*made.document["terms"], *own])
     hdf5.needed()
     if flag(lerobot, "lerobot"):
         lerobot_layout.needed()
     if made.fields.simulate:
         engine()
-    check_cameras(made)
+    check_frames(made)
     if jobs > 1 or scheduler is not None:
         needs_dask(scheduler)
     folder = file_path(out, "out", "a folder")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 from collections.abc import Mapping
@@ -13,6 +14,7 @@ import numpy as np
 from pydantic import Field
 
 from vkc_pin.arguments import mapping
+from vkc_pin.datasets.terms import TermSchema, check_entries
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.files.documents import Document, check, read_yaml
 from vkc_pin.files.fields import Name, NotNegative, Number, Positive, Schema, Vector3, count, require, text_for
@@ -23,6 +25,7 @@ from vkc_pin.scene.rooms.fixtures import known_objects
 from vkc_pin.scene.rooms.parts import CARRIED
 from vkc_pin.scene.rooms.settings import RoomSettings
 from vkc_pin.simulation.cameras.mount import BASE, HAND, Camera
+from vkc_pin.task.terms import Term, as_data
 
 __all__ = [
     "CAMERAS",
@@ -144,6 +147,7 @@ class RecipeSchema(Schema):
     rate: Positive = 10.0
     simulate: bool = False
     cameras: tuple[CameraSchema, ...] = ()
+    terms: tuple[TermSchema, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -167,14 +171,25 @@ class Recipe:
     def digest(self) -> str:
         """A name for what it says: the same for recipes that make the same episodes."""
         said = {key: value for key, value in self.document.items() if key not in ("name", "license")}
-        if not self.fields.cameras:
-            del said["cameras"]  # datasets without images are gone on with whatever the version
+        for name in ("cameras", "terms"):
+            if not said[name]:
+                del said[name]  # datasets without them are gone on with whatever the version
         return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:16]
 
     @property
     def cameras(self) -> tuple[Camera, ...]:
         """The cameras that take images."""
         return tuple(Camera(**entry.model_dump()) for entry in self.fields.cameras)
+
+    @functools.cached_property
+    def terms(self) -> tuple[Term, ...]:
+        """Its own constraints and costs, in order: what every motion keeps to, about frames by words; see `terms`."""
+        return as_data([entry.term() for entry in self.fields.terms])
+
+    def terms_of(self, task: str) -> tuple[Term, ...]:
+        """Return those of its terms that a task has to keep to."""
+        entries = zip(self.terms, self.fields.terms, strict=True)
+        return tuple(term for term, entry in entries if not entry.tasks or task in entry.tasks)
 
     def rng(self, *words: object) -> np.random.Generator:
         """Return random numbers that depend on the recipe and on some words, such as the number of an episode, alone."""
@@ -220,6 +235,7 @@ def load_recipe(recipe: str | Path | Mapping[str, Any] | Recipe, **changes: Any)
             Camera(**camera.model_dump())
         if camera.name in [other.name for other in fields.cameras[:k]]:
             raise document.error(("cameras", k, "name"), "two cameras of one name", expected="another name", got=camera.name)
+    check_entries(document, fields.terms, TASKS)
     if fields.cameras and not fields.simulate:
         expected = "`simulate: true` as well, or --simulate: images are of what happens in physics"
         raise document.error(("cameras",), "nothing is simulated", expected=expected, got="cameras")

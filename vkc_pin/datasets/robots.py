@@ -1,4 +1,4 @@
-"""Robots of a recipe: those whose hand nobody has described yet are imported into the dataset's folder first, once."""
+"""Robots of a recipe: whether they have what it names, and those that are imported into the dataset's folder first, once."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 from vkc_pin.datasets.problems import robot_name
 from vkc_pin.datasets.recipe import Recipe
+from vkc_pin.datasets.terms import check_robot
 from vkc_pin.importing.robots.robot_import import import_robot
 from vkc_pin.models.robot_file import find_robot, load_robot
 from vkc_pin.scene.scene import load_scene
@@ -14,24 +15,25 @@ from vkc_pin.simulation.cameras.mount import check_frame
 from vkc_pin.simulation.physics import engine
 from vkc_pin.simulation.snapshots import drawing_context
 
-__all__ = ["check_cameras", "ready_robots"]
+__all__ = ["check_frames", "ready_robots"]
 
 _SAMPLES = 1000  # configurations for pairs that need no check, as of robots that are loaded without an SRDF
 
 
-def check_cameras(recipe: Recipe) -> None:
-    """Refuse cameras that cannot take images here, or that a robot of the recipe has no frame for.
+def check_frames(recipe: Recipe) -> None:
+    """Refuse cameras that cannot take images here, and cameras and terms that a robot of the recipe has no frame for.
 
     Raises:
         InputError: MuJoCo is not installed.
         UnknownNameError: A robot lacks a frame.
         VkcError: There is no OpenGL without a screen.
     """
-    if not recipe.cameras:
+    if not recipe.cameras and not recipe.terms:
         return
-    engine()
-    with drawing_context((8, 8)):
-        pass
+    if recipe.cameras:
+        engine()
+        with drawing_context((8, 8)):
+            pass
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what is said of robots is said when they are made ready
         fields = recipe.fields
@@ -39,6 +41,7 @@ def check_cameras(recipe: Recipe) -> None:
             robot = load_scene(name).robot if fields.scenes else load_robot(name)
             for camera in recipe.cameras:
                 check_frame(robot, camera.frame)
+            check_robot(robot, recipe.terms)
 
 
 def ready_robots(recipe: Recipe, folder: Path) -> dict[str, str]:

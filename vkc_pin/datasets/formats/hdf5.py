@@ -27,6 +27,7 @@ from vkc_pin.models.robot import Robot
 from vkc_pin.needed import optional_package
 from vkc_pin.simulation.cameras.images import Images
 from vkc_pin.task.steps import step_to_dict
+from vkc_pin.task.terms import term_to_dict
 
 if TYPE_CHECKING:
     import h5py
@@ -128,6 +129,8 @@ def _write(group: h5py.Group, episode: Episode, robot: Robot, rate: float) -> in
         "motion": motion,
         "validation": report,
     }
+    if episode.terms:
+        said["terms"] = [term_to_dict(term) for term in episode.terms]
     if images is not None:
         said["images"], said["segments"] = list(images.pictures), images.segments
     group.attrs["episode"] = json.dumps(said, sort_keys=True)

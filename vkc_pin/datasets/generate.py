@@ -90,7 +90,7 @@ def generate(
         made = load_recipe(made, terms=[*made.document["terms"], *own])
     hdf5.needed()
     if flag(lerobot, "lerobot"):
-        lerobot_layout.needed()
+        lerobot_layout.needed(made.fields.rate)
     if made.fields.simulate:
         engine()
     check_frames(made)

@@ -104,6 +104,7 @@ def test_statistics_are_those_of_all_frames(root: Path) -> None:
 def test_frames_a_second_are_whole(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="whole numbers of frames"):
         generate({**SMALL, "rate": 12.5}, 1, tmp_path / "out", lerobot=True)
+    assert not (tmp_path / "out").exists()  # not after hours of planning
 
 
 def test_lerobot_reads_it(made: Dataset, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -83,6 +84,14 @@ def test_a_finished_one_is_left_as_it_is(made: Dataset, monkeypatch: pytest.Monk
     assert {file: file.read_bytes() for file in made.folder.rglob("*") if file.is_file()} == before
     with pytest.raises(InputError, match="more episodes"):
         generate(SMALL, EPISODES - 1, made.folder)
+
+
+@pytest.mark.parametrize("removed", ["work/*", "shards/*/*", "*/*"])
+def test_what_somebody_has_removed_is_made_again(made: Dataset, tmp_path: Path, removed: str) -> None:
+    generate(SMALL, 3, tmp_path / "out")
+    for file in (tmp_path / "out").glob(removed):
+        shutil.rmtree(file) if file.is_dir() else file.unlink()
+    assert contents(generate(SMALL, EPISODES, tmp_path / "out").folder) == contents(made.folder)
 
 
 @pytest.mark.parametrize("kind", ["SIGINT", "SIGKILL"])

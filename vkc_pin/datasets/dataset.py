@@ -137,7 +137,7 @@ class Register:
         path = self.dataset.folder / "shards" / robot / f"shard-{k:05d}.hdf5"
         files = [work_file(self.dataset.folder, number) for number in numbers]
         if not path.is_file() or numbers_of(path) != numbers:
-            episodes = [unpacked(file.read_bytes(), self.dataset.folder / "robots") for file in files]
+            episodes = self._episodes(path, numbers)
             for episode in episodes:
                 write_scene(self.dataset.folder / "scenes", episode.document)
             fields = self.dataset.recipe.fields
@@ -145,6 +145,15 @@ class Register:
         if len(numbers) == EPISODES_A_SHARD:
             for file in files:
                 file.unlink(missing_ok=True)
+
+    def _episodes(self, path: Path, numbers: Sequence[int]) -> list[Episode]:
+        """Return episodes, those whose files of work somebody has removed from the shard that is to be replaced."""
+        files = {number: work_file(self.dataset.folder, number) for number in numbers}
+        there: dict[int, Episode] = {}
+        if not all(file.is_file() for file in files.values()):
+            there = {episode.number: episode for episode in episodes_of(path, self.dataset.folder / "scenes")}
+        robots = self.dataset.folder / "robots"
+        return [there[number] if number in there else unpacked(file.read_bytes(), robots) for number, file in files.items()]
 
     @functools.cached_property
     def _loaded(self) -> dict[str, Robot]:

@@ -8,7 +8,7 @@ import sys
 import time
 import warnings
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any
 
@@ -100,11 +100,14 @@ def generate(
     with _journal(folder, made) as journal:
         _at_work(folder, made)
         dataset = Dataset(folder, made)
-        if (there := len(dataset.numbers())) > wanted:
+        numbers = dataset.numbers()
+        if (there := len(numbers)) > wanted:
             raise InputError(
                 "there are more episodes already", file=folder, field="episodes", expected=f"at least {there}", got=wanted
             )
         register = Register(dataset, wanted)
+        for key in _lost(dataset, journal, set(numbers)):
+            del journal.lines[key]  # a number is all that it takes to make them again
         for key in sorted(journal.lines, key=int):
             register.add(_kept(journal, key))
         if not register.full:
@@ -141,6 +144,12 @@ def _at_work(folder: Path, recipe: Recipe) -> None:
 def _kept(journal: Journal, key: str) -> dict[str, Any]:
     (record,) = journal.lines[key]
     return record
+
+
+def _lost(dataset: Dataset, journal: Journal, there: Set[int]) -> list[str]:
+    """Return which episodes somebody has removed: the journal says that they succeeded, and neither shard nor file has them."""
+    good = [key for key in journal.lines if _kept(journal, key)["success"] and int(key) not in there]
+    return [key for key in good if not work_file(dataset.folder, int(key)).is_file()]
 
 
 def _run(dataset: Dataset, register: Register, journal: Journal, jobs: int, scheduler: str | None, progress: bool) -> None:

@@ -60,7 +60,7 @@ def test_what_a_journal_says(tmp_path: Path) -> None:
         (3, "b", 1.0, 0.4),
         (4, "a", 2.0, 0.6),
     ):
-        record = {"number": key, "success": key != 3, "seconds": seconds}
+        record = {"number": key, "success": key != 3, "cpu_time": seconds}
         more = {"memory_mb": 1.0, "resident_mb": 1.0, "process": process, "seconds": seconds, "client_seconds": client}
         lines.append({"key": str(key), "records": [record], **more})
     (tmp_path / "journal.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))

@@ -30,8 +30,8 @@ class Costs:
     """What tasks took; a task is the episodes of a room.
 
     Attributes:
-        first: Times of the first task of each process [s].
-        later: Times of the others [s].
+        first: Processor times of the first task of each process [s].
+        later: Those of the others [s].
         client: Processor time of the client for a task, with Dask's scheduler if there was one [s].
         episodes: Episodes that a task gives, on average.
     """
@@ -54,7 +54,7 @@ def measured(dataset: Dataset) -> Costs:
     size = fields.rooms.episodes * fields.variants
     tasks: dict[tuple[int, str], list[float]] = {}
     for key, (record,) in kept.lines.items():
-        tasks.setdefault((int(key) // size, kept.processes.get(key, "")), []).append(float(record.get("seconds", 0.0)))
+        tasks.setdefault((int(key) // size, kept.processes.get(key, "")), []).append(float(record.get("cpu_time", 0.0)))
     first: list[float] = []
     later: list[float] = []
     known = set[str]()

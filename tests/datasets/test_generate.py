@@ -169,7 +169,7 @@ def test_full_shards_are_written_once_and_their_work_goes(tmp_path: Path, monkey
     out = generate(SMALL, EPISODES, tmp_path / "out")
     assert [shard.name for shard in out.shards] == ["shard-00000.hdf5", "shard-00001.hdf5", "shard-00002.hdf5"]
     assert sorted(out.numbers()) == sorted(made.numbers())
-    left = {int(file.stem) for file in (out.folder / "work").glob("*.npz")}
+    left = {int(file.stem) for file in (out.folder / "work").glob("*.hdf5")}
     assert not left & set(out.numbers()[:4])
     assert set(out.numbers()[4:]) <= left
 

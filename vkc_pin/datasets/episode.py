@@ -294,4 +294,4 @@ def made_of(data: Mapping[str, Any], arrays: Mapping[str, Floats], robots: Path 
 
 def work_file(out: Path, number: int) -> Path:
     """Return where an episode is kept until it is in a shard."""
-    return out / "work" / f"{number:08d}.npz"
+    return out / "work" / f"{number:08d}.hdf5"

@@ -17,10 +17,11 @@ from tqdm import tqdm
 
 from vkc_pin.arguments import flag, whole
 from vkc_pin.datasets.dataset import Dataset, Register
-from vkc_pin.datasets.episode import Made, attempts, work_file
+from vkc_pin.datasets.episode import Made, work_file
 from vkc_pin.datasets.formats import hdf5
 from vkc_pin.datasets.formats import lerobot as lerobot_layout
 from vkc_pin.datasets.formats.card import card
+from vkc_pin.datasets.formats.parts import parts
 from vkc_pin.datasets.recipe import CAMERAS, Recipe, load_recipe
 from vkc_pin.datasets.robots import check_frames, ready_robots
 from vkc_pin.datasets.terms import as_entries
@@ -175,7 +176,7 @@ def _run(dataset: Dataset, register: Register, journal: Journal, jobs: int, sche
     journal.append({"session": {"jobs": jobs}})
     bar = tqdm(total=register.wanted, initial=len(register.accepted), unit="episode", smoothing=0.05, disable=not progress)
     found = results(
-        attempts,
+        parts,
         tasks(),
         jobs=jobs,
         scheduler=scheduler,

@@ -7,14 +7,13 @@ import itertools
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vkc_pin.arrays import Floats
 from vkc_pin.datasets.grasping import grasped
-from vkc_pin.datasets.recipe import Recipe, load_recipe
+from vkc_pin.datasets.recipe import Recipe, load_recipe, robot_name
 from vkc_pin.datasets.terms import meant
 from vkc_pin.errors import VkcError
 from vkc_pin.options import Options
@@ -27,7 +26,7 @@ from vkc_pin.task.goals import goals
 from vkc_pin.task.steps import Actuate, Grasp, Place, Step
 from vkc_pin.task.terms import Term
 
-__all__ = ["NoProblemError", "Problem", "problem", "robot_name", "terms_of"]
+__all__ = ["NoProblemError", "Problem", "problem", "terms_of"]
 
 _KEPT = 48  # rooms that a process keeps
 _STARTS = 300  # places that are tried for the robot
@@ -105,12 +104,6 @@ def problem(recipe: Recipe, number: int, robots: Mapping[str, str], planner: Pla
 def terms_of(recipe: Recipe, scene: Scene, about: Mapping[str, Any]) -> tuple[Term, ...]:
     """Return what the motion of an episode about something must keep to; see `Episode.about`."""
     return meant(recipe.terms_of(about["task"]), scene, about["object"], about["attachment"])
-
-
-def robot_name(name: str) -> str:
-    """Return what a robot is called in a dataset: its name, or that of its file or folder."""
-    path = Path(name)
-    return (path.parent.name if path.name == "robot.yaml" else path.stem) if len(path.parts) > 1 else name
 
 
 _scene = functools.lru_cache(maxsize=_KEPT)(load_scene)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -38,6 +38,7 @@ __all__ = [
     "RoomsSchema",
     "StartSchema",
     "load_recipe",
+    "robot_name",
 ]
 
 TASKS = ("given-open", "drive-open", "fetch-place")
@@ -104,14 +105,7 @@ class CameraSchema(Schema):
 
 CAMERAS = (
     {"name": "head", "frame": BASE, "position": [0.0, 0.0, 1.5], "target": [1.2, 0.0, 0.6], "fov": 90.0},
-    {
-        "name": "wrist",
-        "frame": HAND,
-        "position": [0.0, -0.12, -0.12],
-        "target": [0.0, 0.0, 0.1],
-        "up": [0.0, -1.0, 0.0],
-        "fov": 75.0,
-    },
+    {"name": "wrist", "frame": HAND, "position": [0, -0.12, -0.12], "target": [0, 0, 0.1], "up": [0, -1, 0], "fov": 75.0},
 )
 """The cameras of recipes that are asked for images and name none: one above the base, one beside the fingers."""
 
@@ -220,7 +214,7 @@ def load_recipe(recipe: str | Path | Mapping[str, Any] | Recipe, **changes: Any)
     fields = check(document, RecipeSchema)
     folder = document.file.parent if document.file else Path()
     found = {
-        "robots": tuple(_robot(document, k, entry, folder) for k, entry in enumerate(fields.robots)),
+        "robots": _robots(document, fields.robots, folder),
         "objects": tuple(_object(document, k, name, folder) for k, name in enumerate(fields.objects)),
         "scenes": tuple(_scene(document, k, name, folder) for k, name in enumerate(fields.scenes)),
     }
@@ -256,16 +250,27 @@ def _options(document: Document, given: Mapping[str, Any]) -> Options:
         raise document.error(("options", name), error.problem, expected=error.expected, got=error.got) from error
 
 
+def robot_name(name: str) -> str:
+    """Return what a robot is called in a dataset: its name, or that of its file or folder."""
+    path = Path(name)
+    return (path.parent.name if path.name == "robot.yaml" else path.stem) if len(path.parts) > 1 else name
+
+
 def _is_path(name: str) -> bool:
     return name.endswith((".yaml", ".yml", ".urdf")) or "/" in name
 
 
-def _robot(document: Document, place: int, entry: RobotEntry, folder: Path) -> RobotEntry:
-    with document.at(("robots", place)):
-        if not _is_path(entry.name):
-            find_robot(entry.name)
-            return entry
-        return entry.model_copy(update={"name": str(find_robot(str((folder / entry.name).resolve())))})
+def _robots(document: Document, entries: Sequence[RobotEntry], folder: Path) -> tuple[RobotEntry, ...]:
+    found: dict[str, str] = {}
+    robots = []
+    for k, entry in enumerate(entries):
+        with document.at(("robots", k)):
+            path = find_robot(str((folder / entry.name).resolve()) if _is_path(entry.name) else entry.name)
+        robots.append(entry.model_copy(update={"name": str(path)}) if _is_path(entry.name) else entry)
+        name = robots[-1].name
+        if found.setdefault(robot_name(name), name) != name:
+            raise document.error(("robots", k), "two robots of one name", expected="folders of different names", got=name)
+    return tuple(robots)
 
 
 def _object(document: Document, place: int, name: str, folder: Path) -> str:

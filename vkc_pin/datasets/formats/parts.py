@@ -36,12 +36,12 @@ def _folder(robots: Mapping[str, str]) -> Path | None:
     return next((Path(file).parent.parent for file in robots.values()), None)
 
 
-_ROBOTS: dict[tuple[str, str], Robot] = {}
-"""By recipe and name, those that a process has loaded: building the scene of every episode again would take far longer."""
+_ROBOTS: dict[tuple[str, str, float | None], Robot] = {}
+"""By recipe, name and height, those that a process has loaded: building the scene of every episode would take far longer."""
 
 
 def _robot(recipe: str, episode: Episode) -> Robot:
-    key = (recipe, str(episode.about["robot"]))
+    key = (recipe, str(episode.about["robot"]), episode.start.get("z"))
     if key not in _ROBOTS:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # what generating it has said already

@@ -51,6 +51,47 @@ def check(trial: dict[str, Any], method: str, number: int) -> None:
     assert trial["iterations"] >= trial["rounds"] >= 1
 
 
+def test_every_experiment_takes_a_scheduler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is asked for reaches the engine, before a trial is run."""
+    asked = []
+
+    def results(function: Any, tasks: Any, *, scheduler: str | None, **others: Any) -> Any:
+        asked.append(scheduler)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("vkc_pin.benchmarks.harness.runner.results", results)
+    names = [
+        "initialization",
+        "baselines",
+        "household",
+        "chores",
+        "scale",
+        "bases",
+        "gap",
+        "ablation",
+        "spread",
+        "first-seed",
+        "impossible",
+    ]
+    for name in [*names, "random", "execution"]:
+        pytest.importorskip("mujoco") if name == "execution" else None
+        command = ["bench", name, "--scheduler", "tcp://here:1", "--out", str(tmp_path / name), "--quiet"]
+        assert main(command) == 130, name
+    assert asked == ["tcp://here:1"] * 13
+
+
+def test_an_experiment_on_a_scheduler_of_somebody_else(tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    command = ["bench", "gap", "--trials", "2", "--quiet", "--out"]
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, host="127.0.0.1", dashboard_address=None) as cluster:
+        assert main([*command, str(tmp_path / "there"), "--scheduler", cluster.scheduler_address]) == 0
+    assert main([*command, str(tmp_path / "here")]) == 0
+    found = [json.loads((tmp_path / where / "results.json").read_text())["trials"] for where in ("there", "here")]
+    assert [[trial[name] for name in ("key", "success", "effort", "base_effort")] for trial in found[0]] == [
+        [trial[name] for name in ("key", "success", "effort", "base_effort")] for trial in found[1]
+    ]
+
+
 def test_initialization(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "tmp"
     command = ["bench", "initialization", "--starts", "2", "--scenes", "init_1", "--methods", "astar", "--jobs", "1", "--quiet"]

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -85,6 +86,14 @@ def test_a_finished_one_is_left_as_it_is(made: Dataset, monkeypatch: pytest.Monk
         generate(SMALL, EPISODES - 1, made.folder)
 
 
+@pytest.mark.parametrize("removed", ["work/*", "shards/*/*", "*/*"])
+def test_what_somebody_has_removed_is_made_again(made: Dataset, tmp_path: Path, removed: str) -> None:
+    generate(SMALL, 3, tmp_path / "out")
+    for file in (tmp_path / "out").glob(removed):
+        shutil.rmtree(file) if file.is_dir() else file.unlink()
+    assert contents(generate(SMALL, EPISODES, tmp_path / "out").folder) == contents(made.folder)
+
+
 @pytest.mark.parametrize("kind", ["SIGINT", "SIGKILL"])
 def test_a_stop_loses_and_doubles_nothing(made: Dataset, tmp_path: Path, kind: str) -> None:
     script = f"import sys, vkc_pin as vkc; vkc.generate({SMALL!r}, {EPISODES}, sys.argv[1])"
@@ -160,7 +169,7 @@ def test_full_shards_are_written_once_and_their_work_goes(tmp_path: Path, monkey
     out = generate(SMALL, EPISODES, tmp_path / "out")
     assert [shard.name for shard in out.shards] == ["shard-00000.hdf5", "shard-00001.hdf5", "shard-00002.hdf5"]
     assert sorted(out.numbers()) == sorted(made.numbers())
-    left = {int(file.stem) for file in (out.folder / "work").glob("*.npz")}
+    left = {int(file.stem) for file in (out.folder / "work").glob("*.hdf5")}
     assert not left & set(out.numbers()[:4])
     assert set(out.numbers()[4:]) <= left
 

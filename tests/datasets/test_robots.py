@@ -1,13 +1,17 @@
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
 from helpers.datasets import SMALL
 
 from vkc_pin.datasets import robots
+from vkc_pin.datasets.check import check_dataset
+from vkc_pin.datasets.generate import generate
 from vkc_pin.datasets.recipe import load_recipe
-from vkc_pin.models.robot_file import load_robot
+from vkc_pin.errors import InputError
+from vkc_pin.models.robot_file import find_robot, load_robot
 
 
 def test_a_robot_without_a_hand_is_imported_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -18,3 +22,26 @@ def test_a_robot_without_a_hand_is_imported_once(tmp_path: Path, monkeypatch: py
     assert load_robot(found["panda"]).touch_links
     monkeypatch.setattr(robots, "import_robot", None)
     assert robots.ready_robots(recipe, tmp_path) == found
+
+
+@pytest.mark.parametrize("given", ["robot.yaml", "husky_ur5e.urdf"])
+def test_a_robot_by_path_is_found_again(tmp_path: Path, given: str) -> None:
+    """The dataset says where its URDF is, since its name alone would not."""
+    pytest.importorskip("h5py")
+    shutil.copytree(find_robot("husky_ur5e").parent, tmp_path / "mine/rover")
+    recipe = {**SMALL, "robots": [str(tmp_path / "mine/rover" / given)]}
+    made = generate(recipe, 1, tmp_path / "out")
+    (episode,) = made.episodes()
+    assert episode.about["robot"] == ("rover" if given == "robot.yaml" else "husky_ur5e")
+    assert episode.scene().robot.urdf == tmp_path / "mine/rover/husky_ur5e.urdf"
+    assert check_dataset(made.folder).ok
+
+
+def test_two_robots_of_one_name_are_refused(tmp_path: Path) -> None:
+    for folder in ("a", "b"):
+        shutil.copytree(find_robot("husky_ur5e").parent, tmp_path / folder / "rover")
+    paths = [str(tmp_path / folder / "rover/robot.yaml") for folder in ("a", "b")]
+    with pytest.raises(InputError, match="two robots of one name") as caught:
+        load_recipe({**SMALL, "robots": paths})
+    assert caught.value.field == "robots[1]"
+    assert len(load_recipe({**SMALL, "robots": [{"name": paths[0], "height": z} for z in (0.1, 0.2)]}).fields.robots) == 2

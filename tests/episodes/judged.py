@@ -49,6 +49,7 @@ def saved(episode: Episode, path: Path) -> Path:
             validation=episode.claimed,
             status="success",
             metrics={},
+            terms=episode.terms,
         )
         return plan.save(path)
 

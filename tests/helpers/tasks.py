@@ -50,3 +50,12 @@ def slow(task: int) -> int:
     block = bytearray(100 << 20)
     time.sleep(1.0)
     return task * len(block) // (50 << 20)
+
+
+def greedy(task: int) -> int:
+    """Take up more and more memory."""
+    held = []
+    while task == 1:
+        held.append(bytearray(b"x" * (20 << 20)))
+        time.sleep(0.02)
+    return 2 * task

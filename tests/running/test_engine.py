@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.tasks import double, fatal, fatal_once, hanging, profiled, where
+from helpers.tasks import double, fatal, fatal_once, greedy, hanging, profiled, slow, where
 
 from vkc_pin.errors import InputError
-from vkc_pin.running.engine import DEATHS, Died, results
+from vkc_pin.running.engine import DEATHS, Died, needs_dask, results
 
 
 def numbered(count: int) -> list[tuple[str, int]]:
@@ -65,6 +65,31 @@ def test_a_task_that_no_process_survives(function: Any, limit: float | None) -> 
     assert [found[key] for key in ("0", "2", "3")] == [0, 4, 6]
 
 
+def test_a_task_that_takes_all_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("vkc_pin.running.engine._share", lambda jobs: 600 << 20)
+    found = dict(results(greedy, numbered(4), jobs=2, dask=True))
+    assert isinstance(found["1"], Died)
+    assert "out of memory" in found["1"].reason
+    assert [found[key] for key in ("0", "2", "3")] == [0, 4, 6]
+
+
+def test_processes_that_keep_much_are_not_paused() -> None:
+    """Dask would, until they have less; ours keep what they have built, and all would wait for ever."""
+    dask = pytest.importorskip("dask")
+    pytest.importorskip("distributed")
+    with dask.config.set({"distributed.worker.memory.pause": 1e-4}):
+        assert dict(results(slow, numbered(6), jobs=2, dask=True)) == {str(k): 2 * k for k in range(6)}
+
+
+def test_many_processes_have_enough_memory_each() -> None:
+    pytest.importorskip("distributed")
+    from vkc_pin.running import engine
+
+    assert engine._share(1000) == engine._LEAST
+    assert engine._share(1) > engine._LEAST
+
+
 def test_processes_have_one_thread_and_are_not_this_one() -> None:
     pytest.importorskip("distributed")
     found = [value for _, value in results(where, numbered(12), jobs=2, dask=True)]
@@ -86,3 +111,26 @@ def test_no_scheduler_there(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match="no scheduler answers") as caught:
         list(results(double, numbered(2), scheduler="tcp://127.0.0.1:9"))
     assert caught.value.field == "scheduler"
+
+
+@pytest.mark.parametrize("address", ["", "here", "tcp://here", "here:8786", "tcp://:8786", 3])
+def test_what_is_no_address(address: Any) -> None:
+    pytest.importorskip("distributed")
+    with pytest.raises(InputError, match="not an address") as caught:
+        needs_dask(address)
+    assert caught.value.field == "scheduler"
+
+
+def test_a_scheduler_without_workers_is_told_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    distributed = pytest.importorskip("distributed")
+    monkeypatch.setattr("vkc_pin.running.engine._LOOKED", 0.2)
+    told: list[str] = []
+    with distributed.LocalCluster(n_workers=0, threads_per_worker=1, host="127.0.0.1", dashboard_address=None) as cluster:
+
+        def tell(line: str) -> None:
+            told.append(line)
+            if "no workers" in line:
+                cluster.scale(1)
+
+        assert dict(results(double, numbered(3), scheduler=cluster.scheduler_address, tell=tell)) == {"0": 0, "1": 2, "2": 4}
+    assert sum("no workers" in line for line in told) == 1

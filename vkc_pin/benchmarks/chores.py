@@ -158,6 +158,7 @@ def run(
     seed: int,
     out: str | Path,
     jobs: int = 1,
+    scheduler: str | None = None,
     chores: Sequence[str] = tuple(CHORES),
     seeds: int = 1,
     step_by_step: bool = False,
@@ -171,6 +172,7 @@ def run(
         seed: Of the starts and of planning.
         out: The folder; if it has trials of the same settings already, they are not run again.
         jobs: Number of processes.
+        scheduler: Address of a Dask scheduler whose workers run the trials instead, see `engine.results`.
         chores: Some of `CHORES`.
         seeds: How many seeds of planning there are to each start: `seed` and those that follow it.
         step_by_step: Whether to plan the steps one by one as well, each from where the one before ends.
@@ -199,7 +201,14 @@ def run(
     settings |= {"window": WINDOW, **_LIMITS, "steps": {name: list(map(str, CHORES[name].planned())) for name in chores}}
     settings |= {"dist_safe": {name: CHORES[name].options.dist_safe for name in chores}}
     return runner.run(
-        specs, functools.partial(_record, solve=solve), out, settings=settings, report=report, jobs=jobs, progress=progress
+        specs,
+        functools.partial(_record, solve=solve),
+        out,
+        settings=settings,
+        report=report,
+        jobs=jobs,
+        scheduler=scheduler,
+        progress=progress,
     )
 
 

@@ -109,9 +109,8 @@ def add_bench(commands: Any) -> None:
     throughput = _add_experiment(benches, "throughput", shown, about, "--episodes", default=200, jobs=1, what=what, seeded=False)
     throughput.set_defaults(benchmark="datasets.throughput")
     throughput.add_argument("--recipe", metavar="RECIPE", help="robots, objects and rooms (default: home)")
-    throughput.add_argument(
-        "--scheduler", metavar="ADDRESS", help="a Dask scheduler, tcp://HOST:PORT, whose workers are used instead"
-    )
+    shown = "do not make the same episodes with one worker and with two as well"
+    throughput.add_argument("--no-curve", dest="curve", action="store_false", help=shown)
 
     about = "Give the same reaches, held doors and held drawers to other planners, to both baselines, and to this package."
     shown = "beside trajopt, OMPL and roboplan (needs the extra `peers`)"
@@ -176,6 +175,8 @@ def _add_experiment(
     _add_starts(parser, number, default, what or f"random starts per {'task' if number == '--trials' else 'scene'}", seeded)
     processes = f"processes (default: {'one per core' if jobs is None else jobs})"
     parser.add_argument("--jobs", type=positive, default=jobs or os.cpu_count() or 1, metavar="J", help=processes)
+    shown = "address of a Dask scheduler, tcp://HOST:PORT, whose workers are used instead"
+    parser.add_argument("--scheduler", metavar="ADDRESS", help=shown)
     about = "folder for results, table and charts; trials that it has already are not run again"
     parser.add_argument("--out", required=True, metavar="DIR", help=about)
     parser.add_argument("--quiet", action="store_true", help="no progress bar")

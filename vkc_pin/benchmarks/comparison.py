@@ -116,6 +116,7 @@ class Comparison:
         out: str | Path,
         solve: Solve | None = None,
         jobs: int = 1,
+        scheduler: str | None = None,
         tasks: Sequence[str] | None = None,
         methods: Sequence[str] = COMPARED_PLANNERS,
         effort: int = EFFORT,
@@ -133,6 +134,7 @@ class Comparison:
             out: The folder; if it has trials of the same settings already, they are not run again.
             solve: What plans a trial; None: `plan_trial`.
             jobs: Number of processes.
+            scheduler: Address of a Dask scheduler whose workers run the trials instead, see `engine.results`.
             tasks: Some of the tasks; None: all.
             methods: Some of `METHODS`.
             effort: What each trial may take at most, in units of effort.
@@ -158,7 +160,7 @@ class Comparison:
         settings |= {**LIMITS, "effort": effort, "retries": RETRIES}
         trials_of = _Trials(self.tasks, out, solve or self.plan_trial, timed=solve is None)
         function = functools.partial(trials_of.record, save_failures=save_failures)
-        result = runner.run(specs, function, out, settings=settings, jobs=jobs, progress=progress)
+        result = runner.run(specs, function, out, settings=settings, jobs=jobs, scheduler=scheduler, progress=progress)
         saved = trials_of.saved(result["trials"], specs, again=save_failures, progress=progress)
         names = {name: self.tasks[name].name for name in tasks}
         pictures = self.draw(result["trials"], out, names, methods) + trials_of.motions(result["trials"], specs)

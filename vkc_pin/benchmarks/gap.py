@@ -35,7 +35,9 @@ def started(seed: int, number: int) -> Scene:
     return random_start(load_scene(SCENE), np.random.default_rng([seed, number]))
 
 
-def run(*, out: str | Path, trials: int = 50, seed: int = 0, jobs: int = 1, progress: bool = True) -> dict[str, Any]:
+def run(
+    *, out: str | Path, trials: int = 50, seed: int = 0, jobs: int = 1, scheduler: str | None = None, progress: bool = True
+) -> dict[str, Any]:
     """Run the experiment, or what is left of it, and write results.json, results.csv and table.md to `out`.
 
     Args:
@@ -43,6 +45,7 @@ def run(*, out: str | Path, trials: int = 50, seed: int = 0, jobs: int = 1, prog
         trials: Number of random starts, at least 1.
         seed: Of the starts and of planning.
         jobs: Number of processes.
+        scheduler: Address of a Dask scheduler whose workers run the trials instead, see `engine.results`.
         progress: Whether to show a progress bar.
 
     Returns:
@@ -56,7 +59,7 @@ def run(*, out: str | Path, trials: int = 50, seed: int = 0, jobs: int = 1, prog
         raise InputError("out of range", field="trials", expected="at least 1", got=trials)
     settings = {"benchmark": "gap", "seed": seed, "starts": trials, "pose": POSE, **LIMITS}
     specs = [{"key": f"{number:04d}", "number": number, "seed": seed} for number in range(trials)]
-    return runner.run(specs, _record, out, settings=settings, report=report, jobs=jobs, progress=progress)
+    return runner.run(specs, _record, out, settings=settings, report=report, jobs=jobs, scheduler=scheduler, progress=progress)
 
 
 def report(result: Mapping[str, Any]) -> str:

@@ -74,6 +74,7 @@ def run(
     seed: int,
     out: str | Path,
     jobs: int = 1,
+    scheduler: str | None = None,
     scenes: Sequence[str] = SCENES,
     methods: Sequence[str] = COMPARED_INITIALIZATIONS,
     progress: bool = True,
@@ -87,6 +88,7 @@ def run(
         seed: Of the starts and of planning.
         out: The folder; if it has trials of the same settings already, they are not run again.
         jobs: Number of processes.
+        scheduler: Address of a Dask scheduler whose workers run the trials instead, see `engine.results`.
         scenes: Some of `SCENES`.
         methods: Some of `COMPARED_INITIALIZATIONS`.
         progress: Whether to show a progress bar.
@@ -106,7 +108,7 @@ def run(
     settings = {"benchmark": "initialization", "seed": seed, "starts": starts, "repeats": repeats, "scenes": scenes}
     settings |= {"methods": methods, "target": TARGET, **LIMITS, "perturbation": PERTURBATION}
     function = functools.partial(_record, solve=solve)
-    result = runner.run(trials, function, out, settings=settings, jobs=jobs, progress=progress)
+    result = runner.run(trials, function, out, settings=settings, jobs=jobs, scheduler=scheduler, progress=progress)
     write_atomically(Path(out) / "table.md", report(result).encode())
     title = f"Success by initialisation, {starts} starts{f', {repeats} trials from each' if repeats > 1 else ''}"
     success_chart(result["trials"], Path(out) / "success.png", _shown(scenes), methods, title=title)

@@ -119,6 +119,7 @@ def run(
     seed: int,
     out: str | Path,
     jobs: int = 1,
+    scheduler: str | None = None,
     of: str = "obstacles",
     counts: Sequence[int] | None = None,
     progress: bool = True,
@@ -132,6 +133,7 @@ def run(
         seed: Of the starts and of planning.
         out: The folder; if it has trials of the same settings already, they are not run again.
         jobs: Number of processes. Several slow each other down, and times are what this is about.
+        scheduler: Address of a Dask scheduler whose workers run the trials instead, see `engine.results`.
         of: What there is more and more of, "obstacles" or "segments"; the latter among 30 obstacles.
         counts: How many; None: those of `AXES`.
         progress: Whether to show a progress bar.
@@ -151,7 +153,7 @@ def run(
         raise InputError("out of range", field="counts", expected=f"numbers of at least {least}", got=counts)
     trials = specify(starts=starts, seed=seed, counts=counts, of=of)
     settings = {"benchmark": "scale", "of": of, "seed": seed, "starts": starts, "counts": counts, **LIMITS}
-    result = runner.run(trials, _record, out, settings=settings, jobs=jobs, progress=progress)
+    result = runner.run(trials, _record, out, settings=settings, jobs=jobs, scheduler=scheduler, progress=progress)
     write_atomically(Path(out) / "table.md", report(result).encode())
     scale_chart(result["trials"], Path(out) / "scale.png", of=of, title=AXES[of].title)
     return result

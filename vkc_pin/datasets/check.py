@@ -18,6 +18,8 @@ from vkc_pin.datasets.dataset import Dataset
 from vkc_pin.datasets.diversity import Seen, homotopy, way
 from vkc_pin.datasets.episode import Episode, scene_name
 from vkc_pin.datasets.formats.hdf5 import episodes_of, numbers_of
+from vkc_pin.datasets.problems import terms_of
+from vkc_pin.datasets.recipe import Recipe, load_recipe
 from vkc_pin.datasets.statistics import statistics_page
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.files.documents import read_text
@@ -99,7 +101,8 @@ def check_dataset(
     target = dataset.folder / "statistics.html" if page is None else Path(page)
     check_writable(target, field="page")
     shards = dataset.shards
-    tasks = ((str(k), (str(shard), str(dataset.folder / "scenes"))) for k, shard in enumerate(shards))
+    recipe = dataset.recipe.document
+    tasks = ((str(k), (str(shard), str(dataset.folder / "scenes"), recipe)) for k, shard in enumerate(shards))
     found: dict[int, tuple[list[dict[str, Any]], list[str]]] = {}
     with tqdm(total=len(shards), unit="shard", disable=not progress) as bar:
         for key, result in results(checked_shard, tasks, jobs=jobs, dask=clustered()):
@@ -118,19 +121,19 @@ def check_dataset(
     return DatasetCheck(dataset.folder, len(records), refused, tuple(problems), tuple(records), target)
 
 
-def checked_shard(task: tuple[str, str]) -> tuple[list[dict[str, Any]], list[str]]:
-    """Return what is known of the episodes of a shard, and what is wrong with the file."""
-    shard, scenes = Path(task[0]), Path(task[1])
+def checked_shard(task: tuple[str, str, Mapping[str, Any]]) -> tuple[list[dict[str, Any]], list[str]]:
+    """Return what is known of the episodes of a shard, by its scenes' folder and its recipe, and what is wrong with the file."""
+    shard, scenes, recipe = Path(task[0]), Path(task[1]), load_recipe(task[2])
     records: list[dict[str, Any]] = []
     try:
         for episode in episodes_of(shard, scenes):
-            records.append(_looked_at(episode))
+            records.append(_looked_at(episode, recipe))
     except (VkcError, OSError) as error:
         return records, [f"{shard.name}: {error}"]
     return records, []
 
 
-def _looked_at(episode: Episode) -> dict[str, Any]:
+def _looked_at(episode: Episode, recipe: Recipe) -> dict[str, Any]:
     """Return what is known of an episode; "refused" says what the validation says against it, "" if nothing."""
     about = dict(episode.about)
     motion = episode.trajectory
@@ -139,6 +142,8 @@ def _looked_at(episode: Episode) -> dict[str, Any]:
         scene = episode.scene()
         report = episode.validate()
         said = [str(violation) for violation in report.violations] + report.contradictions(episode.claimed)
+        if episode.terms != terms_of(recipe, scene, about):
+            said.append("its own terms are not those of the recipe")
         refused, winding = "; ".join(said[:3]), homotopy(scene, motion)
         start = scene.start
     except VkcError as error:

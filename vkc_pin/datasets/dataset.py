@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import functools
 import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,13 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from vkc_pin.datasets.diversity import Seen
-from vkc_pin.datasets.episode import Episode, unpacked, work_file
-from vkc_pin.datasets.formats.hdf5 import episodes_of, numbers_of, write_scene, write_shard
+from vkc_pin.datasets.episode import Episode, work_file
+from vkc_pin.datasets.formats.hdf5 import episodes_of, numbers_of, write_shard
 from vkc_pin.datasets.recipe import Recipe, load_recipe
 from vkc_pin.errors import InputError
 from vkc_pin.files.resources import file_path
 from vkc_pin.files.writing import write_atomically
-from vkc_pin.models.robot import Robot
 
 __all__ = ["EPISODES_A_SHARD", "Dataset", "Register", "write_table"]
 
@@ -136,26 +134,17 @@ class Register:
         numbers = self._robots[robot][k * EPISODES_A_SHARD : (k + 1) * EPISODES_A_SHARD]
         path = self.dataset.folder / "shards" / robot / f"shard-{k:05d}.hdf5"
         files = [work_file(self.dataset.folder, number) for number in numbers]
-        if not path.is_file() or numbers_of(path) != numbers:
-            episodes = [unpacked(file.read_bytes(), self.dataset.folder / "robots") for file in files]
-            for episode in episodes:
-                write_scene(self.dataset.folder / "scenes", episode.document)
-            fields = self.dataset.recipe.fields
-            write_shard(path, episodes, self._robot(episodes[0]), fields.rate, self.dataset.recipe.digest)
+        there = numbers_of(path) if path.is_file() else []
+        if there != numbers:
+            # What somebody has removed of the files may be in the shard that is replaced.
+            parts = [
+                (file, 0) if file.is_file() or number not in there else (path, there.index(number))
+                for file, number in zip(files, numbers, strict=True)
+            ]
+            write_shard(path, parts, self.dataset.folder / "scenes")
         if len(numbers) == EPISODES_A_SHARD:
             for file in files:
                 file.unlink(missing_ok=True)
-
-    @functools.cached_property
-    def _loaded(self) -> dict[str, Robot]:
-        return {}
-
-    def _robot(self, episode: Episode) -> Robot:
-        """Return an episode's robot, loaded once."""
-        name = str(episode.about["robot"])
-        if name not in self._loaded:
-            self._loaded[name] = episode.scene().robot
-        return self._loaded[name]
 
 
 def write_table(path: Path, records: Sequence[Mapping[str, Any]]) -> Path:

@@ -31,6 +31,7 @@ from vkc_pin.simulation.cameras.images import Images, taken
 from vkc_pin.simulation.execution import simulate
 from vkc_pin.simulation.result import SimulationResult
 from vkc_pin.task.steps import Step, step_from_dict, step_to_dict
+from vkc_pin.task.terms import Term, term_from_dict, term_to_dict
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import validate
 
@@ -57,6 +58,7 @@ class Episode:
         options: How it was planned.
         trajectory: The motion.
         claimed: What the validation said of it.
+        terms: What the motion had to keep to beside that, of the recipe.
     """
 
     number: int
@@ -68,6 +70,7 @@ class Episode:
     options: Options
     trajectory: Trajectory
     claimed: Report
+    terms: tuple[Term, ...] = ()
     robots: Path | None = None
     load_images: Callable[[], Images] | None = None
 
@@ -88,7 +91,7 @@ class Episode:
 
     def validate(self) -> Report:
         """Return what the independent check says of the motion, in the scene built anew."""
-        return validate(self.scene(), self.steps, self.trajectory, self.options)
+        return validate(self.scene(), self.steps, self.trajectory, self.options, self.terms)
 
 
 @functools.cache
@@ -131,6 +134,7 @@ def attempt(said: Mapping[str, Any], number: int, robots: Mapping[str, str]) -> 
                 effort=recipe.fields.effort,
                 time_limit=recipe.fields.time_limit,
                 perturbation=0.0 if asked.seed == 0 else _PERTURBED,
+                terms=asked.terms,
                 planner=_planner(),
             )
             record |= _outcome(found)
@@ -218,6 +222,7 @@ def packed(number: int, about: Mapping[str, Any], found: Plan, images: bytes = b
         "start": start,
         "where": str(found.scene.folder.resolve()) if outside else None,
         "steps": [step_to_dict(step) for step in found.steps],
+        "terms": [term_to_dict(term) for term in found.terms],
         "options": asdict(found.options),
         "motion": motion,
         "validation": {**found.validation.to_dict(), "clearance": _finite(found.validation.clearance)},
@@ -278,6 +283,7 @@ def made_of(data: Mapping[str, Any], arrays: Mapping[str, Floats], robots: Path 
             options=Options(**data["options"]),
             trajectory=Trajectory.from_dict(motion),
             claimed=Report.from_dict(report),
+            terms=tuple(term_from_dict(term) for term in data.get("terms", ())),
             robots=robots,
         )
     except (LookupError, TypeError, AttributeError) as error:
@@ -288,4 +294,4 @@ def made_of(data: Mapping[str, Any], arrays: Mapping[str, Floats], robots: Path 
 
 def work_file(out: Path, number: int) -> Path:
     """Return where an episode is kept until it is in a shard."""
-    return out / "work" / f"{number:08d}.npz"
+    return out / "work" / f"{number:08d}.hdf5"

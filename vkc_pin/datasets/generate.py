@@ -8,7 +8,7 @@ import sys
 import time
 import warnings
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +17,14 @@ from tqdm import tqdm
 
 from vkc_pin.arguments import flag, whole
 from vkc_pin.datasets.dataset import Dataset, Register
-from vkc_pin.datasets.episode import Made, attempts, work_file
+from vkc_pin.datasets.episode import Made, work_file
 from vkc_pin.datasets.formats import hdf5
 from vkc_pin.datasets.formats import lerobot as lerobot_layout
 from vkc_pin.datasets.formats.card import card
+from vkc_pin.datasets.formats.parts import parts
 from vkc_pin.datasets.recipe import CAMERAS, Recipe, load_recipe
-from vkc_pin.datasets.robots import check_cameras, ready_robots
+from vkc_pin.datasets.robots import check_frames, ready_robots
+from vkc_pin.datasets.terms import as_entries
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.files.resources import file_path
 from vkc_pin.files.writing import check_writable, write_atomically
@@ -30,6 +32,7 @@ from vkc_pin.running.engine import Died, needs_dask, results
 from vkc_pin.running.journal import Journal
 from vkc_pin.running.machine import process_name, versions
 from vkc_pin.simulation.physics import engine
+from vkc_pin.task.terms import Term
 
 __all__ = ["generate"]
 
@@ -48,6 +51,7 @@ def generate(
     variants: int | None = None,
     simulate: bool | None = None,
     cameras: bool = False,
+    terms: Sequence[Term] = (),
     lerobot: bool = False,
     progress: bool = False,
 ) -> Dataset:
@@ -67,6 +71,9 @@ def generate(
         simulate: Whether only episodes count that physics confirms (the extra `sim`), instead of what the recipe says.
         cameras: Keep what cameras on the robot see of it as well: those of the recipe, or one above the base and one beside the
             fingers. Only of what is simulated. Recipes that name cameras need not be asked.
+        terms: Own constraints and costs that every motion keeps to, beside those of the recipe, whose part they become. Frames
+            are "base", "hand", "object" (the link that the hand takes hold of), or those of every robot of the recipe;
+            `holding="object"` is while it is held.
         lerobot: Write LeRobot's layout as well.
         progress: Show a progress bar with the time left.
 
@@ -80,23 +87,28 @@ def generate(
     made = load_recipe(recipe, variants=variants, simulate=simulate)
     if flag(cameras, "cameras") and not made.fields.cameras:
         made = load_recipe(made, cameras=CAMERAS)
+    if own := as_entries(terms):
+        made = load_recipe(made, terms=[*made.document["terms"], *own])
     hdf5.needed()
     if flag(lerobot, "lerobot"):
-        lerobot_layout.needed()
+        lerobot_layout.needed(made.fields.rate)
     if made.fields.simulate:
         engine()
-    check_cameras(made)
+    check_frames(made)
     if jobs > 1 or scheduler is not None:
         needs_dask(scheduler)
     folder = file_path(out, "out", "a folder")
     with _journal(folder, made) as journal:
         _at_work(folder, made)
         dataset = Dataset(folder, made)
-        if (there := len(dataset.numbers())) > wanted:
+        numbers = dataset.numbers()
+        if (there := len(numbers)) > wanted:
             raise InputError(
                 "there are more episodes already", file=folder, field="episodes", expected=f"at least {there}", got=wanted
             )
         register = Register(dataset, wanted)
+        for key in _lost(dataset, journal, set(numbers)):
+            del journal.lines[key]  # a number is all that it takes to make them again
         for key in sorted(journal.lines, key=int):
             register.add(_kept(journal, key))
         if not register.full:
@@ -135,6 +147,12 @@ def _kept(journal: Journal, key: str) -> dict[str, Any]:
     return record
 
 
+def _lost(dataset: Dataset, journal: Journal, there: Set[int]) -> list[str]:
+    """Return which episodes somebody has removed: the journal says that they succeeded, and neither shard nor file has them."""
+    good = [key for key in journal.lines if _kept(journal, key)["success"] and int(key) not in there]
+    return [key for key in good if not work_file(dataset.folder, int(key)).is_file()]
+
+
 def _run(dataset: Dataset, register: Register, journal: Journal, jobs: int, scheduler: str | None, progress: bool) -> None:
     """Make attempts, lowest numbers first, until there are enough episodes."""
     document, fields = dataset.recipe.document, dataset.recipe.fields
@@ -158,7 +176,7 @@ def _run(dataset: Dataset, register: Register, journal: Journal, jobs: int, sche
     journal.append({"session": {"jobs": jobs}})
     bar = tqdm(total=register.wanted, initial=len(register.accepted), unit="episode", smoothing=0.05, disable=not progress)
     found = results(
-        attempts,
+        parts,
         tasks(),
         jobs=jobs,
         scheduler=scheduler,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from vkc_pin.options import Options
@@ -13,6 +15,7 @@ from vkc_pin.scene.scene import Scene
 from vkc_pin.seeds.knots import Knots, depth
 from vkc_pin.task.compiler import compile_task
 from vkc_pin.task.steps import Actuate
+from vkc_pin.task.terms import Term, traced
 
 __all__ = ["grasped"]
 
@@ -20,7 +23,9 @@ _BATCH = 48  # random configurations that inverse kinematics brings to the grasp
 _DRAWS = 6  # batches before there is none
 
 
-def grasped(scene: Scene, step: Actuate, rng: np.random.Generator, options: Options, planner: Planner) -> Scene | None:
+def grasped(
+    scene: Scene, step: Actuate, rng: np.random.Generator, options: Options, planner: Planner, terms: Sequence[Term] = ()
+) -> Scene | None:
     """Return the scene with the robot at a random free configuration that holds what a step moves; None if none is found.
 
     The program that is built for it is the one that the step is planned with from there.
@@ -31,11 +36,12 @@ def grasped(scene: Scene, step: Actuate, rng: np.random.Generator, options: Opti
         rng: Random numbers.
         options: Clearances.
         planner: Keeps what is built.
+        terms: What the motion must keep to, for the program; the start need not.
     """
     name, attachment = step.object, str(step.attachment)
     holding = scene.with_held({name: attachment})  # wherever the hand is: the chain does not depend on it
     with planner.lent() as cache:
-        problem = TrajectoryProblem(holding, compile_task(holding, [step], options), options, (), cache=cache)
+        problem = TrajectoryProblem(holding, compile_task(holding, [step], options), options, traced(scene, terms), cache=cache)
         chain, robot = problem.chain, scene.robot.coordinates.size
         search = Knots(problem, rng)
         pose = search.pose_at(1)

@@ -7,14 +7,14 @@ import itertools
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vkc_pin.arrays import Floats
 from vkc_pin.datasets.grasping import grasped
-from vkc_pin.datasets.recipe import Recipe, load_recipe
+from vkc_pin.datasets.recipe import Recipe, load_recipe, robot_name
+from vkc_pin.datasets.terms import meant
 from vkc_pin.errors import VkcError
 from vkc_pin.options import Options
 from vkc_pin.planning.planner import Planner
@@ -24,8 +24,9 @@ from vkc_pin.scene.rooms.settings import RoomSettings
 from vkc_pin.scene.scene import START_CLEARANCE, Scene, load_scene
 from vkc_pin.task.goals import goals
 from vkc_pin.task.steps import Actuate, Grasp, Place, Step
+from vkc_pin.task.terms import Term
 
-__all__ = ["NoProblemError", "Problem", "problem", "robot_name"]
+__all__ = ["NoProblemError", "Problem", "problem", "terms_of"]
 
 _KEPT = 48  # rooms that a process keeps
 _STARTS = 300  # places that are tried for the robot
@@ -49,6 +50,7 @@ class Problem:
         options: How to plan.
         seed: Of planning.
         about: What was drawn, as plain data: task, robot, room, object, kind, attachment, goal.
+        terms: What the motion must keep to beside that.
     """
 
     number: int
@@ -57,6 +59,7 @@ class Problem:
     options: Options
     seed: int
     about: dict[str, Any] = field(default_factory=dict)
+    terms: tuple[Term, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,15 +95,15 @@ def problem(recipe: Recipe, number: int, robots: Mapping[str, str], planner: Pla
         entry = fields.robots[(block + block // rooms) % len(fields.robots)]  # in turn, and another one every time round
         place = _place(said, fields.rooms.first + block % rooms, robots.get(entry.name, entry.name), entry.height)
         robot = entry.name
-    about = {"task": task, "robot": robot_name(robot), "room": place.scene.name}
+    about: dict[str, Any] = {"task": task, "robot": robot_name(robot), "room": place.scene.name}
     scene, steps, more = (_fetch if task == "fetch-place" else _open)(recipe, place, rng, task == "given-open", planner)
-    return Problem(number, scene, steps, recipe.options, variant, {**about, **more, "variant": variant})
+    about |= {**more, "variant": variant}
+    return Problem(number, scene, steps, recipe.options, variant, about, terms_of(recipe, scene, about))
 
 
-def robot_name(name: str) -> str:
-    """Return what a robot is called in a dataset: its name, or that of its file or folder."""
-    path = Path(name)
-    return (path.parent.name if path.name == "robot.yaml" else path.stem) if len(path.parts) > 1 else name
+def terms_of(recipe: Recipe, scene: Scene, about: Mapping[str, Any]) -> tuple[Term, ...]:
+    """Return what the motion of an episode about something must keep to; see `Episode.about`."""
+    return meant(recipe.terms_of(about["task"]), scene, about["object"], about["attachment"])
 
 
 _scene = functools.lru_cache(maxsize=_KEPT)(load_scene)
@@ -162,7 +165,8 @@ def _open(
     step = Actuate(name, step.joints, attachment)
     ((joint, goal),) = step.joints.items()
     if given:
-        found = grasped(scene, step, rng, recipe.options, planner)
+        terms = meant(recipe.terms_of("given-open"), scene, name, attachment)
+        found = grasped(scene, step, rng, recipe.options, planner, terms)
         if found is None:
             raise NoProblemError(f"no free grasp of {name}.{attachment} in {scene.name} was found")
         scene = found

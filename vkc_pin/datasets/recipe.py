@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -13,6 +14,7 @@ import numpy as np
 from pydantic import Field
 
 from vkc_pin.arguments import mapping
+from vkc_pin.datasets.terms import TermSchema, check_entries
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.files.documents import Document, check, read_yaml
 from vkc_pin.files.fields import Name, NotNegative, Number, Positive, Schema, Vector3, count, require, text_for
@@ -23,6 +25,7 @@ from vkc_pin.scene.rooms.fixtures import known_objects
 from vkc_pin.scene.rooms.parts import CARRIED
 from vkc_pin.scene.rooms.settings import RoomSettings
 from vkc_pin.simulation.cameras.mount import BASE, HAND, Camera
+from vkc_pin.task.terms import Term, as_data
 
 __all__ = [
     "CAMERAS",
@@ -35,6 +38,7 @@ __all__ = [
     "RoomsSchema",
     "StartSchema",
     "load_recipe",
+    "robot_name",
 ]
 
 TASKS = ("given-open", "drive-open", "fetch-place")
@@ -101,14 +105,7 @@ class CameraSchema(Schema):
 
 CAMERAS = (
     {"name": "head", "frame": BASE, "position": [0.0, 0.0, 1.5], "target": [1.2, 0.0, 0.6], "fov": 90.0},
-    {
-        "name": "wrist",
-        "frame": HAND,
-        "position": [0.0, -0.12, -0.12],
-        "target": [0.0, 0.0, 0.1],
-        "up": [0.0, -1.0, 0.0],
-        "fov": 75.0,
-    },
+    {"name": "wrist", "frame": HAND, "position": [0, -0.12, -0.12], "target": [0, 0, 0.1], "up": [0, -1, 0], "fov": 75.0},
 )
 """The cameras of recipes that are asked for images and name none: one above the base, one beside the fingers."""
 
@@ -144,6 +141,7 @@ class RecipeSchema(Schema):
     rate: Positive = 10.0
     simulate: bool = False
     cameras: tuple[CameraSchema, ...] = ()
+    terms: tuple[TermSchema, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -167,14 +165,25 @@ class Recipe:
     def digest(self) -> str:
         """A name for what it says: the same for recipes that make the same episodes."""
         said = {key: value for key, value in self.document.items() if key not in ("name", "license")}
-        if not self.fields.cameras:
-            del said["cameras"]  # datasets without images are gone on with whatever the version
+        for name in ("cameras", "terms"):
+            if not said[name]:
+                del said[name]  # datasets without them are gone on with whatever the version
         return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:16]
 
     @property
     def cameras(self) -> tuple[Camera, ...]:
         """The cameras that take images."""
         return tuple(Camera(**entry.model_dump()) for entry in self.fields.cameras)
+
+    @functools.cached_property
+    def terms(self) -> tuple[Term, ...]:
+        """Its own constraints and costs, in order: what every motion keeps to, about frames by words; see `terms`."""
+        return as_data([entry.term() for entry in self.fields.terms])
+
+    def terms_of(self, task: str) -> tuple[Term, ...]:
+        """Return those of its terms that a task has to keep to."""
+        entries = zip(self.terms, self.fields.terms, strict=True)
+        return tuple(term for term, entry in entries if not entry.tasks or task in entry.tasks)
 
     def rng(self, *words: object) -> np.random.Generator:
         """Return random numbers that depend on the recipe and on some words, such as the number of an episode, alone."""
@@ -205,7 +214,7 @@ def load_recipe(recipe: str | Path | Mapping[str, Any] | Recipe, **changes: Any)
     fields = check(document, RecipeSchema)
     folder = document.file.parent if document.file else Path()
     found = {
-        "robots": tuple(_robot(document, k, entry, folder) for k, entry in enumerate(fields.robots)),
+        "robots": _robots(document, fields.robots, folder),
         "objects": tuple(_object(document, k, name, folder) for k, name in enumerate(fields.objects)),
         "scenes": tuple(_scene(document, k, name, folder) for k, name in enumerate(fields.scenes)),
     }
@@ -220,6 +229,7 @@ def load_recipe(recipe: str | Path | Mapping[str, Any] | Recipe, **changes: Any)
             Camera(**camera.model_dump())
         if camera.name in [other.name for other in fields.cameras[:k]]:
             raise document.error(("cameras", k, "name"), "two cameras of one name", expected="another name", got=camera.name)
+    check_entries(document, fields.terms, TASKS)
     if fields.cameras and not fields.simulate:
         expected = "`simulate: true` as well, or --simulate: images are of what happens in physics"
         raise document.error(("cameras",), "nothing is simulated", expected=expected, got="cameras")
@@ -240,16 +250,27 @@ def _options(document: Document, given: Mapping[str, Any]) -> Options:
         raise document.error(("options", name), error.problem, expected=error.expected, got=error.got) from error
 
 
+def robot_name(name: str) -> str:
+    """Return what a robot is called in a dataset: its name, or that of its file or folder."""
+    path = Path(name)
+    return (path.parent.name if path.name == "robot.yaml" else path.stem) if len(path.parts) > 1 else name
+
+
 def _is_path(name: str) -> bool:
     return name.endswith((".yaml", ".yml", ".urdf")) or "/" in name
 
 
-def _robot(document: Document, place: int, entry: RobotEntry, folder: Path) -> RobotEntry:
-    with document.at(("robots", place)):
-        if not _is_path(entry.name):
-            find_robot(entry.name)
-            return entry
-        return entry.model_copy(update={"name": str(find_robot(str((folder / entry.name).resolve())))})
+def _robots(document: Document, entries: Sequence[RobotEntry], folder: Path) -> tuple[RobotEntry, ...]:
+    found: dict[str, str] = {}
+    robots = []
+    for k, entry in enumerate(entries):
+        with document.at(("robots", k)):
+            path = find_robot(str((folder / entry.name).resolve()) if _is_path(entry.name) else entry.name)
+        robots.append(entry.model_copy(update={"name": str(path)}) if _is_path(entry.name) else entry)
+        name = robots[-1].name
+        if found.setdefault(robot_name(name), name) != name:
+            raise document.error(("robots", k), "two robots of one name", expected="folders of different names", got=name)
+    return tuple(robots)
 
 
 def _object(document: Document, place: int, name: str, folder: Path) -> str:

@@ -1,12 +1,16 @@
-"""Robots of a recipe: those whose hand nobody has described yet are imported into the dataset's folder first, once."""
+"""Robots of a recipe: whether they have what it names, and those that are imported into the dataset's folder first, once."""
 
 from __future__ import annotations
 
 import warnings
 from pathlib import Path
 
-from vkc_pin.datasets.problems import robot_name
-from vkc_pin.datasets.recipe import Recipe
+import yaml
+
+from vkc_pin.datasets.recipe import Recipe, robot_name
+from vkc_pin.datasets.terms import check_robot
+from vkc_pin.files.documents import read_text
+from vkc_pin.files.writing import write_atomically
 from vkc_pin.importing.robots.robot_import import import_robot
 from vkc_pin.models.robot_file import find_robot, load_robot
 from vkc_pin.scene.scene import load_scene
@@ -14,24 +18,25 @@ from vkc_pin.simulation.cameras.mount import check_frame
 from vkc_pin.simulation.physics import engine
 from vkc_pin.simulation.snapshots import drawing_context
 
-__all__ = ["check_cameras", "ready_robots"]
+__all__ = ["check_frames", "ready_robots"]
 
 _SAMPLES = 1000  # configurations for pairs that need no check, as of robots that are loaded without an SRDF
 
 
-def check_cameras(recipe: Recipe) -> None:
-    """Refuse cameras that cannot take images here, or that a robot of the recipe has no frame for.
+def check_frames(recipe: Recipe) -> None:
+    """Refuse cameras that cannot take images here, and cameras and terms that a robot of the recipe has no frame for.
 
     Raises:
         InputError: MuJoCo is not installed.
         UnknownNameError: A robot lacks a frame.
         VkcError: There is no OpenGL without a screen.
     """
-    if not recipe.cameras:
+    if not recipe.cameras and not recipe.terms:
         return
-    engine()
-    with drawing_context((8, 8)):
-        pass
+    if recipe.cameras:
+        engine()
+        with drawing_context((8, 8)):
+            pass
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what is said of robots is said when they are made ready
         fields = recipe.fields
@@ -39,6 +44,7 @@ def check_cameras(recipe: Recipe) -> None:
             robot = load_scene(name).robot if fields.scenes else load_robot(name)
             for camera in recipe.cameras:
                 check_frame(robot, camera.frame)
+            check_robot(robot, recipe.terms)
 
 
 def ready_robots(recipe: Recipe, folder: Path) -> dict[str, str]:
@@ -46,7 +52,8 @@ def ready_robots(recipe: Recipe, folder: Path) -> dict[str, str]:
 
     Args:
         recipe: The recipe.
-        folder: Where folders are made; what is there is not made again. On a cluster, all workers must see it.
+        folder: Where folders are made; what is there is not made again. On a cluster, all workers must see it. Of a robot by path
+            that says what its hand is, there is what points to its URDF.
 
     Raises:
         InputError: A robot cannot be imported.
@@ -57,8 +64,21 @@ def ready_robots(recipe: Recipe, folder: Path) -> dict[str, str]:
         for entry in () if recipe.fields.scenes else recipe.fields.robots:
             made = folder / robot_name(entry.name)
             if not (made / "robot.yaml").is_file():
-                if load_robot(entry.name).touch_links:
+                if not load_robot(entry.name).touch_links:
+                    import_robot(find_robot(entry.name), made, samples=_SAMPLES)
+                elif Path(entry.name).is_absolute():
+                    _point(find_robot(entry.name), made)
+                else:
                     continue
-                import_robot(find_robot(entry.name), made, samples=_SAMPLES)
             found[entry.name] = str((made / "robot.yaml").resolve())
     return found
+
+
+def _point(source: Path, folder: Path) -> None:
+    """Write a description into a folder that says what the one at `source`, a robot.yaml or a URDF beside one, says."""
+    beside = source if source.name == "robot.yaml" else source.parent / "robot.yaml"
+    said = yaml.safe_load(read_text(beside, "YAML"))
+    for field in ("urdf", "srdf"):
+        if field in said:
+            said[field] = str((beside.parent / said[field]).resolve())
+    write_atomically(folder / "robot.yaml", yaml.safe_dump(said, sort_keys=False, allow_unicode=True).encode())

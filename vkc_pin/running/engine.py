@@ -9,6 +9,7 @@ import contextlib
 import itertools
 import os
 import queue
+import re
 import secrets
 import signal
 import threading
@@ -18,7 +19,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-from vkc_pin.errors import InputError, VkcError
+from vkc_pin.errors import InputError, VkcError, shown
 from vkc_pin.interrupt import handled
 from vkc_pin.needed import optional_package
 
@@ -26,9 +27,12 @@ __all__ = ["DEATHS", "Died", "clustered", "needs_dask", "results"]
 
 DEATHS = 4
 """How many processes a task may take with it on a cluster before it is given up."""
+_ADDRESS = re.compile(r"[a-z]+://[^/\s]+:\d{1,5}")
 _AHEAD = 2  # tasks that wait for each process, so that none waits for a task
 _CONNECTING = 20.0  # [s] to reach a scheduler
 _LOOKED = 5.0  # [s] without a result after which it is looked whether all processes are there
+
+_LEAST = 2_000_000_000  # [bytes] of memory that a process may take, however many there are
 
 Function = Callable[[Any], Any]
 
@@ -45,15 +49,17 @@ class Died:
 
 
 def needs_dask(scheduler: str | None) -> None:
-    """Look for Dask, which runs tasks in other processes.
+    """Look for Dask, which runs tasks in other processes, and at the address of a scheduler.
 
     Args:
         scheduler: Address of the scheduler that is asked for, None for processes of this machine.
 
     Raises:
-        InputError: It is not installed.
+        InputError: It is not installed, or the address is none.
     """
     field = "jobs" if scheduler is None else "scheduler"
+    if scheduler is not None and not (isinstance(scheduler, str) and _ADDRESS.fullmatch(scheduler)):
+        raise InputError("not an address", field=field, expected="such as tcp://HOST:8786", got=shown(scheduler))
     optional_package("distributed", "cluster", what="running in other processes", field=field)
 
 
@@ -174,6 +180,9 @@ def _on_cluster(
                 except queue.Empty:
                     if cluster is not None:
                         cluster.scale(jobs)  # a process that was killed while it started is not started anew otherwise
+                    elif tell is not None and not client.nthreads():
+                        tell(f"{scheduler} has no workers; waiting for some")
+                        tell = None  # once
                     continue
                 key, task, _ = running.pop(future.key)
                 try:
@@ -212,6 +221,9 @@ def _client(jobs: int, scheduler: str | None) -> Generator[tuple[Any, Any]]:
         "distributed.admin.system-monitor.interval": "5s",
         "distributed.worker.memory.monitor-interval": "1s",
         "distributed.scheduler.active-memory-manager.start": False,  # results leave the processes at once
+        # So there is nothing to move to the disk; and a process that is paused, for what it keeps of rooms and programs, never
+        # gets less, so that all would wait for it for ever.
+        **{f"distributed.worker.memory.{what}": False for what in ("target", "spill", "pause")},
         "distributed.comm.timeouts.connect": f"{_CONNECTING:g}s",
     }
     with dask.config.set(settings), contextlib.ExitStack() as stack:
@@ -223,6 +235,7 @@ def _client(jobs: int, scheduler: str | None) -> Generator[tuple[Any, Any]]:
                         threads_per_worker=1,
                         host="127.0.0.1",
                         dashboard_address="127.0.0.1:0",
+                        memory_limit=_share(jobs),
                         silence_logs=logging.CRITICAL,
                     )
                 )
@@ -235,6 +248,13 @@ def _client(jobs: int, scheduler: str | None) -> Generator[tuple[Any, Any]]:
                 "no scheduler answers there", field="scheduler", expected="tcp://HOST:PORT of a Dask scheduler", got=scheduler
             ) from error
         yield stack.enter_context(client), None
+
+
+def _share(jobs: int) -> int:
+    """Return how much memory each of some processes of this machine may take before it is ended and started anew [bytes]."""
+    from distributed.system import MEMORY_LIMIT
+
+    return max(int(MEMORY_LIMIT) // jobs, _LEAST)
 
 
 def _watched(function: Function, task: Any, limit: float | None) -> Any:

@@ -22,6 +22,7 @@ class Kept:
             processor time until then of the process that writes [s].
         memory: The largest memory of a process [MB].
         memories: Process → the memory it used after each of its tasks [MB], in their order; of tasks that say it.
+        processes: Key → the process that ran the task; of tasks that say it.
     """
 
     def __init__(self) -> None:
@@ -29,6 +30,7 @@ class Kept:
         self.sessions: list[dict[str, Any]] = []
         self.memory = 0.0
         self.memories: dict[str, list[float]] = {}
+        self.processes: dict[str, str] = {}
 
     @classmethod
     def read(cls, path: Path) -> Kept:
@@ -80,6 +82,7 @@ class Kept:
         if "client_seconds" in line:
             self.sessions[-1]["client_seconds"] = line["client_seconds"]
         if "process" in line:
+            self.processes[line["key"]] = line["process"]
             self.memories.setdefault(line["process"], []).append(line["resident_mb"])
 
 

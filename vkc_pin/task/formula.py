@@ -10,7 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from vkc_pin.arguments import known
+from vkc_pin.arguments import known, text
 from vkc_pin.arrays import Floats
 
 __all__ = ["Formula", "State"]
@@ -24,10 +24,11 @@ class State:
 
     Coordinates are those of the robot (`base_x`, `elbow_joint`) and of objects (`door.hinge`); frames are those of the robot,
     links among them, and links of objects (`cup.cup`, `door.panel`), whoever holds them. Everything is in the world frame.
-    All methods raise `UnknownNameError` for a name that does not exist.
+    All methods raise `UnknownNameError` for a name that does not exist. Where it is not known yet what there will be (None), any
+    name does.
     """
 
-    def __init__(self, frames: Sequence[str], coordinates: Sequence[str], field: str | None = None) -> None:
+    def __init__(self, frames: Sequence[str] | None, coordinates: Sequence[str] | None, field: str | None = None) -> None:
         self._field = field  # for errors
         self._known = {"frame": frames, "coordinate": coordinates}
         self._symbols: Mapping[str, dict[str, tuple[Any, Any]]] = {"frame": {}, "coordinate": {}}
@@ -63,7 +64,11 @@ class State:
 
     def _of(self, kind: str, name: str) -> tuple[Any, Any]:
         """Return symbols of a coordinate, or of a frame's rotation (by columns) and position: now and before."""
-        known(name, self._known[kind], kind, self._field)
+        choices = self._known[kind]
+        if choices is None:
+            text(name, self._field or kind, f"the name of a {kind}")
+        else:
+            known(name, choices, kind, self._field)
         size = 12 if kind == "frame" else 1
         return self._symbols[kind].setdefault(name, (ca.SX.sym("now", size), ca.SX.sym("before", size)))
 

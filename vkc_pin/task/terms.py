@@ -22,7 +22,18 @@ from vkc_pin.task.formula import Formula, State
 if TYPE_CHECKING:
     from vkc_pin.scene.scene import Scene
 
-__all__ = ["Constraint", "Cost", "State", "Term", "check_active", "term_from_dict", "term_to_dict", "traced"]
+__all__ = [
+    "Constraint",
+    "Cost",
+    "State",
+    "Term",
+    "as_data",
+    "check_active",
+    "renamed",
+    "term_from_dict",
+    "term_to_dict",
+    "traced",
+]
 
 Numbers = float | Sequence[float] | NDArray[np.float64]
 Expression = Callable[[State], Any] | Formula
@@ -165,13 +176,39 @@ def traced(scene: Scene, terms: Sequence[Term]) -> tuple[Term, ...]:
     things = [(name, placed.object) for name, placed in scene.objects.items()]
     frames = [*robot, *(f"{name}.{link}" for name, thing in things for link in thing.links)]
     joints = [f"{name}.{joint}" for name, thing in things for joint in thing.coordinates.names]
+    for term in terms:
+        if term.holding is not None and term.holding not in scene.objects:
+            raise UnknownNameError("object", term.holding, scene.objects, field=f"terms[{term.name!r}].holding")
+    return _all_traced(terms, frames, [*scene.robot.coordinates.names, *joints])
+
+
+def as_data(terms: Sequence[Term]) -> tuple[Term, ...]:
+    """Return terms with their expressions as data, for scenes that are not there yet: frames and coordinates may have any name.
+
+    Raises:
+        InputError: They are no terms, two share a name, or an expression is none.
+    """
+    return _all_traced(items(terms, "terms", "a list of Constraint and Cost", (Constraint, Cost)), None, None)
+
+
+def renamed(term: Term, frames: Mapping[str, str], objects: Mapping[str, str]) -> Term:
+    """Return a traced term about other frames, and another object that must be held for it.
+
+    Args:
+        term: The term.
+        frames: Name of a frame in its expression → the one that is meant; others stay.
+        objects: The same of `holding`.
+    """
+    formula = term.formula
+    formula = replace(formula, frames=tuple(frames.get(name, name) for name in formula.frames))
+    return replace(term, expression=formula, holding=objects.get(term.holding or "", term.holding))
+
+
+def _all_traced(terms: Sequence[Term], frames: Sequence[str] | None, coordinates: Sequence[str] | None) -> tuple[Term, ...]:
     found: list[Term] = []
     for term in terms:
         if term.name in (other.name for other in found):
             raise InputError("two terms share a name", field="terms", expected="different names", got=shown(term.name))
-        if term.holding is not None and term.holding not in scene.objects:
-            raise UnknownNameError("object", term.holding, scene.objects, field=f"terms[{term.name!r}].holding")
-        coordinates = [*scene.robot.coordinates.names, *joints]
         found.append(_traced(term, State(frames, coordinates, f"terms[{term.name!r}].expression")))
     return tuple(found)
 

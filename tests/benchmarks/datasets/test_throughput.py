@@ -7,6 +7,7 @@ import pytest
 import yaml
 from helpers.datasets import SMALL
 
+from vkc_pin.benchmarks.datasets.simulated import WORKERS
 from vkc_pin.benchmarks.datasets.throughput import _slope, run
 from vkc_pin.cli import main
 from vkc_pin.datasets.recipe import TASKS
@@ -15,16 +16,15 @@ pytest.importorskip("h5py")
 
 
 def test_one_record_a_task(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    recipe = tmp_path / "small.yaml"
-    recipe.write_text(yaml.safe_dump(SMALL))
+    recipe = write(tmp_path)
     out = tmp_path / "out"
-    assert main(["bench", "throughput", "--episodes", "2", "--out", str(out), "--recipe", str(recipe), "--quiet"]) == 0
+    assert main(["bench", "throughput", "--episodes", "2", "--out", str(out), "--recipe", recipe, "--quiet"]) == 0
     assert "drive-open" in capsys.readouterr().out
     result = json.loads((out / "results.json").read_text())
     records = result["trials"]
     assert [record["task"] for record in records] == list(TASKS)
     for record in records:
-        assert {"episodes_per_hour", "attempts", "successes", "workers", "memory_mb"} <= set(record)
+        assert {"task", "episodes_per_hour", "attempts", "successes", "workers", "memory_mb"} <= set(record)
         assert record["workers"] == 1
         assert record["attempts"] >= record["successes"] >= 2
         assert record["episodes_per_hour"] > 0.0
@@ -34,8 +34,34 @@ def test_one_record_a_task(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
         lines = (out / record["task"] / "journal.jsonl").read_text().splitlines()[1:]
         seconds = [json.loads(line)["seconds"] for line in lines if "session" not in json.loads(line)]
         assert record["episodes_per_hour"] == pytest.approx(3600.0 * record["successes"] / seconds[-1], rel=1e-2)
-    again = run(out=out, episodes=2, recipe=str(recipe), progress=False)  # nothing is made again
+    assert result["curve"] == []  # of one worker
+    for task in TASKS:
+        many = [one for one in result["simulated"] if one["task"] == task]
+        assert [one["workers"] for one in many] == list(WORKERS)
+        assert all(0.0 < one["efficiency"] <= 1.0 for one in many)
+    assert (out / "workers.png").read_bytes().startswith(b"\x89PNG")
+    again = run(out=out, episodes=2, recipe=recipe, progress=False)  # nothing is made again
     assert [r["attempts"] for r in again["trials"]] == [r["attempts"] for r in records]
+
+
+def test_a_curve_of_workers(tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    result = run(out=tmp_path / "out", episodes=2, jobs=2, recipe=write(tmp_path), progress=False)
+    assert [(one["task"], one["workers"]) for one in result["curve"]] == [(task, count) for task in TASKS for count in (1, 2)]
+    for one, two in zip(result["curve"][::2], result["curve"][1::2], strict=True):
+        assert one["times"] == 1.0
+        assert two["times"] == pytest.approx(two["episodes_per_hour"] / one["episodes_per_hour"], abs=1e-3)
+        folders = tmp_path / "out/1_workers" / one["task"], tmp_path / "out" / one["task"]
+        shards = [[file.read_bytes() for file in sorted(folder.glob("shards/*/*"))] for folder in folders]
+        assert shards[0] == shards[1]
+    assert [one["workers"] for one in result["trials"]] == [2, 2, 2]
+    assert "times one" in (tmp_path / "out/table.md").read_text()
+
+
+def write(folder: Path) -> str:
+    recipe = folder / "small.yaml"
+    recipe.write_text(yaml.safe_dump(SMALL))
+    return str(recipe)
 
 
 def test_growth_is_that_of_the_process_that_grows_most() -> None:

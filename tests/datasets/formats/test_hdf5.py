@@ -11,7 +11,7 @@ from helpers.datasets import SMALL
 
 from vkc_pin.datasets.dataset import Dataset
 from vkc_pin.datasets.episode import attempt, unpacked
-from vkc_pin.datasets.formats.hdf5 import episodes_of, numbers_of, write_shard
+from vkc_pin.datasets.formats.hdf5 import episodes_of, numbers_of, part, write_shard
 from vkc_pin.datasets.formats.samples import sampled
 from vkc_pin.datasets.generate import generate
 from vkc_pin.errors import InputError
@@ -88,10 +88,17 @@ def test_small_enough(made: Dataset) -> None:
 
 
 def test_the_same_episodes_give_the_same_bytes(made: Dataset, tmp_path: Path) -> None:
-    episodes = list(made.episodes())
-    again = write_shard(tmp_path / "shard.hdf5", episodes, episodes[0].scene().robot, made.recipe.fields.rate, made.recipe.digest)
-    assert again.read_bytes() == made.shards[0].read_bytes()
+    """Made anew of what was read back, and copied from the shard itself."""
+    files = []
+    for episode in made.episodes():
+        files.append(tmp_path / f"{episode.number}.hdf5")
+        files[-1].write_bytes(part(episode, episode.scene().robot, made.recipe.fields.rate, made.recipe.digest))
+    again = write_shard(tmp_path / "again.hdf5", [(file, 0) for file in files], tmp_path / "scenes")
+    copied = write_shard(tmp_path / "copied.hdf5", [(made.shards[0], k) for k in range(4)], tmp_path / "scenes")
+    assert again.read_bytes() == copied.read_bytes() == made.shards[0].read_bytes()
     assert numbers_of(again) == made.numbers()
+    scenes = [{file.name: file.read_bytes() for file in (folder / "scenes").iterdir()} for folder in (tmp_path, made.folder)]
+    assert scenes[0] == scenes[1]
 
 
 def test_damage_is_told(made: Dataset, tmp_path: Path) -> None:

@@ -57,6 +57,7 @@ def run(
     seed: int = 0,
     robots: Sequence[str] = ROBOTS,
     jobs: int = 1,
+    scheduler: str | None = None,
     progress: bool = True,
 ) -> dict[str, Any]:
     """Run the experiment, or what is left of it, and write results.json, results.csv and table.md to `out`.
@@ -68,6 +69,7 @@ def run(
         seed: Of the poses, of importing and of planning.
         robots: Names of example-robot-data, or paths of URDF, xacro and MJCF files.
         jobs: Number of processes.
+        scheduler: Address of a Dask scheduler whose workers run the trials instead, see `engine.results`.
         progress: Whether to show a progress bar.
 
     Returns:
@@ -87,7 +89,7 @@ def run(
         {"key": name, "robot": name, "file": str(file), "out": str(out), "goals": goals, "seed": seed}
         for name, file in files.items()
     ]
-    return runner.run(specs, _records, out, settings=settings, report=report, jobs=jobs, progress=progress)
+    return runner.run(specs, _records, out, settings=settings, report=report, jobs=jobs, scheduler=scheduler, progress=progress)
 
 
 def report(result: Mapping[str, Any]) -> str:

@@ -31,6 +31,7 @@ def run(
     robots: Sequence[str] = ROBOTS,
     objects: Sequence[str] = OBJECTS,
     jobs: int = 1,
+    scheduler: str | None = None,
     progress: bool = True,
 ) -> dict[str, Any]:
     """Run the experiment, or what is left of it, and write results.json, results.csv, table.md and success.png to `out`.
@@ -45,6 +46,7 @@ def run(
             files, each as such or as "name=..."; "...#link" is that link of a file alone, "default" stands for `OBJECTS`. Files
             are imported into `out`/objects first, once.
         jobs: Number of processes.
+        scheduler: Address of a Dask scheduler whose workers run the trials instead, see `engine.results`.
         progress: Whether to show a progress bar.
 
     Returns:
@@ -67,7 +69,7 @@ def run(
         for robot, file in ready.items()
         for thing, path in things.items()
     ]
-    result = runner.run(specs, _records, out, settings=settings, report=report, jobs=jobs, progress=progress)
+    result = runner.run(specs, _records, out, settings=settings, report=report, jobs=jobs, scheduler=scheduler, progress=progress)
     chart(result["trials"], Path(out) / "success.png")
     return result
 

@@ -1,4 +1,7 @@
-"""How many validated episodes an hour a machine makes of each task, of which share of attempts, and with how much memory."""
+"""How many validated episodes an hour a machine makes of each task, of which share of attempts, and with how much memory.
+
+With several workers, one alone makes the same episodes as well, for the cost curve; and many are simulated from what tasks took.
+"""
 
 from __future__ import annotations
 
@@ -6,20 +9,25 @@ import json
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vkc_pin.benchmarks.datasets.simulated import WORKERS, Costs, measured, simulated
 from vkc_pin.benchmarks.harness.record import Record, meta
 from vkc_pin.benchmarks.harness.tables import decimal, foot, markdown, to_csv
 from vkc_pin.datasets.dataset import Dataset
 from vkc_pin.datasets.generate import generate
-from vkc_pin.datasets.recipe import TASKS, Recipe, load_recipe
+from vkc_pin.datasets.recipe import TASKS, load_recipe
 from vkc_pin.errors import InputError
 from vkc_pin.files.writing import write_atomically
+from vkc_pin.plotting.style import COLOURS, new_figure, save_figure, styled
 from vkc_pin.running.journal import Kept
 
-__all__ = ["RECIPE", "record", "report", "run"]
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["RECIPE", "record", "report", "run", "workers_chart"]
 
 RECIPE = "home"
 """Of the package: which robots, objects and rooms."""
@@ -33,9 +41,10 @@ def run(
     jobs: int = 1,
     recipe: str = RECIPE,
     scheduler: str | None = None,
+    curve: bool = True,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Make datasets of one task each and write results.json, results.csv and table.md to `out`.
+    """Make datasets of one task each and write results.json, results.csv, table.md and workers.png to `out`.
 
     Args:
         out: The folder. What it has of the same recipe already is not made again, and not timed.
@@ -43,13 +52,18 @@ def run(
         jobs: Number of processes.
         recipe: Name or path of a recipe; its own tasks make no difference.
         scheduler: Address of a Dask scheduler; see `generate`.
+        curve: Whether one worker, and two if `jobs` are more, make the same episodes as well, in folders of their own.
         progress: Whether to show a progress bar.
 
     Returns:
-        {"meta": ..., "trials": [...]}: one record a task with `task`, `episodes_per_hour`, `attempts`, `successes`, `workers`,
-        `memory_mb`, `memory_slope_mb` (growth of a process in a thousand attempts), `client_ms` (processor time an attempt of
-        the process that feeds the others, writes down what comes and fills shards), `episodes_per_core_hour` and the medians of
-        what attempts take.
+        {"meta": ..., "trials": [...], "curve": [...], "simulated": [...]}.
+
+        In "trials", one record a task with `task`, `episodes_per_hour`, `attempts`, `successes`, `workers`, `memory_mb`,
+        `memory_slope_mb` (growth of a process in a thousand attempts), `client_ms` (processor time an attempt of the process that
+        feeds the others, writes down what comes and fills shards), `episodes_per_core_hour` and the medians of what attempts
+        take. In "curve", one a task and number of workers, with `times`: how many times as fast as one worker of this run. In
+        "simulated", one a task and number of workers, see `simulated`, with `saturated_at`: the number of workers at which the
+        client would be busy all the time.
 
     Raises:
         InputError: No episodes, or the recipe or `out` is wrong.
@@ -57,36 +71,55 @@ def run(
     """
     if episodes < 1:
         raise InputError("out of range", field="episodes", expected="at least 1", got=episodes)
-    made, folder, records = load_recipe(recipe), Path(out), []
+    made, folder = load_recipe(recipe), Path(out)
+    counts = sorted({*(count for count in (1, 2) if curve and scheduler is None and count < jobs), jobs})
+    records: list[dict[str, Any]] = []
+    curves: list[dict[str, Any]] = []
+    many: list[dict[str, Any]] = []
     for task in TASKS:
-        own = load_recipe({**made.document, "tasks": [task]})
-        records.append(_task(task, own, folder / task, episodes, jobs, scheduler, progress))
+        own, rates = load_recipe({**made.document, "tasks": [task]}), dict[int, float]()
+        for count in counts:
+            where = folder / task if count == jobs else folder / f"{count}_workers" / task
+            began = time.perf_counter()
+            dataset = generate(own, episodes, where, jobs=count, scheduler=scheduler, progress=progress)
+            found = record(task, dataset, None if scheduler is not None else count, time.perf_counter() - began)
+            rates[count] = found["episodes_per_hour"]
+            if count == jobs:
+                records.append(found)
+                many += _many(task, measured(dataset))
+        if len(rates) > 1:
+            curves += [
+                {
+                    "task": task,
+                    "workers": count,
+                    "episodes_per_hour": rate,
+                    "times": round(rate / rates[1], 3) if rates[1] else 0.0,
+                }
+                for count, rate in rates.items()
+            ]
     about = meta(benchmark="throughput", recipe=made.digest, episodes=episodes, jobs=jobs, sessions=[])
-    about |= {"peak_memory_mb": max(record["memory_mb"] for record in records)}
-    result = {"meta": about, "trials": records}
+    about |= {"peak_memory_mb": max(record["memory_mb"] for record in records), "scheduled": jobs > 1 or scheduler is not None}
+    result = {"meta": about, "trials": records, "curve": curves, "simulated": many}
     write_atomically(folder / "results.csv", to_csv(records).encode())
     write_atomically(folder / "results.json", (json.dumps(result, indent=1, allow_nan=False) + "\n").encode())
+    workers_chart(result, folder / "workers.png")
     write_atomically(folder / "table.md", report(result).encode())
     return result
 
 
-def _task(
-    task: str, recipe: Recipe, folder: Path, episodes: int, jobs: int, scheduler: str | None, progress: bool
-) -> dict[str, Any]:
-    """Make episodes of one task; return its record."""
-    began = time.perf_counter()
-    dataset = generate(recipe, episodes, folder, jobs=jobs, scheduler=scheduler, progress=progress)
-    wall = time.perf_counter() - began
-    return record(task, dataset, jobs, wall)
+def _many(task: str, costs: Costs) -> list[dict[str, Any]]:
+    """Return what numbers of workers would come to with a task."""
+    full = round(costs.mean / costs.client, 1) if costs.client else None
+    return [{"task": task, **simulated(costs, count), "saturated_at": full} for count in WORKERS]
 
 
-def record(task: str, dataset: Dataset, jobs: int, wall: float) -> dict[str, Any]:
+def record(task: str, dataset: Dataset, jobs: int | None, wall: float) -> dict[str, Any]:
     """Return what the journal of a dataset says of how fast it was made.
 
     Args:
         task: Which.
         dataset: The dataset.
-        jobs: Processes of the last session.
+        jobs: Processes of the last session; None: as many as there were.
         wall: Time of the call [s], with what starting processes and writing takes.
     """
     kept = Kept.read(dataset.folder / "journal.jsonl")
@@ -101,7 +134,7 @@ def record(task: str, dataset: Dataset, jobs: int, wall: float) -> dict[str, Any
         "attempts": len(attempts),
         "successes": good,
         "success": good == len(attempts),
-        "workers": jobs,
+        "workers": len(kept.memories) if jobs is None else jobs,
         "memory_mb": round(kept.memory, 1),
         "memory_slope_mb": _slope(kept.memories.values()),
         "client_ms": round(
@@ -163,6 +196,8 @@ def report(result: Mapping[str, Any]) -> str:
         "attempts have filled its caches; the client feeds the processes and writes down what comes, and takes so much "
         "processor time an attempt. Medians of an attempt, of what sets it up (room, start, grasp) and of planning it.",
         markdown(head, [_row(one) for one in records]),
+        *_curve(result["curve"]),
+        *_simulation(result["simulated"], bool(about["scheduled"])),
     ]
     return "\n\n".join([*parts, foot(about)]) + "\n"
 
@@ -174,3 +209,61 @@ def _row(one: Record) -> list[str]:
     growth = "–" if one["memory_slope_mb"] is None else f"{one['memory_slope_mb']:.0f}"
     paid = (f"{one['memory_mb']:.0f}", growth, f"{one['client_ms']:.1f}")
     return [one["task"], *rates, share, str(one["workers"]), *paid, *map(decimal, times)]
+
+
+def _curve(curve: Sequence[Record]) -> list[str]:
+    """Return the table of what one and more workers made in one run, headed by a sentence; nothing for no curve."""
+    if not curve:
+        return []
+    rows = [[one["task"], str(one["workers"]), f"{one['episodes_per_hour']:.0f}", decimal(one["times"])] for one in curve]
+    text = "The same episodes by fewer workers, in this run too. One works in the client's own process, without Dask."
+    return [text, markdown(["task", "workers", "episodes an hour", "times one"], rows)]
+
+
+def _simulation(many: Sequence[Record], scheduled: bool) -> list[str]:
+    """Return the table of what many workers would come to, headed by what that is simulated from."""
+    head = ["task", "workers", "episodes an hour, simulated", "efficiency", "client busy", "in vain", "client saturated at"]
+    rows = [
+        [
+            *(one["task"], str(one["workers"]), f"{one['episodes_per_hour']:.0f}"),
+            *(f"{100.0 * one[name]:.0f} %" for name in ("efficiency", "client", "in_vain")),
+            "–" if one["saturated_at"] is None else f"{one['saturated_at']:.0f} workers",
+        ]
+        for one in many
+    ]
+    text = (
+        "Many workers, simulated from what these tasks took, a hundred tasks for each. Every result waits for the one client, "
+        f"which takes its processor time {'with' if scheduled else 'but not'} that of Dask's scheduler; efficiency is the share "
+        "of the workers' time that goes into the dataset, and work in vain is what was begun beyond its last number. Nothing is "
+        "said of network and disk."
+    )
+    return [text, markdown(head, rows), "![Efficiency of many workers, simulated](workers.png)"]
+
+
+def workers_chart(result: Mapping[str, Any], path: str | Path | None) -> Figure:
+    """Draw the efficiency of many workers, simulated, and of few, measured.
+
+    Args:
+        result: Of `run`.
+        path: The file to write, .png, .svg or .pdf; None writes nothing.
+
+    Returns:
+        The figure.
+    """
+    with styled():
+        figure = new_figure(6.4, 3.6)
+        axes = figure.subplots()
+        for task, colour in zip(TASKS, COLOURS, strict=False):
+            own = [one for one in result["simulated"] if one["task"] == task]
+            axes.plot([one["workers"] for one in own], [one["efficiency"] for one in own], "o-", color=colour, label=task)
+            seen = [one for one in result["curve"] if one["task"] == task]
+            shares = [one["times"] / one["workers"] for one in seen]
+            axes.plot([one["workers"] for one in seen], shares, "x", color=colour, markersize=9.0)
+        axes.set_xscale("log")
+        axes.set_xticks(WORKERS, [str(count) for count in WORKERS])
+        axes.minorticks_off()
+        axes.set_ylim(0.0, 1.1)
+        axes.set_xlabel("workers")
+        axes.set_ylabel("efficiency (crosses: measured)")
+        axes.legend()
+        return save_figure(figure, path)

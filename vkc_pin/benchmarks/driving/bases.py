@@ -53,6 +53,7 @@ def run(
     tasks: Sequence[str] | None = None,
     bases: Sequence[str] | None = None,
     jobs: int = 1,
+    scheduler: str | None = None,
     progress: bool = True,
 ) -> dict[str, Any]:
     """Run the experiment, or what is left of it, and write results.json, results.csv and table.md to `out`.
@@ -64,6 +65,7 @@ def run(
         tasks: Some of `TASKS`; None: all.
         bases: Some of `BASES`; None: all.
         jobs: Number of processes.
+        scheduler: Address of a Dask scheduler whose workers run the trials instead, see `engine.results`.
         progress: Whether to show a progress bar.
 
     Returns:
@@ -85,7 +87,7 @@ def run(
         for base in bases
         for number in range(trials)
     ]
-    return runner.run(specs, _record, out, settings=settings, report=report, jobs=jobs, progress=progress)
+    return runner.run(specs, _record, out, settings=settings, report=report, jobs=jobs, scheduler=scheduler, progress=progress)
 
 
 def report(result: Mapping[str, Any]) -> str:

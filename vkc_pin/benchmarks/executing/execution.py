@@ -58,6 +58,7 @@ def run(
     trials: int = 10,
     seed: int = 0,
     jobs: int = 1,
+    scheduler: str | None = None,
     tasks: Sequence[str] = tuple(TASKS),
     grasp: str = "weld",
     progress: bool = True,
@@ -69,6 +70,7 @@ def run(
         trials: Number of random starts per task, at least 1.
         seed: Of the starts and of planning.
         jobs: Number of processes.
+        scheduler: Address of a Dask scheduler whose workers run the trials instead, see `engine.results`.
         tasks: Some of `TASKS`.
         grasp: What holds, see `simulate`.
         progress: Whether to show a progress bar.
@@ -92,7 +94,7 @@ def run(
         for name in names
         for number in range(trials)
     ]
-    return runner.run(specs, _record, out, settings=settings, report=report, jobs=jobs, progress=progress)
+    return runner.run(specs, _record, out, settings=settings, report=report, jobs=jobs, scheduler=scheduler, progress=progress)
 
 
 def report(result: Mapping[str, Any]) -> str:

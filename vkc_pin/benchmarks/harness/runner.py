@@ -21,7 +21,7 @@ from vkc_pin.benchmarks.harness.tables import to_csv
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.files.resources import folder, package_folder
 from vkc_pin.files.writing import check_writable, write_atomically
-from vkc_pin.running.engine import Died, results
+from vkc_pin.running.engine import Died, needs_dask, results
 from vkc_pin.running.journal import Journal
 
 __all__ = ["Function", "chosen", "run"]
@@ -74,6 +74,8 @@ def run(
     """
     if jobs < 1:
         raise InputError("out of range", field="jobs", expected="at least 1", got=jobs)
+    if scheduler is not None:
+        needs_dask(scheduler)
     todo = {str(trial["key"]): dict(trial) for trial in trials}
     if len(todo) < len(trials):
         raise InputError("two trials have the same key", field="trials")

@@ -57,6 +57,7 @@ def run(
     trials: int = 20,
     seed: int = 0,
     jobs: int = 1,
+    scheduler: str | None = None,
     tasks: Sequence[str] = tuple(TASKS),
     methods: Sequence[str] = METHODS,
     time_limit: float = TIME_LIMIT,
@@ -69,6 +70,7 @@ def run(
         trials: Number of problems per task, at least 1.
         seed: Of the problems and of planning.
         jobs: Number of processes.
+        scheduler: Address of a Dask scheduler whose workers run the trials instead, see `engine.results`.
         tasks: Some of `TASKS`.
         methods: Some of `METHODS`.
         time_limit: By the clock, for a trial [s].
@@ -95,7 +97,7 @@ def run(
         for method in chosen
     ]
     function = functools.partial(_record, folder=str(Path(out) / "plans"))
-    return runner.run(specs, function, out, settings=settings, report=report, jobs=jobs, progress=progress)
+    return runner.run(specs, function, out, settings=settings, report=report, jobs=jobs, scheduler=scheduler, progress=progress)
 
 
 def report(result: Mapping[str, Any]) -> str:

@@ -42,6 +42,7 @@ def run(
     out: str | Path,
     seed: int = 0,
     jobs: int = 1,
+    scheduler: str | None = None,
     changes: Sequence[str] = (),
     problems: Sequence[int] | None = None,
     progress: bool = True,
@@ -52,6 +53,7 @@ def run(
         out: The folder; if it has trials of the same settings already, they are not run again.
         seed: Of planning.
         jobs: Number of processes. Several slow each other down.
+        scheduler: Address of a Dask scheduler whose workers run the trials instead, see `engine.results`.
         changes: Settings to change, one at a time; see `changes.parsed`.
         problems: Numbers of problems; None: all.
         progress: Whether to show a progress bar.
@@ -69,7 +71,7 @@ def run(
     settings = {"benchmark": "ablation", "seed": seed, "problems": numbers, "changes": [str(change) for change in chosen_changes]}
     settings |= LIMITS
     specs = specify(problems=numbers, changes=chosen_changes, seed=seed)
-    return runner.run(specs, _record, out, settings=settings, report=report, jobs=jobs, progress=progress)
+    return runner.run(specs, _record, out, settings=settings, report=report, jobs=jobs, scheduler=scheduler, progress=progress)
 
 
 def chosen(problems: Sequence[int] | None) -> list[int]:

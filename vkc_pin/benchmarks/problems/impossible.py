@@ -29,7 +29,9 @@ _HALL = 6.0  # [m] from the middle of the hall to its edges
 _Problem = tuple[Scene, tuple[Step, ...]]
 
 
-def run(*, out: str | Path, problems: int = 50, seed: int = 0, jobs: int = 1, progress: bool = True) -> dict[str, Any]:
+def run(
+    *, out: str | Path, problems: int = 50, seed: int = 0, jobs: int = 1, scheduler: str | None = None, progress: bool = True
+) -> dict[str, Any]:
     """Run the experiment, or what is left of it, and write results.json, results.csv and table.md to `out`.
 
     Args:
@@ -37,6 +39,7 @@ def run(*, out: str | Path, problems: int = 50, seed: int = 0, jobs: int = 1, pr
         problems: How many, at least 1; kinds take turns.
         seed: Of the problems and of planning.
         jobs: Number of processes.
+        scheduler: Address of a Dask scheduler whose workers run the trials instead, see `engine.results`.
         progress: Whether to show a progress bar.
 
     Returns:
@@ -51,7 +54,7 @@ def run(*, out: str | Path, problems: int = 50, seed: int = 0, jobs: int = 1, pr
         raise InputError("out of range", field="problems", expected="at least 1", got=problems)
     settings = {"benchmark": "impossible", "seed": seed, "problems": problems, **LIMITS}
     specs = [{"key": f"{number:05d}", "number": number, "seed": seed} for number in range(problems)]
-    return runner.run(specs, _record, out, settings=settings, report=report, jobs=jobs, progress=progress)
+    return runner.run(specs, _record, out, settings=settings, report=report, jobs=jobs, scheduler=scheduler, progress=progress)
 
 
 def report(result: Mapping[str, Any]) -> str:

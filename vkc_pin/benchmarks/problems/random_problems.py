@@ -31,7 +31,14 @@ OF = ("anything", "rooms")
 
 
 def run(
-    *, out: str | Path, problems: int = 100, seed: int = 0, of: str = "anything", jobs: int = 1, progress: bool = True
+    *,
+    out: str | Path,
+    problems: int = 100,
+    seed: int = 0,
+    of: str = "anything",
+    jobs: int = 1,
+    scheduler: str | None = None,
+    progress: bool = True,
 ) -> dict[str, Any]:
     """Run the experiment, or what is left of it, and write results.json, results.csv, table.md and plans/*.npz to `out`.
 
@@ -41,6 +48,7 @@ def run(
         seed: Of the problems and of planning.
         of: "anything" for steps at random, possible or not; "rooms" for `random_task`: something to open in a random room.
         jobs: Number of processes.
+        scheduler: Address of a Dask scheduler whose workers run the trials instead, see `engine.results`.
         progress: Whether to show a progress bar.
 
     Returns:
@@ -56,7 +64,7 @@ def run(
     settings = {"benchmark": "random" if of == OF[0] else of, "seed": seed, "problems": problems, **_LIMITS}
     specs = [{"key": f"{number:05d}", "number": number, "seed": seed, "of": of} for number in range(problems)]
     function = functools.partial(_record, folder=str(Path(out) / "plans"))
-    return runner.run(specs, function, out, settings=settings, report=report, jobs=jobs, progress=progress)
+    return runner.run(specs, function, out, settings=settings, report=report, jobs=jobs, scheduler=scheduler, progress=progress)
 
 
 def report(result: Mapping[str, Any]) -> str:

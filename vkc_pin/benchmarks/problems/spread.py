@@ -30,6 +30,7 @@ def run(
     out: str | Path,
     seed: int = 0,
     jobs: int = 1,
+    scheduler: str | None = None,
     seeds: int = 5,
     problems: Sequence[int] | None = None,
     progress: bool = True,
@@ -40,6 +41,7 @@ def run(
         out: The folder; if it has trials of the same settings already, they are not run again.
         seed: The first seed of planning; the others follow it.
         jobs: Number of processes.
+        scheduler: Address of a Dask scheduler whose workers run the trials instead, see `engine.results`.
         seeds: How many seeds, at least 2.
         problems: Numbers of problems; None: all.
         progress: Whether to show a progress bar.
@@ -60,7 +62,7 @@ def run(
         for number in numbers
         for own in range(seed, seed + seeds)
     ]
-    return runner.run(specs, _record, out, settings=settings, report=report, jobs=jobs, progress=progress)
+    return runner.run(specs, _record, out, settings=settings, report=report, jobs=jobs, scheduler=scheduler, progress=progress)
 
 
 def spread_of(records: Sequence[Record], field: str) -> float | None:

@@ -37,12 +37,14 @@ _KINDS = {"timestamp": "float32", "frame_index": "int64", "episode_index": "int6
 _STATE = ("base_pose", "arm_position", "gripper")
 
 
-def needed() -> Any:
-    """Return pyarrow.
+def needed(rate: float) -> Any:
+    """Return pyarrow, if frames can be written at a rate [Hz].
 
     Raises:
-        InputError: It is not installed.
+        InputError: It is not installed, or the rate is no whole number.
     """
+    if rate != int(rate):
+        raise InputError("LeRobot has whole numbers of frames a second", field="rate", expected="a whole number", got=rate)
     optional_package("pyarrow.parquet", "data", what="LeRobot's layout", field="lerobot")
     return optional_package("pyarrow", "data", what="LeRobot's layout", field="lerobot")
 
@@ -66,7 +68,7 @@ def write_lerobot(path: Path, episodes: Iterable[Episode], robot: Robot, rate: f
         robot: Theirs.
         rate: Frames a second, a whole number.
     """
-    arrow = needed()
+    arrow = needed(rate)
     with folder_at_once(path, force=True) as folder:
         writer = _Writer(arrow, folder, robot, rate)
         for episode in episodes:
@@ -79,8 +81,6 @@ class _Writer:
     """Writes frames as they come, and at the end all that is about them."""
 
     def __init__(self, arrow: Any, folder: Path, robot: Robot, rate: float) -> None:
-        if rate != int(rate):
-            raise InputError("LeRobot has whole numbers of frames a second", field="rate", expected="a whole number", got=rate)
         self.arrow, self.folder, self.robot, self.rate = arrow, folder, robot, int(rate)
         names = list(robot.coordinates.names)
         hand = ["hand_x", "hand_y", "hand_z", "hand_qx", "hand_qy", "hand_qz", "hand_qw", "holding"]

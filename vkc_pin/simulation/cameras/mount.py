@@ -11,7 +11,7 @@ from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.models.robot import Robot
 
-__all__ = ["BASE", "HAND", "Camera", "check_frame"]
+__all__ = ["BASE", "HAND", "Camera", "check_frame", "frame_of"]
 
 BASE, HAND = "base", "hand"
 """What every robot has: the frame that its base moves, and the one that grasps (z ahead, fingers close along x)."""
@@ -67,9 +67,14 @@ class Camera:
             UnknownNameError: The robot has none of this name.
         """
         check_frame(robot, self.frame)
-        if self.frame == BASE:
-            return str(robot.model.names[1])
-        return robot.tool_frame if self.frame == HAND else self.frame
+        return frame_of(robot, self.frame)
+
+
+def frame_of(robot: Robot, frame: str) -> str:
+    """Return the frame of a robot's model that is meant by `BASE`, `HAND`, or its own name."""
+    if frame == BASE:
+        return str(robot.model.names[1])
+    return robot.tool_frame if frame == HAND else frame
 
 
 def check_frame(robot: Robot, frame: str) -> None:

@@ -1,0 +1,69 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from helpers.datasets import SMALL
+
+from vkc_pin.benchmarks.datasets.simulated import Costs, measured, simulated
+from vkc_pin.datasets.dataset import Dataset
+from vkc_pin.datasets.recipe import load_recipe
+
+
+def test_alone_with_a_client_that_costs_nothing() -> None:
+    found = simulated(Costs(first=(3.0,), later=(2.0,), client=0.0, episodes=4.0), 1, 10)
+    assert found["efficiency"] == 1.0
+    assert found["in_vain"] == 0.0
+    assert found["episodes_per_hour"] == pytest.approx(3600.0 * 40.0 / (3.0 + 9 * 2.0), abs=0.1)
+
+
+def test_equal_tasks_leave_nothing_in_vain_but_the_last() -> None:
+    found = simulated(Costs((2.0,), (2.0,), 0.0, 1.0), 10, 100)
+    assert found["efficiency"] == 1.0
+    odd = simulated(Costs((2.0,), (2.0,), 0.0, 1.0), 10, 91)  # one works on the last one, nine on others
+    assert odd["efficiency"] == pytest.approx(0.91)
+    assert odd["in_vain"] == pytest.approx(0.09)
+
+
+def test_a_client_that_is_busy_limits_all() -> None:
+    costs = Costs((2.0,), (2.0,), client=0.1, episodes=1.0)
+    few, many = simulated(costs, 10), simulated(costs, 200)  # 20 workers keep it busy
+    assert few["efficiency"] > 0.95
+    assert few["client"] == pytest.approx(0.5, abs=0.03)
+    assert many["client"] > 0.99
+    assert many["episodes_per_hour"] == pytest.approx(3600.0 / 0.1, rel=0.03)
+    assert many["efficiency"] == pytest.approx(0.1, rel=0.1)
+
+
+def test_one_that_straggles_keeps_all_waiting() -> None:
+    costs = Costs((1.0,), tuple([1.0] * 99 + [200.0]), 0.0, 1.0)
+    even, straggling = simulated(Costs((1.0,), (1.0,), 0.0, 1.0), 100, 1000), simulated(costs, 100, 1000)
+    assert even["efficiency"] == 1.0
+    assert straggling["efficiency"] < 0.3
+    assert straggling["in_vain"] > 0.5  # the others go on with numbers that nobody needs
+
+
+def test_the_same_numbers_give_the_same_result() -> None:
+    costs = Costs((3.0, 4.0), (1.0, 2.0, 2.5), 0.01, 4.0)
+    assert simulated(costs, 50) == simulated(costs, 50)
+
+
+def test_what_a_journal_says(tmp_path: Path) -> None:
+    """Blocks of two; the first of each process is the first in the journal."""
+    (tmp_path / "recipe.yaml").write_text(json.dumps(SMALL))
+    lines: list[object] = [{"settings": {}}, {"session": {"jobs": 2}}]
+    for key, process, seconds, client in (
+        (0, "a", 5.0, 0.1),
+        (1, "a", 1.0, 0.2),
+        (2, "b", 4.0, 0.3),
+        (3, "b", 1.0, 0.4),
+        (4, "a", 2.0, 0.6),
+    ):
+        record = {"number": key, "success": key != 3, "cpu_time": seconds}
+        more = {"memory_mb": 1.0, "resident_mb": 1.0, "process": process, "seconds": seconds, "client_seconds": client}
+        lines.append({"key": str(key), "records": [record], **more})
+    (tmp_path / "journal.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    found = measured(Dataset(tmp_path, load_recipe(SMALL)))
+    assert found == Costs(first=(6.0, 5.0), later=(2.0,), client=0.6 / 3, episodes=4 / 3)
+    assert found.mean == 2.0

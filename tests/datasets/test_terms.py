@@ -1,0 +1,209 @@
+"""Own terms of recipes: what each kind says, against numbers; episodes that keep to them and say so; what is refused."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.datasets import SMALL
+
+import vkc_pin as vkc
+from vkc_pin.datasets.check import check_dataset
+from vkc_pin.datasets.dataset import Dataset
+from vkc_pin.datasets.generate import generate
+from vkc_pin.datasets.problems import terms_of
+from vkc_pin.datasets.recipe import load_recipe
+from vkc_pin.datasets.terms import KeepOutSchema, SpeedSchema, TracedSchema, UprightSchema
+from vkc_pin.errors import InputError, UnknownNameError
+
+h5py = pytest.importorskip("h5py")
+SLOW = {"type": "speed", "frame": "base", "most": 0.3}
+RECIPE: dict[str, Any] = {**SMALL, "terms": [SLOW]}
+
+
+def low(frame: str = "hand") -> vkc.Constraint:
+    return vkc.Constraint("low", lambda s: s.position(frame)[2], upper=2.5)
+
+
+def recipe(*terms: dict[str, Any]) -> Any:
+    return load_recipe({**SMALL, "terms": list(terms)})
+
+
+def inputs(now: pin.SE3, before: pin.SE3, dt: float) -> np.ndarray:
+    columns = [np.concatenate([one.rotation.T.ravel(), one.translation]) for one in (now, before)]
+    return np.concatenate([*columns, [dt]])[None]
+
+
+def test_what_each_kind_says() -> None:
+    rng = np.random.default_rng(3)
+    axis = np.array([1.0, 2.0, -0.5])
+    upright, speed, away = recipe(
+        {"type": "upright", "frame": "object", "axis": axis.tolist(), "angle": 0.3, "held": True},
+        {"type": "speed", "frame": "hand", "most": 0.4},
+        {"type": "keep-out", "frame": "base", "position": [1.0, -0.5, 0.2], "size": [2.0, 0.6, 1.0]},
+    ).terms
+    assert [term.name for term in (upright, speed, away)] == ["upright object", "speed hand", "keep-out base"]
+    assert [term.holding for term in (upright, speed, away)] == ["object", None, None]
+    for _ in range(50):
+        now, before, dt = pin.SE3.Random(), pin.SE3.Random(), float(rng.uniform(0.01, 0.5))
+        now.translation, before.translation = rng.uniform(-2.0, 2.0, (2, 3))
+        row = inputs(now, before, dt)
+        tilt = math.acos(float((now.rotation @ axis)[2] / np.linalg.norm(axis)))
+        assert (upright.formula.values(row)[0, 0] >= upright.lower) == (tilt <= 0.3)
+        expected = np.linalg.norm(now.translation - before.translation) / dt
+        assert speed.formula.values(row)[0, 0] == pytest.approx(expected, rel=1e-6)
+        inside = np.all(np.abs(now.translation - [1.0, -0.5, 0.2]) < [1.0, 0.3, 0.5])
+        assert (away.formula.values(row)[0, 0] < 0.0) == inside
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return generate(RECIPE, 3, tmp_path_factory.mktemp("made") / "out", terms=[low()])
+
+
+def test_episodes_keep_to_them_and_say_so(made: Dataset) -> None:
+    assert [entry.type for entry in made.recipe.fields.terms] == ["speed", "traced"]
+    for episode in made.episodes():
+        assert [term.name for term in episode.terms] == ["speed base", "low"]
+        assert [term.formula.frames for term in episode.terms] == [("base",), (episode.scene().robot.tool_frame,)]
+        assert episode.validate().ok
+        times = episode.trajectory.times
+        fine = np.linspace(times[0], times[-1], 2000)
+        speeds = np.linalg.norm(episode.trajectory.velocity(fine)[:, :2], axis=1)
+        assert speeds.max() < 0.3 + 1e-2
+    assert check_dataset(made.folder).ok
+
+
+def test_without_them_the_base_is_faster(tmp_path: Path) -> None:
+    """Or the test before could not fail."""
+    plain = generate(SMALL, 3, tmp_path / "out")
+    motions = [episode.trajectory for episode in plain.episodes()]
+    fine = [motion.velocity(np.linspace(motion.times[0], motion.times[-1], 2000))[:, :2] for motion in motions]
+    assert max(np.linalg.norm(velocities, axis=1).max() for velocities in fine) > 0.31
+
+
+@pytest.fixture
+def copy(made: Dataset, tmp_path: Path) -> Path:
+    shutil.copytree(made.folder, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+def said(folder: Path, change: Any) -> int:
+    """Change what an episode's file says of it; return its number."""
+    with h5py.File(Dataset.open(folder).shards[0], "r+") as file:
+        group = file["data/demo_1"]
+        words = json.loads(group.attrs["episode"])
+        change(words)
+        group.attrs["episode"] = json.dumps(words)
+        return int(group.attrs["number"])
+
+
+def test_a_motion_that_breaks_one_is_refused(copy: Path) -> None:
+    def stricter(words: Any) -> None:
+        words["terms"][0]["upper"] = 0.01
+
+    number = said(copy, stricter)
+    found = check_dataset(copy)
+    assert list(found.refused) == [number]
+    assert "speed base" in found.refused[number]
+
+
+def test_terms_that_are_not_the_recipe_s_are_noticed(copy: Path) -> None:
+    number = said(copy, lambda words: words.pop("terms"))
+    found = check_dataset(copy)
+    assert list(found.refused) == [number]
+    assert "terms are not those of the recipe" in found.refused[number]
+
+
+def test_they_are_part_of_what_determines_episodes(made: Dataset) -> None:
+    plain, slow = load_recipe(SMALL), load_recipe(RECIPE)
+    assert len({plain.digest, slow.digest, made.recipe.digest}) == 3
+    assert load_recipe(made.recipe.document).digest == made.recipe.digest
+    assert load_recipe(made.folder / "recipe.yaml").terms == made.recipe.terms
+    with pytest.raises(InputError, match="run otherwise"):
+        generate(RECIPE, 3, made.folder)
+    assert generate(RECIPE, 3, made.folder, terms=[low()]).numbers() == made.numbers()
+
+
+def test_tasks_have_those_of_their_own(made: Dataset) -> None:
+    own = load_recipe({**SMALL, "tasks": ["given-open", "drive-open"], "terms": [{**SLOW, "tasks": ["drive-open"]}]})
+    episode = next(made.episodes())
+    found = [terms_of(own, episode.scene(), {**episode.about, "task": task}) for task in ("given-open", "drive-open")]
+    assert [len(terms) for terms in found] == [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("entry", "field", "text"),
+    [
+        ("{type: uprigt}", "terms[0].type", "did you mean 'upright'"),
+        ("{type: speed, frame: hand}", "terms[0].most", "missing"),
+        ("{type: speed, most: -1}", "terms[0].most", "out of range"),
+        ("{type: speed, most: .nan}", "terms[0].most", "finite"),
+        ("{type: speed, most: 1, frme: hand}", "terms[0].frme", "did you mean 'frame'"),
+        ("{type: upright, axis: [0, 0, 0]}", "terms[0].axis", "no direction"),
+        ("{type: upright, angle: 4}", "terms[0].angle", "out of range"),
+        ("{type: keep-out, position: [0, 0], size: [1, 1, 1]}", "terms[0].position", "3 values"),
+        ("{type: keep-out, position: [0, 0, 0], size: [1, 1, 0]}", "terms[0].size[2]", "out of range"),
+        ("{type: speed, most: 1, tasks: [drive-opn]}", "terms[0].tasks[0]", "did you mean 'drive-open'"),
+        ("{type: traced, traced: {term: Constraint, name: x, expression: import os}}", "terms[0]", "not a saved term"),
+        ("{type: python, expression: os.getcwd()}", "terms[0].type", "traced"),
+    ],
+)
+def test_what_is_no_term(tmp_path: Path, entry: str, field: str, text: str) -> None:
+    file = tmp_path / "recipe.yaml"
+    file.write_text(f"name: small\nterms:\n  - {entry}\n", encoding="utf-8")
+    with pytest.raises(InputError) as caught:
+        load_recipe(file)
+    assert (caught.value.file, caught.value.line, caught.value.field) == (file, 3, field)
+    assert text in str(caught.value)
+
+
+def test_operations_that_do_not_exist_are_refused(made: Dataset) -> None:
+    entry = made.recipe.document["terms"][1]
+    code = entry["traced"]["expression"]["code"]
+    entry["traced"]["expression"]["code"] = [["system", *code[0][1:]], *code[1:]]
+    with pytest.raises(InputError, match="not a saved term"):
+        recipe(entry)
+
+
+def test_two_of_one_name() -> None:
+    with pytest.raises(InputError, match="two terms of one name") as caught:
+        recipe(SLOW, {**SLOW, "most": 0.2})
+    assert caught.value.field == "terms[1]"
+    assert len(recipe(SLOW, {**SLOW, "most": 0.2, "name": "slower"}).terms) == 2
+
+
+@pytest.mark.parametrize(
+    ("terms", "text"),
+    [
+        ([low("hnd")], "did you mean 'hand'"),
+        ([vkc.Constraint("x", lambda s: s.coordinate("elbow"), upper=1.0)], "coordinate of husky_ur5e"),
+        ([vkc.Constraint("x", lambda s: s.position("hand")[2], upper=1.0, during="reach")], "phases are not known yet"),
+        ([low(), low()], "two terms share a name"),
+        (["low"], "a list of Constraint and Cost"),
+        (3, "not a list"),
+    ],
+)
+def test_nothing_is_written_for_terms_that_cannot_hold(tmp_path: Path, terms: Any, text: str) -> None:
+    with pytest.raises(InputError) as caught:
+        generate(SMALL, 1, tmp_path / "out", terms=terms)
+    assert text in str(caught.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_frames_of_the_recipe_are_looked_for_first(tmp_path: Path) -> None:
+    with pytest.raises(UnknownNameError, match="frame of husky_ur5e"):
+        generate({**SMALL, "terms": [{**SLOW, "frame": "bse"}]}, 1, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_documentation_has_every_field() -> None:
+    page = (Path(__file__).parents[2] / "docs/datasets.md").read_text(encoding="utf-8")
+    for schema in (UprightSchema, SpeedSchema, KeepOutSchema, TracedSchema):
+        assert [name for name in schema.model_fields if f"`{name}`" not in page] == [], schema.__name__

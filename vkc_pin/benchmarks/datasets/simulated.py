@@ -1,0 +1,120 @@
+"""Many workers, simulated from what tasks took with few: what the one client costs, stragglers, and work in vain.
+
+A simulation of discrete events of how `running.engine` feeds processes. Every worker has a task in hand and one waiting. What it
+returns waits for the client, which takes results one after the other: it writes them down, fills shards, and sends the worker
+another task. A dataset is the first numbers that become episodes, so that it ends when the last of these is there; whatever
+was begun beyond them is in vain. What tasks take is drawn from what they took, the first of a worker from first ones.
+"""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from vkc_pin.datasets.dataset import Dataset
+from vkc_pin.running.journal import Kept
+
+__all__ = ["WORKERS", "Costs", "measured", "simulated"]
+
+WORKERS = (1, 2, 10, 100, 1000)
+_AHEAD = 2  # tasks in hand or waiting at a worker, as the engine has them
+_EACH = 100  # tasks of a worker, on average
+_SEED = 0
+
+
+@dataclass(frozen=True)
+class Costs:
+    """What tasks took; a task is the episodes of a room.
+
+    Attributes:
+        first: Processor times of the first task of each process [s].
+        later: Those of the others [s].
+        client: Processor time of the client for a task, with Dask's scheduler if there was one [s].
+        episodes: Episodes that a task gives, on average.
+    """
+
+    first: tuple[float, ...]
+    later: tuple[float, ...]
+    client: float
+    episodes: float
+
+    @property
+    def mean(self) -> float:
+        """What a task takes, on average [s]."""
+        return float(np.mean(self.later or self.first))
+
+
+def measured(dataset: Dataset) -> Costs:
+    """Return what a dataset's journal says of its tasks, of which there is one at least."""
+    kept = Kept.read(dataset.folder / "journal.jsonl")
+    fields = dataset.recipe.fields
+    size = fields.rooms.episodes * fields.variants
+    tasks: dict[tuple[int, str], list[float]] = {}
+    for key, (record,) in kept.lines.items():
+        tasks.setdefault((int(key) // size, kept.processes.get(key, "")), []).append(float(record.get("cpu_time", 0.0)))
+    first: list[float] = []
+    later: list[float] = []
+    known = set[str]()
+    for (_, process), times in tasks.items():
+        (later if process in known else first).append(sum(times))
+        known.add(process)
+    good = sum(bool(record["success"]) for (record,) in kept.lines.values())
+    client = sum(float(session.get("client_seconds", 0.0)) for session in kept.sessions)
+    return Costs(tuple(first), tuple(later), client / len(tasks), good / len(tasks))
+
+
+def simulated(costs: Costs, workers: int, tasks: int | None = None) -> dict[str, Any]:
+    """Return what so many workers come to.
+
+    Args:
+        costs: Of tasks.
+        workers: How many.
+        tasks: How many make the dataset; None: a hundred for each worker.
+
+    Returns:
+        `workers`, `tasks`; `episodes_per_hour`; `efficiency`: the share of the workers' time, from the first task's sending to
+        the end, in which they work on what becomes part of the dataset; `client`: the share of the time in which the client is
+        busy; `in_vain`: the share of the workers' time in which they work on what is not needed.
+    """
+    wanted = _EACH * workers if tasks is None else tasks
+    rng = np.random.default_rng(_SEED)
+    later = costs.later or costs.first
+    half = costs.client / 2.0  # to send a task; the other half to take its result
+    free = 0.0  # when the client has done what it has to do so far
+    ready = [0.0] * workers  # when a worker has done what it has been sent so far
+    ended: list[tuple[float, int, int]] = []  # results on their way to the client: when, which task, which worker's
+    spans: list[tuple[float, float]] = []  # of each task
+
+    def send(worker: int) -> None:
+        """Send the next task to a worker."""
+        nonlocal free
+        free += half
+        task, begins = len(spans), max(ready[worker], free)
+        drawn = costs.first if task < workers else later
+        ready[worker] = begins + drawn[int(rng.integers(len(drawn)))]
+        spans.append((begins, ready[worker]))
+        heapq.heappush(ended, (ready[worker], task, worker))
+
+    for _ in range(_AHEAD):
+        for worker in range(workers):
+            send(worker)
+    left, results = wanted, 0
+    while True:
+        moment, task, worker = heapq.heappop(ended)
+        free, results, left = max(free, moment) + half, results + 1, left - (task < wanted)
+        if not left:
+            break
+        send(worker)
+    all_time = workers * free
+    needed, others = (sum(max(0.0, min(end, free) - begin) for begin, end in part) for part in (spans[:wanted], spans[wanted:]))
+    return {
+        "workers": workers,
+        "tasks": wanted,
+        "episodes_per_hour": round(3600.0 * wanted * costs.episodes / free, 1),
+        "efficiency": round(needed / all_time, 4),
+        "client": round(half * (len(spans) + results) / free, 4),
+        "in_vain": round(others / all_time, 4),
+    }

@@ -1,0 +1,190 @@
+"""Own constraints of recipes: what every motion of a dataset keeps to, for robots and objects that are drawn later."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from vkc_pin.arguments import known
+from vkc_pin.files.documents import Document
+from vkc_pin.files.fields import Positive, Schema, Vector3, count, require
+from vkc_pin.models.robot import Robot
+from vkc_pin.scene.scene import Scene
+from vkc_pin.simulation.cameras.mount import BASE, HAND, frame_of
+from vkc_pin.task.terms import Constraint, State, Term, as_data, renamed, term_from_dict, term_to_dict
+
+__all__ = [
+    "OBJECT",
+    "KeepOutSchema",
+    "SpeedSchema",
+    "TermSchema",
+    "TracedSchema",
+    "UprightSchema",
+    "as_entries",
+    "check_entries",
+    "check_robot",
+    "meant",
+]
+
+OBJECT = "object"
+"""The link that an episode takes hold of, as a frame, and the object that it belongs to, in `holding`."""
+
+Axis = Annotated[Vector3, require(lambda value: math.hypot(*value) > 0.0, "no direction", "an axis of some length")]
+Size = Annotated[tuple[Positive, Positive, Positive], count(3)]
+
+
+class _Entry(Schema):
+    """What all have: a name for reports, the tasks in which it holds (none: all), and whether only while the hand holds."""
+
+    name: str | None = None
+    tasks: tuple[str, ...] = ()
+
+    def term(self) -> Term:
+        """Return it as a term about `BASE`, `HAND`, `OBJECT`, or frames by name."""
+        raise NotImplementedError
+
+
+class _Framed(_Entry):
+    type: str
+    frame: str = HAND
+    held: bool = False
+
+    @property
+    def called(self) -> str:
+        """What reports call it."""
+        return self.name or f"{self.type} {self.frame}"
+
+    @property
+    def holding(self) -> str | None:
+        """The object that must be held for it."""
+        return OBJECT if self.held else None
+
+
+class UprightSchema(_Framed):
+    """An axis of a frame is never further from the vertical than an angle [rad]."""
+
+    type: Literal["upright"]
+    axis: Axis = (0.0, 0.0, 1.0)
+    angle: Annotated[Positive, Field(lt=math.pi)] = 0.2
+
+    def term(self) -> Term:
+        """Return it as a term: the vertical's share of the axis."""
+        unit = [value / math.hypot(*self.axis) for value in self.axis]
+
+        def rises(s: State) -> Any:
+            return sum(value * s.rotation(self.frame)[2, k] for k, value in enumerate(unit))
+
+        return Constraint(self.called, rises, lower=math.cos(self.angle), holding=self.holding)
+
+
+class SpeedSchema(_Framed):
+    """The origin of a frame never moves faster than this [m/s]."""
+
+    type: Literal["speed"]
+    most: Positive
+
+    def term(self) -> Term:
+        """Return it as a term: the speed."""
+
+        def speed(s: State) -> Any:
+            moved = s.velocity(self.frame)
+            return (moved.T @ moved) ** 0.5
+
+        return Constraint(self.called, speed, upper=self.most, holding=self.holding)
+
+
+class KeepOutSchema(_Framed):
+    """The origin of a frame is never in a box of the world, which is no obstacle otherwise."""
+
+    type: Literal["keep-out"]
+    position: Vector3
+    size: Size
+
+    def term(self) -> Term:
+        """Return it as a term: how far the origin is outside of the box along the axis in which that is most [m]."""
+
+        def outside(s: State) -> Any:
+            away = s.position(self.frame)
+            x, y, z = ((away[k] - self.position[k]).fabs() - self.size[k] / 2.0 for k in range(3))
+            return x.fmax(y).fmax(z)
+
+        return Constraint(self.called, outside, lower=0.0, holding=self.holding)
+
+
+class TracedSchema(_Entry):
+    """A constraint or cost that was a function of Python: operations, of which none runs anything but arithmetic."""
+
+    type: Literal["traced"]
+    traced: dict[str, Any]
+
+    def term(self) -> Term:
+        """Return the term."""
+        return term_from_dict(self.traced)
+
+
+TermSchema = Annotated[UprightSchema | SpeedSchema | KeepOutSchema | TracedSchema, Field(discriminator="type")]
+Entry = UprightSchema | SpeedSchema | KeepOutSchema | TracedSchema
+
+
+def as_entries(terms: Sequence[Term]) -> list[dict[str, Any]]:
+    """Return terms as entries of a recipe: plain data.
+
+    Raises:
+        InputError: They are no terms, or name phases, which are called after what is drawn.
+    """
+    for term in (found := as_data(terms)):
+        if term.during is not None:
+            expected = f"holding={OBJECT!r}, or nothing: phases are called after objects that are drawn"
+            raise term.error("phases are not known yet", "during", expected, list(term.during))
+    return [{"type": "traced", "traced": term_to_dict(term)} for term in found]
+
+
+def check_entries(document: Document, entries: Sequence[Entry], tasks: Sequence[str]) -> None:
+    """Refuse entries of a recipe for tasks that do not exist, two of one name, and what is no term.
+
+    Raises:
+        UnknownNameError: There is no such task.
+        InputError: Something else is wrong; the error names file, line and field.
+    """
+    names: list[str] = []
+    for k, entry in enumerate(entries):
+        for j, task in enumerate(entry.tasks):
+            if task not in tasks:
+                raise document.unknown(("terms", k, "tasks", j), "task", task, tasks)
+        with document.at(("terms", k)):
+            (term,) = as_data([entry.term()])
+        if term.name in names:
+            raise document.error(("terms", k), "two terms of one name", expected="another `name`", got=term.name)
+        names.append(term.name)
+
+
+def check_robot(robot: Robot, terms: Sequence[Term]) -> None:
+    """Refuse terms about frames or coordinates that a robot lacks; those of objects ("cup.cup") are known when these are drawn.
+
+    Raises:
+        UnknownNameError: It lacks one.
+    """
+    frames = sorted({BASE, HAND, OBJECT, *(str(frame.name) for frame in robot.model.frames)} - {"universe"})
+    for term in terms:
+        where = f"terms[{term.name!r}]"
+        for frame in (name for name in term.formula.frames if "." not in name):
+            known(frame, frames, f"frame of {robot.name}", where)
+        for coordinate in (name for name in term.formula.coordinates if "." not in name):
+            known(coordinate, robot.coordinates.names, f"coordinate of {robot.name}", where)
+
+
+def meant(terms: Sequence[Term], scene: Scene, name: str, attachment: str) -> tuple[Term, ...]:
+    """Return terms about what is there.
+
+    Args:
+        terms: About `BASE`, `HAND`, `OBJECT`.
+        scene: Whose robot and objects they are about then.
+        name: The object that the episode is about.
+        attachment: Where the hand takes hold of it.
+    """
+    link = scene.objects[name].object.attachments[attachment].link
+    frames = {word: frame_of(scene.robot, word) for word in (BASE, HAND)} | {OBJECT: f"{name}.{link}"}
+    return tuple(renamed(term, frames, {OBJECT: name}) for term in terms)

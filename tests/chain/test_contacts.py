@@ -22,7 +22,8 @@ from helpers.small_problems import (
     with_objects,
 )
 
-from vkc_pin.budget import Budget
+from vkc_pin.budget import Budget, SpentError
+from vkc_pin.chain.collision_pairs import phase_geometries
 from vkc_pin.chain.contacts import Contacts
 from vkc_pin.errors import InputError
 from vkc_pin.models.shapes import link_name
@@ -511,3 +512,18 @@ def test_every_configuration_that_is_looked_at_is_spent() -> None:
         with budget.running():
             look()
         assert budget.used == 7
+
+
+def test_what_comes_after_what_is_blocked_is_not_spent() -> None:
+    problem = door_problem()
+    z = np.tile(problem.start, (5, 1))
+    z[2:, :2] = door_scene().objects["door"].placement.translation[:2]  # amid the door
+    with Budget().running() as budget:
+        assert problem.contacts.first_blocked(z, 1, reach=0.1, allowed=0.01) == 2
+    assert budget.used == 3
+
+
+def test_pairing_ends_with_the_budget() -> None:
+    problem = door_problem()
+    with Budget(seconds=0.0).running(), pytest.raises(SpentError):
+        phase_geometries(door_scene(), problem.chain, problem.task, SHORT)

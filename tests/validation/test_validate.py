@@ -62,6 +62,11 @@ def test_a_plain_drive_is_accepted(empty: Scene, drive: Trajectory) -> None:
     assert validate(empty, [vkc.GoTo(2.0, 0.0)], drive, Options()).ok
 
 
+def test_what_was_asked_for_is_asked_about(empty: Scene, drive: Trajectory) -> None:
+    found = only(validate(empty, [vkc.GoTo(3.0, 0.0)], drive))
+    assert (found.constraint, found.subject) == ("goal", "base")
+
+
 def test_the_same_heading_a_turn_further_is_as_good(empty: Scene, drive: Trajectory) -> None:
     assert validate(empty, [vkc.GoTo(2.0, 0.0, np.pi / 2 - 4 * np.pi)], drive).ok
 

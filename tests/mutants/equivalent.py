@@ -34,4 +34,6 @@ EQUIVALENT: dict[str, str] = {
     "solver/between.py: SPACING = 0.02  # [m] or [rad] between the states looked at first, in the coordinate that moves most | constant: 0.02 → 0.04": "a setting of the search or of Ipopt: another one leads to motions that are as good, later or sooner",
     "validation/distances.py: POINT = 1e-4  # [m], radius of a point | constant: 1e-4 → 0.0002": "a point has a size only because coal asks for one; any that is small does",
     "validation/validate.py: begin = np.where(crossed, before / np.where(crossed, before + after, 1.0), 0.0) | constant: 1.0 → 2.0": "the divisor where nothing is crossed, of a quotient that is not taken there",
+    "chain/collision_pairs.py: if not lower <= value <= upper: | comparison: <= → < (the same, 2)": "both differ only where two numbers are the same to the last bit, or a distance is exactly zero, which is neither right nor wrong",
+    "chain/collision_pairs.py: table[rows[one], 2] = np.minimum(table[rows[one], 2], one.margin) | swapped: table[rows[one], 2], one.margin → one.margin, table[rows[one], 2]": "min(a, b) is min(b, a)",
 }

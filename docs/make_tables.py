@@ -20,7 +20,7 @@ import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from statistics import median
+from statistics import mean, median
 from typing import Any
 
 from vkc_pin.benchmarks.harness.record import distribution
@@ -225,6 +225,7 @@ FIGURES: dict[str, Callable[[Sequence[Mapping[str, Any]], str], float | str]] = 
     "trials": lambda trials, field: f"{len(trials)}",
     "count": lambda trials, field: f"{sum(bool(trial.get(field)) for trial in trials)}",
     "median": lambda trials, field: distribution(trials, field)[0],
+    "mean": lambda trials, field: mean(float(trial[field]) for trial in trials),
     "late": lambda trials, field: distribution(trials, field)[1],
     "most": lambda trials, field: max(float(trial[field]) for trial in trials),
     "least": lambda trials, field: min(float(trial[field]) for trial in trials),

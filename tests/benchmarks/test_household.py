@@ -21,7 +21,7 @@ from vkc_pin.benchmarks import comparison, household
 from vkc_pin.benchmarks.comparison import placed
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.limits import LIMITS
-from vkc_pin.benchmarks.household import COMPARED_PLANNERS, COMPARISON, TABLE_TOP, TASKS, on_the_coffee_table
+from vkc_pin.benchmarks.household import COMPARED_PLANNERS, COMPARISON, PAPER, TABLE_TOP, TASKS, on_the_coffee_table, papers_home
 from vkc_pin.cli import main
 from vkc_pin.models.shapes import clearance, placed_shapes
 from vkc_pin.scene.placed import standing_geometry
@@ -104,6 +104,66 @@ def test_every_method_is_asked_for_the_same(monkeypatch: pytest.MonkeyPatch) -> 
     common = {**LIMITS, "seed": 8}
     hows = ({**common, "method": "B1", "finer": 2}, {**common, "method": "B2", "finer": 2}, common)
     assert asked == [("scene", task.steps, how) for task in TASKS.values() for how in hows]
+
+
+def test_the_variant_has_the_numbers_of_the_papers_code() -> None:
+    """A cup at (-0.6, -1.6, 1.11) that stands on something, a rack out by 0.8 by a hand at its side; all else is the same."""
+    ours, theirs = vkc.load_scene("household"), papers_home()
+    differing = {name: task.steps for name, task in PAPER.tasks.items() if task != TASKS[name]}
+    assert differing == {
+        "cup": (vkc.Place("cup", (-0.6, -1.6, 1.11)),),
+        "dishwasher": (vkc.Actuate("dishwasher", {"rack": 0.8}, attachment="other_side"),),
+    }
+    upper = {name: dict(zip(o.object.coordinates.names, o.object.upper, strict=True)) for name, o in theirs.objects.items()}
+    was = {name: dict(zip(o.object.coordinates.names, o.object.upper, strict=True)) for name, o in ours.objects.items()}
+    assert upper == {**was, "dishwasher": {**was["dishwasher"], "rack": 0.8}}
+    there = theirs.with_placement("cup", pin.SE3(np.eye(3), np.array([-0.6, -1.6, 1.11])))
+    cup = placed_shapes(standing_geometry(there.objects["cup"]))
+    assert clearance(cup, placed_shapes(there.obstacles)) == pytest.approx(1e-3, abs=1e-6)
+    labels = [[label for label in scene.obstacle_labels if "dining_table" not in label] for scene in (ours, theirs)]
+    assert labels[0] == labels[1]
+    assert vkc.Scene.from_document(theirs.document, theirs.folder).document == theirs.document
+
+
+def test_the_variant_begins_where_the_experiment_does() -> None:
+    plain, paper = (
+        which.specify(trials=2, seed=3, tasks=list(TASKS), methods=["VKC"], effort=7) for which in (COMPARISON, PAPER)
+    )
+    assert plain == paper
+
+
+def test_the_variant_is_run_and_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its own two tasks unless told otherwise, in its own scene."""
+    seen: list[Any] = []
+
+    def look(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
+        seen.append((spec["scene"], float(scene.objects["dishwasher"].object.upper[1])))
+        return solve(scene, spec)
+
+    monkeypatch.setattr(comparison, "motions_chart", lambda plans, path, title: path.write_bytes(title.encode()))
+    how: dict[str, Any] = {"trials": 1, "seed": 3, "methods": ["VKC"], "progress": False, "solve": look}
+    result = household.run(variant="paper", out=tmp_path / "paper", **how)
+    assert seen
+    assert {(task, rack) for task, rack in seen} == {("cup", 0.8), ("dishwasher", 0.8)}
+    assert result["meta"]["goals"] == {
+        "cup": {"cup": [-0.6, -1.6, 1.11]},
+        "dishwasher": {"dishwasher.rack": 0.8},
+    }
+    title = "# Two tasks in a home, with the numbers of the paper's code\n"
+    assert household.report(result).startswith(title)
+    assert (tmp_path / "paper" / "table.md").read_text(encoding="utf-8").startswith(title)
+    usual = household.run(out=tmp_path / "usual", tasks=["cup"], **how)
+    assert household.report(usual).startswith("# Six tasks in a home\n")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["cup", "dishwasher"])
+def test_the_variant_is_really_planned(name: str) -> None:
+    (spec,) = PAPER.specify(trials=1, seed=7, tasks=[name], methods=["VKC"])
+    scene = placed(papers_home(), spec).with_start(base=spec["base"])
+    plan = PAPER.plan_trial(scene, spec)
+    assert plan.success, plan.report()
+    assert vkc.validate(scene, PAPER.tasks[name].steps, plan.trajectory, plan.options).ok
 
 
 @pytest.mark.long
@@ -282,7 +342,14 @@ def test_twenty_trials_unless_told_otherwise() -> None:
     assert make_parser().parse_args(["bench", "baselines", "--out", "x"]).trials == 50
 
 
-@pytest.mark.parametrize(("more", "words"), [(["--tasks", "fridge"], "there is no task 'fridge'"), (["--methods", "B3"], "'B3'")])
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (["--tasks", "fridge"], "there is no task 'fridge'"),
+        (["--methods", "B3"], "'B3'"),
+        (["--variant", "papers"], "there is no variant 'papers'"),
+    ],
+)
 def test_misuse(more: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "household", "--out", str(tmp_path / "out"), *more]) == 2
     assert words in capsys.readouterr().err

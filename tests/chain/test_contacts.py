@@ -22,7 +22,8 @@ from helpers.small_problems import (
     with_objects,
 )
 
-from vkc_pin.budget import Budget
+from vkc_pin.budget import Budget, SpentError
+from vkc_pin.chain.collision_pairs import phase_geometries
 from vkc_pin.chain.contacts import Contacts
 from vkc_pin.errors import InputError
 from vkc_pin.models.shapes import link_name
@@ -30,8 +31,9 @@ from vkc_pin.options import Options
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.scene.contact import EASED_TIME
 from vkc_pin.scene.hold import Hold
+from vkc_pin.scene.neighbours import allowances
 from vkc_pin.scene.obstacles import FLOOR
-from vkc_pin.scene.scene import Scene
+from vkc_pin.scene.scene import Scene, load_scene
 from vkc_pin.task.steps import Actuate, GoTo, Grasp, Reach, Step
 
 CURVED = {"Cylinder", "Cone", "Capsule", "Sphere", "Ellipsoid"}
@@ -511,3 +513,68 @@ def test_every_configuration_that_is_looked_at_is_spent() -> None:
         with budget.running():
             look()
         assert budget.used == 7
+
+
+def test_what_comes_after_what_is_blocked_is_not_spent() -> None:
+    problem = door_problem()
+    z = np.tile(problem.start, (5, 1))
+    z[2:, :2] = door_scene().objects["door"].placement.translation[:2]  # amid the door
+    with Budget().running() as budget:
+        assert problem.contacts.first_blocked(z, 1, reach=0.1, allowed=0.01) == 2
+    assert budget.used == 3
+
+
+def test_pairing_ends_with_the_budget() -> None:
+    problem = door_problem()
+    with Budget(seconds=0.0).running(), pytest.raises(SpentError):
+        phase_geometries(door_scene(), problem.chain, problem.task, SHORT)
+
+
+def side_by_side(*, out: float = 0.0) -> Scene:
+    """Return a room with two drawers, whose fronts are 15 mm apart; the second stands open by so much [m]."""
+    scene = load_scene("drawer")
+    pair = [
+        {"type": "drawer", "name": name, "position": [1.93, y, 0.0], "state": {"slide": slide}}
+        for name, y, slide in (("near", 0.0, 0.0), ("next", 0.605, out))
+    ]
+    return Scene.from_document({**scene.document, "objects": pair, "obstacles": []}, scene.folder)
+
+
+def test_neighbours_may_be_close_as_long_as_both_are_where_they_are() -> None:
+    """Half as close as they stand; not where one that stands still has left the other's side."""
+    shut = program_of(side_by_side(), [Actuate("near", {"slide": 0.3})], options=SHORT)
+    (allowance,) = allowances(side_by_side(), SHORT.dist_safe)
+    part = shut.contacts.phases[shut.contacts.phase_of(waypoint_in(shut, "move"))]
+    (near,) = part.neighbours
+    labels = {frozenset((part.labels[i], part.labels[j])) for i, j in part.pairs[near.pairs]}
+    assert labels == {frozenset(("near.tray", "next.tray"))}
+    assert near.margin == pytest.approx(0.5 * allowance.distance)
+    assert near.columns.tolist() == [shut.chain.index("near.slide")]
+    assert (near.lower[0], near.upper[0]) == pytest.approx(allowance.ranges["near.slide"])
+    opened = side_by_side().with_state("near", {"slide": 0.3})
+    shutting = program_of(opened, [Actuate("near", {"slide": 0.0})], options=SHORT)  # it comes back to where it is one
+    assert shutting.contacts.phases[shutting.contacts.phase_of(waypoint_in(shutting, "move"))].neighbours
+    end = allowance.ranges["next.slide"][1]
+    for out, beside in ((end - 1e-4, True), (end + 1e-4, False)):
+        problem = program_of(side_by_side(out=out), [Actuate("near", {"slide": 0.3})], options=SHORT)
+        part = problem.contacts.phases[problem.contacts.phase_of(waypoint_in(problem, "move"))]
+        assert bool(part.neighbours) == beside
+
+
+def test_what_a_scene_allows_is_no_pair_or_keeps_what_it_says() -> None:
+    document = side_by_side().document
+    for said, margin in (({"margin": 0.007}, 0.007), ({}, None)):
+        allowed = Scene.from_document(
+            {**document, "allow": [{"pair": ["near.tray", "next.tray"], **said}]}, side_by_side().folder
+        )
+        problem = program_of(allowed, [Actuate("near", {"slide": 0.3})], options=SHORT)
+        number = problem.contacts.phase_of(waypoint_in(problem, "move"))
+        own = {pair: keep for pair, keep in pairs(problem, number).items() if set(pair) == {"near.tray", "next.tray"}}
+        if margin is None:
+            assert not own
+        else:
+            assert {keep for every in own.values() for keep in every} == {margin}
+        others = {
+            keep for pair, every in pairs(problem, number).items() if set(pair) != {"near.tray", "next.tray"} for keep in every
+        }
+        assert min(others) >= min(MARGIN, CLOSE)

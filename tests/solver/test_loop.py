@@ -364,7 +364,7 @@ def test_standing_still_where_one_is_already() -> None:
 
 
 def test_the_merit_falls_from_one_accepted_step_to_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
-    """While weights and times stay: f and what all that is missing costs."""
+    """While weights and times stay: f and what all that is missing costs. No round promises more than staying would cost."""
     problem = round_a_pillar()
     merits: list[tuple[float, float, bool]] = []
     judge = solver._Loop.judge
@@ -373,6 +373,8 @@ def test_the_merit_falls_from_one_accepted_step_to_the_next(monkeypatch: pytest.
         before, after = (loop.merit.price(found, clearance=True).sum() for found in (loop.found, trial.found))
         accepted = judge(loop, trial, *prices)
         merits.append((loop.objective + before, trial.objective + after, accepted))
+        assert trial.promise.min() > -1e-6
+        assert trial.objective + trial.promise.sum() <= (loop.objective + before) * (1.0 + 1e-4)
         return accepted
 
     monkeypatch.setattr(solver._Loop, "judge", watch)

@@ -8,6 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.drives import hall, moved, through
+from helpers.executions import holding, still
 from helpers.judging import names, only, until_the_grasp, with_object
 
 import vkc_pin as vkc
@@ -163,3 +164,9 @@ def test_no_steps(door_plan: vkc.Plan) -> None:
     for steps in ([], ["open the door"]):
         with pytest.raises(InputError, match="steps"):
             validate(door_plan.scene, steps, door_plan.trajectory, door_plan.options)
+
+
+def test_what_is_to_be_let_go_of_is_held_still() -> None:
+    """However many steps ask for it, each thing counts once."""
+    found = only(validate(holding(), [vkc.Release()], still(holding())))
+    assert (found.constraint, found.subject, found.amount, found.unit) == ("goal", "stick", 1.0, "holds")

@@ -29,6 +29,9 @@ def test_a_differential_base_does_not_slip() -> None:
     found = only(validate(scene, [vkc.GoTo(2.0, 0.1, 0.0)], sideways))
     assert (found.constraint, found.subject, found.unit) == ("slip", "base", "m")
     assert found.amount == pytest.approx(np.diff(sideways.positions[:, 1]).max())
+    for step, right in ((0.9e-4, True), (1.5e-4, False)):  # 0.1 mm aside in a step is all right
+        aside = through(scene, scene.start, moved(scene.start, x=2.0, y=0.1 * step / found.amount))
+        assert ("slip" not in {v.constraint for v in validate(scene, [vkc.GoTo(2.0, 0.0)], aside).violations}) == right
     assert validate(hall(), [vkc.GoTo(2.0, 0.1, 0.0)], sideways).ok
 
 

@@ -62,6 +62,11 @@ def test_a_plain_drive_is_accepted(empty: Scene, drive: Trajectory) -> None:
     assert validate(empty, [vkc.GoTo(2.0, 0.0)], drive, Options()).ok
 
 
+def test_what_was_asked_for_is_asked_about(empty: Scene, drive: Trajectory) -> None:
+    found = only(validate(empty, [vkc.GoTo(3.0, 0.0)], drive))
+    assert (found.constraint, found.subject) == ("goal", "base")
+
+
 def test_the_same_heading_a_turn_further_is_as_good(empty: Scene, drive: Trajectory) -> None:
     assert validate(empty, [vkc.GoTo(2.0, 0.0, np.pi / 2 - 4 * np.pi)], drive).ok
 
@@ -283,6 +288,7 @@ def by_itself(scene: Scene, hinge: np.ndarray, knob: np.ndarray) -> Trajectory:
         ([0.3, -0.3, -0.3], [0.0, 0.0, 0.0], 0.5),  # through the frame to the other side
         ([0.1, 0.3, 0.3], [0.0, 0.0, 0.0], 0.0),  # ajar: the bolt is out of the lock
         ([0.04, 0.3, 0.3], [0.2, 0.2, 0.2], 0.3),  # ajar, but within the latch's reach
+        ([0.0, 0.04, 0.3], [0.7, 0.5, 0.7], 0.0),  # released as long as it is within reach, though on its way back
     ],
 )
 def test_latch(door_plan: vkc.Plan, hinge: list[float], knob: list[float], short: float) -> None:

@@ -50,6 +50,9 @@ def add_bench(commands: Any) -> None:
         others = "B1x1 B2x1 (as many waypoints as VKC, not twice as many) B1x3 B2x3"
         _add_choice(comparison, "methods", f"B1 B2 VKC (default: these) {others}")
         comparison.add_argument("--effort", type=positive, metavar="E", help="units of effort a trial may take (default 1000000)")
+        if name == "household":
+            words = "paper: the cup's and the dishwasher's tasks with the numbers of the paper's code"
+            comparison.add_argument("--variant", metavar="VARIANT", help=words)
         comparison.add_argument("--save-failures", action="store_true", help="save the plans of failures, to be viewed")
 
     about = "Plan chores of many steps, each in one call, from random starts."

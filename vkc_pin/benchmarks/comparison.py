@@ -60,6 +60,11 @@ class Assignment:
     scatter: Callable[[Scene, np.random.Generator], dict[str, list[float]]] | None = None
 
 
+@functools.cache
+def _scene(name: str) -> Scene:
+    return load_scene(name)  # once per process
+
+
 @dataclass(frozen=True)
 class Comparison:
     """An experiment that compares `COMPARED_PLANNERS`.
@@ -69,12 +74,14 @@ class Comparison:
         title: Of its tables.
         tasks: Name → task.
         draw: What draws its charts.
+        load: Returns a scene by its name.
     """
 
     benchmark: str
     title: str
     tasks: Mapping[str, Assignment]
     draw: Draw
+    load: Callable[[str], Scene] = _scene
 
     def plan_trial(self, scene: Scene, spec: Mapping[str, Any]) -> Plan:
         """Plan the task of one trial: `scene` (the task's name), `method`, `seed`, `effort` and `planner` say how."""
@@ -96,7 +103,7 @@ class Comparison:
         specs = []
         for name in tasks:
             task = self.tasks[name]
-            rng, scene = np.random.default_rng([seed, list(self.tasks).index(name)]), load_scene(task.scene)
+            rng, scene = np.random.default_rng([seed, list(self.tasks).index(name)]), self.load(task.scene)
             starts: list[dict[str, Any]] = []
             for _ in range(trials):
                 more = {"placed": task.scatter(scene, rng)} if task.scatter else {}
@@ -158,7 +165,7 @@ class Comparison:
         settings["scenes"] = {name: self.tasks[name].scene for name in tasks}
         settings["goals"] = {name: goals(self.tasks[name].steps) for name in tasks}
         settings |= {**LIMITS, "effort": effort, "retries": RETRIES}
-        trials_of = _Trials(self.tasks, out, solve or self.plan_trial, timed=solve is None)
+        trials_of = _Trials(self, out, solve or self.plan_trial, timed=solve is None)
         function = functools.partial(trials_of.record, save_failures=save_failures)
         result = runner.run(specs, function, out, settings=settings, jobs=jobs, scheduler=scheduler, progress=progress)
         saved = trials_of.saved(result["trials"], specs, again=save_failures, progress=progress)
@@ -206,13 +213,13 @@ class _Trials:
     """Runs single trials, and keeps their plans in a folder.
 
     Attributes:
-        tasks: Name → task.
+        experiment: Whose trials they are.
         out: The folder.
         solve: What plans a trial.
         timed: Whether calls are timed by the clock, the first ones cold, too.
     """
 
-    tasks: Mapping[str, Assignment]
+    experiment: Comparison
     out: Path
     solve: Solve
     timed: bool = False
@@ -225,8 +232,7 @@ class _Trials:
         if save_failures and not found.success and found.status != "interrupted":
             found.save(self._file(spec, "failures"))
         own = {"scene": spec["scene"], "number": spec["number"], "duration": found.metrics["duration"], **peaks(found.trajectory)}
-        own |= times
-        own |= {"placed": spec["placed"]} if "placed" in spec else {}
+        own |= times | ({"placed": spec["placed"]} if "placed" in spec else {})
         return trial(found, method=spec["method"], seed=spec["seed"], **own)
 
     def saved(
@@ -246,8 +252,8 @@ class _Trials:
         """Draw the motions of one trial of every task in which a method succeeds in any; return the pictures in Markdown."""
         methods, pictures = tuple(dict.fromkeys(spec["method"] for spec in specs)), []
         for task in dict.fromkeys(spec["scene"] for spec in specs):
-            number, name = shown([record for record in records if record["scene"] == task], methods), self.tasks[task].name
-            if number is not None:
+            own, name = [record for record in records if record["scene"] == task], self.experiment.tasks[task].name
+            if (number := shown(own, methods)) is not None:
                 plans = {s["method"]: self._kept(s) for s in specs if (s["scene"], s["number"]) == (task, number)}
                 motions_chart(plans, self.out / f"{task}_joints.png", title=f"{name.capitalize()}, trial {number}")
                 pictures.append(f"![Motions of trial {number}: {name}]({task}_joints.png)")
@@ -280,7 +286,7 @@ class _Trials:
         return found, {"wall_time": times.get("warm_time", 0.0), **times}
 
     def _plan(self, spec: Mapping[str, Any]) -> Plan:
-        scene = placed(_scene(self.tasks[spec["scene"]].scene), spec)
+        scene = placed(self.experiment.load(self.experiment.tasks[spec["scene"]].scene), spec)
         return self.solve(scene.with_start(base=spec["base"]), spec)
 
     def _file(self, spec: Mapping[str, Any], folder: str) -> Path:
@@ -294,6 +300,3 @@ def shown(records: Sequence[Record], methods: Sequence[str]) -> int | None:
         if record["success"]:
             good.setdefault(int(record["number"]), set()).add(str(record["method"]))
     return max(sorted(good), key=lambda k: (len(good[k]) == len(methods), "VKC" in good[k], len(good[k])), default=None)
-
-
-_scene = functools.cache(load_scene)  # once per process

@@ -62,6 +62,20 @@ def test_of_several_stretches_the_longest_is_named() -> None:
         assert (first.begin, first.end) == (curve.times[long[0]], curve.times[long[1]])
 
 
+def test_what_bounds_a_two_hundredth_of_the_duration_is_told_of() -> None:
+    plan = door_plan()
+    samples, curve = Samples(plan.scene, plan.trajectory), plan.trajectory.curve
+    assert curve is not None
+    moments, shares = moments_of(curve), np.diff(curve.times) / curve.times[-1]
+    number = {told: int(np.argmin(np.abs(shares - share))) for told, share in ((True, 0.0075), (False, 0.002))}
+    assert 0.005 < shares[number[True]] < 0.01, "no cubic takes so long: choose several"
+    assert shares[number[False]] < 0.005
+    for told, piece in number.items():
+        torques = np.zeros((len(moments.times), plan.trajectory.robot_size))
+        torques[moments.pieces == piece, 4] = 50.0
+        assert ("torque" in {bound.kind for bound in bounds(samples, moments, torques)}) == told
+
+
 def test_without_a_curve_nothing_is_said() -> None:
     plan = drawer_plan()
     bare = dataclasses.replace(plan.trajectory, curve=None)

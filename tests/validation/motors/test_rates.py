@@ -10,7 +10,7 @@ from helpers.executions import drawer_plan
 
 import vkc_pin as vkc
 from vkc_pin.motion.curve import Curve
-from vkc_pin.motion.trajectory import Trajectory
+from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.retiming.retime import retimed
 from vkc_pin.validation.motors.rates import check_rates
 from vkc_pin.validation.report import Violation
@@ -37,6 +37,37 @@ def test_jerks_are_looked_at_where_they_are_limited() -> None:
     assert motion.curve is not None
     strongest = motion.curve.jerks()[0][:, motion.names.index("elbow_joint")].max()
     assert found(motion, jerk_time=0.5)[kind].amount == pytest.approx(strongest - 1.4 / 0.5)
+
+
+def played(share: float) -> Trajectory:
+    """The elbow alone, from rest to rest along one cubic, whose strongest acceleration is this share of its limit, 1.4 rad/s²."""
+    plan = drawer_plan()
+    motion, elbow = plan.trajectory, plan.trajectory.names.index("elbow_joint")
+    rows = np.tile(motion.positions[0], (2, 1))
+    rows[1, elbow] += share * 1.4 / 6.0 * 2.0**2  # 3s² − 2s³ in 2 s has 6 / 2² at its ends
+    times = np.array([0.0, 2.0])
+    curve = Curve(times, rows, np.zeros_like(rows))
+    return Trajectory(motion.names, times, rows, (PhaseSpan("move", 0, 1),), motion.robot_size, curve)
+
+
+@pytest.mark.parametrize(("share", "kinds"), [(1.0005, set()), (1.0015, {"acceleration"}), (0.5, set())])
+def test_an_excess_of_a_thousandth_of_the_limit_is_all_right(share: float, kinds: set[str]) -> None:
+    assert {kind for kind, _ in found(played(share))} == kinds
+
+
+@pytest.mark.parametrize(("speed", "rests"), [(0.9e-6, True), (1.5e-6, False)])
+@pytest.mark.parametrize("end", [0, -1])
+def test_a_motion_begins_and_ends_at_rest(speed: float, rests: bool, end: int) -> None:
+    motion = played(0.1)
+    assert motion.curve is not None
+    rates = motion.curve.rates.copy()
+    rates[end, motion.names.index("elbow_joint")] = speed
+    curve = Curve(motion.curve.times, motion.curve.positions, rates)
+    rows = found(dataclasses.replace(motion, curve=curve))
+    assert (not rows) == rests
+    if not rests:
+        (row,) = rows.values()
+        assert (row.constraint, row.waypoint) == ("velocity", 0 if end == 0 else 1)
 
 
 def test_accelerations_that_jump_are_named() -> None:

@@ -94,6 +94,13 @@ def test_what_is_carried_without_a_mass_is_named() -> None:
     assert Motors(Samples(holding(), still(holding()))).facts()["remarks"] == ()
 
 
+def test_jerk_bounds_nothing_unless_it_is_limited() -> None:
+    plan = door_plan()
+    motors = Motors(Samples(plan.scene, plan.trajectory))
+    assert "jerk" not in {bound.kind for bound in motors.facts()["bounds"]}
+    assert "jerk" in {bound.kind for bound in motors.facts(1.0)["bounds"]}
+
+
 def test_reports_tell_of_torques_and_plans_keep_that(tmp_path: Path) -> None:
     plan = door_plan()
     assert plan.metrics["torque"] == plan.validation.torque > 0.0

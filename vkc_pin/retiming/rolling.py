@@ -23,6 +23,7 @@ _ROUNDS = 12  # of Newton's method
 _STIFF = 1e-3  # error of a place that is as bad as a bump of the way, so that none comes of rounding where the base stands
 _LEVER = 0.5  # [m/rad]: bump of the way that is as bad as one of the heading
 _LOOKS = 8  # moments on each cubic of a curve
+_NOWHERE = 1e-9  # [m] that is no way
 _OFF = 1e-5  # [m] by which the places may be missed; the rest is spread over the step
 _TIGHT = 3e-4  # share by which a turn may be tighter than the least radius, to allow for rounding
 
@@ -96,7 +97,10 @@ def _rolled(
     bounds = np.append(limits[0], np.inf), np.append(limits[1], -np.inf)  # it goes back nowhere but where it turns round
     path = path_through(np.column_stack([points, driven]), np.append(scale, 0.0), bounds)
     parts = finer * max(_PARTS, int(np.ceil(np.abs(turn).max() / _TURN)))
-    steps = _Steps(points[:, :3], path(path.x, 1)[:, [2, -1]], np.diff(path.x), np.diff(driven), parts)
+    slopes = path(path.x, 1)[:, [2, -1]]
+    if rolling.radius > 0.0:
+        slopes[:, 0] = _bends(turn, np.diff(driven), rolling.radius) * slopes[:, 1]
+    steps = _Steps(points[:, :3], slopes, np.diff(path.x), np.diff(driven), parts)
     # An arc is where it should be but for rounding, of which bumps would make tight turns where a step is short.
     left = steps.missing() if len(points) == 2 else steps.fit()
     at = moments_at(path.x, np.arange(parts) / parts, last=True)
@@ -105,6 +109,25 @@ def _rolled(
     values = np.column_stack([base, path(at)[:, 3:-1], wheels[0][:, None] + half * base[:, 2:]])
     rates = np.column_stack([slopes, path(at, 1)[:, 3:-1], wheels[1][:, None] + half * slopes[:, 2:]])
     return CubicHermiteSpline(at, values, rates), (np.abs(left) > _OFF) | steps.tight(rolling.radius)
+
+
+def _bends(turns: Floats, ways: Floats, radius: float) -> Floats:
+    """Return how much a path bends at waypoints, shape (m,) [rad/m], so that no step between turns tighter than need be.
+
+    A step that bends by κ in the middle of what it goes, and by a and b at its ends, bends by 3/2·κ − (a + b)/4 half-way: no more
+    than 1/r if both are at least 3κ − 2/r. Where steps before and after ask for no less than that, it is the mean of both.
+
+    Args:
+        turns: Of the steps, shape (m − 1,) [rad].
+        ways: How far they go, shape (m − 1,) [m].
+        radius: The least of the turns, r [m].
+    """
+    bends = radius * turns / np.where(np.abs(ways) > _NOWHERE, ways, np.inf)
+    least, most = np.minimum(3.0 * bends - 2.0, 1.0), np.maximum(3.0 * bends + 2.0, -1.0)
+    lengths = np.maximum(np.abs(ways), _NOWHERE)
+    mean = (bends[:-1] * lengths[1:] + bends[1:] * lengths[:-1]) / (lengths[1:] + lengths[:-1])
+    inner = np.clip(mean, np.maximum(least[:-1], least[1:]), np.minimum(most[:-1], most[1:]))
+    return np.concatenate([bends[:1], inner, bends[-1:]]) / radius
 
 
 class _Steps:

@@ -25,6 +25,7 @@ _COLLISION, _DEPTH = 10.0, 300.0  # cost of a collision, and of its depth [1/m],
 _NOT_FOUND = 1e3  # cost if there is no configuration, or no path of the base
 _TOLERABLE = 60.0  # cost of collisions that the solver may be left to push apart: a graze or two
 _SHORTENINGS = 8  # times that each knot of paths is drawn to its neighbours
+_SECTORS, _EACH = 8, 4  # of headings of the base, and how many of each are kept before more of the others
 _JUMP = 0.5  # [m] of the base from knot to knot while something fixed is held: a path through an obstacle, no doubt
 
 
@@ -49,6 +50,7 @@ class _Mode(NamedTuple):
 
     thorough: bool
     backwards: bool
+    apart: bool
 
 
 class Beam:
@@ -70,18 +72,20 @@ class Beam:
             if phase.grasps
         }
 
-    def search(self, *, thorough: bool, backwards: bool = False) -> Found:
+    def search(self, *, thorough: bool, backwards: bool = False, apart: bool = False) -> Found:
         """Go from knot to knot, keeping the cheapest paths.
 
         Args:
             thorough: Draw more, and shake the arms at every knot at which something fixed is held.
             backwards: Where something fixed is held, begin where it is let go of, and go back to where it is grasped: a passage
                 may be wide at its end only, and hardly anything that is free at its beginning leads there.
+            apart: Keep paths on which the base heads elsewhere, too, rather than the cheapest alone: one that is steered needs room
+                to turn, and what is cheap so far may head where there is none.
         """
         # A hand that chooses where to grasp, and then clamps, chooses before it moves anything.
         chosen = [grasp + 1 for _, grasp, _ in self.problem.choices if grasp < self.problem.segments]
         backwards = backwards and not any(map(self._closed_at, chosen))
-        mode = _Mode(thorough, backwards)
+        mode = _Mode(thorough, backwards, apart)
         problem = self.problem
         found = Found(problem.start[None, None, :], np.zeros(1), np.zeros(1), [0])
         closed = [problem.closed(phase) for phase in problem.task.phases]
@@ -126,7 +130,7 @@ class Beam:
         open_phase = not self.problem.closed(self.problem.task.phases[phase])
         if not self.careful and open_phase and self.knots.pose_at(knot) is not None:
             parents, z, bad, total = self._with_shortened(found, parents, z, bad, total, knot, phase)
-        best = self._kept(total, z, drawn, _WIDTH)
+        best = self._kept(total, z, drawn, _WIDTH, _SECTORS if mode.apart else 1)
         paths = np.concatenate([found.paths[parents[best]], z[best, None]], axis=1)
         return Found(paths, total[best], (found.trouble[parents] + bad)[best], [*found.at, knot])
 
@@ -148,18 +152,25 @@ class Beam:
         )
 
     @staticmethod
-    def _kept(total: Floats, z: Floats, drawn: int, width: int) -> Ints:
+    def _kept(total: Floats, z: Floats, drawn: int, width: int, sectors: int) -> Ints:
         """Return which continuations to keep: of those that are alike the cheapest, and of these the cheapest.
 
-        At most half of them are not as they were `drawn`, the first ones: what is short may be what nothing goes on from.
+        At most half of them are not as they were `drawn`, the first ones: what is short may be what nothing goes on from. With
+        more than one sector of headings, those come last before which there are enough of their sector.
         """
-        rest, kept = np.argsort(total, kind="stable"), list[int]()
+        rest, kept, late = np.argsort(total, kind="stable"), list[int](), list[int]()
+        sector, full = (z[:, 2] % (2 * np.pi) * sectors / (2 * np.pi)).astype(int), np.zeros(sectors, int)
         while len(rest) and len(kept) < width:
-            kept.append(int(rest[0]))
-            rest = rest[np.abs(z[rest] - z[rest[0]]).max(axis=1) > ALIKE]
+            first = int(rest[0])
+            if sectors > 1 and full[sector[first] % sectors] >= _EACH:
+                late.append(first)
+            else:
+                kept.append(first)
+                full[sector[first] % sectors] += 1
+            rest = rest[np.abs(z[rest] - z[first]).max(axis=1) > ALIKE]
             if np.count_nonzero(np.array(kept) >= drawn) >= width // 2:
                 rest = rest[rest < drawn]
-        return np.array(kept)
+        return np.array(kept + late[: width - len(kept)])
 
     def _go_back(self, found: Found, knots: list[int], phase: int, mode: _Mode) -> Found:
         """Return the cheapest paths through knots, of which all but the first are while something fixed is held after a phase."""

@@ -216,8 +216,16 @@ class _SeedSearch:
 
     def _search(self, attempt: int) -> Found | None:
         """Return what a search finds: a quick one, None if it is no good, then thorough ones."""
-        found = self.beam.search(thorough=attempt > 0)
+        found = self._searched(thorough=attempt > 0)
         return found if attempt > 0 or self.beam.tolerable(found) else None
+
+    def _searched(self, *, thorough: bool, backwards: bool = False) -> Found:
+        """Return what a search finds; of a base that is steered, with headings kept apart where that of the cheapest is no good."""
+        found = self.beam.search(thorough=thorough, backwards=backwards)
+        if self.problem.rolling.radius <= 0.0 or self.beam.tolerable(found):
+            return found
+        apart = self.beam.search(thorough=thorough, backwards=backwards, apart=True)
+        return apart if apart.cost.min() < found.cost.min() else found
 
     def _ordered(self, found: Found) -> Iterable[Floats]:
         """Return paths in the order in which they are to be joined, each after what it comes to when it is shortened.
@@ -289,7 +297,7 @@ class _Rrt(_SeedSearch):
 
     def _search(self, attempt: int) -> Found | None:
         """Return what a search finds, None if it is no good: a quick one, then thorough ones, every other backwards."""
-        found = self.beam.search(thorough=attempt > 0, backwards=attempt % 2 == 1)
+        found = self._searched(thorough=attempt > 0, backwards=attempt % 2 == 1)
         return found if self.beam.tolerable(found) else None
 
     def _will_do(self, short: float, overlap: float) -> bool:

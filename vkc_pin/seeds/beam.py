@@ -79,8 +79,8 @@ class Beam:
             thorough: Draw more, and shake the arms at every knot at which something fixed is held.
             backwards: Where something fixed is held, begin where it is let go of, and go back to where it is grasped: a passage
                 may be wide at its end only, and hardly anything that is free at its beginning leads there.
-            apart: Keep paths on which the base heads elsewhere, too, rather than the cheapest alone: one that is steered needs room
-                to turn, and what is cheap so far may head where there is none.
+            apart: Keep paths on which the base heads elsewhere, too, rather than the cheapest alone: one that is steered needs
+                room to turn, and what is cheap so far may head where there is none.
         """
         # A hand that chooses where to grasp, and then clamps, chooses before it moves anything.
         chosen = [grasp + 1 for _, grasp, _ in self.problem.choices if grasp < self.problem.segments]

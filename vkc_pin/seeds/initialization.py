@@ -220,7 +220,7 @@ class _SeedSearch:
         return found if attempt > 0 or self.beam.tolerable(found) else None
 
     def _searched(self, *, thorough: bool, backwards: bool = False) -> Found:
-        """Return what a search finds; of a base that is steered, with headings kept apart where that of the cheapest is no good."""
+        """Return what a search finds; a base that is steered keeps headings apart where the cheapest are no good."""
         found = self.beam.search(thorough=thorough, backwards=backwards)
         if self.problem.rolling.radius <= 0.0 or self.beam.tolerable(found):
             return found

@@ -78,10 +78,10 @@ def test_between_waypoints_it_goes_where_the_base_would() -> None:
 
 
 def test_a_steered_base_stops_where_it_would_have_to_turn_too_tightly() -> None:
-    """Straight, and on from there on its smallest circle; on a wider one it needs no stop."""
+    """From one smallest circle to that on the other side; from straight on to it, or between wider ones, it needs no stop."""
     scale = np.array([1.0, 1.0, 0.5, 0.3])
-    for radius, stops in ((1.0, 1), (1.8, 0)):
-        points = arcs([(0.2, 0.0)] * 5 + [(0.2, 0.2 / (1.001 * radius))] * 5)
+    for before, after, stops in ((-1.0, 1.0, 1), (np.inf, 1.0, 0), (-1.8, 1.8, 0)):
+        points = arcs([(0.2, 0.2 / (1.001 * before))] * 5 + [(0.2, 0.2 / (1.001 * after))] * 5)
         paths = rolling_paths(points, scale, FAR, Rolling(radius=1.0))
         assert len(paths) == 1 + stops
         for path, _ in paths:
@@ -133,3 +133,24 @@ def test_points_between_waypoints_lie_on_arcs(base: str) -> None:
     times = np.arange(divided.times[0], divided.times[-1], 1e-3)
     (vx, vy, _), yaw = divided.velocity(times)[:, :3].T, divided(times)[:, 2]
     assert np.abs(np.cos(yaw) * vy - np.sin(yaw) * vx).max() < 3e-4
+
+
+def test_rounding_of_places_is_no_reason_to_stop() -> None:
+    """Millimetres along a wide circle, each place off by a micrometre, as a solver leaves them: one path, no turn too tight."""
+    radius, points = 0.8, arcs([(1.2e-3, 0.7 * 1.2e-3 / 0.8)] * 6)
+    points[1:-1, :2] += 3e-7 * np.array([[1.0, -1.0], [-1.0, 0.5], [0.7, 1.0], [-1.0, -1.0], [0.3, 1.0]])
+    ((path, own),) = rolling_paths(points, np.array([1.0, 1.0, 0.5, 0.3]), FAR, Rolling(radius=radius))
+    assert len(own) == 7
+    dense = np.linspace(0.0, path.x[-1], 3000)
+    rates, yaw = path(dense, 1), path(dense)[:, 2]
+    along = np.cos(yaw) * rates[:, 0] + np.sin(yaw) * rates[:, 1]
+    assert (np.abs(rates[:, 2]) * radius <= np.abs(along) * 1.02).all()
+
+
+def test_on_its_smallest_circle_a_steered_base_needs_no_stop() -> None:
+    """Steps grow and shrink along it, as they do where a motion begins and ends; from straight on it may bend within a step."""
+    scale = np.array([1.0, 1.0, 0.5, 0.3])
+    lengths = [0.02, 0.06, 0.1, 0.12, 0.12, 0.1, 0.05, 0.02]
+    assert len(rolling_paths(arcs([(length, length / 0.8) for length in lengths]), scale, FAR, Rolling(radius=0.8))) == 1
+    straight = arcs([(0.1, 0.0)] * 4 + [(0.1, 0.1 / 0.81)] * 4)
+    assert len(rolling_paths(straight, scale, FAR, Rolling(radius=0.8))) == 1

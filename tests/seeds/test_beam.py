@@ -120,6 +120,16 @@ def test_of_paths_that_end_alike_the_cheapest_is_kept() -> None:
     assert Beam._kept(total, z, 2, 4).tolist() == [5, 1, 2]  # two of four are shortened: no more of them
 
 
+def test_headings_are_kept_apart_if_asked_for() -> None:
+    """The cheapest head alike; with sectors, dearer ones that head elsewhere come before the fifth of them."""
+    z = np.zeros((12, 4))
+    z[:, 0], z[10:, 2] = np.arange(12.0), (2.0, -2.0)
+    total = np.arange(12.0)
+    assert Beam._kept(total, z, 12, 6, 1).tolist() == [0, 1, 2, 3, 4, 5]
+    assert Beam._kept(total, z, 12, 6, 8).tolist() == [0, 1, 2, 3, 10, 11]
+    assert Beam._kept(total, z, 12, 8, 8).tolist() == [0, 1, 2, 3, 10, 11, 4, 5]
+
+
 def test_no_two_paths_of_a_search_end_alike() -> None:
     found = beam(1).search(thorough=True)
     ends = found.paths[:, -1]

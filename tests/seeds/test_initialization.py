@@ -58,7 +58,7 @@ def test_interpolated_seeds_hold_the_handle(seed: int) -> None:
 @pytest.mark.parametrize("robot", [{"base": "differential"}, {"base": "ackermann", "turning_radius": 0.8}], ids=["tank", "car"])
 @pytest.mark.parametrize(("name", "goal"), [("door", {"hinge": 1.2}), ("drawer", {"slide": 0.35})])
 def test_seeds_of_bases_on_wheels_can_be_driven(name: str, goal: dict[str, float], robot: dict[str, Any], method: str) -> None:
-    """They roll, turn no tighter than they can, and hold what they hold."""
+    """They roll, turn no tighter than they can, and hold what they hold; where the arm does not reach in, the base gives way."""
     scene = vkc.load_scene(name)
     document, rng = {**scene.document, "robot": {"name": "husky_ur5e", **robot}}, np.random.default_rng(5)
     scene = vkc.Scene.from_document(document, scene.folder)
@@ -66,8 +66,11 @@ def test_seeds_of_bases_on_wheels_can_be_driven(name: str, goal: dict[str, float
         p = program_of(scene.sample_start(rng), [vkc.Actuate(name, goal)], options=vkc.Options())
         seed = next(initialize(p, method, 0))
         along, aside, turn = p.rolling.steps(p.waypoints(seed.z))
-        np.testing.assert_allclose(aside, 0.0, atol=1e-4)
-        assert (np.abs(along) >= robot.get("turning_radius", 0.0) * np.abs(turn) - 1e-4).all()
+        end = int(p.ends[0])
+        allowed = np.full(len(aside), 1e-4)
+        allowed[end - p.options.steps(p.options.approach_time) : end] = 0.01
+        assert (np.abs(aside) <= allowed).all()
+        assert (np.abs(along) >= robot.get("turning_radius", 0.0) * np.abs(turn) - allowed).all()
         assert np.abs(along).sum() > 0.5
         assert p.pose_error(seed.z) < 1e-2
 

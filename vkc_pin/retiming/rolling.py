@@ -25,6 +25,7 @@ _LEVER = 0.5  # [m/rad]: bump of the way that is as bad as one of the heading
 _LOOKS = 8  # moments on each cubic of a curve
 _NOWHERE = 1e-9  # [m] that is no way
 _OFF = 1e-5  # [m] by which the places may be missed; the rest is spread over the step
+_ROUNDING = 2e-6  # [m] of a place that no bump is worth if it makes a turn too tight
 _TIGHT = 3e-4  # share by which a turn may be tighter than the least radius, to allow for rounding
 
 
@@ -103,6 +104,8 @@ def _rolled(
     steps = _Steps(points[:, :3], slopes, np.diff(path.x), np.diff(driven), parts)
     # An arc is where it should be but for rounding, of which bumps would make tight turns where a step is short.
     left = steps.missing() if len(points) == 2 else steps.fit()
+    if rolling.radius > 0.0 and (bent := steps.tight(rolling.radius)).any():
+        left = steps.plain(bent)
     at = moments_at(path.x, np.arange(parts) / parts, last=True)
     base, slopes, wheels = steps.at_knots(left)
     half = rolling.track / 2 * np.array([-1.0, 1.0])
@@ -144,7 +147,8 @@ class _Steps:
     def __init__(self, poses: Floats, slopes: Floats, spans: Floats, ways: Floats, parts: int) -> None:
         self.poses, self.spans, self.parts = poses, spans[:, None], parts
         self.yaw, self.way = ([column[:-1, None] * self.spans, column[1:, None] * self.spans] for column in slopes.T)
-        self.ways, self.hops, self.bumps = ways[:, None], np.zeros((len(ways), 1)), np.zeros((len(ways), 1))
+        self.ways = self._driven = ways[:, None]
+        self.hops, self.bumps = np.zeros((len(ways), 1)), np.zeros((len(ways), 1))
         nodes, weights = np.polynomial.legendre.leggauss(5)
         self._inside = ((np.arange(parts)[:, None] + (nodes + 1) / 2) / parts).ravel()
         self._weights = np.tile(weights / (2 * parts), parts)
@@ -177,6 +181,18 @@ class _Steps:
             self.ways, self.hops, self.bumps = self.ways + change[:, 0], self.hops + change[:, 1], self.bumps + change[:, 2]
             if np.abs(change).max() < 1e-12:
                 break
+        return self.missing()
+
+    def plain(self, which: Bools) -> Floats:
+        """Take back what `fit` did to some steps, shape (N,), if next to nothing is missing without it; return what is then.
+
+        A bump that makes up for rounding bends a short step as much as a turn.
+        """
+        fitted = self.ways, self.hops, self.bumps
+        self.ways, self.hops, self.bumps = self._driven, 0.0 * self.hops, 0.0 * self.bumps
+        back = (which & (np.abs(self.missing()) < _ROUNDING))[:, None]
+        plain = self.ways, self.hops, self.bumps
+        self.ways, self.hops, self.bumps = (np.where(back, new, old) for new, old in zip(plain, fitted, strict=True))
         return self.missing()
 
     def missing(self) -> Floats:

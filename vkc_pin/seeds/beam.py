@@ -79,8 +79,8 @@ class Beam:
             thorough: Draw more, and shake the arms at every knot at which something fixed is held.
             backwards: Where something fixed is held, begin where it is let go of, and go back to where it is grasped: a passage
                 may be wide at its end only, and hardly anything that is free at its beginning leads there.
-            apart: Keep paths on which the base heads elsewhere, too, rather than the cheapest alone: one that is steered needs
-                room to turn, and what is cheap so far may head where there is none.
+            apart: Keep paths on which the base heads elsewhere, too: one that is steered needs room to turn, and the cheapest
+                so far may head where there is none.
         """
         # A hand that chooses where to grasp, and then clamps, chooses before it moves anything.
         chosen = [grasp + 1 for _, grasp, _ in self.problem.choices if grasp < self.problem.segments]
@@ -152,21 +152,19 @@ class Beam:
         )
 
     @staticmethod
-    def _kept(total: Floats, z: Floats, drawn: int, width: int, sectors: int) -> Ints:
+    def _kept(total: Floats, z: Floats, drawn: int, width: int, sectors: int = 1) -> Ints:
         """Return which continuations to keep: of those that are alike the cheapest, and of these the cheapest.
 
         At most half of them are not as they were `drawn`, the first ones: what is short may be what nothing goes on from. With
         more than one sector of headings, those come last before which there are enough of their sector.
         """
         rest, kept, late = np.argsort(total, kind="stable"), list[int](), list[int]()
-        sector, full = (z[:, 2] % (2 * np.pi) * sectors / (2 * np.pi)).astype(int), np.zeros(sectors, int)
+        headings = np.floor(z[:, 2] / (2 * np.pi) * sectors).astype(int) % sectors if sectors > 1 else np.zeros(len(z), int)
+        full = np.zeros(sectors, int)
         while len(rest) and len(kept) < width:
             first = int(rest[0])
-            if sectors > 1 and full[sector[first] % sectors] >= _EACH:
-                late.append(first)
-            else:
-                kept.append(first)
-                full[sector[first] % sectors] += 1
+            (late if sectors > 1 and full[headings[first]] >= _EACH else kept).append(first)
+            full[headings[first]] += 1
             rest = rest[np.abs(z[rest] - z[first]).max(axis=1) > ALIKE]
             if np.count_nonzero(np.array(kept) >= drawn) >= width // 2:
                 rest = rest[rest < drawn]

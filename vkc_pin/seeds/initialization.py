@@ -219,13 +219,12 @@ class _SeedSearch:
         found = self._searched(thorough=attempt > 0)
         return found if attempt > 0 or self.beam.tolerable(found) else None
 
-    def _searched(self, *, thorough: bool, backwards: bool = False) -> Found:
-        """Return what a search finds; a base that is steered keeps headings apart where the cheapest are no good."""
-        found = self.beam.search(thorough=thorough, backwards=backwards)
-        if self.problem.rolling.radius <= 0.0 or self.beam.tolerable(found):
-            return found
-        apart = self.beam.search(thorough=thorough, backwards=backwards, apart=True)
-        return apart if apart.cost.min() < found.cost.min() else found
+    def _searched(self, **how: bool) -> Found:
+        """Return what a search finds; if it is no good, and the base is steered, with headings kept apart."""
+        found = self.beam.search(**how)
+        if self.problem.rolling.radius > 0.0 and not self.beam.tolerable(found):
+            found = min(found, self.beam.search(**how, apart=True), key=lambda one: float(one.cost.min()))
+        return found
 
     def _ordered(self, found: Found) -> Iterable[Floats]:
         """Return paths in the order in which they are to be joined, each after what it comes to when it is shortened.
@@ -247,7 +246,7 @@ class _SeedSearch:
         return kept
 
     def _differ(self, path: Floats, other: Floats) -> bool:
-        """Return whether the base is elsewhere somewhere along two paths, (K, n), by more than a clearance [m] or [rad]."""
+        """Return whether the base is elsewhere somewhere along paths, (K, n), by more than a clearance [m] or [rad]."""
         return bool(np.abs(path - other)[:, :3].max() > self.problem.options.dist_safe)
 
     def _will_do(self, short: float, overlap: float) -> bool:
@@ -278,11 +277,7 @@ class _SeedSearch:
 
 
 class _Rrt(_SeedSearch):
-    """Base and arm together along what two random trees find; slow, so the first seed that is nearly free will do.
-
-    Args:
-        shared: Problem, random numbers, notes.
-    """
+    """Base and arm together along what two random trees find; slow, so the first seed that is nearly free will do."""
 
     alike = 3  # where nothing leads along the base's path, hardly anything does with another arm
 
@@ -290,14 +285,12 @@ class _Rrt(_SeedSearch):
         super().__init__(shared, "rrt")
 
     def _parts(self, shared: _Shared) -> tuple[Beam, Joiner]:
-        """Return what finds knots, and what joins them."""
         knots = shared.knots()
         beam = Beam(knots, shared.driven, careful=True)
         return beam, Joiner(knots, Approach(knots, stands=True), RrtPaths(knots, shared.routes))
 
     def _search(self, attempt: int) -> Found | None:
-        """Return what a search finds, None if it is no good: a quick one, then thorough ones, every other backwards."""
-        found = self._searched(thorough=attempt > 0, backwards=attempt % 2 == 1)
+        found = self._searched(thorough=attempt > 0, backwards=attempt % 2 == 1)  # every other backwards
         return found if self.beam.tolerable(found) else None
 
     def _will_do(self, short: float, overlap: float) -> bool:

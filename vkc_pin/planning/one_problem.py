@@ -91,14 +91,13 @@ class OneProblem:
         self.scene, self.task, self.settings, self.goals_first = scene, task, settings, goals_first
         self.times = dict.fromkeys(TIMES, 0.0)
         self.rounds = self.iterations = 0
-        self.checking = 0.0
+        self.checking, self.hindered = 0.0, False
         self.history: list[dict[str, float]] = []
         self.blocked: list[str] = []  # phases in which there is no way for the base
         self._best: _Try | None = None
         self._astray: tuple[Solution, str] | None = None  # the nearest of those that nobody need check
         self._explained: dict[int, Blocked | None] = {}
         self._proven: list[str] | None = None
-        self.hindered = False
 
     def run(self, seed: Callable[[TrajectoryProblem], Seed] | None = None) -> Plan:
         """Try seeds until validation accepts a motion, there are no more, or the budget is at its end.
@@ -175,8 +174,8 @@ class OneProblem:
         if nearest is None:
             lines += self.blocked
         elif searched and not lines:
-            missing = ways(problem, best.z, best.report, self.blocked, self.settings.random_seed)
-            lines, status = missing.lines, "infeasible" if missing.cut_off else status
+            lines, cut_off = ways(problem, best.z, best.report, self.blocked, self.settings.random_seed)
+            status = "infeasible" if cut_off else status
         return best.noted(lines), status
 
     def _nearest(self) -> _Try | None:

@@ -50,8 +50,7 @@ class Assignment:
         scene: The scene's name.
         steps: What should change in it.
         name: To show.
-        scatter: Draws where objects stand: returns object → (x, y, z, roll, pitch, yaw) [m, rad] of its base link in the world;
-            None leaves all as in the scene.
+        scatter: Draws where objects stand, by name, (x, y, z, roll, pitch, yaw) [m, rad] each; None: all is as in the scene.
     """
 
     scene: str
@@ -166,11 +165,12 @@ class Comparison:
         settings["goals"] = {name: goals(self.tasks[name].steps) for name in tasks}
         settings |= {**LIMITS, "effort": effort, "retries": RETRIES}
         trials_of = _Trials(self, out, solve or self.plan_trial, timed=solve is None)
-        function = functools.partial(trials_of.record, save_failures=save_failures)
-        result = runner.run(specs, function, out, settings=settings, jobs=jobs, scheduler=scheduler, progress=progress)
+        record = functools.partial(trials_of.record, save_failures=save_failures)
+        result = runner.run(specs, record, out, settings=settings, jobs=jobs, scheduler=scheduler, progress=progress)
         saved = trials_of.saved(result["trials"], specs, again=save_failures, progress=progress)
-        names = {name: self.tasks[name].name for name in tasks}
-        pictures = self.draw(result["trials"], out, names, methods) + trials_of.motions(result["trials"], specs)
+        pictures = self.draw(result["trials"], out, {name: self.tasks[name].name for name in tasks}, methods) + trials_of.motions(
+            result["trials"], specs
+        )
         write_atomically(out / "table.md", self.report(result, saved=saved, pictures=pictures).encode())
         return result
 

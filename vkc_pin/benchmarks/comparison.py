@@ -59,9 +59,7 @@ class Assignment:
     scatter: Callable[[Scene, np.random.Generator], dict[str, list[float]]] | None = None
 
 
-@functools.cache
-def _scene(name: str) -> Scene:
-    return load_scene(name)  # once per process
+_scene = functools.cache(load_scene)  # once per process
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,7 @@ TABLE = re.compile(r"(?:^\|.*\n)+", re.MULTILINE)
 REPORTS = {  # name of a record → whose report it is
     **{name: name for name in ("baselines", "household", "initialization", "chores", "scale", "gap")},
     **{"segments": "scale", "sixty": "problems.ablation", "tradeoff": "problems.ablation"},
+    "sensitivity": "problems.ablation",
     **{"spread": "problems.spread", "first_seed": "problems.first_seed", "robots": "anything.robots"},
     **{"anything": "anything.matrix", "cluttered": "chores"},
     **{"robots_rest": "anything.robots", "robots_packages": "anything.robots", "execution": "executing.execution"},
@@ -111,6 +112,7 @@ EVIDENCE: list[tuple[str, str, str, str]] = [
     ("held by friction", "execution.md", "friction", "execution --trials 20 --seed 20270106 --grasp friction"),
     ("as fast as the limits allow", "rates_and_limits.md", "timing", "python -m tests.optimal --starts 5"),
     ("beside other planners", "comparison.md", "peers", "peers --trials 20 --seed 20270110 --time-limit 30"),
+    ("what half and twice of other settings do", "decisions.md", "sensitivity", "ablation --seed 20270111"),
     ("what a metre of the base is worth", "decisions.md", "tradeoff", "ablation --seed 101"),
 ]
 
@@ -202,7 +204,7 @@ def evidence() -> str:
         timed = sum(session["trials"] for session in sessions)
         if not sessions:  # of the door, whose record has no sessions
             minutes, jobs = sum(trial["planning_time"] + trial["build_time"] for trial in trials) / 60.0, "planning alone"
-        for option in {"friction": ("tasks",), "tradeoff": ("changes",)}.get(
+        for option in {"friction": ("tasks",), "tradeoff": ("changes",), "sensitivity": ("changes",)}.get(
             name, ("robots",) if command.startswith("robots") else ()
         ):
             command += f" --{option} {' '.join(chosen for chosen in found['meta'][option] if chosen != 'unchanged')}"

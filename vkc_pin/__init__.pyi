@@ -5,7 +5,7 @@ from .datasets.check import DatasetCheck, check_dataset
 from .datasets.dataset import Dataset
 from .datasets.episode import Episode
 from .datasets.generate import generate
-from .datasets.recipe import Recipe, load_recipe
+from .datasets.recipes.recipe import Recipe, load_recipe
 from .errors import BuildError, InputError, UnknownNameError, VkcError
 from .importing.homes.home_import import ImportedHome, import_home
 from .importing.objects.object_import import ImportedObject, import_object

@@ -8,7 +8,7 @@ from helpers.datasets import SMALL
 
 from vkc_pin.datasets import episode as module
 from vkc_pin.datasets.episode import attempt, made_of, packed, scene_name, unpacked
-from vkc_pin.datasets.recipe import load_recipe
+from vkc_pin.datasets.recipes.recipe import load_recipe
 from vkc_pin.errors import InputError
 from vkc_pin.planning.planner import plan
 from vkc_pin.scene.scene import load_scene

@@ -19,7 +19,7 @@ from vkc_pin.datasets import generate as module
 from vkc_pin.datasets.dataset import Dataset, Register
 from vkc_pin.datasets.episode import Made
 from vkc_pin.datasets.generate import generate
-from vkc_pin.datasets.recipe import load_recipe
+from vkc_pin.datasets.recipes.recipe import load_recipe
 from vkc_pin.errors import InputError, UnknownNameError, VkcError
 
 pytest.importorskip("h5py")

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import pytest
 from helpers.small_problems import SHORT, door_scene, program_of
@@ -33,19 +31,12 @@ def test_a_way_costs_what_the_program_makes_it_cost_in_radians_of_the_arm() -> N
 
 
 class Ways:
-    """Routes twice as long as straight ones, three times with the arm folded; with the arm at home some may be blocked."""
-
-    def __init__(self, blocked: Sequence[int] = ()) -> None:
-        self.blocked, self.asked = list(blocked), list[bool]()
+    """Routes twice as long as straight ones."""
 
     def distances(
-        self, phase: int, first: NDArray[np.float64], last: NDArray[np.float64], *, folded: bool = False
+        self, phase: int, first: NDArray[np.float64], last: NDArray[np.float64], *, folded: bool
     ) -> NDArray[np.float64]:
-        self.asked.append(folded)
-        found = np.asarray((3.0 if folded else 2.0) * np.linalg.norm(last[:, :2] - first[:, :2], axis=1))
-        if not folded:
-            found[self.blocked] = np.inf
-        return found
+        return np.asarray(2.0 * np.linalg.norm(last[:, :2] - first[:, :2], axis=1))
 
 
 def test_a_way_around_costs_as_much_as_it_is_long() -> None:
@@ -55,24 +46,6 @@ def test_a_way_around_costs_as_much_as_it_is_long() -> None:
     moved = start.copy()
     moved[0, :2] += [0.3, 0.4]
     assert search._path_cost(start, moved, 0)[0] == pytest.approx(2 * 0.5 / np.sqrt(0.025), rel=1e-12)
-
-
-@pytest.mark.parametrize(("careful", "blocked"), [(True, [0]), (True, [0, 1]), (False, [0, 1])])
-def test_a_folded_arm_counts_where_no_way_is_wide_enough_for_it_at_home(careful: bool, blocked: list[int]) -> None:
-    """As for the guides of trees; the fine grid that it takes is not made before."""
-    search = beam()
-    search.routes = ways = Ways(blocked)  # type: ignore[assignment]
-    search.careful = careful
-    start = np.tile(search.problem.start, (2, 1))
-    moved = start.copy()
-    moved[:, :2] += [0.3, 0.4]
-    folded = careful and len(blocked) == 2
-    assert ways.asked == []
-    cost = search._path_cost(start, moved, 0)
-    assert ways.asked == ([False, True] if folded else [False])
-    length = 0.5 / np.sqrt(0.025)
-    assert cost[1] == pytest.approx(3 * length if folded else 1e3 if 1 in blocked else 2 * length, rel=1e-12)
-    assert cost[0] == pytest.approx(3 * length if folded else 1e3, rel=1e-12)
 
 
 def scattered(monkeypatch: pytest.MonkeyPatch, share: float) -> int:

@@ -59,9 +59,6 @@ class Assignment:
     scatter: Callable[[Scene, np.random.Generator], dict[str, list[float]]] | None = None
 
 
-_scene = functools.cache(load_scene)  # once per process
-
-
 @dataclass(frozen=True)
 class Comparison:
     """An experiment that compares `COMPARED_PLANNERS`.
@@ -78,7 +75,7 @@ class Comparison:
     title: str
     tasks: Mapping[str, Assignment]
     draw: Draw
-    load: Callable[[str], Scene] = _scene
+    load: Callable[[str], Scene] = load_scene
 
     def plan_trial(self, scene: Scene, spec: Mapping[str, Any]) -> Plan:
         """Plan the task of one trial: `scene` (the task's name), `method`, `seed`, `effort` and `planner` say how."""
@@ -180,14 +177,13 @@ class Comparison:
 
 def placed(scene: Scene, spec: Mapping[str, Any]) -> Scene:
     """Return a scene with its objects where the specification of a trial has them."""
-    for name, pose in spec.get("placed", {}).items():
-        scene = scene.with_placement(name, as_placement(pose))
-    return scene
+    placements = {name: as_placement(pose) for name, pose in spec.get("placed", {}).items()}
+    return functools.reduce(lambda scene, item: scene.with_placement(*item), placements.items(), scene)
 
 
 def goals(steps: Sequence[Step]) -> dict[str, Any]:
     """Return what steps ask for as plain data: "<object>.<joint>" → value, object → place, "base" → place."""
-    found: dict[str, Any] = {}
+    found = dict[str, Any]()
     for step in steps:
         if isinstance(step, Actuate):
             found |= {f"{step.object}.{joint}": value for joint, value in step.joints.items()}
@@ -201,9 +197,8 @@ def goals(steps: Sequence[Step]) -> dict[str, Any]:
 def peaks(trajectory: Trajectory) -> dict[str, float]:
     """Return the largest velocity [rad/s] and acceleration [rad/s²] of an arm joint: peak_velocity, peak_acceleration."""
     arm, curve = slice(3, trajectory.robot_size), trajectory.curve
-    rates = (trajectory.velocities(), trajectory.accelerations()) if curve is None else curve.speeds()
-    largest = [float(np.abs(rate[:, arm]).max(initial=0.0)) for rate in rates]
-    return dict(zip(("peak_velocity", "peak_acceleration"), largest, strict=True))
+    speeds, changes = (trajectory.velocities(), trajectory.accelerations()) if curve is None else curve.speeds()
+    return {f"peak_{n}": float(np.abs(v[:, arm]).max(initial=0.0)) for n, v in (("velocity", speeds), ("acceleration", changes))}
 
 
 @dataclass(frozen=True)
@@ -229,8 +224,8 @@ class _Trials:
         found, times = self._timed(spec)
         if save_failures and not found.success and found.status != "interrupted":
             found.save(self._file(spec, "failures"))
-        own = {"scene": spec["scene"], "number": spec["number"], "duration": found.metrics["duration"], **peaks(found.trajectory)}
-        own |= times | ({"placed": spec["placed"]} if "placed" in spec else {})
+        own = {"duration": found.metrics["duration"], **peaks(found.trajectory), **times}
+        own |= {key: spec[key] for key in ("scene", "number", "placed") if key in spec}
         return trial(found, method=spec["method"], seed=spec["seed"], **own)
 
     def saved(
@@ -284,11 +279,16 @@ class _Trials:
         return found, {"wall_time": times.get("warm_time", 0.0), **times}
 
     def _plan(self, spec: Mapping[str, Any]) -> Plan:
-        scene = placed(self.experiment.load(self.experiment.tasks[spec["scene"]].scene), spec)
+        scene = placed(_scene(self.experiment.load, self.experiment.tasks[spec["scene"]].scene), spec)
         return self.solve(scene.with_start(base=spec["base"]), spec)
 
     def _file(self, spec: Mapping[str, Any], folder: str) -> Path:
         return self.out / folder / f"{spec['scene']}_{spec['number']:04d}_{spec['method']}.npz"
+
+
+@functools.cache
+def _scene(load: Callable[[str], Scene], name: str) -> Scene:
+    return load(name)  # once per process
 
 
 def shown(records: Sequence[Record], methods: Sequence[str]) -> int | None:

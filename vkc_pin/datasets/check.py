@@ -19,7 +19,7 @@ from vkc_pin.datasets.diversity import Seen, homotopy, way
 from vkc_pin.datasets.episode import Episode, scene_name
 from vkc_pin.datasets.formats.hdf5 import episodes_of, numbers_of
 from vkc_pin.datasets.problems import terms_of
-from vkc_pin.datasets.recipe import Recipe, load_recipe
+from vkc_pin.datasets.recipes.recipe import Recipe, load_recipe
 from vkc_pin.datasets.statistics import statistics_page
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.files.documents import read_text

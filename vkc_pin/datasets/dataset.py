@@ -12,7 +12,7 @@ from typing import Any
 from vkc_pin.datasets.diversity import Seen
 from vkc_pin.datasets.episode import Episode, work_file
 from vkc_pin.datasets.formats.hdf5 import episodes_of, numbers_of, write_shard
-from vkc_pin.datasets.recipe import Recipe, load_recipe
+from vkc_pin.datasets.recipes.recipe import Recipe, load_recipe
 from vkc_pin.errors import InputError
 from vkc_pin.files.resources import file_path
 from vkc_pin.files.writing import write_atomically

@@ -18,7 +18,7 @@ import numpy as np
 from vkc_pin.arrays import Floats
 from vkc_pin.datasets.diversity import way
 from vkc_pin.datasets.problems import NoProblemError, problem
-from vkc_pin.datasets.recipe import Recipe, load_recipe
+from vkc_pin.datasets.recipes.recipe import Recipe, load_recipe
 from vkc_pin.errors import InputError
 from vkc_pin.files.resources import folder
 from vkc_pin.motion.trajectory import Trajectory

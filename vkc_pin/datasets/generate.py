@@ -22,9 +22,9 @@ from vkc_pin.datasets.formats import hdf5
 from vkc_pin.datasets.formats import lerobot as lerobot_layout
 from vkc_pin.datasets.formats.card import card
 from vkc_pin.datasets.formats.parts import parts
-from vkc_pin.datasets.recipe import CAMERAS, Recipe, load_recipe
+from vkc_pin.datasets.recipes.recipe import CAMERAS, Recipe, load_recipe
+from vkc_pin.datasets.recipes.terms import as_entries
 from vkc_pin.datasets.robots import check_frames, ready_robots
-from vkc_pin.datasets.terms import as_entries
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.files.resources import file_path
 from vkc_pin.files.writing import check_writable, write_atomically

@@ -13,8 +13,8 @@ import numpy as np
 
 from vkc_pin.arrays import Floats
 from vkc_pin.datasets.grasping import grasped
-from vkc_pin.datasets.recipe import Recipe, load_recipe, robot_name
-from vkc_pin.datasets.terms import meant
+from vkc_pin.datasets.recipes.recipe import Recipe, load_recipe, robot_name
+from vkc_pin.datasets.recipes.terms import meant
 from vkc_pin.errors import VkcError
 from vkc_pin.options import Options
 from vkc_pin.planning.planner import Planner

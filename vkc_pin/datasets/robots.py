@@ -7,8 +7,8 @@ from pathlib import Path
 
 import yaml
 
-from vkc_pin.datasets.recipe import Recipe, robot_name
-from vkc_pin.datasets.terms import check_robot
+from vkc_pin.datasets.recipes.recipe import Recipe, robot_name
+from vkc_pin.datasets.recipes.terms import check_robot
 from vkc_pin.files.documents import read_text
 from vkc_pin.files.writing import write_atomically
 from vkc_pin.importing.robots.robot_import import import_robot

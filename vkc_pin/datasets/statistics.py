@@ -13,7 +13,7 @@ import numpy as np
 
 from vkc_pin.datasets.diversity import spread
 from vkc_pin.datasets.episode import Episode
-from vkc_pin.datasets.recipe import Recipe
+from vkc_pin.datasets.recipes.recipe import Recipe
 from vkc_pin.motion.world import World
 from vkc_pin.plotting.style import COLOURS, new_figure, styled
 from vkc_pin.plotting.top_view import draw_top_view

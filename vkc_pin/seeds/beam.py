@@ -50,7 +50,7 @@ class _Mode(NamedTuple):
 
     thorough: bool
     backwards: bool
-    apart: bool
+    apart: bool = False
 
 
 class Beam:
@@ -189,9 +189,7 @@ class Beam:
             lengths, turns = self.knots.curves.lengths(first[:, :3], last[:, :3])
             cost[:, 0], cost[:, 2] = self.metric[0] * lengths, self.metric[2] * turns
         if self.routes is not None and not self.problem.closed(self.problem.task.phases[phase]):
-            distances = self.routes.distances(phase, first[:, :3], last[:, :3])
-            if self.careful and np.isinf(distances).all():  # as the trees' guides
-                distances = self.routes.distances(phase, first[:, :3], last[:, :3], folded=True)  # on a finer grid
+            distances = self.routes.distances(phase, first[:, :3], last[:, :3], folded=self.careful)
             cost[:, 0] = self.metric[0] * distances
             np.minimum(cost, _NOT_FOUND, out=cost)  # where there is no path, others come first
         elif self.routes is not None:

@@ -8,7 +8,7 @@ from helpers.datasets import SMALL
 
 from vkc_pin.benchmarks.datasets.simulated import Costs, measured, simulated
 from vkc_pin.datasets.dataset import Dataset
-from vkc_pin.datasets.recipe import load_recipe
+from vkc_pin.datasets.recipes.recipe import load_recipe
 
 
 def test_alone_with_a_client_that_costs_nothing() -> None:

@@ -10,7 +10,7 @@ from helpers.datasets import SMALL
 from vkc_pin.benchmarks.datasets.simulated import WORKERS
 from vkc_pin.benchmarks.datasets.throughput import _slope, run
 from vkc_pin.cli import main
-from vkc_pin.datasets.recipe import TASKS
+from vkc_pin.datasets.recipes.recipe import TASKS
 
 pytest.importorskip("h5py")
 

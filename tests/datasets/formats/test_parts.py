@@ -8,7 +8,7 @@ from helpers.datasets import SMALL
 from vkc_pin.datasets.episode import attempts
 from vkc_pin.datasets.formats.hdf5 import episodes_of, numbers_of, write_shard
 from vkc_pin.datasets.formats.parts import parts
-from vkc_pin.datasets.recipe import load_recipe
+from vkc_pin.datasets.recipes.recipe import load_recipe
 
 pytest.importorskip("h5py")
 

@@ -18,7 +18,7 @@ from vkc_pin.benchmarks.harness.record import Record, meta
 from vkc_pin.benchmarks.harness.tables import decimal, foot, markdown, to_csv
 from vkc_pin.datasets.dataset import Dataset
 from vkc_pin.datasets.generate import generate
-from vkc_pin.datasets.recipe import TASKS, load_recipe
+from vkc_pin.datasets.recipes.recipe import TASKS, load_recipe
 from vkc_pin.errors import InputError
 from vkc_pin.files.writing import write_atomically
 from vkc_pin.plotting.style import COLOURS, new_figure, save_figure, styled

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import Field
 
 from vkc_pin.arguments import mapping
-from vkc_pin.datasets.terms import TermSchema, check_entries
+from vkc_pin.datasets.recipes.terms import TermSchema, check_entries
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.files.documents import Document, check, read_yaml
 from vkc_pin.files.fields import Name, NotNegative, Number, Positive, Schema, Vector3, count, require, text_for

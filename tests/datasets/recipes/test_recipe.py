@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from vkc_pin.datasets.recipe import GoalSchema, RecipeSchema, RobotEntry, RoomsSchema, StartSchema, load_recipe
+from vkc_pin.datasets.recipes.recipe import GoalSchema, RecipeSchema, RobotEntry, RoomsSchema, StartSchema, load_recipe
 from vkc_pin.errors import InputError, UnknownNameError
 
 SMALL: dict[str, Any] = {"name": "small", "objects": ["random_oven"], "rooms": {"count": 2, "objects": 1}}
@@ -105,7 +105,7 @@ def test_values_that_make_no_sense(tmp_path: Path, line: str, field: str) -> Non
 
 
 def test_the_documentation_has_every_field(tmp_path: Path) -> None:
-    page = (Path(__file__).parents[2] / "docs/datasets.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[3] / "docs/datasets.md").read_text(encoding="utf-8")
     (block,) = re.findall(r"^```yaml\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
     assert load_recipe(write(tmp_path, block)).fields.name == "home"
     for schema in (RecipeSchema, RoomsSchema, StartSchema, GoalSchema, RobotEntry):

@@ -18,8 +18,8 @@ from vkc_pin.datasets.check import check_dataset
 from vkc_pin.datasets.dataset import Dataset
 from vkc_pin.datasets.generate import generate
 from vkc_pin.datasets.problems import terms_of
-from vkc_pin.datasets.recipe import load_recipe
-from vkc_pin.datasets.terms import KeepOutSchema, SpeedSchema, TracedSchema, UprightSchema
+from vkc_pin.datasets.recipes.recipe import load_recipe
+from vkc_pin.datasets.recipes.terms import KeepOutSchema, SpeedSchema, TracedSchema, UprightSchema
 from vkc_pin.errors import InputError, UnknownNameError
 
 h5py = pytest.importorskip("h5py")
@@ -204,6 +204,6 @@ def test_frames_of_the_recipe_are_looked_for_first(tmp_path: Path) -> None:
 
 
 def test_the_documentation_has_every_field() -> None:
-    page = (Path(__file__).parents[2] / "docs/datasets.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[3] / "docs/datasets.md").read_text(encoding="utf-8")
     for schema in (UprightSchema, SpeedSchema, KeepOutSchema, TracedSchema):
         assert [name for name in schema.model_fields if f"`{name}`" not in page] == [], schema.__name__

@@ -106,6 +106,9 @@ def test_distances_around_a_wall() -> None:
     several = grid.distances_from(np.array([(-2.0, -3.0), (3.0, 3.0)]))
     np.testing.assert_array_equal(several[0], found)
     assert several[1, 80, 80] < 0.1
+    many = np.random.default_rng(0).uniform(-3.0, 3.0, (7, 2))
+    for threads in (2, 9):
+        np.testing.assert_array_equal(grid.distances_from(many, threads=threads), grid.distances_from(many))
 
 
 def test_distances_from_where_the_base_cannot_be() -> None:

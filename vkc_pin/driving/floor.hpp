@@ -44,7 +44,8 @@ public:
   }
 
   // From W places, the k-th of which has the cells firsts[k]..firsts[k + 1] with their costs: [m], (W, cells, cells).
-  Array<double> distances(const Indices<1> & firsts, const Indices<1> & begins, const Numbers<1> & costs) const
+  Array<double> distances(
+    const Indices<1> & firsts, const Indices<1> & begins, const Numbers<1> & costs, std::size_t threads) const
   {
     const std::size_t places = firsts.shape(0) - 1, count = std::size_t(cells_ * cells_);
     if (firsts.shape(0) < 1 || begins.shape(0) != costs.shape(0) || std::size_t(firsts(places)) != begins.shape(0))
@@ -52,22 +53,25 @@ public:
     std::vector<double> found(places * count);
     {
       nb::gil_scoped_release released;
-      std::vector<double> least(leads_.size());
       const auto [shortest, longest] = std::minmax_element(lengths_.begin(), lengths_.end());
-      for (std::size_t k = 0; k < places; ++k)
-      {
-        std::fill(least.begin(), least.end(), std::numeric_limits<double>::infinity());
-        std::vector<std::pair<double, Index>> first;
-        for (Index entry = firsts(k); entry < firsts(k + 1); ++entry)
-          first.emplace_back(costs(entry), inner(begins(entry)));
-        spread(least, std::move(first), *shortest, *longest, [&](Index cell, double cost, const auto & reach) {
-          for (std::size_t heading = 0; heading < HEADINGS; ++heading)
-            if (leads_[std::size_t(cell)] >> heading & 1u)
-              reach(cell + moves_[heading], cost + lengths_[heading]);
-        });
-        for (Index i = 0; i < cells_; ++i)
-          std::copy_n(least.begin() + inner(i * cells_), cells_, found.begin() + std::ptrdiff_t(k * count) + i * cells_);
-      }
+      const double least_move = *shortest, most_move = *longest;
+      in_parts(places, threads, [&](std::size_t, std::size_t begin, std::size_t end) {
+        std::vector<double> least(leads_.size());
+        for (std::size_t k = begin; k < end; ++k)
+        {
+          std::fill(least.begin(), least.end(), std::numeric_limits<double>::infinity());
+          std::vector<std::pair<double, Index>> first;
+          for (Index entry = firsts(k); entry < firsts(k + 1); ++entry)
+            first.emplace_back(costs(entry), inner(begins(entry)));
+          spread(least, std::move(first), least_move, most_move, [&](Index cell, double cost, const auto & reach) {
+            for (std::size_t heading = 0; heading < HEADINGS; ++heading)
+              if (leads_[std::size_t(cell)] >> heading & 1u)
+                reach(cell + moves_[heading], cost + lengths_[heading]);
+          });
+          for (Index i = 0; i < cells_; ++i)
+            std::copy_n(least.begin() + inner(i * cells_), cells_, found.begin() + std::ptrdiff_t(k * count) + i * cells_);
+        }
+      });
     }
     return handed_over(std::move(found), {places, std::size_t(cells_), std::size_t(cells_)});
   }

@@ -219,11 +219,12 @@ class BaseGrid:
                 np.minimum(room[rows, columns], distance - body.span[s], out=room[rows, columns])
         return [room.tolist() for room in rooms]
 
-    def distances_from(self, starts: Floats) -> Floats:
+    def distances_from(self, starts: Floats, *, threads: int = 1) -> Floats:
         """Return how far the base drives at least from places, shape (W, 2) [m], to every cell, shape (W, cells, cells) [m].
 
         Infinite: there is no path. Turns are free, and only what surely blocks the base counts. Each start takes about a
-        millisecond on 100 x 100 cells; for many of them, a grid of fewer cells will do.
+        millisecond on 100 x 100 cells; for many of them, a grid of fewer cells will do. It makes no difference how many threads
+        look for them.
         """
         blocked = np.asarray(self.stuck.all(axis=2))
         entries: list[tuple[Ints, Floats]] = []
@@ -236,7 +237,7 @@ class BaseGrid:
             entries.append((self.cells * cells[:, 0] + cells[:, 1], np.hypot(*(self.origin + cells * self.step - (x, y)).T)))
         firsts = np.cumsum([0, *(len(cells) for cells, _ in entries)])
         begins, costs = (np.concatenate(part) for part in zip(*entries, strict=True))
-        return np.asarray(self._floor.distances(firsts, begins, costs))
+        return np.asarray(self._floor.distances(firsts, begins, costs, threads))
 
     @cached_property
     def _floor(self) -> Any:

@@ -8,6 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.arrays import Floats
+from vkc_pin.distances.threads import available_threads
 from vkc_pin.driving.body import Shape
 from vkc_pin.driving.curves import Curves, spread_along
 from vkc_pin.driving.grid import BaseGrid, fine_cells
@@ -85,7 +86,8 @@ class Routes:
         keys = [(phase, folded, *cell) for cell in begin]
         new = {key: start[:2] for key, start in zip(keys, starts, strict=True) if key not in self._distances}
         if new:
-            self._distances |= dict(zip(new, grid.distances_from(np.array(list(new.values()))), strict=True))
+            found = grid.distances_from(np.array(list(new.values())), threads=available_threads())
+            self._distances |= dict(zip(new, found, strict=True))
         return np.array([self._distances[key][i, j] for key, (i, j) in zip(keys, end, strict=True)])
 
     def path(self, phase: int, start: Floats, goal: Floats, steps: int) -> Floats | None:

@@ -15,10 +15,11 @@ from helpers.pages import clips, commands_of
 import vkc_pin as vkc
 from vkc_pin.benchmarks import baselines, comparison
 from vkc_pin.benchmarks.baselines import COMPARED_PLANNERS, TASKS
-from vkc_pin.benchmarks.comparison import peaks, shown
+from vkc_pin.benchmarks.comparison import shown
 from vkc_pin.benchmarks.comparison_report import report
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.limits import EFFORT, LIMITS
+from vkc_pin.benchmarks.harness.record import peaks
 from vkc_pin.cli import main
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.motion.spans import PhaseSpan

@@ -282,6 +282,16 @@ def test_what_is_good_is_improved_as_long_as_that_is_worth_while(objectives: lis
     assert (solution.rounds, solution.converged) == (expected, True)
 
 
+@pytest.mark.parametrize(("shortfall", "expected"), [(0.009, 2), (0.011, 3)])
+def test_a_motion_that_nearly_held_is_one_to_compare_with(
+    shortfall: float, expected: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first motion at which everything holds is hardly better than it; one that was far from free says nothing."""
+    monkeypatch.setattr(Scripted, "done", lambda _, trial: trial.contacts.violation() == 0.0)
+    solution = scripted((8.0, shortfall, True), (7.9, 0.0, True), (7.8, 0.0, True), (5.0, 0.0, True), step=1.0).solution
+    assert (solution.rounds, solution.converged) == (expected, True)
+
+
 @pytest.mark.parametrize(("done", "small"), [(True, False), (False, True)])
 def test_only_what_is_not_yet_free_needs_small_steps(done: bool, small: bool) -> None:
     _, after, *_ = scripted((8.1, 0.0, True), (8.1, 0.0, True), done=done, step=1.0).radii

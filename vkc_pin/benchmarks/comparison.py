@@ -21,17 +21,16 @@ from vkc_pin.benchmarks.comparison_report import WAYPOINTS, report
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.charts import motions_chart
 from vkc_pin.benchmarks.harness.limits import EFFORT, LIMITS
-from vkc_pin.benchmarks.harness.record import Record, Solve, trial
+from vkc_pin.benchmarks.harness.record import Record, Solve, peaks, trial
 from vkc_pin.errors import InputError
 from vkc_pin.files.writing import write_atomically
-from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import Planner, plan
 from vkc_pin.scene.poses import as_placement
 from vkc_pin.scene.scene import Scene, load_scene
 from vkc_pin.task.steps import Actuate, GoTo, Place, Step
 
-__all__ = ["COLD", "COMPARED_PLANNERS", "METHODS", "Assignment", "Comparison", "peaks"]
+__all__ = ["COLD", "COMPARED_PLANNERS", "METHODS", "Assignment", "Comparison"]
 
 COMPARED_PLANNERS = (*BASELINES, "VKC")
 METHODS = (*COMPARED_PLANNERS[:-1], *WAYPOINTS, "VKC")  # in the order of the tables
@@ -163,9 +162,8 @@ class Comparison:
         record = functools.partial(trials_of.record, save_failures=save_failures)
         result = runner.run(specs, record, out, settings=settings, jobs=jobs, scheduler=scheduler, progress=progress)
         saved = trials_of.saved(result["trials"], specs, again=save_failures, progress=progress)
-        pictures = self.draw(result["trials"], out, {name: self.tasks[name].name for name in tasks}, methods) + trials_of.motions(
-            result["trials"], specs
-        )
+        names = {name: self.tasks[name].name for name in tasks}
+        pictures = self.draw(result["trials"], out, names, methods) + trials_of.motions(result["trials"], specs)
         write_atomically(out / "table.md", self.report(result, saved=saved, pictures=pictures).encode())
         return result
 
@@ -177,13 +175,14 @@ class Comparison:
 
 def placed(scene: Scene, spec: Mapping[str, Any]) -> Scene:
     """Return a scene with its objects where the specification of a trial has them."""
-    placements = {name: as_placement(pose) for name, pose in spec.get("placed", {}).items()}
-    return functools.reduce(lambda scene, item: scene.with_placement(*item), placements.items(), scene)
+    for name, pose in spec.get("placed", {}).items():
+        scene = scene.with_placement(name, as_placement(pose))
+    return scene
 
 
 def goals(steps: Sequence[Step]) -> dict[str, Any]:
     """Return what steps ask for as plain data: "<object>.<joint>" → value, object → place, "base" → place."""
-    found = dict[str, Any]()
+    found: dict[str, Any] = {}
     for step in steps:
         if isinstance(step, Actuate):
             found |= {f"{step.object}.{joint}": value for joint, value in step.joints.items()}
@@ -192,13 +191,6 @@ def goals(steps: Sequence[Step]) -> dict[str, Any]:
         elif isinstance(step, GoTo):
             found["base"] = [step.x, step.y] if step.yaw is None else [step.x, step.y, step.yaw]
     return found
-
-
-def peaks(trajectory: Trajectory) -> dict[str, float]:
-    """Return the largest velocity [rad/s] and acceleration [rad/s²] of an arm joint: peak_velocity, peak_acceleration."""
-    arm, curve = slice(3, trajectory.robot_size), trajectory.curve
-    speeds, changes = (trajectory.velocities(), trajectory.accelerations()) if curve is None else curve.speeds()
-    return {f"peak_{n}": float(np.abs(v[:, arm]).max(initial=0.0)) for n, v in (("velocity", speeds), ("acceleration", changes))}
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ __all__ = ["Hit", "sweep"]
 
 RESOLUTION = 1e-3  # [m] of penetration that may stay unseen between two samples
 STILL = 1e-6  # [m] of relative motion between two samples that changes nothing, as of what stands where it was put
-_AT_ONCE = 64  # states whose pairs are looked at together: tables of all of a chore's would take half a gigabyte
+_AT_ONCE = 64  # states whose pairs are looked at together, until the nearest of all of them are found
 
 
 class Hit(NamedTuple):

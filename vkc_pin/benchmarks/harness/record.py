@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.files.resources import package_folder
+from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.planning.plan import Plan
 from vkc_pin.running.machine import machine, peak_memory, versions
 from vkc_pin.scene.scene import Scene
 
-__all__ = ["Record", "Solve", "commit", "distribution", "meta", "peak_memory", "trial", "values", "versions"]
+__all__ = ["Record", "Solve", "commit", "distribution", "meta", "peak_memory", "peaks", "trial", "values", "versions"]
 
 Record = Mapping[str, Any]
 """What is kept of a trial, by field; see `trial`."""
@@ -64,6 +65,14 @@ def trial(plan: Plan, *, method: str, seed: int, **more: Any) -> dict[str, Any]:
         "commit": commit(),
         **more,
     }
+
+
+def peaks(trajectory: Trajectory) -> dict[str, float]:
+    """Return the largest velocity [rad/s] and acceleration [rad/s²] of an arm joint: peak_velocity, peak_acceleration."""
+    arm, curve = slice(3, trajectory.robot_size), trajectory.curve
+    rates = (trajectory.velocities(), trajectory.accelerations()) if curve is None else curve.speeds()
+    largest = [float(np.abs(rate[:, arm]).max(initial=0.0)) for rate in rates]
+    return dict(zip(("peak_velocity", "peak_acceleration"), largest, strict=True))
 
 
 def values(trials: Iterable[Record], field: str) -> list[float]:

@@ -25,7 +25,7 @@ class Relaxed:
         self.merit = Merit(REST)
         self.merit.weights["clearance"] = CLEARANCE
         self._planes = p.contacts.planes(z, contacts, slots=t.slots)
-        solver = t.solver(rates=True, options=QUIET)
+        solver = t.solver(rates=True, options=QUIET).function
         self._cost, self._rows = (solver.get_function(name) for name in ("nlp_grad_f", "nlp_jac_g"))
         self.lower, self.upper = p.row_bounds(self.timing)
 

@@ -193,7 +193,7 @@ def test_rows_and_costs_are_the_expressions_at_the_waypoints(name: str) -> None:
 def test_derivatives_are_those_of_finite_differences(name: str) -> None:
     p = problem(name)
     t, rng = p.transcription, np.random.default_rng(1)
-    solver = t.solver(rates=False, options=QUIET)
+    solver = t.solver(rates=False, options=QUIET).function
     objective, constraints, lagrangian = (solver.get_function(f) for f in ("nlp_grad_f", "nlp_jac_g", "nlp_hess_l"))
     planes = rng.normal(size=(t.segments, t.slots, 12 * (p.chain.model.njoints - 1)))
     offsets = rng.normal(size=(t.segments, t.slots))

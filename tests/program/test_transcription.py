@@ -148,7 +148,7 @@ def random_point(p: TrajectoryProblem, seed: int = 0) -> Point:
 
 def functions(p: TrajectoryProblem, *, rates: bool) -> tuple[ca.Function, ca.Function, ca.Function]:
     """Return what Ipopt is given: (x, p) → f, ∇f; (x, p) → g, ∂g; (x, p, σ, λ) → the upper half of ∇²L."""
-    solver = p.transcription.solver(rates=rates, options=QUIET)
+    solver = p.transcription.solver(rates=rates, options=QUIET).function
     return tuple(solver.get_function(name) for name in ("nlp_grad_f", "nlp_jac_g", "nlp_hess_l"))
 
 

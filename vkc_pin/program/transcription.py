@@ -265,7 +265,7 @@ class Transcription:
         starts = (self.start_first[:, None], self.start_second[:, None])
         self.rate_start = ca.vertcat(*(ca.kron(sparse(part), identity) for part in starts))
 
-    def solver(self, *, rates: bool, options: dict[str, Any]) -> ca.Function:
+    def solver(self, *, rates: bool, options: dict[str, Any]) -> Ipopt:
         """Return Ipopt on this program.
 
         Args:
@@ -273,7 +273,7 @@ class Transcription:
             options: For CasADi's nlpsol.
         """
         key = ("ipopt", self.structure.key, rates, tuple(sorted(options.items())))
-        return self.cache.get(key, lambda: self._make_solver(rates, options)).solver
+        return self.cache.get(key, lambda: self._make_solver(rates, options))
 
     def _make_solver(self, rates: bool, options: dict[str, Any]) -> Ipopt:
         g, jacobian, multipliers, parameters = self.g, self.jacobian, self.multipliers, self.parameters

@@ -11,6 +11,7 @@ import numpy as np
 from vkc_pin.arrays import Floats
 from vkc_pin.chain.contacts import Contacts
 from vkc_pin.motion.timing import Timing
+from vkc_pin.needed import compiled_module
 from vkc_pin.program.merit import TOLERANCE, Infeasibility, Merit, shortfalls
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.solver.solution import Solution
@@ -20,7 +21,9 @@ __all__ = ["Step", "Subproblem"]
 _IPOPT: Mapping[str, Any] = {
     "ipopt.print_level": 0,
     "ipopt.sb": "yes",
-    "ipopt.linear_solver": "mumps",
+    "ipopt.linear_solver": "ma97",  # the interface; what it leads to is `_kkt`
+    "ipopt.ma97_order": "amd",
+    "ipopt.ma97_scaling": "none",
     "ipopt.tol": 1e-4,
     "ipopt.acceptable_tol": 1e-3,
     "ipopt.constr_viol_tol": 1e-5,
@@ -102,7 +105,8 @@ class Subproblem:
         if relaxed:  # on the way: the rows of the round before were others, and its end need not be exact
             self.forget()
         how = _ROUGH if relaxed else _WARM if self._multipliers else {}
-        options = {"ipopt.max_iter": problem.options.max_iterations, **_IPOPT, **how}
+        kkt = compiled_module("vkc_pin.solver._kkt").__file__
+        options = {"ipopt.max_iter": problem.options.max_iterations, "ipopt.hsllib": kkt, **_IPOPT, **how}
         solver = t.solver(rates=rates, options=options)
         prices = merit.price(found, clearance=False)
         shares = np.where(relaxed & (prices > 0.0), 1.0, 0.0)
@@ -132,12 +136,10 @@ class Subproblem:
         begin = time.perf_counter()
         result = solver(**arguments, **self._multipliers)
         total = time.perf_counter() - begin
-        stats = solver.stats()
-        casadi_time = sum(value for key, value in stats.items() if key.startswith("t_wall_nlp_"))
-        self.solution.timings["casadi"] += casadi_time
-        self.solution.timings["ipopt"] += total - casadi_time
-        self.solution.iterations += int(stats["iter_count"])
+        self.solution.timings["casadi"] += solver.evaluating
+        self.solution.timings["ipopt"] += total - solver.evaluating
+        self.solution.iterations += int(solver.stats["iter_count"])
         self._multipliers = {"lam_x0": result["lam_x"], "lam_g0": result["lam_g"]}
-        x = np.asarray(result["x"]).reshape(t.segments, t.width)
+        x = result["x"].reshape(t.segments, t.width)
         slack, shares = np.maximum(x[:, t.n : -1].sum(axis=1), 0.0), np.clip(x[:, -1], 0.0, 1.0)
-        return Step(x[:, : t.n], slack, shares, bool(stats["success"]))
+        return Step(x[:, : t.n], slack, shares, bool(solver.stats["success"]))

@@ -1,0 +1,162 @@
+"""The linear solver that Ipopt loads, against dense algebra, and within Ipopt."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vkc_pin.needed import compiled_module
+
+KKT = compiled_module("vkc_pin.solver._kkt")
+OWN = {"ipopt.linear_solver": "ma97", "ipopt.hsllib": KKT.__file__, "ipopt.ma97_order": "amd", "ipopt.ma97_scaling": "none"}
+QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False}
+
+
+def lower(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return columns, rows and values of a lower triangle, with all of its diagonal."""
+    triangle = np.tril(matrix)
+    kept = (triangle != 0.0) | np.eye(len(matrix), dtype=bool)
+    columns = np.r_[0, np.cumsum(kept.sum(axis=0))].astype(np.int32)
+    rows = np.concatenate([np.flatnonzero(column) for column in kept.T]).astype(np.int32)
+    return columns, rows, np.concatenate([column[mask] for column, mask in zip(triangle.T, kept.T, strict=True)])
+
+
+def factored(matrix: np.ndarray) -> tuple[Any, bool]:
+    columns, rows, values = lower(matrix)
+    factorization = KKT.Factorization(columns, rows)
+    return factorization, factorization.factor(values)
+
+
+def system(seed: int, waypoints: int, size: int, equalities: int, planes: int) -> np.ndarray:
+    """Return a system as that of a trajectory: blocks, coupled to the next two, rows of each, and slacks of some rows."""
+    rng = np.random.default_rng(seed)
+    n, m = waypoints * size, waypoints * (equalities + planes)
+    hessian = np.zeros((n, n))
+    for k in range(waypoints):
+        block, root = slice(k * size, (k + 1) * size), rng.normal(size=(size, size))
+        hessian[block, block] += root @ root.T + 0.1 * np.eye(size)
+        if k > 1:
+            change = np.zeros((size, n))
+            change[:, block] = np.eye(size)
+            change[:, slice((k - 1) * size, k * size)] = -2.0 * np.eye(size)
+            change[:, slice((k - 2) * size, (k - 1) * size)] = np.eye(size)
+            hessian += 10.0 * change.T @ change
+    rows = np.zeros((m, n))
+    for row in range(m):
+        k = row // (equalities + planes)
+        rows[row, k * size : (k + 1) * size] = rng.normal(size=size)
+    slack = np.flatnonzero(np.arange(m) % (equalities + planes) >= equalities)
+    total = n + len(slack) + m
+    matrix = np.zeros((total, total))
+    matrix[:n, :n] = hessian
+    matrix[np.arange(n, n + len(slack)), np.arange(n, n + len(slack))] = 10.0 ** rng.uniform(-4.0, 4.0, len(slack))
+    matrix[n + len(slack) :, :n] = rows
+    matrix[n + len(slack) + slack, n + np.arange(len(slack))] = -1.0
+    return np.tril(matrix) + np.tril(matrix, -1).T
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10**6), st.integers(1, 6), st.integers(2, 6), st.integers(0, 2), st.integers(0, 3))
+def test_systems_of_trajectories_are_solved_and_their_negative_eigenvalues_counted(
+    seed: int, waypoints: int, size: int, equalities: int, planes: int
+) -> None:
+    matrix = system(seed, waypoints, size, min(equalities, size), planes)
+    factorization, done = factored(matrix)
+    assert done
+    assert factorization.negative == np.count_nonzero(np.linalg.eigvalsh(matrix) < 0.0)
+    wanted = np.random.default_rng(seed).normal(size=len(matrix))
+    x = matrix @ wanted
+    factorization.solve(x)
+    residual = np.abs(matrix @ (x - wanted)).max() / (np.abs(matrix).sum(axis=1).max() * np.abs(wanted).max())
+    assert residual < 1e-10
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10**6), st.integers(1, 12), st.floats(0.1, 1.0))
+def test_any_matrix_is_solved_or_said_to_be_singular(seed: int, size: int, density: float) -> None:
+    rng = np.random.default_rng(seed)
+    matrix = np.where(rng.uniform(size=(size, size)) < density, rng.normal(size=(size, size)), 0.0)
+    matrix += matrix.T
+    factorization, done = factored(matrix)
+    if not done:  # a pivot is zero, as it is in every singular matrix and, since pivots are taken as they come, in some others
+        assert min(abs(np.linalg.det(matrix[:k, :k])) for k in range(1, size + 1)) < 1e-8 or np.any(np.diag(matrix) == 0.0)
+        return
+    assert factorization.negative == np.count_nonzero(np.linalg.eigvalsh(matrix) < 0.0)
+
+
+def test_a_second_matrix_is_factored_as_if_it_were_the_first() -> None:
+    first, second = system(1, 4, 5, 2, 2), system(1, 4, 5, 2, 2)
+    second[np.diag_indices(20)] += 3.0
+    columns, rows, _ = lower(first)
+    again, anew = KKT.Factorization(columns, rows), KKT.Factorization(columns, rows)
+    assert again.factor(lower(first)[2])
+    assert again.factor(lower(second)[2])
+    assert anew.factor(lower(second)[2])
+    b = np.arange(len(first), dtype=float)
+    x, y = b.copy(), b.copy()
+    again.solve(x)
+    anew.solve(y)
+    np.testing.assert_array_equal(x, y)
+
+
+def test_rows_that_say_the_same_are_singular_and_what_follows_is_right() -> None:
+    matrix = system(2, 3, 4, 2, 0)
+    doubled = matrix.copy()
+    doubled[-1], doubled[:, -1] = doubled[-2], doubled[:, -2]
+    columns, rows, values = lower(np.where(matrix != 0.0, matrix, 0.0))
+    factorization = KKT.Factorization(columns, rows)
+    assert not factorization.factor(lower_of(doubled, columns, rows))
+    with pytest.raises(ValueError, match="once it is factored"):
+        factorization.solve(np.ones(len(matrix)))
+    assert factorization.factor(values)
+    x = matrix @ np.ones(len(matrix))
+    factorization.solve(x)
+    np.testing.assert_allclose(x, 1.0, atol=1e-8)
+
+
+def lower_of(matrix: np.ndarray, columns: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Return the values of a matrix at entries of a triangle."""
+    return np.concatenate([matrix[rows[columns[j] : columns[j + 1]], j] for j in range(len(matrix))])
+
+
+def test_not_a_number_is_no_pivot() -> None:
+    matrix = system(3, 2, 3, 1, 0)
+    columns, rows, values = lower(matrix)
+    values[0] = np.nan
+    assert not KKT.Factorization(columns, rows).factor(values)
+
+
+@pytest.mark.parametrize(
+    ("columns", "rows", "message"),
+    [
+        ([], [], "columns begin with 0"),
+        ([1, 2], [0, 0], "columns begin with 0"),
+        ([0, 2, 1], [0, 1], "columns ascend"),
+        ([0, 1, 2], [0, 0], "lower triangle"),
+        ([0, 1, 2], [0, 2], "lower triangle"),
+        ([0, 1], [0, 0], "columns ascend"),
+    ],
+)
+def test_what_is_no_lower_triangle_is_refused(columns: list[int], rows: list[int], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        KKT.Factorization(np.array(columns, np.int32), np.array(rows, np.int32))
+
+
+@pytest.mark.parametrize("bounds", [(0.0, 0.0), (-np.inf, 0.0), (0.0, np.inf)], ids=["equal", "below", "above"])
+def test_ipopt_goes_where_it_goes_with_mumps(bounds: tuple[float, float]) -> None:
+    """A program with a Hessian that is not definite, and more rows than it needs: two say the same."""
+    x = ca.MX.sym("x", 6)
+    f = ca.sumsqr(x[1:] - x[:-1] ** 2) + ca.sumsqr(1.0 - x[:-1]) + ca.cos(3.0 * x[5])
+    g = ca.vertcat(x[0] + x[1] - 1.0, x[2] * x[3] - 0.5, 2.0 * (x[0] + x[1] - 1.0), x[4] - ca.sin(x[5]))
+    found = []
+    for options in ({"ipopt.linear_solver": "mumps"}, OWN):
+        solver = ca.nlpsol("solver", "ipopt", {"x": x, "f": f, "g": g}, {**QUIET, **options})
+        result = solver(x0=np.full(6, 0.3), lbg=[bounds[0]] * 4, ubg=[bounds[1]] * 4, lbx=-5.0, ubx=5.0)
+        assert solver.stats()["success"]
+        found.append(np.ravel(result["x"]))
+    np.testing.assert_allclose(found[1], found[0], atol=1e-6)

@@ -5,10 +5,12 @@
 #include <cmath>
 #include <cstddef>
 #include <limits>
+#include <utility>
 #include <vector>
 
-// Factors P·A·Pᵀ = L·D·Lᵀ with a diagonal D, row by row (up-looking: Davis, "User Guide for LDL", 2005; Stewart, "Building an
-// Old-Fashioned Sparse Solver", 2003).
+// Factors P·A·Pᵀ = L·D·Lᵀ with a diagonal D, a few neighbouring columns at a time: a panel of L is dense, has only the rows in which
+// one of its columns has an entry, and when it is done the columns to its right are updated (right-looking supernodes: Ng and
+// Peyton, "Block Sparse Cholesky Algorithms on Advanced Uniprocessor Computers", 1993).
 //
 // A system of an interior-point method has primal rows, whose diagonals are positive at first, and dual ones, whose diagonals
 // are zero. Pivots are taken as they come, so the order has to see to it that none is zero (Bridson, "An Ordering Method for
@@ -24,7 +26,7 @@ class Factorization
 public:
   // Takes the lower triangle, column by column: rows[columns[j] - base] and on are those of column j, counted from base.
   Factorization(std::size_t size, const int * columns, const int * rows, int base)
-  : size_(size)
+  : size_(int(size))
   , columns_(columns, columns + size + 1)
   , rows_(rows, rows + (columns[size] - base))
   {
@@ -34,12 +36,12 @@ public:
       row -= base;
   }
 
-  std::size_t size() const { return size_; }
+  std::size_t size() const { return std::size_t(size_); }
   std::size_t entries() const { return rows_.size(); }
   // Number of negative pivots: by Sylvester's law, of negative eigenvalues.
   int negative() const { return negative_; }
-  // Number of entries below the diagonal of L.
-  std::size_t filled() const { return entries_.size(); }
+  // Number of entries of the panels.
+  std::size_t filled() const { return values_.size(); }
   // Whether the last call of `factor` worked, so that there is something to solve with.
   bool factored() const { return factored_; }
 
@@ -49,39 +51,17 @@ public:
   {
     factored_ = false;
     if (order_.empty())
-    {
-      order(values);
-      analyse();
-    }
-    constexpr double least = 8.0 * std::numeric_limits<double>::epsilon();
+      analyse(order(values));
     negative_ = 0;
-    std::fill(ends_.begin(), ends_.end(), 0);
-    std::fill(seen_.begin(), seen_.end(), -1);
-    for (int k = 0; k < int(size_); ++k)
+    std::fill(values_.begin(), values_.end(), 0.0);
+    std::fill(sums_.begin(), sums_.end(), 0.0);
+    for (std::size_t p = 0; p < places_.size(); ++p)
+      values_[places_[p]] += values[p];
+    for (const Panel & panel : panels_)
     {
-      const int first = reach(k, values);
-      double pivot = work_[k], size = std::abs(pivot);
-      work_[k] = 0.0;
-      for (int at = first; at < int(size_); ++at)
-      {
-        const int i = reached_[at];
-        const double value = work_[i], share = value / pivots_[i];
-        work_[i] = 0.0;
-        const int end = begins_[i] + ends_[i]++;
-        for (int p = begins_[i]; p < end; ++p)
-          work_[places_[p]] -= entries_[p] * value;
-        pivot -= share * value;
-        size += std::abs(share * value);
-        places_[end] = k;
-        entries_[end] = share;
-      }
-      if (!(std::abs(pivot) > least * size))
-      {
-        std::fill(work_.begin(), work_.end(), 0.0);
+      if (!eliminate(panel))
         return false;
-      }
-      pivots_[k] = pivot;
-      negative_ += pivot < 0.0;
+      update(panel);
     }
     return factored_ = true;
   }
@@ -89,32 +69,64 @@ public:
   // Replaces b by the solution of A·x = b.
   void solve(double * x)
   {
-    const int size = int(size_);
-    for (int k = 0; k < size; ++k)
+    for (int k = 0; k < size_; ++k)
       work_[k] = x[order_[k]];
-    for (int k = 0; k < size; ++k)
-      for (int p = begins_[k]; p < begins_[k + 1]; ++p)
-        work_[places_[p]] -= entries_[p] * work_[k];
-    for (int k = size - 1; k >= 0; --k)
+    for (const Panel & panel : panels_)
     {
-      double sum = work_[k] / pivots_[k];
-      for (int p = begins_[k]; p < begins_[k + 1]; ++p)
-        sum -= entries_[p] * work_[places_[p]];
-      work_[k] = sum;
+      const int * rows = &panel_rows_[panel.rows];
+      for (int k = 0; k < panel.width; ++k)
+      {
+        const double * column = &values_[panel.values + k * panel.height];
+        const double value = work_[panel.first + k];
+        for (int i = k + 1; i < panel.width; ++i)
+          work_[panel.first + i] -= column[i] * value;
+        for (int i = panel.width; i < panel.height; ++i)
+          work_[rows[i]] -= column[i] * value;
+      }
     }
-    for (int k = 0; k < size; ++k)
+    for (auto panel = panels_.rbegin(); panel != panels_.rend(); ++panel)
+    {
+      const int * rows = &panel_rows_[panel->rows];
+      for (int k = panel->width - 1; k >= 0; --k)
+      {
+        const double * column = &values_[panel->values + k * panel->height];
+        double sum = work_[panel->first + k] / column[k];
+        for (int i = k + 1; i < panel->width; ++i)
+          sum -= column[i] * work_[panel->first + i];
+        for (int i = panel->width; i < panel->height; ++i)
+          sum -= column[i] * work_[rows[i]];
+        work_[panel->first + k] = sum;
+      }
+    }
+    for (int k = 0; k < size_; ++k)
       x[order_[k]] = work_[k];
-    std::fill(work_.begin(), work_.end(), 0.0);
   }
 
 private:
-  // Finds the order of elimination.
-  void order(const double * values)
+  static constexpr int WIDTH = 8; // columns of a panel at most
+
+  // Columns of L next to each other: `width` from the `first` on, `height` entries each, the first ones of which are of the panel's
+  // own rows; where their rows, values and updates begin.
+  struct Panel
   {
-    const int size = int(size_);
+    int first, width, height;
+    std::size_t rows, values, updates, last_update;
+  };
+
+  // What a panel changes in another: its rows from `begin` to `end` are columns of that, whose places in it, and those of the rows
+  // after them, are in `updated_` from `places` on.
+  struct Update
+  {
+    int panel, begin, end;
+    std::size_t places;
+  };
+
+  // Finds the order of elimination; returns how many columns come first that are panels on their own.
+  int order(const double * values)
+  {
     std::vector<char> dual(size_, true);
     std::vector<int> degree(size_, 0), primal(size_, 0); // how many rows know each, and how many primal ones
-    for (int j = 0; j < size; ++j)
+    for (int j = 0; j < size_; ++j)
       for (int p = columns_[j]; p < columns_[j + 1]; ++p)
         if (rows_[p] == j && values[p] > 0.0)
           dual[j] = false;
@@ -123,7 +135,7 @@ private:
       primal[i] += !dual[j];
     });
     std::vector<char> slack(size_), slackened(size_, false);
-    for (int j = 0; j < size; ++j)
+    for (int j = 0; j < size_; ++j)
       slack[j] = !dual[j] && degree[j] <= 1 && primal[j] == 0;
     std::vector<int> last(size_, -1); // the last primal row that knows a dual one
     each_pair([&](int i, int j) {
@@ -135,7 +147,8 @@ private:
     // What comes before all others, then what comes with each row of the program, then what nothing primal knows.
     enum { SLACK = -2, SLACKENED = -1 };
     std::vector<std::pair<int, int>> when;
-    for (int j = 0; j < size; ++j)
+    int alone = 0;
+    for (int j = 0; j < size_; ++j)
     {
       int turn = 2 * j;
       if (slack[j])
@@ -143,19 +156,21 @@ private:
       else if (slackened[j])
         turn = SLACKENED;
       else if (dual[j])
-        turn = last[j] < 0 ? 2 * size : 2 * last[j] + 1;
+        turn = last[j] < 0 ? 2 * size_ : 2 * last[j] + 1;
+      alone += turn < 0;
       when.emplace_back(turn, j);
     }
     std::sort(when.begin(), when.end());
     for (const auto & [turn, j] : when)
       order_.push_back(j);
+    return alone;
   }
 
   // Calls f(i, j) and f(j, i) for every entry off the diagonal.
   template<typename Function>
   void each_pair(const Function & f) const
   {
-    for (int j = 0; j < int(size_); ++j)
+    for (int j = 0; j < size_; ++j)
       for (int p = columns_[j]; p < columns_[j + 1]; ++p)
         if (rows_[p] != j)
         {
@@ -164,84 +179,194 @@ private:
         }
   }
 
-  // Finds where L has entries.
-  void analyse()
+  // Finds the panels, where entries of the matrix are in them, and what they change in others.
+  void analyse(int alone)
   {
-    const int size = int(size_);
-    std::vector<int> place(size_);
-    for (int k = 0; k < size; ++k)
-      place[order_[k]] = k;
-    above_.assign(size_ + 1, 0);
+    std::vector<int> when(size_), panel_of(size_), at(size_ + 1, 0), below(rows_.size());
+    for (int k = 0; k < size_; ++k)
+      when[order_[k]] = k;
     const auto each = [&](const auto & f) {
-      for (int j = 0; j < size; ++j)
+      for (int j = 0; j < size_; ++j)
         for (int p = columns_[j]; p < columns_[j + 1]; ++p)
-          f(std::minmax(place[j], place[rows_[p]]), p);
+          f(std::min(when[j], when[rows_[p]]), std::max(when[j], when[rows_[p]]), p);
     };
-    each([&](auto ends, int) { ++above_[ends.second + 1]; });
-    for (int k = 0; k < size; ++k)
-      above_[k + 1] += above_[k];
-    std::vector<int> next(above_.begin(), above_.end() - 1);
-    above_rows_.resize(rows_.size());
-    values_.resize(rows_.size());
-    each([&](auto ends, int p) {
-      const int at = next[ends.second]++;
-      above_rows_[at] = ends.first;
-      values_[at] = p;
-    });
-    // The elimination tree, and how many entries each column of L has.
-    parents_.assign(size_, -1);
-    seen_.assign(size_, -1);
-    ends_.assign(size_, 0);
-    for (int k = 0; k < size; ++k)
+    each([&](int column, int, int) { ++at[column + 1]; });
+    for (int k = 0; k < size_; ++k)
+      at[k + 1] += at[k];
+    std::vector<int> next(at.begin(), at.end() - 1);
+    each([&](int column, int row, int) { below[next[column]++] = row; });
+    // Rows of a panel: those of its entries, and those of panels the first of whose later rows are columns of it.
+    std::vector<int> seen(size_, -1);
+    std::vector<std::vector<int>> children;
+    for (int first = 0; first < size_;)
     {
-      seen_[k] = k;
-      for (int p = above_[k]; p < above_[k + 1]; ++p)
-        for (int i = above_rows_[p]; seen_[i] != k; i = parents_[i])
+      const int number = int(panels_.size()), width = first < alone ? 1 : std::min(WIDTH, size_ - first);
+      for (int k = first; k < first + width; ++k)
+        panel_of[k] = number;
+      panels_.push_back({first, width, 0, 0, 0, 0, 0});
+      first += width;
+    }
+    children.resize(panels_.size());
+    for (std::size_t number = 0; number < panels_.size(); ++number)
+    {
+      Panel & panel = panels_[number];
+      const int end = panel.first + panel.width;
+      panel.rows = panel_rows_.size();
+      for (int k = panel.first; k < end; ++k)
+        panel_rows_.push_back(k);
+      const auto add = [&](int row) {
+        if (row >= end && seen[row] != int(number))
         {
-          if (parents_[i] < 0)
-            parents_[i] = k;
-          ++ends_[i];
-          seen_[i] = k;
+          seen[row] = int(number);
+          panel_rows_.push_back(row);
         }
+      };
+      std::for_each(below.begin() + at[panel.first], below.begin() + at[end], add);
+      for (const int child : children[number])
+        for (int i = panels_[child].width; i < panels_[child].height; ++i)
+          add(panel_rows_[panels_[child].rows + i]);
+      std::sort(panel_rows_.begin() + std::ptrdiff_t(panel.rows), panel_rows_.end());
+      panel.height = int(panel_rows_.size() - panel.rows);
+      if (panel.height > panel.width)
+        children[panel_of[panel_rows_[panel.rows + panel.width]]].push_back(int(number));
+      panel.values = values_.size();
+      values_.resize(values_.size() + std::size_t(panel.width) * panel.height);
     }
-    begins_.assign(size_ + 1, 0);
-    for (int k = 0; k < size; ++k)
-      begins_[k + 1] = begins_[k] + ends_[k];
-    places_.resize(begins_[size]);
-    entries_.resize(begins_[size]);
-    pivots_.resize(size_);
-    work_.assign(size_, 0.0);
-    reached_.resize(size_);
+    for (Panel & panel : panels_)
+      plan_updates(panel, panel_of);
+    places_.resize(rows_.size());
+    each([&](int column, int row, int p) {
+      const Panel & panel = panels_[panel_of[column]];
+      places_[p] = panel.values + std::size_t(column - panel.first) * panel.height + place(panel, row);
+    });
+    sums_.resize(size_);
+    work_.resize(size_);
   }
 
-  // Puts row k of the matrix, up to its diagonal, where work is done; returns from where on `reached_` has the columns of L in
-  // which that row has entries, each after those that it waits for.
-  int reach(int k, const double * values)
+  // Where a row is among those of a panel.
+  int place(const Panel & panel, int row) const
   {
-    int first = int(size_);
-    seen_[k] = k;
-    for (int p = above_[k]; p < above_[k + 1]; ++p)
-    {
-      int i = above_rows_[p], length = 0;
-      work_[i] += values[values_[p]];
-      for (; seen_[i] != k; i = parents_[i])
-      {
-        reached_[length++] = i;
-        seen_[i] = k;
-      }
-      while (length > 0)
-        reached_[--first] = reached_[--length];
-    }
-    return first;
+    const auto begin = panel_rows_.begin() + std::ptrdiff_t(panel.rows);
+    return int(std::lower_bound(begin, begin + panel.height, row) - begin);
   }
 
-  std::size_t size_;
-  std::vector<int> columns_, rows_;              // the lower triangle
-  std::vector<int> order_;                       // which row is eliminated when
-  std::vector<int> above_, above_rows_, values_; // the upper triangle in that order, and where its values are
-  std::vector<int> parents_, seen_, reached_;    // the elimination tree
-  std::vector<int> begins_, ends_, places_;      // of columns of L; how many entries each has by now; their rows
-  std::vector<double> entries_, pivots_, work_;
+  void plan_updates(Panel & panel, const std::vector<int> & panel_of)
+  {
+    panel.updates = updates_.size();
+    const int * rows = &panel_rows_[panel.rows];
+    for (int begin = panel.width; begin < panel.height;)
+    {
+      const int number = panel_of[rows[begin]];
+      int end = begin;
+      while (end < panel.height && panel_of[rows[end]] == number)
+        ++end;
+      updates_.push_back({number, begin, end, updated_.size()});
+      for (int i = begin; i < panel.height; ++i)
+        updated_.push_back(place(panels_[number], rows[i]));
+      begin = end;
+    }
+    panel.last_update = updates_.size();
+  }
+
+  // Factors the columns of a panel; false: a pivot is zero, but for what rounding leaves of the sum that it is.
+  bool eliminate(const Panel & panel)
+  {
+    constexpr double least = 8.0 * std::numeric_limits<double>::epsilon();
+    const int height = panel.height;
+    for (int k = 0; k < panel.width; ++k)
+    {
+      double * column = &values_[panel.values + std::size_t(k) * height];
+      const double pivot = column[k];
+      if (!(std::abs(pivot) > least * sums_[panel.first + k]))
+        return false;
+      negative_ += pivot < 0.0;
+      for (int j = k + 1; j < panel.width; ++j)
+      {
+        double * other = &values_[panel.values + std::size_t(j) * height];
+        const double share = column[j] / pivot;
+        if (share == 0.0)
+          continue;
+        sums_[panel.first + j] += std::abs(share * column[j]);
+        for (int i = j; i < height; ++i)
+          other[i] -= share * column[i];
+      }
+      const double inverse = 1.0 / pivot;
+      for (int i = k + 1; i < height; ++i)
+        column[i] *= inverse;
+    }
+    return true;
+  }
+
+  // Takes what a panel's columns come to off the columns to its right.
+  void update(const Panel & panel)
+  {
+    const int height = panel.height, width = panel.width;
+    const double * values = &values_[panel.values];
+    const int * rows = &panel_rows_[panel.rows];
+    double products[WIDTH];
+    for (std::size_t u = panel.updates; u < panel.last_update; ++u)
+    {
+      const Update & update = updates_[u];
+      const Panel & other = panels_[update.panel];
+      const int * places = &updated_[update.places] - update.begin;
+      for (int j = update.begin; j < update.end; ++j)
+      {
+        double sum = 0.0;
+        for (int k = 0; k < width; ++k)
+        {
+          const double entry = values[std::size_t(k) * height + j];
+          products[k] = entry * values[std::size_t(k) * height + k];
+          sum += std::abs(products[k] * entry);
+        }
+        sums_[rows[j]] += sum;
+        double * target = &values_[other.values + std::size_t(places[j]) * other.height];
+        subtract(values, height, width, products, j, places, target);
+      }
+    }
+  }
+
+  // Takes L·products, from row j on, off a column.
+  void subtract(
+    const double * values, int height, int width, const double * products, int j, const int * places, double * target)
+  {
+    if (width == 1)
+    {
+      for (int i = j; i < height; ++i)
+        target[places[i]] -= values[i] * products[0];
+      return;
+    }
+    if (int(sum_.size()) < height)
+      sum_.resize(height);
+    double * sum = sum_.data();
+    int k = 0;
+    std::fill(sum + j, sum + height, 0.0);
+    for (; k + 4 <= width; k += 4)
+    {
+      const double *a = values + std::size_t(k) * height, *b = a + height, *c = b + height, *d = c + height;
+      const double p = products[k], q = products[k + 1], r = products[k + 2], s = products[k + 3];
+      for (int i = j; i < height; ++i)
+        sum[i] += (a[i] * p + b[i] * q) + (c[i] * r + d[i] * s);
+    }
+    for (; k < width; ++k)
+    {
+      const double * a = values + std::size_t(k) * height;
+      for (int i = j; i < height; ++i)
+        sum[i] += a[i] * products[k];
+    }
+    for (int i = j; i < height; ++i)
+      target[places[i]] -= sum[i];
+  }
+
+  int size_;
+  std::vector<int> columns_, rows_; // the lower triangle
+  std::vector<int> order_;          // which row is eliminated when
+  std::vector<Panel> panels_;
+  std::vector<int> panel_rows_, updated_;
+  std::vector<Update> updates_;
+  std::vector<std::size_t> places_; // of the matrix' entries in the panels
+  std::vector<double> values_;      // of the panels: L below the diagonal, D on it
+  std::vector<double> sums_;        // of the sizes of all that was taken off each pivot
+  std::vector<double> work_, sum_;
   int negative_ = 0;
   bool factored_ = false;
 };

@@ -6,10 +6,11 @@
 #include <array>
 #include <cmath>
 #include <limits>
+#include <stdexcept>
 #include <utility>
 #include <vector>
 
-#include "lattice.hpp"
+#include "../distances/arrays.hpp"
 
 namespace reeds_shepp {
 

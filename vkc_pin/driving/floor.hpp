@@ -53,8 +53,8 @@ public:
     std::vector<double> found(places * count);
     {
       nb::gil_scoped_release released;
-      const auto [shortest, longest] = std::minmax_element(lengths_.begin(), lengths_.end());
-      const double least_move = *shortest, most_move = *longest;
+      const double shortest = *std::min_element(lengths_.begin(), lengths_.end());
+      const double longest = *std::max_element(lengths_.begin(), lengths_.end());
       in_parts(places, threads, [&](std::size_t, std::size_t begin, std::size_t end) {
         std::vector<double> least(leads_.size());
         for (std::size_t k = begin; k < end; ++k)
@@ -63,7 +63,7 @@ public:
           std::vector<std::pair<double, Index>> first;
           for (Index entry = firsts(k); entry < firsts(k + 1); ++entry)
             first.emplace_back(costs(entry), inner(begins(entry)));
-          spread(least, std::move(first), least_move, most_move, [&](Index cell, double cost, const auto & reach) {
+          spread(least, std::move(first), shortest, longest, [&](Index cell, double cost, const auto & reach) {
             for (std::size_t heading = 0; heading < HEADINGS; ++heading)
               if (leads_[std::size_t(cell)] >> heading & 1u)
                 reach(cell + moves_[heading], cost + lengths_[heading]);

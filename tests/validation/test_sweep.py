@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -49,15 +50,25 @@ def test_no_pair_that_comes_close_is_left_out(seed: int, size: float) -> None:
         assert hit.at_waypoint == (hit.row in samples.waypoint_rows)
 
 
-@pytest.mark.parametrize("many", [1, 2, 3, 5])
-def test_hits_are_the_same_however_many_states_are_looked_at_together(monkeypatch: pytest.MonkeyPatch, many: int) -> None:
+def test_the_closest_pair_of_every_waypoint_is_told() -> None:
+    """Also where all is far away, and however many waypoints there are."""
     door = door_scene()
-    motion = wander(door, 3, size=0.5)
-    _, samples, expected = swept(door, motion)
-    assert len(samples.waypoint_rows) == 4
-    monkeypatch.setattr(validation_sweep, "_AT_ONCE", many)
-    assert swept(door, motion)[2] == expected
-    assert any(not hit.at_waypoint for hit in expected)
+    parts = [wander(door, seed, size=0.5).positions for seed in range(25)]
+    rows = np.concatenate([*parts, parts[0] + 30.0 * np.eye(parts[0].shape[1])[0]])
+    one = wander(door, 0, size=0.5)
+    phases = (replace(one.phases[0], last=len(rows) - 1),)
+    motion = replace(one, times=np.arange(len(rows)), positions=rows, phases=phases)
+    world = World(door)
+    table, z = PairTable(door, Solids(world), motion, 0.02), world.positions(motion, motion.times)
+    robots = np.array([group == "robot" for group in table.group])
+    with_others = np.flatnonzero(robots[table.pairs].sum(axis=1) == 1)  # the robot is close to itself everywhere, as is the door
+    table.pairs, table.margins = table.pairs[with_others], table.margins[with_others]
+    least = np.full(len(z), np.inf)
+    for hit in sweep(table, z, np.arange(len(z))):
+        if hit.at_waypoint:
+            least[hit.row] = min(least[hit.row], hit.distance)
+    np.testing.assert_allclose(least, brute_force(table, z).min(axis=1), atol=1e-5)
+    assert least.min() < 0.0 < 10.0 < least.max()
 
 
 @settings(max_examples=10, deadline=None)

@@ -19,7 +19,6 @@ __all__ = ["Hit", "sweep"]
 
 RESOLUTION = 1e-3  # [m] of penetration that may stay unseen between two samples
 STILL = 1e-6  # [m] of relative motion between two samples that changes nothing, as of what stands where it was put
-_AT_ONCE = 64  # states whose pairs are looked at together, until the nearest of all of them are found
 
 
 class Hit(NamedTuple):
@@ -136,13 +135,7 @@ class _Sweep:
 
     def _nearest(self, placed: Placed) -> tuple[Ints, Ints, Floats]:
         """Return (state, pair), the closest and all that fall short of their margins among them, and their distances [m]."""
-        found = [part for states in _in_parts(len(placed)) for part in self._nearest_at(placed, states)]
-        states, pairs, distances = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        order = np.lexsort((pairs, states))
-        return states[order], pairs[order], distances[order]
-
-    def _nearest_at(self, placed: Placed, todo: Ints) -> Iterator[tuple[Ints, Ints, Floats]]:
-        """Yield those of some states, in no order."""
+        found, todo = list[tuple[Ints, Ints, Floats]](), np.arange(len(placed))
         reach = max(self._table.margins.max(), RESOLUTION)
         while len(todo):
             at, pairs = self._table.near(placed, todo, todo, np.zeros((len(todo), len(self._table.group))), reach)
@@ -152,8 +145,11 @@ class _Sweep:
             np.minimum.at(least, states[apart], distances[apart])
             done = ~(least > reach)  # all others are further apart
             kept = done[states]
-            yield states[kept], pairs[kept], distances[kept]
+            found.append((states[kept], pairs[kept], distances[kept]))
             todo, reach = todo[~done[todo]], 2.0 * reach
+        states, pairs, distances = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        order = np.lexsort((pairs, states))
+        return states[order], pairs[order], distances[order]
 
     def _active(self, placed: Placed, moved: Floats, smallest: float) -> tuple[Ints, Ints]:
         """Return (t, pair) of all but those that boxes prove to stay `smallest` apart between waypoints t and t + 1 [m].
@@ -180,11 +176,6 @@ class _Sweep:
         columns = (column.tolist() for column in (rows, self._table.pairs[pairs], distances, margins, contacts))
         for row, (i, j), distance, margin, contact in zip(*columns, strict=True):
             yield Hit(row, labels[i], labels[j], distance, margin, contact, at_waypoint)
-
-
-def _in_parts(count: int) -> list[Ints]:
-    """Return 0 .. count - 1 in parts; a part that is empty if there are none."""
-    return np.array_split(np.arange(count), range(_AT_ONCE, count, _AT_ONCE))
 
 
 class Stretches(NamedTuple):

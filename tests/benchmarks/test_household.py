@@ -137,14 +137,15 @@ def test_the_variant_is_run_and_reported(tmp_path: Path, monkeypatch: pytest.Mon
     seen: list[Any] = []
 
     def look(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
-        seen.append((spec["scene"], float(scene.objects["dishwasher"].object.upper[1])))
+        seen.append((spec["scene"], scene.name, float(scene.objects["dishwasher"].object.upper[1])))
         return solve(scene, spec)
 
     monkeypatch.setattr(comparison, "motions_chart", lambda plans, path, title: path.write_bytes(title.encode()))
     how: dict[str, Any] = {"trials": 1, "seed": 3, "methods": ["VKC"], "progress": False, "solve": look}
     result = household.run(variant="paper", out=tmp_path / "paper", **how)
     assert seen
-    assert {(task, rack) for task, rack in seen} == {("cup", 0.8), ("dishwasher", 0.8)}
+    assert {(task, rack) for task, _, rack in seen} == {("cup", 0.8), ("dishwasher", 0.8)}
+    assert all("paper" in name for _, name, _ in seen)
     assert result["meta"]["goals"] == {
         "cup": {"cup": [-0.6, -1.6, 1.11]},
         "dishwasher": {"dishwasher.rack": 0.8},
@@ -154,6 +155,9 @@ def test_the_variant_is_run_and_reported(tmp_path: Path, monkeypatch: pytest.Mon
     assert (tmp_path / "paper" / "table.md").read_text(encoding="utf-8").startswith(title)
     usual = household.run(out=tmp_path / "usual", tasks=["cup"], **how)
     assert household.report(usual).startswith("# Six tasks in a home\n")
+    seen.clear()
+    household.run(variant="paper", out=tmp_path / "door", tasks=["door"], **how)  # which has no other numbers there
+    assert set(seen) == {("door", "household", 0.55)}
 
 
 @pytest.mark.long

@@ -96,7 +96,7 @@ class Comparison:
         specs = []
         for name in tasks:
             task = self.tasks[name]
-            rng, scene = np.random.default_rng([seed, list(self.tasks).index(name)]), self.load(task.scene)
+            rng, scene = np.random.default_rng([seed, list(self.tasks).index(name)]), _scene(self.load, task.scene)
             starts: list[dict[str, Any]] = []
             for _ in range(trials):
                 more = {"placed": task.scatter(scene, rng)} if task.scatter else {}

@@ -20,7 +20,6 @@ EQUIVALENT: dict[str, str] = {
     "validation/sweep.py: free = (np.minimum(todo.before, todo.after) >= -overlap) & (todo.before + todo.after < motion) | comparison: < → <=": "both differ only where two numbers are the same to the last bit, or a distance is exactly zero, which is neither right nor wrong",
     "solver/subproblem.py: self.forget() | dropped: self.forget() → pass": "a setting of the search or of Ipopt: another one leads to motions that are as good, later or sooner",
     'solver/subproblem.py: "ipopt.warm_start_slack_bound_frac": 1e-6, | constant: 1e-6 → 2e-06': "a setting of the search or of Ipopt: another one leads to motions that are as good, later or sooner",
-    "validation/pairs.py: lows, highs = (np.ascontiguousarray(corners[0, self._still].T) for corners in (lower, upper)) | constant: 0 → 1": "of what stands still every state is the same",
     'solver/subproblem.py: "ipopt.mu_init": 1.0, | constant: 1.0 → 2.0': "a setting of the search or of Ipopt: another one leads to motions that are as good, later or sooner",
     "validation/samples.py: if abs(gripper.nearest(opening) - opening) > EXACT: | comparison: > → >=": "both differ only where two numbers are the same to the last bit, or a distance is exactly zero, which is neither right nor wrong",
     "solver/between.py: shapes = int(found.pair.max(initial=0)) + 1 | constant: 0 → 1": "any larger number makes keys as unique",

@@ -229,6 +229,18 @@ def test_a_held_object_can_hit_other_objects_and_its_own_other_branches_stand() 
     assert cabinet().attachments["grip"].link == "knob"
 
 
+def test_links_of_a_held_object_keep_apart_where_its_description_says_that_they_can_meet() -> None:
+    """Those that the hand moves from each other, and from what of the object stands."""
+    scene, meeting = full_scene(), frozenset({frozenset({"arm", "flap"}), frozenset({"tray", "lid"})})
+    placed = scene.objects["cabinet"]
+    placed = dataclasses.replace(placed, object=dataclasses.replace(placed.object, own_pairs=meeting))
+    steps = [Actuate("cabinet", {"swing": 0.5})]
+    found = pairs(program_of(with_objects(scene, {"cabinet": placed}), steps, options=SHORT), 1)
+    own = {key: margins for key, margins in found.items() if all(label.startswith("cabinet.") for label in key)}
+    assert {frozenset(link.removeprefix("cabinet.") for link in key) for key in own} == meeting
+    assert all(set(margins) == {MARGIN} for margins in own.values())
+
+
 def test_two_objects_one_after_the_other() -> None:
     problem = program_of(full_scene(), [Grasp("door"), Actuate("drawer", {"slide": 0.2})], options=SHORT)
     phases = problem.task.phases

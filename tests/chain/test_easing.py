@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.carrying import STICK, TOP, above, box, lifted, moved_base, reaching, room, table, tool_at
-from helpers.riding import plates
+from helpers.riding import cup, plates, scene_of
 from helpers.small_problems import SHORT, program_of
 
 from vkc_pin.chain.easing import EASED_SHARE
@@ -150,6 +150,14 @@ def test_what_rides_is_eased_from_what_is_beside_it_where_the_ride_begins_alone(
     row = margins(p, number)["cup.cup", "wall"]
     assert row[0] == pytest.approx(EASED_SHARE * 0.01, abs=1e-4)
     assert row[-1] == LONG.dist_safe
+
+
+def test_what_rides_on_something_carried_is_eased_from_what_is_beside_it_where_that_is_lifted() -> None:
+    """A cup on a tray, a centimetre in front of a wall; where the tray is put down there is none."""
+    things = [{"name": "tray", "type": "tray.yaml", "position": [0.8, 0.0, 0.7]}, cup(at=(0.82, 0.05, 0.72))]
+    p = problem(scene_of(things, [box("wall", [0.02, 0.02, 0.05], [0.875, 0.05, 0.78])]), Place("tray", (-0.5, -1.5, 0.7)))
+    (number,) = (k for k, phase in enumerate(p.task.phases) if phase.rides)
+    only_near(margins(p, number)["cup.cup", "wall"], EASED_SHARE * 0.01, begin=True, within=1e-4)
 
 
 def test_in_a_short_phase_both_ends_must_be_possible() -> None:

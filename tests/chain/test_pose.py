@@ -79,6 +79,15 @@ def test_half_a_turn_is_no_solution(away: float, axis: np.ndarray | None) -> Non
         assert np.linalg.norm(residual(placement, target)[3:]) > (0.1 if axis is None else 0.5)
 
 
+def test_within_a_thousandth_of_half_a_turn_it_is_twice_the_axis() -> None:
+    rng = np.random.default_rng(6)
+    for axis in (*np.eye(3), *(random_axis(rng) for _ in range(10))):
+        for angle in (np.pi, np.pi - 5e-4):
+            target = pin.SE3.Random()
+            found = residual(turned(target, angle, axis), target)[3:]
+            np.testing.assert_allclose(found * np.sign(found @ axis), 2.0 * axis, rtol=0.0, atol=0.02)
+
+
 @pytest.mark.parametrize("axis", np.eye(3), ids="xyz")
 def test_newton_steps_lead_away_from_half_a_turn(axis: np.ndarray) -> None:
     target = pin.SE3.Random()

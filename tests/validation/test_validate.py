@@ -288,6 +288,7 @@ def by_itself(scene: Scene, hinge: np.ndarray, knob: np.ndarray) -> Trajectory:
         ([0.3, -0.3, -0.3], [0.0, 0.0, 0.0], 0.5),  # through the frame to the other side
         ([0.1, 0.3, 0.3], [0.0, 0.0, 0.0], 0.0),  # ajar: the bolt is out of the lock
         ([0.04, 0.3, 0.3], [0.2, 0.2, 0.2], 0.3),  # ajar, but within the latch's reach
+        ([0.04, 0.04, 0.3], [0.0, 0.6, 0.6], 0.0),  # it may rest ajar until the knob is turned
         ([0.0, 0.04, 0.3], [0.7, 0.5, 0.7], 0.0),  # released as long as it is within reach, though on its way back
     ],
 )

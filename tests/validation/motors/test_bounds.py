@@ -40,7 +40,7 @@ def test_torques_count_as_any_other_limit() -> None:
     moments = moments_of(curve)
     torques = np.zeros((len(moments.times), plan.trajectory.robot_size))
     torques[moments.pieces < len(curve.times) // 2, 4] = 1.5
-    (first, *_) = bounds(samples, moments, torques)
+    (first, *_) = bounds(samples, moments, torques, 0.0)
     assert (first.subject, first.kind) == ("shoulder_lift_joint", "torque")
     assert first.begin == 0.0
 
@@ -56,7 +56,7 @@ def test_of_several_stretches_the_longest_is_named() -> None:
         torques = np.zeros((len(moments.times), plan.trajectory.robot_size))
         for begin, end in parts:
             torques[(moments.pieces >= begin) & (moments.pieces < end), 4] = 50.0
-        first = next(bound for bound in bounds(samples, moments, torques) if bound.kind == "torque")
+        first = next(bound for bound in bounds(samples, moments, torques, 0.0) if bound.kind == "torque")
         lengths = {(a, b): curve.times[b] - curve.times[a] for a, b in parts}
         assert max(lengths, key=lambda part: lengths[part]) == long, "times are uneven: choose other stretches"
         assert (first.begin, first.end) == (curve.times[long[0]], curve.times[long[1]])
@@ -73,10 +73,10 @@ def test_what_bounds_a_two_hundredth_of_the_duration_is_told_of() -> None:
     for told, piece in number.items():
         torques = np.zeros((len(moments.times), plan.trajectory.robot_size))
         torques[moments.pieces == piece, 4] = 50.0
-        assert ("torque" in {bound.kind for bound in bounds(samples, moments, torques)}) == told
+        assert ("torque" in {bound.kind for bound in bounds(samples, moments, torques, 0.0)}) == told
 
 
 def test_without_a_curve_nothing_is_said() -> None:
     plan = drawer_plan()
     bare = dataclasses.replace(plan.trajectory, curve=None)
-    assert bounds(Samples(plan.scene, bare), moments_of(plan.trajectory.curve), np.zeros((0, 0))) == ()  # type: ignore[arg-type]
+    assert bounds(Samples(plan.scene, bare), moments_of(plan.trajectory.curve), np.zeros((0, 0)), 0.0) == ()  # type: ignore[arg-type]

@@ -17,7 +17,7 @@ _STILL = 1e-9  # of a limit
 _LEAST = 5e-3  # of the duration: less is not told of
 
 
-def bounds(samples: Samples, moments: Moments, torques: Floats, jerk_time: float = 0.0) -> tuple[Bound, ...]:
+def bounds(samples: Samples, moments: Moments, torques: Floats, jerk_time: float) -> tuple[Bound, ...]:
     """Return what bounds a motion and for how long, the longest first; nothing without a curve.
 
     Args:

@@ -23,7 +23,7 @@ __all__ = ["INITIALIZATIONS", "initialize"]
 
 INITIALIZATIONS = ("auto", "interpolated", "astar", "rrt", "stationary")
 _FREE = 0.05  # [m] shortfall of clearance of a seed, summed over its waypoints, below which no better one is looked for
-_POOR = 0.2  # [m] overlap, summed over waypoints, above which other seeds come first, and trees if there is no better one
+_POOR = 0.045  # [m] overlap at a waypoint above which other seeds come first, and trees if there is no better one
 _COMPARED_PATHS = 8  # paths of the beam whose seeds are compared, or along which trees grow
 _PLACES = 128  # random places of which one is where a phase ends, once the stationary seed led nowhere
 
@@ -267,7 +267,7 @@ class _SeedSearch:
                 continue
             contacts = self.problem.evaluate_contacts(z, reach=self.problem.options.largest_margin, nearest=1)
             short = contacts.shortfall(len(z))
-            overlap = float(np.maximum(short - self.problem.options.dist_safe, 0.0).sum())
+            overlap = float(max(short.max() - self.problem.options.dist_safe, 0.0))
             merit = self.problem.objective(z, self.problem.timing_for(z).dt) + self.problem.options.penalty * float(short.sum())
             if merit < least:
                 best, least = (path, z, overlap), merit

@@ -24,7 +24,7 @@ class Seed:
     Attributes:
         name: The method, and the number of the try if it is not the first.
         z: z_1..z_N, shape (N, n).
-        overlap: What waypoints lack of their clearances beyond `Options.dist_safe`, summed [m]; NaN if nobody looked.
+        overlap: The most that a waypoint lacks of its clearance beyond `Options.dist_safe` [m]; NaN if nobody looked.
         radius: How far the solver believes planes at first, shape (N,); None: as usual.
     """
 

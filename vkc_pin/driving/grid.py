@@ -100,6 +100,7 @@ class BaseGrid:
         self.stuck, self.stuck_carrying = stuck(base, carried, standing, lattice, margin, views=views)
         # Whether these are free, with everything and for the base alone; -1: nobody has asked yet.
         self._known = np.full((3, 2, self.cells, self.cells, HEADINGS), -1, np.int8)
+        self._refused: list[tuple[list[tuple[int, ...]], ...]] = [([], []) for _ in range(3)]
 
     def center(self, i: int, j: int) -> tuple[float, float]:
         """Return the world position of a cell's centre [m]."""
@@ -120,9 +121,8 @@ class BaseGrid:
         """
         key = (_FREE, int(reaching), i, j, heading)
         if self._known[key] < 0:
-            self._known[key] = self._roomy(i, j, reaching) or self.clear(
-                *self.center(i, j), float(self.yaws[heading]), reaching=reaching
-            )
+            roomy = self._roomy(i, j, reaching)
+            self._note(key, roomy or self.clear(*self.center(i, j), float(self.yaws[heading]), reaching=reaching))
         return bool(self._known[key])
 
     def clear(self, x: float, y: float, yaw: float, *, reaching: bool = False) -> bool:
@@ -170,9 +170,9 @@ class BaseGrid:
             k, m = i + int(self.moves[heading, 0]), j + int(self.moves[heading, 1])
             enough = self.lengths[heading]
             room = [rows[i][j] + rows[k][m] for rows in self._room]
-            self._known[key] = (room[0] >= enough and (reaching or room[1] >= enough)) or self.driven(
-                self.center(i, j), self.center(k, m), float(self.yaws[heading]), reaching=reaching
-            )
+            roomy = room[0] >= enough and (reaching or room[1] >= enough)
+            ends = self.center(i, j), self.center(k, m)
+            self._note(key, roomy or self.driven(*ends, float(self.yaws[heading]), reaching=reaching))
         return bool(self._known[key])
 
     def left(self, i: int, j: int, heading: int, *, reaching: bool = False) -> bool:
@@ -180,21 +180,30 @@ class BaseGrid:
         key = (_LEFT, int(reaching), i, j, heading)
         if self._known[key] < 0:
             end = float(self.yaws[heading + 1]) if heading + 1 < HEADINGS else 2 * np.pi
-            self._known[key] = self._roomy(i, j, reaching) or self.turned(
-                self.center(i, j), float(self.yaws[heading]), end, reaching=reaching
-            )
+            roomy = self._roomy(i, j, reaching)
+            self._note(key, roomy or self.turned(self.center(i, j), float(self.yaws[heading]), end, reaching=reaching))
         return bool(self._known[key])
 
-    def refused(self, reaching: Bools) -> Bools:
+    def refused(self, reaching: Bools) -> tuple[Ints, Ints, Ints]:
         """Return what was asked and is not free: to be in a cell, to move ahead from it, and to turn left in it.
 
         Args:
             reaching: Where only the base counts, shape (cells, cells).
 
         Returns:
-            Shape (3, cells, cells, HEADINGS), headings as in `free`, `forward` and `left`.
+            Cells and headings as in `free`, `forward` and `left`, shape (K, 3) each.
         """
-        return np.where(reaching[..., None], self._known[:, 1], self._known[:, 0]) == 0
+        found = []
+        for parts in self._refused:
+            rows = [np.array(part, int).reshape(-1, 3) for part in parts]
+            found.append(np.concatenate([part[reaching[part[:, 0], part[:, 1]] == alone] for alone, part in enumerate(rows)]))
+        return found[_FREE], found[_FORWARD], found[_LEFT]
+
+    def _note(self, key: tuple[int, int, int, int, int], free: bool) -> None:
+        """Remember an answer; `key` is what was asked, whether of the base alone, and where."""
+        self._known[key] = free
+        if not free:
+            self._refused[key[0]][key[1]].append(key[2:])
 
     def _roomy(self, i: int, j: int, reaching: bool) -> bool:
         """Return whether nothing can be hit from a cell at any heading."""

@@ -70,7 +70,7 @@ class _Search:
     def __init__(self, query: Query) -> None:
         self.query, self.ground, self.grid = query, query.ground, query.ground.grid
         grid, starts, ends = self.grid, query.starts, query.ends
-        self.near: list[int] = self.ground.near.reshape(-1).tolist()
+        self.near = self.ground.near.reshape(-1)
         lengths = np.rint(grid.lengths / UNIT)
         left = np.rint(grid.turning * wrapped(np.roll(grid.yaws, -1) - grid.yaws) / UNIT)
         costs = np.column_stack([lengths, np.rint(BACKWARDS * grid.lengths / UNIT), left, np.roll(left, 1)])
@@ -83,15 +83,13 @@ class _Search:
 
     def _flags(self) -> NDArray[np.uint8]:
         """Return what is known not to be free: flags of all nodes, shape (cells, cells, HEADINGS)."""
-        near = self.ground.near
+        near, flags = self.ground.near, self.ground.stuck.astype(np.uint8) * np.uint8(_BLOCKED)
         stays, ahead, left = self.grid.refused(near >= 0)
-        i, j, heading = np.nonzero(ahead)
         # What is near different places is looked at in another way, see `_move`.
-        there = np.column_stack([i, j]) + self.grid.moves[heading]
-        ahead[i, j, heading] = near[i, j] == near[there[:, 0], there[:, 1]]
-        flags = np.where(self.ground.stuck | stays, np.uint8(_BLOCKED), np.uint8(0))
-        flags[ahead] |= _NO_AHEAD
-        flags[left] |= _NO_LEFT
+        there = ahead[:, :2] + self.grid.moves[ahead[:, 2]]
+        ahead = ahead[near[ahead[:, 0], ahead[:, 1]] == near[there[:, 0], there[:, 1]]]
+        for rows, flag in ((stays, _BLOCKED), (ahead, _NO_AHEAD), (left, _NO_LEFT)):
+            flags[tuple(rows.T)] |= flag
         return flags
 
     def free(self, path: list[int], begin: int, end: int) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import casadi as ca
@@ -13,22 +14,19 @@ from hypothesis import strategies as st
 from vkc_pin.needed import compiled_module
 
 KKT = compiled_module("vkc_pin.solver._kkt")
-OWN = {"ipopt.linear_solver": "ma97", "ipopt.hsllib": KKT.__file__, "ipopt.ma97_order": "amd", "ipopt.ma97_scaling": "none"}
+OWN = {"ipopt.linear_solver": "ma27", "ipopt.hsllib": KKT.__file__, "ipopt.linear_system_scaling": "none"}
 QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False}
 
 
 def lower(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return columns, rows and values of a lower triangle, with all of its diagonal."""
-    triangle = np.tril(matrix)
-    kept = (triangle != 0.0) | np.eye(len(matrix), dtype=bool)
-    columns = np.r_[0, np.cumsum(kept.sum(axis=0))].astype(np.int32)
-    rows = np.concatenate([np.flatnonzero(column) for column in kept.T]).astype(np.int32)
-    return columns, rows, np.concatenate([column[mask] for column, mask in zip(triangle.T, kept.T, strict=True)])
+    """Return rows, columns and values of a lower triangle, with all of its diagonal."""
+    rows, columns = np.nonzero((np.tril(matrix) != 0.0) | np.eye(len(matrix), dtype=bool))
+    return rows.astype(np.int32), columns.astype(np.int32), matrix[rows, columns]
 
 
 def factored(matrix: np.ndarray) -> tuple[Any, bool]:
-    columns, rows, values = lower(matrix)
-    factorization = KKT.Factorization(columns, rows)
+    rows, columns, values = lower(matrix)
+    factorization = KKT.Factorization(len(matrix), rows, columns)
     return factorization, factorization.factor(values)
 
 
@@ -92,8 +90,8 @@ def test_any_matrix_is_solved_or_said_to_be_singular(seed: int, size: int, densi
 def test_a_second_matrix_is_factored_as_if_it_were_the_first() -> None:
     first, second = system(1, 4, 5, 2, 2), system(1, 4, 5, 2, 2)
     second[np.diag_indices(20)] += 3.0
-    columns, rows, _ = lower(first)
-    again, anew = KKT.Factorization(columns, rows), KKT.Factorization(columns, rows)
+    rows, columns, _ = lower(first)
+    again, anew = (KKT.Factorization(len(first), rows, columns) for _ in range(2))
     assert again.factor(lower(first)[2])
     assert again.factor(lower(second)[2])
     assert anew.factor(lower(second)[2])
@@ -108,9 +106,9 @@ def test_rows_that_say_the_same_are_singular_and_what_follows_is_right() -> None
     matrix = system(2, 3, 4, 2, 0)
     doubled = matrix.copy()
     doubled[-1], doubled[:, -1] = doubled[-2], doubled[:, -2]
-    columns, rows, values = lower(np.where(matrix != 0.0, matrix, 0.0))
-    factorization = KKT.Factorization(columns, rows)
-    assert not factorization.factor(lower_of(doubled, columns, rows))
+    rows, columns, values = lower(matrix)
+    factorization = KKT.Factorization(len(matrix), rows, columns)
+    assert not factorization.factor(doubled[rows, columns])
     with pytest.raises(ValueError, match="once it is factored"):
         factorization.solve(np.ones(len(matrix)))
     assert factorization.factor(values)
@@ -119,32 +117,64 @@ def test_rows_that_say_the_same_are_singular_and_what_follows_is_right() -> None
     np.testing.assert_allclose(x, 1.0, atol=1e-8)
 
 
-def lower_of(matrix: np.ndarray, columns: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return the values of a matrix at entries of a triangle."""
-    return np.concatenate([matrix[rows[columns[j] : columns[j + 1]], j] for j in range(len(matrix))])
-
-
 def test_not_a_number_is_no_pivot() -> None:
     matrix = system(3, 2, 3, 1, 0)
-    columns, rows, values = lower(matrix)
+    rows, columns, values = lower(matrix)
     values[0] = np.nan
-    assert not KKT.Factorization(columns, rows).factor(values)
+    assert not KKT.Factorization(len(matrix), rows, columns).factor(values)
+
+
+def test_entries_above_the_diagonal_and_those_in_one_place_are_summed() -> None:
+    matrix = system(4, 3, 4, 1, 2)
+    rows, columns, values = lower(matrix)
+    flipped = np.arange(len(rows)) % 2 == 0
+    places = np.where(flipped, columns, rows), np.where(flipped, rows, columns)
+    twice = [np.concatenate([part, part]) for part in places]
+    factorization = KKT.Factorization(len(matrix), *twice)
+    assert factorization.factor(np.concatenate([0.25 * values, 0.75 * values]))
+    x = matrix @ np.ones(len(matrix))
+    factorization.solve(x)
+    np.testing.assert_allclose(x, 1.0, atol=1e-8)
 
 
 @pytest.mark.parametrize(
-    ("columns", "rows", "message"),
+    ("size", "rows", "columns", "message"),
     [
-        ([], [], "columns begin with 0"),
-        ([1, 2], [0, 0], "columns begin with 0"),
-        ([0, 2, 1], [0, 1], "columns ascend"),
-        ([0, 1, 2], [0, 0], "lower triangle"),
-        ([0, 1, 2], [0, 2], "lower triangle"),
-        ([0, 1], [0, 0], "columns ascend"),
+        (0, [], [], "there are rows"),
+        (2, [0, 1], [0], "as many rows as columns"),
+        (2, [0, 2], [0, 1], "in the matrix"),
+        (2, [0, 1], [0, -1], "in the matrix"),
     ],
 )
-def test_what_is_no_lower_triangle_is_refused(columns: list[int], rows: list[int], message: str) -> None:
+def test_places_outside_of_the_matrix_are_refused(size: int, rows: list[int], columns: list[int], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        KKT.Factorization(np.array(columns, np.int32), np.array(rows, np.int32))
+        KKT.Factorization(size, np.array(rows, np.int32), np.array(columns, np.int32))
+
+
+def test_as_many_values_as_places() -> None:
+    factorization = KKT.Factorization(1, np.zeros(1, np.int32), np.zeros(1, np.int32))
+    with pytest.raises(ValueError, match="one value for each entry"):
+        factorization.factor(np.ones(2))
+    assert factorization.factor(np.ones(1))
+    with pytest.raises(ValueError, match="as many numbers"):
+        factorization.solve(np.ones(2))
+
+
+def test_ipopt_does_the_same_every_time_and_in_every_thread() -> None:
+    """Also where the first system has the wrong number of negative eigenvalues, and where others are solved meanwhile."""
+    x = ca.MX.sym("x", 40)
+    f = ca.sumsqr(x[1:] - ca.sin(3.0 * x[:-1])) - 0.5 * ca.sumsqr(x[::3])
+    program = {"x": x, "f": f, "g": x[:-1] * x[1:]}
+    warm = {"ipopt.warm_start_init_point": "yes", "ipopt.mu_init": 1e-3}
+
+    def solved(_: int) -> bytes:
+        solver = ca.nlpsol("solver", "ipopt", program, {**QUIET, **OWN, **warm})
+        result = solver(x0=np.linspace(-1.0, 1.0, 40), lbg=-0.5, ubg=0.5, lbx=-2.0, ubx=2.0)
+        return bytes(np.ravel(result["x"]).tobytes())
+
+    alone = solved(0)
+    with ThreadPoolExecutor(4) as threads:
+        assert set(threads.map(solved, range(16))) == {alone}
 
 
 @pytest.mark.parametrize("bounds", [(0.0, 0.0), (-np.inf, 0.0), (0.0, np.inf)], ids=["equal", "below", "above"])

@@ -1,7 +1,9 @@
 // The linear solver of Ipopt's systems. Ipopt loads it at run time (its options `hsllib` and `linear_solver`) and speaks to it in
-// the C interface of HSL_MA97, of which this is what Ipopt uses; https://www.hsl.rl.ac.uk/catalogue/hsl_ma97.html describes it.
+// the interface of HSL's MA27, of which this is what Ipopt uses; https://www.hsl.rl.ac.uk/archive/specs/ma27.pdf describes it.
 
-#include <cstring>
+#include <algorithm>
+#include <limits>
+#include <memory>
 #include <new>
 #include <stdexcept>
 
@@ -11,55 +13,48 @@
 namespace
 {
 
-// The names and layouts of ma97_control_d and ma97_info_d.
-struct Control
+// MA27 keeps all that it knows in its caller's arrays. Here these have only the number of a system: each thread has one at a time.
+struct System
 {
-  int f_arrays, action, nemin;
-  double multiplier;
-  int ordering, print_level, scaling;
-  double small, u;
-  int unit_diagnostics, unit_error, unit_warning;
-  long factor_min;
-  int solve_blas3;
-  long solve_min;
-  int solve_mf;
-  double consist_tol;
-  int ispare[5];
-  double rspare[10];
+  int number = 0;
+  std::unique_ptr<Factorization> factorization;
 };
 
-struct Info
-{
-  int flag, flag68, flag77, matrix_dup, matrix_rank, matrix_outrange, matrix_missing_diag, maxdepth, maxfront, num_delay;
-  long num_factor, num_flops;
-  int num_neg, num_sup, num_two, ordering, stat;
-  int ispare[5];
-  double rspare[10];
-};
+thread_local System current;
 
+Factorization * system(int number) { return number == current.number ? current.factorization.get() : nullptr; }
+
+// Places in `info`, and what can be said there.
+enum Field
+{
+  FLAG = 0,
+  REALS = 4,
+  INTEGERS = 5,
+  NEGATIVE = 14,
+  FIELDS = 20
+};
 enum Flag
 {
   DONE = 0,
-  NO_MEMORY = -1,
-  SINGULAR = -7
+  NO_SYSTEM = -1,
+  NO_MEMORY = -2,
+  SINGULAR = -5
 };
 
 // Calls work, and notes in `info` how that went; no exception leaves it.
 template<typename Work>
-void noted(Info * info, const Work & work)
+void noted(int * info, const Work & work)
 {
-  std::memset(info, 0, sizeof(Info));
+  std::fill(info, info + FIELDS, 0);
   try
   {
-    info->flag = work();
+    info[FLAG] = work();
   }
   catch (const std::bad_alloc &)
   {
-    info->flag = NO_MEMORY;
+    info[FLAG] = NO_MEMORY;
   }
 }
-
-Factorization & factorization(void ** akeep) { return *static_cast<Factorization *>(*akeep); }
 
 } // namespace
 
@@ -67,65 +62,87 @@ extern "C"
 {
 #define EXPORTED __attribute__((visibility("default")))
 
-EXPORTED void ma97_default_control_d(Control * control) { std::memset(control, 0, sizeof(Control)); }
-
-EXPORTED void ma97_free_akeep_d(void ** akeep)
+// Settings: there are none.
+EXPORTED void ma27id_(int * integers, double * reals)
 {
-  delete static_cast<Factorization *>(*akeep);
-  *akeep = nullptr;
+  std::fill(integers, integers + 30, 0);
+  std::fill(reals, reals + 5, 0.0);
 }
 
-EXPORTED void ma97_finalise_d(void ** akeep, void ** fkeep)
-{
-  ma97_free_akeep_d(akeep);
-  *fkeep = nullptr;
-}
-
-EXPORTED void ma97_analyse_d(
-  int, int size, const int * columns, const int * rows, double *, void ** akeep, const Control * control, Info * info, int *)
-{
-  ma97_free_akeep_d(akeep);
-  noted(info, [&] {
-    *akeep = new Factorization(std::size_t(size), columns, rows, control->f_arrays ? 1 : 0);
-    return DONE;
-  });
-}
-
-EXPORTED void ma97_factor_d(
-  int, const int *, const int *, const double * values, void ** akeep, void **, const Control *, Info * info, double *)
-{
-  noted(info, [&] { return factorization(akeep).factor(values) ? DONE : SINGULAR; });
-  if (info->flag == DONE)
-    info->num_neg = factorization(akeep).negative();
-}
-
-EXPORTED void
-ma97_solve_d(int, int count, double * x, int stride, void ** akeep, void **, const Control *, Info * info)
-{
-  noted(info, [&] {
-    for (int k = 0; k < count; ++k)
-      factorization(akeep).solve(x + std::ptrdiff_t(k) * stride);
-    return DONE;
-  });
-}
-
-EXPORTED void ma97_factor_solve_d(
-  int type,
-  const int * columns,
+// Where a system has entries.
+EXPORTED void ma27ad_(
+  const int * size,
+  const int * entries,
   const int * rows,
-  const double * values,
-  int count,
-  double * x,
-  int stride,
-  void ** akeep,
-  void ** fkeep,
-  const Control * control,
-  Info * info,
-  double * scale)
+  const int * columns,
+  int *,
+  const int *,
+  int * keep,
+  int *,
+  int * steps,
+  const int *,
+  const int *,
+  const double *,
+  int * info,
+  double * operations)
 {
-  ma97_factor_d(type, columns, rows, values, akeep, fkeep, control, info, scale);
-  if (info->flag == DONE)
-    ma97_solve_d(0, count, x, stride, akeep, fkeep, control, info);
+  noted(info, [&] {
+    current.factorization =
+      std::make_unique<Factorization>(std::size_t(*size), std::size_t(*entries), rows, columns, 1);
+    keep[0] = current.number = current.number % std::numeric_limits<int>::max() + 1;
+    return DONE;
+  });
+  *steps = 1;
+  *operations = 0.0;
+  info[REALS] = *entries;
+  info[INTEGERS] = 1;
+}
+
+// Factors a system.
+EXPORTED void ma27bd_(
+  const int *,
+  const int *,
+  const int *,
+  const int *,
+  const double * values,
+  const int *,
+  int * kept,
+  const int *,
+  const int * keep,
+  const int *,
+  int * front,
+  int *,
+  const int *,
+  const double *,
+  int * info)
+{
+  Factorization * const found = system(keep[0]);
+  noted(info, [&] { return !found ? NO_SYSTEM : found->factor(values) ? DONE : SINGULAR; });
+  kept[0] = keep[0];
+  *front = 1;
+  if (found)
+    info[NEGATIVE] = found->negative();
+}
+
+// Solves it.
+EXPORTED void ma27cd_(
+  const int * size,
+  const double *,
+  const int *,
+  const int * kept,
+  const int *,
+  double *,
+  const int *,
+  double * x,
+  int *,
+  const int *,
+  const int *,
+  const double *)
+{
+  if (Factorization * const found = system(kept[0]); found && found->factored())
+    found->solve(x);
+  else
+    std::fill(x, x + *size, std::numeric_limits<double>::quiet_NaN());
 }
 }
 
@@ -140,20 +157,6 @@ void check(bool fits, const char * message)
     throw std::invalid_argument(message);
 }
 
-// Checks that columns and rows are those of a lower triangle.
-void check_triangle(const Places & columns, const Places & rows)
-{
-  check(columns.shape(0) > 0 && columns(0) == 0, "columns begin with 0");
-  const std::size_t size = columns.shape(0) - 1;
-  for (std::size_t j = 0; j < size; ++j)
-  {
-    check(columns(j) <= columns(j + 1) && std::size_t(columns(j + 1)) <= rows.shape(0), "columns ascend to the number of rows");
-    for (int p = columns(j); p < columns(j + 1); ++p)
-      check(rows(p) >= int(j) && rows(p) < int(size), "rows are those of a lower triangle");
-  }
-  check(std::size_t(columns(size)) == rows.shape(0), "columns ascend to the number of rows");
-}
-
 } // namespace
 
 NB_MODULE(_kkt, module)
@@ -163,9 +166,13 @@ NB_MODULE(_kkt, module)
   nb::class_<Factorization>(module, "Factorization")
     .def(
       "__init__",
-      [](Factorization * self, const Places & columns, const Places & rows) {
-        check_triangle(columns, rows);
-        new (self) Factorization(columns.shape(0) - 1, columns.data(), rows.data(), 0);
+      [](Factorization * self, int size, const Places & rows, const Places & columns) {
+        check(size > 0, "there are rows");
+        check(rows.shape(0) == columns.shape(0), "as many rows as columns");
+        for (const Places * places : {&rows, &columns})
+          for (std::size_t p = 0; p < places->shape(0); ++p)
+            check((*places)(p) >= 0 && (*places)(p) < size, "places are in the matrix");
+        new (self) Factorization(std::size_t(size), rows.shape(0), rows.data(), columns.data(), 0);
       })
     .def(
       "factor",

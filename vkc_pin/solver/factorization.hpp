@@ -24,20 +24,15 @@
 class Factorization
 {
 public:
-  // Takes the lower triangle, column by column: rows[columns[j] - base] and on are those of column j, counted from base.
-  Factorization(std::size_t size, const int * columns, const int * rows, int base)
-  : size_(int(size))
-  , columns_(columns, columns + size + 1)
-  , rows_(rows, rows + (columns[size] - base))
+  // Takes where entries are, each above or below the diagonal, counted from `base`; those in one place are summed.
+  Factorization(std::size_t size, std::size_t entries, const int * rows, const int * columns, int base) : size_(int(size))
   {
-    for (int & entry : columns_)
-      entry -= base;
-    for (int & row : rows_)
-      row -= base;
+    for (std::size_t p = 0; p < entries; ++p)
+      entries_.emplace_back(rows[p] - base, columns[p] - base);
   }
 
   std::size_t size() const { return std::size_t(size_); }
-  std::size_t entries() const { return rows_.size(); }
+  std::size_t entries() const { return entries_.size(); }
   // Number of negative pivots: by Sylvester's law, of negative eigenvalues.
   int negative() const { return negative_; }
   // Number of entries of the panels.
@@ -124,12 +119,14 @@ private:
   // Finds the order of elimination; returns how many columns come first that are panels on their own.
   int order(const double * values)
   {
-    std::vector<char> dual(size_, true);
-    std::vector<int> degree(size_, 0), primal(size_, 0); // how many rows know each, and how many primal ones
+    std::vector<double> diagonal(size_, 0.0);
+    for (std::size_t p = 0; p < entries_.size(); ++p)
+      if (entries_[p].first == entries_[p].second)
+        diagonal[entries_[p].first] += values[p];
+    std::vector<char> dual(size_);
     for (int j = 0; j < size_; ++j)
-      for (int p = columns_[j]; p < columns_[j + 1]; ++p)
-        if (rows_[p] == j && values[p] > 0.0)
-          dual[j] = false;
+      dual[j] = !(diagonal[j] > 0.0);
+    std::vector<int> degree(size_, 0), primal(size_, 0); // how many rows know each, and how many primal ones
     each_pair([&](int i, int j) {
       ++degree[i];
       primal[i] += !dual[j];
@@ -170,31 +167,32 @@ private:
   template<typename Function>
   void each_pair(const Function & f) const
   {
-    for (int j = 0; j < size_; ++j)
-      for (int p = columns_[j]; p < columns_[j + 1]; ++p)
-        if (rows_[p] != j)
-        {
-          f(rows_[p], j);
-          f(j, rows_[p]);
-        }
+    for (const auto & [i, j] : entries_)
+      if (i != j)
+      {
+        f(i, j);
+        f(j, i);
+      }
   }
 
   // Finds the panels, where entries of the matrix are in them, and what they change in others.
   void analyse(int alone)
   {
-    std::vector<int> when(size_), panel_of(size_), at(size_ + 1, 0), below(rows_.size());
+    std::vector<int> when(size_), panel_of(size_), at(size_ + 1, 0), below(entries_.size());
     for (int k = 0; k < size_; ++k)
       when[order_[k]] = k;
     const auto each = [&](const auto & f) {
-      for (int j = 0; j < size_; ++j)
-        for (int p = columns_[j]; p < columns_[j + 1]; ++p)
-          f(std::min(when[j], when[rows_[p]]), std::max(when[j], when[rows_[p]]), p);
+      for (std::size_t p = 0; p < entries_.size(); ++p)
+      {
+        const auto [first, last] = std::minmax(when[entries_[p].first], when[entries_[p].second]);
+        f(first, last, p);
+      }
     };
-    each([&](int column, int, int) { ++at[column + 1]; });
+    each([&](int column, int, std::size_t) { ++at[column + 1]; });
     for (int k = 0; k < size_; ++k)
       at[k + 1] += at[k];
     std::vector<int> next(at.begin(), at.end() - 1);
-    each([&](int column, int row, int) { below[next[column]++] = row; });
+    each([&](int column, int row, std::size_t) { below[next[column]++] = row; });
     // Rows of a panel: those of its entries, and those of panels the first of whose later rows are columns of it.
     std::vector<int> seen(size_, -1);
     std::vector<std::vector<int>> children;
@@ -234,8 +232,8 @@ private:
     }
     for (Panel & panel : panels_)
       plan_updates(panel, panel_of);
-    places_.resize(rows_.size());
-    each([&](int column, int row, int p) {
+    places_.resize(entries_.size());
+    each([&](int column, int row, std::size_t p) {
       const Panel & panel = panels_[panel_of[column]];
       places_[p] = panel.values + std::size_t(column - panel.first) * panel.height + place(panel, row);
     });
@@ -358,8 +356,8 @@ private:
   }
 
   int size_;
-  std::vector<int> columns_, rows_; // the lower triangle
-  std::vector<int> order_;          // which row is eliminated when
+  std::vector<std::pair<int, int>> entries_; // where they are
+  std::vector<int> order_;                   // which row is eliminated when
   std::vector<Panel> panels_;
   std::vector<int> panel_rows_, updated_;
   std::vector<Update> updates_;

@@ -21,9 +21,9 @@ __all__ = ["Step", "Subproblem"]
 _IPOPT: Mapping[str, Any] = {
     "ipopt.print_level": 0,
     "ipopt.sb": "yes",
-    "ipopt.linear_solver": "ma97",  # the interface; what it leads to is `_kkt`
-    "ipopt.ma97_order": "amd",
-    "ipopt.ma97_scaling": "none",
+    "ipopt.linear_solver": "ma27",  # the interface; what it leads to is `_kkt`
+    "ipopt.linear_system_scaling": "none",
+    "ipopt.ma27_la_init_factor": 1.0,
     "ipopt.tol": 1e-4,
     "ipopt.acceptable_tol": 1e-3,
     "ipopt.constr_viol_tol": 1e-5,

@@ -186,6 +186,5 @@ NB_MODULE(_kkt, module)
         check(x.shape(0) == self.size() && self.factored(), "as many numbers as the matrix has rows, once it is factored");
         self.solve(x.data());
       })
-    .def_prop_ro("negative", &Factorization::negative)
-    .def_prop_ro("filled", &Factorization::filled);
+    .def_prop_ro("negative", &Factorization::negative);
 }

@@ -1,26 +1,16 @@
-// LDLᵀ of a sparse symmetric matrix, in an order that is made for the systems of an interior-point method on a trajectory.
 #pragma once
 
 #include <algorithm>
 #include <cmath>
 #include <cstddef>
 #include <limits>
-#include <utility>
 #include <vector>
+
+#include "elimination.hpp"
 
 // Factors P·A·Pᵀ = L·D·Lᵀ with a diagonal D, a few neighbouring columns at a time: a panel of L is dense, has only the rows in which
 // one of its columns has an entry, and when it is done the columns to its right are updated (right-looking supernodes: Ng and
 // Peyton, "Block Sparse Cholesky Algorithms on Advanced Uniprocessor Computers", 1993).
-//
-// A system of an interior-point method has primal rows, whose diagonals are positive at first, and dual ones, whose diagonals
-// are zero. Pivots are taken as they come, so the order has to see to it that none is zero (Bridson, "An Ordering Method for
-// the Direct Solution of Saddle-Point Matrices", 2007):
-//   1. primal rows that only one dual one knows, such as slacks: they cost nothing;
-//   2. dual rows that know one of these, each of which has a pivot now; for the rest that is as if it were not there, but for
-//      what it adds to the Hessian;
-//   3. other primal rows in the order of the program, which is that of time: what is coupled lies close together, and what is
-//      filled in is a band;
-//   4. each other dual row after the last primal one that it knows.
 class Factorization
 {
 public:
@@ -35,8 +25,6 @@ public:
   std::size_t entries() const { return entries_.size(); }
   // Number of negative pivots: by Sylvester's law, of negative eigenvalues.
   int negative() const { return negative_; }
-  // Number of entries of the panels.
-  std::size_t filled() const { return values_.size(); }
   // Whether the last call of `factor` worked, so that there is something to solve with.
   bool factored() const { return factored_; }
 
@@ -45,8 +33,8 @@ public:
   bool factor(const double * values)
   {
     factored_ = false;
-    if (order_.empty())
-      analyse(order(values));
+    if (order_.rows.empty())
+      analyse(values);
     negative_ = 0;
     std::fill(values_.begin(), values_.end(), 0.0);
     std::fill(sums_.begin(), sums_.end(), 0.0);
@@ -65,7 +53,7 @@ public:
   void solve(double * x)
   {
     for (int k = 0; k < size_; ++k)
-      work_[k] = x[order_[k]];
+      work_[k] = x[order_.rows[k]];
     for (const Panel & panel : panels_)
     {
       const int * rows = &panel_rows_[panel.rows];
@@ -94,7 +82,7 @@ public:
       }
     }
     for (int k = 0; k < size_; ++k)
-      x[order_[k]] = work_[k];
+      x[order_.rows[k]] = work_[k];
   }
 
 private:
@@ -116,71 +104,13 @@ private:
     std::size_t places;
   };
 
-  // Finds the order of elimination; returns how many columns come first that are panels on their own.
-  int order(const double * values)
-  {
-    std::vector<double> diagonal(size_, 0.0);
-    for (std::size_t p = 0; p < entries_.size(); ++p)
-      if (entries_[p].first == entries_[p].second)
-        diagonal[entries_[p].first] += values[p];
-    std::vector<char> dual(size_);
-    for (int j = 0; j < size_; ++j)
-      dual[j] = !(diagonal[j] > 0.0);
-    std::vector<int> degree(size_, 0), primal(size_, 0); // how many rows know each, and how many primal ones
-    each_pair([&](int i, int j) {
-      ++degree[i];
-      primal[i] += !dual[j];
-    });
-    std::vector<char> slack(size_), slackened(size_, false);
-    for (int j = 0; j < size_; ++j)
-      slack[j] = !dual[j] && degree[j] <= 1 && primal[j] == 0;
-    std::vector<int> last(size_, -1); // the last primal row that knows a dual one
-    each_pair([&](int i, int j) {
-      if (dual[i] && slack[j])
-        slackened[i] = true;
-      else if (dual[i] && !dual[j])
-        last[i] = std::max(last[i], j);
-    });
-    // What comes before all others, then what comes with each row of the program, then what nothing primal knows.
-    enum { SLACK = -2, SLACKENED = -1 };
-    std::vector<std::pair<int, int>> when;
-    int alone = 0;
-    for (int j = 0; j < size_; ++j)
-    {
-      int turn = 2 * j;
-      if (slack[j])
-        turn = SLACK;
-      else if (slackened[j])
-        turn = SLACKENED;
-      else if (dual[j])
-        turn = last[j] < 0 ? 2 * size_ : 2 * last[j] + 1;
-      alone += turn < 0;
-      when.emplace_back(turn, j);
-    }
-    std::sort(when.begin(), when.end());
-    for (const auto & [turn, j] : when)
-      order_.push_back(j);
-    return alone;
-  }
-
-  // Calls f(i, j) and f(j, i) for every entry off the diagonal.
-  template<typename Function>
-  void each_pair(const Function & f) const
-  {
-    for (const auto & [i, j] : entries_)
-      if (i != j)
-      {
-        f(i, j);
-        f(j, i);
-      }
-  }
-
   // Finds the panels, where entries of the matrix are in them, and what they change in others.
-  void analyse(int alone)
+  void analyse(const double * values)
   {
+    order_ = elimination_order(size_, entries_, values);
     std::vector<int> when(size_), panel_of(size_), at(size_ + 1, 0), below(entries_.size());
     for (int k = 0; k < size_; ++k)
-      when[order_[k]] = k;
+      when[order_.rows[k]] = k;
     const auto each = [&](const auto & f) {
       for (std::size_t p = 0; p < entries_.size(); ++p)
       {
@@ -198,7 +128,7 @@ private:
     std::vector<std::vector<int>> children;
     for (int first = 0; first < size_;)
     {
-      const int number = int(panels_.size()), width = first < alone ? 1 : std::min(WIDTH, size_ - first);
+      const int number = int(panels_.size()), width = first < order_.alone ? 1 : std::min(WIDTH, size_ - first);
       for (int k = first; k < first + width; ++k)
         panel_of[k] = number;
       panels_.push_back({first, width, 0, 0, 0, 0, 0});
@@ -336,8 +266,8 @@ private:
     if (int(sum_.size()) < height)
       sum_.resize(height);
     double * sum = sum_.data();
-    int k = 0;
     std::fill(sum + j, sum + height, 0.0);
+    int k = 0;
     for (; k + 4 <= width; k += 4)
     {
       const double *a = values + std::size_t(k) * height, *b = a + height, *c = b + height, *d = c + height;
@@ -356,8 +286,8 @@ private:
   }
 
   int size_;
-  std::vector<std::pair<int, int>> entries_; // where they are
-  std::vector<int> order_;                   // which row is eliminated when
+  Entries entries_;
+  Order order_;
   std::vector<Panel> panels_;
   std::vector<int> panel_rows_, updated_;
   std::vector<Update> updates_;

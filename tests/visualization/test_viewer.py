@@ -388,7 +388,7 @@ def test_browser_shows_each_thing_where_it_is_at_that_time(page: Path, plan: Pla
     probed = page.with_name("probed.htm")
     probed.write_text(page.read_text(encoding="utf-8").replace("</body>", probe), encoding="utf-8")
     moment = 4.4
-    text = browser.document(probed, time=moment)
+    text = browser.document(probed, time=moment, until='<pre id="seen">')
     assert 'data-ready="yes"' in text
     assert "data-refused" not in text
     assert "data-error" not in text

@@ -12,9 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vkc_pin.needed import compiled_module
+from vkc_pin.solver.subproblem import linear_solver
 
 KKT = compiled_module("vkc_pin.solver._kkt")
-OWN = {"ipopt.linear_solver": "ma27", "ipopt.hsllib": KKT.__file__, "ipopt.linear_system_scaling": "none"}
+OWN = linear_solver()
 QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False}
 
 
@@ -117,6 +118,26 @@ def test_rows_that_say_the_same_are_singular_and_what_follows_is_right() -> None
     np.testing.assert_allclose(x, 1.0, atol=1e-8)
 
 
+@pytest.mark.parametrize("size", [3, 9, 20])
+def test_what_only_rounding_keeps_from_being_zero_is_singular(size: int) -> None:
+    """The last pivot, also where nothing but other panels is taken off it."""
+    root = np.eye(size, size - 1) + 0.1 * np.random.default_rng(size).normal(size=(size, size - 1))  # no other pivot is small
+    gram = root @ root.T
+    assert not factored(gram)[1]
+    assert factored(gram + 1e-6 * np.eye(size))[1]
+
+
+def test_dual_rows_may_come_first() -> None:
+    """Where they are numbered makes no difference: they are eliminated after what they know."""
+    matrix = system(5, 4, 5, 2, 3)[::-1, ::-1]
+    factorization, done = factored(matrix)
+    assert done
+    assert factorization.negative == np.count_nonzero(np.linalg.eigvalsh(matrix) < 0.0)
+    x = matrix @ np.ones(len(matrix))
+    factorization.solve(x)
+    np.testing.assert_allclose(x, 1.0, atol=1e-7)
+
+
 def test_not_a_number_is_no_pivot() -> None:
     matrix = system(3, 2, 3, 1, 0)
     rows, columns, values = lower(matrix)
@@ -125,13 +146,13 @@ def test_not_a_number_is_no_pivot() -> None:
 
 
 def test_entries_above_the_diagonal_and_those_in_one_place_are_summed() -> None:
-    matrix = system(4, 3, 4, 1, 2)
+    matrix = system(4, 3, 4, 1, 2)[::-1, ::-1]  # dual rows first
     rows, columns, values = lower(matrix)
     flipped = np.arange(len(rows)) % 2 == 0
     places = np.where(flipped, columns, rows), np.where(flipped, rows, columns)
     twice = [np.concatenate([part, part]) for part in places]
     factorization = KKT.Factorization(len(matrix), *twice)
-    assert factorization.factor(np.concatenate([0.25 * values, 0.75 * values]))
+    assert factorization.factor(np.concatenate([1.5 * values, -0.5 * values])), "by the last values alone no row is primal"
     x = matrix @ np.ones(len(matrix))
     factorization.solve(x)
     np.testing.assert_allclose(x, 1.0, atol=1e-8)

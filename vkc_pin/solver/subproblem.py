@@ -16,14 +16,11 @@ from vkc_pin.program.merit import TOLERANCE, Infeasibility, Merit, shortfalls
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.solver.solution import Solution
 
-__all__ = ["Step", "Subproblem"]
+__all__ = ["Step", "Subproblem", "linear_solver"]
 
 _IPOPT: Mapping[str, Any] = {
     "ipopt.print_level": 0,
     "ipopt.sb": "yes",
-    "ipopt.linear_solver": "ma27",  # the interface; what it leads to is `_kkt`
-    "ipopt.linear_system_scaling": "none",
-    "ipopt.ma27_la_init_factor": 1.0,
     "ipopt.tol": 1e-4,
     "ipopt.acceptable_tol": 1e-3,
     "ipopt.constr_viol_tol": 1e-5,
@@ -46,6 +43,20 @@ _ROUGH: Mapping[str, Any] = {
     "ipopt.acceptable_iter": 3,
     "ipopt.max_iter": 40,
 }
+
+
+def linear_solver() -> dict[str, Any]:
+    """Return the options with which Ipopt has its systems factored by `_kkt`, which it speaks to as to HSL's MA27.
+
+    Raises:
+        BuildError: The module cannot be imported.
+    """
+    return {
+        "ipopt.linear_solver": "ma27",
+        "ipopt.hsllib": compiled_module("vkc_pin.solver._kkt").__file__,
+        "ipopt.linear_system_scaling": "none",
+        "ipopt.ma27_la_init_factor": 1.0,  # what is factored is not in Ipopt's arrays
+    }
 
 
 class Step(NamedTuple):
@@ -105,8 +116,7 @@ class Subproblem:
         if relaxed:  # on the way: the rows of the round before were others, and its end need not be exact
             self.forget()
         how = _ROUGH if relaxed else _WARM if self._multipliers else {}
-        kkt = compiled_module("vkc_pin.solver._kkt").__file__
-        options = {"ipopt.max_iter": problem.options.max_iterations, "ipopt.hsllib": kkt, **_IPOPT, **how}
+        options = {"ipopt.max_iter": problem.options.max_iterations, **linear_solver(), **_IPOPT, **how}
         solver = t.solver(rates=rates, options=options)
         prices = merit.price(found, clearance=False)
         shares = np.where(relaxed & (prices > 0.0), 1.0, 0.0)

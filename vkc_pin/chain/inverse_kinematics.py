@@ -33,11 +33,11 @@ class PoseSolver:
         residual = ca.densify(pose_residual(pose.kind, *pose.placement(placements), target))
         self.rows = int(residual.numel())
         jacobian = ca.densify(ca.jacobian(residual, z))
-        self._function = BatchFunction(ca.Function("pose", [z, target], [residual, jacobian], {"cse": True}))
+        self._function = BatchFunction(ca.Function("pose", [z, target], [residual, jacobian]))
         lower, upper, weights = (ca.SX.sym(name, self.size) for name in ("lower", "upper", "weights"))
         step = _step(z, residual, jacobian, weights, (lower, upper))
         moved = [ca.mmax(ca.fabs(residual)), ca.fmin(ca.fmax(z + step, lower), upper)]
-        self._moved = BatchFunction(ca.Function("moved", [z, target, lower, upper, weights], moved, {"cse": True}))
+        self._moved = BatchFunction(ca.Function("moved", [z, target, lower, upper, weights], moved))
 
     @property
     def nbytes(self) -> int:

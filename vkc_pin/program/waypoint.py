@@ -112,13 +112,12 @@ class WaypointFunctions:
         inner = ca.Function("inner", [z, share, targets, away, w, multipliers], [hessian])
         hessian = inner(z, share, targets, away, planes.T @ of_planes, multipliers)
         inputs = [own, ca.vec(planes), offsets, ca.vec(targets), ca.vec(away)]
-        options = {"cse": True}
         spend()
-        self.value = ca.Function("g", inputs, [rows], options)
-        self.jacobian = ca.Function("rows_jacobian", inputs, [ca.vertcat(*jacobian.nonzeros())], options)
+        self.value = ca.Function("g", inputs, [rows])
+        self.jacobian = ca.Function("rows_jacobian", inputs, [ca.vertcat(*jacobian.nonzeros())])
         spend()
         self.jacobian_pattern = jacobian.sparsity().get_triplet()
-        self.hessian = ca.Function("lagrangian_hessian", [*inputs, multipliers], [ca.vertcat(*hessian.nonzeros())], options)
+        self.hessian = ca.Function("lagrangian_hessian", [*inputs, multipliers], [ca.vertcat(*hessian.nonzeros())])
         self.hessian_pattern = hessian.sparsity().get_triplet()
         self.code = MachineCode(self.value, self.jacobian, self.hessian)
         self.nbytes = size_of(self.value, self.jacobian, self.hessian)

@@ -85,12 +85,12 @@ class WaypointFunctions:
     """The SX functions of one kind of waypoint: a model, so many witness planes, and which poses it must satisfy."""
 
     def __init__(self, model: pin.Model, slots: int, poses: tuple[PoseRow, ...], cache: Cache) -> None:
-        coordinates = Coordinates(model)
-        n, joints = coordinates.size, model.njoints - 1
+        n, joints = Coordinates(model).size, model.njoints - 1
         z, s, share = ca.SX.sym("z", n), ca.SX.sym("s", slots), ca.SX.sym("e")
         planes, offsets = ca.SX.sym("C", slots, 12 * joints), ca.SX.sym("R", slots)
         targets, away = ca.SX.sym("W", 12, max(len(poses), 1)), ca.SX.sym("D", AWAY, max(len(poses), 1))
-        placements = kinematics_of(model, cache).symbolic(z)
+        sweep = cache.get(("sweep", model.saveToString(), slots), lambda: _Sweep(model, slots, cache))
+        placements, slopes_of_planes = sweep.function(z, planes)
         stacked = ca.vec(placements)
         # Every row is linear in the placements: rows = L·vec(M) + const, so one sweep of the kinematics serves them all.
         parts = []
@@ -104,7 +104,7 @@ class WaypointFunctions:
         multipliers = ca.SX.sym("lam", self.rows)
         of_planes, of_poses = ca.vertsplit(multipliers, [0, slots, self.rows])  # a slice of a scalar would be a row
         own = ca.vertcat(z, s, share)
-        slopes = ca.horzcat(_slopes(model, coordinates, z, placements, planes), ca.SX.eye(slots), ca.SX(slots, 1))
+        slopes = ca.horzcat(slopes_of_planes, ca.SX.eye(slots), ca.SX(slots, 1))
         jacobian = ca.vertcat(slopes, ca.jacobian(pose_values, own))
         spend()
         w = ca.SX.sym("w", 12 * joints)
@@ -200,6 +200,17 @@ def _step_functions(rolling: Rolling) -> tuple[ca.Function, ca.Function, ca.Func
         ca.Function("roll_jacobian", [poses, gear], [ca.jacobian(rows, poses)], {"cse": True}),
         ca.Function("roll_hessian", [poses, gear, multipliers], [hessian], {"cse": True}),
     )
+
+
+class _Sweep:
+    """One sweep over a model's joints, for all kinds of waypoints: z, planes → placements, slopes of the planes' values."""
+
+    def __init__(self, model: pin.Model, slots: int, cache: Cache) -> None:
+        coordinates = Coordinates(model)
+        z, planes = ca.SX.sym("z", coordinates.size), ca.SX.sym("C", slots, 12 * (model.njoints - 1))
+        placements = kinematics_of(model, cache).symbolic(z)
+        self.function = ca.Function("sweep", [z, planes], [placements, _slopes(model, coordinates, z, placements, planes)])
+        self.nbytes = size_of(self.function)
 
 
 def _slopes(model: pin.Model, coordinates: Coordinates, z: Any, placements: Any, planes: Any) -> Any:

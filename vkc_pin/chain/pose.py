@@ -142,7 +142,8 @@ def away_from(kind: str, rotations: Floats, translations: Floats, target: pin.SE
         turn = np.column_stack([vertical[:, 1], -vertical[:, 0], np.zeros(len(turn))])
         turn, along = np.where(turn.any(axis=1, keepdims=True), turn, [1e-99, 0.0, 0.0]) @ target.rotation, vertical[:, 2]
     elif kind == "pose":
-        quaternions = np.array([pin.Quaternion(error).coeffs() for error in target.rotation.T @ rotations]).reshape(-1, 4)
+        errors = map(np.asfortranarray, target.rotation.T @ rotations)  # eigenpy never frees its copies of rows-first matrices
+        quaternions = np.array([pin.Quaternion(error).coeffs() for error in errors]).reshape(-1, 4)
         turn, along = quaternions[:, :3] * np.where(quaternions[:, 3:] < 0.0, -1.0, 1.0), np.abs(quaternions[:, 3])
     size = np.linalg.norm(turn, axis=1, keepdims=True)
     axis = np.where(size > 0.0, turn / np.maximum(size, np.finfo(float).tiny), [0.0, 0.0, 1.0])

@@ -6,6 +6,7 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
+from helpers.memory import growth
 
 from vkc_pin.chain.pose import AWAY, ROW_BOUNDS, PoseRow, away_from, pose_residual, pose_rows, receded, target_vector
 
@@ -336,6 +337,13 @@ def away_of(kind: str, target: pin.SE3, *placements: pin.SE3) -> np.ndarray:
     np.testing.assert_allclose(np.linalg.norm(found[:, 3:6], axis=1), 1.0, rtol=0.0, atol=1e-12)
     assert ((found[:, 6] >= 0.0) & (found[:, 6] <= np.pi + 1e-12)).all()
     return np.asarray(found)
+
+
+def test_how_far_away_leaves_nothing_behind() -> None:
+    target, placements = pin.SE3.Random(), [pin.SE3.Random() for _ in range(50)]
+    left, objects = growth(lambda: away_of("pose", target, *placements))
+    assert left <= 50 * 8
+    assert objects <= 50 / 2
 
 
 def some_placement(kind: str, target: pin.SE3, angle: float, rng: np.random.Generator) -> pin.SE3:

@@ -6,6 +6,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 import pytest
+from helpers.memory import growth
 from helpers.small_problems import door_scene, random_configurations
 
 from vkc_pin.distances.placements import ShapePlacements, columns_of
@@ -17,6 +18,13 @@ def test_numbers_of_a_placement() -> None:
     (numbers,) = columns_of([pin.SE3(rotation, np.array([4.0, 5.0, 6.0]))])
     np.testing.assert_array_equal(numbers, [*rotation[:, 0], *rotation[:, 1], *rotation[:, 2], 4.0, 5.0, 6.0])
     assert columns_of([]).shape == (0, 12)
+
+
+def test_models_leave_nothing_behind() -> None:
+    world = World(door_scene())
+    left, objects = growth(lambda: [ShapePlacements(world.model, world.bodies) for _ in range(50)])
+    assert left <= 50 * 8
+    assert objects <= 50 / 2
 
 
 def check(model: pin.Model, geometry: pin.GeometryModel, q: np.ndarray) -> None:

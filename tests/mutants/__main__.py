@@ -26,9 +26,14 @@ MODULES = [
 ]
 MODULES += ["scene/contact.py", "planning/one_problem.py"]
 TESTS = ["tests/validation", "tests/solver", "tests/oracle", "tests/program/test_merit.py", "tests/program/test_problem.py"]
-TESTS += [f"tests/chain/test_{name}.py" for name in ("contacts", "contacts_carried", "easing", "pose", "inverse_kinematics")]
+TESTS += ["tests/scene/test_contact.py"]
 TESTS += [
-    f"tests/planning/test_{name}.py" for name in ("one_problem", "pushes", "near_grasps", "riding", "plan_loaded", "infeasible")
+    f"tests/chain/test_{name}.py"
+    for name in ("collision_pairs", "contacts", "contacts_carried", "easing", "easing_parts", "pose", "inverse_kinematics")
+]
+TESTS += [
+    f"tests/planning/test_{name}.py"
+    for name in ("one_problem", "one_problem_parts", "pushes", "near_grasps", "riding", "plan_loaded", "infeasible")
 ]
 
 

@@ -109,7 +109,9 @@ def test_of_each_segment_and_pair_the_deepest_is_kept(rows: list[tuple[int, tupl
 
 def test_merged_contacts_come_by_waypoint_and_those_first_that_fall_shortest() -> None:
     one = contacts(np.array([0, 1]), np.array([[0, 1], [0, 2]]), np.array([0.3, 0.1]), np.array([0.02, 0.02]))
-    other = contacts(np.array([0, 1, 0]), np.array([[0, 3], [0, 4], [0, 5]]), np.array([0.5, 0.2, 0.1]), np.array([0.4, 0.3, 0.0]))
+    other = contacts(
+        np.array([0, 1, 0]), np.array([[0, 3], [0, 4], [0, 5]]), np.array([0.5, 0.2, 0.1]), np.array([0.4, 0.3, 0.0])
+    )
     joined = merge(one, other)
     assert joined.waypoint.tolist() == [0, 0, 0, 1, 1]
     assert joined.pair[:, 1].tolist() == [3, 5, 1, 4, 2]

@@ -115,7 +115,9 @@ def test_what_moves_before_its_turn_is_named(monkeypatch: pytest.MonkeyPatch) ->
     assert ordered(monkeypatch, early, hands, ["..x.", "...x", "...x"]) == [("order", "stick", 10, 5.0, 0.25, "m")]
     assert ordered(monkeypatch, early, hands, [".x..", "...x", "...x"]) == []
     own = [{"stick": 0.1, "ball": 0.5}, {}, {}]
-    assert ordered(monkeypatch, own, ["stick", "stick", "", ""], ["...x", "...x", "...x"]) == [("order", "ball", 0, 0.0, 0.5, "m")]
+    assert ordered(monkeypatch, own, ["stick", "stick", "", ""], ["...x", "...x", "...x"]) == [
+        ("order", "ball", 0, 0.0, 0.5, "m")
+    ]
 
 
 @pytest.mark.parametrize(
@@ -187,9 +189,7 @@ def test_how_far_what_is_carried_goes() -> None:
     z[:, 4] = [0.0, 5.0, 6.0, 7.0, 8.0]
     world = SimpleNamespace(placement_columns=lambda owner: [1, 2, 3, 4, 5, 6, 7])
     phases = [SimpleNamespace(held={"stick": "grip", "door": "handle"})]
-    samples: Any = SimpleNamespace(
-        z=z, world=world, rows=lambda phase: np.arange(4), trajectory=SimpleNamespace(phases=phases)
-    )
+    samples: Any = SimpleNamespace(z=z, world=world, rows=lambda phase: np.arange(4), trajectory=SimpleNamespace(phases=phases))
     assert goals._carried(samples, 0, {"stick", "cup"}) == {"stick": (9.0, "m")}
     assert goals._carried(samples, 0, {"cup"}) == {}
 

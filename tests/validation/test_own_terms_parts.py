@@ -72,7 +72,9 @@ def test_formulas_are_given_frames_coordinates_and_the_last_steps(moving: bool) 
     def expected(time: float) -> np.ndarray:
         z = samples.world.positions(motion, np.array([time]))
         pin.framesForwardKinematics(model, data, samples.world.coordinates.q(z)[0])
-        parts = [np.append(data.oMf[f].rotation.T.ravel(), data.oMf[f].translation) for f in map(model.getFrameId, formula.frames)]
+        parts = [
+            np.append(data.oMf[f].rotation.T.ravel(), data.oMf[f].translation) for f in map(model.getFrameId, formula.frames)
+        ]
         return np.concatenate([*parts, [z[0, samples.world.coordinates.index(name)] for name in formula.coordinates]])
 
     assert len(formula.frames) == 2

@@ -49,6 +49,8 @@ def test_what_holds_for_a_pair_between_two_waypoints(
     rows = range(len(asked))
     assert table.contact_at(which, first, last).tolist() == [max([0.0, *of(row, "contact")]) for row in rows]
     assert table.together_at(which, first, last).tolist() == [any(of(row, "together")) for row in rows]
-    here = [[windows[w].margin for w, (a, b, own) in enumerate(given_spans) if mine[p] in own and a <= t <= b] for p, t, _ in asked]
+    here = [
+        [windows[w].margin for w, (a, b, own) in enumerate(given_spans) if mine[p] in own and a <= t <= b] for p, t, _ in asked
+    ]
     assert table.margins_at(which, first).tolist() == [min([0.02, *margins]) for margins in here]
     assert (table.margins == 0.02).all()  # they are left as they are

@@ -16,7 +16,9 @@ WHEELS = SimpleNamespace(rim=2.0, track=0.5)
 TIMES = np.array([0.0, 1.0, 3.0, 4.0])
 
 
-def found(rows: Any, *, base: str = "differential", wheels: Any = None, radius: float = 0.0, rates: Any = None) -> list[Violation]:
+def found(
+    rows: Any, *, base: str = "differential", wheels: Any = None, radius: float = 0.0, rates: Any = None
+) -> list[Violation]:
     """Return what is said of a base that is at (x, y, yaw) at `TIMES`; with `rates` it moves along cubics."""
     positions = np.asarray(rows, float)
     curve = None if rates is None else Curve(TIMES, positions, np.asarray(rates, float))

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.carrying import Script, above, reaching, room, table, tool_at, STICK
+from helpers.carrying import STICK, Script, above, reaching, room, table, tool_at
 from helpers.drives import hall, moved, of_rows
 from helpers.small_problems import door_scene
 from hypothesis import given

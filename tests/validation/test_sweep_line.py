@@ -145,7 +145,8 @@ def test_halves_are_looked_at_in_turn() -> None:
     """First the middle, then the middles of the halves in which something may be, at last between two samples."""
     line = Line((5.3, 0.05))
     swept(line, np.linspace(0.0, 8.0, 9), [0, 8])
-    assert line.asked[2:6] == [(4.0,), (2.0, 6.0), (3.0, 5.0, 7.0), (5.5,)]
+    looks = [states for states in line.asked if not {0.0, 8.0} & set(states)]
+    assert looks[:4] == [(4.0,), (2.0, 6.0), (3.0, 5.0, 7.0), (5.5,)]
 
 
 @pytest.mark.parametrize(

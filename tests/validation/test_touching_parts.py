@@ -136,9 +136,7 @@ def told(openings: list[float | None], *holds: tuple[Hold, ...], monkeypatch: py
     asked = {"stick.grip": 0.03, "door.handle": None}
     way = [0.0] * (len(phases) + 1)
     times = 10.0 * np.arange(len(way))
-    found = rests(
-        way, phases, held=holds[0], times=times.tolist(), gripper=GRIPPER, openings=asked, monkeypatch=monkeypatch
-    )
+    found = rests(way, phases, held=holds[0], times=times.tolist(), gripper=GRIPPER, openings=asked, monkeypatch=monkeypatch)
     assert {one.constraint for one in found} <= {"opening"}
     return [(one.subject, one.waypoint, one.time, pytest.approx(one.amount), one.unit) for one in found]
 

@@ -55,7 +55,10 @@ TABLE = [(0, 1, 0.02), (1, 2, 0.02), (2, 3, 0.01), (0, 4, 0.02), (3, 4, 0.02), (
 SLIDE = {"drawer.slide": (-0.1, 0.4)}
 
 
-def allowed(*allowances: Allowance, within: Any = (np.array([5]), np.array([-0.1]), np.array([0.4]))) -> Any:
+WITHIN = np.array([5]), np.array([-0.1]), np.array([0.4])
+
+
+def allowed(*allowances: Allowance, within: Any = WITHIN) -> Any:
     """Return the pairs with their margins, and where some may be close: (pairs, margin) each."""
     made = pairing(*allowances)
     made._within = lambda phase, ranges: within if ranges else (np.zeros(0, int), np.zeros(0), np.zeros(0))

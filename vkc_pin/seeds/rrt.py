@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from vkc_pin.arrays import Floats
+from vkc_pin.arrays import Floats, Ints
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.knots import depth, smooth
 
@@ -23,6 +23,9 @@ TRIES = 1500
 _STEPS = (0.15, 0.04)  # [rad] between configurations that are looked at; the latter where the former overlooked something
 _STRAIGHTENINGS = 12  # times that the arm and each of its joints are tried to be straightened
 _WORTH = 1e-3  # share of a path's length that is to be saved by it
+_SHORTER = 0.02  # the same share for which they are tried so often once more
+_PATHS = 3  # paths of trees at most, of which the shortest is kept
+_DETOUR = 1.5  # way of the arm, as a multiple of the straight one, up to which there is no need of another path
 _BESIDE_PATH = 0.1  # [m] and [rad] standard deviation, at most, of bases beside their path
 _AROUND = 0.4  # [m] and [rad] standard deviation, at most, of bases around the ends, and of arms
 
@@ -51,11 +54,19 @@ def connect(
         tries: How often a tree may grow.
     """
     coarse, fine = (_Search(problem, phase, first, poses, arms, rng, step) for step in _STEPS)
-    path = coarse.run(ends, tries)
-    if path is not None and not fine.free(path):
-        finer = fine.run(ends, tries)
-        path = path if finer is None else finer
-    return None if path is None else fine.straightened(path)
+    best = None
+    for _ in range(_PATHS):
+        path = coarse.run(ends, tries)
+        if path is not None and not fine.free(path):
+            finer = fine.run(ends, tries)
+            path = path if finer is None else finer
+        if path is None:
+            break
+        path = fine.straightened(path)
+        best = path if best is None or fine.length(path) < fine.length(best) else best
+        if fine.detour(best) <= _DETOUR:
+            break
+    return best
 
 
 def spread(path: Floats, steps: int, metric: Floats) -> Floats:
@@ -200,22 +211,39 @@ class _Search:
 
         What leads through a passage with another posture takes all joints along; straight lines of all coordinates seldom undo
         that, and the solver cannot, since things are between. So coordinates are taken apart (partial shortcuts: Geraerts and
-        Overmars, IJRR 2007), at first all along the path, then between random places on it.
+        Overmars, IJRR 2007), at first all along the path, then between random places on it, as long as that is worth it.
         """
         groups = [np.arange(3, self.size), *(np.array([column]) for column in range(3, self.size))]
-        length = self._passed(path)[-1]
-        for attempt, columns in itertools.product(range(_STRAIGHTENINGS), groups):
-            passed = self._passed(path)
-            s, t = np.sort(self.rng.uniform(0.0, passed[-1], 2)) if attempt else (0.0, passed[-1])
-            at = np.concatenate([[s], passed[(s < passed) & (passed < t)], [t]])
-            part = np.column_stack([np.interp(at, passed, column) for column in path.T])
-            share = ((at - s) / max(t - s, 1e-12))[:, None]
-            part[1:-1, columns] = (part[0, columns] + share * (part[-1, columns] - part[0, columns]))[1:-1]
-            changed = np.concatenate([path[passed <= s], part, path[passed >= t]])
-            shorter = self._passed(changed)[-1]
-            if shorter < (1.0 - _WORTH) * length and self.free(part):
-                path, length = changed[np.diff(self._passed(changed), prepend=-1.0) > 0.0], shorter
+        before = np.inf
+        for columns in groups:
+            path = self._even(path, columns, 0.0, self.length(path))
+        while self.length(path) < (1.0 - _SHORTER) * before:
+            before = self.length(path)
+            for _, columns in itertools.product(range(_STRAIGHTENINGS), groups):
+                path = self._even(path, columns, *np.sort(self.rng.uniform(0.0, self.length(path), 2)))
         return path
+
+    def _even(self, path: Floats, columns: Ints, s: float, t: float) -> Floats:
+        """Return a path that is shorter as some coordinates change evenly from `s` to `t` along it; if nothing hinders that."""
+        passed = self._passed(path)
+        at = np.concatenate([[s], passed[(s < passed) & (passed < t)], [t]])
+        part = np.column_stack([np.interp(at, passed, column) for column in path.T])
+        share = ((at - s) / max(t - s, 1e-12))[:, None]
+        part[1:-1, columns] = (part[0, columns] + share * (part[-1, columns] - part[0, columns]))[1:-1]
+        changed = np.concatenate([path[passed <= s], part, path[passed >= t]])
+        if self.length(changed) >= (1.0 - _WORTH) * passed[-1] or not self.free(part):
+            return path
+        return changed[np.diff(self._passed(changed), prepend=-1.0) > 0.0]
+
+    def length(self, path: Floats) -> float:
+        """Return how long a path is, shape (K, m)."""
+        return float(self._passed(path)[-1])
+
+    def detour(self, path: Floats) -> float:
+        """Return how far the arm goes along a path, shape (K, m), as a multiple of how far it had to go at least."""
+        arm = path[:, 3:] * self.weights[3:]
+        least = float(np.abs(arm[-1] - arm[0]).sum())
+        return float(np.abs(np.diff(arm, axis=0)).sum()) / max(least, 1e-12)
 
     def _passed(self, path: Floats) -> Floats:
         """Return how far it is along a path to each of its configurations, shape (K,)."""

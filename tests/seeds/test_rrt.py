@@ -103,6 +103,42 @@ def test_straight_ways_are_free_and_no_longer(seed: int) -> None:
     is_a_way(problem, again)
 
 
+@pytest.mark.parametrize(
+    ("turns", "asked", "kept"),
+    [((3.0, 1.0, 2.0), 3, 1.0), ((0.1, 1.0, 2.0), 1, 0.1), ((3.0, 0.1, 2.0), 2, 0.1), ((3.0, None), 2, 3.0), ((None,), 1, None)],
+)
+def test_where_the_arm_goes_far_round_the_shortest_of_a_few_paths_is_kept(
+    monkeypatch: pytest.MonkeyPatch, turns: tuple[float | None, ...], asked: int, kept: float | None
+) -> None:
+    """A shoulder turns by so much there and back on its way to 1 rad, in what trees find one time after the other."""
+    problem, _, _ = gate()
+    given, tries = iter(turns), list[int]()
+
+    def run(search: trees._Search, ends: np.ndarray, most: int) -> np.ndarray | None:
+        tries.append(most)
+        search.grown = 7
+        turn = next(given)
+        path = np.tile(problem.start[:SIZE], (3, 1))
+        path[:, 3] += [0.0, 1.0 + (turn or 0.0), 1.0]
+        return None if turn is None else path
+
+    monkeypatch.setattr(trees._Search, "run", run)
+    monkeypatch.setattr(trees._Search, "free", lambda search, path: True)
+    monkeypatch.setattr(trees._Search, "straightened", lambda search, path: path)
+    path = through(0)
+    assert tries == [trees.TRIES, 14, 14][:asked]
+    assert (path is None) if kept is None else path is not None and path[1, 3] == pytest.approx(problem.start[3] + 1.0 + kept)
+
+
+def test_the_way_of_the_arm_is_compared_with_the_straight_one() -> None:
+    problem, guide, arms = gate()
+    search = trees._Search(problem, 0, problem.start, guide, arms, np.random.default_rng(0), 0.04)
+    path = np.tile(problem.start[:SIZE], (3, 1))
+    path[1:, 0] += [0.5, 0.0]  # the base does not count
+    path[1:, 4] += [0.3, 0.1]
+    assert search.detour(path) == pytest.approx(5.0)
+
+
 def is_a_way(problem: vkc.TrajectoryProblem, path: np.ndarray) -> None:
     short, allowed = missing(problem, finely(path)), GRAZE * problem.options.dist_safe
     assert short.max() <= allowed + HIDDEN

@@ -52,6 +52,9 @@ def connect(
         arms: Postures that are likely to be needed, shape (A, m - 3) [m] and [rad].
         rng: Random numbers.
         tries: How often a tree may grow.
+
+    Where the arm goes far round, other paths are looked for, too, and the shortest is kept: trees take a share of a second, and
+    the solver stays on the side of things on which it begins.
     """
     coarse, fine = (_Search(problem, phase, first, poses, arms, rng, step) for step in _STEPS)
     best = None
@@ -66,6 +69,7 @@ def connect(
         best = path if best is None or fine.length(path) < fine.length(best) else best
         if fine.detour(best) <= _DETOUR:
             break
+        tries = min(tries, 2 * coarse.grown)  # another one is welcome if it is found as soon
     return best
 
 
@@ -95,6 +99,7 @@ class _Search:
         self.weights = problem.chain.metric[: self.size]
         limits = np.array([problem.limits(name) for name in problem.chain.names[: self.size]])
         self.lower, self.upper = limits.T
+        self.grown = 0  # how often trees grew until they met, or no more
 
     def run(self, ends: Floats, tries: int) -> Floats | None:
         """Return the path to one of `ends`."""
@@ -104,6 +109,7 @@ class _Search:
         trees = _Tree(start[None], self.weights), _Tree(ends, self.weights)
         direct = [*ends]
         for number in range(tries):
+            self.grown = number + 1
             tree, other = (trees[0], trees[1]) if direct or number % 2 else (trees[1], trees[0])
             if direct:
                 node = self._grow(tree, direct.pop(0))

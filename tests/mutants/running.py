@@ -51,21 +51,24 @@ class Coverage:
         self.seconds, self.lines = seconds, lines
 
     def tests_of(self, mutant: Mutant, most: float) -> list[str]:
-        """Return the tests that execute a changed line: those of the module's own file, then others, files that are quick first.
+        """Return the tests that execute a changed line: those of the module's own files, then others, files that are quick first.
+
+        Those whose names begin as the module's do are its own: test_sweep.py and test_sweep_line.py are sweep.py's.
 
         Args:
             mutant: The fault. One outside of functions is in the lines that use what is defined there.
             most: CPU time that they may take together [s]; those that are left out are the last.
         """
         found = {test for line in mutant.lines for test in self.lines.get(f"{mutant.module}:{line}", [])}
-        own = f"tests/{Path(mutant.module).parent}/test_{Path(mutant.module).name}"
+        mine = f"tests/{Path(mutant.module).with_suffix('').parent}/test_{Path(mutant.module).stem}"
+        own = {file for file in map(_file, self.seconds) if file == f"{mine}.py" or file.startswith(f"{mine}_")}
         if mutant.lines != (mutant.line,):  # a constant, which tests may look at themselves
-            own_tests = {test for test in self.seconds if _file(test) == own}
+            own_tests = {test for test in self.seconds if _file(test) in own}
             found |= own_tests | (set() if found else set(self.lines.get(f"{mutant.module}:{ALWAYS}", [])))
         whole: dict[str, float] = defaultdict(float)
         for test in found:
             whole[_file(test)] += self.seconds[test]
-        order = sorted(found, key=lambda test: (_file(test) != own, whole[_file(test)], _file(test), self.seconds[test]))
+        order = sorted(found, key=lambda test: (_file(test) not in own, whole[_file(test)], _file(test), self.seconds[test]))
         spent = list(itertools.accumulate(self.seconds[test] for test in order))
         return [test for test, until in zip(order, spent, strict=True) if until <= most or test == order[0]]
 

@@ -11,7 +11,7 @@ from . import __main__
 from .__main__ import drawn
 from .equivalent import EQUIVALENT
 from .mutations import mutants
-from .running import PACKAGE
+from .running import PACKAGE, Coverage
 
 SOURCE = '''"""Docstring 3 < 4."""
 __all__ = ["area"]
@@ -112,3 +112,18 @@ def test_same_faults_are_known_apart() -> None:
     names = [mutant.name for mutant in mutants("x.py", source)]
     assert len(set(names)) == len(names) == 4
     assert [mutant.again for mutant in mutants("x.py", source) if mutant.at == "a += b"] == [0, 1]
+
+
+def test_a_modules_own_files_are_asked_first_and_quick_ones_before_slow_ones() -> None:
+    seconds = {
+        "tests/wing/test_x.py::slow": 9.0,
+        "tests/wing/test_x_line.py::b": 0.2,
+        "tests/wing/test_x_line.py::a": 0.1,
+        "tests/wing/test_xy.py::other": 0.01,
+        "tests/other/test_x.py::far": 0.02,
+    }
+    mutant = next(iter(mutants("wing/x.py", "def f(a):\n    return a + 1\n")))
+    known = Coverage(seconds, {"wing/x.py:2": list(seconds)})
+    own = ["tests/wing/test_x_line.py::a", "tests/wing/test_x_line.py::b", "tests/wing/test_x.py::slow"]
+    assert known.tests_of(mutant, 100.0) == [*own, "tests/wing/test_xy.py::other", "tests/other/test_x.py::far"]
+    assert known.tests_of(mutant, 5.0) == own[:2]

@@ -25,7 +25,14 @@ MODULES = [
     "program/merit.py",
 ]
 MODULES += ["scene/contact.py", "planning/one_problem.py"]
-TESTS = ["tests/validation", "tests/solver", "tests/oracle", "tests/program/test_merit.py", "tests/program/test_problem.py"]
+TESTS = [
+    "tests/validation",
+    "tests/solver",
+    "tests/oracle",
+    "tests/program/test_merit.py",
+    "tests/program/test_merit_numbers.py",
+    "tests/program/test_problem.py",
+]
 TESTS += ["tests/scene/test_contact.py"]
 TESTS += [
     f"tests/chain/test_{name}.py"

@@ -227,3 +227,61 @@ def test_of_several_attachments_the_one_that_is_nearest_in_its_worse_part() -> N
     assert asked[-1] == ("stick", "near", [7], "cup.rim")
     scene.held, phases[1].held = {}, {}
     assert goals._grasp(samples, Grasp("stick"), 7) == ("unused", (0.0, 0.0))
+
+
+# --- all of it --------------------------------------------------------------------------------------------------------
+
+
+def checked(
+    monkeypatch: pytest.MonkeyPatch,
+    table: Sequence[Sequence[Sequence[float]]],
+    dropped: Mapping[tuple[int, int], float] | None = None,
+) -> tuple[list[tuple[Any, ...]], list[list[bool]]]:
+    """Return what is said of steps, and which hold at the start of which phase; by how much each of them misses then."""
+    samples = samples_of(phases=[[]] * (len(table[0]) - 1))
+    steps: list[Any] = list(range(len(table)))
+    held: list[list[list[bool]]] = []
+
+    def misses(_: Any, step: int, k: int, options: Any) -> list[goals.Miss]:
+        return [goals.Miss(f"x{i}", amount, "m", "") for i, amount in enumerate(table[step][k])]
+
+    def fallen(_: Any, __: Any, hands: Any, number: int, k: int) -> list[goals.Miss]:
+        assert hands == "hands"
+        return [goals.Miss("stick", amount, "holds", "") for at, amount in (dropped or {}).items() if at == (number, k)]
+
+    monkeypatch.setattr(goals, "_in_hand", lambda *_: "hands")
+    monkeypatch.setattr(goals, "_misses", misses)
+    monkeypatch.setattr(goals, "_dropped", fallen)
+    monkeypatch.setattr(goals, "_check_order", lambda _, __, hands, holds: held.append(holds) or [])
+    found = goals.check_goals(samples, steps, None)  # type: ignore[arg-type]
+    return [(one.constraint, one.subject, one.waypoint, one.time, one.amount) for one in found], held[0] if held else []
+
+
+def test_each_step_is_done_at_the_end_of_a_phase_after_those_before_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    yes, no = [], [0.5]
+    assert checked(monkeypatch, [[no, yes, no], [no, no, yes]]) == ([], [[False, True, False], [False, False, True]])
+    assert checked(monkeypatch, [[yes, no, no], [no, no, yes]])[0] == []  # before anything begins
+    assert checked(monkeypatch, [[no, no, yes], [yes, yes, yes]])[0] == []  # both with the last
+    assert checked(monkeypatch, [[no, no, yes], [no, yes, no], [yes, yes, yes]])[0] == [("goal", "x0", 20, 10.0, 0.5)]
+    assert checked(monkeypatch, [[no, yes, yes], [yes, no, no], [yes, yes, yes]])[0] != []  # too early
+    assert checked(monkeypatch, [[no, yes, no], [no, yes, no], [no, no, yes]])[0] == []
+
+
+def test_the_last_step_must_hold_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert checked(monkeypatch, [[[], [], [0.5]]])[0] == [("goal", "x0", 20, 10.0, 0.5)]
+    assert checked(monkeypatch, [[[9.0], [9.0], []]])[0] == []
+
+
+def test_where_it_came_nearest_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the worse of what is missing, and all of that; not before anything has begun."""
+    missing = [[0.1], [0.9, 0.2], [0.5, 0.6], [0.7]]
+    ended = [[1.0], [1.0], [1.0], []]
+    assert checked(monkeypatch, [missing, ended])[0] == [("goal", "x0", 20, 10.0, 0.5), ("goal", "x1", 20, 10.0, 0.6)]
+
+
+def test_what_is_not_in_the_hand_is_missing_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of all steps that are not done, one after the other."""
+    table: list[list[list[float]]] = [[[], [], []], [[], [], []]]
+    assert checked(monkeypatch, table, {(1, 2): 1.0})[0] == [("goal", "stick", 20, 10.0, 1.0)]
+    both = {(0, k): 1.0 for k in range(3)} | {(1, 2): 1.0}
+    assert checked(monkeypatch, table, both)[0] == [("goal", "stick", 10, 5.0, 1.0), ("goal", "stick", 20, 10.0, 1.0)]

@@ -250,6 +250,23 @@ def test_what_nobody_holds_and_what_a_hand_does_not_drive() -> None:
     ]
 
 
+def test_only_a_hand_that_clamps_must_not_slide() -> None:
+    """In the phases in which it holds, of all that it could choose."""
+    clamps = SimpleNamespace(firm=True, coordinates=("grip_slide", "grip_turn"))
+    leaves = SimpleNamespace(firm=False, coordinates=("handle_turn",))
+    objects = {
+        "stick": SimpleNamespace(object=SimpleNamespace(attachments={"grip": clamps})),
+        "door": SimpleNamespace(object=SimpleNamespace(attachments={"handle": leaves})),
+    }
+    both = (Hold("stick", "grip"), Hold("door", "handle"))
+    made = check(phases=[PhaseSpan("p", 0, 1), PhaseSpan("q", 1, 3, both)], scene=SimpleNamespace(objects=objects))
+    noted: list[tuple[Any, ...]] = []
+    made._still = lambda phase, *what: noted.append((phase.name, *what))
+    made._slides()
+    said = "the hand moves on 'stick' by ", " while it clamps it"
+    assert noted == [("q", "slide", f"stick.{name}", *said) for name in clamps.coordinates]
+
+
 @pytest.mark.parametrize(("angle", "tips"), [(0.9 * LEVEL, False), (1.1 * LEVEL, True)])
 def test_what_something_stands_on_stays_level(angle: float, tips: bool) -> None:
     """As it was at the phase's begin, whichever way it turns about the vertical."""

@@ -130,13 +130,16 @@ def test_where_the_arm_goes_far_round_the_shortest_of_a_few_paths_is_kept(
     assert (path is None) if kept is None else path is not None and path[1, 3] == pytest.approx(problem.start[3] + 1.0 + kept)
 
 
-def test_the_way_of_the_arm_is_compared_with_the_straight_one() -> None:
+def test_a_detour_is_the_share_of_a_path_that_the_arm_goes_beyond_its_straight_way() -> None:
     problem, guide, arms = gate()
     search = trees._Search(problem, 0, problem.start, guide, arms, np.random.default_rng(0), 0.04)
     path = np.tile(problem.start[:SIZE], (3, 1))
-    path[1:, 0] += [0.5, 0.0]  # the base does not count
+    path[1:, 0] += [0.5, 0.0]
     path[1:, 4] += [0.3, 0.1]
-    assert search.detour(path) == pytest.approx(5.0)
+    driven, turned = problem.chain.metric[[0, 4]]  # what a metre and a radian count
+    assert search.detour(path) == pytest.approx(0.4 * turned / (1.0 * driven + 0.5 * turned))
+    assert search.detour(path[[0, 2]]) == pytest.approx(0.0)
+    assert search.detour(path[:1]) == 0.0
 
 
 def is_a_way(problem: vkc.TrajectoryProblem, path: np.ndarray) -> None:

@@ -25,7 +25,7 @@ _STRAIGHTENINGS = 12  # times that the arm and each of its joints are tried to b
 _WORTH = 1e-3  # share of a path's length that is to be saved by it
 _SHORTER = 0.02  # the same share for which they are tried so often once more
 _PATHS = 3  # paths of trees at most, of which the shortest is kept
-_DETOUR = 1.5  # way of the arm, as a multiple of the straight one, up to which there is no need of another path
+_DETOUR = 1 / 3  # share of a path that the arm goes beyond its straight way, up to which no other one is looked for
 _BESIDE_PATH = 0.1  # [m] and [rad] standard deviation, at most, of bases beside their path
 _AROUND = 0.4  # [m] and [rad] standard deviation, at most, of bases around the ends, and of arms
 
@@ -246,10 +246,10 @@ class _Search:
         return float(self._passed(path)[-1])
 
     def detour(self, path: Floats) -> float:
-        """Return how far the arm goes along a path, shape (K, m), as a multiple of how far it had to go at least."""
-        arm = path[:, 3:] * self.weights[3:]
-        least = float(np.abs(arm[-1] - arm[0]).sum())
-        return float(np.abs(np.diff(arm, axis=0)).sum()) / max(least, 1e-12)
+        """Return which share of a path, shape (K, m), the arm goes beyond its straight way."""
+        base, arm = (part * weights for part, weights in zip(np.split(path, [3], 1), np.split(self.weights, [3]), strict=True))
+        way, driven = np.abs(np.diff(arm, axis=0)).sum(), np.linalg.norm(np.diff(base, axis=0), axis=1).sum()
+        return float((way - np.abs(arm[-1] - arm[0]).sum()) / max(way + driven, 1e-12))
 
     def _passed(self, path: Floats) -> Floats:
         """Return how far it is along a path to each of its configurations, shape (K,)."""

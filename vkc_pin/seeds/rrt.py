@@ -21,9 +21,9 @@ TRIES = 1500
 """How often a tree may grow until they meet."""
 
 _STEPS = (0.15, 0.04)  # [rad] between configurations that are looked at; the latter where the former overlooked something
-_STRAIGHTENINGS = 12  # times that the arm and each of its joints are tried to be straightened
+_STRAIGHTENINGS = 11  # times that the arm and each of its joints are tried to be straightened between random places
 _WORTH = 1e-3  # share of a path's length that is to be saved by it
-_SHORTER = 0.02  # the same share for which they are tried so often once more
+_SHORTER = 0.02  # share for which they are tried so often once more where the arm goes far round
 _PATHS = 3  # paths of trees at most, of which the shortest is kept
 _DETOUR = 1 / 3  # share of a path that the arm goes beyond its straight way, up to which no other one is looked for
 _BESIDE_PATH = 0.1  # [m] and [rad] standard deviation, at most, of bases beside their path
@@ -217,16 +217,19 @@ class _Search:
 
         What leads through a passage with another posture takes all joints along; straight lines of all coordinates seldom undo
         that, and the solver cannot, since things are between. So coordinates are taken apart (partial shortcuts: Geraerts and
-        Overmars, IJRR 2007), at first all along the path, then between random places on it, as long as that is worth it.
+        Overmars, IJRR 2007), at first all along the path, then between random places on it; where the arm goes far round, as
+        long as that is worth it.
         """
         groups = [np.arange(3, self.size), *(np.array([column]) for column in range(3, self.size))]
-        before = np.inf
+        length = np.inf
         for columns in groups:
             path = self._even(path, columns, 0.0, self.length(path))
-        while self.length(path) < (1.0 - _SHORTER) * before:
-            before = self.length(path)
+        while self.length(path) < (1.0 - _SHORTER) * length:
+            length = self.length(path)
             for _, columns in itertools.product(range(_STRAIGHTENINGS), groups):
                 path = self._even(path, columns, *np.sort(self.rng.uniform(0.0, self.length(path), 2)))
+            if self.detour(path) <= _DETOUR:
+                break
         return path
 
     def _even(self, path: Floats, columns: Ints, s: float, t: float) -> Floats:

@@ -7,6 +7,7 @@ import importlib
 import importlib.abc
 import importlib.machinery
 import importlib.util
+import inspect
 import itertools
 import json
 import os
@@ -133,6 +134,7 @@ class _Recorder:
     def __init__(self, modules: Sequence[str]) -> None:
         self.modules = {str(PACKAGE / module): module for module in modules}
         self.now: set[str] = set()
+        self.at_import: set[str] = set()  # in functions that a file of tests calls before any of them runs
         self.of_test: dict[str, set[str]] = {}
         self.of_fixture: dict[str, set[str]] = defaultdict(set)
         self.fixtures: dict[str, list[str]] = {}
@@ -140,7 +142,7 @@ class _Recorder:
 
     def trace(self, frame: FrameType, event: str, argument: Any) -> Any:
         module = self.modules.get(frame.f_code.co_filename)
-        if module is None:
+        if module is None or (self.now is self.at_import and not frame.f_code.co_flags & inspect.CO_OPTIMIZED):
             return None
         self.now.add(f"{module}:{ALWAYS}")
         self.now.add(f"{module}:{frame.f_lineno}")
@@ -162,6 +164,11 @@ class _Recorder:
             sys.settrace(self.trace if before else None)
 
     @pytest.hookimpl(hookwrapper=True)
+    def pytest_make_collect_report(self) -> Iterator[None]:
+        with self.into(self.at_import):
+            yield
+
+    @pytest.hookimpl(hookwrapper=True)
     def pytest_fixture_setup(self, fixturedef: Any) -> Iterator[None]:
         with self.into(self.of_fixture[fixturedef.argname]):
             yield
@@ -177,7 +184,7 @@ class _Recorder:
     def coverage(self) -> dict[str, Any]:
         lines = defaultdict(list)
         for test, own in self.of_test.items():
-            for line in own.union(*(self.of_fixture.get(name, set()) for name in self.fixtures[test])) - {""}:
+            for line in own.union(self.at_import, *(self.of_fixture.get(name, set()) for name in self.fixtures[test])) - {""}:
                 lines[line].append(test)
         return {"seconds": self.seconds, "lines": lines}
 

@@ -322,3 +322,42 @@ def test_pieces_are_the_waypoints_of_each_phase() -> None:
     piece = one.piece()
     assert (piece.names, piece.seed) == (one.problem.chain.names, "mine")
     assert [part.tolist() for part in piece.waypoints] == [path[:4].tolist(), path[3:].tolist()]
+
+
+@pytest.mark.parametrize("listening", [False, True])
+def test_each_round_is_told_of(listening: bool) -> None:
+    """To the progress, and to whoever wants to know."""
+    told: list[Any] = []
+    one = object.__new__(OneProblem)
+    callback = (lambda row: told.append(("callback", row))) if listening else None
+    one.settings = SimpleNamespace(progress=lambda row: told.append(("progress", row)), callback=callback)  # type: ignore
+    one._report("row")  # type: ignore[arg-type]
+    assert told == [("progress", "row"), ("callback", "row")][: 1 + listening]
+
+
+def test_what_is_being_done_is_told_and_timed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A check, whose time is kept for the last one, and a search for seeds."""
+    told: list[str] = []
+    asked: list[tuple[Any, ...]] = []
+    monkeypatch.setattr(module, "validate", lambda *what: asked.append(what) or "report")
+    one = made(vkc.GoTo(1.0, 0.0))
+    s = one.settings
+    settings: Any = SimpleNamespace(
+        progress=SimpleNamespace(doing=told.append), options=s.options, terms=s.terms, budget=SimpleNamespace(checking=0.0)
+    )
+    one.settings = settings
+    spent = 0.0
+    for count in (1, 2):
+        assert one._check("motion") == "report"  # type: ignore[arg-type]
+        assert told == ["checking"] * count
+        assert 0.0 < one.checking == settings.budget.checking < 1.0
+        spent += one.checking
+        assert one.times["validation"] == pytest.approx(spent)
+    assert asked == [(one.scene, one.task.steps, "motion", s.options, s.terms)] * 2
+    told.clear()
+    monkeypatch.setattr(module, "initialize", lambda *_, **__: iter("ab"))
+    one.settings = SimpleNamespace(  # type: ignore[assignment]
+        progress=settings.progress, options=s.options, cache=s.cache, initialization="auto", random_seed=0, perturbation=0.0
+    )
+    assert list(one._seeds(None)) == ["a", "b"]  # type: ignore[arg-type]
+    assert told == ["looking for a seed"] * 3

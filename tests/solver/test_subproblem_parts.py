@@ -168,6 +168,7 @@ def test_multipliers_are_taken_over_only_from_one_exact_round_to_the_next(made: 
         how, asked = made.ipopt.how[-1], made.ipopt.asked[-1]
         assert kinds[how["ipopt.mu_init"]] == kind
         assert how["ipopt.linear_solver"] == "own"
+        assert how["ipopt.print_level"] == 0  # it says nothing, not even of errors
         assert how["ipopt.max_iter"] == (40 if kind == "rough" else 77)
         assert (asked.get("lam_x0"), asked.get("lam_g0")) == ((f"x{before}", f"g{before}") if before else (None, None))
     made.subproblem.forget()

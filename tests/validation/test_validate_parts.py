@@ -273,7 +273,8 @@ def test_what_something_stands_on_stays_level(angle: float, tips: bool) -> None:
     made = check(phases=[PhaseSpan("p", 0, 1), PhaseSpan("q", 1, 3)])
     made.samples.free = SimpleNamespace(rides=[{}, {"cup": "tray.plate"}])
     start = pin.utils.rotate("x", 0.3)
-    turns = [start, pin.utils.rotate("z", 1.0) @ start, pin.utils.rotate("y", angle) @ start, start, start]
+    little = pin.utils.rotate("z", 1.0) @ pin.utils.rotate("y", -0.2 * LEVEL) @ start
+    turns = [start, little, pin.utils.rotate("y", angle) @ start, start, start]
     made.samples.placements = lambda rows, label: [pin.SE3(turn, np.zeros(3)) for turn in turns]
     made._tips()
     assert told(made) == ([("tips", "cup", 2, 2.0, pytest.approx(angle - LEVEL), "rad")] if tips else [])

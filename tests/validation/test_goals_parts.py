@@ -120,6 +120,13 @@ def test_what_moves_before_its_turn_is_named(monkeypatch: pytest.MonkeyPatch) ->
     ]
 
 
+def test_where_it_could_be_the_turn_of_several_it_is_the_last_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both may be it; the first moves the door, the second the cup: not both at once."""
+    steps: list[Step] = [Actuate("door", {"hinge": 1.0}), Place("cup", PUT)]
+    found = ordered(monkeypatch, [{"door": 0.25, "cup": 0.5}], ["", "", ""], ["xx", ".x"], steps)
+    assert found == [("order", "door", 0, 0.0, 0.25, "m")]
+
+
 @pytest.mark.parametrize(
     ("steps", "right"),
     [

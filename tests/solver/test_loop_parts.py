@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from types import SimpleNamespace
 from typing import Any
 
@@ -249,3 +250,14 @@ def test_a_budget_at_its_end_is_the_status_unless_a_motion_was_good(good: bool, 
     assert solution.astray == 0.0
     np.testing.assert_array_equal(solution.z, kept[0] if good else problem.clip(problem.still))
     assert (solution.dt is kept[1]) == good
+
+
+def test_rounds_are_timed_from_where_they_begin(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a clock that began long ago, and goes on by one whenever it is looked at."""
+    clock = itertools.count(1_000_000)
+    monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: float(next(clock))))
+    problem = drive()
+    rows = solve(problem, problem.still, rounds=3).history
+    assert rows
+    assert 0.0 < rows[0].time < 20.0
+    assert all(before.time < after.time < before.time + 20.0 for before, after in itertools.pairwise(rows))

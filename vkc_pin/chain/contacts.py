@@ -148,7 +148,7 @@ class ContactModel:
 
     def phase_of(self, waypoint: int) -> int:
         """Return the phase whose geometry holds at `waypoint`: at a boundary the earlier, before the grasp."""
-        return int(self.phases_of(np.array([waypoint]))[0])
+        return max(int(self.first_waypoint.searchsorted(waypoint)) - 1, 0)
 
     def phases_of(self, waypoints: Ints) -> Ints:
         """Return the phase of each waypoint, shape (W,), see `phase_of`."""

@@ -110,7 +110,7 @@ class Coordinates:
         self._joint_count = int(model.njoints)
         self._plain_q, self._plain_z = np.array(plain, int).reshape(-1, 2).T
         self._angle_q, self._angle_z = np.array(angles, int).reshape(-1, 2).T
-        self._quaternions = quaternions
+        self._quaternions, self._turns, self._runs = quaternions, angles, _runs(plain)
 
     @property
     def followers(self) -> tuple[Moved, ...]:
@@ -159,9 +159,11 @@ class Coordinates:
         if z.shape[-1:] != (self.size,):
             raise InputError("wrong number of coordinates", field="z", expected=f"(..., {self.size})", got=z.shape)
         q = np.empty((*z.shape[:-1], self.nq))
-        q[..., self._plain_q] = z[..., self._plain_z]
-        q[..., self._angle_q] = np.cos(z[..., self._angle_z])
-        q[..., self._angle_q + 1] = np.sin(z[..., self._angle_z])
+        for there, here in self._runs:
+            q[..., there] = z[..., here]
+        for i, j in self._turns:
+            angle = z[..., j].copy()  # without gaps, where NumPy may compute otherwise
+            q[..., i], q[..., i + 1] = np.cos(angle), np.sin(angle)
         for i, j in self._quaternions:
             q[..., i : i + 4] = z[..., j : j + 4] / np.linalg.norm(z[..., j : j + 4], axis=-1, keepdims=True)
         return q
@@ -197,3 +199,14 @@ class Coordinates:
 def wrapped(angle: Any) -> Any:
     """Return an angle, or an array of them, between -π and π [rad]."""
     return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+def _runs(pairs: list[tuple[int, int]]) -> list[tuple[slice, slice]]:
+    """Return pairs that follow each other as slices, which arrays are indexed with in a fraction of the time."""
+    found: list[tuple[slice, slice]] = []
+    for i, j in pairs:
+        if found and (found[-1][0].stop, found[-1][1].stop) == (i, j):
+            found[-1] = slice(found[-1][0].start, i + 1), slice(found[-1][1].start, j + 1)
+        else:
+            found.append((slice(i, i + 1), slice(j, j + 1)))
+    return found

@@ -193,8 +193,8 @@ class _Search:
 
     def _robot_at(self, rows: Floats) -> Floats:
         """Return configurations with the robot at `rows`, shape (B, m): shape (B, n)."""
-        z = np.tile(self.first, (len(rows), 1))
-        z[:, : self.size] = rows
+        z = np.empty((len(rows), len(self.first)))
+        z[:], z[:, : self.size] = self.first, rows
         return z
 
     def _shortened(self, path: Floats) -> Floats:

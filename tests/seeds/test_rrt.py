@@ -130,6 +130,31 @@ def test_where_the_arm_goes_far_round_the_shortest_of_a_few_paths_is_kept(
     assert (path is None) if kept is None else path is not None and path[1, 3] == pytest.approx(problem.start[3] + 1.0 + kept)
 
 
+@pytest.mark.parametrize(("detour", "passes"), [(0.3, 1), (0.35, 3)])
+def test_paths_are_straightened_again_where_the_arm_goes_far_round_as_long_as_that_pays(
+    monkeypatch: pytest.MonkeyPatch, detour: float, passes: int
+) -> None:
+    """What is tried makes a path shorter all along it and in two passes over random places; then nothing does."""
+    problem, guide, arms = gate()
+    search = trees._Search(problem, 0, problem.start, guide, arms, np.random.default_rng(0), 0.04)
+    groups = 1 + SIZE - 3
+    asked: list[tuple[float, float]] = []
+
+    def even(path: np.ndarray, columns: np.ndarray, s: float, t: float) -> np.ndarray:
+        asked.append((s, t))
+        pays = len(asked) <= groups * (1 + 2 * trees._STRAIGHTENINGS)
+        return path[0] + (0.99 if pays else 1.0) * (path - path[0])
+
+    monkeypatch.setattr(search, "_even", even)
+    monkeypatch.setattr(search, "detour", lambda path: detour)
+    path = np.tile(problem.start[:SIZE], (2, 1))
+    path[1, 3] += 1.0
+    search.straightened(path)
+    assert len(asked) == groups * (1 + passes * trees._STRAIGHTENINGS)
+    assert [s for s, _ in asked[:groups]] == [0.0] * groups
+    assert all(0.0 < s < t for s, t in asked[groups:])
+
+
 def test_a_detour_is_the_share_of_a_path_that_the_arm_goes_beyond_its_straight_way() -> None:
     problem, guide, arms = gate()
     search = trees._Search(problem, 0, problem.start, guide, arms, np.random.default_rng(0), 0.04)

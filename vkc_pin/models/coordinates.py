@@ -108,9 +108,7 @@ class Coordinates:
         for move in self.moves:
             (self.lengths if move.slides else self.turns)[move.coordinate] += abs(move.factor)
         self._joint_count = int(model.njoints)
-        self._plain_q, self._plain_z = np.array(plain, int).reshape(-1, 2).T
-        self._angle_q, self._angle_z = np.array(angles, int).reshape(-1, 2).T
-        self._quaternions, self._turns, self._runs = quaternions, angles, _runs(plain)
+        self._plain, self._angles, self._quaternions, self._runs = plain, angles, quaternions, _runs(plain)
 
     @property
     def followers(self) -> tuple[Moved, ...]:
@@ -161,7 +159,7 @@ class Coordinates:
         q = np.empty((*z.shape[:-1], self.nq))
         for there, here in self._runs:
             q[..., there] = z[..., here]
-        for i, j in self._turns:
+        for i, j in self._angles:
             angle = z[..., j].copy()  # without gaps, where NumPy may compute otherwise
             q[..., i], q[..., i + 1] = np.cos(angle), np.sin(angle)
         for i, j in self._quaternions:
@@ -174,8 +172,10 @@ class Coordinates:
         if q.shape[-1:] != (self.nq,):
             raise InputError("wrong size of configuration", field="q", expected=f"(..., {self.nq})", got=q.shape)
         z = np.empty((*q.shape[:-1], self.size))
-        z[..., self._plain_z] = q[..., self._plain_q]
-        z[..., self._angle_z] = np.arctan2(q[..., self._angle_q + 1], q[..., self._angle_q])
+        for there, here in self._runs:
+            z[..., here] = q[..., there]
+        for i, j in self._angles:
+            z[..., j] = np.arctan2(q[..., i + 1].copy(), q[..., i].copy())
         for i, j in self._quaternions:
             z[..., j : j + 4] = q[..., i : i + 4]
         return z
@@ -185,10 +185,10 @@ class Coordinates:
         import casadi
 
         entries: list[Any] = [None] * self.nq
-        for i, j in zip(self._plain_q, self._plain_z, strict=True):
-            entries[i] = z[int(j)]
-        for i, j in zip(self._angle_q, self._angle_z, strict=True):
-            entries[i], entries[i + 1] = casadi.cos(z[int(j)]), casadi.sin(z[int(j)])
+        for i, j in self._plain:
+            entries[i] = z[j]
+        for i, j in self._angles:
+            entries[i], entries[i + 1] = casadi.cos(z[j]), casadi.sin(z[j])
         return casadi.vertcat(*entries)
 
     def index(self, name: str) -> int:

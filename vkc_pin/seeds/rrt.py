@@ -43,6 +43,9 @@ def connect(
 ) -> Floats | None:
     """Return configurations of the robot, straight between which hardly anything is hit, shape (K, m), or None if none are found.
 
+    Where the arm goes far round, other paths are looked for, too, and the shortest is kept: trees take a share of a second, and
+    the solver stays on the side of things on which it begins.
+
     Args:
         problem: Whose robot and phase it is.
         phase: In which nothing fixed is held.
@@ -52,9 +55,6 @@ def connect(
         arms: Postures that are likely to be needed, shape (A, m - 3) [m] and [rad].
         rng: Random numbers.
         tries: How often a tree may grow.
-
-    Where the arm goes far round, other paths are looked for, too, and the shortest is kept: trees take a share of a second, and
-    the solver stays on the side of things on which it begins.
     """
     coarse, fine = (_Search(problem, phase, first, poses, arms, rng, step) for step in _STEPS)
     best = None

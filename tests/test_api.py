@@ -15,7 +15,9 @@ import vkc_pin as vkc
 
 ROOT = Path(__file__).resolve().parent.parent
 # Compiled, and a process of its own.
-COMPILED = ("vkc_pin.cpin._cpin", "vkc_pin.distances._distances", "vkc_pin.driving._driving", "vkc_pin.solver._kkt")
+COMPILED = tuple(
+    f"vkc_pin.{name}" for name in ("cpin._cpin", "distances._distances", "driving._driving", "seeds._trees", "solver._kkt")
+)
 SCRIPTS = (*COMPILED, "vkc_pin.visualization.server", "vkc_pin.cli.__main__")
 MODULES = [name for _, name, _ in pkgutil.walk_packages(vkc.__path__, "vkc_pin.") if name not in SCRIPTS]
 BARE = set(vars(types.ModuleType("bare"))) | {"__builtins__", "__cached__", "__file__", "__path__", "annotations"}

@@ -15,6 +15,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as some
 
 import vkc_pin as vkc
+from vkc_pin.budget import Budget, SpentError
+from vkc_pin.needed import compiled_module
 from vkc_pin.seeds import rrt as trees
 from vkc_pin.seeds.routes import Routes
 from vkc_pin.seeds.rrt import connect, spread
@@ -137,22 +139,18 @@ def test_paths_are_straightened_again_where_the_arm_goes_far_round_as_long_as_th
     """What is tried makes a path shorter all along it and in two passes over random places; then nothing does."""
     problem, guide, arms = gate()
     search = trees._Search(problem, 0, problem.start, guide, arms, np.random.default_rng(0), 0.04)
-    groups = 1 + SIZE - 3
-    asked: list[tuple[float, float]] = []
+    asked: list[int] = []
 
-    def even(path: np.ndarray, columns: np.ndarray, s: float, t: float) -> np.ndarray:
-        asked.append((s, t))
-        pays = len(asked) <= groups * (1 + 2 * trees._STRAIGHTENINGS)
-        return path[0] + (0.99 if pays else 1.0) * (path - path[0])
+    def evened(path: np.ndarray, times: int) -> np.ndarray:
+        asked.append(times)
+        return path[0] + (0.9 if len(asked) <= 3 else 1.0) * (path - path[0])
 
-    monkeypatch.setattr(search, "_even", even)
+    monkeypatch.setattr(search, "_evened", evened)
     monkeypatch.setattr(search, "detour", lambda path: detour)
     path = np.tile(problem.start[:SIZE], (2, 1))
     path[1, 3] += 1.0
     search.straightened(path)
-    assert len(asked) == groups * (1 + passes * trees._STRAIGHTENINGS)
-    assert [s for s, _ in asked[:groups]] == [0.0] * groups
-    assert all(0.0 < s < t for s, t in asked[groups:])
+    assert asked == [0, *[trees._STRAIGHTENINGS] * passes]
 
 
 def test_a_detour_is_the_share_of_a_path_that_the_arm_goes_beyond_its_straight_way() -> None:
@@ -308,7 +306,7 @@ def test_a_line_is_free_up_to_the_last_place_before_the_first_that_is_blocked() 
         rows = a + np.arange(1, count + 1)[:, None] / count * (b - a)
         blocked = np.flatnonzero(missing(problem, rows) > finder.allowed)
         shares.append(blocked[0] / count if len(blocked) else 1.0)
-        assert finder._along(a, b) == shares[-1]
+        assert finder.along(a, b) == shares[-1]
     assert (min(shares), max(shares)) == (0.0, 1.0)
     assert len(set(shares)) > 5
 
@@ -338,50 +336,105 @@ def test_runs_are_the_free_parts_of_the_way_with_each_arm() -> None:
     assert sum(map(len, all_)) < 2 * len(guide)
 
 
+def raw(one: trees._Search, ends: np.ndarray, tries: int) -> np.ndarray:
+    """Return what trees find, as it is before it is shortened."""
+    path, _ = one._trees.run(one.first[None, :SIZE], ends, tries)
+    return np.asarray(path)
+
+
 def test_a_tree_that_gets_to_a_run_takes_in_all_of_it() -> None:
-    one = search()
-    number = max(range(len(one.runs)), key=lambda k: len(one.runs[k]))
-    rows = one.runs[number]
-    root = rows[0].copy()
-    root[3:] += 0.05
-    tree = trees._Tree(root[None], METRE)
-    tree.runs = set(range(len(one.runs))) - {number}
-    node = None
-    for _ in range(20):  # towards one of its places each time; not all of them can be seen from its beginning
-        if number not in tree.runs:
-            node = one._grow_to_run(tree)
-    assert node is not None
-    assert tree.runs == set(range(len(one.runs)))
-    at_ = [int(np.flatnonzero((tree.nodes == row).all(axis=1))[0]) for row in rows]
-    assert node in at_
-    for first, second in itertools.pairwise(at_):
-        assert tree.parents[first] == second or tree.parents[second] == first
-    for end in (at_[0], at_[-1]):
-        is_a_way(gate()[0], tree.path(end))
+    """The run leads through the gate; nothing else is drawn that does."""
+    problem, _, _ = gate()
+    for seed in range(3):
+        one = search(seed)
+        run = max(one.runs, key=len)
+        one.runs, one.poses, one.arms = [run], problem.start[None, :3], problem.start[None, 3:]
+        end = run[-1].copy()
+        end[3:] += 0.05
+        path = raw(one, end[None], 200)
+        rows = [int(np.flatnonzero((path == row).all(axis=1))[0]) for row in run if (path == row).all(axis=1).any()]
+        assert len(rows) > len(run) / 3
+        assert np.all(np.diff(rows) == 1), "they follow each other as on the run"
+        is_a_way(problem, path)
 
 
 def test_a_tree_that_is_stopped_before_a_run_does_not_take_it_in() -> None:
-    one, (problem, _, arms) = search(), gate()
-    one.runs = [np.tile(np.append([4.0, 0.5, 0.0], arms[0]), (3, 1))]  # behind the wall, the arm at home
-    tree = trees._Tree(at(problem, (0.0, 2.0, 0.0))[None], METRE)
-    node = one._grow_to_run(tree)
-    assert node is not None
-    assert tree.runs == set()
-    assert len(tree.nodes) == 2
-    assert tree.nodes[node][0] < 2.0
+    problem, _, arms = gate()
+    one = search()
+    one.runs = [np.tile(np.append([2.0, 1.5, 0.0], arms[0]), (3, 1))]  # in the wall
+    path = raw(one, at(problem, GOAL)[None], trees.TRIES)
+    assert len(path)
+    assert not (path == one.runs[0][0]).all(axis=1).any()
+    is_a_way(problem, path)
 
 
 @pytest.mark.parametrize("found", [True, False])
-def test_free_runs_alone_lead_through_the_gate(found: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_free_runs_alone_lead_through_the_gate(found: bool) -> None:
     """Nothing is drawn that would."""
-    if not found:
-        monkeypatch.setattr(trees._Search, "runs", [])
-    monkeypatch.setattr(trees._Search, "_draw", lambda *_: gate()[0].start.copy())
+    problem, _, _ = gate()
     for seed in range(3):
-        path = through(seed, tries=60)
-        assert (path is not None) == found
-        if path is not None:
-            is_a_way(gate()[0], path)
+        one = search(seed)
+        one.runs = one.runs if found else []
+        one.poses, one.arms = problem.start[None, :3], problem.start[None, 3:]
+        path = raw(one, at(problem, GOAL)[None], 60)
+        assert (len(path) > 0) == found
+        if found:
+            is_a_way(problem, path)
+
+
+def test_what_searches_look_at_counts_as_effort() -> None:
+    problem, _, _ = gate()
+    with Budget().running() as budget:
+        through(0)
+        whole = budget.used
+        one = search()
+        assert one._trees
+        before = budget.used
+        assert one.free(np.array([problem.start, problem.start + 0.01 * np.eye(SIZE)[3]]))
+        assert budget.used == before + 1
+    assert whole > 500
+    with Budget(effort=whole // 2).running(), pytest.raises(SpentError):
+        through(0)
+
+
+def test_compiled_trees_refuse_what_does_not_fit() -> None:
+    one = search()
+    rows = np.zeros((2, SIZE))
+    for call in (
+        lambda: one._trees.run(rows[:, 1:], rows, 1),
+        lambda: one._trees.run(rows, rows, 1),
+        lambda: one._trees.run(rows[:1], rows[:0], 1),
+        lambda: one._trees.along(rows[:1]),
+        lambda: one._trees.free(rows[:, :3]),
+        lambda: one._trees.evened(rows[:0], 0, 0.0),
+    ):
+        with pytest.raises(ValueError, match=r"robot's coordinates|one configuration|two ends"):
+            call()
+    trees_of = compiled_module("vkc_pin.seeds._trees").Trees
+    good = [one.weights, one.lower, one.upper, one.poses[:2], one.arms, np.concatenate(one.runs), [len(run) for run in one.runs]]
+
+    def made(**changed: object) -> None:
+        parts = {f"part{k}": value for k, value in enumerate(good)} | changed
+        rows = [np.ascontiguousarray(value, np.int64 if name == "part6" else float) for name, value in parts.items()]
+        trees_of(one._lines, *rows, 0.1, 0.4, 7)
+
+    made()
+    for number, wrong in enumerate((one.weights[1:], one.lower[1:], one.upper[1:], one.poses[:0], one.arms[:, 1:], rows[:, 1:])):
+        with pytest.raises(ValueError, match="of the robot's coordinates"):
+            made(**{f"part{number}": wrong})
+    with pytest.raises(ValueError, match="as long as is said"):
+        made(part6=[10**6])
+
+
+def test_lines_refuse_what_does_not_fit() -> None:
+    one, contacts = search(), gate()[0].contacts
+    how = {"weights": one.weights, "step": 0.1, "reach": 0.0, "allowed": 0.0}
+    with pytest.raises(ValueError, match="more coordinates move"):
+        contacts.lines(one.first, one.waypoint, **how | {"weights": np.ones(40)})
+    with pytest.raises(ValueError, match="no step"):
+        contacts.lines(one.first, one.waypoint, **how | {"step": 0.0})
+    with pytest.raises(IndexError, match="no such coordinate"):
+        contacts.lines(one.first[:-1], one.waypoint, **how)
 
 
 # --- spread --------------------------------------------------------------------------------------------------------------

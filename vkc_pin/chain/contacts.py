@@ -202,6 +202,20 @@ class ContactModel:
         spend(min(found + 1, len(z)))
         return found
 
+    def lines(self, z: Floats, waypoint: int, *, weights: Floats, step: float, reach: float, allowed: float) -> Any:
+        """Return what looks at straight lines of the first coordinates, with all else as in z; see `Clearances.lines`.
+
+        Args:
+            z: A configuration, shape (n,).
+            waypoint: Whose phase it is.
+            weights: How much each coordinate that moves counts, shape (m,).
+            step: How far it goes at most, times its weight, from one configuration that is looked at to the next.
+            reach: Pairs further apart do not count [m].
+            allowed: [m].
+        """
+        places, clearances = self.chain.coordinates.places, self._clearances[self.phase_of(waypoint)]
+        return clearances.lines(places, z, waypoint, weights=weights, step=step, reach=reach, allowed=allowed)
+
     def placements(self, z: Floats) -> tuple[Floats, Floats]:
         """Return the same as the chain's `joint_placements`; in portions of one size, as CasADi prepares for each size anew."""
         parts = [self.chain.joint_placements(z[row : row + _ROWS]) for row in range(0, max(len(z), 1), _ROWS)]

@@ -33,9 +33,17 @@ struct States
   std::size_t count, coordinates, columns;
 
   States(const Parts & parts, const Numbers<2> & q, const Numbers<2> & z)
-  : q(q.data()), z(z.data()), count(q.shape(0)), coordinates(q.shape(1)), columns(z.shape(1))
+  : States(parts, q.data(), z.data(), q.shape(0), q.shape(1), z.shape(0) == q.shape(0) ? z.shape(1) : 0)
   {
-    if (coordinates != parts.bodies.coordinates() || z.shape(0) != count || columns < parts.margins.coordinates())
+    if (z.shape(0) != count)
+      throw std::invalid_argument("there are as many configurations as coordinates");
+  }
+
+  States(
+    const Parts & parts, const double * q, const double * z, std::size_t count, std::size_t coordinates, std::size_t columns)
+  : q(q), z(z), count(count), coordinates(coordinates), columns(columns)
+  {
+    if (coordinates != parts.bodies.coordinates() || columns < parts.margins.coordinates())
       throw std::invalid_argument("configurations are of shape (W, nq), coordinates of shape (W, n)");
     if (
       parts.boxes.size() != parts.shapes.size() || parts.boxes.moving() != parts.shapes.moving()

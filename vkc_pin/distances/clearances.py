@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
+import numpy as np
 import pinocchio as pin
 
 from vkc_pin.arrays import Floats, Ints
@@ -98,3 +99,26 @@ class Clearances:
             ValueError: Arrays do not fit together.
         """
         return int(self._first_blocked(*self._parts, q, z, waypoint, reach, allowed, _ROUNDING))
+
+    def lines(
+        self, places: Sequence[Ints], z: Floats, waypoint: int, *, weights: Floats, step: float, reach: float, allowed: float
+    ) -> Any:
+        """Return what looks at straight lines from configuration to configuration: up to the first in which `first_blocked` is.
+
+        Compiled searches are made with it. It must not outlive what this was made of.
+
+        Args:
+            places: Where in Pinocchio's configurations the numbers of z go; see `models.coordinates.Coordinates.places`.
+            z: A configuration, shape (n,).
+            waypoint: At which margins are looked up.
+            weights: For each coordinate that moves, the first ones of z, how much it counts, shape (m,).
+            step: How far each coordinate, times its weight, goes at most from one configuration to the next.
+            reach: Pairs further apart do not count [m].
+            allowed: By how much pairs may fall short of their margins [m].
+
+        Raises:
+            ValueError: Arrays do not fit together.
+        """
+        where = [np.ascontiguousarray(part, np.int64) for part in places]
+        moved = np.ascontiguousarray(z, float), np.ascontiguousarray(weights, float)
+        return compiled().Lines(*self._parts, *where, *moved, step, waypoint, reach, allowed, _ROUNDING)

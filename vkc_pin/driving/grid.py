@@ -50,6 +50,7 @@ class BaseGrid:
         base, carried: The shapes of either, which can be asked about a drive or a turn on their own.
         stuck: Where the base surely hits something, shape (cells, cells, HEADINGS).
         stuck_carrying: Where what is carried surely does, shape (cells, cells, HEADINGS).
+        turns: What is known of how far the base can turn where a path begins or ends, by pose; see `Ground.turnable`.
     """
 
     def __init__(
@@ -98,6 +99,7 @@ class BaseGrid:
         views = (cache or Cache()).get("plan views", PlanViews)
         lattice = Lattice(self.origin, self.step, self.cells, self.yaws)
         self.stuck, self.stuck_carrying = stuck(base, carried, standing, lattice, margin, views=views)
+        self.turns: dict[tuple[bytes, bool, bytes | None], tuple[float, float]] = {}
         # Whether these are free, with everything and for the base alone; -1: nobody has asked yet.
         self._known = np.full((3, 2, self.cells, self.cells, HEADINGS), -1, np.int8)
         self._refused: list[tuple[list[tuple[int, ...]], ...]] = [([], []) for _ in range(3)]

@@ -176,14 +176,19 @@ class Ground:
 
     def turnable(self, pose: Floats, connections: Connections, margins: Floats | None = None) -> Bools:
         """Return for which connections the base can turn at the pose between its yaw and theirs, up to a few degrees more."""
-        limits = []
-        for side in (1.0, -1.0):
-            turned = 0.0
-            while turned < np.pi and self.turned(pose[:2], pose[2] + side * turned, pose[2] + side * (turned + _TRY), margins):
-                turned += _TRY
-            limits.append(turned + _TRY)
+        key = pose.tobytes(), self._reaching(pose[:2]), None if margins is None else margins.tobytes()
+        if key not in self.grid.turns:  # one start, or goal, has paths to many
+            self.grid.turns[key] = self._turns(pose, 1.0, margins) + _TRY, self._turns(pose, -1.0, margins) + _TRY
+        left, right = self.grid.turns[key]
         turn = wrapped(connections.yaw - pose[2])
-        return (turn < limits[0]) & (turn > -limits[1])
+        return (turn < left) & (turn > -right)
+
+    def _turns(self, pose: Floats, side: float, margins: Floats | None) -> float:
+        """Return how far the base can turn at a pose to the left (`side` 1) or right (-1), up to half a turn [rad]."""
+        turned = 0.0
+        while turned < np.pi and self.turned(pose[:2], pose[2] + side * turned, pose[2] + side * (turned + _TRY), margins):
+            turned += _TRY
+        return turned
 
     def begin(self, connections: Connections, number: int) -> tuple[Drive, float]:
         """Return the drive of a connection from the start, and the yaw in its cell."""

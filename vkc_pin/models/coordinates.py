@@ -13,7 +13,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from vkc_pin.arguments import known, numbers
-from vkc_pin.arrays import Bools, Floats
+from vkc_pin.arrays import Bools, Floats, Ints
 from vkc_pin.errors import InputError
 
 __all__ = ["Coordinates", "Moved", "wrapped"]
@@ -109,6 +109,12 @@ class Coordinates:
             (self.lengths if move.slides else self.turns)[move.coordinate] += abs(move.factor)
         self._joint_count = int(model.njoints)
         self._plain, self._angles, self._quaternions, self._runs = plain, angles, quaternions, _runs(plain)
+
+    @property
+    def places(self) -> tuple[Ints, Ints, Ints]:
+        """Where in q, and where in z, what `q` maps begins, shape (K, 2) each: equal numbers, angles, quaternions."""
+        plain, angles, quaternions = (np.array(p, int).reshape(-1, 2) for p in (self._plain, self._angles, self._quaternions))
+        return plain, angles, quaternions
 
     @property
     def followers(self) -> tuple[Moved, ...]:

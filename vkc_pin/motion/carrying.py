@@ -18,6 +18,8 @@ from vkc_pin.scene.scene import Scene
 
 __all__ = ["FreeObjects", "as_numbers"]
 
+_STILL = 1e-12  # [m] and [rad] by which a grasp that is kept differs between samples: what interpolation rounds
+
 
 class FreeObjects:
     """The free objects of a scene along a motion, every one of which moves rigidly with whatever carries it.
@@ -105,7 +107,7 @@ class FreeObjects:
             grasped = placed.object.link_placement(attachment.link, placed.state)
             names = [f"{hold.object}.{name}" for name in attachment.coordinates]
             freedom = values[:, [self.trajectory.names.index(name) for name in names]]
-            still = attachment.tool(freedom[0]) if not np.ptp(freedom, axis=0).any() else None
+            still = attachment.tool(freedom[0]) if np.all(np.ptp(freedom, axis=0) <= _STILL) else None
             ideal = [
                 holder * (grasped * (still if still is not None else attachment.tool(row))).inverse()
                 for holder, row in zip(holders, freedom, strict=True)

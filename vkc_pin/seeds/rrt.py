@@ -6,12 +6,15 @@ arm near postures it is likely to need there, so that narrow passages are found 
 
 from __future__ import annotations
 
-import itertools
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from vkc_pin.arrays import Floats, Ints
+from vkc_pin.arrays import Floats
+from vkc_pin.budget import spend
+from vkc_pin.needed import compiled_module
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.knots import depth, smooth
 
@@ -82,6 +85,12 @@ def spread(path: Floats, steps: int, metric: Floats) -> Floats:
 
 
 class _Search:
+    """Looks for paths in one phase, in which nothing fixed is held; what takes long is compiled (`_trees.cpp`).
+
+    Attributes:
+        grown: How often trees grew the last time, until they met, or no more.
+    """
+
     def __init__(
         self,
         problem: TrajectoryProblem,
@@ -98,32 +107,16 @@ class _Search:
         self.allowed = problem.options.dist_safe  # all of a margin may be missing: the solver pushes that apart
         self.weights = problem.chain.metric[: self.size]
         limits = np.array([problem.limits(name) for name in problem.chain.names[: self.size]])
-        self.lower, self.upper = limits.T
-        self.grown = 0  # how often trees grew until they met, or no more
+        self.lower, self.upper = np.ascontiguousarray(limits.T)
+        self.grown = 0
 
     def run(self, ends: Floats, tries: int) -> Floats | None:
         """Return the path to one of `ends`."""
-        start = self.first[: self.size]
         short = self._depth(ends)
         ends = ends[short <= max(self.allowed, short.min())]
-        trees = _Tree(start[None], self.weights), _Tree(ends, self.weights)
-        direct = [*ends]
-        for number in range(tries):
-            self.grown = number + 1
-            tree, other = (trees[0], trees[1]) if direct or number % 2 else (trees[1], trees[0])
-            if direct:
-                node = self._grow(tree, direct.pop(0))
-            elif self.rng.integers(2) and len(tree.runs) < len(self.runs):
-                node = self._grow_to_run(tree)
-            else:
-                node = self._grow(tree, self._draw(start, ends))
-            if node is None:
-                continue
-            met = self._grow(other, tree.nodes[node])
-            if met is not None and np.array_equal(other.nodes[met], tree.nodes[node]):
-                there, back = (node, met) if tree is trees[0] else (met, node)
-                return self._shortened(np.concatenate([trees[0].path(there), trees[1].path(back)[-2::-1]]))
-        return None
+        path, self.grown = self._trees.run(_array(self.first[None, : self.size]), _array(ends), tries)
+        self._spend()
+        return self._shortened(path) if len(path) else None
 
     @cached_property
     def runs(self) -> list[Floats]:
@@ -142,74 +135,44 @@ class _Search:
                     begin = None
         return runs
 
-    def _grow_to_run(self, tree: _Tree) -> int | None:
-        """Let a tree grow towards a free part of the base's path, and take in all of it if it gets there."""
-        number = int(self.rng.choice([k for k in range(len(self.runs)) if k not in tree.runs]))
-        rows = self.runs[number]
-        at = int(self.rng.integers(len(rows)))
-        node = self._grow(tree, rows[at])
-        if node is not None and np.array_equal(tree.nodes[node], rows[at]):
-            tree.runs.add(number)
-            for side in (rows[at + 1 :], rows[:at][::-1]):
-                parent = node
-                for row in side:
-                    parent = tree.add(row, parent)
-        return node
+    @cached_property
+    def _lines(self) -> Any:
+        """Looks at straight lines."""
+        contacts, weights = self.problem.contacts, self.weights
+        return contacts.lines(self.first, self.waypoint, weights=weights, step=self.step, reach=0.0, allowed=self.allowed)
 
-    def _draw(self, start: Floats, ends: Floats) -> Floats:
-        """Return a configuration beside the base's path or around one of its ends, the arm at or around a likely posture."""
-        rng, guided = self.rng, self.rng.integers(2)
-        poses = self.poses if guided else (start[None], ends)[rng.integers(2)]
-        goal = np.concatenate([poses[rng.integers(len(poses)), :3], self.arms[rng.integers(len(self.arms))]])
-        goal[:3] += rng.random() * (_BESIDE_PATH if guided else _AROUND) * rng.normal(size=3)
-        goal[3:] += rng.integers(2) * rng.random() * _AROUND * rng.normal(size=self.size - 3)
-        return np.clip(goal, self.lower, self.upper)
+    @cached_property
+    def _trees(self) -> Any:
+        """Grows trees, and straightens what they find."""
+        runs = np.concatenate(self.runs) if self.runs else np.empty((0, self.size))
+        rows = map(_array, (self.weights, self.lower, self.upper, self.poses, self.arms, runs))
+        lengths, seed = np.array([len(run) for run in self.runs], np.int64), int(self.rng.integers(2**63))
+        module = compiled_module("vkc_pin.seeds._trees")
+        return module.Trees(self._lines, *rows, lengths, _BESIDE_PATH, _AROUND, seed)
 
-    def _grow(self, tree: _Tree, goal: Floats) -> int | None:
-        """Let a tree grow from its nearest node towards a configuration, as far as nothing is hit; return the new node."""
-        near = tree.nearest(goal)
-        start = tree.nodes[near]
-        if np.array_equal(goal, start):
-            return near
-        reached = self._along(start, goal)
-        if reached <= 0.0:
-            return None
-        return tree.add(goal if reached == 1.0 else start + reached * (goal - start), near)
+    def _spend(self) -> None:
+        spend(self._lines.looked())
 
     def free(self, path: Floats) -> bool:
         """Return whether hardly anything is hit along a path, shape (K, m)."""
-        return all(self._along(a, b) == 1.0 for a, b in itertools.pairwise(path))
+        free = bool(self._trees.free(_array(path)))
+        self._spend()
+        return free
 
-    def _along(self, a: Floats, b: Floats) -> float:
+    def along(self, a: Floats, b: Floats) -> float:
         """Return what share of the straight line from `a` to `b`, both (m,), is free."""
-        count = max(1, int(np.ceil(np.abs((b - a) * self.weights).max() / self.step)))
-        s = np.arange(count + 1) / count
-        z = self._robot_at(a + s[1:, None] * (b - a))
-        return float(s[self.problem.contacts.first_blocked(z, self.waypoint, reach=0.0, allowed=self.allowed)])
+        return float(self._trees.along(_array([a, b])))
 
     def _depth(self, rows: Floats) -> Floats:
         """Return how far the robot, shape (B, m), falls short of its margins where it overlaps something, shape (B,) [m]."""
-        return depth(self.problem, self._robot_at(rows), self.waypoint, reach=0.0)
-
-    def _robot_at(self, rows: Floats) -> Floats:
-        """Return configurations with the robot at `rows`, shape (B, m): shape (B, n)."""
-        z = np.empty((len(rows), len(self.first)))
-        z[:], z[:, : self.size] = self.first, rows
-        return z
+        z = np.tile(self.first, (len(rows), 1))
+        z[:, : self.size] = rows
+        return depth(self.problem, z, self.waypoint, reach=0.0)
 
     def _shortened(self, path: Floats) -> Floats:
         """Return a path that goes straight between random places on it, as many as it has, where nothing is in the way."""
-        for _ in path:
-            if len(path) < 3:
-                break
-            passed = self._passed(path)
-            s, t = np.sort(self.rng.uniform(0.0, passed[-1], 2))
-            i, j = np.searchsorted(passed, [s, t], side="right") - 1
-            if i == j:
-                continue
-            a, b = (np.array([np.interp(at, passed, column) for column in path.T]) for at in (s, t))
-            if self._along(a, b) == 1.0:
-                path = np.concatenate([path[: i + 1], [a, b], path[j + 1 :]])
+        path = self._trees.shortened(_array(path))
+        self._spend()
         return path
 
     def straightened(self, path: Floats) -> Floats:
@@ -220,33 +183,22 @@ class _Search:
         Overmars, IJRR 2007), at first all along the path, then between random places on it; where the arm goes far round, as
         long as that is worth it.
         """
-        groups = [np.arange(3, self.size), *(np.array([column]) for column in range(3, self.size))]
-        length = np.inf
-        for columns in groups:
-            path = self._even(path, columns, 0.0, self.length(path))
+        length, path = np.inf, self._evened(path, 0)
         while self.length(path) < (1.0 - _SHORTER) * length:
-            length = self.length(path)
-            for _, columns in itertools.product(range(_STRAIGHTENINGS), groups):
-                path = self._even(path, columns, *np.sort(self.rng.uniform(0.0, self.length(path), 2)))
+            length, path = self.length(path), self._evened(path, _STRAIGHTENINGS)
             if self.detour(path) <= _DETOUR:
                 break
         return path
 
-    def _even(self, path: Floats, columns: Ints, s: float, t: float) -> Floats:
-        """Return a path that is shorter as some coordinates change evenly from `s` to `t` along it; if nothing hinders that."""
-        passed = self._passed(path)
-        at = np.concatenate([[s], passed[(s < passed) & (passed < t)], [t]])
-        part = np.column_stack([np.interp(at, passed, column) for column in path.T])
-        share = ((at - s) / max(t - s, 1e-12))[:, None]
-        part[1:-1, columns] = (part[0, columns] + share * (part[-1, columns] - part[0, columns]))[1:-1]
-        changed = np.concatenate([path[passed <= s], part, path[passed >= t]])
-        if self.length(changed) >= (1.0 - _WORTH) * passed[-1] or not self.free(part):
-            return path
-        return changed[np.diff(self._passed(changed), prepend=-1.0) > 0.0]
+    def _evened(self, path: Floats, times: int) -> Floats:
+        """Return a path tried to be straightened all along it (`times` 0), or so many times between random places on it."""
+        path = self._trees.evened(_array(path), times, _WORTH)
+        self._spend()
+        return path
 
     def length(self, path: Floats) -> float:
         """Return how long a path is, shape (K, m)."""
-        return float(self._passed(path)[-1])
+        return float(np.linalg.norm(np.diff(path, axis=0) * self.weights, axis=1).sum())
 
     def detour(self, path: Floats) -> float:
         """Return which share of a path, shape (K, m), the arm goes beyond its straight way."""
@@ -254,38 +206,7 @@ class _Search:
         way, driven = np.abs(np.diff(arm, axis=0)).sum(), np.linalg.norm(np.diff(base, axis=0), axis=1).sum()
         return float((way - np.abs(arm[-1] - arm[0]).sum()) / max(way + driven, 1e-12))
 
-    def _passed(self, path: Floats) -> Floats:
-        """Return how far it is along a path to each of its configurations, shape (K,)."""
-        return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0) * self.weights, axis=1))])
 
-
-class _Tree:
-    """Configurations, each with the one it was reached from."""
-
-    def __init__(self, roots: Floats, weights: Floats) -> None:
-        self._rows, self.parents, self.weights = roots.copy(), [-1] * len(roots), weights  # rows: those in use, and spare ones
-        self.runs: set[int] = set()
-
-    @property
-    def nodes(self) -> Floats:
-        """The configurations, shape (K, m)."""
-        return self._rows[: len(self.parents)]
-
-    def nearest(self, goal: Floats) -> int:
-        return int(np.argmin(np.linalg.norm((self.nodes - goal) * self.weights, axis=1)))
-
-    def add(self, node: Floats, parent: int) -> int:
-        number = len(self.parents)
-        if number == len(self._rows):
-            self._rows = np.concatenate([self._rows, np.empty_like(self._rows)])
-        self._rows[number] = node
-        self.parents.append(parent)
-        return number
-
-    def path(self, node: int) -> Floats:
-        """Return the configurations from the root to a node, shape (K, m)."""
-        found = []
-        while node >= 0:
-            found.append(self.nodes[node])
-            node = self.parents[node]
-        return np.array(found[::-1])
+def _array(rows: ArrayLike) -> Floats:
+    """Return rows as compiled code takes them."""
+    return np.ascontiguousarray(rows, float)

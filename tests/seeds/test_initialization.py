@@ -229,14 +229,14 @@ class Looked:
         ([0.0, 0.0], [0.0, 0.0], [0.0], "s0 S0 a0 A0 t0 T0 s1 S1 a1 A1"),
         ([], [0.0, 0.0], [0.0, 0.0], "a0 A0 t0 T0 a1 A1 t1 T1"),
         ([FINE], [LOST], [0.0], "s0 S0 a0 t0 T0 A0"),
-        # What goes straight hits things, what goes around does not: it waits until nothing better is left.
-        ([LOST, 0.0], [0.0, 0.0], [], "s0 a0 A0 s1 S1 a1 A1 S0"),
-        ([POOR, 0.0], [FINE, 0.0], [0.0], "s0 a0 A0 t0 T0 s1 S1 a1 A1 S0"),
+        # What goes straight hits things, what goes around does not: it waits until nothing better is left, and is asked last.
+        ([LOST, 0.0], [0.0, 0.0], [], "s0 a0 A0 a1 A1 s1 S1 S0"),
+        ([POOR, 0.0], [FINE, 0.0], [0.0], "s0 a0 A0 t0 T0 a1 A1 s1 S1 S0"),
         # Both do, or there is no way around: what trees find comes first.
         ([POOR], [LOST], [0.0, 0.0], "s0 a0 t0 T0 t1 T1 S0 A0"),
         ([LOST], [], [0.0], "s0 t0 T0 S0"),
         ([POOR], [POOR], [LOST], "s0 a0 t0 S0 A0 T0"),  # of equals, what goes straight
-        ([LOST, LOST], [POOR, 0.0], [0.0, 0.0], "s0 a0 t0 T0 s1 a1 A1 t1 T1 A0 S0 S1"),
+        ([LOST, LOST], [POOR, 0.0], [0.0, 0.0], "s0 a0 t0 T0 t1 T1 s1 a1 A1 A0 S0 S1"),
         ([LOST, LOST], [LOST, LOST], [], "s0 a0 S0 s1 a1 A0 S1 A1"),
         ([POOR, POOR], [], [], "s0 S0 s1 S1"),
         # A search that finds nothing.

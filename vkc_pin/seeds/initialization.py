@@ -79,25 +79,24 @@ def _kind(method: str, shared: _Shared, count: int, hopeless: Callable[[Sequence
 def _in_turn(*kinds: Iterator[Seed | None]) -> Iterator[Seed]:
     """Yield from all kinds in turn; seeds that hit things wait until no kind has a better one.
 
-    Kinds are asked one after the other until one finds a seed that is good; the next time, those come first that have waited
-    longest. If none does, the best of all that have been found so far is yielded.
-
-    Args:
-        kinds: In the order in which they are asked at first.
+    Kinds are asked in this order until one finds a seed that is good. The next time, those that found none the last time come
+    after the others; of both, those come first that have waited longest. If none finds any, the best of all so far is yielded.
     """
-    waiting, found = list(kinds), list[Seed]()
+    waiting, found, poor = list(kinds), list[Seed](), set[Iterator[Seed | None]]()
     while waiting or found:
-        for kind in tuple(waiting):
+        for kind in sorted(waiting, key=lambda kind: kind in poor):
             waiting.remove(kind)
             try:
                 seed = next(kind)
             except StopIteration:
                 continue
             waiting.append(kind)
+            good = seed is not None and not seed.overlap > _POOR
+            (poor.discard if good else poor.add)(kind)
             if seed is not None:
                 found.append(seed)
-                if not seed.overlap > _POOR:
-                    break
+            if good:
+                break
         if found:
             yield found.pop(min(range(len(found)), key=lambda k: found[k].overlap))
 

@@ -123,7 +123,7 @@ def test_the_stationary_seed_leaves_the_robot_where_it_is() -> None:
     for seed in (0, 1):
         z, *others = seeds("stationary", seed=seed, count=4)
         robot = problem().chain.robot.coordinates.size
-        assert len(others) == 3
+        assert len(others) == 6
         for number, other in enumerate(others):  # in which the base goes straight from place to place
             np.testing.assert_array_equal(other[:, 3:], z[:, 3:])
             assert all(np.abs(other - one)[:, :3].max() > 0.1 for one in [z, *others[:number]])

@@ -43,11 +43,11 @@ def initialize(
     Args:
         problem: What is to be solved.
         method: "stationary": the robot stays at its start, only the objects' joints go to their goals; in seeds after the first
-            the base goes straight to random places. "interpolated": straight to a configuration at each goal, found by inverse
-            kinematics from random seeds; where something fixed is held, the seed follows its motion. "astar": to such
-            configurations, the base along the shortest way around what stands there, heading along it. "rrt": to such
-            configurations, base and arm together along what two random trees find. "auto": these three in turn; where what one
-            finds overlaps things, the next is asked at once, and the best that was found comes first.
+            the base goes straight to random places, twice as many, as they take no search. "interpolated": straight to a
+            configuration at each goal, found by inverse kinematics from random seeds; where something fixed is held, the seed
+            follows its motion. "astar": to such configurations, the base along the shortest way around what stands there, heading
+            along it. "rrt": to such configurations, base and arm together along what two random trees find. "auto": these three
+            in turn; where what one finds overlaps things, the next is asked at once, and the best that was found comes first.
         random_seed: Of the random numbers.
         count: How many different seeds to return.
         perturbation: Standard deviation of what is added to the robot's coordinates, smoothly over time, [m] and [rad].
@@ -57,7 +57,7 @@ def initialize(
     """
     said: list[str] = [] if notes is None else notes
     if method == "stationary":
-        seeds = _stationary(problem, count, np.random.default_rng([random_seed, 2]))
+        seeds = _stationary(problem, 2 * count - 1, np.random.default_rng([random_seed, 2]))
     else:
         shared = _Shared(problem, random_seed, said, Routes(problem), Known())
         kinds = ("interpolated", "astar", "rrt") if method == "auto" else (method,)

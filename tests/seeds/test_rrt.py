@@ -132,6 +132,20 @@ def test_where_the_arm_goes_far_round_the_shortest_of_a_few_paths_is_kept(
     assert (path is None) if kept is None else path is not None and path[1, 3] == pytest.approx(problem.start[3] + 1.0 + kept)
 
 
+@pytest.mark.parametrize("finer", [True, False])
+def test_what_hits_things_between_configurations_that_were_looked_at_is_no_path(
+    monkeypatch: pytest.MonkeyPatch, finer: bool
+) -> None:
+    straight = np.array([gate()[0].start, at(gate()[0], GOAL)])
+
+    def run(search: trees._Search, ends: np.ndarray, most: int) -> np.ndarray | None:
+        return straight if search.step == trees._STEPS[0] or finer else None
+
+    monkeypatch.setattr(trees._Search, "run", run)
+    path = through(0)
+    assert (path is not None) == finer
+
+
 @pytest.mark.parametrize(("detour", "passes"), [(0.3, 1), (0.35, 3)])
 def test_paths_are_straightened_again_where_the_arm_goes_far_round_as_long_as_that_pays(
     monkeypatch: pytest.MonkeyPatch, detour: float, passes: int

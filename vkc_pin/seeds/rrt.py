@@ -64,8 +64,7 @@ def connect(
     for _ in range(_PATHS):
         path = coarse.run(ends, tries)
         if path is not None and not fine.free(path):
-            finer = fine.run(ends, tries)
-            path = path if finer is None else finer
+            path = fine.run(ends, tries)
         if path is None:
             break
         path = fine.straightened(path)

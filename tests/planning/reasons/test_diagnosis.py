@@ -109,3 +109,16 @@ def test_how_something_is_grasped_is_open_where_it_is_put_down() -> None:
     below = problem(littered(shelf(*BELOW[:2])), vkc.Place("litter", BELOW, "grip"))
     assert [phase.kind for phase in below.task.phases] == ["grasp", "place"]
     assert blocked(below, 1, 0) is None
+
+
+@pytest.mark.parametrize(("missing", "free"), [(-1e-4, True), (4e-4, True), (1e-3, False)])
+def test_where_a_motion_may_end_the_next_may_begin(missing: float, free: bool) -> None:
+    """The base stands before a crate, of whose clearance so much is missing [m]; the solver is content with less than 0.5 mm."""
+    scene = hall(obstacles=[CRATE])
+    front = 1.5 - 0.3 - 0.495
+    stop = problem(scene, vkc.GoTo(front - vkc.Options().dist_safe + missing, 0.0, 0.0))
+    found = blocked(stop, 0, 0)
+    assert (found is None) == free
+    if found is not None:
+        assert "base_link – crate" in found.text
+        assert found.short == pytest.approx(missing, abs=1e-5)

@@ -11,6 +11,7 @@ from vkc_pin.program.merit import TOLERANCE
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.scene.contact import CONTACT
 from vkc_pin.seeds.knots import depth, scatter
+from vkc_pin.solver.trust_region import CLOSE_ENOUGH
 from vkc_pin.validation.report import Violation
 
 __all__ = ["Blocked", "blocked", "explain", "impossible"]
@@ -100,7 +101,7 @@ def blocked(problem: TrajectoryProblem, number: int, random_seed: int) -> Blocke
     reached = z[residual < TOLERANCE]
     contacts = problem.contacts.evaluate(reached, np.full(len(reached), end), reach=problem.options.largest_margin)
     shortfall = contacts.shortfall(len(reached))
-    if shortfall.min() <= 0.0:
+    if shortfall.min() <= CLOSE_ENOUGH:  # a motion that ended so may go on so
         return None
     best = int(np.argmin(shortfall))
     worst = int(np.flatnonzero(contacts.waypoint == best)[0])
@@ -122,7 +123,7 @@ def _try(problem: TrajectoryProblem, waypoint: int, rng: np.random.Generator) ->
             return None
         found.append(tried)
         z = tried[0][tried[1] < TOLERANCE]
-        if len(z) and depth(problem, z, waypoint).min() <= 0.0:
+        if len(z) and depth(problem, z, waypoint).min() <= CLOSE_ENOUGH:
             break
     return np.concatenate([z for z, _ in found]), np.concatenate([residual for _, residual in found])
 

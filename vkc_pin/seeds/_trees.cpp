@@ -1,7 +1,6 @@
 // Two random trees of configurations that grow towards each other (RRT-Connect, Kuffner and LaValle, ICRA 2000); see rrt.py.
 
 #include <deque>
-#include <limits>
 #include <stdexcept>
 #include <utility>
 
@@ -10,10 +9,10 @@
 #include "../distances/arrays.hpp"
 #include "paths.hpp"
 #include "random.hpp"
+#include "tree.hpp"
 
 namespace {
 
-constexpr std::size_t NONE = std::numeric_limits<std::size_t>::max();
 constexpr std::size_t BASE = 3; // x, y and yaw come first
 
 Rows rows_of(const Numbers<2> & numbers)
@@ -23,48 +22,6 @@ Rows rows_of(const Numbers<2> & numbers)
     found.emplace_back(numbers.data() + k * numbers.shape(1), numbers.data() + (k + 1) * numbers.shape(1));
   return found;
 }
-
-// Configurations, each with the one it was reached from.
-class Tree
-{
-public:
-  Tree(const Rows & roots, std::size_t runs) : nodes(roots), taken(runs, false), parents_(roots.size(), NONE) {}
-
-  std::size_t nearest(const Row & goal, const Measure & measure) const
-  {
-    std::size_t best = 0;
-    double least = std::numeric_limits<double>::infinity();
-    for (std::size_t k = 0; k < nodes.size(); ++k)
-      if (const double square = measure.square(nodes[k], goal); square < least)
-      {
-        best = k;
-        least = square;
-      }
-    return best;
-  }
-
-  std::size_t add(const Row & node, std::size_t parent)
-  {
-    nodes.push_back(node);
-    parents_.push_back(parent);
-    return nodes.size() - 1;
-  }
-
-  // From a node to its root.
-  Rows back(std::size_t node) const
-  {
-    Rows found;
-    for (; node != NONE; node = parents_[node])
-      found.push_back(nodes[node]);
-    return found;
-  }
-
-  Rows nodes;
-  std::vector<bool> taken; // which runs it has taken in
-
-private:
-  std::vector<std::size_t> parents_;
-};
 
 // For one thread at a time.
 class Trees

@@ -8,15 +8,14 @@ import numpy as np
 
 from vkc_pin.arrays import Bools, Floats, Ints
 from vkc_pin.program.pose_goals import approach_at
-from vkc_pin.seeds.knots import SCATTER, Knots
+from vkc_pin.seeds.knots import ALIKE, SCATTER, Knots
 from vkc_pin.seeds.routes import Routes
 
-__all__ = ["ALIKE", "Beam", "Found"]
+__all__ = ["Beam", "Found"]
 
 _BATCHES = 6  # batches of random samples at most: good grasps are rare
 _FREE_OPEN = 60  # free configurations at a knot with which no more are sampled, nor pushed out of collisions
 _FREE_HELD = 12  # the same at a knot at which something fixed is held
-ALIKE = 0.1  # [m] and [rad] up to which configurations are alike: from both the same follows
 _CHILDREN = 4  # configurations tried per knot, as a multiple of the beam
 _KNOT_TIME = 1.0  # [s] from knot to knot along a phase in which something fixed is held, at `Options.dt` a waypoint
 _WIDTH = 24  # configurations kept per knot

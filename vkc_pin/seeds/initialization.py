@@ -13,9 +13,9 @@ from vkc_pin.arrays import Floats, Ints
 from vkc_pin.program.merit import Merit, infeasibility
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.approach import Approach
-from vkc_pin.seeds.beam import ALIKE, Beam, Found
+from vkc_pin.seeds.beam import Beam, Found
 from vkc_pin.seeds.joining import Joiner, RrtPaths, base_paths
-from vkc_pin.seeds.knots import Knots, Known, follow_objects
+from vkc_pin.seeds.knots import ALIKE, Knots, Known, follow_objects
 from vkc_pin.seeds.routes import Routes
 from vkc_pin.seeds.seed import Seed
 

@@ -15,8 +15,9 @@ from vkc_pin.program.merit import TOLERANCE
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.clearing import clear_out
 
-__all__ = ["SCATTER", "Knots", "Known", "depth", "follow_objects", "scatter", "smooth"]
+__all__ = ["ALIKE", "SCATTER", "Knots", "Known", "depth", "follow_objects", "scatter", "smooth"]
 
+ALIKE = 0.1  # [m] and [rad] up to which configurations are alike: from both the same follows
 SCATTER = 192  # random seeds of inverse kinematics for a configuration that nothing leads to
 
 

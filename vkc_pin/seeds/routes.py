@@ -17,12 +17,12 @@ from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.seeds.folded_arm import folded_arm
+from vkc_pin.seeds.knots import ALIKE
 
 __all__ = ["Routes", "grid_shapes"]
 
 _ARM_BASE = 2  # the joint of the model that is the arm's first: joint 1 is the base
 _REACHING_RADIUS = 0.4  # [m] from the ends of a path within which the arm reaches in and out, and only the base counts
-_SAME_PLACE = 0.1  # [m] across, of squares from which it is as far to anywhere, within what a choice among grasps is worth
 
 
 class Routes:
@@ -80,11 +80,11 @@ class Routes:
     def distances(self, phase: int, starts: Floats, goals: Floats, *, folded: bool = False) -> Floats:
         """Return how far it is at least from starts to goals, both (B, 3), one by one, shape (B,) [m]; infinite: no path.
 
-        Starts beside one that was asked about share its distances.
+        Starts that are `ALIKE` share the distances of the first that was asked about.
         """
         grid = self.grid(phase, folded=folded)
         end = np.clip(np.floor((goals[:, :2] - grid.origin) / grid.step + 0.5).astype(int), 0, grid.cells - 1).tolist()
-        begin = np.floor(starts[:, :2] / _SAME_PLACE).astype(int).tolist()
+        begin = np.floor(starts[:, :2] / ALIKE).astype(int).tolist()
         keys = [(phase, folded, *cell) for cell in begin]
         new = {key: start[:2] for key, start in zip(keys, starts, strict=True) if key not in self._distances}
         if new:

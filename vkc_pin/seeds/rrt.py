@@ -23,7 +23,7 @@ __all__ = ["TRIES", "connect", "spread"]
 TRIES = 1500
 """How often a tree may grow until they meet."""
 
-_STEP = 0.04  # [rad] between configurations that are looked at
+_STEPS = (0.15, 0.04)  # [rad] between configurations that are looked at; the latter where the former overlooked something
 _STRAIGHTENINGS = 11  # times that the arm and each of its joints are tried to be straightened between random places
 _WORTH = 1e-3  # share of a path's length that is to be saved by it
 _SHORTER = 0.02  # share for which they are tried so often once more where the arm goes far round
@@ -59,16 +59,19 @@ def connect(
         rng: Random numbers.
         tries: How often a tree may grow.
     """
-    search, best = _Search(problem, phase, first, poses, arms, rng), None
+    coarse, fine = (_Search(problem, phase, first, poses, arms, rng, step) for step in _STEPS)
+    best = None
     for _ in range(_PATHS):
-        path = search.run(ends, tries)
+        path = coarse.run(ends, tries)
+        if path is not None and not fine.free(path):
+            path = fine.run(ends, tries)
         if path is None:
             break
-        path = search.straightened(path)
-        best = path if best is None or search.length(path) < search.length(best) else best
-        if search.detour(best) <= _DETOUR:
+        path = fine.straightened(path)
+        best = path if best is None or fine.length(path) < fine.length(best) else best
+        if fine.detour(best) <= _DETOUR:
             break
-        tries = min(tries, 2 * search.grown)  # another one is welcome if it is found as soon
+        tries = min(tries, 2 * coarse.grown)  # another one is welcome if it is found as soon
     return best
 
 
@@ -95,8 +98,9 @@ class _Search:
         poses: Floats,
         arms: Floats,
         rng: np.random.Generator,
+        step: float,
     ) -> None:
-        self.problem, self.first, self.poses, self.arms, self.rng = problem, first, poses, arms, rng
+        self.problem, self.first, self.poses, self.arms, self.rng, self.step = problem, first, poses, arms, rng, step
         self.size = problem.chain.robot.coordinates.size
         self.waypoint = problem.contacts.inside(phase)
         self.allowed = problem.options.dist_safe  # all of a margin may be missing: the solver pushes that apart
@@ -134,7 +138,7 @@ class _Search:
     def _lines(self) -> Any:
         """Looks at straight lines."""
         contacts, weights = self.problem.contacts, self.weights
-        return contacts.lines(self.first, self.waypoint, weights=weights, step=_STEP, reach=0.0, allowed=self.allowed)
+        return contacts.lines(self.first, self.waypoint, weights=weights, step=self.step, reach=0.0, allowed=self.allowed)
 
     @cached_property
     def _trees(self) -> Any:

@@ -419,7 +419,7 @@ def test_compiled_trees_refuse_what_does_not_fit() -> None:
         lambda: one._trees.run(rows, rows, 1),
         lambda: one._trees.run(rows[:1], rows[:0], 1),
         lambda: one._trees.along(rows[:1]),
-        lambda: one._trees.free(rows[:, :3]),
+        lambda: one._trees.along(rows[:, :3]),
         lambda: one._trees.evened(rows[:0], 0, 0.0),
     ):
         with pytest.raises(ValueError, match=r"robot's coordinates|one configuration|two ends"):

@@ -33,10 +33,10 @@ struct States
   std::size_t count, coordinates, columns;
 
   States(const Parts & parts, const Numbers<2> & q, const Numbers<2> & z)
-  : States(parts, q.data(), z.data(), q.shape(0), q.shape(1), z.shape(0) == q.shape(0) ? z.shape(1) : 0)
+  : States(parts, q.data(), z.data(), q.shape(0), q.shape(1), z.shape(1))
   {
     if (z.shape(0) != count)
-      throw std::invalid_argument("there are as many configurations as coordinates");
+      throw std::invalid_argument("configurations are of shape (W, nq), coordinates of shape (W, n)");
   }
 
   States(

@@ -57,7 +57,8 @@ public:
     double allowed,
     double rounding)
   : parts_{bodies, boxes, shapes, margins}, z_(z.data(), z.data() + z.shape(0)), q_(bodies.coordinates()),
-    weights_(weights.data(), weights.data() + weights.shape(0)), places_{pairs(plain, 1, 1), pairs(angles, 2, 1), pairs(quaternions, 4, 4)},
+    weights_(weights.data(), weights.data() + weights.shape(0)),
+    places_{pairs(plain, 1, 1), pairs(angles, 2, 1), pairs(quaternions, 4, 4)},
     states_(parts_, q_.data(), z_.data(), 1, q_.size(), z_.size()), clearing_(parts_, states_, reach, rounding), step_(step),
     waypoint_(waypoint), allowed_(allowed)
   {
@@ -97,9 +98,10 @@ private:
     std::vector<std::pair<std::size_t, std::size_t>> found;
     for (std::size_t k = 0; k < rows.shape(0); ++k)
     {
-      if (rows(k, 0) < 0 || rows(k, 1) < 0 || std::size_t(rows(k, 0)) + there > q_.size() || std::size_t(rows(k, 1)) + here > z_.size())
+      const Index i = rows(k, 0), j = rows(k, 1);
+      if (i < 0 || j < 0 || std::size_t(i) + there > q_.size() || std::size_t(j) + here > z_.size())
         throw std::out_of_range("no such coordinate");
-      found.emplace_back(rows(k, 0), rows(k, 1));
+      found.emplace_back(i, j);
     }
     return found;
   }

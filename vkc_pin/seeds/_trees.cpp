@@ -42,8 +42,8 @@ public:
   : kept_(std::move(lines)),
     lines_(static_cast<vkc_pin::StraightLines *>(nb::cast<nb::capsule>(kept_.attr("straight")()).data(vkc_pin::STRAIGHT_LINES))),
     measure_(Row(weights.data(), weights.data() + weights.shape(0))), lower_(lower.data(), lower.data() + lower.shape(0)),
-    upper_(upper.data(), upper.data() + upper.shape(0)), poses_(rows_of(poses)), arms_(rows_of(arms)), beside_(beside), around_(around),
-    random_(seed)
+    upper_(upper.data(), upper.data() + upper.shape(0)), poses_(rows_of(poses)), arms_(rows_of(arms)), beside_(beside),
+    around_(around), random_(seed)
   {
     const std::size_t size = lines_->size();
     if (
@@ -115,12 +115,6 @@ public:
     if (ends.shape(0) != 2)
       throw std::invalid_argument("a line has two ends");
     return lines_->free(ends.data(), ends.data() + ends.shape(1));
-  }
-
-  bool free(const Numbers<2> & path)
-  {
-    check(path);
-    return free_along(*lines_, rows_of(path));
   }
 
 private:
@@ -263,6 +257,5 @@ NB_MODULE(_trees, module)
     .def("run", &Trees::run)
     .def("shortened", &Trees::shortened)
     .def("evened", &Trees::evened)
-    .def("along", &Trees::along)
-    .def("free", &Trees::free);
+    .def("along", &Trees::along);
 }

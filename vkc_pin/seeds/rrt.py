@@ -6,6 +6,7 @@ arm near postures it is likely to need there, so that narrow passages are found 
 
 from __future__ import annotations
 
+import itertools
 from functools import cached_property
 from typing import Any
 
@@ -154,13 +155,13 @@ class _Search:
 
     def free(self, path: Floats) -> bool:
         """Return whether hardly anything is hit along a path, shape (K, m)."""
-        free = bool(self._trees.free(_array(path)))
-        self._spend()
-        return free
+        return all(self.along(a, b) == 1.0 for a, b in itertools.pairwise(path))
 
     def along(self, a: Floats, b: Floats) -> float:
         """Return what share of the straight line from `a` to `b`, both (m,), is free."""
-        return float(self._trees.along(_array([a, b])))
+        share = float(self._trees.along(_array([a, b])))
+        self._spend()
+        return share
 
     def _depth(self, rows: Floats) -> Floats:
         """Return how far the robot, shape (B, m), falls short of its margins where it overlaps something, shape (B,) [m]."""

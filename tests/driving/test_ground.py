@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from vkc_pin.driving.body import Shape
 from vkc_pin.driving.grid import BaseGrid
-from vkc_pin.driving.ground import BACKWARDS, SIDEWAYS, UNIT, Drive, Ground, wrapped
+from vkc_pin.driving.ground import BACKWARDS, SIDEWAYS, UNIT, Connections, Drive, Ground, wrapped
 
 TURNING = 0.3  # [m/rad] where a grid is not told
 
@@ -119,3 +119,24 @@ def test_what_is_carried_counts_away_from_start_and_goals() -> None:
     # The rod passes over the second post's cells, where only the mask knows.
     assert not places.likely(Drive(np.array([0.5, 0.0]), np.array([3.5, 0.0]), 0.0))
     assert places.likely(Drive(np.array([-0.5, 0.0]), np.array([0.5, 0.0]), 0.0))
+
+
+def test_how_far_the_base_turns_is_remembered_for_each_place_alone() -> None:
+    """Between two walls it turns a little, in the open all round, whichever is asked first, and with other margins further."""
+    walls: list[Shape] = [(coal.Box(2.0, 0.1, 1.0), at(0.0, sign * 0.5, 0.5)) for sign in (-1, 1)]
+    places = [START, np.array([3.5, 0.0, 0.0])]
+
+    def turns(grid: BaseGrid, place: np.ndarray, margins: np.ndarray | None = None) -> list[bool]:
+        one = Ground(grid, place, np.array([[3.5, 3.0, 0.0]]))
+        yaws = np.linspace(-3.0, 3.0, 41)
+        every = Connections(np.zeros(41, int), np.zeros(41, int), yaws, np.zeros(41, int))
+        return one.turnable(place, every, margins).tolist()
+
+    alone = [turns(BaseGrid(chassis(), [], walls, HALL, MARGIN), place) for place in places]
+    assert 0 < sum(alone[0]) < 41 == sum(alone[1])
+    for order in ((0, 1), (1, 0), (0, 1, 0, 1)):
+        shared = BaseGrid(chassis(), [], walls, HALL, MARGIN)
+        for k in order:
+            assert turns(shared, places[k]) == alone[k]
+    wide = turns(shared, places[0], np.full(2, -np.inf))
+    assert sum(wide) == 41

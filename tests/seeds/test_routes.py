@@ -7,6 +7,7 @@ from helpers.small_problems import program_of
 
 import vkc_pin as vkc
 from vkc_pin.seeds.initialization import initialize
+from vkc_pin.seeds.knots import ALIKE
 from vkc_pin.seeds.routes import Routes
 
 
@@ -130,3 +131,20 @@ def test_the_arm_is_folded_once_for_what_is_held(monkeypatch: pytest.MonkeyPatch
     routes = Routes(problem)
     assert [routes.folded_arm(phase)[0] for phase in (0, 1, 0, 1)] == [0.0, 1.0, 0.0, 1.0]
     assert asked == [0, 1]
+
+
+def test_starts_share_distances_where_they_are_alike_and_nowhere_else() -> None:
+    """On either side of a wall and along it, asked together and one by one; within a square it makes its width of difference."""
+    problem = walled(1.6)
+    goal = np.array([4.0, 1.5, 0.0])
+    starts = np.array([[x, y, 0.0] for x in (0.5, 3.5) for y in (-0.55, -0.35, 0.05, 0.85)])
+    together = Routes(problem).distances(0, starts, np.tile(goal, (len(starts), 1)))
+    alone = [Routes(problem).distances(0, start[None], goal[None])[0] for start in starts]
+    np.testing.assert_array_equal(together, alone)
+    assert np.abs(np.diff(np.sort(together))).min() > 1e-3
+    beside = starts + np.array([0.04, -0.04, 0.0])
+    routes = Routes(problem)
+    shared = [routes.distances(0, each, np.tile(goal, (len(starts), 1))) for each in (starts, beside)]
+    np.testing.assert_array_equal(shared[0], shared[1])
+    own = Routes(problem).distances(0, beside, np.tile(goal, (len(starts), 1)))
+    assert np.abs(own - shared[1]).max() < np.hypot(ALIKE, ALIKE)

@@ -14,7 +14,7 @@ from vkc_pin.seeds.routes import Routes
 __all__ = ["Beam", "Found"]
 
 _BATCHES = 6  # batches of random samples at most: good grasps are rare
-_FREE_OPEN = 60  # free configurations at a knot where nothing fixed is held with which no more are drawn, nor pushed out of collisions
+_FREE = 60  # free configurations at a knot with which no more are drawn, nor pushed, where nothing fixed is held
 _KNOT_TIME = 1.0  # [s] from knot to knot along a phase in which something fixed is held, at `Options.dt` a waypoint
 _WIDTH = 24  # configurations kept per knot
 _EASY = 0.5  # share of the beam that must go on freely for a knot to be easy where something fixed is held
@@ -41,6 +41,10 @@ class Found(NamedTuple):
     trouble: Floats
     at: list[int]
 
+    def only(self, which: Ints) -> Found:
+        """Return some of the paths."""
+        return Found(self.paths[which], self.cost[which], self.trouble[which], self.at)
+
 
 class _Mode(NamedTuple):
     """How a search goes on; see `Beam.search`."""
@@ -56,8 +60,8 @@ class Beam:
     Args:
         knots: Where configurations come from.
         routes: The paths that the base would drive; None: as if it drove straight.
-        careful: Whether grasps count as free only if the straight path to them is free, too, none are shortened, and paths of the
-            base are those with the arm folded: for narrow places.
+        careful: Whether grasps count as free only if the straight path to them is free, too, none are shortened on the way, and
+            paths of the base are those with the arm folded: for narrow places.
     """
 
     def __init__(self, knots: Knots, routes: Routes | None = None, *, careful: bool = False) -> None:
@@ -203,7 +207,7 @@ class Beam:
                 z, found = knots.knot(paths[parents, -1], waypoint, "scatter")
                 price = cost[parents] + self._path_cost(paths[parents, -1], z, phase)
                 samples.append(self._cheapest(price, parents, z, found, waypoint))
-                if sum(np.count_nonzero(bad == 0) for _, _, bad in samples) >= _FREE_OPEN:
+                if sum(np.count_nonzero(bad == 0) for _, _, bad in samples) >= _FREE:
                     break
             parents, z, bad = (np.concatenate(parts) for parts in zip(*samples, strict=True))
             return self._pushed(paths, cost, parents, z, bad, waypoint, phase)
@@ -226,7 +230,7 @@ class Beam:
         self, paths: Floats, cost: Floats, parents: Ints, z: Floats, bad: Floats, waypoint: int, phase: int
     ) -> tuple[Ints, Floats, Floats]:
         """Return continuations and, if few of them are free, the best of them pushed out of what they are in."""
-        if np.count_nonzero(bad == 0) >= (_EASY * _WIDTH if self._closed_at(waypoint) else _FREE_OPEN):
+        if np.count_nonzero(bad == 0) >= (_EASY * _WIDTH if self._closed_at(waypoint) else _FREE):
             return parents, z, bad
         price = cost[parents] + self._path_cost(paths[parents, -1], z, phase) + bad
         best = np.argsort(price, kind="stable")[: 2 * _WIDTH]

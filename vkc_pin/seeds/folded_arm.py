@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from vkc_pin.arrays import Floats
@@ -12,7 +14,6 @@ from vkc_pin.seeds.knots import depth
 __all__ = ["folded_arm"]
 
 _POSTURES = 1000  # random postures: with 192 the arm may stay wider than the base, with 4000 it gets no narrower
-_AT_ONCE = 50  # of these looked at together: one of the first is mostly free
 
 
 def folded_arm(problem: TrajectoryProblem, phase: int, resting: Floats) -> Floats:
@@ -34,7 +35,7 @@ def folded_arm(problem: TrajectoryProblem, phase: int, resting: Floats) -> Float
     z = np.tile(resting, (_POSTURES, 1))
     z[:, arm] = [home, *rng.uniform(lower, upper, (_POSTURES - 1, len(home)))]
     z = z[np.argsort(_size(problem, phase, z), kind="stable")]
-    for tried in np.array_split(z, _POSTURES // _AT_ONCE):
+    for tried in np.array_split(z, math.isqrt(_POSTURES)):  # one of the first is mostly free
         free = depth(problem, tried, problem.contacts.inside(phase), standing=False) <= 0.0
         if free.any():
             return tried[np.argmax(free), arm].copy()

@@ -22,8 +22,7 @@ from vkc_pin.seeds.seed import Seed
 __all__ = ["INITIALIZATIONS", "initialize"]
 
 INITIALIZATIONS = ("auto", "interpolated", "astar", "rrt", "stationary")
-_FREE = 0.05  # [m] shortfall of clearance of a seed, summed over its waypoints, below which no better one is looked for
-_POOR = 0.045  # [m] overlap at a waypoint above which other seeds come first, and trees if there is no better one
+_POOR = 0.045  # [m] overlap at a waypoint above which other seeds come first, and shortfall in all up to which a seed will do
 _COMPARED_PATHS = 8  # paths of the beam whose seeds are compared, or along which trees grow
 _PLACES = 128  # random places of which one is where a phase ends, once the stationary seed led nowhere
 
@@ -226,19 +225,20 @@ class _SeedSearch:
         return found
 
     def _ordered(self, found: Found) -> Iterable[Floats]:
-        """Return paths in the order in which they are to be joined, each after what it comes to when it is shortened.
-
-        What is short may be what grazes things, so that the merit of their seeds chooses between the two.
-        """
+        """Return paths in the order in which they are to be joined."""
         if len(found.at) == 2:  # the search has shortened ways to one knot alone
             return found.paths[np.argsort(found.cost, kind="stable")]
+        return self._beside_shortened(found)
+
+    def _beside_shortened(self, found: Found) -> list[Floats]:
+        """Return paths, each after what it comes to when it is shortened: what is short may be what grazes things."""
         short = self.beam.shortened(found)
-        order = np.argsort(short.cost, kind="stable")
-        return itertools.chain.from_iterable(zip(short.paths[order], found.paths[order], strict=True))
+        order = np.lexsort((short.cost, self.beam.careful & (short.trouble > 0)))
+        return list(itertools.chain.from_iterable(zip(short.paths[order], found.paths[order], strict=True)))
 
     def _tried(self, paths: Sequence[Floats]) -> Sequence[Floats]:
         """Return a few paths of which no two are alike."""
-        kept: list[Floats] = []
+        kept = list[Floats]()
         for path in paths:
             if len(kept) < _COMPARED_PATHS and all(np.abs(path - other)[:, : self.alike].max() > ALIKE for other in kept):
                 kept.append(path)
@@ -250,7 +250,7 @@ class _SeedSearch:
 
     def _will_do(self, short: float, overlap: float) -> bool:
         """Return whether a seed that falls so short of clearances [m], and overlaps so much [m], is not compared with others."""
-        return short < _FREE
+        return short < _POOR
 
     def _best(self, found: Found, given: Sequence[Floats]) -> tuple[Floats, Floats, float] | None:
         """Return the path, of the first that are not `given`, whose seed has the least l1 merit, that seed and its overlap.
@@ -296,4 +296,5 @@ class _Rrt(_SeedSearch):
         return overlap <= _POOR
 
     def _ordered(self, found: Found) -> Iterable[Floats]:
-        return found.paths[np.lexsort((found.cost, found.trouble > 0))]  # those with knots in collision last
+        best, rest = np.split(np.lexsort((found.cost, found.trouble > 0)), [_COMPARED_PATHS])
+        return [*self._beside_shortened(found.only(best)), *found.paths[rest]]

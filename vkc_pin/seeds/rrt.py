@@ -26,8 +26,7 @@ TRIES = 1500
 
 _STEPS = (0.15, 0.04)  # [rad] between configurations that are looked at; the latter where the former overlooked something
 _STRAIGHTENINGS = 11  # times that the arm and each of its joints are tried to be straightened between random places
-_WORTH = 1e-3  # share of a path's length that is to be saved by it
-_SHORTER = 0.02  # share for which they are tried so often once more where the arm goes far round
+_WORTH = 1e-3  # share of a path's length that is to be saved by it, or by all of that once more where the arm goes far round
 _PATHS = 3  # paths of trees at most, of which the shortest is kept
 _DETOUR = 1 / 3  # share of a path that the arm goes beyond its straight way, up to which no other one is looked for
 _BESIDE_PATH = 0.1  # [m] and [rad] standard deviation, at most, of bases beside their path
@@ -184,7 +183,7 @@ class _Search:
         long as that is worth it.
         """
         length, path = np.inf, self._evened(path, 0)
-        while self.length(path) < (1.0 - _SHORTER) * length:
+        while self.length(path) < (1.0 - _WORTH) * length:
             length, path = self.length(path), self._evened(path, _STRAIGHTENINGS)
             if self.detour(path) <= _DETOUR:
                 break

@@ -390,6 +390,34 @@ def test_searches_are_quick_first_and_for_trees_careful_and_backwards_in_turn(
         assert found
 
 
+@pytest.mark.parametrize(
+    ("ways", "expected"),
+    [
+        ("forwards backwards", "fbfbf"),  # in turn
+        ("backwards", "fbbbb"),
+        ("forwards", "fbfff"),
+        ("", "fbfbf"),
+    ],
+)
+def test_trees_search_again_in_the_direction_that_led_somewhere(
+    ways: str, expected: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, found = list[str](), Found(np.zeros((0, 1, 9)), np.zeros(0), np.zeros(0), [0])
+
+    def search(_: Beam, *, thorough: bool, backwards: bool = False) -> Found:
+        asked.append("b" if backwards else "f")
+        return found
+
+    def tolerable(*_: object) -> bool:
+        return ("backwards" if asked[-1] == "b" else "forwards") in ways
+
+    monkeypatch.setattr(Beam, "search", search)
+    monkeypatch.setattr(Beam, "tolerable", tolerable)
+    monkeypatch.setattr(initialization._Rrt, "_best", lambda *_: None)
+    assert seeds("rrt", count=4) == []
+    assert "".join(asked) == expected
+
+
 class Watched:
     """Notes what beams find: for ways of the base alone, and, with care, for trees."""
 

@@ -17,7 +17,7 @@ from vkc_pin.seeds.beam import Beam, Found
 from vkc_pin.seeds.joining import Joiner, RrtPaths, base_paths
 from vkc_pin.seeds.knots import ALIKE, Knots, Known, follow_objects
 from vkc_pin.seeds.routes import Routes
-from vkc_pin.seeds.seed import Seed
+from vkc_pin.seeds.seed import Seed, perturbed
 
 __all__ = ["INITIALIZATIONS", "initialize"]
 
@@ -64,7 +64,7 @@ def initialize(
         seeds = _in_turn(*(_kind(kind, shared, count, asked) for kind in kinds))
     rng = np.random.default_rng([random_seed, 1])
     for item in seeds:
-        yield replace(item, z=_perturbed(problem, item.z, perturbation, rng)) if perturbation else item
+        yield replace(item, z=perturbed(problem, item.z, perturbation, rng)) if perturbation else item
 
 
 def _kind(method: str, shared: _Shared, count: int, hopeless: Callable[[Sequence[int]], bool]) -> Iterator[Seed | None]:
@@ -136,16 +136,6 @@ def _merit(problem: TrajectoryProblem, z: Floats, waypoint: int) -> float:
     contacts = problem.evaluate_contacts(z, reach=options.largest_margin, nearest=options.contact_slots)
     missing = Merit(options.penalty).price(infeasibility(problem, z, timing, contacts, rates=False), clearance=True)
     return problem.objective(z, timing.dt) + float(missing[:waypoint].sum())
-
-
-def _perturbed(problem: TrajectoryProblem, z: Floats, deviation: float, rng: np.random.Generator) -> Floats:
-    """Return a seed with smooth noise on the robot's coordinates: half waves in time, of amplitudes as their lengths squared."""
-    robot, waves = problem.chain.robot.coordinates.size, np.arange(1, len(z) + 1)
-    shape = np.sin(np.pi * np.outer(waves / (len(z) + 1), waves)) / waves**2
-    noise = shape @ rng.normal(0.0, deviation, (len(waves), robot)) / np.sqrt(np.sum(0.5 / waves**4))
-    z = z.copy()
-    z[:, :robot] += noise
-    return problem.clip(z)
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,6 +272,7 @@ class _Rrt(_SeedSearch):
 
     def __init__(self, shared: _Shared) -> None:
         super().__init__(shared, "rrt")
+        self.vain = set[bool]()  # whether searches were backwards of which the last found nothing
 
     def _parts(self, shared: _Shared) -> tuple[Beam, Joiner]:
         knots = shared.knots()
@@ -289,8 +280,16 @@ class _Rrt(_SeedSearch):
         return beam, Joiner(knots, Approach(knots, stands=True), RrtPaths(knots, shared.routes))
 
     def _search(self, attempt: int) -> Found | None:
-        found = self._searched(thorough=attempt > 0, backwards=attempt % 2 == 1)  # every other backwards
-        return found if self.beam.tolerable(found) else None
+        """Every other is backwards, but not if the last that way found nothing, and the last the other way did."""
+        backwards = attempt % 2 == 1
+        if backwards in self.vain and len(self.vain) == 1:
+            backwards = not backwards
+        found = self._searched(thorough=attempt > 0, backwards=backwards)
+        if self.beam.tolerable(found):
+            self.vain.discard(backwards)
+            return found
+        self.vain.add(backwards)
+        return None
 
     def _will_do(self, short: float, overlap: float) -> bool:
         return overlap <= _POOR

@@ -12,7 +12,7 @@ from vkc_pin.motion.splicing import filled
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.task.phases import PhaseKey
 
-__all__ = ["PhaseWaypoints", "Seed", "seed_of"]
+__all__ = ["PhaseWaypoints", "Seed", "perturbed", "seed_of"]
 
 _WARM_RADIUS = 0.2  # [m] and [rad] trust region at first: what is nearly free already is improved in smaller steps
 
@@ -79,3 +79,13 @@ def _resampled(waypoints: Floats, segments: int) -> Floats:
         return waypoints[1:]
     at = np.linspace(0.0, len(waypoints) - 1, segments + 1)[1:]
     return np.stack([np.interp(at, np.arange(len(waypoints)), column) for column in waypoints.T], axis=1)
+
+
+def perturbed(problem: TrajectoryProblem, z: Floats, deviation: float, rng: np.random.Generator) -> Floats:
+    """Return a seed with smooth noise on the robot's coordinates: half waves in time, of amplitudes as their lengths squared."""
+    robot, waves = problem.chain.robot.coordinates.size, np.arange(1, len(z) + 1)
+    shape = np.sin(np.pi * np.outer(waves / (len(z) + 1), waves)) / waves**2
+    noise = shape @ rng.normal(0.0, deviation, (len(waves), robot)) / np.sqrt(np.sum(0.5 / waves**4))
+    z = z.copy()
+    z[:, :robot] += noise
+    return problem.clip(z)

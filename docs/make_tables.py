@@ -16,6 +16,7 @@ from __future__ import annotations
 import importlib
 import json
 import re
+import shlex
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
@@ -34,7 +35,7 @@ TABLE = re.compile(r"(?:^\|.*\n)+", re.MULTILINE)
 REPORTS = {  # name of a record → whose report it is
     **{name: name for name in ("baselines", "household", "initialization", "chores", "scale", "gap")},
     **{"segments": "scale", "sixty": "problems.ablation", "tradeoff": "problems.ablation"},
-    "sensitivity": "problems.ablation",
+    **{"sensitivity": "problems.ablation", "numbers": "problems.ablation"},
     **{"spread": "problems.spread", "first_seed": "problems.first_seed", "robots": "anything.robots"},
     **{"anything": "anything.matrix", "cluttered": "chores"},
     **{"robots_rest": "anything.robots", "robots_packages": "anything.robots", "execution": "executing.execution"},
@@ -113,6 +114,7 @@ EVIDENCE: list[tuple[str, str, str, str]] = [
     ("as fast as the limits allow", "rates_and_limits.md", "timing", "python -m tests.optimal --starts 5"),
     ("beside other planners", "comparison.md", "peers", "peers --trials 20 --seed 20270110 --time-limit 30"),
     ("what half and twice of other settings do", "decisions.md", "sensitivity", "ablation --seed 20270111"),
+    ("what each number of seeds and solver is worth", "decisions.md", "numbers", "ablation --seed 20270121"),
     ("what a metre of the base is worth", "decisions.md", "tradeoff", "ablation --seed 101"),
 ]
 
@@ -204,10 +206,10 @@ def evidence() -> str:
         timed = sum(session["trials"] for session in sessions)
         if not sessions:  # of the door, whose record has no sessions
             minutes, jobs = sum(trial["planning_time"] + trial["build_time"] for trial in trials) / 60.0, "planning alone"
-        for option in {"friction": ("tasks",), "tradeoff": ("changes",), "sensitivity": ("changes",)}.get(
+        for option in {"friction": ("tasks",), "tradeoff": ("changes",), "sensitivity": ("changes",), "numbers": ("changes",)}.get(
             name, ("robots",) if command.startswith("robots") else ()
         ):
-            command += f" --{option} {' '.join(chosen for chosen in found['meta'][option] if chosen != 'unchanged')}"
+            command += f" --{option} {shlex.join(chosen for chosen in found['meta'][option] if chosen != 'unchanged')}"
         file = f"--json out/{name}.json" if "door" in name or name == "timing" else f"--out out/{name}"
         whole = f"`{'' if command.startswith('python') else 'vkc-pin bench '}{command} {file}`"
         rows.append([f"[{claim}]({page})", whole, f"[{name}](results/{name}.json)", commits(trials), f"{len(trials)}"])

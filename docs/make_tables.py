@@ -206,9 +206,8 @@ def evidence() -> str:
         timed = sum(session["trials"] for session in sessions)
         if not sessions:  # of the door, whose record has no sessions
             minutes, jobs = sum(trial["planning_time"] + trial["build_time"] for trial in trials) / 60.0, "planning alone"
-        for option in {"friction": ("tasks",), "tradeoff": ("changes",), "sensitivity": ("changes",), "numbers": ("changes",)}.get(
-            name, ("robots",) if command.startswith("robots") else ()
-        ):
+        changed = dict.fromkeys(("tradeoff", "sensitivity", "numbers"), ("changes",))
+        for option in {"friction": ("tasks",), **changed}.get(name, ("robots",) if command.startswith("robots") else ()):
             command += f" --{option} {shlex.join(chosen for chosen in found['meta'][option] if chosen != 'unchanged')}"
         file = f"--json out/{name}.json" if "door" in name or name == "timing" else f"--out out/{name}"
         whole = f"`{'' if command.startswith('python') else 'vkc-pin bench '}{command} {file}`"

@@ -423,14 +423,12 @@ class Watched:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.found: list[tuple[str, Found]] = []
-        self.beams: list[Beam] = []
         search = Beam.search
 
         def watch(beam: Beam, *, thorough: bool, backwards: bool = False) -> Found:
             found = search(beam, thorough=thorough, backwards=backwards)
             kind = "rrt" if beam.careful else "interpolated" if beam.routes is None else "astar"
             self.found.append((kind, found))
-            self.beams.append(beam)
             return found
 
         monkeypatch.setattr(Beam, "search", watch)
@@ -454,33 +452,9 @@ def test_trees_search_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
     *others, first = initialize(problem(), "auto", 0)
     assert [seed.name for seed in [*others, first]] == ["interpolated", "astar", "rrt"]
     assert watched.kinds == ["interpolated", "astar", "rrt"]
-    shortened = watched.beams[-1].shortened(watched.found[-1][1])
-    apart = np.concatenate([grasps(watched.found[-1][1]), grasps(shortened)]) - first.z[int(problem().ends[0]) - 1, :9]
+    apart = grasps(watched.found[-1][1]) - first.z[int(problem().ends[0]) - 1, :9]
     apart[:, 2] = wrapped(apart[:, 2])  # on the way there the base may turn the other way round
     assert np.abs(apart).max(axis=1).min() < 1e-3
-
-
-class HalvingBeam:
-    """Shortens every path to half of its cost, to other configurations; that of the third ends in collision."""
-
-    careful = True
-
-    def shortened(self, found: Found) -> Found:
-        self.asked = found
-        return Found(-found.paths, found.cost / 2.0, np.where(found.cost == 3.0, 10.0, 0.0), found.at)
-
-
-def test_trees_are_led_to_the_best_grasps_each_shortened_and_as_it_was_drawn() -> None:
-    count = initialization._COMPARED_PATHS + 2
-    cost = np.array([*range(count, 1, -1), 0.0])  # the cheapest is in collision itself
-    trouble = np.where(cost == 0.0, 10.0, 0.0)
-    search = initialization._Rrt.__new__(initialization._Rrt)
-    search.beam = HalvingBeam()  # type: ignore[assignment]
-    said = [float(path[0, 0]) for path in search._ordered(Found(cost[:, None, None], cost, trouble, [0, 1]))]
-    best = [2.0, *np.arange(4.0, initialization._COMPARED_PATHS + 2)]  # of which those in collision come last
-    assert said[:-2] == [value for one in [*best, 3.0] for value in (-one, one)]
-    assert said[-2:] == [count, 0.0]
-    assert len(search.beam.asked.cost) == initialization._COMPARED_PATHS  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])

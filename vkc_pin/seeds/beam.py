@@ -41,10 +41,6 @@ class Found(NamedTuple):
     trouble: Floats
     at: list[int]
 
-    def only(self, which: Ints) -> Found:
-        """Return some of the paths."""
-        return Found(self.paths[which], self.cost[which], self.trouble[which], self.at)
-
 
 class _Mode(NamedTuple):
     """How a search goes on; see `Beam.search`."""
@@ -60,7 +56,7 @@ class Beam:
     Args:
         knots: Where configurations come from.
         routes: The paths that the base would drive; None: as if it drove straight.
-        careful: Whether grasps count as free only if the straight path to them is free, too, none are shortened on the way, and
+        careful: Whether grasps count as free only if the straight path to them is free, too, none are shortened, and
             paths of the base are those with the arm folded: for narrow places.
     """
 

@@ -215,16 +215,15 @@ class _SeedSearch:
         return found
 
     def _ordered(self, found: Found) -> Iterable[Floats]:
-        """Return paths in the order in which they are to be joined."""
+        """Return paths in the order in which they are to be joined, each after what it comes to when it is shortened.
+
+        What is short may be what grazes things, so that the merit of their seeds chooses between the two.
+        """
         if len(found.at) == 2:  # the search has shortened ways to one knot alone
             return found.paths[np.argsort(found.cost, kind="stable")]
-        return self._beside_shortened(found)
-
-    def _beside_shortened(self, found: Found) -> list[Floats]:
-        """Return paths, each after what it comes to when it is shortened: what is short may be what grazes things."""
         short = self.beam.shortened(found)
-        order = np.lexsort((short.cost, self.beam.careful & (short.trouble > 0)))
-        return list(itertools.chain.from_iterable(zip(short.paths[order], found.paths[order], strict=True)))
+        order = np.argsort(short.cost, kind="stable")
+        return itertools.chain.from_iterable(zip(short.paths[order], found.paths[order], strict=True))
 
     def _tried(self, paths: Sequence[Floats]) -> Sequence[Floats]:
         """Return a few paths of which no two are alike."""
@@ -295,5 +294,4 @@ class _Rrt(_SeedSearch):
         return overlap <= _POOR
 
     def _ordered(self, found: Found) -> Iterable[Floats]:
-        best, rest = np.split(np.lexsort((found.cost, found.trouble > 0)), [_COMPARED_PATHS])
-        return [*self._beside_shortened(found.only(best)), *found.paths[rest]]
+        return found.paths[np.lexsort((found.cost, found.trouble > 0))]  # those with knots in collision last

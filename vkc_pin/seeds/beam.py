@@ -56,8 +56,8 @@ class Beam:
     Args:
         knots: Where configurations come from.
         routes: The paths that the base would drive; None: as if it drove straight.
-        careful: Whether grasps count as free only if the straight path to them is free, too, none are shortened, and
-            paths of the base are those with the arm folded: for narrow places.
+        careful: Whether grasps count as free only if the straight path to them is free, too, none are shortened, and paths of the
+            base are those with the arm folded: for narrow places.
     """
 
     def __init__(self, knots: Knots, routes: Routes | None = None, *, careful: bool = False) -> None:

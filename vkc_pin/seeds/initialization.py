@@ -227,7 +227,7 @@ class _SeedSearch:
 
     def _tried(self, paths: Sequence[Floats]) -> Sequence[Floats]:
         """Return a few paths of which no two are alike."""
-        kept = list[Floats]()
+        kept: list[Floats] = []
         for path in paths:
             if len(kept) < _COMPARED_PATHS and all(np.abs(path - other)[:, : self.alike].max() > ALIKE for other in kept):
                 kept.append(path)
@@ -271,7 +271,7 @@ class _Rrt(_SeedSearch):
 
     def __init__(self, shared: _Shared) -> None:
         super().__init__(shared, "rrt")
-        self.vain = set[bool]()  # whether searches were backwards of which the last found nothing
+        self.vain = set[bool]()  # directions, backwards or not, in which the last search found nothing
 
     def _parts(self, shared: _Shared) -> tuple[Beam, Joiner]:
         knots = shared.knots()
@@ -279,9 +279,9 @@ class _Rrt(_SeedSearch):
         return beam, Joiner(knots, Approach(knots, stands=True), RrtPaths(knots, shared.routes))
 
     def _search(self, attempt: int) -> Found | None:
-        """Every other is backwards, but not if the last that way found nothing, and the last the other way did."""
+        """Return what a search finds: every other goes backwards, but none where only the last of its direction was in vain."""
         backwards = attempt % 2 == 1
-        if backwards in self.vain and len(self.vain) == 1:
+        if self.vain == {backwards}:
             backwards = not backwards
         found = self._searched(thorough=attempt > 0, backwards=backwards)
         if self.beam.tolerable(found):

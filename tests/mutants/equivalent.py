@@ -43,6 +43,7 @@ EQUIVALENT: dict[str, str] = {
     "validation/samples.py: which = which.reshape(-1) | constant: 1 → 2": "NumPy takes any negative number for the length that follows from the others",
     "validation/pairs.py: most = max((int(window.pairs.max()) for window in windows if len(window.pairs)), default=0) | constant: 0 → 1": "any number that is no less than all of them makes numbers of pairs as unique, and pairs have a 1 in them at least",
     "solver/loop.py: nearly = trial.contacts.violation() < NEARLY | comparison: < → <=": "both differ only where two numbers are the same to the last bit, or a distance is exactly zero, which is neither right nor wrong",
+    "solver/between.py: CLOSE = 0.015  # [m] beyond `KEEP` within which a state is looked at closer | constant: 0.015 → 0.03": "a setting of the search or of Ipopt: another one leads to motions that are as good, later or sooner",
     "validation/validate.py: if not abs(value - right) <= START_TOLERANCE: | comparison: <= → <": "both differ only where two numbers are the same to the last bit, or a distance is exactly zero, which is neither right nor wrong",
     "validation/validate.py: excess = np.maximum(lower - low, high - upper) | swapped: lower - low, high - upper → high - upper, lower - low": "max(a, b) is max(b, a)",
     "chain/collision_pairs.py: np.array([half for _, half in boxes]).reshape(-1, 3), | constant: 1 → 2": "NumPy takes any negative number for the length that follows from the others",

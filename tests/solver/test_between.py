@@ -9,7 +9,7 @@ from helpers.small_problems import program_of
 
 import vkc_pin as vkc
 from vkc_pin.program.problem import TrajectoryProblem
-from vkc_pin.solver.between import KEEP, SPACING, Between, collisions_between, merge
+from vkc_pin.solver.between import CLOSE, KEEP, Between, collisions_between, merge
 
 ARM = [np.pi, -1.2, 1.9, -0.7, np.pi / 2, 0.0]  # stretched out ahead of the base
 WIDTH = 2.0  # [m] the base drives sideways
@@ -75,7 +75,7 @@ def test_what_is_asked_for_is_what_is_missing_in_between() -> None:
     problem, z = straight(past_a_post())
     found = collisions_between(problem, z).contacts
     states = sub_states(problem, z, 2, 400)
-    dense = problem.contacts.evaluate(states, np.full(len(states), 3), reach=KEEP + SPACING)
+    dense = problem.contacts.evaluate(states, np.full(len(states), 3), reach=KEEP + CLOSE)
     pairs = np.unique(found.pair, axis=0)
     assert len(pairs) > 1
     for pair in pairs:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import vkc_pin as vkc
 from vkc_pin.chain.contacts import ContactModel, Contacts
-from vkc_pin.solver.between import CLOSE_ENOUGH, FINER, KEEP, SPACING, _deepest, collisions_between, merge
+from vkc_pin.solver.between import CLOSE, CLOSE_ENOUGH, FINER, KEEP, SPACING, _deepest, collisions_between, merge
 
 POST = {"name": "post", "type": "cylinder", "radius": 0.02, "length": 1.6, "position": [0.0, 2.0, 0.8]}
 
@@ -41,7 +41,7 @@ def test_states_lie_evenly_in_each_segment_and_closer_where_something_is_near(mo
     monkeypatch.setattr(ContactModel, "evaluate", noted)
     collisions_between(problem, z)
     (states, waypoints, reach, near), (finer, ends, again, _) = asked
-    assert reach == again == KEEP + SPACING
+    assert reach == again == KEEP + CLOSE
     counts = [25, 1, 51, 75]
     assert (SPACING, FINER) == (0.02, 4)
     np.testing.assert_array_equal(waypoints, np.repeat([1, 2, 3, 4], counts))

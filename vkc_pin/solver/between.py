@@ -15,7 +15,8 @@ from vkc_pin.solver.trust_region import CLOSE_ENOUGH
 __all__ = ["Between", "collisions_between", "merge"]
 
 SPACING = 0.02  # [m] or [rad] between the states looked at first, in the coordinate that moves most
-KEEP = 1e-2  # [m] clearance asked for between waypoints; states that are `SPACING` from falling short of it are looked at closer
+KEEP = 1e-2  # [m] clearance asked for between waypoints
+CLOSE = 0.015  # [m] beyond `KEEP` within which a state is looked at closer
 FINER = 4  # states there instead of one
 
 
@@ -51,7 +52,7 @@ def collisions_between(problem: TrajectoryProblem, z: Floats) -> Between:
     piece = np.arange(len(segment)) - np.searchsorted(segment, segment)
     # The middles of the pieces first, and of pieces that something is close to the rest.
     middles, waypoints = _states(path, segment, (piece + 0.5) / counts[segment])
-    near = contacts.evaluate(middles, waypoints, reach=KEEP + SPACING)
+    near = contacts.evaluate(middles, waypoints, reach=KEEP + CLOSE)
     passed = passages(contacts, middles, segment, near)
     rows = np.unique(near.waypoint)
     segment, begin, length = segment[rows], piece[rows] / counts[segment[rows]], 1 / counts[segment[rows]]
@@ -60,7 +61,7 @@ def collisions_between(problem: TrajectoryProblem, z: Floats) -> Between:
     segment = np.repeat(segment, FINER)
     s = (begin[:, None] + length[:, None] * (np.arange(FINER) + 0.5) / FINER).ravel()
     states, waypoints = _states(path, segment, s)
-    found = _deepest(contacts.evaluate(states, waypoints, reach=KEEP + SPACING), segment)
+    found = _deepest(contacts.evaluate(states, waypoints, reach=KEEP + CLOSE), segment)
     # A start that is close to something leaves it as it can: only what collides on the way counts.
     found = found.select(np.flatnonzero((segment[found.waypoint] > 0) | (found.distance < 0)))
     keep = np.minimum(KEEP, found.margin)

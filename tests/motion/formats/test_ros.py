@@ -15,6 +15,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.interpolate import PchipInterpolator
 
 import vkc_pin as vkc
+from vkc_pin.motion.curve import Curve
 from vkc_pin.motion.formats.ros import along, rates
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.planning.plan import Plan
@@ -150,6 +151,21 @@ def test_points_at_a_rate(plan: Plan, rate: float) -> None:
     )
 
 
+@pytest.mark.parametrize("rate", [1.0, 3.0, 25.0])
+def test_rests_last_as_long_at_any_rate(rate: float) -> None:
+    """Where all stands still there are points at both ends of it, and none beside them but those of the rate."""
+    knots = np.array([0.0, 1.1, 1.4, 2.0, 2.00002, 3.3])
+    places = np.array([0.0, 1.0, 1.0, 2.0, 2.0, 3.0])[:, None] * np.ones(3)
+    curve = Curve(knots, places, np.zeros((6, 3)))
+    motion = Trajectory(("base_x", "base_y", "base_yaw"), knots, places, (vkc.PhaseSpan("drive", 0, 5),), 3, curve)
+    sent = Trajectory.from_ros(motion.to_ros(rate=rate))
+    even = np.append(np.arange(np.ceil(3.3 * rate - 1e-6)) / rate, 3.3)
+    even = even[(np.abs(even[:, None] - knots[1:5]) > 1e-4).all(axis=1)]
+    np.testing.assert_allclose(sent.times, np.sort([*even, *knots[1:5]]), atol=1e-8)
+    moments = np.linspace(1.1, 1.4, 20)
+    np.testing.assert_allclose(sent.at(moments), 1.0, atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -224,10 +240,11 @@ def test_the_arm_alone_is_no_trajectory(plan: Plan) -> None:
         Trajectory.from_ros(few)
 
 
+@pytest.mark.parametrize("rate", [20, 50, 125])
 @pytest.mark.parametrize("smooth", [True, False])
-def test_what_is_sent_can_be_validated(door_plan: Plan, smooth: bool) -> None:
+def test_what_is_sent_can_be_validated(door_plan: Plan, smooth: bool, rate: float) -> None:
     """Between waypoints, on lines or cubics, the motion does what was asked for, and keeps its distances."""
-    sent = Trajectory.from_ros(door_plan.to_ros(joints="all", rate=50, smooth=smooth), like=door_plan.trajectory)
+    sent = Trajectory.from_ros(door_plan.to_ros(joints="all", rate=rate, smooth=smooth), like=door_plan.trajectory)
     assert [phase.name for phase in sent.phases] == [phase.name for phase in door_plan.trajectory.phases]
     options = dataclasses.replace(door_plan.options, dist_safe=0.01)  # what is kept between waypoints
     report = vkc.validate(door_plan.scene, door_plan.steps, sent, options)

@@ -23,6 +23,7 @@ __all__ = ["along", "from_ros", "rates", "to_ros"]
 
 _MOST = 1_000_000  # positions in a message: some 300 MB
 _NANO = 1_000_000_000
+_NEXT = 1e-4  # [s] between points at a rate and one where all comes to rest, up to which the latter alone is there
 
 
 def to_ros(
@@ -45,7 +46,8 @@ def to_ros(
         motion: What to convert.
         joints: One of `GROUPS`, or names of coordinates in the order wanted. The joints of objects are not in it unless asked
             for: no motor moves them.
-        rate: Points a second, and one at the end [Hz]; None: the knots of the curve, or else the waypoints.
+        rate: Points a second [Hz], and one at the end and wherever all comes to rest or leaves it, so that rests last as long as
+            they did; None: the knots of the curve, or else the waypoints.
         smooth: Of a motion without a curve: whether points at a rate are on cubics through its waypoints; otherwise they are on
             the straight lines between these, where velocities jump.
         derivatives: 0: positions only; 1: velocities as well; 2: accelerations as well. None: 1 if there is a curve, since
@@ -76,7 +78,7 @@ def to_ros(
         if times[-1] * rate > most:
             expected = f"at most {most} points, {most / times[-1]:.4g} a second for this motion of {times[-1]:.4g} s"
             raise InputError("too many points", field="rate", expected=expected, got=rate)
-    moments = times if rate is None else evenly(times, rate)
+    moments = times if rate is None else _with_rests(evenly(times, rate), times, np.array(source["positions"], float))
     if cubics is not None:
         positions, velocities, accelerations = (read(moments) for read in (cubics.at, cubics.velocity, cubics.acceleration))
     elif smooth and rate is not None:
@@ -155,6 +157,14 @@ def _rates(point: Any, size: int, file: Path | None, where: str) -> list[float]:
             field = f"{where}velocities[{place}]"
             raise InputError("not a number", file=file, field=field, expected="a number", got=shown(value))
     return values
+
+
+def _with_rests(moments: Floats, times: Floats, positions: Floats) -> Floats:
+    """Return moments, and instead of those that are next to them the times between which positions, (T, n), stay as they are."""
+    still = ~np.diff(positions, axis=0).any(axis=1)
+    rests = times[np.append(still, False) | np.append(False, still)]
+    after = np.searchsorted(rests, moments - _NEXT)  # the first that is not well before each
+    return np.sort(np.concatenate([moments[np.append(rests, np.inf)[after] > moments + _NEXT], rests]))
 
 
 def rates(times: Floats, positions: Floats) -> tuple[Floats, Floats]:

@@ -55,8 +55,9 @@ def write_rosbag(
     Args:
         motion: What to write.
         path: The folder to make.
-        rate: Points a second of the trajectories and of the path [Hz]; None: the knots of the curve, or else the waypoints.
-        states: Velocities of the base and states of objects a second [Hz].
+        rate: Points a second of the trajectories and of the path [Hz]; see `to_ros`. None: the knots of the curve, or else the
+            waypoints.
+        states: Velocities of the base and states of objects a second [Hz]; see `to_ros`, too.
         namespace: What the topics' names begin with.
         frame: `header.frame_id`, the frame of the base's coordinates.
         base_frame: The same of the base's velocities.

@@ -138,6 +138,9 @@ def _add_problems(benches: Any) -> None:
         if name == "ablation":
             form = "settings to change, one at a time: Options.FIELD=VALUE or MODULE:NAME=VALUE, e.g. solver.loop:PROGRESS=0.6"
             parser.add_argument("--changes", nargs="+", metavar="CHANGE", help=form)
+            choices = "door drawer init_1 init_2 init_3 corridor_door ..., from random starts, instead of the sixty problems"
+            _add_choice(parser, "tasks", choices)
+            parser.add_argument("--starts", type=positive, default=10, metavar="N", help="random starts per task (default 10)")
         else:
             count = functools.partial(natural, least=2)
             parser.add_argument("--seeds", type=count, default=5, metavar="K", help="random seeds per problem (default 5)")

@@ -38,6 +38,21 @@ def test_ablation(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(command) == 0  # nothing is left to do
 
 
+def test_tasks(tmp_path: Path) -> None:
+    """Starts of an experiment's tasks instead of the sixty problems."""
+    result = ablation.run(out=tmp_path, tasks=["drawer", "door"], starts=2, seed=5, changes=[CHANGE], progress=False)
+    assert (result["meta"]["tasks"], result["meta"]["starts"]) == (["door", "drawer"], 2)
+    told = {(r["task"], r["number"], r["method"]): r for r in result["trials"]}
+    assert len(told) == len(result["trials"]) == 8
+    assert told["drawer", 0, "unchanged"]["base_effort"] == told["drawer", 0, CHANGE]["base_effort"]
+    assert told["drawer", 0, CHANGE]["base_effort"] != told["drawer", 1, CHANGE]["base_effort"]
+    text = ablation.report(result)
+    good = sum(record["success"] for (task, _, method), record in told.items() if (task, method) == ("door", CHANGE))
+    assert "2 random starts a task, planning seed 5" in text
+    assert f"| {CHANGE} | door | {good} of 2 |" in text
+    assert f"| {CHANGE} | 4 | " in text
+
+
 def test_ratios_are_of_pairs_of_successes() -> None:
     def record(number: int, method: str, time: float, success: bool = True) -> dict[str, object]:
         efforts = {"base_effort": 1.0, "arm_effort": 0.0, "objective": 2.0 * time, "rounds": 1, "iterations": 2}
@@ -59,7 +74,8 @@ def test_ratios_are_of_pairs_of_successes() -> None:
 
 
 def test_wrong_arguments(tmp_path: Path) -> None:
-    for given in ({"problems": [60]}, {"problems": []}, {"changes": ["Options.none=1"]}):
+    wrong = ({"problems": [60]}, {"problems": []}, {"changes": ["Options.none=1"]}, {"tasks": ["dor"]})
+    for given in (*wrong, {"tasks": ["door"], "problems": [1]}, {"tasks": ["door"], "starts": 0}):
         with pytest.raises(vkc.InputError):
             ablation.run(out=tmp_path, **given)  # type: ignore[arg-type]
     assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""Sixty problems that nothing was tuned on, with the planner as it is and with one setting changed at a time."""
+"""Problems that nothing was tuned on, or starts of the experiments' tasks, as planned and with one setting changed at a time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from vkc_pin.benchmarks.harness.record import Record, distribution, values
 from vkc_pin.benchmarks.harness.tables import decimal, failures, foot, markdown, quartiles
 from vkc_pin.benchmarks.problems import trials
 from vkc_pin.benchmarks.problems.changes import UNCHANGED, Change, parsed
-from vkc_pin.benchmarks.problems.problem_set import KINDS, NUMBER, Problem, kind_of, problem
+from vkc_pin.benchmarks.problems.problem_set import KINDS, NUMBER, TASKS, Problem, kind_of, problem, started
+from vkc_pin.errors import InputError
 
 __all__ = ["SUMMARY", "every_trial", "report", "run", "specify", "summary"]
 
@@ -28,11 +29,24 @@ SUMMARY = (
 """Columns that sum up trials; see `summary`."""
 
 
-def specify(*, problems: Sequence[int], changes: Sequence[Change], seed: int) -> list[dict[str, Any]]:
-    """Return the trials: all settings take turns at a problem, so that they meet the same machine."""
+def specify(
+    *, problems: Sequence[int], changes: Sequence[Change], seed: int, tasks: Sequence[str] = (), starts: int = 10
+) -> list[dict[str, Any]]:
+    """Return the trials: all settings take turns at a problem, so that they meet the same machine.
+
+    With tasks, the problems are so many random starts of each, by the seed; otherwise those with these numbers.
+    """
+    if tasks:
+        own = [
+            (f"{list(TASKS).index(task):02d}/{number:04d}", {"task": task, "number": number, "kind": task})
+            for task in tasks
+            for number in range(starts)
+        ]
+    else:
+        own = [(f"{number:02d}", {"number": number, "kind": kind_of(number)}) for number in problems]
     return [
-        {"key": f"{number:02d}/{setting:03d}", "number": number, "kind": kind_of(number), "method": str(change), "seed": seed}
-        for number in problems
+        {"key": f"{key}/{setting:03d}", **what, "method": str(change), "seed": seed}
+        for key, what in own
         for setting, change in enumerate(changes)
     ]
 
@@ -45,32 +59,42 @@ def run(
     scheduler: str | None = None,
     changes: Sequence[str] = (),
     problems: Sequence[int] | None = None,
+    tasks: Sequence[str] = (),
+    starts: int = 10,
     progress: bool = True,
 ) -> dict[str, Any]:
     """Run the experiment, or what is left of it, and write results.json, results.csv and table.md to `out`.
 
     Args:
         out: The folder; if it has trials of the same settings already, they are not run again.
-        seed: Of planning.
+        seed: Of planning, and of the starts of tasks.
         jobs: Number of processes. Several slow each other down.
         scheduler: Address of a Dask scheduler whose workers run the trials instead, see `engine.results`.
         changes: Settings to change, one at a time; see `changes.parsed`.
         problems: Numbers of problems; None: all.
+        tasks: Some of `TASKS`, from random starts, instead of the sixty problems.
+        starts: Random starts per task, at least 1.
         progress: Whether to show a progress bar.
 
     Returns:
         {"meta": ..., "trials": [...]}, each trial with its `kind` and the change as its `method`; see `runner.run`.
 
     Raises:
-        UnknownNameError: There is no such field, module or constant.
-        InputError: A change is none, there is no such problem, or `out` has trials of other settings.
+        UnknownNameError: There is no such field, module, constant or task.
+        InputError: A change is none, there is no such problem, both problems and tasks are given, there are no starts, or `out`
+            has trials of other settings.
         KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
     """
-    numbers = chosen(problems)
+    if tasks and problems is not None:
+        raise InputError("only one of them counts", field="tasks", expected="no numbers of problems beside", got=problems)
+    if starts < 1:
+        raise InputError("out of range", field="starts", expected="at least 1", got=starts)
+    names = runner.chosen("task", tasks, TASKS) if tasks else ()
+    numbers = [] if tasks else chosen(problems)
     chosen_changes = list(dict.fromkeys([UNCHANGED, *(parsed(text) for text in changes)]))
-    settings = {"benchmark": "ablation", "seed": seed, "problems": numbers, "changes": [str(change) for change in chosen_changes]}
-    settings |= LIMITS
-    specs = specify(problems=numbers, changes=chosen_changes, seed=seed)
+    what: dict[str, Any] = {"tasks": names, "starts": starts} if tasks else {"problems": numbers}
+    settings = {"benchmark": "ablation", "seed": seed, **what, "changes": [str(change) for change in chosen_changes], **LIMITS}
+    specs = specify(problems=numbers, changes=chosen_changes, seed=seed, tasks=names, starts=starts)
     return runner.run(specs, _record, out, settings=settings, report=report, jobs=jobs, scheduler=scheduler, progress=progress)
 
 
@@ -85,18 +109,23 @@ def chosen(problems: Sequence[int] | None) -> list[int]:
 def report(result: Mapping[str, Any]) -> str:
     """Return the tables of a result in Markdown, with versions and machine at the foot."""
     about, records = result["meta"], result["trials"]
-    base = {record["number"]: record for record in records if record["method"] == str(UNCHANGED)}
+    base = {_which(record): record for record in records if record["method"] == str(UNCHANGED)}
     rows, paired = [], []
     for change in about["changes"]:
         own = [record for record in records if record["method"] == change]
         rows.append([change, *summary(own)])
-        pairs = [(base[r["number"]], r) for r in own if r["success"] and base.get(r["number"], {}).get("success")]
+        pairs = [(base[_which(r)], r) for r in own if r["success"] and base.get(_which(r), {}).get("success")]
         paired.append([change, str(len(pairs)), *(_ratio(pairs, field) for field in PAIRED)])
     head = ["setting", *SUMMARY]
-    kinds = [["unchanged", kind, *summary([r for r in base.values() if r.get("kind") == kind])] for kind in KINDS]
+    kinds = [
+        [change, kind, *summary([r for r in records if (r["method"], r.get("kind")) == (change, kind)])]
+        for kind in about.get("tasks", KINDS)
+        for change in (about["changes"] if "tasks" in about else [str(UNCHANGED)])
+    ]
+    what = f"{about['starts']} random starts a task" if "tasks" in about else f"{len(about['problems'])} problems"
     parts = [
         "# One setting changed at a time",
-        f"{len(about['problems'])} problems, planning seed {about['seed']}, {allowed(about)} each. "
+        f"{what}, planning seed {about['seed']}, {allowed(about)} each. "
         "Success is the word of the independent validation; the first seed sufficed where the solver ran once. "
         "Times are those of all trials: of planning, and of the process's CPU for all of the call, with building symbolic "
         "programs. Rounds and iterations are means, efforts medians of successes.",
@@ -149,6 +178,11 @@ def summary(own: Sequence[Record]) -> list[str]:
     return [f"{len(good)} of {len(own)}", f"{first} of {len(own)}", *map(decimal, times), *counts, *efforts, failures(own)]
 
 
+def _which(record: Record) -> tuple[Any, ...]:
+    """Return what tells a trial's problem from others."""
+    return record.get("task"), record["number"]
+
+
 def _mean(records: Sequence[Record], field: str) -> float:
     found = values(records, field)
     return float(np.mean(found)) if found else float("nan")
@@ -161,11 +195,15 @@ def _ratio(pairs: Sequence[tuple[Record, Record]], field: str) -> str:
     return f"{median:.3f} ({first:.3f}–{third:.3f})" if ratios else "–"
 
 
-_problem = functools.lru_cache(maxsize=2)(problem)  # settings take turns at it
+@functools.lru_cache(maxsize=2)  # settings take turns at it
+def _problem(task: str | None, seed: int, number: int) -> Problem:
+    if task is None:
+        return problem(number)
+    return Problem(number, f"{task} {number}", task, started(task, seed, number), TASKS[task].steps)
 
 
 def _record(spec: dict[str, Any]) -> dict[str, Any]:
-    own: Problem = _problem(spec["number"])
+    own = _problem(spec.get("task"), spec["seed"], spec["number"])
     change = UNCHANGED if spec["method"] == str(UNCHANGED) else parsed(spec["method"])
-    more = {"number": own.number, "problem": own.name, "kind": own.kind}
+    more = {"number": own.number, "problem": own.name, "kind": own.kind} | ({"task": spec["task"]} if "task" in spec else {})
     return trials.tried(own.scene, own.steps, seed=spec["seed"], change=change, **more)

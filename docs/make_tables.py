@@ -35,7 +35,7 @@ TABLE = re.compile(r"(?:^\|.*\n)+", re.MULTILINE)
 REPORTS = {  # name of a record → whose report it is
     **{name: name for name in ("baselines", "household", "initialization", "chores", "scale", "gap")},
     **{"segments": "scale", "sixty": "problems.ablation", "tradeoff": "problems.ablation"},
-    **{"sensitivity": "problems.ablation", "numbers": "problems.ablation"},
+    **{"sensitivity": "problems.ablation", "numbers": "problems.ablation", "narrow": "problems.ablation"},
     **{"spread": "problems.spread", "first_seed": "problems.first_seed", "robots": "anything.robots"},
     **{"anything": "anything.matrix", "cluttered": "chores"},
     **{"robots_rest": "anything.robots", "robots_packages": "anything.robots", "execution": "executing.execution"},
@@ -115,6 +115,7 @@ EVIDENCE: list[tuple[str, str, str, str]] = [
     ("beside other planners", "comparison.md", "peers", "peers --trials 20 --seed 20270110 --time-limit 30"),
     ("what half and twice of other settings do", "decisions.md", "sensitivity", "ablation --seed 20270111"),
     ("what each number of seeds and solver is worth", "decisions.md", "numbers", "ablation --seed 20270121"),
+    ("and in narrow places", "decisions.md", "narrow", "ablation --seed 20270131"),
     ("what a metre of the base is worth", "decisions.md", "tradeoff", "ablation --seed 101"),
 ]
 

@@ -70,7 +70,7 @@ def scattered(monkeypatch: pytest.MonkeyPatch, share: float) -> int:
 
 @pytest.mark.parametrize(
     ("holding", "free", "pushed"),
-    [(False, 0, True), (False, 59, True), (False, 60, False), (True, 0, True), (True, 11, True), (True, 12, False)],
+    [(False, 0, True), (False, 59, True), (False, 60, False), (True, 0, True), (True, 23, True), (True, 24, False)],
 )
 def test_where_some_are_free_none_are_pushed(monkeypatch: pytest.MonkeyPatch, holding: bool, free: int, pushed: bool) -> None:
     """While something is held a few are enough: there are many such knots."""

@@ -300,12 +300,12 @@ def test_only_what_is_not_yet_free_needs_small_steps(done: bool, small: bool) ->
 
 def test_where_nothing_moves_and_little_is_missing_that_becomes_dearer() -> None:
     """Until it is given up; where much is missing, other seeds come to more."""
-    few = scripted(*[(10.0, 1.2e-3, True)] * 20, step=1e-3)
+    few = scripted(*[(10.0, 1.2e-3, True)] * 20, step=1e-4)
     assert few.merit.weights["clearance"] > GROWTH * 200.0  # more than once
     assert few.merit.weights["poses"] == 200.0
     assert any((radius == trust_region.FIRST_RADIUS).all() for radius in few.radii[2:])
     assert few.solution.rounds < 20
-    much = scripted(*[(10.0, 0.5, True)] * 20, step=1e-3)
+    much = scripted(*[(10.0, 0.5, True)] * 20, step=1e-4)
     assert much.merit.weights["clearance"] == 200.0
     assert much.solution.rounds == 1
 

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from vkc_pin.solver.trust_region import (
     CLOSE_ENOUGH,
     FIRST_RADIUS,
-    MIN_RADIUS,
     SETTLE_RADIUS,
     Trial,
     TrustRegion,
@@ -87,7 +86,7 @@ def test_stuck_is_where_something_is_in_the_way_and_does_not_move() -> None:
     shortfall[12] = 2 * CLOSE_ENOUGH
     step = np.full(SEGMENTS, 0.1)
     assert not region.stuck(trial(step=step), shortfall)
-    step[12] = MIN_RADIUS / 2
+    step[12] = CLOSE_ENOUGH / 2
     assert region.stuck(trial(step=step), shortfall)
     shortfall[15] = 2 * CLOSE_ENOUGH  # which moves
     assert not region.stuck(trial(step=step), shortfall)

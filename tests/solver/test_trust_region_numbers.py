@@ -12,7 +12,6 @@ from vkc_pin.solver.trust_region import (
     CLOSE_ENOUGH,
     FIRST_RADIUS,
     INSIDE,
-    MIN_RADIUS,
     NO_MATTER,
     SETTLE_RADIUS,
     SHRINK,
@@ -99,8 +98,8 @@ def test_where_nothing_moves_any_more() -> None:
     fields: dict[str, Any] = dict.fromkeys(field.name for field in dataclasses.fields(Trial))
 
     def stuck(radius: list[float], step: list[float], short: list[float]) -> bool:
-        region = TrustRegion(3, 1, MIN_RADIUS * np.array(radius))
-        trial = Trial(**{**fields, "step": MIN_RADIUS * np.array(step)})
+        region = TrustRegion(3, 1, CLOSE_ENOUGH * np.array(radius))
+        trial = Trial(**{**fields, "step": CLOSE_ENOUGH * np.array(step)})
         return region.stuck(trial, CLOSE_ENOUGH * np.array(short))
 
     assert stuck([9.0, 0.9, 9.0], [9.0, 9.0, 9.0], [0.0, 1.1, 0.0])

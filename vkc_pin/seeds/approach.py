@@ -17,7 +17,6 @@ from vkc_pin.task.phases import FrameGoal, Phase
 
 __all__ = ["Approach"]
 
-_STANDOFFS = 6  # configurations on the path to what is touched: with one alone the tool comes in from the side
 _UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -25,7 +24,7 @@ class Approach:
     """Finds configurations on straight paths to and from the ends of a problem's phases.
 
     A path is the tool's, `Options.approach` long: back along its approach for what it grasps or lets go of, up for what is lifted
-    or put down. Back along the frame's z axis for what a frame touches it is several times as long.
+    or put down, back along the frame's z axis for what a frame touches. It is one configuration, or none where none is found.
 
     Args:
         knots: Of the problem.
@@ -42,22 +41,22 @@ class Approach:
         self.solver = cache.get(key, lambda: PoseSolver(model, PoseRow(joint, local, ()), cache))
 
     def before(self, z: Floats, phase: Phase) -> Floats:
-        """Return configurations on the path to `z`, shape (n,), a phase's end: shape (K, n), the last is the nearest."""
-        return self._leaving(z, phase.grasps, phase.lowered, phase.frames)[::-1]
+        """Return where the path to `z`, shape (n,), a phase's end, begins: shape (K, n), K is 1 or 0."""
+        return self._leaving(z, phase.grasps, phase.lowered, phase.frames)
 
     def after(self, z: Floats, phase: Phase, before: Phase | None) -> Floats:
-        """Return configurations on the path from `z`, shape (n,), a phase's start: shape (K, n), the first is the nearest."""
+        """Return where the path from `z`, shape (n,), a phase's start, leads: shape (K, n), K is 1 or 0."""
         return self._leaving(z, phase.leaves, phase.lifted, before.frames if before else ())
 
     def _leaving(self, z: Floats, holds: Sequence[Hold], lifted: Sized, frames: Sequence[FrameGoal]) -> Floats:
-        """Return configurations on the path away from a grasp, from where something stands, or from what a frame touches."""
+        """Return where the path away from a grasp, from where something stands, or from what a frame touches, leads."""
         if holds:
             return self._retreat(z, -self._ahead(z, self.chain.holder(holds[0])))
         if lifted:
             return self._retreat(z, _UP)
         for goal in frames:
             if goal.touches:
-                return self._retreat(z, -self._ahead(z, self.chain.frame(goal.frame, goal.hold)), _STANDOFFS)
+                return self._retreat(z, -self._ahead(z, self.chain.frame(goal.frame, goal.hold)))
         return np.empty((0, len(z)))
 
     def away(self, z: Floats, phase: Phase) -> Floats:
@@ -75,25 +74,19 @@ class Approach:
         rotations, _ = self.chain.joint_placements(z[None])
         return np.asarray((rotations[0, joint] @ local.rotation)[:, 2])
 
-    def _retreat(self, z: Floats, direction: Floats, count: int = 1, *, drives: bool = True) -> Floats:
-        """Return up to `count` configurations, the tool of each `Options.approach` further along `direction`, shape (K, n)."""
+    def _retreat(self, z: Floats, direction: Floats, *, drives: bool = True) -> Floats:
+        """Return a configuration, the tool `Options.approach` further along `direction`: shape (K, n), K is 1 or 0."""
         rotations, translations = self.chain.joint_placements(z[None])
         carrier = pin.SE3(rotations[0, self.joint], translations[0, self.joint])
         tool = carrier * self.local
+        target = pin.SE3(tool.rotation, tool.translation + self.problem.options.approach * direction)
         lower, upper = z.copy(), z.copy()  # only the robot moves
         for column, name in enumerate(self.chain.names[: self.knots.robot]):
             if drives or column > 2:
                 lower[column], upper[column] = self.problem.limits(name)
         standing = np.concatenate([z[:3], lower[3:]]), np.concatenate([z[:3], upper[3:]])
-        weights, found = self.knots.weights, list[Floats]()
-        for number in range(1, count + 1):
-            target = pin.SE3(tool.rotation, tool.translation + number * self.problem.options.approach * direction)
-            start = (found[-1] if found else z)[None]
-            for low, high in (standing, (lower, upper)) if self.stands else ((lower, upper),):
-                near, ok = self.solver.solve(start, target, lower=low, upper=high, weights=weights, tolerance=TOLERANCE)
-                if ok[0]:
-                    break
-            else:
-                break
-            found.append(near[0])
-        return np.array(found).reshape(len(found), len(z))
+        for low, high in (standing, (lower, upper)) if self.stands else ((lower, upper),):
+            near, ok = self.solver.solve(z[None], target, lower=low, upper=high, weights=self.knots.weights, tolerance=TOLERANCE)
+            if ok[0]:
+                return near
+        return np.empty((0, len(z)))

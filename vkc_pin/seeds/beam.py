@@ -17,7 +17,6 @@ _BATCHES = 6  # batches of random samples at most: good grasps are rare
 _FREE = 60  # free configurations at a knot with which no more are drawn, nor pushed, where nothing fixed is held
 _KNOT_TIME = 1.0  # [s] from knot to knot along a phase in which something fixed is held, at `Options.dt` a waypoint
 _WIDTH = 24  # configurations kept per knot
-_EASY = 0.5  # share of the beam that must go on freely for a knot to be easy where something fixed is held
 _COLLISION, _DEPTH = 10.0, 300.0  # cost of a collision, and of its depth [1/m], a radian of a joint costing 1
 _NOT_FOUND = 1e3  # cost if there is no configuration, or no path of the base
 _TOLERABLE = 60.0  # cost of collisions that the solver may be left to push apart: a graze or two
@@ -211,7 +210,7 @@ class Beam:
         z, found = knots.knot(paths[:, -1], waypoint, "track")
         if not mode.thorough:
             bad = self._bad(z, found, waypoint)
-            if np.count_nonzero(bad == 0) >= _EASY * len(paths):
+            if not bad.any():
                 return parents, z, bad
         more = np.arange(SCATTER // 2 - len(paths)) % len(paths)
         shaken, also = knots.knot(paths[more, -1], waypoint, "shake")
@@ -226,7 +225,7 @@ class Beam:
         self, paths: Floats, cost: Floats, parents: Ints, z: Floats, bad: Floats, waypoint: int, phase: int
     ) -> tuple[Ints, Floats, Floats]:
         """Return continuations and, if few of them are free, the best of them pushed out of what they are in."""
-        if np.count_nonzero(bad == 0) >= (_EASY * _WIDTH if self._closed_at(waypoint) else _FREE):
+        if np.count_nonzero(bad == 0) >= (_WIDTH if self._closed_at(waypoint) else _FREE):
             return parents, z, bad
         price = cost[parents] + self._path_cost(paths[parents, -1], z, phase) + bad
         best = np.argsort(price, kind="stable")[: 2 * _WIDTH]

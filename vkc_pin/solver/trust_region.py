@@ -17,10 +17,9 @@ BLOCK_TIME = 2.5  # [s] of motion that share a radius, at `Options.dt` a waypoin
 FIRST_RADIUS = 0.5  # [m] and [rad] of the trust region at first, and after weights have grown
 INSIDE = 0.9  # share of the radius: steps that end within it were not held back (Ipopt ends a little inside its bounds)
 SETTLE_RADIUS = 0.05  # [m] and [rad] in which planes are as good as distances
-MIN_RADIUS = 5e-3  # [m] and [rad] below which nothing moves any more
 SHRINK = 0.4  # of the radius, or of the step if that was shorter, where a promise did not come true
 NO_MATTER = 0.4  # of the merit, in a block: 8 mm of shortfall at the weight that it has at first
-CLOSE_ENOUGH = 5e-4  # [m] shortfall of clearance at a waypoint that is none, and clearance between waypoints that will do
+CLOSE_ENOUGH = 5e-4  # [m] shortfall at a waypoint, clearance between waypoints, and steps ([rad], too), that do not matter
 
 
 @dataclass(frozen=True)
@@ -99,11 +98,11 @@ class TrustRegion:
         self.radius = np.minimum(self.radius, SETTLE_RADIUS)
 
     def stuck(self, trial: Trial, shortfall: Floats) -> bool:
-        """Return whether nothing moves any more where something is in the way."""
+        """Return whether nothing moves any more, by what is close enough, where something is in the way."""
         bad = shortfall > CLOSE_ENOUGH
         if not bad.any():
             bad[:] = True
-        return bool((np.minimum(self.radius, trial.step)[bad] < MIN_RADIUS).all())
+        return bool((np.minimum(self.radius, trial.step)[bad] < CLOSE_ENOUGH).all())
 
     def restart(self) -> None:
         """Begin again."""

@@ -303,7 +303,8 @@ def test_with_what_is_to_be_reached_the_arm_of_a_tree_ends_there() -> None:
         assert way is not None
         assert way.shape == (30, ROBOT)
         np.testing.assert_allclose(way[-1, :3], GOAL, atol=1e-9)  # there is no reason to turn round
-        allowed = [end[3:], p.start[3:], p.chain.robot.home, grown.routes.folded_arm(0)][: 1 if reaches else None]
+        near = grown.routes.nearest_folded_arm(0, p.start[3:], end[3:])
+        allowed = [end[3:], p.start[3:], p.chain.robot.home, grown.routes.folded_arm(0), near][: 1 if reaches else None]
         assert min(np.abs(way[-1, 3:] - arm).max() for arm in allowed) < 1e-9
 
 
@@ -343,10 +344,53 @@ def test_trees_that_failed_try_less_until_they_succeed_again(monkeypatch: pytest
     monkeypatch.setattr(joining, "connect", connect)
     for number, phase in enumerate([0, 0, 1, 0, 0, 0, 0, 0]):
         monkeypatch.setattr(ways.routes, "guide", lambda *_: np.zeros((2, 3)))
-        monkeypatch.setattr(ways.routes, "folded_arm", lambda _: p.start[3:ROBOT])
+        for name in ("folded_arm", "nearest_folded_arm"):
+            monkeypatch.setattr(ways.routes, name, lambda *_: p.start[3:ROBOT])
         way = ways.path(phase, p.start, at(p, GOAL), 5, turns=True, reaches=True)
         assert (way is not None) == (number == 5)
     assert tries == [TRIES, TRIES // 2, TRIES, TRIES // 4, TRIES // 8, TRIES // 16, TRIES, TRIES // 2]
+
+
+def test_trees_that_failed_where_something_is_held_try_less_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    p, through, _ = door()
+    ways, tries, found = trees(p), list[int](), iter([False, False, True, False])
+
+    def path(*given: Any) -> np.ndarray | None:
+        tries.append(given[-1])
+        return given[-2] if next(found) else None
+
+    monkeypatch.setattr(joining, "held_path", path)
+    for _ in range(4):
+        ways.held(2, through, through)
+    assert tries == [TRIES, TRIES // 2, TRIES // 4, TRIES]
+
+
+def test_where_something_is_held_trees_say_how_the_door_moves_and_where_the_robot_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A door that opens in the second half of its time alone, and a base that is elsewhere in the end."""
+    p, knots, at_ = door()
+    steps, hinge = p.segments - int(p.ends[1]), p.chain.index("door.hinge")
+    asked = []
+
+    def path(_: Knots, phase: int, through: np.ndarray, straight: np.ndarray, tries: int) -> np.ndarray | None:
+        asked.append((phase, len(through), len(straight)))
+        if phase < 2:
+            return None
+        late = straight.copy()
+        late[:, hinge] = np.interp(np.arange(1, steps + 1), [steps / 2, steps], [0.0, 1.2])
+        return late
+
+    monkeypatch.setattr(joining, "held_path", path)
+    monkeypatch.setattr(RrtPaths, "path", lambda self, phase, first, last, steps, **_: straight_way(first, last, steps))
+    z = joiner(p, trees(p)).join(knots, list(at_))
+    assert z is not None
+    assert [phase for phase, _, _ in asked] == [1, 2]
+    assert asked[1][2] == steps
+    np.testing.assert_allclose(z[int(p.ends[1]) + steps // 2 - 1, hinge], 0.0, atol=1e-9)
+    holds_the_handle(z)
+
+
+def straight_way(first: np.ndarray, last: np.ndarray, steps: int) -> np.ndarray:
+    return np.asarray(first + np.outer(np.arange(1, steps + 1) / steps, last - first))[:, :ROBOT]
 
 
 def test_trees_of_a_fixed_base_move_the_arm_alone(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -125,9 +125,9 @@ def test_the_arm_is_folded_once_for_what_is_held(monkeypatch: pytest.MonkeyPatch
 
     def fold(_: object, phase: int, *__: object) -> np.ndarray:
         asked.append(phase)
-        return np.full(6, float(phase))
+        return np.full((1, 6), float(phase))
 
-    monkeypatch.setattr("vkc_pin.seeds.routes.folded_arm", fold)
+    monkeypatch.setattr("vkc_pin.seeds.routes.folded_arms", fold)
     routes = Routes(problem)
     assert [routes.folded_arm(phase)[0] for phase in (0, 1, 0, 1)] == [0.0, 1.0, 0.0, 1.0]
     assert asked == [0, 1]

@@ -105,31 +105,17 @@ def test_straight_ways_are_free_and_no_longer(seed: int) -> None:
     is_a_way(problem, again)
 
 
-@pytest.mark.parametrize(
-    ("turns", "asked", "kept"),
-    [((3.0, 1.0, 2.0), 3, 1.0), ((0.1, 1.0, 2.0), 1, 0.1), ((3.0, 0.1, 2.0), 2, 0.1), ((3.0, None), 2, 3.0), ((None,), 1, None)],
-)
-def test_where_the_arm_goes_far_round_the_shortest_of_a_few_paths_is_kept(
-    monkeypatch: pytest.MonkeyPatch, turns: tuple[float | None, ...], asked: int, kept: float | None
+@pytest.mark.parametrize(("there", "back", "far"), [(1.0, 0.0, False), (1.2, 0.2, False), (2.0, 1.5, True), (3.0, 0.0, False)])
+def test_the_arm_goes_far_round_where_a_third_of_its_way_is_none_of_the_straight_one(
+    there: float, back: float, far: bool
 ) -> None:
-    """A shoulder turns by so much there and back on its way to 1 rad, in what trees find one time after the other."""
-    problem, _, _ = gate()
-    given, tries = iter(turns), list[int]()
-
-    def run(search: trees._Search, ends: np.ndarray, most: int) -> np.ndarray | None:
-        tries.append(most)
-        search.grown = 7
-        turn = next(given)
-        path = np.tile(problem.start[:SIZE], (3, 1))
-        path[:, 3] += [0.0, 1.0 + (turn or 0.0), 1.0]
-        return None if turn is None else path
-
-    monkeypatch.setattr(trees._Search, "run", run)
-    monkeypatch.setattr(trees._Search, "free", lambda search, path: True)
-    monkeypatch.setattr(trees._Search, "straightened", lambda search, path: path)
-    path = through(0)
-    assert tries == [trees.TRIES, 14, 14][:asked]
-    assert (path is None) if kept is None else path is not None and path[1, 3] == pytest.approx(problem.start[3] + 1.0 + kept)
+    """A shoulder turns by so much there and back, in one phase of two; what is held there does not count."""
+    problem = program_of(hall(), [vkc.GoTo(0.5, 0.0), vkc.GoTo(1.0, 0.0)])
+    z, middle = np.tile(problem.start, (problem.segments, 1)), int(problem.ends[0])
+    z[:, 0] = np.linspace(0.0, 1.0, len(z))
+    turn = problem.segments - middle
+    z[middle:, 3] += np.interp(np.arange(1, turn + 1), [0, turn // 2, turn], [0.0, there, there - back])
+    assert trees.far_round(problem, z) == far
 
 
 @pytest.mark.parametrize("finer", [True, False])
@@ -160,7 +146,7 @@ def test_paths_are_straightened_again_where_the_arm_goes_far_round_as_long_as_th
         return path[0] + (0.9 if len(asked) <= 3 else 1.0) * (path - path[0])
 
     monkeypatch.setattr(search, "_evened", evened)
-    monkeypatch.setattr(search, "detour", lambda path: detour)
+    monkeypatch.setattr(trees, "_detour", lambda path, metric: detour)
     path = np.tile(problem.start[:SIZE], (2, 1))
     path[1, 3] += 1.0
     search.straightened(path)
@@ -168,15 +154,14 @@ def test_paths_are_straightened_again_where_the_arm_goes_far_round_as_long_as_th
 
 
 def test_a_detour_is_the_share_of_a_path_that_the_arm_goes_beyond_its_straight_way() -> None:
-    problem, guide, arms = gate()
-    search = trees._Search(problem, 0, problem.start, guide, arms, np.random.default_rng(0), 0.04)
+    problem, metric = gate()[0], gate()[0].chain.metric[:SIZE]
     path = np.tile(problem.start[:SIZE], (3, 1))
     path[1:, 0] += [0.5, 0.0]
     path[1:, 4] += [0.3, 0.1]
     driven, turned = problem.chain.metric[[0, 4]]  # what a metre and a radian count
-    assert search.detour(path) == pytest.approx(0.4 * turned / (1.0 * driven + 0.5 * turned))
-    assert search.detour(path[[0, 2]]) == pytest.approx(0.0)
-    assert search.detour(path[:1]) == 0.0
+    assert trees._detour(path, metric) == pytest.approx(0.4 * turned / (1.0 * driven + 0.5 * turned))
+    assert trees._detour(path[[0, 2]], metric) == pytest.approx(0.0)
+    assert trees._detour(path[:1], metric) == 0.0
 
 
 def is_a_way(problem: vkc.TrajectoryProblem, path: np.ndarray) -> None:

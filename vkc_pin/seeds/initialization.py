@@ -17,6 +17,7 @@ from vkc_pin.seeds.beam import Beam, Found
 from vkc_pin.seeds.joining import Joiner, RrtPaths, base_paths
 from vkc_pin.seeds.knots import ALIKE, Knots, Known, follow_objects
 from vkc_pin.seeds.routes import Routes
+from vkc_pin.seeds.rrt import far_round
 from vkc_pin.seeds.seed import Seed, perturbed
 
 __all__ = ["INITIALIZATIONS", "initialize"]
@@ -237,7 +238,7 @@ class _SeedSearch:
         """Return whether the base is elsewhere somewhere along paths, (K, n), by more than a clearance [m] or [rad]."""
         return bool(np.abs(path - other)[:, :3].max() > self.problem.options.dist_safe)
 
-    def _will_do(self, short: float, overlap: float) -> bool:
+    def _will_do(self, z: Floats, short: float, overlap: float) -> bool:
         """Return whether a seed that falls so short of clearances [m], and overlaps so much [m], is not compared with others."""
         return short < _POOR
 
@@ -259,13 +260,13 @@ class _SeedSearch:
             merit = self.problem.objective(z, self.problem.timing_for(z).dt) + self.problem.options.penalty * float(short.sum())
             if merit < least:
                 best, least = (path, z, overlap), merit
-            if self._will_do(float(short.sum()), overlap):
+            if self._will_do(z, float(short.sum()), overlap):
                 break
         return best
 
 
 class _Rrt(_SeedSearch):
-    """Base and arm together along what two random trees find; slow, so the first seed that is nearly free will do."""
+    """Base and arm together along what two random trees find; slow, so the first seed that is nearly free and direct will do."""
 
     alike = 3  # where nothing leads along the base's path, hardly anything does with another arm
 
@@ -290,8 +291,8 @@ class _Rrt(_SeedSearch):
         self.vain.add(backwards)
         return None
 
-    def _will_do(self, short: float, overlap: float) -> bool:
-        return overlap <= _POOR
+    def _will_do(self, z: Floats, short: float, overlap: float) -> bool:
+        return overlap <= _POOR and not far_round(self.problem, z)
 
     def _ordered(self, found: Found) -> Iterable[Floats]:
         return found.paths[np.lexsort((found.cost, found.trouble > 0))]  # those with knots in collision last

@@ -9,6 +9,7 @@ import numpy as np
 from vkc_pin.arrays import Floats
 from vkc_pin.driving.curves import Curves, between, spread_along
 from vkc_pin.seeds.approach import Approach
+from vkc_pin.seeds.held import held_path
 from vkc_pin.seeds.knots import Knots, smooth
 from vkc_pin.seeds.routes import Routes
 from vkc_pin.seeds.rrt import TRIES, connect, spread
@@ -55,7 +56,7 @@ class CurvePaths:
 
 
 class RrtPaths:
-    """Base and arm along a path that two random trees find, guided by one of the base."""
+    """Base and arm along what two random trees find: guided by a path of the base, or on the manifold of what is held."""
 
     careful = True
 
@@ -77,15 +78,25 @@ class RrtPaths:
             else:
                 guide[:, 2] -= turned  # the trees find where there is room to turn
             poses = guide
-        arms = [first[3:size], last[3:size], problem.chain.robot.home, self.routes.folded_arm(phase)]
+        folded = self.routes.folded_arm(phase), self.routes.nearest_folded_arm(phase, first[3:size], last[3:size])
+        arms = [first[3:size], last[3:size], problem.chain.robot.home, *folded]
         ends = np.tile(last[:size], (1 if reaches else len(arms), 1))
         if not reaches:
             ends[:, 3:] = arms
-        tries = max(1, TRIES // 2 ** self.failed[phase])  # what failed before is likely to fail again
-        given = {"poses": poses, "arms": np.array(arms), "rng": self.knots.rng, "tries": tries}
-        path = connect(problem, phase, first, ends, **given)
+        rng, tries = self.knots.rng, self._tries(phase)
+        path = connect(problem, phase, first, ends, poses=poses, arms=np.array(arms), rng=rng, tries=tries)
         self.failed[phase] = 0 if path is not None else self.failed[phase] + 1
         return None if path is None else spread(path, steps, self.knots.chain.metric[: path.shape[1]])
+
+    def held(self, phase: int, through: Floats, straight: Floats) -> Floats | None:
+        """Return waypoints of a phase in which something fixed is held, if the straight ones overlap things; see `held_path`."""
+        path = held_path(self.knots, phase, through, straight, self._tries(phase))
+        self.failed[phase] = 0 if path is not None else self.failed[phase] + 1
+        return path
+
+    def _tries(self, phase: int) -> int:
+        """Return how often trees may grow in a phase: what failed before is likely to fail again."""
+        return max(1, TRIES // 2 ** self.failed[phase])
 
 
 Paths = CurvePaths | DrivenPaths | RrtPaths
@@ -118,16 +129,20 @@ class Joiner:
         None if there is no path somewhere.
         """
         problem, size = self.problem, self.problem.chain.size
-        z, knots = np.empty((problem.segments, size)), through.copy()
+        z, knots, objects = np.empty((problem.segments, size)), through.copy(), self.knots.objects.copy()
         begin, previous = 0, None
         for number, (phase, end) in enumerate(zip(problem.task.phases, problem.ends.tolist(), strict=True)):
             inside = [k for k, waypoint in enumerate(at) if begin <= waypoint <= end]
             if problem.closed(phase):
                 self._straight(z[begin:end], knots[inside], [at[k] - begin for k in inside])
+                held = self.paths.held(number, knots[inside], z[begin:end]) if isinstance(self.paths, RrtPaths) else None
+                if held is not None:
+                    z[begin:end] = objects[begin:end] = held
+                    knots[inside[-1]] = held[-1]
             elif not self._open(z[begin:end], knots, inside, number, previous):
                 return None
             begin, previous = end, phase
-        self._close(z)
+        self._close(z, objects)
         return problem.clip(z)
 
     def _straight(self, z: Floats, through: Floats, when: list[int]) -> None:
@@ -186,15 +201,15 @@ class Joiner:
     def _free(self, z: Floats, waypoint: int) -> bool:
         return not len(z) or bool(np.all(self.knots.depth(z, waypoint) < self.problem.options.dist_safe / 2))
 
-    def _close(self, z: Floats) -> None:
-        """Move the objects' joints in z, shape (N, n), as they are driven, and the robot with what it holds."""
+    def _close(self, z: Floats, objects: Floats) -> None:
+        """Move the objects' joints in z, shape (N, n), as they are driven in `objects`, and the robot with what it holds."""
         problem, driven = self.problem, self.knots.driven
-        z[:, driven] = self.knots.objects[:, driven]
+        z[:, driven] = objects[:, driven]
         for pose, row in enumerate(problem.transcription.structure.poses):
             if len(row.waypoints) > 1:
                 rows = np.array(row.waypoints) - 1
                 lower, upper = problem.lower[rows].copy(), problem.upper[rows].copy()
-                lower[:, driven] = upper[:, driven] = self.knots.objects[np.ix_(rows, driven)]
+                lower[:, driven] = upper[:, driven] = objects[np.ix_(rows, driven)]
                 if self.knots.curves is not None:
                     lower[:, :3] = upper[:, :3] = z[rows, :3]
                 solver, target = self.knots.solver(pose)

@@ -1,28 +1,29 @@
-"""Paths of the base for every phase of a problem: A* around what stands there, with what is carried."""
+"""Paths of the base for every phase of a problem: A* around what stands there, with what is carried; arms folded for it."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.arrays import Floats
+from vkc_pin.arrays import Bools, Floats
 from vkc_pin.distances.threads import available_threads
-from vkc_pin.driving.body import Shape
+from vkc_pin.driving.body import Shape, hull_points
 from vkc_pin.driving.curves import Curves, spread_along
 from vkc_pin.driving.grid import BaseGrid, fine_cells
 from vkc_pin.driving.path import BasePath, poses_along, shortest_path
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.scene.hold import Hold
 from vkc_pin.scene.obstacles import FLOOR
-from vkc_pin.seeds.folded_arm import folded_arm
-from vkc_pin.seeds.knots import ALIKE
+from vkc_pin.seeds.knots import ALIKE, depth
 
-__all__ = ["Routes", "grid_shapes"]
+__all__ = ["Routes", "folded_arms", "grid_shapes"]
 
 _ARM_BASE = 2  # the joint of the model that is the arm's first: joint 1 is the base
 _REACHING_RADIUS = 0.4  # [m] from the ends of a path within which the arm reaches in and out, and only the base counts
+_POSTURES = 1000  # random postures: with 192 the arm may stay wider than the base, with 4000 it gets no narrower
 
 
 class Routes:
@@ -63,10 +64,23 @@ class Routes:
         return self._grids[key]
 
     def folded_arm(self, phase: int) -> Floats:
-        """Return the arm folded with what is held in a phase, shape (m - 3,); see `folded_arm.folded_arm`."""
+        """Return the arm, shape (m - 3,) [m] and [rad], that is folded most with what is held in a phase; see `folded_arms`."""
+        return np.asarray(self._folded_arms(phase)[0])
+
+    def nearest_folded_arm(self, phase: int, first: Floats, last: Floats) -> Floats:
+        """Return the folded arm, shape (m - 3,), by way of which it is least far from one to another, both (m - 3,)."""
+        chain, arms = self.problem.chain, self._folded_arms(phase)
+        turning = [self.problem.unit(name) == "rad" for name in chain.names[self.arm]]
+        wound = arms + 2.0 * np.pi * np.array([0.0, -1.0, 1.0])[:, None, None] * turning
+        ways = (np.abs(wound - first) + np.abs(wound - last)) * chain.metric[self.arm]
+        ways[1:][(wound < chain.lower[self.arm])[1:] | (wound > chain.upper[self.arm])[1:]] = np.inf
+        nearest = int(np.argmin(ways.min(axis=0).sum(axis=1)))
+        return np.asarray(wound[ways[:, nearest].argmin(axis=0), nearest, np.arange(len(first))])
+
+    def _folded_arms(self, phase: int) -> Floats:
         held = self.problem.task.phases[phase].held
         if held not in self._folded:
-            self._folded[held] = folded_arm(self.problem, phase, self._resting())
+            self._folded[held] = folded_arms(self.problem, phase, self._resting())
         return self._folded[held]
 
     def _resting(self) -> Floats:
@@ -128,6 +142,60 @@ class Routes:
                 grid = self.grid(phase, folded=folded)
                 return self._poses(grid, path, steps, grid.turning)
         return None
+
+
+def folded_arms(problem: TrajectoryProblem, phase: int, resting: Floats) -> Floats:
+    """Return arms, shape (F, m - 3) [m] and [rad], with which the robot is compact: of random postures, the same every time.
+
+    The first is the best of all: what counts is how far the arm, and what is carried, reach from the base's origin along its
+    three axes, in sum. The others reach no further over the floor than that one, or than the base itself, along either axis. The
+    robot is free of collisions with itself and with what it carries.
+
+    Args:
+        problem: Whose robot it is.
+        phase: In which it carries what it carries.
+        resting: Where robot and load rest, shape (n,): what is not the arm stays so; where the base is does not matter.
+    """
+    chain, rng = problem.chain, np.random.default_rng(0)
+    arm, home = slice(3, chain.robot.coordinates.size), chain.robot.home
+    turns = np.array([problem.unit(name) == "rad" for name in chain.names[arm]])
+    lower = np.where(turns, np.maximum(chain.lower[arm], home - np.pi), chain.lower[arm])
+    upper = np.where(turns, np.minimum(chain.upper[arm], home + np.pi), chain.upper[arm])
+    z = np.tile(resting, (_POSTURES, 1))
+    z[:, arm] = [home, *rng.uniform(lower, upper, (_POSTURES - 1, len(home)))]
+    reach, base = _reach(problem, phase, z)
+    order = np.argsort(reach.sum(axis=1), kind="stable")
+    for tried in np.array_split(order, math.isqrt(_POSTURES)):  # one of the first is mostly free
+        free = tried[_apart(problem, phase, z[tried])]
+        if len(free):
+            best = free[0]
+            room = np.maximum(base, reach[best])[:2]
+            others = np.flatnonzero((reach[:, :2] <= room).all(axis=1))
+            return np.vstack([z[best, arm], z[others[_apart(problem, phase, z[others])], arm]])
+    return np.array(home[None])
+
+
+def _apart(problem: TrajectoryProblem, phase: int, z: Floats) -> Bools:
+    """Return with which configurations, shape (B, n), the robot keeps its margins to itself and to what it carries."""
+    return depth(problem, z, problem.contacts.inside(phase), standing=False) <= 0.0
+
+
+def _reach(problem: TrajectoryProblem, phase: int, z: Floats) -> tuple[Floats, Floats]:
+    """Return how far what the base carries in a phase reaches along the base's axes, and the base itself, (B, 3) and (3,) [m]."""
+    chain, shapes = problem.chain, problem.contacts.phases[phase].shapes
+    rotations, translations = chain.joint_placements(z)
+    reach, base = np.zeros((len(z), 3)), np.zeros(3)
+    carried = problem.contacts.carried(phase)
+    for shape in (shapes[i] for i in [*range(len(chain.robot.collision.geometryObjects)), *carried]):
+        joint = shape.parentJoint
+        corners, radius = hull_points(shape.geometry, shape.placement, outer=True)
+        at = rotations[:, joint] @ corners.T + translations[:, joint, :, None] - translations[:, 1, :, None]
+        own = np.abs(rotations[:, 1].transpose(0, 2, 1) @ at).max(axis=2) + radius
+        if joint > 1:
+            np.maximum(reach, own, out=reach)
+        else:
+            np.maximum(base, own[0], out=base)
+    return reach, base
 
 
 def grid_shapes(problem: TrajectoryProblem, phase: int, z: Floats) -> tuple[list[tuple[int, Shape]], list[Shape]]:

@@ -19,7 +19,7 @@ from vkc_pin.needed import compiled_module
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.knots import depth, smooth
 
-__all__ = ["TRIES", "connect", "spread"]
+__all__ = ["TRIES", "connect", "far_round", "spread"]
 
 TRIES = 1500
 """How often a tree may grow until they meet."""
@@ -27,7 +27,6 @@ TRIES = 1500
 _STEPS = (0.15, 0.04)  # [rad] between configurations that are looked at; the latter where the former overlooked something
 _STRAIGHTENINGS = 11  # times that the arm and each of its joints are tried to be straightened between random places
 _WORTH = 1e-3  # share of a path's length that is to be saved by it, or by all of that once more where the arm goes far round
-_PATHS = 3  # paths of trees at most, of which the shortest is kept
 _DETOUR = 1 / 3  # share of a path that the arm goes beyond its straight way, up to which no other one is looked for
 _BESIDE_PATH = 0.1  # [m] and [rad] standard deviation, at most, of bases beside their path
 _AROUND = 0.4  # [m] and [rad] standard deviation, at most, of bases around the ends, and of arms
@@ -46,9 +45,6 @@ def connect(
 ) -> Floats | None:
     """Return configurations of the robot, straight between which hardly anything is hit, shape (K, m), or None if none are found.
 
-    Where the arm goes far round, other paths are looked for, too, and the shortest is kept: trees take a share of a second, and
-    the solver stays on the side of things on which it begins.
-
     Args:
         problem: Whose robot and phase it is.
         phase: In which nothing fixed is held.
@@ -60,19 +56,25 @@ def connect(
         tries: How often a tree may grow.
     """
     coarse, fine = (_Search(problem, phase, first, poses, arms, rng, step) for step in _STEPS)
-    best = None
-    for _ in range(_PATHS):
-        path = coarse.run(ends, tries)
-        if path is not None and not fine.free(path):
-            path = fine.run(ends, tries)
-        if path is None:
-            break
-        path = fine.straightened(path)
-        best = path if best is None or fine.length(path) < fine.length(best) else best
-        if fine.detour(best) <= _DETOUR:
-            break
-        tries = min(tries, 2 * coarse.grown)  # another one is welcome if it is found as soon
-    return best
+    path = coarse.run(ends, tries)
+    if path is not None and not fine.free(path):
+        path = fine.run(ends, tries)
+    return None if path is None else fine.straightened(path)
+
+
+def far_round(problem: TrajectoryProblem, z: Floats) -> bool:
+    """Return whether the arm goes far round in a phase of a motion, z_1..z_N of shape (N, n), in which nothing fixed is held."""
+    rows, metric = problem.waypoints(z)[:, : problem.chain.robot.coordinates.size], problem.chain.metric
+    spans = zip(problem.task.phases, itertools.pairwise([0, *problem.ends.tolist()]), strict=True)
+    ways = [rows[begin : end + 1] for phase, (begin, end) in spans if not problem.closed(phase)]
+    return any(_detour(way, metric[: way.shape[1]]) > _DETOUR for way in ways)
+
+
+def _detour(path: Floats, metric: Floats) -> float:
+    """Return which share of a path of the robot, shape (K, m), the arm goes beyond its straight way, in a metric, shape (m,)."""
+    base, arm = np.split(path * metric, [3], axis=1)
+    way, driven = np.abs(np.diff(arm, axis=0)).sum(), np.linalg.norm(np.diff(base, axis=0), axis=1).sum()
+    return float((way - np.abs(arm[-1] - arm[0]).sum()) / max(way + driven, 1e-12))
 
 
 def spread(path: Floats, steps: int, metric: Floats) -> Floats:
@@ -84,11 +86,7 @@ def spread(path: Floats, steps: int, metric: Floats) -> Floats:
 
 
 class _Search:
-    """Looks for paths in one phase, in which nothing fixed is held; what takes long is compiled (`_trees.cpp`).
-
-    Attributes:
-        grown: How often trees grew the last time, until they met, or no more.
-    """
+    """Looks for paths in one phase, in which nothing fixed is held; what takes long is compiled (`_trees.cpp`)."""
 
     def __init__(
         self,
@@ -107,13 +105,12 @@ class _Search:
         self.weights = problem.chain.metric[: self.size]
         limits = np.array([problem.limits(name) for name in problem.chain.names[: self.size]])
         self.lower, self.upper = np.ascontiguousarray(limits.T)
-        self.grown = 0
 
     def run(self, ends: Floats, tries: int) -> Floats | None:
         """Return the path to one of `ends`."""
         short = self._depth(ends)
         ends = ends[short <= max(self.allowed, short.min())]
-        path, self.grown = self._trees.run(_array(self.first[None, : self.size]), _array(ends), tries)
+        path, _ = self._trees.run(_array(self.first[None, : self.size]), _array(ends), tries)
         self._spend()
         return self._shortened(path) if len(path) else None
 
@@ -185,7 +182,7 @@ class _Search:
         length, path = np.inf, self._evened(path, 0)
         while self.length(path) < (1.0 - _WORTH) * length:
             length, path = self.length(path), self._evened(path, _STRAIGHTENINGS)
-            if self.detour(path) <= _DETOUR:
+            if _detour(path, self.weights) <= _DETOUR:
                 break
         return path
 
@@ -198,12 +195,6 @@ class _Search:
     def length(self, path: Floats) -> float:
         """Return how long a path is, shape (K, m)."""
         return float(np.linalg.norm(np.diff(path, axis=0) * self.weights, axis=1).sum())
-
-    def detour(self, path: Floats) -> float:
-        """Return which share of a path, shape (K, m), the arm goes beyond its straight way."""
-        base, arm = (part * weights for part, weights in zip(np.split(path, [3], 1), np.split(self.weights, [3]), strict=True))
-        way, driven = np.abs(np.diff(arm, axis=0)).sum(), np.linalg.norm(np.diff(base, axis=0), axis=1).sum()
-        return float((way - np.abs(arm[-1] - arm[0]).sum()) / max(way + driven, 1e-12))
 
 
 def _array(rows: ArrayLike) -> Floats:

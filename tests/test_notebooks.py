@@ -121,7 +121,7 @@ def test_first_plan(tmp_path: Path) -> None:
     assert half_way == pytest.approx(dict(zip(motion.names, motion.at(motion.times[-1] / 2), strict=True)), abs=6e-4)
     assert "wrist_3_joint" in text(cells["files"])
     count = int(re.findall(r"(\d+) points", text(cells["files"]))[0])
-    assert count == pytest.approx(100 * motion.times[-1], abs=2)
+    assert -2 < count - 100 * motion.times[-1] < 8  # and where it comes to rest or leaves it
     assert len((tmp_path / "door.csv").read_text(encoding="utf-8").splitlines()) == len(motion.curve.times) + 1
     assert (tmp_path / "door.html").stat().st_size > 100_000
     assert result(cells["again"])["text/plain"].count("True") == 3

@@ -117,8 +117,8 @@ def test_the_others_reach_no_further_over_the_floor_than_the_first_or_the_base(l
     room = np.maximum(own, first)[:2] + 0.03
     for arm in arms[1:]:
         assert np.all(np.max(np.abs(reach(load, with_arm(load, arm))), axis=0)[:2] <= room)
-    heights = [np.max(np.abs(reach(load, with_arm(load, arm))), axis=0).sum() for arm in arms]
-    assert min(heights) > heights[0] - 0.03
+    sizes = [np.max(np.abs(reach(load, with_arm(load, arm))), axis=0).sum() for arm in arms]
+    assert min(sizes) > sizes[0] - 0.03
 
 
 def test_the_nearest_is_that_by_way_of_which_it_is_least_far() -> None:

@@ -16,7 +16,7 @@ from vkc_pin.seeds.beam import Beam
 from vkc_pin.seeds.held import held_path
 from vkc_pin.seeds.joining import Joiner
 from vkc_pin.seeds.knots import Knots, depth
-from vkc_pin.seeds.rrt import TRIES
+from vkc_pin.seeds.rrt import STEP, TRIES
 
 FEW = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=24)
 OPEN = vkc.Actuate("door", {"hinge": 1.2})
@@ -135,17 +135,17 @@ def test_a_path_becomes_no_longer_and_keeps_its_ends() -> None:
     for each in (path, short):
         np.testing.assert_array_equal(each.z[0], through[0])
         assert (each.at[0], each.at[-1]) == (own.begin, own.end)
-        assert own.apart(each.z[1:], each.z[:-1]).max() <= 2.0 * held._STEP + 1e-9
+        assert own.apart(each.z[1:], each.z[:-1]).max() <= 2.0 * STEP + 1e-9
         assert own.free(each.z).all()
     np.testing.assert_array_equal(short.z[-1], path.z[-1])
 
 
-def test_what_was_chosen_at_the_grasp_stays() -> None:
+def test_what_was_chosen_at_the_grasp_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     """Samples hold as it was grasped; here by what the base's x is, which none of them has."""
     p, through, _ = free_door()
+    assert len(finder(p).drawn(through, finder(p).end)) > 0
+    monkeypatch.setattr(Knots, "chosen", lambda self, waypoint: [0])
     own = finder(p)
-    assert len(own.drawn(through, own.end)) > 0
-    own.chosen = [0]
     assert len(own.drawn(through, own.end)) == 0
     z, closed = own.close(through[1:] + 0.01, np.full(len(through) - 1, own.end))
     assert closed.any()

@@ -109,7 +109,7 @@ def test_straight_ways_are_free_and_no_longer(seed: int) -> None:
 def test_the_arm_goes_far_round_where_a_third_of_its_way_is_none_of_the_straight_one(
     there: float, back: float, far: bool
 ) -> None:
-    """A shoulder turns by so much there and back, in one phase of two; what is held there does not count."""
+    """A shoulder turns by so much there and back, in one phase of two."""
     problem = program_of(hall(), [vkc.GoTo(0.5, 0.0), vkc.GoTo(1.0, 0.0)])
     z, middle = np.tile(problem.start, (problem.segments, 1)), int(problem.ends[0])
     z[:, 0] = np.linspace(0.0, 1.0, len(z))
@@ -337,8 +337,7 @@ def test_runs_are_the_free_parts_of_the_way_with_each_arm() -> None:
 
 def raw(one: trees._Search, ends: np.ndarray, tries: int) -> np.ndarray:
     """Return what trees find, as it is before it is shortened."""
-    path, _ = one._trees.run(one.first[None, :SIZE], ends, tries)
-    return np.asarray(path)
+    return np.asarray(one._trees.run(one.first[None, :SIZE], ends, tries))
 
 
 def test_a_tree_that_gets_to_a_run_takes_in_all_of_it() -> None:

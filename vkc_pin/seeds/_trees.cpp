@@ -4,7 +4,6 @@
 #include <stdexcept>
 #include <utility>
 
-#include <nanobind/stl/pair.h>
 
 #include "../distances/arrays.hpp"
 #include "paths.hpp"
@@ -61,8 +60,8 @@ public:
     }
   }
 
-  // A path from `start` to one of `ends`, empty if none was found, and how often trees grew.
-  std::pair<Array<double>, Index> run(const Numbers<2> & start, const Numbers<2> & ends, Index tries)
+  // A path from `start` to one of `ends`, empty if none was found.
+  Array<double> run(const Numbers<2> & start, const Numbers<2> & ends, Index tries)
   {
     check(start);
     check(ends);
@@ -70,12 +69,11 @@ public:
       throw std::invalid_argument("paths begin at one configuration");
     const Rows first = rows_of(start), last = rows_of(ends);
     Rows path;
-    Index grown = 0;
     {
       nb::gil_scoped_release released;
-      path = grow_until_they_meet(first, last, tries, grown);
+      path = grow_until_they_meet(first, last, tries);
     }
-    return {array(path), grown};
+    return array(path);
   }
 
   // Shortened by straight lines between random places on it, as many times as it has configurations.
@@ -144,11 +142,11 @@ private:
     return array(rows);
   }
 
-  Rows grow_until_they_meet(const Rows & start, const Rows & ends, Index tries, Index & grown)
+  Rows grow_until_they_meet(const Rows & start, const Rows & ends, Index tries)
   {
     Tree trees[] = {Tree(start, runs_.size()), Tree(ends, runs_.size())};
     std::deque<Row> direct(ends.begin(), ends.end());
-    for (grown = 1; grown <= tries; ++grown)
+    for (Index grown = 1; grown <= tries; ++grown)
     {
       const bool forwards = !direct.empty() || grown % 2 == 0;
       Tree &tree = trees[forwards ? 0 : 1], &other = trees[forwards ? 1 : 0];
@@ -173,7 +171,6 @@ private:
       there.insert(there.end(), back.begin() + 1, back.end()); // both have where they meet
       return there;
     }
-    grown = tries;
     return {};
   }
 

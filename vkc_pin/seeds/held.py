@@ -13,11 +13,10 @@ import numpy as np
 
 from vkc_pin.arrays import Bools, Floats, Ints
 from vkc_pin.program.merit import TOLERANCE
-from vkc_pin.seeds.knots import SCATTER, Knots, depth, smooth
+from vkc_pin.seeds.knots import SCATTER, Knots, depth
+from vkc_pin.seeds.rrt import STEP, spread
 
 __all__ = ["held_path"]
-
-_STEP = 0.15  # between nodes, in the metric of searches: [rad] of a joint
 
 
 def held_path(knots: Knots, phase: int, through: Floats, straight: Floats, tries: int) -> Floats | None:
@@ -92,16 +91,15 @@ class _Search:
         self.solver, self.target = knots.solver(pose)
         before = self.problem.start if self.begin == 0 else knots.objects[self.begin - 1]
         self.moved = np.vstack([before, knots.objects[self.begin : self.end]])[:, knots.driven]
-        self.chosen = [column for column, grasp, last in self.problem.choices if grasp < self.end <= last]
+        self.chosen = knots.chosen(self.end)
 
     def close(self, z: Floats, at: Floats) -> tuple[Floats, Bools]:
         """Return the nearest configurations with the objects as they are at waypoints, in the hand, and which of them are."""
         z, driven = z.copy(), self.knots.driven
         whole = np.arange(self.begin, self.end + 1)
         z[:, driven] = np.column_stack([np.interp(at, whole, column) for column in self.moved.T])
-        lower, upper = (np.tile(limits[self.waypoint - 1], (len(z), 1)) for limits in (self.problem.lower, self.problem.upper))
-        fixed = [*driven, *self.chosen]
-        lower[:, fixed] = upper[:, fixed] = z[:, fixed]
+        lower, upper = self.knots.limits(z, self.waypoint)
+        lower[:, driven] = upper[:, driven] = z[:, driven]
         return self.solver.solve(z, self.target, lower=lower, upper=upper, weights=self.knots.weights, tolerance=TOLERANCE)
 
     def free(self, z: Floats) -> Bools:
@@ -145,7 +143,7 @@ class _Search:
         reached = self.grow(other, tree.z[tips], tree.at[tips])
         gaps = self.apart(other.z[reached], tree.z[tips])
         best = int(np.argmin(gaps))
-        if gaps[best] > _STEP:
+        if gaps[best] > STEP:
             return None
         here, there = tree.branch(int(tips[best])), other.branch(int(reached[best]))
         return _Path(np.vstack([here.z[::-1], there.z]), np.concatenate([here.at[::-1], there.at]))
@@ -156,14 +154,14 @@ class _Search:
         going = np.arange(len(goals))
         while len(going):
             left = self.apart(tree.z[ends[going]], goals[going])
-            going, left = going[left > _STEP], left[left > _STEP]
-            here, share = ends[going], _STEP / left
+            going, left = going[left > STEP], left[left > STEP]
+            here, share = ends[going], STEP / left
             moved, closed = self.close(
                 tree.z[here] + share[:, None] * (goals[going] - tree.z[here]),
                 now := tree.at[here] + share * (at[going] - tree.at[here]),
             )
             nearer = left - self.apart(moved, goals[going])
-            good = closed & (self.apart(moved, tree.z[here]) <= 2.0 * _STEP) & (nearer > _STEP / 4.0)
+            good = closed & (self.apart(moved, tree.z[here]) <= 2.0 * STEP) & (nearer > STEP / 4.0)
             good[good] = self.free(moved[good])
             going = going[good]
             ends[going] = tree.add(moved[good], now[good], here[good])
@@ -173,7 +171,7 @@ class _Search:
         """Return a path that goes straight, but for closures, between random places on it where nothing is in the way."""
         for _ in range(len(path.z)):
             first, last = sorted(self.knots.rng.integers(len(path.z), size=2))
-            count = int(np.ceil(self.apart(path.z[first], path.z[last]) / _STEP))
+            count = int(np.ceil(self.apart(path.z[first], path.z[last]) / STEP))
             if not 1 < count < last - first:
                 continue
             share = np.arange(1, count)[:, None] / count
@@ -181,7 +179,7 @@ class _Search:
             between, closed = self.close(path.z[first] + share * (path.z[last] - path.z[first]), at)
             way = np.vstack([path.z[first], between, path.z[last]])
             gaps, before = self.apart(way[1:], way[:-1]), path.z[first : last + 1]
-            shorter = gaps.max() <= 2.0 * _STEP and gaps.sum() < self.apart(before[1:], before[:-1]).sum()
+            shorter = gaps.max() <= 2.0 * STEP and gaps.sum() < self.apart(before[1:], before[:-1]).sum()
             if closed.all() and shorter and self.free(between).all():
                 z = np.vstack([path.z[: first + 1], between, path.z[last:]])
                 path = _Path(z, np.concatenate([path.at[: first + 1], at, path.at[last:]]))
@@ -189,8 +187,6 @@ class _Search:
 
     def spread(self, path: _Path, steps: int) -> Floats | None:
         """Return waypoints along a path, shape (steps, n), slow at both ends; None if one of them cannot be closed."""
-        passed = np.concatenate([[0.0], np.cumsum(self.apart(path.z[1:], path.z[:-1]) + 1e-12)])
-        when = passed[-1] * smooth(steps)
-        rows = np.column_stack([np.interp(when, passed, column) for column in path.z.T])
-        rows, closed = self.close(rows, np.interp(when, passed, path.at))
+        rows = spread(np.column_stack([path.z, path.at]), steps, np.append(self.knots.weights, 0.0))
+        rows, closed = self.close(rows[:, :-1], rows[:, -1])
         return rows if closed.all() else None

@@ -108,7 +108,7 @@ class Knots:
     def _knot(self, before: Floats, waypoint: int, how: str) -> tuple[Floats, Bools]:
         z = before.copy()
         z[:, self.driven] = self.objects[waypoint - 1, self.driven]
-        lower, upper = self._limits(before, waypoint)
+        lower, upper = self.limits(before, waypoint)
         pose = self.pose_at(waypoint)
         if pose is None:
             return np.clip(z, lower, upper), np.ones(len(z), bool)
@@ -132,7 +132,7 @@ class Knots:
         rolling, turning = self.problem.rolling, self.chain.robot.lever
         there, (solver, target) = z.copy(), self.solver(pose)
         there[:, :3] = nearest_arc(before[:, :3], z[:, :3], radius=rolling.radius, turning=turning)
-        lower, upper = self._limits(before, waypoint)
+        lower, upper = self.limits(before, waypoint)
         lower[:, :3] = upper[:, :3] = np.clip(there[:, :3], lower[:, :3], upper[:, :3])
         there, reached = solver.solve(there, target, lower=lower, upper=upper, weights=self.weights, tolerance=TOLERANCE)
         return np.where(reached[:, None], there, z), reached
@@ -148,7 +148,7 @@ class Knots:
         return _row_by_row(self.known.cleared, lambda rows, at: self._clear(rows, at, pose), z, waypoint)
 
     def _clear(self, z: Floats, waypoint: int, pose: int) -> Floats:
-        lower, upper = self._limits(z, waypoint)
+        lower, upper = self.limits(z, waypoint)
         if self.curves is not None and self._held_at(waypoint):
             lower[:, :3] = upper[:, :3] = z[:, :3]  # where an arc led to
         solver, target = self.solver(pose)
@@ -157,15 +157,18 @@ class Knots:
         exact, _ = solver.solve(pushed, target, lower=lower, upper=upper, weights=weights, iterations=3, tolerance=TOLERANCE)
         return exact
 
-    def _limits(self, before: Floats, waypoint: int) -> tuple[Floats, Floats]:
+    def limits(self, before: Floats, waypoint: int) -> tuple[Floats, Floats]:
         """Return the limits of what comes from `before`, shape (B, n), at a waypoint: lower and upper, shape (B, n)."""
         row = waypoint - 1
         lower, upper = (np.tile(limits[row], (len(before), 1)) for limits in (self.problem.lower, self.problem.upper))
         lower[:, self.driven] = upper[:, self.driven] = self.objects[row, self.driven]
-        for column, grasp, last in self.problem.choices:
-            if grasp < waypoint <= last:
-                lower[:, column] = upper[:, column] = before[:, column]
+        for column in self.chosen(waypoint):
+            lower[:, column] = upper[:, column] = before[:, column]
         return lower, upper
+
+    def chosen(self, waypoint: int) -> list[int]:
+        """Return the columns that say how something was grasped that is held at a waypoint; they stay as long as it is."""
+        return [column for column, grasp, last in self.problem.choices if grasp < waypoint <= last]
 
     def _shaken(self, z: Floats, pose: int, deviations: tuple[float, float]) -> Floats:
         """Return other arms, of standard deviations between two [m] and [rad], with the base under them as `pose` needs it."""
@@ -242,10 +245,9 @@ def scatter(problem: TrajectoryProblem, waypoint: int, rng: np.random.Generator)
     search = Knots(problem, rng)
     pose, row = search.pose_at(waypoint), waypoint - 1
     z = np.tile(problem.start, (SCATTER, 1))
-    for column, grasp, last in problem.choices:  # how it was grasped is as open as the rest
-        if grasp < waypoint <= last:
-            lower, upper = np.clip([problem.lower[row, column], problem.upper[row, column]], -np.pi, np.pi)
-            z[:, column] = rng.uniform(lower, upper, SCATTER)
+    for column in search.chosen(waypoint):  # how it was grasped is as open as the rest
+        lower, upper = np.clip([problem.lower[row, column], problem.upper[row, column]], -np.pi, np.pi)
+        z[:, column] = rng.uniform(lower, upper, SCATTER)
     if pose is not None:
         z, found = search.knot(z, waypoint, "scatter")
         pushed = z.copy()

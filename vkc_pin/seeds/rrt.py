@@ -19,12 +19,14 @@ from vkc_pin.needed import compiled_module
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.seeds.knots import depth, smooth
 
-__all__ = ["TRIES", "connect", "far_round", "spread"]
+__all__ = ["STEP", "TRIES", "connect", "far_round", "spread"]
 
 TRIES = 1500
 """How often a tree may grow until they meet."""
+STEP = 0.15
+"""Between configurations that are looked at, in the metric of searches: [rad] of a joint."""
 
-_STEPS = (0.15, 0.04)  # [rad] between configurations that are looked at; the latter where the former overlooked something
+_STEPS = (STEP, 0.04)  # of one search after the other: the latter where the former overlooked something
 _STRAIGHTENINGS = 11  # times that the arm and each of its joints are tried to be straightened between random places
 _WORTH = 1e-3  # share of a path's length that is to be saved by it, or by all of that once more where the arm goes far round
 _DETOUR = 1 / 3  # share of a path that the arm goes beyond its straight way, up to which no other one is looked for
@@ -110,7 +112,7 @@ class _Search:
         """Return the path to one of `ends`."""
         short = self._depth(ends)
         ends = ends[short <= max(self.allowed, short.min())]
-        path, _ = self._trees.run(_array(self.first[None, : self.size]), _array(ends), tries)
+        path = self._trees.run(_array(self.first[None, : self.size]), _array(ends), tries)
         self._spend()
         return self._shortened(path) if len(path) else None
 

@@ -15,7 +15,7 @@ from vkc_pin.benchmarks.harness.record import Record, distribution, values
 from vkc_pin.benchmarks.harness.tables import decimal, failures, foot, markdown, quartiles
 from vkc_pin.benchmarks.problems import trials
 from vkc_pin.benchmarks.problems.changes import UNCHANGED, Change, parsed
-from vkc_pin.benchmarks.problems.problem_set import KINDS, NUMBER, TASKS, Problem, kind_of, problem, started
+from vkc_pin.benchmarks.problems.problem_set import KINDS, NUMBER, TASKS, Problem, kind_of, problem, problem_of_task
 from vkc_pin.errors import InputError
 
 __all__ = ["SUMMARY", "every_trial", "report", "run", "specify", "summary"]
@@ -197,9 +197,7 @@ def _ratio(pairs: Sequence[tuple[Record, Record]], field: str) -> str:
 
 @functools.lru_cache(maxsize=2)  # settings take turns at it
 def _problem(task: str | None, seed: int, number: int) -> Problem:
-    if task is None:
-        return problem(number)
-    return Problem(number, f"{task} {number}", task, started(task, seed, number), TASKS[task].steps)
+    return problem(number) if task is None else problem_of_task(task, seed, number)
 
 
 def _record(spec: dict[str, Any]) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from vkc_pin.benchmarks.harness.limits import LIMITS
 from vkc_pin.benchmarks.harness.record import distribution
 from vkc_pin.benchmarks.harness.tables import decimal, failures, foot, markdown, wilson
 from vkc_pin.benchmarks.problems.ablation import every_trial
-from vkc_pin.benchmarks.problems.problem_set import TASKS, started
+from vkc_pin.benchmarks.problems.problem_set import TASKS, problem_of_task
 from vkc_pin.benchmarks.problems.trials import tried
 from vkc_pin.errors import InputError
 
@@ -82,7 +82,5 @@ def report(result: Mapping[str, Any]) -> str:
 
 
 def _record(spec: dict[str, Any]) -> dict[str, Any]:
-    task, number = spec["task"], spec["number"]
-    scene = started(task, spec["seed"], number)
-    more = {"number": number, "task": task, "problem": f"{task} {number}"}
-    return tried(scene, TASKS[task].steps, seed=spec["seed"], **more)
+    own = problem_of_task(spec["task"], spec["seed"], spec["number"])
+    return tried(own.scene, own.steps, seed=spec["seed"], number=own.number, task=own.kind, problem=own.name)

@@ -5,6 +5,7 @@ Which problems these are follows from numbers alone. No planner was asked whethe
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -19,7 +20,7 @@ from vkc_pin.scene.rooms.random_room import random_layout
 from vkc_pin.scene.scene import Scene, load_scene
 from vkc_pin.task.steps import Actuate, Grasp, Place, Reach, Step, Touch
 
-__all__ = ["KINDS", "NUMBER", "TASKS", "Problem", "kind_of", "problem", "started"]
+__all__ = ["KINDS", "NUMBER", "TASKS", "Problem", "kind_of", "problem", "problem_of_task", "started"]
 
 KINDS = ("reach", "door", "pull", "carry", "scene")
 """Kinds of problems: ten of each of the first four, in random rooms, then twenty in scenes that come along."""
@@ -57,7 +58,7 @@ class Problem:
     Attributes:
         number: Which one, from 0.
         name: Of the room or the task, and what is to be done.
-        kind: One of `KINDS`.
+        kind: One of `KINDS`, or a task.
         scene: Where it begins.
         steps: What should change.
     """
@@ -92,9 +93,14 @@ def problem(number: int) -> Problem:
     kind = kind_of(number)
     if kind == "scene":
         name, start = _FIXED[number - (len(KINDS) - 1) * _EACH]
-        return Problem(number, f"{name} {start}", kind, started(name, _STARTS, start), TASKS[name].steps)
+        return dataclasses.replace(problem_of_task(name, _STARTS, start), number=number, kind=kind)
     scene, step, about = {"reach": _reach, "door": _door, "pull": _pull, "carry": _carry}[kind](number)
     return Problem(number, f"{scene.name} {about}", kind, scene, (step,))
+
+
+def problem_of_task(task: str, seed: int, number: int) -> Problem:
+    """Return a task from a random start as a problem, of which both are the kind and the number; see `started`."""
+    return Problem(number, f"{task} {number}", task, started(task, seed, number), TASKS[task].steps)
 
 
 def started(task: str, seed: int, number: int) -> Scene:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -20,11 +19,7 @@ from vkc_pin.motion.dynamics.torques import Torques
 from vkc_pin.motion.world import World
 from vkc_pin.plotting.style import COLOURS, new_figure, save_figure, styled
 from vkc_pin.plotting.top_view import draw_top_view
-from vkc_pin.program.problem import TrajectoryProblem
-from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.placed import standing_geometry
-from vkc_pin.seeds import held, joining
-from vkc_pin.seeds.knots import Knots, depth
 from vkc_pin.visualization import drawing
 from vkc_pin.visualization import viewer as visualization
 
@@ -45,7 +40,6 @@ PUSHED = (2.3, -0.2, 0.8), (-0.5, -2.6, 2.9)
 PUSHING = 14.0  # [s] of the motion at the door that stands open
 CARRIED = 15.0  # [s] of the motion with the tray
 FINGERS = 0.04  # [m] between them
-EVERY = 6  # of the waypoints of a held door, that are drawn
 GAP = (0.1, -0.3, 0.2), (-3.4, -5.0, 5.6)
 FURNITURE = {  # kinds, and the seeds of those that are shown
     **{"door": 1, "drawers": 2, "cabinet": 1, "refrigerator": 2, "dishwasher": 0},
@@ -264,63 +258,6 @@ def opening_picture() -> None:
         save_figure(figure, IMAGES / "opening.png")
 
 
-def held_picture() -> None:
-    """Write a picture of a narrow door on its way shut, from above: straight between knots, and as trees lead the robot."""
-    scene = chores.cluttered_home().with_state("door", {"hinge": 1.52}).with_start(base=(1.2, 2.6, -1.57))
-    seen: list[tuple[TrajectoryProblem, list[np.ndarray]]] = []
-    search = joining.held_path
-
-    def kept(knots: Knots, phase: int, through: np.ndarray, straight: np.ndarray, tries: int) -> np.ndarray | None:
-        path = search(knots, phase, through, straight, tries)
-        if path is not None:
-            own = held._Search(knots, phase, len(straight))
-            closed, _ = own.close(straight, np.arange(own.begin + 1.0, own.end + 1.0))
-            seen.append((knots.problem, [closed, path]))
-        return path
-
-    joining.held_path = kept
-    step = vkc.Actuate("door", {"hinge": 0.0}, "handle_free")
-    plan = vkc.plan(scene, [step], options=chores.CHORES["cluttered"].options, initialization="rrt")
-    joining.held_path = search
-    sys.stdout.write(plan.report() + "\n")
-    problem, ways = seen[-1]
-    phase = len(problem.task.phases) - 1
-    with styled():
-        figure = new_figure(8.0, 3.9)
-        for number, (way, title) in enumerate(zip(ways, ("straight between knots", "as trees lead it"), strict=True)):
-            axes = figure.add_subplot(1, 2, number + 1)
-            short = depth(problem, way, problem.contacts.inside(phase), reach=0.0) - problem.options.dist_safe
-            draw_held(axes, problem, way, int(np.argmax(short)) if short.max() > 0.0 else None)
-            overlap = f"{1e3 * short.max():.0f} mm inside at most" if short.max() > 0.0 else "nothing overlaps"
-            axes.set_title(f"{title}: {overlap}")
-        save_figure(figure, IMAGES / "held.png")
-
-
-def draw_held(axes: Any, problem: TrajectoryProblem, way: np.ndarray, worst: int | None) -> None:
-    """Draw walls, and the arm and the door's leaf at some of the waypoints; at the worst in another colour."""
-    from matplotlib.colors import to_rgb
-    from scipy.spatial import ConvexHull
-
-    part = problem.contacts.phases[len(problem.task.phases) - 1]
-    rotations, translations = problem.chain.joint_placements(way)
-    shown = [*range(0, len(way), EVERY), *([] if worst is None else [worst])]
-    for shape, label in zip(part.shapes, part.labels, strict=True):
-        points = triangles(shape.geometry)[0]
-        for k in shown if shape.parentJoint else [0]:
-            placed = pin.SE3(rotations[k, shape.parentJoint], translations[k, shape.parentJoint]) * shape.placement
-            at = points @ placed.rotation.T + placed.translation
-            arm = 1 < shape.parentJoint < 8
-            if label == FLOOR or (not arm and not 0.5 < at[:, 2].min() + 0.5 * np.ptp(at[:, 2]) < 1.5):
-                continue
-            outline = at[ConvexHull(at[:, :2]).vertices, :2]
-            if shape.parentJoint == 0:
-                axes.fill(*outline.T, facecolor="0.75", edgecolor="0.5", linewidth=0.5)
-            elif arm or label.startswith("door"):
-                colour = COLOURS[1] if k == worst else COLOURS[0] if arm else "0.4"
-                axes.fill(*outline.T, facecolor=(*to_rgb(colour), 0.12), edgecolor=colour, linewidth=1.0 if k == worst else 0.6)
-    axes.set(xlim=(0.9, 2.3), ylim=(0.45, 2.05), aspect="equal", xlabel="x [m]", ylabel="y [m]")
-
-
 def torque_picture() -> None:
     """Write what the motors do while a door with a closer is opened, against what they have, over time."""
     scenes = vkc.load_scene("door"), closer(damping=400.0, stiffness=5.0, springref=-2.0)
@@ -381,7 +318,6 @@ def main() -> int:
     push_picture()
     bases_picture()
     opening_picture()
-    held_picture()
     torque_picture()
     return 0
 

@@ -140,6 +140,25 @@ def test_a_path_becomes_no_longer_and_keeps_its_ends() -> None:
     np.testing.assert_array_equal(short.z[-1], path.z[-1])
 
 
+@pytest.mark.parametrize("out", [False, True])
+def test_a_path_that_cannot_be_closed_somewhere_gives_no_waypoints(out: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The base has to stand where no arm reaches the handle from."""
+    _, through, _ = free_door()
+    own = finder(blocked(), 5)
+    path = own.run(through, TRIES)
+    assert path is not None
+    limits = own.knots.limits
+
+    def beyond(z: np.ndarray, waypoint: int) -> tuple[np.ndarray, np.ndarray]:
+        lower, upper = limits(z, waypoint)
+        lower[:, 0] = upper[:, 0] = -3.0
+        return lower, upper
+
+    if out:
+        monkeypatch.setattr(own.knots, "limits", beyond)
+    assert (own.spread(path, own.end - own.begin) is None) == out
+
+
 def test_what_was_chosen_at_the_grasp_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     """Samples hold as it was grasped; here by what the base's x is, which none of them has."""
     p, through, _ = free_door()

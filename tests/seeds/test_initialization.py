@@ -457,6 +457,33 @@ def test_trees_search_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
     assert np.abs(apart).max(axis=1).min() < 1e-3
 
 
+def test_where_the_arm_goes_far_round_trees_grow_from_other_grasps_too_and_the_least_merit_wins(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As many as are compared, if it goes far round from all of them; the first alone, if it does not."""
+    joined, join = list[np.ndarray](), joining.Joiner.join
+
+    def joins(self: joining.Joiner, through: np.ndarray, at: list[int]) -> np.ndarray | None:
+        z = join(self, through, at)
+        joined.extend([] if z is None else [z])
+        return z
+
+    monkeypatch.setattr(joining.Joiner, "join", joins)
+    (first,) = initialize(problem(), "rrt", 0)
+    assert len(joined) == 1
+    joined.clear()
+    monkeypatch.setattr(initialization, "far_round", lambda *_: True)
+    (best,) = initialize(problem(), "rrt", 0)
+    assert 1 < len(joined) <= initialization._COMPARED_PATHS
+    np.testing.assert_array_equal(joined[0], first.z)
+
+    def merit(z: np.ndarray) -> float:
+        contacts = problem().evaluate_contacts(z, reach=problem().options.largest_margin, nearest=1)
+        return problem().objective(z, problem().timing_for(z).dt) + problem().options.penalty * contacts.shortfall(len(z)).sum()
+
+    assert merit(best.z) == min(map(merit, joined))
+
+
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_of_every_kind_so_many_seeds_are_asked_for(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: dict[str, int] = {}

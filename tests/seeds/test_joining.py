@@ -366,31 +366,42 @@ def test_trees_that_failed_where_something_is_held_try_less_too(monkeypatch: pyt
 
 
 def test_where_something_is_held_trees_say_how_the_door_moves_and_where_the_robot_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A door that opens in the second half of its time alone, and a base that is elsewhere in the end."""
-    p, knots, at_ = door()
-    steps, hinge = p.segments - int(p.ends[1]), p.chain.index("door.hinge")
-    asked = []
+    """A door that opens in the second half of its time alone, and another posture in the end, from which the next phase leads."""
+    p = program_of(door_scene(), [OPEN, vkc.GoTo(-1.0, 0.5)], options=FEW)
+    own = Knots(p, np.random.default_rng(0))
+    found = Beam(own).search(thorough=True)
+    knots, move = found.paths[int(np.argmin(found.cost))], int(p.ends[2])
+    begin, hinge, at_ = int(p.ends[1]), p.chain.index("door.hinge"), found.at.index(move)
+    others = found.paths[found.trouble < 1e3, at_]
+    other = others[int(np.abs(others - knots[at_])[:, :ROBOT].max(axis=1).argmax())]
+    assert np.abs(other - knots[at_])[:3].max() > 0.05, "they all end in the same place"
+    asked, firsts = list[tuple[int, int]](), list[np.ndarray]()
 
     def path(_: Knots, phase: int, through: np.ndarray, straight: np.ndarray, tries: int) -> np.ndarray | None:
-        asked.append((phase, len(through), len(straight)))
+        asked.append((phase, len(straight)))
         if phase < 2:
             return None
         late = straight.copy()
-        late[:, hinge] = np.interp(np.arange(1, steps + 1), [steps / 2, steps], [0.0, 1.2])
+        late[:, hinge] = np.interp(np.arange(1, len(late) + 1), [len(late) / 2, len(late)], [0.0, 1.2])
+        late[-1] = other
         return late
 
+    def way(self: RrtPaths, phase: int, first: np.ndarray, last: np.ndarray, steps: int, **_: Any) -> np.ndarray:
+        firsts.append(first.copy())
+        return np.asarray(first + np.outer(np.arange(1, steps + 1) / steps, last - first))[:, :ROBOT]
+
     monkeypatch.setattr(joining, "held_path", path)
-    monkeypatch.setattr(RrtPaths, "path", lambda self, phase, first, last, steps, **_: straight_way(first, last, steps))
-    z = joiner(p, trees(p)).join(knots, list(at_))
+    monkeypatch.setattr(RrtPaths, "path", way)
+    z = joiner(p, trees(p)).join(knots, list(found.at))
     assert z is not None
-    assert [phase for phase, _, _ in asked] == [1, 2]
-    assert asked[1][2] == steps
-    np.testing.assert_allclose(z[int(p.ends[1]) + steps // 2 - 1, hinge], 0.0, atol=1e-9)
-    holds_the_handle(z)
-
-
-def straight_way(first: np.ndarray, last: np.ndarray, steps: int) -> np.ndarray:
-    return np.asarray(first + np.outer(np.arange(1, steps + 1) / steps, last - first))[:, :ROBOT]
+    assert asked == [(1, begin - int(p.ends[0])), (2, move - begin)]
+    np.testing.assert_allclose(z[begin + (move - begin) // 2 - 1, hinge], 0.0, atol=1e-9)
+    for row in z[int(p.ends[0]) - 1 : move]:
+        assert hand_off_the_handle(door_scene(), row, row[hinge], row[p.chain.index("door.knob")]) < 1e-3
+    assert z[move - 1, hinge] == pytest.approx(1.2)
+    np.testing.assert_allclose(z[move - 1], other, atol=1e-3)
+    there = Approach(own).after(other, p.task.phases[3], p.task.phases[2])
+    np.testing.assert_allclose(firsts[-1], there[0] if len(there) and own.depth(there, p.contacts.inside(3))[0] < 0.01 else other)
 
 
 def test_trees_of_a_fixed_base_move_the_arm_alone(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,7 @@ from vkc_pin.plotting.style import COLOURS, new_figure, save_figure, styled
 from vkc_pin.program.problem import TrajectoryProblem
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.seeds import held, joining
-from vkc_pin.seeds.knots import Knots, depth
+from vkc_pin.seeds.knots import depth
 
 EVERY = 6  # of the waypoints that are drawn
 
@@ -25,20 +25,20 @@ def main() -> int:
     """Write a picture of a narrow door on its way shut, from above: straight between knots, and as trees lead the robot."""
     scene = chores.cluttered_home().with_state("door", {"hinge": 1.52}).with_start(base=(1.2, 2.6, -1.57))
     seen: list[tuple[TrajectoryProblem, list[np.ndarray]]] = []
-    search = joining.held_path
+    search = joining.RrtPaths.held
 
-    def kept(knots: Knots, phase: int, through: np.ndarray, straight: np.ndarray, tries: int) -> np.ndarray | None:
-        path = search(knots, phase, through, straight, tries)
+    def kept(paths: joining.RrtPaths, phase: int, through: np.ndarray, straight: np.ndarray) -> np.ndarray | None:
+        path, knots = search(paths, phase, through, straight), paths.knots
         if path is not None:
             own = held._Search(knots, phase, len(straight))
             closed, _ = own.close(straight, np.arange(own.begin + 1.0, own.end + 1.0))
             seen.append((knots.problem, [closed, path]))
         return path
 
-    joining.held_path = kept
+    joining.RrtPaths.held = kept
     step = vkc.Actuate("door", {"hinge": 0.0}, "handle_free")
     plan = vkc.plan(scene, [step], options=chores.CHORES["cluttered"].options, initialization="rrt")
-    joining.held_path = search
+    joining.RrtPaths.held = search
     sys.stdout.write(plan.report() + "\n")
     problem, ways = seen[-1]
     phase = len(problem.task.phases) - 1

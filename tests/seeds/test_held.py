@@ -13,7 +13,7 @@ from vkc_pin.budget import Budget, SpentError
 from vkc_pin.scene.scene import Scene
 from vkc_pin.seeds import held
 from vkc_pin.seeds.beam import Beam
-from vkc_pin.seeds.held import held_path
+from vkc_pin.seeds.held import held_path, obstructed
 from vkc_pin.seeds.joining import Joiner
 from vkc_pin.seeds.knots import Knots, depth
 from vkc_pin.seeds.rrt import STEP, TRIES
@@ -54,7 +54,7 @@ def blocked() -> vkc.TrajectoryProblem:
 
 def search(seed: int, *, tries: int = TRIES) -> np.ndarray | None:
     _, through, straight = free_door()
-    return held_path(Knots(blocked(), np.random.default_rng(seed)), MOVE, through, straight, tries)
+    return held_path(Knots(blocked(), np.random.default_rng(seed)), MOVE, through, len(straight), tries)
 
 
 def overlap(p: vkc.TrajectoryProblem, rows: np.ndarray) -> float:
@@ -81,18 +81,18 @@ def test_they_lead_around_what_is_in_the_way_with_the_handle_in_the_hand(seed: i
     assert steps.max() < 0.6
 
 
-def test_what_is_free_stays_straight() -> None:
+def test_what_is_free_is_not_obstructed_and_neither_is_what_begins_in_collision() -> None:
     p, through, straight = free_door()
     assert overlap(p, straight) <= 0.0
-    assert held_path(Knots(p, np.random.default_rng(0)), MOVE, through, straight, TRIES) is None
-
-
-def test_few_tries_and_a_start_in_collision_lead_nowhere() -> None:
-    _, through, straight = free_door()
-    assert search(0, tries=0) is None
-    inside = through.copy()
+    assert not obstructed(Knots(p, np.random.default_rng(0)), MOVE, through, straight)
+    knots, inside = Knots(blocked(), np.random.default_rng(0)), through.copy()
+    assert obstructed(knots, MOVE, through, straight)
     inside[0] = straight[len(straight) // 2]
-    assert held_path(Knots(blocked(), np.random.default_rng(0)), MOVE, inside, straight, TRIES) is None
+    assert not obstructed(knots, MOVE, inside, straight), "no tree leads out of things"
+
+
+def test_without_tries_nothing_is_found() -> None:
+    assert search(0, tries=0) is None
 
 
 def test_equal_random_numbers_give_equal_paths() -> None:

@@ -351,17 +351,21 @@ def test_trees_that_failed_try_less_until_they_succeed_again(monkeypatch: pytest
     assert tries == [TRIES, TRIES // 2, TRIES, TRIES // 4, TRIES // 8, TRIES // 16, TRIES, TRIES // 2]
 
 
-def test_trees_that_failed_where_something_is_held_try_less_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_trees_that_failed_where_something_is_held_try_less_too_but_where_none_grew_nothing_failed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     p, through, _ = door()
     ways, tries, found = trees(p), list[int](), iter([False, False, True, False])
+    blocked = iter([False, True, False, True, False, False, True, True])
 
     def path(*given: Any) -> np.ndarray | None:
         tries.append(given[-1])
-        return given[-2] if next(found) else None
+        return through if next(found) else None
 
+    monkeypatch.setattr(joining, "obstructed", lambda *_: next(blocked))
     monkeypatch.setattr(joining, "held_path", path)
-    for _ in range(4):
-        ways.held(2, through, through)
+    led = [ways.held(2, through, through) is not None for _ in range(8)]
+    assert led == [False] * 6 + [True, False]
     assert tries == [TRIES, TRIES // 2, TRIES // 4, TRIES]
 
 
@@ -377,7 +381,7 @@ def test_where_something_is_held_trees_say_how_the_door_moves_and_where_the_robo
     assert np.abs(other - knots[at_])[:3].max() > 0.05, "they all end in the same place"
     asked, firsts = list[tuple[int, int]](), list[np.ndarray]()
 
-    def path(_: Knots, phase: int, through: np.ndarray, straight: np.ndarray, tries: int) -> np.ndarray | None:
+    def path(_: RrtPaths, phase: int, through: np.ndarray, straight: np.ndarray) -> np.ndarray | None:
         asked.append((phase, len(straight)))
         if phase < 2:
             return None
@@ -390,7 +394,7 @@ def test_where_something_is_held_trees_say_how_the_door_moves_and_where_the_robo
         firsts.append(first.copy())
         return np.asarray(first + np.outer(np.arange(1, steps + 1) / steps, last - first))[:, :ROBOT]
 
-    monkeypatch.setattr(joining, "held_path", path)
+    monkeypatch.setattr(RrtPaths, "held", path)
     monkeypatch.setattr(RrtPaths, "path", way)
     z = joiner(p, trees(p)).join(knots, list(found.at))
     assert z is not None

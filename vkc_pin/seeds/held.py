@@ -16,34 +16,46 @@ from vkc_pin.program.merit import TOLERANCE
 from vkc_pin.seeds.knots import SCATTER, Knots, depth
 from vkc_pin.seeds.rrt import STEP, spread
 
-__all__ = ["held_path"]
+__all__ = ["held_path", "obstructed"]
 
 
-def held_path(knots: Knots, phase: int, through: Floats, straight: Floats, tries: int) -> Floats | None:
-    """Return waypoints of a phase in which something fixed is held, closed, from the first of some configurations.
+def obstructed(knots: Knots, phase: int, through: Floats, straight: Floats) -> bool:
+    """Return whether something is in the straight way through a phase, and trees may lead around it.
+
+    Not where the base drives on wheels, whose arcs trees do not know, or where the robot overlaps things as the phase begins.
 
     Args:
         knots: Of the problem.
-        phase: The phase's number.
+        phase: The phase's number, in which something fixed is held.
         through: Configurations at its begin, within and at its end, shape (K, n).
         straight: Its waypoints on straight lines through them, shape (steps, n).
+    """
+    if knots.curves is not None:
+        return False
+    search = _Search(knots, phase, len(straight))
+    closed, _ = search.close(straight, np.arange(search.begin + 1.0, search.end + 1.0))
+    return not search.free(closed).all() and bool(search.free(through[:1]).all())
+
+
+def held_path(knots: Knots, phase: int, through: Floats, steps: int, tries: int) -> Floats | None:
+    """Return waypoints of a phase in which something fixed is held, closed, from the first of some configurations.
+
+    Args:
+        knots: Of the problem, whose base does not drive on wheels.
+        phase: The phase's number.
+        through: Configurations at its begin, within and at its end, shape (K, n).
+        steps: How many waypoints the phase has.
         tries: How often trees may grow until they meet.
 
     Returns:
-        The waypoints, shape (steps, n), which overlap nothing but may end elsewhere. None if the straight ones, closed, overlap
-        nothing, if no others are found, or if the base drives on wheels, whose arcs the trees do not know.
+        The waypoints, shape (steps, n), which overlap nothing but may end elsewhere; None if none are found.
 
     Raises:
         SpentError: The effort of planning is spent.
     """
-    if knots.curves is not None:
-        return None
-    search = _Search(knots, phase, len(straight))
-    closed, _ = search.close(straight, np.arange(search.begin + 1.0, search.end + 1.0))
-    if search.free(closed).all() or not search.free(through[:1]).all():
-        return None
+    search = _Search(knots, phase, steps)
     path = search.run(through, tries)
-    return None if path is None else search.spread(search.shortened(path), len(straight))
+    return None if path is None else search.spread(search.shortened(path), steps)
 
 
 class _Path(NamedTuple):

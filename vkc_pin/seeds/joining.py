@@ -9,7 +9,7 @@ import numpy as np
 from vkc_pin.arrays import Floats
 from vkc_pin.driving.curves import Curves, between, spread_along
 from vkc_pin.seeds.approach import Approach
-from vkc_pin.seeds.held import held_path
+from vkc_pin.seeds.held import held_path, obstructed
 from vkc_pin.seeds.knots import Knots, smooth
 from vkc_pin.seeds.routes import Routes
 from vkc_pin.seeds.rrt import TRIES, connect, spread
@@ -89,8 +89,10 @@ class RrtPaths:
         return None if path is None else spread(path, steps, self.knots.chain.metric[: path.shape[1]])
 
     def held(self, phase: int, through: Floats, straight: Floats) -> Floats | None:
-        """Return waypoints of a phase in which something fixed is held, if the straight ones overlap things; see `held_path`."""
-        path = held_path(self.knots, phase, through, straight, self._tries(phase))
+        """Return waypoints of a phase in which something fixed is held, if trees lead around what is in the straight way."""
+        if not obstructed(self.knots, phase, through, straight):
+            return None
+        path = held_path(self.knots, phase, through, len(straight), self._tries(phase))
         self.failed[phase] = 0 if path is not None else self.failed[phase] + 1
         return path
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -48,6 +49,30 @@ def test_it_is_read_while_it_is_written(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="this line is damaged") as caught:
         Kept.read(tmp_path / "bad")
     assert caught.value.line == 2
+
+
+def test_records_stay_in_the_file(tmp_path: Path) -> None:
+    """A run of a million tasks would not fit into memory."""
+    journal = opened(tmp_path / "j")
+    journal.append({"session": {"jobs": 1}})
+    way = [[0.001 * k, 0.002 * k] for k in range(200)]
+    tracemalloc.start()
+    for key in range(300):
+        journal.append({**line(key), "records": [{"number": key, "way": way}]})
+    kept = Kept.read(tmp_path / "j")
+    size, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert size < (tmp_path / "j").stat().st_size / 5
+    for lines in (journal.lines, kept.lines):
+        assert len(lines) == 300
+        assert lines["7"] == [{"number": 7, "way": way}]
+        assert "300" not in lines
+        with pytest.raises(KeyError):
+            lines["300"]
+    del journal.lines["7"]
+    assert ("7" in journal.lines, len(journal.lines), list(journal.lines)[6:8]) == (False, 299, ["6", "8"])
+    journal.append({**line(7), "records": [{"number": 7}, {"number": 7, "again": True}]})  # what is run again counts
+    assert journal.lines["7"] == Kept.read(tmp_path / "j").lines["7"] == [{"number": 7}, {"number": 7, "again": True}]
 
 
 def test_memories_and_the_time_of_the_writer(tmp_path: Path) -> None:

@@ -77,8 +77,8 @@ class Register:
     nor any stop makes a difference.
 
     Attributes:
-        accepted: Records of the episodes, in order.
-        failures: Records of attempts that are none, in order; near-duplicates among them.
+        accepted: Of the records of the episodes what tables have, in order.
+        failures: The same of attempts that are none, in order; near-duplicates among them.
     """
 
     def __init__(self, dataset: Dataset, wanted: int) -> None:
@@ -108,14 +108,14 @@ class Register:
 
     def _decide(self, record: Mapping[str, Any]) -> None:
         if not record["success"]:
-            self.failures.append(record)
+            self.failures.append(_row(record))
             return
         twin = self._seen.twin(record)
         if twin is not None:
             reason = f"nearly the same motion as that of episode {twin}"
-            self.failures.append({**record, "success": False, "status": "duplicate", "reason": reason})
+            self.failures.append(_row({**record, "status": "duplicate", "reason": reason}))
             return
-        self.accepted.append(record)
+        self.accepted.append(_row(record))
         own = self._robots.setdefault(str(record["robot"]), [])
         own.append(int(record["number"]))
         if len(own) % EPISODES_A_SHARD == 0:
@@ -145,6 +145,11 @@ class Register:
         if len(numbers) == EPISODES_A_SHARD:
             for file in files:
                 file.unlink(missing_ok=True)
+
+
+def _row(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what tables have of a record: the rest, most of it, would stay in memory for nothing."""
+    return {name: record[name] for name in _COLUMNS if name in record}
 
 
 def write_table(path: Path, records: Sequence[Mapping[str, Any]]) -> Path:

@@ -4,20 +4,58 @@ from __future__ import annotations
 
 import fcntl
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
 from vkc_pin.errors import InputError
 
-__all__ = ["Journal", "Kept"]
+__all__ = ["Journal", "Kept", "Records"]
+
+
+class Records(Mapping[str, list[dict[str, Any]]]):
+    """Key → records of a finished task. Its line is read when it is asked for: a run may have millions.
+
+    Args:
+        path: The journal.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path.absolute()
+        self._places: dict[str, int] = {}
+
+    def note(self, key: str, place: int) -> None:
+        """Take note of where in the file [bytes] the line of a task begins."""
+        self._places[key] = place
+
+    def __getitem__(self, key: str) -> list[dict[str, Any]]:
+        place = self._places[key]
+        with self._path.open("rb") as stream:
+            stream.seek(place)
+            records: list[dict[str, Any]] = json.loads(stream.readline())["records"]
+        return records
+
+    def __delitem__(self, key: str) -> None:
+        del self._places[key]
+
+    def __contains__(self, key: object) -> bool:
+        return key in self._places
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._places)
+
+    def __len__(self) -> int:
+        return len(self._places)
 
 
 class Kept:
     """What a journal says.
 
+    Args:
+        path: Of the journal.
+
     Attributes:
-        lines: Key → records of every finished task.
+        lines: The records of every finished task.
         sessions: For each session its jobs, the number of tasks, the time until the last of them [s] and, if tasks say it, the
             processor time until then of the process that writes [s].
         memory: The largest memory of a process [MB].
@@ -25,8 +63,8 @@ class Kept:
         processes: Key → the process that ran the task; of tasks that say it.
     """
 
-    def __init__(self) -> None:
-        self.lines: dict[str, list[dict[str, Any]]] = {}
+    def __init__(self, path: Path) -> None:
+        self.lines = Records(path)
         self.sessions: list[dict[str, Any]] = []
         self.memory = 0.0
         self.memories: dict[str, list[float]] = {}
@@ -39,13 +77,12 @@ class Kept:
         Raises:
             InputError: It cannot be read, or has a line that is none.
         """
-        kept = Kept()
+        kept = Kept(path)
         try:
-            whole = path.read_bytes().rpartition(b"\n")[0]
+            with path.open("rb") as stream:
+                kept._parse(path, stream)
         except OSError as error:
             raise InputError("cannot read this", file=path, expected="a journal", got=error.strerror) from error
-        if whole:
-            kept._parse(path, whole)
         return kept
 
     @property
@@ -53,29 +90,37 @@ class Kept:
         """How long the sessions took in all, each until the last of its tasks [s]."""
         return float(sum(session["seconds"] for session in self.sessions))
 
-    def _parse(self, path: Path, whole: bytes) -> None:
-        """Take note of all that whole lines say."""
-        for number, text in enumerate(whole.split(b"\n"), start=1):
+    def _parse(self, path: Path, lines: Iterable[bytes]) -> int:
+        """Take note of all that whole lines say; return where they end [bytes]."""
+        end = 0
+        for number, text in enumerate(lines, start=1):
+            if not text.endswith(b"\n"):
+                break
             try:
                 line = json.loads(text)
                 if number == 1:
                     self._begin(line)
                 else:
-                    self._take(line)
+                    self._take(line, end)
             except (ValueError, LookupError, TypeError, AttributeError) as error:
                 if isinstance(error, InputError):
                     raise
                 expected = "the lines that a run writes"
                 raise InputError("this line is damaged", file=path, line=number, expected=expected) from error
+            end += len(text)
+        return end
 
     def _begin(self, header: Mapping[str, Any]) -> None:
         """Take note of the first line."""
 
-    def _take(self, line: dict[str, Any]) -> None:
+    def _take(self, line: dict[str, Any], place: int) -> None:
+        """Take note of a line that begins at some place [bytes]."""
         if "session" in line:
             self.sessions.append({**line["session"], "trials": 0, "seconds": 0.0})
             return
-        self.lines[line["key"]] = line["records"]
+        if not isinstance(line["records"], list):
+            raise TypeError("a task's records are a list")
+        self.lines.note(line["key"], place)
         self.memory = max(self.memory, line["memory_mb"])
         self.sessions[-1]["trials"] += 1
         self.sessions[-1]["seconds"] = line["seconds"]
@@ -102,7 +147,7 @@ class Journal(Kept):
     """
 
     def __init__(self, path: Path, stream: IO[bytes], header: Mapping[str, Any], what: str = "trials") -> None:
-        super().__init__()
+        super().__init__(path)
         try:  # for this process alone
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -110,22 +155,22 @@ class Journal(Kept):
         self._path, self._stream, self._what = path, stream, what
         self._header = json.loads(json.dumps(header))
         stream.seek(0)
-        whole, newline, torn = stream.read().rpartition(b"\n")
-        if torn:  # what a kill left of the last line
-            stream.truncate(len(whole) + len(newline))
-        if newline:
-            self._parse(path, whole)
-        else:
+        self._end = self._parse(path, stream)
+        stream.truncate(self._end)  # what a kill left of the last line
+        if not self._end:
             self._write(self._header)
 
     def append(self, line: dict[str, Any]) -> None:
         """Write one line down, and take note of it."""
+        place = self._end
         self._write(line)
-        self._take(line)
+        self._take(line, place)
 
     def _write(self, line: Mapping[str, Any]) -> None:
-        self._stream.write(json.dumps(line, allow_nan=False).encode() + b"\n")
+        text = json.dumps(line, allow_nan=False).encode() + b"\n"
+        self._stream.write(text)
         self._stream.flush()
+        self._end += len(text)
 
     def _begin(self, header: Mapping[str, Any]) -> None:
         """Raise an error that names what differs between two headers, if anything does."""

@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from .agreement import judged, table, written
+from .agreement import judged, recorded, table, written
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -14,12 +14,17 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.oracle", description=__doc__)
     parser.add_argument("paths", nargs="+", type=Path, help="saved plans (.npz), or folders with some")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument("--record", type=Path, help="results.json of the only folder's trials, in which verdicts are noted")
     given = parser.parse_args(arguments)
+    if given.record and len(given.paths) > 1:
+        parser.error("--record is of one folder")
     wrong = 0
     for path in given.paths:
         verdicts = judged(sorted(path.rglob("*.npz")) if path.is_dir() else [path], jobs=given.jobs)
         if path.is_dir():
             written(verdicts, path)
+        if given.record:
+            recorded(verdicts, given.record)
         print(table(verdicts))
         wrong += sum(bool(verdict.success and verdict.found) for verdict in verdicts)
     return 1 if wrong else 0

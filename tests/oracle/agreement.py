@@ -11,7 +11,7 @@ from pathlib import Path
 
 from .judge import Verdict, judge
 
-__all__ = ["judged", "table", "written"]
+__all__ = ["judged", "recorded", "table", "written"]
 
 
 def judged(paths: Sequence[Path], *, jobs: int = 1) -> list[Verdict]:
@@ -28,6 +28,24 @@ def written(verdicts: Iterable[Verdict], folder: Path) -> None:
     lines = [json.dumps({**asdict(one), "path": one.path.relative_to(folder).as_posix()}) for one in verdicts]
     (folder / "verdicts.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
     (folder / "agreement.md").write_text(table(verdicts) + "\n", encoding="utf-8")
+
+
+def recorded(verdicts: Iterable[Verdict], record: Path) -> None:
+    """Write into a record of trials, as `oracle` of each, how many violations were found in its plan, the one named by its key.
+
+    Raises:
+        ValueError: Trials and plans are not the same, or a plan was not judged; nothing is written.
+    """
+    result = json.loads(record.read_text(encoding="utf-8"))
+    own = {one.path.stem: one for one in verdicts}
+    keys = {trial["key"] for trial in result["trials"]}
+    if keys != set(own):
+        raise ValueError(f"{record}: plans and trials are others: {', '.join(sorted(keys ^ set(own))[:5])}")
+    if skipped := [one.path for one in own.values() if one.unjudged]:
+        raise ValueError(f"{record}: {len(skipped)} plans were not judged, {skipped[0]} for one")
+    for trial in result["trials"]:
+        trial["oracle"] = len(own[trial["key"]].found)
+    record.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
 
 
 def table(verdicts: Sequence[Verdict]) -> str:

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from oracle.agreement import judged, written
+from oracle.agreement import judged, recorded, written
 from oracle.plan import read_plan
 
 from vkc_pin.benchmarks.problems import random_problems
@@ -63,6 +63,19 @@ def test_plans_are_kept_and_judged(tmp_path: Path, capsys: pytest.CaptureFixture
     lines = (out / "plans" / "verdicts.jsonl").read_text(encoding="utf-8").splitlines()
     assert [json.loads(line)["path"] for line in lines] == [f"{trial['key']}.npz" for trial in trials]
     assert f"| success | success, and nothing found | {good} |" in (out / "plans" / "agreement.md").read_text(encoding="utf-8")
+
+    record = out / "results.json"
+    recorded(verdicts, record)
+    noted = json.loads(record.read_text(encoding="utf-8"))["trials"]
+    assert [trial.pop("oracle") for trial in noted] == [len(verdict.found) for verdict in verdicts]
+    assert noted == trials
+    kept_record = record.read_bytes()
+    with pytest.raises(ValueError, match="plans and trials are others: 00003"):
+        recorded(verdicts[:-1], record)
+    verdicts[0].unjudged = "moved away"
+    with pytest.raises(ValueError, match=r"1 plans were not judged, .*00000\.npz"):
+        recorded(verdicts, record)
+    assert record.read_bytes() == kept_record
 
     before = (out / "trials.jsonl").read_bytes()
     assert main(command) == 0  # nothing is left to do

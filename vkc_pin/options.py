@@ -83,7 +83,7 @@ class Options:
     closure_angle: float = 1e-3
     goal_position: float = 1e-3
     goal_angle: float = 1e-3
-    max_outer: int = 16
+    max_outer: int = 40
     max_iterations: int = 200
     penalty: float = 50.0
     max_restarts: int = 4

@@ -19,6 +19,7 @@ from vkc_pin.solver import loop as module
 from vkc_pin.solver.between import Between
 from vkc_pin.solver.loop import _Loop, solve
 from vkc_pin.solver.passages import Passage
+from vkc_pin.solver.solution import Solution
 from vkc_pin.solver.trust_region import CLOSE_ENOUGH
 
 N = 8
@@ -208,6 +209,33 @@ def test_only_what_is_missing_becomes_dearer_and_multipliers_are_forgotten(short
     assert loop.grow() == grows
     assert loop.merit.weights["clearance"] == (8.0 if grows else 2.0)
     assert done == ["forget"]
+
+
+# --- when it is given up ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("short", "accepted", "rounds"), [(0.009, False, 12), (0.011, False, 5), (0.009, True, 5), (0.011, True, 5), (0.0, False, 12)]
+)
+def test_steps_that_are_too_long_are_no_lack_of_progress_where_hardly_any_clearance_is_missing(
+    short: float, accepted: bool, rounds: int
+) -> None:
+    found = missing(clearance=short, poses=0.1)
+    row = {"objective": 1.0, "pose_error": 0.1, "contacts": contact(0.02 - short), "step": np.zeros(N)}
+    loop: Any = SimpleNamespace(
+        solution=Solution(np.zeros((N, 2)), np.ones(N)),
+        found=found,
+        objective=1.0,
+        merit=Merit(2.0),
+        try_step=lambda radius: SimpleNamespace(**row),
+        prices=lambda trial: (np.zeros(N), np.zeros(N)),
+        judge=lambda *_: accepted,
+        accept=lambda trial: None,
+        done=lambda trial: False,
+    )
+    region: Any = SimpleNamespace(radius=np.ones(N), adapt=lambda *_: None, stuck=lambda *_: False)
+    module._iterate(loop, region, None, 12)
+    assert loop.solution.rounds == rounds
 
 
 # --- what is returned -------------------------------------------------------------------------------------------------

@@ -24,6 +24,8 @@ from pathlib import Path
 from statistics import mean, median
 from typing import Any
 
+import yaml
+
 from vkc_pin.benchmarks.harness.record import distribution
 from vkc_pin.benchmarks.harness.tables import foot, markdown
 
@@ -32,18 +34,6 @@ ROOT = DOCS.parent
 PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
 LINES = ("Measured on", "Mean ± standard deviation; median. Trials in which all methods succeed")
 TABLE = re.compile(r"(?:^\|.*\n)+", re.MULTILINE)
-REPORTS = {  # name of a record → whose report it is
-    **{name: name for name in ("baselines", "household", "initialization", "chores", "scale", "gap")},
-    **{"segments": "scale", "sixty": "problems.ablation", "tradeoff": "problems.ablation"},
-    **{"sensitivity": "problems.ablation", "numbers": "problems.ablation", "narrow": "problems.ablation"},
-    **{"spread": "problems.spread", "first_seed": "problems.first_seed", "robots": "anything.robots"},
-    **{"anything": "anything.matrix", "cluttered": "chores"},
-    **{"robots_rest": "anything.robots", "robots_packages": "anything.robots", "execution": "executing.execution"},
-    "friction": "executing.execution",
-    **{"bases": "driving.bases", "impossible": "problems.impossible", "timing": "tests.optimal.__main__"},
-    "peers": "peers.run",
-    "household_paper": "household",
-}
 DOOR = ("door_seed_0", "door_seed_1")
 TASKS = ("reach", "push", "push blind", "whole")
 PARTS = {"initialization": "seeds", "coal": "coal", "casadi": "CasADi", "ipopt": "Ipopt", "validation": "validation"}
@@ -70,54 +60,7 @@ STATUS: list[tuple[str, str, dict[str, str]]] = [
 ]
 
 
-# What is claimed of which record, by the page that shows it, and the command that makes it again.
-EVIDENCE: list[tuple[str, str, str, str]] = [
-    ("ways of initialising", "initialization.md", "initialization", "initialization --starts 50 --seed 20270103"),
-    (
-        "base and arm together, or one after the other",
-        "baselines.md",
-        "baselines",
-        "baselines --trials 50 --seed 20270101 --methods B1 B2 B1x1 B2x1 VKC",
-    ),
-    ("six tasks in a home", "household.md", "household", "household --trials 20 --seed 20270102"),
-    (
-        "two of them with the numbers of the paper's code",
-        "household.md",
-        "household_paper",
-        "household --variant paper --trials 10 --seed 20270102",
-    ),
-    ("chores", "chores.md", "chores", "chores --trials 5 --seed 20270104"),
-    (
-        "chores, full and tight",
-        "chores.md",
-        "cluttered",
-        "chores --chores cluttered --trials 1 --seeds 5 --seed 20270108 --step-by-step",
-    ),
-    ("the door, seed 0", "benchmarks.md", "door_seed_0", "door --trials 50 --seed 0"),
-    ("the door, seed 1", "benchmarks.md", "door_seed_1", "door --trials 50 --seed 1"),
-    ("many obstacles", "benchmarks.md", "scale", "scale --starts 30 --seed 0"),
-    ("many segments", "benchmarks.md", "segments", "scale --of segments --starts 20 --seed 0"),
-    ("a narrow gap", "benchmarks.md", "gap", "gap --trials 50 --seed 101"),
-    ("bases that drive", "benchmarks.md", "bases", "bases --trials 50 --seed 20270105"),
-    ("sixty problems", "benchmarks.md", "sixty", "ablation --seed 101"),
-    ("how much hangs on random numbers", "benchmarks.md", "spread", "spread --seeds 5 --seed 101"),
-    ("with the first seed alone", "benchmarks.md", "first_seed", "first-seed --trials 10 --seed 101"),
-    ("random problems", "benchmarks.md", "random", "random --problems 2000 --seed 20261123"),
-    ("random rooms", "benchmarks.md", "rooms", "random --of rooms --problems 1000 --seed 0"),
-    ("impossible problems", "benchmarks.md", "impossible", "impossible --problems 50 --seed 0"),
-    ("robots and objects", "benchmarks.md", "anything", "anything --starts 5 --seed 0"),
-    ("ten robots from their files", "benchmarks.md", "robots", "robots --goals 20 --seed 0"),
-    ("others of the same packages", "benchmarks.md", "robots_rest", "robots --goals 20 --seed 0"),
-    ("and by the path of a file", "benchmarks.md", "robots_packages", "robots --goals 20 --seed 0"),
-    ("in physics", "execution.md", "execution", "execution --trials 20 --seed 20270107"),
-    ("held by friction", "execution.md", "friction", "execution --trials 20 --seed 20270106 --grasp friction"),
-    ("as fast as the limits allow", "rates_and_limits.md", "timing", "python -m tests.optimal --starts 5"),
-    ("beside other planners", "comparison.md", "peers", "peers --trials 20 --seed 20270110 --time-limit 30"),
-    ("what half and twice of other settings do", "decisions.md", "sensitivity", "ablation --seed 20270111"),
-    ("what each number of seeds and solver is worth", "decisions.md", "numbers", "ablation --seed 20270121"),
-    ("and in narrow places", "decisions.md", "narrow", "ablation --seed 20270131"),
-    ("what a metre of the base is worth", "decisions.md", "tradeoff", "ablation --seed 101"),
-]
+RECORDS: list[dict[str, Any]] = yaml.safe_load((DOCS / "records.yaml").read_text(encoding="utf-8"))
 
 
 def result(name: str) -> dict[str, Any]:
@@ -199,22 +142,24 @@ def commits(trials: Iterable[Mapping[str, Any]]) -> str:
 def evidence() -> str:
     """Return the table of claims, commands and records, and that of figures without a record."""
     rows, rest = [], []
-    for claim, page, name, command in EVIDENCE:
+    for entry in RECORDS:
+        name, command = entry["record"], entry["command"]
         found = result(name)
-        sessions, trials = found["meta"].get("sessions", ()), found["trials"]
+        about, trials = found["meta"], found["trials"]
+        sessions = about.get("sessions", ())
         jobs = ", ".join(f"{number} at a time" for number in sorted({session["jobs"] for session in sessions}))
         minutes = sum(session["seconds"] for session in sessions) / 60.0
         timed = sum(session["trials"] for session in sessions)
         if not sessions:  # of the door, whose record has no sessions
             minutes, jobs = sum(trial["planning_time"] + trial["build_time"] for trial in trials) / 60.0, "planning alone"
-        changed = dict.fromkeys(("tradeoff", "sensitivity", "numbers"), ("changes",))
-        for option in {"friction": ("tasks",), **changed}.get(name, ("robots",) if command.startswith("robots") else ()):
-            command += f" --{option} {shlex.join(chosen for chosen in found['meta'][option] if chosen != 'unchanged')}"
+        for option in entry.get("options", ()):
+            values = about[option] if isinstance(about[option], list) else [str(about[option])]
+            command += f" --{option} {shlex.join(value for value in values if value != 'unchanged')}"
         file = f"--json out/{name}.json" if "door" in name or name == "timing" else f"--out out/{name}"
         whole = f"`{'' if command.startswith('python') else 'vkc-pin bench '}{command} {file}`"
-        rows.append([f"[{claim}]({page})", whole, f"[{name}](results/{name}.json)", commits(trials), f"{len(trials)}"])
-        part = f", {timed} of them" if timed not in (0, len(trials)) and not command.startswith("robots") else ""
-        rows[-1] += [f"{minutes:.1f} min, {jobs}{part}"]
+        rows.append([f"[{entry['claim']}]({entry['page']})", whole, f"[{name}](results/{name}.json)", commits(trials)])
+        part = f", {timed} of them" if timed not in (0, len(trials)) and "robots" not in entry.get("options", ()) else ""
+        rows[-1] += [f"{len(trials)}", f"{minutes:.1f} min, {jobs}{part}"]
     for page in PAGES:
         for commit, date in dict.fromkeys(re.findall(r"<!-- measured: (\w+) ([\d-]+) -->", page.read_text(encoding="utf-8"))):
             where = "../README.md" if page.name == "README.md" else page.name
@@ -228,6 +173,7 @@ FIGURES: dict[str, Callable[[Sequence[Mapping[str, Any]], str], float | str]] = 
     "successes": lambda trials, field: f"{sum(trial['success'] for trial in trials)}",
     "trials": lambda trials, field: f"{len(trials)}",
     "count": lambda trials, field: f"{sum(bool(trial.get(field)) for trial in trials)}",
+    "steady": lambda trials, field: _steady(trials),
     "median": lambda trials, field: distribution(trials, field)[0],
     "mean": lambda trials, field: mean(float(trial[field]) for trial in trials),
     "late": lambda trials, field: distribution(trials, field)[1],
@@ -236,8 +182,16 @@ FIGURES: dict[str, Callable[[Sequence[Mapping[str, Any]], str], float | str]] = 
     "percent": lambda trials, field: 100.0 * sum(bool(trial.get(field)) for trial in trials) / len(trials),
     "slowdown": lambda trials, field: _slowdown(trials, field),
 }
-"""What may be asked of trials, of a field of theirs after a colon. The 95th percentile is `late`; `slowdown:1000` is the median,
-over the starts, of the ratio of times among so many obstacles and among 30."""
+"""What may be asked of trials, of a field of theirs after a colon. The 95th percentile is `late`; `steady` counts starts of which
+every trial succeeds; `slowdown:1000` is the median, over the starts, of the ratio of times among so many obstacles and 30."""
+
+
+def _steady(trials: Sequence[Mapping[str, Any]]) -> str:
+    starts: dict[tuple[str, int], bool] = {}
+    for trial in trials:
+        start = trial["scene"], trial["number"]
+        starts[start] = starts.get(start, True) and trial["success"]
+    return f"{sum(starts.values())} of {len(starts)}"
 
 
 def _slowdown(trials: Sequence[Mapping[str, Any]], count: str) -> float:
@@ -266,7 +220,7 @@ def reported(name: str) -> str:
     }
     if name in own:
         return own[name]() + "\n"
-    whose = REPORTS[name]
+    whose = next(entry["report"] for entry in RECORDS if entry["record"] == name)
     if whose.startswith("tests."):
         sys.path.insert(0, str(ROOT))
     module = importlib.import_module(whose if whose.startswith("tests.") else f"vkc_pin.benchmarks.{whose}")

@@ -230,8 +230,8 @@ def test_tables_are_as_the_results_on_record_say() -> None:
 
 def test_every_record_has_a_claim_and_the_command_that_makes_it_again() -> None:
     script = runpy.run_path(str(ROOT / "docs/make_tables.py"))
-    rows = {name: command for _, _, name, command in script["EVIDENCE"]}
-    assert len(rows) == len(script["EVIDENCE"])
+    rows = {entry["record"]: entry["command"] for entry in script["RECORDS"]}
+    assert len(rows) == len(script["RECORDS"])
     assert set(rows) == {file.stem for file in (ROOT / "docs/results").glob("*.json")}
     own = [name for name, command in rows.items() if not command.startswith("python")]
     commands = re.findall(r"`(vkc-pin bench [^`]+)`", read("docs/evidence.md"))[: len(own)]

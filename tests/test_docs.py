@@ -264,8 +264,8 @@ def test_figures_in_sentences_come_from_records_or_say_when_they_were_measured()
     [
         ("good gap", None, None),
         ("gap good", "", "50 of 50"),
-        ("household successes method=B1 scene=door", "", "11"),
-        ("door_seed_0 median:planning_time task=push~blind", "0.00", "0.10"),
+        ("household successes method=B1 scene=door", "", "15"),
+        ("door_seed_0 median:planning_time task=push~blind", "0.00", "0.08"),
         ("door_seed_0 median:planning_time task=nothing", "0.0", None),
     ],
 )

@@ -149,7 +149,7 @@ def _kept(journal: Journal, key: str) -> dict[str, Any]:
 
 def _lost(dataset: Dataset, journal: Journal, there: Set[int]) -> list[str]:
     """Return which episodes somebody has removed: the journal says that they succeeded, and neither shard nor file has them."""
-    good = [key for key in journal.lines if _kept(journal, key)["success"] and int(key) not in there]
+    good = [key for key in journal.lines if int(key) not in there and _kept(journal, key)["success"]]
     return [key for key in good if not work_file(dataset.folder, int(key)).is_file()]
 
 

@@ -21,7 +21,7 @@ from vkc_pin.solver.trust_region import BLOCK_TIME, CLOSE_ENOUGH, INSIDE, Trial,
 __all__ = ["solve"]
 
 NEARLY = 0.01  # [m], [rad] of clearance, or of closures, goals and grasps, that is missing of a motion that nearly holds
-PROGRESS_ROUNDS = 5  # rounds in which what is missing must fall; where hardly any clearance is, those alone that are gone on from
+PROGRESS_ROUNDS = 5  # rounds in which what is missing must fall; accepted ones, where hardly any clearance is missing
 PROGRESS = 0.7  # share of what was missing to which it must fall, or the motion is given up
 WORTHWHILE = 0.05  # relative decrease of the objective for which a feasible motion is improved further
 
@@ -209,7 +209,7 @@ def _iterate(loop: _Loop, region: TrustRegion, callback: Callable[[Iteration], N
                 if not improved or (trial.step < INSIDE * used).all():
                     break
         region.adapt(before, after, trial, accepted)
-        since += accepted or short.max() >= NEARLY  # the others narrow the region, until something comes of it or nothing moves
+        since += accepted or short.max() >= NEARLY  # refused steps narrow the region, which has an end
         if not PROGRESS * missing < loop.found.total <= missing:  # more is missing where the objective fell instead
             missing, since = loop.found.total, 0
         if since >= PROGRESS_ROUNDS:

@@ -184,3 +184,11 @@ def test_a_joint_that_follows_nothing_is_warned_of(tmp_path: Path) -> None:
     lines = [*links("a", "b"), joint("j", "a", "b", kind="continuous", inside='<mimic joint="k"/>')]
     with pytest.warns(UserWarning, match="thing.urdf:4: j: there is no joint 'k' to follow"):
         read_urdf(written(tmp_path, *lines))
+
+
+def test_a_robot_without_a_name_is_named_like_its_file_whatever_that_is(tmp_path: Path) -> None:
+    file = tmp_path / "x\x01\udcff\n.urdf"
+    file.write_text(f"<robot>{''.join(links('a'))}</robot>")
+    model, collision, _ = load_urdf(file)
+    assert model.name == "x\ufffd\ufffd\n"
+    assert len(collision.geometryObjects) == 1

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vkc_pin.errors import InputError
-from vkc_pin.files.xml import check_indices, line_of, parse_xml
+from vkc_pin.files.xml import check_indices, line_of, parse_xml, quote, replace_forbidden
 
 FILE = Path("thing.urdf")
 
@@ -77,3 +77,19 @@ def test_indices(tmp_path: Path) -> None:
         check_indices(file)
     with pytest.raises(InputError, match="cannot read"):
         check_indices(tmp_path)
+
+
+@given(st.text())
+def test_quoted_text_is_read_back(text: str) -> None:
+    root = parse_xml(f"<robot name={quote(text)}/>", FILE)
+    assert root.get("name") == replace_forbidden(text)
+
+
+@given(st.text(st.characters(exclude_categories=["Cc", "Cs", "Cn"])))
+def test_printable_text_stays(text: str) -> None:
+    assert replace_forbidden(text) == text
+
+
+def test_forbidden_characters_become_replacement_characters() -> None:
+    text = "a\0b\x1fc\ud800d\uffffe\tf\ng"
+    assert replace_forbidden(text) == "a\ufffdb\ufffdc\ufffdd\ufffde\tf\ng"

@@ -5,9 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
 
 import vkc_pin as vkc
-from vkc_pin.importing.targets import check_target, made_by
+from vkc_pin.importing.targets import check_target, format_comment, made_by
 
 
 def test_only_what_the_same_command_made_may_be_replaced(tmp_path: Path) -> None:
@@ -34,3 +37,26 @@ def test_a_file_is_no_folder(tmp_path: Path) -> None:
     (tmp_path / "mine").write_text(f"# Made of x {made_by('import-home')}.\n", encoding="utf-8")
     with pytest.raises(vkc.InputError, match="got a file"):
         check_target(tmp_path / "mine", "import-home", force=True)
+
+
+@given(st.text())
+def test_a_comment_is_one_line_of_yaml_that_says_the_text(text: str) -> None:
+    line = format_comment(text)
+    assert line.startswith("# ")
+    assert line.splitlines(keepends=True) == [line]
+    assert line.isascii() or line[:-1].isprintable()
+    for loader in (yaml.SafeLoader, yaml.CSafeLoader):
+        assert yaml.load(f"{line}free: false\n", Loader=loader) == {"free": False}
+    escaped = line[2:-1].encode("ascii", "backslashreplace")
+    assert escaped.decode("unicode_escape") == text
+
+
+def test_plain_text_is_a_comment_as_it_stands() -> None:
+    assert format_comment("Made of Küche (1).urdf: “x”.") == "# Made of Küche (1).urdf: “x”.\n"
+
+
+def test_a_folder_is_recognized_by_a_first_line_with_the_longest_file_name(tmp_path: Path) -> None:
+    name = "\udcff" * 255
+    head = format_comment(f"Made of {name} {made_by('import-home')}.")
+    (tmp_path / "a.yaml").write_text(head, encoding="utf-8")
+    check_target(tmp_path, "import-home", force=True)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -217,3 +218,10 @@ def test_tiago_rests_free(tmp_path: Path) -> None:
     distances.place(np.array([0.0, 0.0, 0.0, *robot.home]))
     for (i, j), margin in robot.own_margins(0.02).items():
         assert distances.between([(i, j)]) >= margin
+
+
+def test_a_robot_whose_name_xml_forbids(husky: Robot, tmp_path: Path) -> None:
+    robot = dataclasses.replace(husky, name='a\x01"b\udcff\n')
+    file = write_srdf(robot, tmp_path / "new.srdf", samples=20)
+    again = read_srdf(file, links=husky.file.links)
+    assert again.allowed == sample_allowed_pairs(husky, samples=20)

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from vkc_pin.arrays import LARGEST
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.files.xml import line_of
+from vkc_pin.files.xml import line_of, replace_forbidden
 
 __all__ = ["MOMENTS", "check_tree", "inertial_of", "numbers_of", "origin_of", "plain_tree"]
 
@@ -68,7 +68,7 @@ def plain_tree(file: Path, root: ElementTree.Element) -> tuple[str, frozenset[st
     Returns:
         The text, and the joints without velocity.
     """
-    plain = ElementTree.Element("robot", name=root.get("name") or file.stem)
+    plain = ElementTree.Element("robot", name=root.get("name") or replace_forbidden(file.stem))
     silent = set[str]()
     for link in root.findall("link"):
         added = ElementTree.SubElement(plain, "link", name=link.get("name", ""))

@@ -1,9 +1,11 @@
-"""Paths of files: of those that users name, and of the robots and scenes that travel with the package."""
+"""Finds files that users name and files of the package, and chooses names for new files."""
 
 from __future__ import annotations
 
 import importlib.util
 import os
+import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,21 @@ import pinocchio as pin
 
 from vkc_pin.errors import InputError, UnknownNameError, shown
 
-__all__ = ["available", "example_robot_data", "file_path", "find", "folder", "located", "package_folder"]
+__all__ = [
+    "available",
+    "choose_file_names",
+    "example_robot_data",
+    "file_path",
+    "find",
+    "folder",
+    "located",
+    "package_folder",
+]
+
+_LONGEST = 64  # characters of a file name without extension; file systems take 255 bytes with it
+_FILE_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
+_PORTS = {f"{port}{number}" for port in ("com", "lpt") for number in range(10)}
+_DEVICES = {"con", "prn", "aux", "nul", *_PORTS}  # reserved on Windows
 
 
 def package_folder() -> Path:
@@ -84,3 +100,54 @@ def example_robot_data() -> Path | None:
         if (prefix / "share" / "example-robot-data" / "robots").is_dir():
             return prefix / "share" / "example-robot-data"
     return None
+
+
+def choose_file_names(
+    names: Iterable[str], *, fallback: str = "part", taken: Iterable[str] = ()
+) -> list[str]:
+    """Choose a file name, without extension, for each of some names.
+
+    A file name has 1 to 64 ASCII letters, digits, "_" and "-", differs from all others in its
+    folder by more than upper and lower case, and is not reserved on Windows ("con"). Names that
+    satisfy this are kept. In others, "_" replaces each other character, and a number tells equal
+    results apart.
+
+    Args:
+        names: Names of links, objects or files. Equal names get different file names.
+        fallback: File name for names without ASCII letters and digits.
+        taken: Names of existing files in the folder, without extension.
+
+    Returns:
+        One file name for each name, in the same order.
+    """
+    given = list(names)
+    used, numbers = {name.lower() for name in taken}, dict[str, int]()
+    chosen: dict[int, str] = {}
+    for index, name in enumerate(given):
+        if _is_file_name(name) and name.lower() not in used:
+            chosen[index] = name
+            used.add(name.lower())
+    for index, name in enumerate(given):
+        if index in chosen:
+            continue
+        stem = name if _is_file_name(name) else _replace_characters(name, fallback)
+        new, number = stem, numbers.get(stem.lower(), 1)
+        while new.lower() in used:
+            number += 1
+            new = f"{stem[: _LONGEST - 1 - len(str(number))]}_{number}"
+        numbers[stem.lower()] = number
+        chosen[index] = new
+        used.add(new.lower())
+    return [chosen[index] for index in range(len(given))]
+
+
+def _is_file_name(name: str) -> bool:
+    return _FILE_NAME.fullmatch(name) is not None and name.lower() not in _DEVICES
+
+
+def _replace_characters(name: str, fallback: str) -> str:
+    """Return a name with "_" in place of each character that file names lack, shortened."""
+    stem = re.sub(r"[^A-Za-z0-9_-]", "_", name)[:_LONGEST]
+    if re.search(r"[A-Za-z0-9]", stem) is None:
+        return fallback
+    return f"{stem}_" if stem.lower() in _DEVICES else stem

@@ -1,18 +1,28 @@
-"""XML with the line of every element."""
+"""Reads XML with the line of every element, and quotes text for XML."""
 
 from __future__ import annotations
 
+import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
+from xml.sax.saxutils import quoteattr
 
 from vkc_pin.errors import InputError, shown
 from vkc_pin.files.documents import read_text
 
-__all__ = ["check_indices", "line_of", "parse_xml", "read_xml"]
+__all__ = [
+    "check_indices",
+    "line_of",
+    "parse_xml",
+    "quote",
+    "read_xml",
+    "replace_forbidden",
+]
 
 _INDICES = ("h", "p", "v", "vcount")
+_FORBIDDEN = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 class _Element(ElementTree.Element):
@@ -73,6 +83,16 @@ def parse_xml(text: str, file: Path) -> ElementTree.Element:
         return builder.close()
     except expat.ExpatError as error:
         raise InputError(f"not valid XML: {error}", file=file, line=error.lineno) from error
+
+
+def replace_forbidden(text: str) -> str:
+    """Replace characters that XML 1.0 forbids, such as most control characters, by U+FFFD."""
+    return _FORBIDDEN.sub("\ufffd", text)
+
+
+def quote(text: str) -> str:
+    """Quote text as the value of an XML attribute, without forbidden characters."""
+    return quoteattr(replace_forbidden(text))
 
 
 def check_indices(file: Path) -> None:

@@ -1,4 +1,4 @@
-"""Where an import writes: a new folder, an empty one, or one that the same import made before and may replace."""
+"""Checks the folder that an import writes to, and formats the comments of its YAML files."""
 
 from __future__ import annotations
 
@@ -6,12 +6,28 @@ from pathlib import Path
 
 from vkc_pin.errors import InputError
 
-__all__ = ["check_target", "made_by"]
+__all__ = ["check_target", "format_comment", "made_by"]
+
+_FIRST = 4096  # characters of a first line: names of files have up to 255 bytes, escaped up to 1530
 
 
 def made_by(command: str) -> str:
     """Return what the first line of a YAML file says by which a folder is known to be made by a command, e.g. "import-home"."""
     return f"by vkc-pin {command}"
+
+
+def format_comment(text: str) -> str:
+    """Format text as one line of a YAML comment.
+
+    Backslashes and unprintable characters, line breaks among them, become Python's escapes.
+    """
+    line = "".join(
+        letter
+        if letter.isprintable() and letter != "\\"
+        else letter.encode("unicode_escape").decode("ascii")
+        for letter in text
+    )
+    return f"# {line}\n"
 
 
 def check_target(folder: Path, command: str, *, force: bool) -> None:
@@ -38,6 +54,6 @@ def check_target(folder: Path, command: str, *, force: bool) -> None:
 def _first_line(file: Path) -> str:
     try:
         with file.open(errors="replace") as stream:
-            return stream.readline(1000)
+            return stream.readline(_FIRST)
     except OSError:
         return ""

@@ -12,7 +12,6 @@ import warnings
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import NamedTuple
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import pinocchio as pin
@@ -20,6 +19,7 @@ import pinocchio as pin
 from vkc_pin.arrays import Floats
 from vkc_pin.files.srdf import Srdf
 from vkc_pin.files.writing import write_atomically
+from vkc_pin.files.xml import quote
 from vkc_pin.kept import record
 from vkc_pin.models.robot import Robot
 from vkc_pin.models.robot_model import neighbours
@@ -263,19 +263,19 @@ def write_srdf(robot: Robot, path: str | Path, *, samples: int = _SAMPLES, seed:
         '<?xml version="1.0"?>',
         f"<!-- Written by `vkc-pin srdf`: {samples} samples, seed {seed}. Adjacent: a joint connects the links. Always: they",
         "     collide in every sample. Never: in none, nor when driven together from those in which they came closest. -->",
-        f"<robot name={quoteattr(robot.name)}>",
+        f"<robot name={quote(robot.name)}>",
         '  <group name="arm">',
-        *(f"    <joint name={quoteattr(name)}/>" for name in robot.coordinates.names[3:]),
+        *(f"    <joint name={quote(name)}/>" for name in robot.coordinates.names[3:]),
         "  </group>",
         '  <group_state name="home" group="arm">',
         *(
-            f"    <joint name={quoteattr(name)} value={quoteattr(f'{value:.12g}')}/>"
+            f"    <joint name={quote(name)} value={quote(f'{value:.12g}')}/>"
             for name, value in zip(robot.coordinates.names[3:], robot.home, strict=True)
         ),
         "  </group_state>",
         *(
-            f"  <disable_collisions link1={quoteattr(one)} link2={quoteattr(other)} reason={quoteattr(reason)}/>"
-            for (one, other), reason in sample_allowed_pairs(robot, samples=samples, seed=seed).items()
+            f"  <disable_collisions link1={quote(a)} link2={quote(b)} reason={quote(reason)}/>"
+            for (a, b), reason in sample_allowed_pairs(robot, samples=samples, seed=seed).items()
         ),
         "</robot>",
     ]

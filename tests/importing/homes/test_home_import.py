@@ -162,3 +162,86 @@ def test_a_folder_is_replaced_only_if_it_was_made_so_and_that_is_wanted(tmp_path
     again = vkc.import_home(tmp_path / "small.xml", out, seed=1, force=True)
     assert np.array_equal(first.scene.start, again.scene.start), "the same seed, another start"
     assert not (out / "objects" / "old").exists()
+
+
+def write_halves(file: Path, wardrobe: str, cabinet: str) -> None:
+    """Write a home that a wardrobe with a tray divides in two, and a cabinet with a drawer."""
+
+    def boxes(name: str, *parts: tuple[str, str]) -> str:
+        shapes = (
+            f'<collision><origin xyz="{at}"/><geometry><box size="{size}"/></geometry></collision>'
+            for size, at in parts
+        )
+        return f'<link name="{name}">{"".join(shapes)}</link>'
+
+    def joint(kind: str, parent: str, child: str, at: str, travel: float = 0.0) -> str:
+        ends = f'<axis xyz="-1 0 0"/><limit lower="0" upper="{travel}"/>' if travel else ""
+        links = f'<parent link="{parent}"/><child link="{child}"/><origin xyz="{at}"/>'
+        return f'<joint name="{child}_joint" type="{kind}">{links}{ends}</joint>'
+
+    walls = (
+        ("8 .1 2.4", "0 1.8 1.2"),
+        ("8 .1 2.4", "0 -1.8 1.2"),
+        (".1 4 2.4", "4 0 1.2"),
+        (".1 4 2.4", "-4 0 1.2"),
+    )
+    parts = [
+        boxes("rooms", *walls),
+        boxes(wardrobe, ("0.4 3.4 0.5", "0 0 0.25"), ("0.4 3.4 1.2", "0 0 1.3")),
+        boxes("tray", ("0.02 0.56 0.1", "0 0 0"), ("0.02 0.2 0.02", "-0.07 0 0")),
+        boxes(cabinet, ("0.3 0.4 0.5", "0 0 0.25")),
+        boxes("drawer", ("0.02 0.36 0.2", "0 0 0"), ("0.02 0.2 0.02", "-0.07 0 0")),
+        joint("fixed", "rooms", wardrobe, "-1 0 0"),
+        joint("prismatic", wardrobe, "tray", "-0.22 0 0.6", 0.15),
+        joint("fixed", "rooms", cabinet, "3.7 -1 0"),
+        joint("prismatic", cabinet, "drawer", "-0.17 0 0.4", 0.25),
+    ]
+    file.write_text(f'<robot name="h">{"".join(parts)}</robot>', encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("wardrobe", "cabinet", "files"),
+    [
+        ("wardrobe", "cabinet", ("wardrobe", "cabinet")),
+        ("шкаф", "стол", ("part", "part_2")),
+        ("a+b", "a b", ("a_b_2", "a_b")),
+    ],
+)
+def test_objects_whose_names_look_alike_stay_what_they_are(
+    wardrobe: str, cabinet: str, files: tuple[str, str], tmp_path: Path
+) -> None:
+    write_halves(tmp_path / "h.urdf", wardrobe, cabinet)
+    done = vkc.import_home(tmp_path / "h.urdf", tmp_path / "out")
+    entries = {entry["name"]: entry["type"] for entry in done.scene.document["objects"]}
+    names = wardrobe, cabinet.replace(" ", "_")
+    assert entries == {
+        name: f"objects/{file}/{file}.yaml" for name, file in zip(names, files, strict=True)
+    }
+    for name, travel, low, high in (
+        (names[0], 0.15, (-1.3, -1.7, 0.0), (-0.8, 1.7, 1.9)),
+        (names[1], 0.25, (3.45, -1.2, 0.0), (3.85, -0.8, 0.5)),
+    ):
+        item = done.scene.objects[name]
+        boxes = np.array(
+            [world_box(shape.geometry, shape.placement) for shape in standing_geometry(item)]
+        )
+        assert boxes[:, 0].min(axis=0) == pytest.approx(low, abs=1e-5), name
+        assert boxes[:, 1].max(axis=0) == pytest.approx(high, abs=1e-5), name
+        assert item.object.upper == pytest.approx([travel])
+    plan = vkc.plan(
+        done.scene.with_start(base=[1.0, 0.0, 0.0]), [vkc.GoTo(-2.5, 0.0)], time_limit=30
+    )
+    assert not plan.success
+    assert plan.status == "infeasible"
+    again = vkc.import_home(tmp_path / "h.urdf", tmp_path / "out", force=True)
+    assert again.scene.document == done.scene.document
+
+
+def test_a_file_name_cannot_add_fields_to_the_scene(tmp_path: Path) -> None:
+    file = tmp_path / "x\nfloor: false\n#\x01\udcff.urdf"
+    write_halves(file, "wardrobe", "cabinet")
+    done = vkc.import_home(file, tmp_path / "out")
+    assert done.scene.floor
+    assert done.scene.name == "x_floor_false"
+    head = done.file.read_text(encoding="utf-8").splitlines()[0]
+    assert head == "# Made of x\\nfloor: false\\n#\\x01\\udcff.urdf by vkc-pin import-home."

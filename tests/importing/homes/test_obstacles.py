@@ -45,3 +45,44 @@ def test_simple_shapes_stay_what_they_are_and_others_become_urdf(tmp_path: Path)
         assert np.vstack([box.min_, box.max_]) == pytest.approx(own.mesh().bounds, abs=2e-3)  # balls of triangles are smaller
         if part.kind != "mesh":
             assert shape.placement.isApprox(part.placement, 1e-5)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "files"),
+    [
+        ("wardrobe", "stool", ("wardrobe", "stool")),
+        ("шкаф", "стул", ("part", "part_2")),
+        ("衣柜", "凳子", ("part", "part_2")),
+        ("a+b", "a b", ("a_b_2", "a_b")),
+        ("Chair", "chair", ("Chair", "chair_2")),
+        ("con", "x" * 300, ("con_", "x" * 64)),
+    ],
+)
+def test_links_whose_names_look_alike_keep_their_own_shapes(
+    first: str, second: str, files: tuple[str, str], tmp_path: Path
+) -> None:
+    def pair(name: str, size: tuple[float, float, float], x: float) -> Link:
+        boxes = (
+            _part("", "box", size, pin.SE3(np.eye(3), np.array([x, y, 1.0]))) for y in (0.0, 0.1)
+        )
+        return Link(name, (), tuple(boxes))
+
+    links = [pair(first, (0.4, 3.4, 1.9), -1.0), pair(second, (0.2, 0.2, 0.3), 3.0)]
+    home = Home((), tuple(links), (), (), 4, ())
+    entries, _ = write_obstacles(home, tmp_path / "home.urdf", tmp_path, set(), {})
+    assert [entry["name"] for entry in entries] == [first, second.replace(" ", "_")]
+    assert [entry["file"] for entry in entries] == [
+        f"obstacles/{name}/{name}.urdf" for name in files
+    ]
+    document = {
+        "robot": "husky_ur5e",
+        "start": {"base": [-3, -3, 0]},
+        "obstacles": entries,
+        "floor": False,
+    }
+    scene = Scene.from_document(document, tmp_path)
+    for shape, part in zip(
+        scene.obstacles, [part for link in links for part in link.collision], strict=True
+    ):
+        assert 2.0 * shape.geometry.halfSide == pytest.approx(part.size)
+        assert shape.placement.isApprox(part.placement, 1e-5)

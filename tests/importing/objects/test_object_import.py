@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 import yaml
 from helpers.downloads import MJCF, SDF, partnet
 
@@ -131,3 +132,53 @@ def test_nothing_is_left_of_what_fails_halfway(tmp_path: Path) -> None:
     assert not (out / "old.stl").exists()
     again = vkc.propose_attachments(done.proposals.object, "husky_ur5e", most=1)
     assert [one.attachment.name for one in again.found] == list(done.object.attachments)
+
+
+def test_a_file_name_cannot_add_fields_to_the_description(tmp_path: Path) -> None:
+    file = tmp_path / "x\nfree: true\n#\x01\udcff.sdf"
+    file.write_text(SDF)
+    done = vkc.import_object(file, tmp_path / "out", most=1)
+    assert done.file.name == "x_free_true.yaml"
+    assert not done.object.free
+    text = done.file.read_text(encoding="utf-8")
+    assert set(yaml.safe_load(text)) == {"urdf", "attachments"}
+    assert text.startswith(
+        "# Made of x\\nfree: true\\n#\\x01\\udcff.sdf by vkc-pin import-object.\n"
+    )
+    again = vkc.import_object(file, tmp_path / "out", most=1, force=True)
+    assert again.file == done.file
+
+
+@pytest.mark.parametrize(
+    ("link", "name"),
+    [("link_2", "link_2"), ("+", "object"), ("con", "con_"), ("x" * 300, "x" * 64)],
+)
+def test_an_object_is_named_after_its_link(link: str, name: str, tmp_path: Path) -> None:
+    file = partnet(tmp_path / "in")
+    file.write_text(file.read_text().replace('"link_2"', f'"{link}"'))
+    done = vkc.import_object(file, tmp_path / "out", link=link, up="y", most=1)
+    assert done.file.name == f"{name}.yaml"
+    assert {path.name for path in done.file.parent.glob("*.urdf")} == {f"{name}.urdf"}
+    assert done.object.base_link == link
+    assert (f"# Name of the link: {link}\n" in done.file.read_text()) == (link != name)
+
+
+@pytest.mark.parametrize(("small", "large"), [("left", "right"), ("é", "ü"), ("a+b", "a b")])
+def test_links_whose_names_look_alike_keep_their_own_pieces(
+    small: str, large: str, tmp_path: Path
+) -> None:
+    def link(name: str, geometry: str, x: float = 0.0, z: float = 0.0) -> str:
+        shape = f'<origin xyz="{x} 0 {z}"/><geometry>{geometry}</geometry>'
+        return f'<link name="{name}"><collision>{shape}</collision></link>'
+
+    text = link("case", '<box size="0.4 0.6 0.8"/>', 0.2, 0.4)
+    for name, size, y in ((small, 0.05, 0.2), (large, 0.2, -0.2)):
+        trimesh.creation.box((size,) * 3).export(tmp_path / f"{size}.stl")
+        text += link(name, f'<mesh filename="{size}.stl"/>')
+        text += f'<joint name="{name}_joint" type="prismatic"><origin xyz="-0.2 {y} 0.5"/>'
+        text += f'<parent link="case"/><child link="{name}"/>'
+        text += '<axis xyz="-1 0 0"/><limit lower="0" upper="0.3"/></joint>'
+    (tmp_path / "o.urdf").write_text(f'<robot name="o">{text}</robot>', encoding="utf-8")
+    item = vkc.import_object(tmp_path / "o.urdf", tmp_path / "out", most=1).object
+    volumes = [shape.geometry.computeVolume() for shape in item.collision.geometryObjects]
+    assert volumes == pytest.approx([0.4 * 0.6 * 0.8, 0.05**3, 0.2**3])

@@ -9,11 +9,14 @@ import pytest
 from helpers.downloads import partnet
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pydantic import TypeAdapter
 
 from vkc_pin.errors import UnknownNameError
+from vkc_pin.files.fields import Name
 from vkc_pin.importing.objects.description import Description, Joint, Link, Part
 from vkc_pin.importing.objects.tidying import (
     bounds,
+    choose_name,
     only,
     renamed,
     rooted,
@@ -149,3 +152,19 @@ def test_a_file_of_several_things_is_told_from_one_with_several_joints(tmp_path:
     assert "'oven' (1 joint), 'chest' (2 joints)" in note
     assert said(oven) == said(oven, box("wall", "world", "fixed")) == ()
     assert said(box("upper", "world", "prismatic"), box("lower", "world", "prismatic")) == ()
+
+
+@given(st.lists(st.text(max_size=5), max_size=8))
+def test_chosen_names_are_names_of_scenes_and_differ(wanted: list[str]) -> None:
+    taken = set[str]()
+    names = [choose_name(name, taken) for name in wanted]
+    assert len(set(names)) == len(names)
+    assert taken == set(names)
+    for name in names:
+        TypeAdapter(Name).validate_python(name)
+
+
+def test_names_that_scenes_accept_stay() -> None:
+    taken = set[str]()
+    names = ["a+b", "a b", "шкаф", "a\x7fb\u200b", "a_b"]
+    assert [choose_name(name, taken) for name in names] == ["a+b", "a_b", "шкаф", "a_b_2", "a_b_3"]

@@ -4,10 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
+import pytest
 import trimesh
 import yaml
 
 import vkc_pin as vkc
+from vkc_pin.files.urdf import read_urdf
 from vkc_pin.importing.objects.description import Description, Joint, Link, Part
 from vkc_pin.importing.objects.writing import write_description, write_urdf
 
@@ -62,3 +64,61 @@ def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
     ball = item.collision.geometryObjects[3]
     assert np.allclose(ball.placement.act(np.asarray(ball.geometry.points()).mean(axis=0)), place.translation, atol=1e-3)
     assert np.allclose(item.visual.geometryObjects[1].meshColor, red)
+
+
+PAIRS = [
+    ("left", "right"),
+    ("é", "ü"),
+    ("a+b", "a b"),
+    ("a_b", "a b"),
+    ("Leaf", "leaf"),
+    ("x" * 300, "x" * 301),
+]
+
+
+@pytest.mark.parametrize(("small", "large"), PAIRS)
+def test_links_whose_names_look_alike_keep_their_own_meshes(
+    small: str, large: str, tmp_path: Path
+) -> None:
+    def solid(size: float) -> tuple[Part, ...]:
+        mesh, here = trimesh.creation.box((size,) * 3), pin.SE3.Identity()
+        return (Part(name="", placement=here, kind="mesh", size=(1.0, 1.0, 1.0), triangles=mesh),)
+
+    parts = {small: solid(0.1), large: solid(0.2)}
+    links = {"case": Link("case"), **{name: Link(name, own, own) for name, own in parts.items()}}
+    joints = {
+        name: Joint(
+            name=f"{name}_joint",
+            kind="prismatic",
+            parent="case",
+            child=name,
+            placement=pin.SE3.Identity(),
+        )
+        for name in parts
+    }
+    write_urdf(Description(tmp_path / "x", links, joints), tmp_path / "thing.urdf")
+    shapes = {
+        kind: read_urdf(tmp_path / "thing.urdf").shapes(kind) for kind in ("collision", "visual")
+    }
+    for kind, found in shapes.items():
+        volumes = {shape.link: shape.mesh().volume for shape in found}
+        assert volumes == pytest.approx({small: 0.1**3, large: 0.2**3}), kind
+        names = {shape.file.name for shape in found if shape.file is not None}
+        assert len(names) == 2
+        assert max(map(len, names)) < 80
+
+
+def test_no_text_ends_a_comment_or_an_attribute(tmp_path: Path) -> None:
+    part = Part(name='a"\n\x01<b/>', placement=pin.SE3.Identity(), kind="box", size=(0.1, 0.1, 0.1))
+    write_urdf(
+        Description(tmp_path / "x", {"a": Link("a", (part,), (part,))}, {}), tmp_path / "thing.urdf"
+    )
+    about = ["Made of x\nfree: true\n#.urdf", "\x85\u2028\x00mass: 3"]
+    write_description(tmp_path / "thing.yaml", "thing.urdf", (), about=about)
+    assert yaml.safe_load((tmp_path / "thing.yaml").read_text()) == {
+        "urdf": "thing.urdf",
+        "attachments": [],
+    }
+    assert not vkc.load_object(tmp_path / "thing.yaml").free
+    (element,) = read_urdf(tmp_path / "thing.urdf").root.iter("collision")
+    assert element.get("name") == 'a"\n\ufffd<b/>'

@@ -194,3 +194,37 @@ def test_a_telescope_is_proposed_as_one_coordinate(tmp_path: Path) -> None:
         assert said.get("couplings", {}) == (FOLLOWERS if told else {})
         assert ("out_2, out_3, out_4 slide along with out_1, as a telescope" in str(made)) == told
         assert set(said["home"]) == {*made.robot.coordinates.names[3:]}
+
+
+def test_names_of_files_and_folders_are_quoted_or_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = write_arms(tmp_path / "given").read_text(encoding="utf-8").replace(' name="robot"', "")
+    file = tmp_path / "x\ntool_frame: body\n#\x01\udcff.urdf"
+    file.write_text(text, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    for folder, target, stem in (
+        (None, "x_tool_frame__body____", "x_tool_frame__body____"),
+        ("моя\x01\n", "моя\x01\n", "robot"),
+    ):
+        made = vkc.import_robot(file, folder, samples=SAMPLES)
+        assert made.folder.name == target
+        said = yaml.safe_load((made.folder / "robot.yaml").read_text(encoding="utf-8"))
+        assert (said["urdf"], said["srdf"], said["tool_frame"]) == (
+            f"{stem}.urdf",
+            f"{stem}.srdf",
+            "tool",
+        )
+        assert {path.suffix: path.stem for path in made.folder.glob("*.?rdf")} == {
+            ".urdf": stem,
+            ".srdf": stem,
+        }
+        head = (made.folder / "robot.yaml").read_text(encoding="utf-8").splitlines()[0]
+        assert head.startswith(
+            "# Made of x\\ntool_frame: body\\n#\\x01\\udcff.urdf (URDF) by vkc-pin import-robot."
+        )
+        assert vkc.load_robot(made.folder).name == target
+        again = vkc.import_robot(file, folder, samples=SAMPLES, force=True)
+        assert sorted(path.name for path in again.folder.iterdir()) == sorted(
+            path.name for path in made.folder.iterdir()
+        )

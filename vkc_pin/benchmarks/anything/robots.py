@@ -179,7 +179,8 @@ def _facts(robot: Robot, folder: Path) -> dict[str, Any]:
     """Return what is measured of an imported robot."""
     said = subprocess.run([sys.executable, "-c", _LOAD, str(folder)], capture_output=True, text=True, check=True)
     every = load_robot(folder, pairs="all")
-    look = Clearances(with_collision_pairs(every, read_srdf(folder / f"{folder.name}.srdf", links=every.file.links).allowed))
+    (srdf,) = folder.glob("*.srdf")
+    look = Clearances(with_collision_pairs(every, read_srdf(srdf, links=every.file.links).allowed))
     look.place(robot.home)  # also of pairs that loading exempts since they overlap there
     links = {tuple(sorted((robot.link_of(pair.first), robot.link_of(pair.second)))) for pair in robot.collision.collisionPairs}
     return {

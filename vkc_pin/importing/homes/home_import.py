@@ -16,7 +16,7 @@ import yaml
 from vkc_pin.arguments import flag, instance, number, whole
 from vkc_pin.errors import InputError
 from vkc_pin.files.documents import read_text
-from vkc_pin.files.resources import file_path
+from vkc_pin.files.resources import choose_file_names, file_path
 from vkc_pin.files.writing import folder_at_once, write_atomically
 from vkc_pin.files.xml import parse_xml
 from vkc_pin.importing.homes.obstacles import write_obstacles
@@ -27,7 +27,7 @@ from vkc_pin.importing.objects.description import WEIGHTLESS
 from vkc_pin.importing.objects.object_import import read_description
 from vkc_pin.importing.objects.pieces import Known
 from vkc_pin.importing.objects.tidying import bounds, renamed, rooted, surfaces
-from vkc_pin.importing.targets import check_target, made_by
+from vkc_pin.importing.targets import check_target, format_comment, made_by
 from vkc_pin.models.robot_file import load_robot
 from vkc_pin.options import Options
 from vkc_pin.scene.obstacles import FLOOR
@@ -131,9 +131,13 @@ def import_home(
         )
     with folder_at_once(target, force=True) as made:  # what is there may be replaced
         known: Known = {}
-        taken = {FLOOR} | {thing.name for thing in home.things}
+        names = [thing.name for thing in home.things]
+        taken = {FLOOR, *names}
         clearances = {"dist_safe": options.dist_safe, "grasp_clearance": options.grasp_clearance}
-        things = tuple(write_thing(thing, hand, made, known, most=most, **clearances) for thing in home.things)
+        things = tuple(
+            write_thing(thing, hand, made, known, stem=stem, most=most, **clearances)
+            for thing, stem in zip(home.things, choose_file_names(names), strict=True)
+        )
         obstacles, changed = write_obstacles(home, path, made, taken, known)
         document: dict[str, Any] = {
             "name": _name(path),
@@ -168,7 +172,8 @@ def _interval(low: float, high: float) -> list[float]:
 
 def _name(path: Path) -> str:
     """Return what to call a home."""
-    return re.sub(r"[^A-Za-z0-9_]+", "_", path.stem).strip("_") or "home"
+    name = re.sub(r"[^A-Za-z0-9_]+", "_", path.stem).strip("_")
+    return choose_file_names([name], fallback="home")[0]
 
 
 def _robot(robot: str | Path) -> str:
@@ -178,7 +183,7 @@ def _robot(robot: str | Path) -> str:
 
 
 def _write(file: Path, source: Path, document: Mapping[str, Any]) -> None:
-    head = f"# Made of {source.name} {made_by(_COMMAND)}.\n"
+    head = format_comment(f"Made of {source.name} {made_by(_COMMAND)}.")
     write_atomically(file, (head + yaml.safe_dump(document, sort_keys=False, width=130, default_flow_style=None)).encode())
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,10 +10,11 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from vkc_pin.files.resources import choose_file_names
 from vkc_pin.importing.homes.splitting import Home
 from vkc_pin.importing.objects.description import Colour, Description, Link, Part
 from vkc_pin.importing.objects.pieces import Known, with_pieces
-from vkc_pin.importing.objects.tidying import bounds, rooted, surfaces
+from vkc_pin.importing.objects.tidying import bounds, choose_name, rooted, surfaces
 from vkc_pin.importing.objects.writing import write_urdf
 
 __all__ = ["write_obstacles"]
@@ -42,9 +42,11 @@ def write_obstacles(
         InputError: A mesh is concave, and CoACD is not installed.
     """
     entries, notes = list[dict[str, Any]](), list[str]()
-    for link in _alone(home):
-        name = _name(link.name, taken)
-        if len(link.solid) == 1 and link.solid[0].kind != "mesh":
+    named = {choose_name(link.name, taken): link for link in _alone(home)}
+    written = [name for name, link in named.items() if not _is_simple(link)]
+    stems = dict(zip(written, choose_file_names(written), strict=True))
+    for name, link in named.items():
+        if name not in stems:
             entries.append(_simple(name, link))
             continue
         description = Description(source, {name: Link(name, link.visual, link.collision)}, {})
@@ -53,7 +55,7 @@ def write_obstacles(
         description = rooted(description, pin.SE3(np.eye(3), -origin))
         description = with_pieces(description, surfaces(description), known)
         notes += description.notes
-        address = f"obstacles/{_plain(name)}/{_plain(name)}.urdf"
+        address = f"obstacles/{stems[name]}/{stems[name]}.urdf"
         write_urdf(description, folder / address)
         entries.append({"name": name, "type": "urdf", "file": address, "position": _numbers(origin)})
     return entries, notes
@@ -67,6 +69,10 @@ def _alone(home: Home) -> Iterator[Link]:
             seen = part if colour is None else _painted(part, colour)
             yield Link(part.name or (link.name if len(link.solid) == 1 else f"{link.name}_{number}"), (seen,), (seen,))
     yield from home.furniture
+
+
+def _is_simple(link: Link) -> bool:
+    return len(link.solid) == 1 and link.solid[0].kind != "mesh"
 
 
 def _simple(name: str, link: Link) -> dict[str, Any]:
@@ -93,20 +99,6 @@ def _colour(part: Part, looks: Iterable[Part]) -> Colour | None:
 
 def _painted(part: Part, colour: Colour) -> Part:
     return dataclasses.replace(part, colour=colour)
-
-
-def _name(wanted: str, taken: set[str]) -> str:
-    """Return a name that a scene can have and that nothing has yet."""
-    stem, number = re.sub(r"[\s./]+", "_", wanted).strip("_") or "part", 1
-    while (name := stem if number == 1 else f"{stem}_{number}") in taken:
-        number += 1
-    taken.add(name)
-    return name
-
-
-def _plain(name: str) -> str:
-    """Return a name that any file can have."""
-    return re.sub(r"[^A-Za-z0-9_-]", "_", name)
 
 
 def _numbers(values: Any, digits: int = 6) -> list[float]:

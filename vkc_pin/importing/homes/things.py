@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,7 +54,16 @@ class ImportedThing:
         return f"{self.name}: {'; '.join(said)}"
 
 
-def write_thing(thing: Thing, robot: Robot, folder: Path, known: Known, *, most: int, **clearances: float) -> ImportedThing:
+def write_thing(
+    thing: Thing,
+    robot: Robot,
+    folder: Path,
+    known: Known,
+    *,
+    stem: str,
+    most: int,
+    **clearances: float,
+) -> ImportedThing:
     """Write an object, and return what it is in a scene.
 
     What is carried is taken hold of as what slides upwards from where it stands.
@@ -65,6 +73,7 @@ def write_thing(thing: Thing, robot: Robot, folder: Path, known: Known, *, most:
         robot: Whose hand the attachments are for.
         folder: The scene's.
         known: Pieces of files that were cut before; its own are added.
+        stem: Name of the object's folder and files, without extension.
         most: Attachments for one joint at most.
         clearances: As of `propose_attachments`.
 
@@ -76,8 +85,7 @@ def write_thing(thing: Thing, robot: Robot, folder: Path, known: Known, *, most:
         description = _standing(description)
     description = with_limits(description, surfaces(description))
     description = with_pieces(description, surfaces(description), known)
-    name = re.sub(r"[^A-Za-z0-9_-]", "_", thing.name)
-    address = f"objects/{name}/{name}.yaml"
+    address = f"objects/{stem}/{stem}.yaml"
     yaml, urdf = folder / address, (folder / address).with_suffix(".urdf")
     with tempfile.TemporaryDirectory() as scratch:
         tried = Path(scratch) / yaml.name if thing.free else yaml

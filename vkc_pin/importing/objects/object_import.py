@@ -16,7 +16,7 @@ from vkc_pin.arguments import flag, instance, quantity, whole
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError, shown
 from vkc_pin.files.documents import read_text
-from vkc_pin.files.resources import file_path
+from vkc_pin.files.resources import choose_file_names, file_path
 from vkc_pin.files.writing import folder_at_once
 from vkc_pin.files.xml import parse_xml
 from vkc_pin.importing.objects.description import WEIGHTLESS, Description
@@ -173,6 +173,8 @@ def import_object(
         yaml, urdf, picture = made / f"{name}.yaml", made / f"{name}.urdf", made / "attachments.png"
         write_urdf(description, urdf)
         about = [f"Made of {path.name} {made_by(_COMMAND)}."]
+        if link is not None and link != name:
+            about.append(f"Name of the link: {link}")
         write_description(yaml, urdf.name, (), about=about)
         proposals = propose_attachments(load_object(yaml), robot, most=most, **clearances)
         about.append(f"Attachments as proposed for the hand of {proposals.hand.robot}, best first.")
@@ -188,7 +190,8 @@ def _name(path: Path, link: str | None) -> str:
     """Return what to call an object: by its link, its file, or the folder of a file whose name says nothing."""
     stem = link or (path.resolve().parent.name if path.stem.lower() in _GENERAL else path.stem)
     name = re.sub(r"[^A-Za-z0-9_]+", "_", stem).strip("_") or "object"
-    return name if name[0].isalpha() else f"object_{name}"
+    (name,) = choose_file_names([name if name[0].isalpha() else f"object_{name}"])
+    return name
 
 
 def _sized(description: Description, height: float | None, scale: float | None) -> tuple[Description, Floats]:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Surfaces",
     "bounds",
+    "choose_name",
     "closed",
     "only",
     "renamed",
@@ -69,22 +70,33 @@ def several(description: Description) -> tuple[str, ...]:
     return (f"several things hang on its root: {listed}; to import one of them, name it (link, --link)",)
 
 
+def choose_name(wanted: str, taken: set[str]) -> str:
+    """Choose a name that scenes accept and that is not in `taken`, and add it to `taken`.
+
+    Characters that cannot be printed, ".", "/" and spaces become "_"; equal results are numbered.
+    """
+    plain = re.sub(r"[\s./]+", "_", wanted)
+    stem = "".join(letter if letter.isprintable() else "_" for letter in plain).strip("_") or "part"
+    name, number = stem, 1
+    while name in taken:
+        number += 1
+        name = f"{stem}_{number}"
+    taken.add(name)
+    return name
+
+
 def renamed(description: Description) -> Description:
-    """Return the object with names of links and joints that attachments and steps can have: without '.', '/' and spaces."""
-    taken: set[str] = set()
-
-    def plain(name: str) -> str:
-        stem, number = re.sub(r"[\s./]+", "_", name).strip("_") or "part", 1
-        while (new := stem if number == 1 else f"{stem}_{number}") in taken:
-            number += 1
-        taken.add(new)
-        return new
-
-    names = {name: plain(name) for name in description.links}
-    taken.clear()
+    """Return the object with names of links and joints that scenes and steps accept."""
+    links_taken, joints_taken = set[str](), set[str]()
+    names = {name: choose_name(name, links_taken) for name in description.links}
     links = {names[name]: dataclasses.replace(link, name=names[name]) for name, link in description.links.items()}
     joints = {
-        names[child]: dataclasses.replace(joint, name=plain(joint.name), parent=names[joint.parent], child=names[child])
+        names[child]: dataclasses.replace(
+            joint,
+            name=choose_name(joint.name, joints_taken),
+            parent=names[joint.parent],
+            child=names[child],
+        )
         for child, joint in description.joints.items()
     }
     return dataclasses.replace(description, links=links, joints=joints)

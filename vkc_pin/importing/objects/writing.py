@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import pinocchio as pin
 import yaml
 
 from vkc_pin.files.meshes import load_parts
+from vkc_pin.files.resources import choose_file_names
 from vkc_pin.files.writing import write_atomically
+from vkc_pin.files.xml import quote
 from vkc_pin.importing.objects.description import Colour, Description, Joint, Link, Part
+from vkc_pin.importing.targets import format_comment
 from vkc_pin.models.articulation import DEFAULT_VELOCITY
 
 if TYPE_CHECKING:
@@ -30,18 +31,23 @@ _GREY: Colour = (0.75, 0.75, 0.75, 1.0)
 def write_urdf(description: Description, file: Path) -> None:
     """Write a URDF, and beside it the folders `collision` and `visual` with its meshes.
 
+    Files of meshes are named after their links, see `choose_file_names`.
+
     Args:
         description: The object; what collides is convex.
         file: The URDF to write.
     """
-    lines = ['<?xml version="1.0"?>', f"<robot name={quoteattr(file.stem)}>"]
-    for link in description.links.values():
-        lines.append(f"  <link name={quoteattr(link.name)}>")
+    lines = ['<?xml version="1.0"?>', f"<robot name={quote(file.stem)}>"]
+    stems = choose_file_names(description.links)
+    for stem, link in zip(stems, description.links.values(), strict=True):
+        lines.append(f"  <link name={quote(link.name)}>")
         for number, (part, mesh, colour) in enumerate(_looks(link)):
-            address = None if mesh is None else _mesh(file, f"visual/{_plain(link.name)}_{number}.stl", mesh)
+            address = None if mesh is None else _mesh(file, f"visual/{stem}_{number}.stl", mesh)
             lines += _element("visual", "", part, address, colour)
         for number, part in enumerate(_plain_shapes(link.collision)):
-            piece = None if part.kind != "mesh" else _mesh(file, f"collision/{_plain(link.name)}_{number}.stl", part.mesh())
+            piece = None
+            if part.kind == "mesh":
+                piece = _mesh(file, f"collision/{stem}_{number}.stl", part.mesh())
             lines += _element("collision", part.name, part, piece, None)
         lines += _inertial(link.inertia)
         lines.append("  </link>")
@@ -62,7 +68,7 @@ def write_description(
         about: Lines for its head.
         free: Whether it can be carried away.
     """
-    head = "".join(f"# {line}\n" for line in about)
+    head = "".join(map(format_comment, about))
     data = {"urdf": urdf, **({"free": True} if free else {}), "attachments": [dict(item) for item in attachments]}
     body = yaml.safe_dump(data, sort_keys=False, width=130)
     write_atomically(file, (head + body).encode())
@@ -108,14 +114,14 @@ def _mesh(urdf: Path, address: str, mesh: trimesh.Trimesh) -> str:
 
 
 def _element(kind: str, name: str, part: Part | None, address: str | None, colour: Colour | None) -> list[str]:
-    lines = [f"    <{kind}{f' name={quoteattr(name)}' if name else ''}>"]
+    lines = [f"    <{kind}{f' name={quote(name)}' if name else ''}>"]
     if part is not None and address is None:
         lines.append(f"      {_origin(part.placement)}")
         keys = {"box": f'size="{_numbers(part.size)}"', "sphere": f'radius="{_numbers(part.size)}"'}
         size = keys.get(part.kind) or f'radius="{_numbers(part.size[:1])}" length="{_numbers(part.size[1:])}"'
         lines.append(f"      <geometry><{part.kind} {size}/></geometry>")
     else:
-        lines.append(f"      <geometry><mesh filename={quoteattr(address or '')}/></geometry>")
+        lines.append(f"      <geometry><mesh filename={quote(address or '')}/></geometry>")
     if colour is not None:
         name = "_".join(f"{round(255 * c):02x}" for c in colour)
         lines.append(f'      <material name="{name}"><color rgba="{_numbers(colour)}"/></material>')
@@ -133,8 +139,8 @@ def _inertial(inertia: pin.Inertia) -> list[str]:
 
 def _joint(joint: Joint) -> list[str]:
     lines = [
-        f"  <joint name={quoteattr(joint.name)} type={quoteattr(joint.kind)}>",
-        f"    <parent link={quoteattr(joint.parent)}/><child link={quoteattr(joint.child)}/>",
+        f"  <joint name={quote(joint.name)} type={quote(joint.kind)}>",
+        f"    <parent link={quote(joint.parent)}/><child link={quote(joint.child)}/>",
         f"    {_origin(joint.placement)}",
         f'    <axis xyz="{_numbers(joint.axis)}"/>',
     ]
@@ -151,8 +157,3 @@ def _origin(placement: pin.SE3) -> str:
 
 def _numbers(values: Any) -> str:
     return " ".join(f"{value + 0.0:.9g}" for value in np.asarray(values, float).round(9).tolist())
-
-
-def _plain(name: str) -> str:
-    """Return a name that any file can have."""
-    return re.sub(r"[^A-Za-z0-9_-]", "_", name)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import copy
 import shutil
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from vkc_pin.errors import InputError
 from vkc_pin.files.meshes import load_mesh
+from vkc_pin.files.resources import choose_file_names
 from vkc_pin.files.urdf import UrdfFile, UrdfShape
 from vkc_pin.importing.convex import Pieces, decompose
 
@@ -18,6 +20,7 @@ __all__ = ["Piece", "own_meshes"]
 _WHOLE = 0.02  # [m] between a hull and its mesh that matters nowhere on a robot,
 _MORE = 0.15  # nor does a hull that fills so much more than its mesh,
 _SHARE = 0.15  # nor does this share of the mesh's longest edge: fingers are small
+_MATERIAL = "mtllib "  # statement of an OBJ file that names its materials' file
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,8 @@ def own_meshes(file: UrdfFile, folder: Path, *, most_pieces: int) -> tuple[Eleme
     """Return a URDF whose meshes are in `folder`, what became of those that collide, and notes of what was left out.
 
     Meshes that collide are written as convex pieces, `collision/<link>_<k>.stl`; those that are seen are copied into `visual`.
+    `choose_file_names` chooses the names.
+
     Links without anything to collide get what is seen of them; flat meshes, and visual ones that cannot be read, are left out.
 
     Args:
@@ -57,6 +62,7 @@ def own_meshes(file: UrdfFile, folder: Path, *, most_pieces: int) -> tuple[Eleme
     """
     root = copy.deepcopy(file.root)
     links = {link.get("name", ""): link for link in root.findall("link")}
+    stems = dict(zip(links, choose_file_names(links), strict=True))
     found, notes = list[Piece](), list[str]()
     shapes: dict[str, list[UrdfShape]] = {}
     for shape in file.shapes("collision"):
@@ -87,7 +93,7 @@ def own_meshes(file: UrdfFile, folder: Path, *, most_pieces: int) -> tuple[Eleme
                 Piece(name, shape.file.name, len(pieces.meshes), pieces.overhead, hull / pieces.solid - 1.0, pieces.error)
             )
             for mesh in pieces.meshes:
-                path = folder / "collision" / f"{_plain(name)}_{written}.stl"
+                path = folder / "collision" / f"{stems[name]}_{written}.stl"
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.write_bytes(mesh.export(file_type="stl"))
                 piece = copy.deepcopy(element)
@@ -101,7 +107,7 @@ def own_meshes(file: UrdfFile, folder: Path, *, most_pieces: int) -> tuple[Eleme
 
 
 def _copy_visual(file: UrdfFile, links: dict[str, ElementTree.Element], folder: Path, notes: list[str]) -> None:
-    copied: dict[Path, str] = {}
+    shown: dict[Path, list[ElementTree.Element]] = {}
     missing = []
     for name, link in links.items():
         for element in link.findall("visual"):
@@ -115,28 +121,58 @@ def _copy_visual(file: UrdfFile, links: dict[str, ElementTree.Element], folder: 
                 link.remove(element)
                 missing.append(name)
                 continue
-            if path not in copied:
-                copied[path] = _copied(path, folder / "visual", len(copied))
-            mesh.set("filename", copied[path])
+            shown.setdefault(path, []).append(mesh)
+    for path, copy_name in _copy_meshes(list(shown), folder / "visual").items():
+        for mesh in shown[path]:
+            mesh.set("filename", f"visual/{copy_name}")
     if missing:
         notes.append(f"what is seen of {', '.join(dict.fromkeys(missing))} is left out: its mesh cannot be read")
 
 
-def _copied(path: Path, folder: Path, number: int) -> str:
-    """Copy a mesh, with the colours that belong to an OBJ file, and return its address in the URDF."""
-    folder.mkdir(parents=True, exist_ok=True)
-    target = folder / path.name
-    if target.exists():
-        target = folder / f"{path.stem}_{number}{path.suffix}"
-    shutil.copyfile(path, target)
-    if path.suffix.lower() == ".obj":
-        for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
-            if line.startswith("mtllib "):
-                material = path.parent / line.removeprefix("mtllib ").strip()
-                if material.is_file() and material.parent == path.parent and not (folder / material.name).exists():
-                    shutil.copyfile(material, folder / material.name)
-    return f"visual/{target.name}"
+def _copy_meshes(paths: Sequence[Path], folder: Path) -> dict[Path, str]:
+    """Copy meshes, OBJ files with their materials, and return the names of the copies."""
+    used = {path: _find_materials(path) for path in paths if path.suffix.lower() == ".obj"}
+    materials = dict.fromkeys(file for files in used.values() for file in files)
+    names = _name_copies([*paths, *materials])
+    for path, name in names.items():
+        folder.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, folder / name)
+    for path, files in used.items():
+        new = {file.name: names[file] for file in files if names[file] != file.name}
+        if new:
+            _rename_materials(folder / names[path], new)
+    return {path: names[path] for path in paths}
 
 
-def _plain(name: str) -> str:
-    return "".join(letter if letter.isalnum() or letter in "_-." else "_" for letter in name)
+def _name_copies(paths: Sequence[Path]) -> dict[Path, str]:
+    """Return a name in one folder for a copy of each file; extensions stay."""
+    names = dict[Path, str]()
+    for extension in dict.fromkeys(path.suffix.lower() for path in paths):
+        same = [path for path in paths if path.suffix.lower() == extension]
+        stems = choose_file_names(path.stem for path in same)
+        names |= {path: f"{stem}{path.suffix}" for path, stem in zip(same, stems, strict=True)}
+    return names
+
+
+def _find_materials(path: Path) -> list[Path]:
+    """Return the files of materials beside an OBJ file that it names."""
+    named = [path.parent / name for line in _read_lines(path) if (name := _get_material(line))]
+    return [file for file in named if file.is_file() and file.parent == path.parent]
+
+
+def _rename_materials(path: Path, names: Mapping[str, str]) -> None:
+    """Replace names of files of materials in an OBJ file."""
+    lines = (
+        f"{_MATERIAL}{names[name]}" if (name := _get_material(line)) in names else line
+        for line in _read_lines(path)
+    )
+    path.write_text("\n".join(lines), encoding="utf-8", errors="surrogateescape")
+
+
+def _get_material(line: str) -> str:
+    """Return the file of materials that a line of an OBJ file names, or ""."""
+    return line.removeprefix(_MATERIAL).strip() if line.startswith(_MATERIAL) else ""
+
+
+def _read_lines(path: Path) -> list[str]:
+    return path.read_text(encoding="utf-8", errors="surrogateescape").split("\n")

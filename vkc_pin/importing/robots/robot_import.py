@@ -16,9 +16,10 @@ import yaml
 from vkc_pin.arguments import flag, mapping, text, whole
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.files.resources import file_path
+from vkc_pin.files.resources import choose_file_names, file_path
 from vkc_pin.files.urdf import UrdfFile
 from vkc_pin.files.writing import folder_at_once
+from vkc_pin.files.xml import replace_forbidden
 from vkc_pin.importing.robots.arms import Arm, base_kind, bodies, choose, find_arms, own_base, telescopes
 from vkc_pin.importing.robots.doctor import Diagnosis, Finding, doctor
 from vkc_pin.importing.robots.envelopes import envelopes, leave_out
@@ -26,7 +27,7 @@ from vkc_pin.importing.robots.hands import Hand, look_at
 from vkc_pin.importing.robots.homes import HOME_ROOM, Home, arm_at, find_home, never_apart, standing
 from vkc_pin.importing.robots.pieces import Piece, own_meshes
 from vkc_pin.importing.robots.sources import Source, free_name, read_source
-from vkc_pin.importing.targets import check_target, made_by
+from vkc_pin.importing.targets import check_target, format_comment, made_by
 from vkc_pin.models.robot import Robot
 from vkc_pin.models.robot_file import load_robot
 from vkc_pin.models.robot_model import full_model
@@ -100,7 +101,7 @@ def import_robot(
         UnknownNameError: There is no such arm or frame; the error names the nearest one.
     """
     path = file_path(file, "file", "a URDF, xacro or MJCF file")
-    name = path.name.split(".")[0]
+    (name,) = choose_file_names([path.name.split(".")[0]], fallback="robot")
     target = Path(name) if folder is None else file_path(folder, "folder", "a folder")
     for field, given in (("arm", arm), ("tool_frame", tool_frame)):
         if given is not None:
@@ -121,9 +122,9 @@ def import_robot(
 
 class _Importer:
     def __init__(self, source: Source, folder: Path, name: str) -> None:
-        self._source, self._folder, self._name = source, folder, name
-        self._file = source.file
-        self._settings: dict[str, Any] = {"urdf": f"{name}.urdf", "srdf": f"{name}.srdf"}
+        self._source, self._file, self._folder, self._name = source, source.file, folder, name
+        (stem,) = choose_file_names([name], fallback="robot")
+        self._settings: dict[str, Any] = {"urdf": f"{stem}.urdf", "srdf": f"{stem}.srdf"}
         self._findings = [Finding("note", "file", note) for note in source.notes]
 
     def make(self, arm: str | None, tool_frame: str | None, most_pieces: int, samples: int, seed: int) -> ImportedRobot:
@@ -141,7 +142,8 @@ class _Importer:
         self._arm(chosen, arms, driving)
         root, pieces, notes = own_meshes(self._file, self._folder, most_pieces=most_pieces)
         self._findings += [Finding("warning", "shapes", note) for note in notes]
-        self._file = UrdfFile(self._folder / f"{self._name}.urdf", ElementTree.tostring(root, encoding="unicode"), root)
+        text = ElementTree.tostring(root, encoding="unicode")
+        self._file = UrdfFile(self._folder / self._settings["urdf"], text, root)
         if chosen is not None:
             self._hand(look_at(self._file, full_model(self._file), chosen), tool_frame)
         if tool_frame is not None:
@@ -224,12 +226,12 @@ class _Importer:
     def _write(self) -> None:
         settings = {key: value for key, value in self._settings.items() if key != "srdf" or (self._folder / value).is_file()}
         ElementTree.indent(self._file.root)
-        source = f"{self._source.file.path.name} ({self._source.kind})"
-        said = f"# Made of {source} {made_by('import-robot')}. Units: m, rad, s.\n"
+        source = f"{self._source.file.path.name} ({self._source.kind}) {made_by('import-robot')}"
+        head = format_comment(f"Made of {source}. Units: m, rad, s.")
         body = yaml.safe_dump(settings, sort_keys=False, default_flow_style=None, width=120)
-        (self._folder / "robot.yaml").write_text(said + body, encoding="utf-8")
-        urdf = self._folder / f"{self._name}.urdf"
-        ElementTree.ElementTree(self._file.root).write(urdf, encoding="utf-8", xml_declaration=True)
+        (self._folder / "robot.yaml").write_text(head + body, encoding="utf-8")
+        tree = ElementTree.ElementTree(self._file.root)
+        tree.write(self._file.path, encoding="utf-8", xml_declaration=True)
 
     def _without_envelopes(self, robot: Robot) -> Robot:
         """Return the robot without shapes that are but around its hand."""
@@ -272,12 +274,12 @@ class _Importer:
         named = [(f"the state '{name}' of the file", arm_at(robot, state)) for name, state in states]
         home = find_home(apart, [*named, ("joints at 0, or in the middle", robot.home)], seed=seed)
         self._settings["home"] = {joint: round(float(value), 6) for joint, value in zip(arm, home.positions, strict=True)}
-        self._write_srdf(self._folder / f"{self._name}.srdf", robot, home.positions, allowed)
+        self._write_srdf(self._folder / self._settings["srdf"], robot, home.positions, allowed)
         self._write()
         return home
 
     def _write_srdf(self, path: Path, robot: Robot, home: Floats, allowed: Mapping[tuple[str, str], str]) -> None:
-        root = ElementTree.Element("robot", name=self._name)
+        root = ElementTree.Element("robot", name=replace_forbidden(self._name))
         arm = ElementTree.SubElement(root, "group", name="arm")
         state = ElementTree.SubElement(root, "group_state", name="home", group="arm")
         for joint, value in zip(robot.coordinates.names[3:], home, strict=True):

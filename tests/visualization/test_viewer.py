@@ -22,7 +22,7 @@ from helpers.pages import clips, commands_of
 from vkc_pin.errors import InputError
 from vkc_pin.motion.world import World
 from vkc_pin.planning.plan import Plan
-from vkc_pin.scene.scene import load_scene
+from vkc_pin.scene.scene import Scene, load_scene
 from vkc_pin.visualization import viewer as visualization
 
 needs_chromium = pytest.mark.skipif(browser.CHROMIUM is None, reason="Chromium is not installed")
@@ -112,6 +112,41 @@ def test_a_scene_alone_is_drawn_without_motion(tmp_path: Path) -> None:
     assert not clips(commands)
     assert any("drawer" in path for path in drawn(commands))
     assert not any("ghosts" in path or "paths" in path for path in drawn(commands))
+
+
+def test_names_that_look_alike_are_drawn_apart(tmp_path: Path) -> None:
+    """Two links of an object, each on a joint of its own, and two fixed ones."""
+    sizes = {"a+b": 0.1, "a b": 0.2, "c+d": 0.3, "c d": 0.4}
+    kinds = {"a+b": "prismatic", "a b": "prismatic", "c+d": "fixed", "c d": "fixed"}
+    limit = '<axis xyz="1 0 0"/><limit lower="0" upper="1" velocity="1" effort="1"/>'
+    shape = '<geometry><box size="{0} {0} {0}"/></geometry>'
+    text = '<robot name="o"><link name="case"/>' + "".join(
+        f'<link name="{name}"><collision>{shape.format(size)}</collision>'
+        f"<visual>{shape.format(size)}</visual></link>"
+        f'<joint name="{name}" type="{kinds[name]}"><parent link="case"/><child link="{name}"/>'
+        f'<origin xyz="0 0 {10 * size}"/>{limit}</joint>'
+        for name, size in sizes.items()
+    )
+    kind = {"urdf": f"{text}</robot>", "attachments": []}
+    document = {
+        "robot": "husky_ur5e",
+        "start": {"base": [-3, -3, 0]},
+        "objects": [{"name": "it", "type": kind, "position": [0, 0, 0]}],
+    }
+    frames = {"x+y": pin.SE3.Identity(), "x y": pin.SE3(np.eye(3), np.ones(3))}
+    file = visualization.to_html(Scene.from_document(document), tmp_path / "it.html", frames=frames)
+    commands = commands_of(file.read_text(encoding="utf-8"))
+    boxes = {path: item for path, item in drawn(commands).items() if "/objects/it/" in path}
+    extents = sorted(np.ptp(vertices(item), axis=0)[0] for item in boxes.values())
+    assert extents == pytest.approx(sorted(sizes.values()), abs=1e-3)
+    places = {c["path"]: c["matrix"][14] for c in commands if c["type"] == "set_transform"}
+    heights = [
+        sum(height for above, height in places.items() if f"{path}/".startswith(f"{above}/"))
+        for path in boxes
+    ]
+    floor = places["/meshcat"]
+    assert sorted(heights) == pytest.approx([10 * size + floor for size in sizes.values()])
+    assert len([path for path in places if path.startswith("/meshcat/frames/")]) == 2
 
 
 # Time

@@ -27,7 +27,7 @@ from vkc_pin.motion.world import World
 from vkc_pin.scene.scene import Scene
 from vkc_pin.validation.report import Report
 from vkc_pin.visualization.camera import FIELD_OF_VIEW, choose_viewpoint
-from vkc_pin.visualization.elements import Ghost, Sun, Triangles, Unshadow, hexadecimal, material, node_name
+from vkc_pin.visualization.elements import Ghost, Sun, Triangles, Unshadow, add_node, hexadecimal, material
 from vkc_pin.visualization.room import Part, Room, drawn_parts
 from vkc_pin.visualization.solids import Solid, coarse, merge_solids, to_solid, tube
 
@@ -85,6 +85,7 @@ class Drawing:
         self.world = World(scene) if world is None else world
         self.motion: Motion = sample_motion(self.world, trajectory, times)
         self.room = Room(scene)
+        self.taken: set[str] = set()  # paths in the tree
         self.nodes = self._nodes()
         self.movers = self._movers()
         self.items = [*self._robot_items(), *self._object_items()]
@@ -110,7 +111,7 @@ class Drawing:
         for name, points, grey in self.room.lines():
             thin = g.LineBasicMaterial(color=hexadecimal((grey, grey, grey)))
             self._unshadowed(f"room/{name}", g.LineSegments(g.PointsGeometry(points.astype(np.float32).T), thin))
-        self._frames(frames or {})
+        self._frames(frames or {}, set())
         if self.trajectory is not None:
             self._paths()
             moving = np.any([*self.movers.values(), np.zeros(self.world.model.njoints, bool)], axis=0)
@@ -143,7 +144,7 @@ class Drawing:
             placed = rest and owner in self.scene.objects
             root = f"objects/{owner}" if placed else "robot"
             above = nodes[model.parents[j]] if model.parents[j] else root
-            nodes.append(f"{above}/{node_name(rest if placed else str(model.names[j]))}")
+            nodes.append(add_node(self.taken, above, rest if placed else str(model.names[j])))
         return nodes
 
     def _robot_items(self) -> list[Item]:
@@ -154,7 +155,7 @@ class Drawing:
         placed = list(self.world.visual.geometryObjects)[: len(_meshes[robot])]  # on the joints of its fingers, too
         for source, shape, solid in zip(robot.visual.geometryObjects, placed, _meshes[robot], strict=True):
             link = str(robot.model.frames[source.parentFrame].name)
-            path = f"{self.nodes[shape.parentJoint]}/{node_name(link)}/{node_name(shape.name)}"
+            path = add_node(self.taken, self.nodes[shape.parentJoint], link, shape.name)
             colour = tuple(map(float, shape.meshColor))
             items.append(Item(path, shape.parentJoint, shape.placement, solid, colour=colour, label=link))
         return items
@@ -168,8 +169,8 @@ class Drawing:
             owner, _, link = label.partition(".")
             root = self.nodes[shape.parentJoint] if shape.parentJoint else f"objects/{owner}"
             for k, (solid, colour) in enumerate(drawn_parts(shape)):
-                name = node_name(shape.name.partition(".")[2]) + (f"_{k}" if k else "")
-                path = f"{root}/{node_name(link)}/{name}"
+                name = shape.name.partition(".")[2] + (f"_{k}" if k else "")
+                path = add_node(self.taken, root, link, name)
                 items.append(Item(path, shape.parentJoint, shape.placement, solid, colour=colour, label=label))
         return items
 
@@ -185,10 +186,10 @@ class Drawing:
         self.viewer[path].set_object(*what)
         self.viewer.window.send(Unshadow(self.viewer[path].path))
 
-    def _frames(self, frames: Mapping[str, pin.SE3]) -> None:
+    def _frames(self, frames: Mapping[str, pin.SE3], taken: set[str]) -> None:
         """Draw axes, red, green and blue, in front of everything: frames of joints are inside of bodies."""
         for name, placement in frames.items():
-            where = f"frames/{node_name(name)}"
+            where = add_node(taken, "frames", name)
             for (axis, colour), end in zip(_AXES.items(), np.eye(3), strict=True):
                 solid = tube(np.stack([np.zeros(3), _AXIS_LENGTH * end]), _AXIS_RADIUS)
                 assert solid is not None

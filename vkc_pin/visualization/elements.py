@@ -13,7 +13,7 @@ from meshcat.path import Path
 from vkc_pin.arrays import Floats
 from vkc_pin.visualization.solids import Solid
 
-__all__ = ["Ghost", "Sun", "Triangles", "Unshadow", "hexadecimal", "material", "node_name"]
+__all__ = ["Ghost", "Sun", "Triangles", "Unshadow", "add_node", "hexadecimal", "material"]
 
 _GHOST_OPACITY = 0.30
 
@@ -110,6 +110,13 @@ def hexadecimal(colour: Sequence[float]) -> int:
     return (red << 16) + (green << 8) + blue
 
 
-def node_name(text: str) -> str:
-    """Return `text` as it can stand in a path of the viewer's tree."""
-    return re.sub(r"[^\w.\-]", "_", text)
+def add_node(taken: set[str], above: str, *names: str) -> str:
+    """Return the path of a new node in the viewer's tree, and add it to `taken`.
+
+    Characters that paths cannot have become "_"; a path that is taken gets "_" at its end.
+    """
+    path = "/".join([above, *(re.sub(r"[^\w.\-]", "_", name) for name in names)])
+    while path in taken:
+        path += "_"
+    taken.add(path)
+    return path

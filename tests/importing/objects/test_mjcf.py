@@ -74,3 +74,32 @@ def test_what_bodies_weigh(tmp_path: Path) -> None:
             axes = data.ximat[body].reshape(3, 3)
             assert np.allclose(inertia.inertia, axes @ np.diag(model.body_inertia[body]) @ axes.T)
     assert found.links["door"].inertia.mass > 0.0
+
+
+def test_links_without_names_of_their_own_replace_no_others(tmp_path: Path) -> None:
+    """The body with two joints needs a second link, and the third body has no name."""
+    (tmp_path / "t.xml").write_text(
+        """<mujoco><worldbody><body name="case"><geom size="0.1"/>
+        <body name="a"><geom size="0.2"/>
+          <joint name="x" range="-1 1"/><joint name="y" axis="0 1 0" range="-1 1"/></body>
+        <body name="a_0"><joint name="z" range="-1 1"/><geom size="0.3"/></body>
+        <body><geom size="0.4"/></body>
+        <body name="body_4"><geom size="0.5"/></body></body></worldbody></mujoco>"""
+    )
+    found = read_object_mjcf(tmp_path / "t.xml")
+    sizes = {name: [part.size[0] for part in link.collision] for name, link in found.links.items()}
+    assert sizes == {
+        "world": [],
+        "case": [0.1],
+        "a_0_": [],
+        "a": [0.2],
+        "a_0": [0.3],
+        "body_4_": [0.4],
+        "body_4": [0.5],
+    }
+    parents = {
+        child: (joint.parent, joint.name)
+        for child, joint in found.joints.items()
+        if joint.kind == "revolute"
+    }
+    assert parents == {"a_0_": ("case", "x"), "a": ("a_0_", "y"), "a_0": ("case", "z")}

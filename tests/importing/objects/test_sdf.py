@@ -48,6 +48,7 @@ def test_a_joint_to_the_world_makes_that_the_root(tmp_path: Path) -> None:
         ("<size>0.4 0.6 0.8</size>", "<size>0.4 0.6</size>", InputError),
         ('<link name="case">', '<include/><link name="case">', InputError),
         ('<model name="box">', '<model name="other"/><model name="box">', InputError),
+        ('<link name="case">', '<link name="door"/><link name="case">', InputError),
     ],
 )
 def test_what_is_wrong_is_said_with_the_file(tmp_path: Path, old: str, new: str, error: type[InputError]) -> None:

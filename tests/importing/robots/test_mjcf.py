@@ -9,6 +9,8 @@ import pinocchio as pin
 import pytest
 
 import vkc_pin as vkc
+from vkc_pin.files.kinematic_tree import check_tree
+from vkc_pin.files.meshes import load_mesh
 from vkc_pin.importing.robots.mjcf import convert
 from vkc_pin.models.robot_model import configuration
 
@@ -144,3 +146,80 @@ def test_a_coupling_the_other_way_round_has_its_inverse(tmp_path: Path) -> None:
     mimic = joints["j2"].find("mimic")
     assert mimic is not None
     assert mimic.attrib == {"joint": "j0", "multiplier": "0.5", "offset": "-0.05"}
+
+
+def test_names_that_look_alike_become_different_links_and_joints(tmp_path: Path) -> None:
+    names = {
+        "shoulder_link": "shoulder",
+        "a+b": "j+1",
+        "a b": "j 1",
+        "a/b": "j/1",
+        "base_fixed": "base",
+    }
+    bodies = "".join(
+        f'<body name="{body}"><joint name="{joint}" range="-1 1"/><geom size="0.1{k}"/></body>'
+        for k, (body, joint) in enumerate(names.items())
+    )
+    path = tmp_path / "arm.xml"
+    path.write_text(
+        '<mujoco><worldbody><body name="base"><geom size="0.2"/>'
+        f"{bodies}</body></worldbody></mujoco>"
+    )
+    root = convert(path, tmp_path / "meshes").root
+    check_tree(path, root)
+    radii = {
+        link.get("name"): [
+            float(sphere.get("radius", "0")) for sphere in link.findall("collision/geometry/sphere")
+        ]
+        for link in root.findall("link")
+    }
+    shapes = {
+        name: radius
+        for name, (radius,) in ((name, found) for name, found in radii.items() if found)
+    }
+    assert shapes == pytest.approx(
+        {
+            "base": 0.2,
+            "shoulder_link": 0.1,
+            "a_b": 0.11,
+            "a_b_body": 0.12,
+            "a_b_body_2": 0.13,
+            "base_fixed": 0.14,
+        }
+    )
+    parents = {
+        child.get("link"): joint for joint in root.iter("joint") for child in joint.iter("child")
+    }
+    moving = {}
+    for name in shapes.keys() - {"base"}:
+        (parent,) = parents[name].findall("parent")
+        moving[name] = parents[parent.attrib["link"]].get("name")
+    assert moving == {
+        "shoulder_link": "shoulder",
+        "a_b": "j_1",
+        "a_b_body": "j_1_joint",
+        "a_b_body_2": "j_1_joint_2",
+        "base_fixed": "base_joint",
+    }
+
+
+def test_meshes_whose_names_look_alike_keep_their_own_files(tmp_path: Path) -> None:
+    sizes = {"é": 0.1, "ü": 0.2, "Wedge": 0.3, "wedge": 0.4, "w" * 300: 0.5}
+    meshes = "".join(
+        f'<mesh name="{name}" vertex="0 0 0  {size} 0 0  0 {size} 0  0 0 {size}"/>'
+        for name, size in sizes.items()
+    )
+    geoms = "".join(f'<geom name="of {name}" type="mesh" mesh="{name}"/>' for name in sizes)
+    path = tmp_path / "arm.xml"
+    path.write_text(
+        f"<mujoco><asset>{meshes}</asset><worldbody><body><joint range='-1 1'/>{geoms}"
+        "</body></worldbody></mujoco>"
+    )
+    root = convert(path, tmp_path / "meshes").root
+    files = [
+        Path(mesh.get("filename", "")) for mesh in root.findall("link/collision/geometry/mesh")
+    ]
+    assert len({file.name.lower() for file in files}) == len(sizes)
+    assert [load_mesh(file).volume for file in files] == pytest.approx(
+        [size**3 / 6.0 for size in sizes.values()]
+    )

@@ -43,14 +43,17 @@ class _Reader:
     def __init__(self, mujoco: Any, model: Any, data: Any, file: Path) -> None:
         self.mujoco, self.model, self.data, self.file = mujoco, model, data, file
         self.notes = list[str]()
+        names = [str(model.body(k).name) for k in range(model.nbody)]
+        self.taken = set(filter(None, names))
+        self.bodies = [name or self._add_name(f"body_{k}") for k, name in enumerate(names)]
 
     def description(self, *, free: bool) -> Description:
         model = self.model
         frames, links, joints = dict[str, pin.SE3](), dict[str, Link](), dict[str, Joint]()
         left_out: set[int] = set()
         for body in range(model.nbody):
-            name, parent = self._name("body", body), int(model.body_parentid[body])
-            above = self._name("body", parent)
+            name, parent = self.bodies[body], int(model.body_parentid[body])
+            above = self.bodies[parent]
             moving = range(int(model.body_jntadr[body]), int(model.body_jntadr[body]) + int(model.body_jntnum[body]))
             if parent in left_out and body:
                 left_out.add(body)
@@ -65,7 +68,7 @@ class _Reader:
                 moving = range(0)
             last = above
             for count, j in enumerate(moving):  # several joints of one body: links without shapes between them
-                link = name if count == len(moving) - 1 else f"{name}_{count}"
+                link = name if count == len(moving) - 1 else self._add_name(f"{name}_{count}")
                 frames[link] = pin.SE3(here.rotation, np.array(self.data.xanchor[j]))
                 joints[link] = self._joint(j, last, link, frames)
                 links[link] = Link(link)
@@ -126,7 +129,8 @@ class _Reader:
             }.get(kind)
             name = self._name("geom", geom, otherwise=self._mesh_name(geom))
             if shape is None:
-                self.notes.append(f"geom '{name}' of body '{self._name('body', body)}' has no volume (a plane): left out")
+                shown = f"geom '{name}' of body '{self.bodies[body]}'"
+                self.notes.append(f"{shown} has no volume (a plane): left out")
                 continue
             part = Part(
                 name=name,
@@ -157,6 +161,13 @@ class _Reader:
     def _mesh_name(self, geom: int) -> str:
         number = int(self.model.geom_dataid[geom])
         return self._name("mesh", number) if number >= 0 else ""
+
+    def _add_name(self, name: str) -> str:
+        """Return a name for a link that the file does not name: `name`, with "_" if it is taken."""
+        while name in self.taken:
+            name += "_"
+        self.taken.add(name)
+        return name
 
     def _name(self, kind: str, number: int, otherwise: str | None = None) -> str:
         name = getattr(self.model, kind)(number).name

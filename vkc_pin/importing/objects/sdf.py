@@ -49,6 +49,9 @@ class _Reader:
         elements = self.model.findall("joint")
         joints = {self._text(joint, "child"): joint for joint in elements}
         names = [link.get("name", "") for link in self.model.findall("link")]
+        if repeated := [name for name in names if names.count(name) > 1]:
+            problem, name = "two links of one name", repeated[0]
+            raise InputError(problem, file=self.file, field=name, expected="a name for each link")
         for child, joint in joints.items():
             for link in (child, self._text(joint, "parent")):
                 if link not in (*names, _BASE):

@@ -15,6 +15,8 @@ import pinocchio as pin
 
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
+from vkc_pin.files.resources import choose_file_names
+from vkc_pin.files.xml import replace_forbidden
 from vkc_pin.needed import optional_package
 
 __all__ = ["Converted", "convert"]
@@ -57,9 +59,13 @@ def convert(file: Path, folder: Path) -> Converted:
 class _Converter:
     def __init__(self, mujoco: Any, model: Any, file: Path, folder: Path) -> None:
         self._mujoco, self._model, self._folder, self._file = mujoco, model, folder, file
-        self._result = Converted(ElementTree.Element("robot", name=file.stem))
-        self._names: dict[tuple[str, str], str] = {}
+        self._result = Converted(ElementTree.Element("robot", name=replace_forbidden(file.stem)))
+        self._names: dict[tuple[str, int], str] = {}
+        counts = {"body": model.nbody, "joint": model.njnt}
+        self._given = {self._plain_name(kind, k) for kind in counts for k in range(counts[kind])}
+        self._added: set[str] = set()  # names of links and joints that the MJCF file lacks
         self._meshes: dict[int, Path] = {}
+        self._stems: list[str] = []  # of files of meshes
 
     def convert(self) -> Converted:
         """Return the largest tree as a URDF."""
@@ -88,11 +94,30 @@ class _Converter:
         return self._result
 
     def _name(self, kind: str, index: int) -> str:
-        """Return the name of something, without what is no name of a URDF's frames, and given only once."""
+        """Return the URDF's name of a body, joint, shape or mesh; no two have the same one."""
+        if (kind, index) not in self._names:
+            plain = name = self._plain_name(kind, index)
+            number = 1
+            while name in self._names.values() or name in self._added:
+                name = f"{plain}_{kind}" if number == 1 else f"{plain}_{kind}_{number}"
+                number += 1
+            self._names[kind, index] = name
+        return self._names[kind, index]
+
+    def _plain_name(self, kind: str, index: int) -> str:
+        """Return the name that the file states, with "_" for characters that frames cannot have."""
         code = getattr(self._mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
         given = self._mujoco.mj_id2name(self._model, code, index) or f"{kind}_{index}"
-        plain = "".join(letter if letter.isalnum() or letter in "_-" else "_" for letter in given)
-        return self._names.setdefault((kind, f"{index}"), plain if plain not in self._names.values() else f"{plain}_{kind}")
+        return "".join(letter if letter.isalnum() or letter in "_-" else "_" for letter in given)
+
+    def _add_name(self, name: str) -> str:
+        """Return a name for a link or joint that the MJCF file lacks, numbered if it is taken."""
+        new, number = name, 1
+        while new in self._given or new in self._added or new in self._names.values():
+            number += 1
+            new = f"{name}_{number}"
+        self._added.add(new)
+        return new
 
     def _scalars(self) -> list[int]:
         """Return the joints that turn or slide, and belong to the robot."""
@@ -102,7 +127,8 @@ class _Converter:
     def _body(self, body: int, *, root: bool) -> None:
         model, kinds, name = self._model, self._mujoco.mjtJoint, self._name("body", body)
         placement = pin.SE3(_rotation(model.body_quat[body]), model.body_pos[body].copy())
-        above = f"{name}_root" if root else self._name("body", int(model.body_parentid[body]))
+        parent = int(model.body_parentid[body])
+        above = self._add_name(f"{name}_root") if root else self._name("body", parent)
         if root:
             ElementTree.SubElement(self._result.root, "link", name=above)
         for joint in range(int(model.body_jntadr[body]), int(model.body_jntadr[body] + model.body_jntnum[body])):
@@ -114,12 +140,13 @@ class _Converter:
                     placement = pin.SE3.Identity()  # it drives: where it stands is not part of it
                 continue
             anchor = pin.SE3(np.eye(3), model.jnt_pos[joint].copy())
-            below = f"{self._name('joint', joint)}_link"
+            below = self._add_name(f"{self._name('joint', joint)}_link")
             ElementTree.SubElement(self._result.root, "link", name=below)
             self._joint(joint, above, below, placement * anchor)
             above, placement = below, anchor.inverse()
         link = ElementTree.SubElement(self._result.root, "link", name=name)
-        fixed = ElementTree.SubElement(self._result.root, "joint", name=f"{name}_fixed", type="fixed")
+        added = self._add_name(f"{name}_fixed")
+        fixed = ElementTree.SubElement(self._result.root, "joint", name=added, type="fixed")
         _connect(fixed, above, name, placement)
         self._inertia(link, body)
         self._shapes(link, body)
@@ -205,7 +232,8 @@ class _Converter:
             ElementTree.SubElement(named, "color", rgba=_text(colour))
 
     def _write(self, name: str, mesh: Any) -> Path:
-        file = self._folder / f"{name}.stl"
+        self._stems += choose_file_names([name], taken=self._stems)
+        file = self._folder / f"{self._stems[-1]}.stl"
         self._folder.mkdir(parents=True, exist_ok=True)
         file.write_bytes(mesh.export(file_type="stl"))
         return file

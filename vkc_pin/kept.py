@@ -12,29 +12,45 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-__all__ = ["VARIABLE", "folder", "only_mine", "record", "write_whole"]
+__all__ = ["TEMPORARY", "VARIABLE", "folder", "only_mine", "record", "write_whole"]
 
-VARIABLE = "VKC_PIN_CACHE"  # names the folder; empty or "off": there is none
+VARIABLE = "VKC_PIN_CACHE"  # names the folder around the cache; empty or "off": no cache
 
+TEMPORARY = ".new-"  # start of the names of incomplete files
+_NAME = "vkc_pin"  # of the cache's own folder, apart from other files
 _LONGEST = 2**24  # bytes of a record; those of the largest robots take some 10 kB
 
 
 def folder() -> Path | None:
-    """Return this user's folder, made if need be; None if there is none, or if others might have written in it."""
+    """Return this user's cache folder, creating it if necessary.
+
+    Returns:
+        The folder `vkc_pin` in the one that `VKC_PIN_CACHE` names, else in the user's cache folder.
+        None if the cache is off, or if other users could write to it.
+    """
     named = os.environ.get(VARIABLE)
     if os.name != "posix" or (named is not None and named.strip().lower() in ("", "off")):
         return None
     try:
         if named is not None:
-            path = Path(named).expanduser().absolute()
+            above = Path(named).expanduser().absolute()
+            above.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if not _is_private(above):
+                return None
         else:
             caches = Path(os.environ.get("XDG_CACHE_HOME", ""))
-            path = (caches if caches.is_absolute() else Path.home() / ".cache") / "vkc_pin"
+            above = caches if caches.is_absolute() else Path.home() / ".cache"
+        path = above / _NAME
         path.mkdir(mode=0o700, parents=True, exist_ok=True)
-        status = path.lstat()
+        return path if _is_private(path) else None
     except (OSError, RuntimeError):  # RuntimeError: nobody knows where the user's home is
         return None
-    return path if stat.S_ISDIR(status.st_mode) and only_mine(status) else None
+
+
+def _is_private(path: Path) -> bool:
+    """Return whether a path is a folder, not a link to one, that only this user can write to."""
+    status = path.lstat()
+    return stat.S_ISDIR(status.st_mode) and only_mine(status)
 
 
 def only_mine(status: os.stat_result) -> bool:
@@ -64,7 +80,7 @@ def record(key: bytes, build: Callable[[], Any]) -> Any:
 
 def write_whole(path: Path, data: bytes) -> None:
     """Write a file whole or not at all, for the owner's eyes only. Raises OSError if it cannot be written."""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".")
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=TEMPORARY)
     try:
         with os.fdopen(handle, "wb") as stream:
             stream.write(data)

@@ -5,18 +5,26 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import re
 import shutil
 import stat
 import time
 from pathlib import Path
 
-from vkc_pin.kept import VARIABLE, folder, only_mine, write_whole
+from vkc_pin.kept import TEMPORARY, VARIABLE, folder, only_mine, write_whole
 
-__all__ = ["VARIABLE", "Libraries"]
+__all__ = ["BUILD", "VARIABLE", "Libraries"]
+
+BUILD = ".build-"
+"""Start of the names of folders in which libraries are compiled."""
 
 _FILES, _BYTES = 256, 512 * 2**20  # libraries that are kept at most, and records; a waypoint's functions take 0.1 MB
 _JOBS = 64  # that wait at most
 _RETRY = 86400.0  # [s] after which what could not be compiled is tried again, and what a dead process left is removed
+# Names of the files and folders that the package creates here. No others are removed or run.
+_RANDOM = "[a-z0-9_]{8}"  # end of a name of `tempfile`
+_FILE = re.compile(rf"[0-9a-f]{{40}}\.(?:so|json|job|failed)|{re.escape(TEMPORARY)}{_RANDOM}")
+_BUILD = re.compile(re.escape(BUILD) + _RANDOM)
 _DIGEST = hashlib.sha256().digest_size  # bytes after the end of a library: loaders do not look at them
 
 
@@ -73,7 +81,8 @@ class Libraries:
 
     def jobs(self) -> list[str]:
         """Return the keys of what was asked for and is not there yet."""
-        return sorted(path.stem for path in self.path.glob("*.job"))
+        found = (path for path in self.path.glob("*.job") if _FILE.fullmatch(path.name))
+        return sorted(path.stem for path in found if path.is_file() and not path.is_symlink())
 
     def job(self, key: str) -> bytes:
         """Return what was asked for."""
@@ -104,15 +113,22 @@ class Libraries:
             (self.path / name).unlink()
 
     def tidy(self) -> None:
-        """Remove what was used longest ago where there is too much, and what dead processes left."""
+        """Remove the least recently used files beyond the limits, and files of processes that died.
+
+        Only regular files and build folders with names that the package creates are removed.
+        """
         libraries, now = [], time.time()
         for path in self.path.iterdir():
             with contextlib.suppress(OSError):
                 status = path.lstat()
-                if path.suffix in (".so", ".json") and not path.name.startswith("."):
-                    libraries.append((status.st_mtime, status.st_size, path))
-                elif path.name != "lock" and now - status.st_mtime > _RETRY:
-                    shutil.rmtree(path) if stat.S_ISDIR(status.st_mode) else path.unlink()
+                is_old = now - status.st_mtime > _RETRY
+                if stat.S_ISREG(status.st_mode) and _FILE.fullmatch(path.name):
+                    if path.suffix in (".so", ".json"):
+                        libraries.append((status.st_mtime, status.st_size, path))
+                    elif is_old:
+                        path.unlink()
+                elif stat.S_ISDIR(status.st_mode) and _BUILD.fullmatch(path.name) and is_old:
+                    shutil.rmtree(path)  # does not follow links
         size = 0
         for count, (_, nbytes, path) in enumerate(sorted(libraries, reverse=True)):
             size += nbytes

@@ -24,7 +24,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 
-from vkc_pin.cpin.libraries import Libraries
+from vkc_pin.cpin.libraries import BUILD, Libraries
 
 __all__ = ["MachineCode", "wait", "work"]
 
@@ -138,7 +138,7 @@ def _compile(folder: Libraries, key: str) -> None:
     folder.try_out(key)
     compiler, texts = json.loads(folder.job(key))
     functions = tuple(ca.Function.deserialize(text) for text in texts)
-    with tempfile.TemporaryDirectory(dir=folder.path, prefix=".build-") as build:
+    with tempfile.TemporaryDirectory(dir=folder.path, prefix=BUILD) as build:
         library, code = Path(build) / "functions.so", ca.CodeGenerator("functions.c")
         for function in functions:
             code.add(function)

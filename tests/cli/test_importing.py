@@ -59,7 +59,8 @@ def test_import_object_writes_and_reports(tmp_path: Path, capsys: pytest.Capture
     assert "0.70 m" in said
     assert "door_bar (bar, called a handle)" in said
     assert said.count("wrote") == 2
-    assert sorted(file.name for file in (tmp_path / "out").iterdir()) == ["attachments.png", "box.urdf", "box.yaml"]
+    names = ["attachments.png", "box.urdf", "box.yaml"]
+    assert sorted(file.name for file in (tmp_path / "out").iterdir()) == [".vkc-pin.json", *names]
     assert commands.run(["import-object", str(tmp_path / "box.sdf"), "--output", str(tmp_path / "out")]) == commands.EXIT_MISUSE
     assert "--force" in capsys.readouterr().err
     assert commands.run(["import-object", box, "--output", folder, "--height", "0.8", "--most", "1", "--force"]) == 0

@@ -12,7 +12,13 @@ from pathlib import Path
 import pytest
 
 from vkc_pin.errors import InputError
-from vkc_pin.files.writing import check_outputs, check_writable, folder_at_once, write_atomically
+from vkc_pin.files.writing import (
+    check_outputs,
+    check_replaceable,
+    check_writable,
+    folder_at_once,
+    write_atomically,
+)
 
 
 def everything(folder: Path) -> set[str]:
@@ -218,16 +224,115 @@ def test_a_folder_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
     with folder_at_once(target) as staging:
         (staging / "a").write_text("1", encoding="utf-8")
         assert not target.exists()
-    assert [path.name for path in target.iterdir()] == ["a"]
+    assert sorted(path.name for path in target.iterdir()) == [".vkc-pin.json", "a"]
     with pytest.raises(FileNotFoundError), folder_at_once(target, force=True) as staging:
         (staging / "none" / "b").write_text("2", encoding="utf-8")
-    assert [path.name for path in target.iterdir()] == ["a"]
+    assert (target / "a").read_text() == "1"
     with pytest.raises(InputError, match="there already"), folder_at_once(target):
         pass
     with folder_at_once(target, force=True) as staging:
         (staging / "b").write_text("2", encoding="utf-8")
-    assert [path.name for path in target.iterdir()] == ["b"]
+    assert sorted(path.name for path in target.iterdir()) == [".vkc-pin.json", "b"]
     assert [path.name for path in target.parent.iterdir()] == ["folder"]
     (tmp_path / "file").write_text("3", encoding="utf-8")
     with pytest.raises(InputError, match="no folder"), folder_at_once(tmp_path / "file", force=True):
         pass
+
+
+def write_folder(target: Path, force: bool = True) -> None:
+    with folder_at_once(target, force=force) as staging:
+        (staging / "deep").mkdir()
+        (staging / "deep" / "a").write_text("own", encoding="utf-8")
+
+
+@pytest.mark.parametrize("other", ["notes.txt", "deep/b", "deep/.vkc-pin.json", ".git/config"])
+@pytest.mark.parametrize("has_manifest", [True, False], ids=["ours", "not ours"])
+def test_a_folder_with_files_of_others_is_not_replaced(
+    tmp_path: Path, other: str, has_manifest: bool
+) -> None:
+    target = tmp_path / "folder"
+    if has_manifest:
+        write_folder(target)
+    (target / other).parent.mkdir(parents=True, exist_ok=True)
+    (target / other).write_text("mine")
+    before = everything(tmp_path)
+    for check in (check_replaceable, write_folder):
+        with pytest.raises(
+            InputError, match="files that vkc-pin did not write, and would delete"
+        ) as caught:
+            check(target)
+        assert (caught.value.file, caught.value.got) == (target, other)
+    assert (target / other).read_text() == "mine"
+    assert everything(tmp_path) == before
+
+
+def test_a_file_that_comes_while_a_folder_is_written_remains(tmp_path: Path) -> None:
+    target = tmp_path / "folder"
+    write_folder(target)
+    with pytest.raises(InputError, match="would delete"), folder_at_once(target, force=True):
+        (target / "notes.txt").write_text("mine")
+    assert everything(tmp_path) == {
+        "folder",
+        "folder/.vkc-pin.json",
+        "folder/deep",
+        "folder/deep/a",
+        "folder/notes.txt",
+    }
+    with pytest.raises(InputError, match="there already"), folder_at_once(tmp_path / "new"):
+        (tmp_path / "new").mkdir()
+
+
+def test_links_in_a_folder_that_is_replaced_are_not_followed(tmp_path: Path) -> None:
+    target = tmp_path / "folder"
+    (tmp_path / "outside").mkdir()
+    (tmp_path / "outside" / "a").write_text("mine")
+    write_folder(target)
+    (target / "link").symlink_to(tmp_path / "outside")
+    with pytest.raises(InputError, match="got link"):
+        write_folder(target)
+    (target / "link").unlink()
+    (target / "deep" / "a").unlink()
+    (target / "deep").rmdir()
+    (target / "deep").symlink_to(tmp_path / "outside")
+    with pytest.raises(InputError, match="got deep"):
+        write_folder(target)
+    assert (tmp_path / "outside" / "a").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "no JSON", "[]", "{}", '{"files": 3}', '{"files": [["notes.txt"]]}', "\ud800", "[" * 5000],
+)
+def test_a_damaged_manifest_lists_nothing(tmp_path: Path, text: str) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    (tmp_path / ".vkc-pin.json").write_bytes(text.encode("utf-8", "surrogatepass"))
+    with pytest.raises(InputError, match=r"got notes\.txt"):
+        check_replaceable(tmp_path)
+
+
+def test_many_files_of_others_are_counted(tmp_path: Path) -> None:
+    for name in "abcde":
+        (tmp_path / name).touch()
+    with pytest.raises(InputError, match="got a, b, c and 2 more"):
+        check_replaceable(tmp_path)
+
+
+def test_a_folder_that_cannot_be_renamed_is_still_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target, rename = tmp_path / "folder", Path.rename
+    write_folder(target)
+    before = everything(tmp_path)
+
+    def refuse(self: Path, other: Path) -> Path:
+        if other == target and (self / "new").exists():
+            raise OSError(errno.EIO, "input/output error")
+        return rename(self, other)
+
+    monkeypatch.setattr(Path, "rename", refuse)
+    with (
+        pytest.raises(InputError, match="input/output error"),
+        folder_at_once(target, force=True) as staging,
+    ):
+        (staging / "new").touch()
+    assert everything(tmp_path) == before

@@ -1,8 +1,9 @@
-"""Writes files whole or not at all, to where their names lead, and tells beforehand whether that can be done."""
+"""Writes files and folders completely or not at all, and checks their names and targets first."""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import secrets
 import shutil
@@ -11,10 +12,21 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from vkc_pin.errors import InputError
+from vkc_pin.files.documents import parse_json, read_text
 from vkc_pin.files.resources import file_path
 from vkc_pin.interrupt import deferred
 
-__all__ = ["check_outputs", "check_writable", "folder_at_once", "write_atomically"]
+__all__ = [
+    "check_outputs",
+    "check_replaceable",
+    "check_writable",
+    "folder_at_once",
+    "write_atomically",
+]
+
+MANIFEST = ".vkc-pin.json"
+"""File in every folder of `folder_at_once` that lists its other files."""
+_SHOWN = 3  # files that a message names
 
 
 def write_atomically(path: str | Path, data: bytes) -> Path:
@@ -88,37 +100,106 @@ def check_outputs(files: Mapping[str, str | Path], *, kept: Mapping[str, str | P
             raise InputError("a file cannot be a folder", file=above, field=field, got=f"the file of {targets[above]}")
 
 
-@contextlib.contextmanager
-def folder_at_once(path: str | Path, *, force: bool = False) -> Iterator[Path]:
-    """Lend a new folder to write into, which becomes `path` if nothing was raised, and is gone otherwise.
-
-    Args:
-        path: The folder to make; what leads to it is made if need be.
-        force: Replace a folder that is there, with all that is in it.
+def check_replaceable(folder: str | Path) -> None:
+    """Check that a folder has no files but those that `folder_at_once` wrote to it.
 
     Raises:
-        InputError: It is there and may not be replaced, is something else than a folder, or cannot be made.
+        InputError: It has others, or cannot be read.
+    """
+    with _told(folder):
+        found = {os.path.relpath(entry.path, folder) for entry in _walk(folder)}
+    if others := sorted(found - {MANIFEST} - _read_manifest(Path(folder))):
+        more = f" and {len(others) - _SHOWN} more" if len(others) > _SHOWN else ""
+        raise InputError(
+            "the folder has files that vkc-pin did not write, and would delete",
+            file=folder,
+            expected="a folder without them: move them elsewhere",
+            got=f"{', '.join(others[:_SHOWN])}{more}",
+        )
+
+
+def _read_manifest(folder: Path) -> set[str]:
+    """Return the files that a folder's manifest lists; none if there is no valid manifest."""
+    try:
+        files = parse_json(read_text(folder / MANIFEST, "JSON"), folder / MANIFEST)["files"]
+        return {name for name in files if isinstance(name, str)}
+    except (InputError, LookupError, TypeError):
+        return set()
+
+
+def _walk(folder: str | Path) -> Iterator[os.DirEntry[str]]:
+    """Yield every entry below a folder that is not a folder itself. Links are not followed."""
+    pending = [os.fspath(folder)]
+    while pending:
+        with os.scandir(pending.pop()) as entries:
+            for entry in entries:
+                if entry.is_dir(follow_symlinks=False):
+                    pending.append(entry.path)
+                else:
+                    yield entry
+
+
+@contextlib.contextmanager
+def folder_at_once(path: str | Path, *, force: bool = False) -> Iterator[Path]:
+    """Yield a new folder to write into, which becomes `path` if nothing is raised, else is removed.
+
+    A list of its files is written to it as well, so that a later call can replace it safely.
+
+    Args:
+        path: The folder to create, with its parents if necessary.
+        force: Replace an existing folder if it is empty, or has only files that this wrote to it.
+
+    Raises:
+        InputError: The folder exists and may not be replaced, it cannot be created, or `path` is
+            not a folder.
     """
     target = Path(os.path.realpath(file_path(path, "path", "a folder")))
-    if target.exists() and not (force and target.is_dir()):
-        if not target.is_dir():
-            raise InputError("this is no folder", file=path, expected="a new folder", got="a file")
-        expected = "a new folder, or force=True (--force) to replace it"
-        raise InputError("this folder is there already", file=path, expected=expected)
+    _check_target(target, path, force)
     with _told(path):
         target.parent.mkdir(parents=True, exist_ok=True)
         staging = _temporary(target.parent)
         staging.mkdir()
     try:
         yield staging
+        _check_target(target, path, force)  # it may have changed in the meantime
         with _told(path), deferred():
-            old = _temporary(target.parent)
-            if target.exists():
-                target.rename(old)
-            staging.rename(target)
-            shutil.rmtree(old, ignore_errors=True)
+            _write_manifest(staging)
+            _replace(target, staging)
     finally:
         shutil.rmtree(staging, ignore_errors=True)
+
+
+def _check_target(target: Path, path: str | Path, force: bool) -> None:
+    """Check that a folder does not exist, or may be replaced. Raises InputError if not."""
+    if not target.exists():
+        return
+    if not target.is_dir():
+        raise InputError("this is no folder", file=path, expected="a new folder", got="a file")
+    if not force:
+        expected = "a new folder, or force=True (--force) to replace it"
+        raise InputError("this folder is there already", file=path, expected=expected)
+    check_replaceable(target)
+
+
+def _write_manifest(folder: Path) -> None:
+    (folder / MANIFEST).unlink(missing_ok=True)
+    files = sorted(os.path.relpath(entry.path, folder) for entry in _walk(folder))
+    (folder / MANIFEST).write_text(json.dumps({"files": files}, indent=1) + "\n", encoding="utf-8")
+
+
+def _replace(target: Path, staging: Path) -> None:
+    """Rename a folder to `target`, and delete the one that had that name."""
+    if not target.exists():
+        staging.rename(target)
+        return
+    old = _temporary(target.parent)
+    target.rename(old)
+    try:
+        staging.rename(target)
+    except OSError:
+        old.rename(target)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
 
 
 def _target(path: str | Path) -> tuple[Path, int | None]:

@@ -157,8 +157,12 @@ def test_a_folder_is_replaced_only_if_it_was_made_so_and_that_is_wanted(tmp_path
     (out / "letter.txt").unlink()
     first = vkc.import_home(tmp_path / "small.xml", out, seed=1)
     (out / "objects" / "old").mkdir()
+    (out / "objects" / "letter.txt").write_text("mine")
     with pytest.raises(vkc.InputError, match="--force"):
         vkc.import_home(tmp_path / "small.xml", out)
+    with pytest.raises(vkc.InputError, match=r"would delete .*got objects/letter\.txt\)"):
+        vkc.import_home(tmp_path / "small.xml", out, force=True)
+    (out / "objects" / "letter.txt").unlink()
     again = vkc.import_home(tmp_path / "small.xml", out, seed=1, force=True)
     assert np.array_equal(first.scene.start, again.scene.start), "the same seed, another start"
     assert not (out / "objects" / "old").exists()

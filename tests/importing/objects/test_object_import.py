@@ -128,8 +128,10 @@ def test_nothing_is_left_of_what_fails_halfway(tmp_path: Path) -> None:
     (out / "old.stl").touch()
     with pytest.raises(vkc.InputError, match="--force"):
         vkc.import_object(tmp_path / "box.sdf", out, most=1)
+    with pytest.raises(vkc.InputError, match=r"would delete .*got old\.stl\)"):
+        vkc.import_object(tmp_path / "box.sdf", out, most=1, force=True)
+    (out / "old.stl").unlink()
     assert vkc.import_object(tmp_path / "box.sdf", out, most=1, force=True).file == done.file
-    assert not (out / "old.stl").exists()
     again = vkc.propose_attachments(done.proposals.object, "husky_ur5e", most=1)
     assert [one.attachment.name for one in again.found] == list(done.object.attachments)
 

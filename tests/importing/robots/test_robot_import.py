@@ -31,7 +31,7 @@ def imported(tmp_path_factory: pytest.TempPathFactory) -> vkc.ImportedRobot:
 
 def test_the_folder_is_whole(imported: vkc.ImportedRobot) -> None:
     names = {path.name for path in imported.folder.iterdir()}
-    assert names == {"robot.yaml", "mine.urdf", "mine.srdf", "collision"}
+    assert names == {".vkc-pin.json", "robot.yaml", "mine.urdf", "mine.srdf", "collision"}
     again = vkc.load_robot(imported.folder)
     assert again.name == "mine"
     assert again.coordinates.names[3:] == tuple(f"right_arm_{k}_joint" for k in range(1, 6))
@@ -156,16 +156,21 @@ def test_a_folder_is_replaced_only_if_asked_and_left_alone_if_importing_fails(tm
     (target / "notes.txt").write_text("dear", encoding="utf-8")
     with pytest.raises(vkc.InputError, match="--force"):
         vkc.import_robot(file, target)
+    with pytest.raises(vkc.InputError, match=r"would delete .*got notes\.txt\)"):
+        vkc.import_robot(file, target, samples=SAMPLES, force=True)
+    (target / "notes.txt").rename(tmp_path / "notes.txt")
+    (target / "mine.urdf").write_text("changed by hand", encoding="utf-8")
     with pytest.raises(vkc.UnknownNameError, match=r"given/robot\.urdf: tool_frame: .*did you mean 'right_hand'|'hand'"):
         vkc.import_robot(file, target, tool_frame="hnd", force=True)
     with pytest.raises(vkc.UnknownNameError):
         vkc.import_robot(file, target, arm="third", force=True)
-    assert (target / "notes.txt").is_file()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["given", "mine"]  # nothing half written
+    assert (target / "mine.urdf").read_text(encoding="utf-8") == "changed by hand"
+    names = ["given", "mine", "notes.txt"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == names, "nothing is half written"
     vkc.import_robot(file, target, samples=SAMPLES, force=True)
-    assert not (target / "notes.txt").exists()
+    assert (target / "mine.urdf").read_text(encoding="utf-8") != "changed by hand"
     assert (target / "robot.yaml").is_file()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["given", "mine"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == names
 
 
 @pytest.mark.parametrize(

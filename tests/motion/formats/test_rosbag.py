@@ -137,12 +137,22 @@ def test_what_a_motion_does_not_have_is_left_out(plan: Plan, tmp_path: Path) -> 
 def test_a_folder_that_is_there_is_kept(plan: Plan, tmp_path: Path) -> None:
     folder = plan.to_rosbag(tmp_path / "deep" / "bag")
     before = sorted((file.name, file.read_bytes()) for file in folder.iterdir())
-    assert [name for name, _ in before] == ["bag.db3", "metadata.yaml"]
+    assert [name for name, _ in before] == [".vkc-pin.json", "bag.db3", "metadata.yaml"]
     with pytest.raises(vkc.InputError, match="there already"):
         plan.to_rosbag(folder, rate=10.0)
     assert sorted((file.name, file.read_bytes()) for file in folder.iterdir()) == before
     assert len(read(plan.to_rosbag(folder, rate=10.0, force=True))["/vkc/base/path"][0][1].poses) == 61
     assert [file.name for file in folder.parent.iterdir()] == ["bag"]
+
+
+def test_a_folder_of_another_kind_is_not_replaced(plan: Plan, tmp_path: Path) -> None:
+    (tmp_path / "thesis" / "chapters").mkdir(parents=True)
+    (tmp_path / "thesis" / "chapters" / "1.tex").write_text("years of work")
+    with pytest.raises(vkc.InputError, match=r"would delete .*got chapters/1\.tex\)") as caught:
+        plan.to_rosbag(tmp_path / "thesis", force=True)
+    assert caught.value.file == tmp_path / "thesis"
+    assert (tmp_path / "thesis" / "chapters" / "1.tex").read_text() == "years of work"
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis"]
 
 
 @pytest.mark.parametrize(

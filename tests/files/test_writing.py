@@ -13,6 +13,9 @@ import pytest
 
 from vkc_pin.errors import InputError
 from vkc_pin.files.writing import (
+    check_inside,
+    check_links,
+    check_name,
     check_outputs,
     check_replaceable,
     check_writable,
@@ -336,3 +339,92 @@ def test_a_folder_that_cannot_be_renamed_is_still_there(
     ):
         (staging / "new").touch()
     assert everything(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    "name", ["a", "husky_ur5e", "ur5e v2.1", "Küche", "x" * 200, "a..b", "-", "con", "0a1b2c3d4e5f"]
+)
+def test_names_of_files(name: str) -> None:
+    assert check_name(name, "robot") == name
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "",
+        ".",
+        "..",
+        ".a",
+        "/",
+        "/a",
+        "a/",
+        "a/b",
+        "../a",
+        "a/../b",
+        "a\\b",
+        "a\0",
+        "a\n",
+        "\u202ea",
+        "\ud800",
+        "x" * 201,
+        "ä" * 101,
+    ],
+)
+def test_what_is_not_the_name_of_a_file(name: str) -> None:
+    with pytest.raises(InputError, match="not a plain file name") as caught:
+        check_name(name, "robot", file="journal.jsonl")
+    assert (caught.value.file, caught.value.field) == ("journal.jsonl", "robot")
+    assert (
+        caught.value.expected
+        == "at most 200 bytes of text without slashes, not beginning with a dot"
+    )
+    assert str(caught.value).isprintable()
+
+
+@pytest.mark.parametrize("name", [None, 3, 1.5, True, b"a", Path("a"), ["a"]])
+def test_a_name_is_text(name: object) -> None:
+    with pytest.raises(InputError, match="field: not a plain file name"):
+        check_name(name, "field")
+
+
+@pytest.mark.parametrize(
+    "target", ["..", "../outside", "/etc", "../folderx", "deep/../../outside", "../outside/none"]
+)
+def test_links_that_lead_out_of_a_folder(tmp_path: Path, target: str) -> None:
+    for name in ("folder/deep", "folderx", "outside"):
+        (tmp_path / name).mkdir(parents=True)
+    link = tmp_path / "folder" / "link"
+    link.symlink_to(target)
+    for check in (
+        lambda: check_links(tmp_path / "folder"),
+        lambda: check_inside(link, tmp_path / "folder"),
+    ):
+        with pytest.raises(InputError, match="leads out of the folder") as caught:
+            check()
+        assert str(caught.value.file) == str(link)
+    link.rename(tmp_path / "folder" / "deep" / "link")
+    if not target.startswith("/"):
+        (tmp_path / "folder" / "deep" / "link").unlink()
+        (tmp_path / "folder" / "deep" / "link").symlink_to(f"../{target}")
+    with pytest.raises(InputError, match="leads out of the folder"):
+        check_links(tmp_path / "folder")
+
+
+def test_links_that_stay_in_a_folder(tmp_path: Path) -> None:
+    (tmp_path / "folder" / "deep").mkdir(parents=True)
+    (tmp_path / "folder" / "file").touch()
+    for name, target in {
+        "one": "file",
+        "two": "deep",
+        "three": "none",
+        "self": ".",
+        "deep/up": "..",
+    }.items():
+        (tmp_path / "folder" / name).symlink_to(target)
+    (tmp_path / "link").symlink_to("folder")
+    check_links(tmp_path / "folder")
+    check_links(tmp_path / "link")
+    check_inside(tmp_path / "link" / "one", tmp_path / "folder")
+    check_inside(tmp_path / "link" / "new", tmp_path / "link")
+    with pytest.raises(InputError, match="cannot write this"):
+        check_links(tmp_path / "none")

@@ -23,7 +23,7 @@ from vkc_pin.datasets.recipes.recipe import Recipe, load_recipe
 from vkc_pin.datasets.statistics import statistics_page
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.files.documents import read_text
-from vkc_pin.files.writing import check_writable, write_atomically
+from vkc_pin.files.writing import check_inside, check_writable, write_atomically
 from vkc_pin.running.engine import Died, clustered, results
 
 __all__ = ["DatasetCheck", "check_dataset"]
@@ -92,13 +92,15 @@ def check_dataset(
         progress: Show a progress bar.
 
     Raises:
-        InputError: There is no dataset.
+        InputError: There is no dataset, or the page cannot be written.
     """
     from tqdm import tqdm
 
     jobs, seed = whole(jobs, "jobs", low=1, high=4096), whole(seed, "seed", low=0)
     dataset = Dataset.open(folder)
     target = dataset.folder / "statistics.html" if page is None else Path(page)
+    if page is None:
+        check_inside(target, dataset.folder)
     check_writable(target, field="page")
     shards = dataset.shards
     recipe = dataset.recipe.document

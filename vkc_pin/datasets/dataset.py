@@ -15,7 +15,7 @@ from vkc_pin.datasets.formats.hdf5 import episodes_of, numbers_of, write_shard
 from vkc_pin.datasets.recipes.recipe import Recipe, load_recipe
 from vkc_pin.errors import InputError
 from vkc_pin.files.resources import file_path
-from vkc_pin.files.writing import write_atomically
+from vkc_pin.files.writing import check_name, write_atomically
 
 __all__ = ["EPISODES_A_SHARD", "Dataset", "Register", "write_table"]
 
@@ -85,7 +85,7 @@ class Register:
         self.dataset, self.wanted = dataset, wanted
         self.accepted: list[Mapping[str, Any]] = []
         self.failures: list[Mapping[str, Any]] = []
-        self._robots: dict[str, list[int]] = {}
+        self._shards: dict[Path, list[int]] = {}  # folder of a robot's shards → its episodes
         self._early: dict[int, Mapping[str, Any]] = {}
         self._next, self._seen = 0, Seen()
 
@@ -115,24 +115,26 @@ class Register:
             reason = f"nearly the same motion as that of episode {twin}"
             self.failures.append(_row({**record, "status": "duplicate", "reason": reason}))
             return
+        name = check_name(record.get("robot"), "robot", file=self.dataset.folder / "journal.jsonl")
+        folder = self.dataset.folder / "shards" / name
         self.accepted.append(_row(record))
-        own = self._robots.setdefault(str(record["robot"]), [])
+        own = self._shards.setdefault(folder, [])
         own.append(int(record["number"]))
         if len(own) % EPISODES_A_SHARD == 0:
-            self._write(str(record["robot"]), len(own) // EPISODES_A_SHARD - 1)
+            self._write(folder, len(own) // EPISODES_A_SHARD - 1)
 
     def finish(self) -> None:
         """Write the shards that are not full, and the tables."""
-        for robot, numbers in self._robots.items():
+        for folder, numbers in self._shards.items():
             if len(numbers) % EPISODES_A_SHARD:
-                self._write(robot, len(numbers) // EPISODES_A_SHARD)
+                self._write(folder, len(numbers) // EPISODES_A_SHARD)
         write_table(self.dataset.folder / "episodes.csv", self.accepted)
         write_table(self.dataset.folder / "failures.csv", self.failures)
 
-    def _write(self, robot: str, k: int) -> None:
-        """Write a robot's shard of a number, unless it is there, and forget what it is made of when it is full."""
-        numbers = self._robots[robot][k * EPISODES_A_SHARD : (k + 1) * EPISODES_A_SHARD]
-        path = self.dataset.folder / "shards" / robot / f"shard-{k:05d}.hdf5"
+    def _write(self, folder: Path, k: int) -> None:
+        """Write shard `k` of a folder, unless it exists; delete the work files of a full one."""
+        numbers = self._shards[folder][k * EPISODES_A_SHARD : (k + 1) * EPISODES_A_SHARD]
+        path = folder / f"shard-{k:05d}.hdf5"
         files = [work_file(self.dataset.folder, number) for number in numbers]
         there = numbers_of(path) if path.is_file() else []
         if there != numbers:

@@ -21,6 +21,7 @@ from vkc_pin.datasets.problems import NoProblemError, problem
 from vkc_pin.datasets.recipes.recipe import Recipe, load_recipe
 from vkc_pin.errors import InputError
 from vkc_pin.files.resources import folder
+from vkc_pin.files.writing import check_name
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
@@ -79,13 +80,13 @@ class Episode:
         return None if self.load_images is None else self.load_images()
 
     def scene(self) -> Scene:
-        """Return the scene, built anew from its description."""
+        """Return the scene, built anew from its description. Raises InputError if it is wrong."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # what generating it has said already
             robot = dict(self.document["robot"])
-            own = None if self.robots is None else self.robots / str(robot["name"])
-            if own is not None and (own / "robot.yaml").is_file():
-                robot["name"] = str(own / "robot.yaml")
+            if self.robots is not None:
+                file = self.robots / check_name(robot["name"], "robot.name") / "robot.yaml"
+                robot["name"] = str(file) if file.is_file() else robot["name"]
             document = {**self.document, "robot": robot, "start": self.start}
             return Scene.from_document(document, self.where or folder("scenes"))
 

@@ -27,7 +27,7 @@ from vkc_pin.datasets.recipes.terms import as_entries
 from vkc_pin.datasets.robots import check_frames, ready_robots
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.files.resources import file_path
-from vkc_pin.files.writing import check_writable, write_atomically
+from vkc_pin.files.writing import check_links, check_replaceable, check_writable, write_atomically
 from vkc_pin.running.engine import Died, needs_dask, results
 from vkc_pin.running.journal import Journal
 from vkc_pin.running.machine import process_name, versions
@@ -99,6 +99,9 @@ def generate(
         needs_dask(scheduler)
     folder = file_path(out, "out", "a folder")
     with _journal(folder, made) as journal:
+        if lerobot and (folder / "lerobot").is_dir():
+            for robot in (folder / "lerobot").iterdir():
+                check_replaceable(robot)
         _at_work(folder, made)
         dataset = Dataset(folder, made)
         numbers = dataset.numbers()
@@ -129,6 +132,8 @@ def _journal(folder: Path, recipe: Recipe) -> Iterator[Journal]:
     if folder.is_dir() and not file.is_file() and any(folder.iterdir()):
         expected = "a new or empty folder, or one with episodes of this recipe"
         raise InputError("there is something else in this folder", file=folder, field="out", expected=expected)
+    if folder.is_dir():
+        check_links(folder)
     check_writable(file)
     folder.mkdir(parents=True, exist_ok=True)
     header = {"settings": {"recipe": recipe.digest}, "versions": versions()}

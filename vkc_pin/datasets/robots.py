@@ -10,7 +10,7 @@ import yaml
 from vkc_pin.datasets.recipes.recipe import Recipe, robot_name
 from vkc_pin.datasets.recipes.terms import check_robot
 from vkc_pin.files.documents import read_text
-from vkc_pin.files.writing import write_atomically
+from vkc_pin.files.writing import check_name, write_atomically
 from vkc_pin.importing.robots.robot_import import import_robot
 from vkc_pin.models.robot_file import find_robot, load_robot
 from vkc_pin.scene.scene import load_scene
@@ -62,7 +62,7 @@ def ready_robots(recipe: Recipe, folder: Path) -> dict[str, str]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what is guessed is in the robot's folder
         for entry in () if recipe.fields.scenes else recipe.fields.robots:
-            made = folder / robot_name(entry.name)
+            made = folder / check_name(robot_name(entry.name), "robots")
             if not (made / "robot.yaml").is_file():
                 if not load_robot(entry.name).touch_links:
                     import_robot(find_robot(entry.name), made, samples=_SAMPLES)

@@ -11,12 +11,15 @@ import stat
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from vkc_pin.errors import InputError
+from vkc_pin.errors import InputError, shown
 from vkc_pin.files.documents import parse_json, read_text
 from vkc_pin.files.resources import file_path
 from vkc_pin.interrupt import deferred
 
 __all__ = [
+    "check_inside",
+    "check_links",
+    "check_name",
     "check_outputs",
     "check_replaceable",
     "check_writable",
@@ -26,6 +29,7 @@ __all__ = [
 
 MANIFEST = ".vkc-pin.json"
 """File in every folder of `folder_at_once` that lists its other files."""
+_LONGEST_NAME = 200  # bytes, so that an ending can be added
 _SHOWN = 3  # files that a message names
 
 
@@ -98,6 +102,61 @@ def check_outputs(files: Mapping[str, str | Path], *, kept: Mapping[str, str | P
     for target, field in targets.items():
         if (above := next((place for place in target.parents if place in targets), None)) is not None:
             raise InputError("a file cannot be a folder", file=above, field=field, got=f"the file of {targets[above]}")
+
+
+def check_name(name: object, field: str, *, file: str | Path | None = None) -> str:
+    """Return a name of a file or folder, to be joined to a folder that the result must not leave.
+
+    Every name that was read from a file is checked with this before it becomes part of a path.
+
+    Args:
+        name: The name.
+        field: Field or argument that it comes from, for the error.
+        file: File that it was read from, for the error.
+
+    Raises:
+        InputError: It is not text, is empty or too long, begins with a dot, or has a slash, a
+            backslash or a character that cannot be printed.
+    """
+    plain = isinstance(name, str) and name.isprintable() and not {"/", "\\"} & set(name)
+    if (
+        isinstance(name, str)
+        and plain
+        and 0 < len(name.encode()) <= _LONGEST_NAME
+        and name[0] != "."
+    ):
+        return name
+    expected = f"at most {_LONGEST_NAME} bytes of text without slashes, not beginning with a dot"
+    problem, got = "not a plain file name", shown(name)
+    raise InputError(problem, file=file, field=field, expected=expected, got=got)
+
+
+def check_inside(path: str | Path, folder: str | Path) -> None:
+    """Check that a path in a folder is not a symbolic link to a place outside.
+
+    Raises:
+        InputError: It is.
+    """
+    root, target = (Path(os.path.realpath(place)) for place in (folder, path))
+    if not target.is_relative_to(root):
+        expected = f"a path inside {root}"
+        raise InputError(
+            "a symbolic link leads out of the folder", file=path, expected=expected, got=target
+        )
+
+
+def check_links(folder: str | Path) -> None:
+    """Check that no symbolic link anywhere in a folder leads out of it.
+
+    Whatever is written to paths in the folder afterwards changes nothing outside.
+
+    Raises:
+        InputError: A link does, or the folder cannot be read.
+    """
+    with _told(folder):
+        links = [entry.path for entry in _walk(folder) if entry.is_symlink()]
+    for link in links:
+        check_inside(link, folder)
 
 
 def check_replaceable(folder: str | Path) -> None:

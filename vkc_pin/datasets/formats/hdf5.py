@@ -22,7 +22,7 @@ from vkc_pin.datasets.episode import Episode, made_of, scene_name
 from vkc_pin.datasets.formats.samples import sampled
 from vkc_pin.errors import InputError
 from vkc_pin.files.documents import parse_json, read_text
-from vkc_pin.files.writing import write_atomically
+from vkc_pin.files.writing import check_name, write_atomically
 from vkc_pin.models.robot import Robot
 from vkc_pin.needed import optional_package
 from vkc_pin.simulation.cameras.images import Images
@@ -75,7 +75,8 @@ def write_shard(path: Path, parts: Sequence[tuple[Path, int]], scenes: Path) -> 
                 if k == 0:
                     for said in ("options", "env_args"):  # of the recipe, and so of all
                         data.attrs[said] = found["data"].attrs[said]
-                _keep_scene(found, scenes / f"{data[name].attrs['scene']}.json")
+                scene = check_name(data[name].attrs["scene"], f"demo_{place}: scene", file=source)
+                _keep_scene(found, scenes / f"{scene}.json")
             total += int(data[name].attrs["num_samples"])
             masks["valid" if data[name].attrs["number"] % _HELD_OUT == _HELD_OUT - 1 else "train"].append(name)
         data.attrs["total"] = total
@@ -207,7 +208,7 @@ def episodes_of(path: Path, scenes: Path) -> Iterator[Episode]:
             try:
                 options = parse_json(str(file["data"].attrs["options"]), path)
                 group = file["data"][f"demo_{k}"]
-                name = str(group.attrs["scene"])
+                name = check_name(group.attrs["scene"], f"demo_{k}: scene", file=path)
                 if name not in documents:
                     documents[name] = _document(scenes, name)
                 said = parse_json(str(group.attrs["episode"]), path)
@@ -241,8 +242,6 @@ def _images(path: Path, k: int) -> Images:
 
 
 def _document(scenes: Path, name: str) -> Any:
-    if not name.isalnum():
-        raise InputError("not the name of a scene", file=scenes, got=name)
     file = scenes / f"{name}.json"
     document = parse_json(read_text(file, "scene"), file)
     if scene_name(document) != name:

@@ -1,0 +1,211 @@
+"""Resuming or checking a dataset from another source changes nothing outside its folder."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers.datasets import SMALL
+
+from vkc_pin.datasets.check import check_dataset
+from vkc_pin.datasets.dataset import Dataset
+from vkc_pin.datasets.formats.hdf5 import write_shard
+from vkc_pin.datasets.generate import generate
+from vkc_pin.datasets.recipes.recipe import RobotEntry, load_recipe
+from vkc_pin.datasets.robots import ready_robots
+from vkc_pin.errors import InputError
+
+h5py = pytest.importorskip("h5py")
+EPISODES = 2
+NOT_NAMES = [
+    "../../../evil",
+    "/evil",
+    "a/b",
+    "..",
+    ".",
+    "",
+    ".hidden",
+    "a\\b",
+    "a\nb",
+    "x" * 300,
+    "\ud800",
+    3,
+    None,
+    ["a"],
+]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return generate(SMALL, EPISODES, tmp_path_factory.mktemp("made") / "out")
+
+
+@pytest.fixture
+def copy(made: Dataset, tmp_path: Path) -> Path:
+    """Return a dataset deep in a folder, with files around it, whose shards are missing."""
+    folder = tmp_path / "a" / "b" / "dataset"
+    shutil.copytree(made.folder, folder)
+    shutil.rmtree(folder / "shards")
+    for name in (
+        "notes.txt",
+        "a/notes.txt",
+        "a/b/evil.hdf5",
+        "outside/shards/deep/file",
+        "outside/README.md",
+    ):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("mine")
+    return folder
+
+
+def surroundings(folder: Path, root: Path) -> dict[str, bytes | None]:
+    """Return every path in `root` that is not in `folder`, with the contents of files."""
+    paths = [path for path in root.rglob("*") if path != folder and folder not in path.parents]
+    return {
+        str(path.relative_to(root)): path.read_bytes() if path.is_file() else None for path in paths
+    }
+
+
+def change_journal(folder: Path, **changes: Any) -> None:
+    """Change the records of all attempts."""
+    file = folder / "journal.jsonl"
+    lines = [json.loads(line) for line in file.read_text().splitlines()]
+    for line in lines:
+        if "records" in line:
+            line["records"] = [{**line["records"][0], **changes}]
+    file.write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+
+@pytest.mark.parametrize("name", NOT_NAMES, ids=repr)
+def test_a_robot_in_the_journal_that_is_not_a_name(copy: Path, tmp_path: Path, name: Any) -> None:
+    change_journal(copy, robot=name)
+    before = surroundings(copy, tmp_path)
+    with pytest.raises(InputError, match="robot: not a plain file name") as caught:
+        generate(SMALL, EPISODES, copy)
+    assert (caught.value.file, caught.value.field) == (copy / "journal.jsonl", "robot")
+    assert (
+        caught.value.expected
+        == "at most 200 bytes of text without slashes, not beginning with a dot"
+    )
+    if name == "../../../evil":
+        assert caught.value.got == "'../../../evil'"
+    assert surroundings(copy, tmp_path) == before
+    assert not (copy / "shards").exists()
+
+
+@pytest.mark.parametrize("name", ["../../evil", "/evil", "a/b", "..", "", 3], ids=repr)
+def test_a_scene_in_a_work_file_that_is_not_a_name(copy: Path, tmp_path: Path, name: Any) -> None:
+    file = sorted((copy / "work").iterdir())[0]
+    with h5py.File(file, "r+") as opened:
+        opened["data/demo_0"].attrs["scene"] = str(tmp_path / "evil") if name == "/evil" else name
+    before, scenes = surroundings(copy, tmp_path), sorted((copy / "scenes").iterdir())
+    with pytest.raises(InputError, match="demo_0: scene: not a plain file name") as caught:
+        generate(SMALL, EPISODES, copy)
+    assert (caught.value.file, caught.value.field) == (file, "demo_0: scene")
+    assert surroundings(copy, tmp_path) == before
+    assert sorted((copy / "scenes").iterdir()) == scenes
+
+
+def test_names_with_dots_and_spaces_are_names(copy: Path) -> None:
+    change_journal(copy, robot="ur5e v2.1")
+    dataset = generate(SMALL, EPISODES, copy)
+    assert [shard.parent.name for shard in dataset.shards] == ["ur5e v2.1"]
+
+
+def test_a_scene_that_is_copied_from_a_shard(made: Dataset, tmp_path: Path) -> None:
+    source = tmp_path / "source.hdf5"
+    shutil.copyfile(made.shards[0], source)
+    with h5py.File(source, "r+") as opened:
+        opened["data/demo_1"].attrs["scene"] = "../evil"
+        opened["scene"] = [1, 2, 3]
+    with pytest.raises(InputError, match="demo_1: scene: not a plain file name"):
+        write_shard(tmp_path / "out" / "shard.hdf5", [(source, 1)], tmp_path / "out" / "scenes")
+    assert [path.name for path in tmp_path.iterdir()] == ["source.hdf5"]
+
+
+def test_a_robot_of_a_scene_that_is_not_a_name(made: Dataset) -> None:
+    episode = next(made.episodes())
+    document = {**episode.document, "robot": {"name": "../../elsewhere"}}
+    with pytest.raises(InputError, match=r"robot\.name: not a plain file name"):
+        dataclasses.replace(episode, document=document).scene()
+
+
+def test_a_robot_of_a_recipe_that_gives_no_name(tmp_path: Path) -> None:
+    recipe = load_recipe(SMALL)
+    fields = recipe.fields.model_copy(update={"robots": (RobotEntry(name=f"{tmp_path}/a/.."),)})
+    with pytest.raises(InputError, match="robots: not a plain file name"):
+        ready_robots(dataclasses.replace(recipe, fields=fields), tmp_path / "out" / "robots")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "link",
+    [
+        "README.md",
+        "recipe.yaml",
+        "episodes.csv",
+        "failures.csv",
+        "journal.jsonl",
+        "work",
+        "shards",
+        "scenes",
+        "robots",
+        "lerobot",
+    ],
+)
+@pytest.mark.parametrize("relative", [True, False], ids=["relative", "absolute"])
+def test_links_that_lead_out_are_refused(
+    copy: Path, tmp_path: Path, link: str, relative: bool
+) -> None:
+    path, target = copy / link, tmp_path / "outside" / link
+    if path.exists():
+        path.rename(target)  # so that all is as it should be, but for the place
+    path.symlink_to(Path("../../../outside") / link if relative else target)
+    before = surroundings(copy, tmp_path)
+    with pytest.raises(InputError, match="a symbolic link leads out of the folder") as caught:
+        generate(SMALL, EPISODES, copy)
+    assert caught.value.file == str(path)
+    assert caught.value.got == target
+    assert surroundings(copy, tmp_path) == before
+
+
+def test_a_deep_link_is_refused_and_links_inside_are_not(copy: Path, tmp_path: Path) -> None:
+    (copy / "shards").mkdir()
+    (copy / "shards" / "husky_ur5e").symlink_to(tmp_path / "outside")
+    before = surroundings(copy, tmp_path)
+    with pytest.raises(InputError, match="leads out of the folder"):
+        generate(SMALL, EPISODES, copy)
+    assert surroundings(copy, tmp_path) == before
+    (copy / "shards" / "husky_ur5e").unlink()
+    (copy / "elsewhere").mkdir()
+    (copy / "shards" / "husky_ur5e").symlink_to("../elsewhere")
+    (tmp_path / "link").symlink_to(copy)
+    assert len(generate(SMALL, EPISODES, tmp_path / "link").numbers()) == EPISODES
+    assert [path.name for path in (copy / "elsewhere").iterdir()] == ["shard-00000.hdf5"]
+
+
+def test_the_page_of_a_check_is_written_inside(copy: Path, tmp_path: Path) -> None:
+    generate(SMALL, EPISODES, copy)
+    (tmp_path / "profile").write_text("mine")
+    (copy / "statistics.html").symlink_to(tmp_path / "profile")
+    with pytest.raises(InputError, match="leads out of the folder"):
+        check_dataset(copy)
+    assert (tmp_path / "profile").read_text() == "mine"
+    assert check_dataset(copy, page=tmp_path / "page.html").page == tmp_path / "page.html"
+
+
+def test_files_of_others_in_the_folder_of_lerobot_remain(copy: Path) -> None:
+    pytest.importorskip("pyarrow")
+    generate(SMALL, EPISODES, copy, lerobot=True)
+    own = copy / "lerobot" / "husky_ur5e"
+    generate(SMALL, EPISODES, copy, lerobot=True)
+    (own / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match=r"would delete .*got notes\.txt\)") as caught:
+        generate(SMALL, EPISODES + 1, copy, lerobot=True)
+    assert caught.value.file == own
+    assert (own / "notes.txt").read_text() == "mine"
+    assert len(Dataset.open(copy).numbers()) == EPISODES, "refused before anything was planned"

@@ -51,6 +51,34 @@ def test_it_is_read_while_it_is_written(tmp_path: Path) -> None:
     assert caught.value.line == 2
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "one line of a user's own",
+        '{"settings": {"recipe": "abd"',
+        '{"settings": {"recipe": "abc"}, "versions": {"pin": "4"}} and more',
+        "[1, 2, 3]\n",
+        "1\n2\n",
+        "\n",
+    ],
+)
+def test_a_file_that_is_not_a_journal_remains(tmp_path: Path, text: str) -> None:
+    (tmp_path / "j").write_text(text)
+    with pytest.raises(InputError, match=r"not a journal|damaged|run otherwise") as caught:
+        opened(tmp_path / "j")
+    assert (caught.value.file, caught.value.line or 1) == (tmp_path / "j", 1)
+    assert (tmp_path / "j").read_text() == text
+
+
+@pytest.mark.parametrize("length", [0, 1, 20, 57])
+def test_a_header_that_was_cut_off_is_written_again(tmp_path: Path, length: int) -> None:
+    header = '{"settings": {"recipe": "abc"}, "versions": {"pin": "4"}}'
+    assert len(header) == 57
+    (tmp_path / "j").write_text(header[:length])
+    opened(tmp_path / "j").append({"session": {"jobs": 1}})
+    assert (tmp_path / "j").read_text() == f'{header}\n{{"session": {{"jobs": 1}}}}\n'
+
+
 def test_records_stay_in_the_file(tmp_path: Path) -> None:
     """A run of a million tasks would not fit into memory."""
     journal = opened(tmp_path / "j")

@@ -143,7 +143,7 @@ class Journal(Kept):
         what: What is kept there, in messages.
 
     Raises:
-        InputError: Another process has the file, it has another header, or a line that is none.
+        InputError: Another process has the file, it is not a journal, or its header is another one.
     """
 
     def __init__(self, path: Path, stream: IO[bytes], header: Mapping[str, Any], what: str = "trials") -> None:
@@ -156,7 +156,9 @@ class Journal(Kept):
         self._header = json.loads(json.dumps(header))
         stream.seek(0)
         self._end = self._parse(path, stream)
-        stream.truncate(self._end)  # what a kill left of the last line
+        if not self._end:
+            self._check_begun()
+        stream.truncate(self._end)  # removes the last line if it is incomplete
         if not self._end:
             self._write(self._header)
 
@@ -166,8 +168,17 @@ class Journal(Kept):
         self._write(line)
         self._take(line, place)
 
+    def _check_begun(self) -> None:
+        """Raise InputError if a file without a whole line is not the beginning of the header."""
+        header = _line(self._header)
+        self._stream.seek(0)
+        if not header.startswith(begun := self._stream.read(len(header))):
+            expected = "a new file, or the lines that a run writes"
+            got = begun[:80].decode(errors="replace")
+            raise InputError("not a journal", file=self._path, line=1, expected=expected, got=got)
+
     def _write(self, line: Mapping[str, Any]) -> None:
-        text = json.dumps(line, allow_nan=False).encode() + b"\n"
+        text = _line(line)
         self._stream.write(text)
         self._stream.flush()
         self._end += len(text)
@@ -181,6 +192,11 @@ class Journal(Kept):
             problem = f"the {self._what} in this folder were run otherwise; use another folder than {self._path.parent}"
             was, now = (", ".join(f"{name.rpartition('.')[2]} {side.get(name)}" for name in named) for side in (old, new))
             raise InputError(problem, file=self._path, field=", ".join(named), expected=was, got=now)
+
+
+def _line(data: Mapping[str, Any]) -> bytes:
+    """Return plain data as a line of a journal."""
+    return json.dumps(data, allow_nan=False).encode() + b"\n"
 
 
 def _flat(data: Mapping[str, Any]) -> dict[str, Any]:

@@ -71,6 +71,33 @@ def test_what_cannot_be_imported_leaves_nothing(tmp_path: Path) -> None:
         ready_object(Given("oven", "oven_0", "door"), tmp_path)
 
 
+@pytest.mark.parametrize("link", ["../../evil", "..", "a/b", "/evil", ".hidden"])
+def test_a_link_whose_name_is_not_that_of_a_file(tmp_path: Path, link: str) -> None:
+    (tmp_path / "evil").mkdir()
+    (tmp_path / "evil" / "letter.txt").write_text("mine")
+    desk = DESK.replace("case", link)
+    (tmp_path / "flat.urdf").write_text(desk, encoding="utf-8")
+    (one,) = parsed([f"{tmp_path / 'flat.urdf'}#{link}"], "objects", ())
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(vkc.InputError, match="objects: not a plain file name"):
+        ready_object(one, tmp_path / "a" / "objects")
+    with pytest.raises(vkc.InputError, match="robots: not a plain file name"):
+        ready_robot(Given(link, "husky_ur5e"), tmp_path / "a" / "robots")
+    assert sorted(tmp_path.rglob("*")) == before
+    (one,) = parsed([f"desk={tmp_path / 'flat.urdf'}#{link}"], "objects", ())
+    assert ready_object(one, tmp_path / "objects") == str(tmp_path / "objects/desk/desk.yaml")
+
+
+def test_files_of_others_are_not_deleted(tmp_path: Path) -> None:
+    (tmp_path / "flat.urdf").write_text(DESK, encoding="utf-8")
+    (tmp_path / "objects" / "desk").mkdir(parents=True)
+    (tmp_path / "objects" / "desk" / "letter.txt").write_text("mine")
+    (one,) = parsed([f"desk={tmp_path / 'flat.urdf'}#case"], "objects", ())
+    with pytest.raises(vkc.InputError, match=r"would delete .*letter\.txt"):
+        ready_object(one, tmp_path / "objects")
+    assert (tmp_path / "objects" / "desk" / "letter.txt").read_text() == "mine"
+
+
 def test_a_robot_that_says_what_its_hand_is_stays_as_it_is(tmp_path: Path) -> None:
     assert ready_robot(Given("husky", "husky_ur5e"), tmp_path) == "husky_ur5e"
     assert not list(tmp_path.iterdir())

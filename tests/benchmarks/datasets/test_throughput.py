@@ -11,6 +11,7 @@ from vkc_pin.benchmarks.datasets.simulated import WORKERS
 from vkc_pin.benchmarks.datasets.throughput import _slope, run
 from vkc_pin.cli import main
 from vkc_pin.datasets.recipes.recipe import TASKS
+from vkc_pin.errors import InputError
 
 pytest.importorskip("h5py")
 
@@ -56,6 +57,15 @@ def test_a_curve_of_workers(tmp_path: Path) -> None:
         assert shards[0] == shards[1]
     assert [one["workers"] for one in result["trials"]] == [2, 2, 2]
     assert "times one" in (tmp_path / "out/table.md").read_text()
+
+
+def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
+    recipe = write(tmp_path)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "table.md").write_text("mine")
+    with pytest.raises(InputError, match="there are other files in this folder"):
+        run(out=tmp_path / "out", episodes=2, recipe=recipe, progress=False)
+    assert [path.read_text() for path in (tmp_path / "out").iterdir()] == ["mine"]
 
 
 def write(folder: Path) -> str:

@@ -141,6 +141,46 @@ def test_a_damaged_line_is_not_skipped(tmp_path: Path) -> None:
             run(tmp_path)
 
 
+def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
+    for name in ("table.md", "results.json", "thesis.tex"):
+        (tmp_path / name).mkdir()
+        assert run(tmp_path / name)["trials"]
+        out = tmp_path / "own" / name
+        out.mkdir(parents=True)
+        (out / name).write_text("mine")
+        with pytest.raises(InputError, match="there are other files in this folder") as caught:
+            run(out)
+        assert (caught.value.file, caught.value.got) == (out, name)
+        assert [(path.name, path.read_text()) for path in out.iterdir()] == [(name, "mine")]
+    (tmp_path / "folders" / "objects").mkdir(parents=True)
+    (tmp_path / "folders" / ".gitignore").touch()
+    assert run(tmp_path / "folders")["trials"]
+
+
+def test_a_file_with_the_name_of_the_journal_remains(tmp_path: Path) -> None:
+    (tmp_path / "trials.jsonl").write_text("court cases, in one line")
+    with pytest.raises(InputError, match="not a journal"):
+        run(tmp_path)
+    assert (tmp_path / "trials.jsonl").read_text() == "court cases, in one line"
+    assert [path.name for path in tmp_path.iterdir()] == ["trials.jsonl"]
+
+
+@pytest.mark.parametrize(
+    "name", ["results.csv", "results.json", "table.md", "trials.jsonl", "deep/x"]
+)
+def test_links_that_lead_out_are_refused(tmp_path: Path, name: str) -> None:
+    out = tmp_path / "out"
+    run(out)
+    (out / "deep").mkdir()
+    (tmp_path / "mine").write_bytes((out / name).read_bytes() if (out / name).is_file() else b"")
+    before = (tmp_path / "mine").read_bytes()
+    (out / name).unlink(missing_ok=True)
+    (out / name).symlink_to("../../mine" if "/" in name else "../mine")
+    with pytest.raises(InputError, match="a symbolic link leads out of the folder"):
+        run(out)
+    assert (tmp_path / "mine").read_bytes() == before
+
+
 def test_other_settings_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run(tmp_path)
     before = (tmp_path / "trials.jsonl").read_bytes()

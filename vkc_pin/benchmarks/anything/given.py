@@ -13,7 +13,7 @@ import numpy as np
 
 from vkc_pin.benchmarks.anything.pairs import description_of
 from vkc_pin.errors import InputError
-from vkc_pin.files.writing import folder_at_once, write_atomically
+from vkc_pin.files.writing import check_name, folder_at_once, write_atomically
 from vkc_pin.importing.objects.object_import import ImportedObject, import_object
 from vkc_pin.importing.robots.robot_import import import_robot
 from vkc_pin.models.robot_file import find_robot, load_robot
@@ -82,10 +82,11 @@ def ready_robot(one: Given, folder: Path) -> str:
 
     Raises:
         UnknownNameError: There is no such robot.
-        InputError: It cannot be imported.
+        InputError: It cannot be imported, or its name in tables is not a plain file name.
     """
     mjcf = one.path.lower().endswith((".xml", ".mjcf"))
-    file, made = Path(one.path) if mjcf else find_robot(one.path), folder / one.called
+    made = folder / check_name(one.called, "robots")
+    file = Path(one.path) if mjcf else find_robot(one.path)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the doctor's report has them
         if not (made / "robot.yaml").is_file():
@@ -104,14 +105,16 @@ def ready_object(one: Given, folder: Path) -> str:
 
     Raises:
         UnknownNameError: There is no such object, or no such link.
-        InputError: It cannot be imported, or its description cannot be read.
+        InputError: It cannot be imported, its description cannot be read, or its name in tables is
+            not a plain file name.
     """
     if not one.imported:
         if one.link is not None:
             raise InputError("only a link of a file can be imported", field="objects", expected=" ".join(_FILES), got=one.path)
         description_of(one.path)
         return one.path
-    made = folder / one.called / f"{one.called}.yaml"
+    name = check_name(one.called, "objects")
+    made = folder / name / f"{name}.yaml"
     if not made.is_file():
         with folder_at_once(made.parent, force=True) as staging, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # what is left out, its report would say

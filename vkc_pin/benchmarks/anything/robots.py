@@ -17,6 +17,7 @@ from vkc_pin.benchmarks.harness.record import Record, distribution, trial
 from vkc_pin.benchmarks.harness.tables import decimal, foot, markdown
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.files.srdf import read_srdf
+from vkc_pin.files.writing import check_name
 from vkc_pin.importing.robots.homes import Clearances
 from vkc_pin.importing.robots.robot_import import import_robot
 from vkc_pin.models.robot import Robot
@@ -150,7 +151,7 @@ def _files(robots: Sequence[str]) -> dict[str, Path]:
 def _records(spec: dict[str, Any]) -> list[dict[str, Any]]:
     """Return a record of every pose; a single one of a robot that cannot be imported, or is hardly ever free."""
     seed, name = spec["seed"], spec["robot"]
-    folder = Path(spec["out"]) / "robots" / name
+    folder = Path(spec["out"]) / "robots" / check_name(name, "robots")
     about: dict[str, Any] = {"robot": name}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what importing found is in its report

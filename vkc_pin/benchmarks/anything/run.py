@@ -60,6 +60,7 @@ def run(
     """
     if starts < 1:
         raise InputError("out of range", field="starts", expected="at least 1", got=starts)
+    runner.check_folder(out)
     chosen = [parsed(robots, "robots", ROBOTS), parsed(objects, "objects", OBJECTS)]
     things = {one.called: ready_object(one, Path(out) / "objects") for one in chosen[1]}
     ready = {one.called: ready_robot(one, Path(out) / "robots") for one in chosen[0]}

@@ -15,6 +15,7 @@ import numpy as np
 
 from vkc_pin.benchmarks.datasets.simulated import WORKERS, Costs, measured, simulated
 from vkc_pin.benchmarks.harness.record import Record, meta
+from vkc_pin.benchmarks.harness.runner import check_folder
 from vkc_pin.benchmarks.harness.tables import decimal, foot, markdown, to_csv
 from vkc_pin.datasets.dataset import Dataset
 from vkc_pin.datasets.generate import generate
@@ -72,6 +73,7 @@ def run(
     if episodes < 1:
         raise InputError("out of range", field="episodes", expected="at least 1", got=episodes)
     made, folder = load_recipe(recipe), Path(out)
+    check_folder(folder, [f"{task}/journal.jsonl" for task in TASKS])
     counts = sorted({*(count for count in (1, 2) if curve and scheduler is None and count < jobs), jobs})
     records: list[dict[str, Any]] = []
     curves: list[dict[str, Any]] = []

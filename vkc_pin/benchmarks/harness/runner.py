@@ -20,15 +20,16 @@ from vkc_pin.benchmarks.harness.record import meta, peak_memory
 from vkc_pin.benchmarks.harness.tables import to_csv
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.files.resources import folder, package_folder
-from vkc_pin.files.writing import check_writable, write_atomically
+from vkc_pin.files.writing import check_links, check_writable, write_atomically
 from vkc_pin.running.engine import Died, needs_dask, results
 from vkc_pin.running.journal import Journal
 
-__all__ = ["Function", "chosen", "run"]
+__all__ = ["Function", "check_folder", "chosen", "run"]
 
 Function = Callable[[dict[str, Any]], Mapping[str, Any] | Sequence[Mapping[str, Any]]]
 """What runs one trial: takes its specification, returns its record, or several."""
 
+_JOURNAL = "trials.jsonl"
 # What shows results has no part in them: a table may be written anew after a change there.
 _NO_PART = ("cli/", "benchmarks/", "datasets/", "running/")
 _DESCRIPTIONS = (".yaml", ".urdf", ".srdf")
@@ -68,7 +69,8 @@ def run(
         {"meta": commit, versions, machine, settings, sessions, peak_memory_mb, "trials": records}, as in results.json.
 
     Raises:
-        InputError: `out` has trials of other settings, versions or machines, is no folder, or is in use by another run.
+        InputError: `out` has trials of other settings, versions or machines, has other files but no
+            trials, is not a folder, or is in use by another run.
         VkcError: A process died.
         KeyboardInterrupt: Ctrl-C was pressed; the message says how far it came.
     """
@@ -80,18 +82,19 @@ def run(
     if len(todo) < len(trials):
         raise InputError("two trials have the same key", field="trials")
     out = Path(out)
+    check_folder(out)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):
         raise InputError("this is no folder", file=out, field="out") from None
-    check_writable(out / "trials.jsonl")
+    check_writable(out / _JOURNAL)
     about = meta()
     made = about.pop("commit")  # what the sources are says more than it about whether trials go together
     about["versions"]["sources"] = _sources()
     described = json.dumps([todo[key] for key in sorted(todo)], sort_keys=True).encode()
     header = {"settings": dict(settings), **about, "specification": hashlib.sha256(described).hexdigest()[:12]}
-    with (out / "trials.jsonl").open("a+b") as stream:
-        journal = Journal(out / "trials.jsonl", stream, header)
+    with (out / _JOURNAL).open("a+b") as stream:
+        journal = Journal(out / _JOURNAL, stream, header)
         left = [trial for key, trial in todo.items() if key not in journal.lines]
         if left:
             done = len(todo) - len(left)
@@ -111,6 +114,29 @@ def run(
     if report is not None:
         write_atomically(out / "table.md", report(result).encode())
     return result
+
+
+def check_folder(out: str | Path, journals: Sequence[str] = (_JOURNAL,)) -> None:
+    """Check that writing to a folder does not overwrite files of other origin.
+
+    Args:
+        out: The folder. Its subfolders may have any content.
+        journals: Paths in the folder of a run, one of which exists in the folder of any run.
+
+    Raises:
+        InputError: The folder has files but no journal, or a symbolic link that leads out of it.
+    """
+    out = Path(out)
+    if not out.is_dir():
+        return
+    files = sorted(
+        path.name for path in out.iterdir() if not path.is_dir() and not path.name.startswith(".")
+    )
+    if files and not any((out / name).is_file() for name in journals):
+        expected = "a new folder, or one with trials of this run"
+        problem, got = "there are other files in this folder", ", ".join(files[:3])
+        raise InputError(problem, file=out, field="out", expected=expected, got=got)
+    check_links(out)
 
 
 def chosen(kind: str, names: Iterable[str], choices: Iterable[str]) -> tuple[str, ...]:

@@ -10,8 +10,11 @@ from types import ModuleType
 import numpy as np
 import pytest
 import trimesh
+from helpers.poles import POLE
+from scipy.spatial import ConvexHull
 
-from vkc_pin.files.hulls import outer_hull
+from vkc_pin.errors import InputError
+from vkc_pin.files.hulls import compute_hull, outer_hull
 
 ROOT = Path(__file__).resolve().parents[2]
 ROBOT = ROOT / "robots" / "husky_ur5e"
@@ -30,6 +33,39 @@ def cutting() -> ModuleType:
 def outside(points: np.ndarray, hull: trimesh.Trimesh) -> float:
     planes = np.einsum("ij,ij->i", hull.face_normals, hull.triangles[:, 0])
     return float((points @ hull.face_normals.T - planes).max())
+
+
+def test_hull_of_a_thin_pole_is_closed_and_faces_outward() -> None:
+    hull = compute_hull(POLE)
+    assert hull.is_volume
+    assert hull.volume == pytest.approx(ConvexHull(POLE).volume, rel=1e-12)
+    assert hull.area == pytest.approx(ConvexHull(POLE).area, rel=1e-12)
+    assert outside(POLE, hull) < 1e-12
+
+
+@pytest.mark.parametrize(
+    "mesh",
+    [
+        trimesh.creation.box((0.1, 0.02, 1.3)),
+        trimesh.creation.cylinder(0.05, height=0.4, sections=100),
+        trimesh.creation.icosphere(subdivisions=2),
+        trimesh.creation.torus(0.3, 0.02),
+    ],
+    ids=["box", "cylinder", "ball", "ring"],
+)
+def test_hull_equals_that_of_trimesh(mesh: trimesh.Trimesh) -> None:
+    points = mesh.apply_transform(trimesh.transformations.rotation_matrix(0.7, [1, 2, 3])).vertices
+    hull, expected = compute_hull(points), trimesh.convex.convex_hull(points)
+    np.testing.assert_array_equal(hull.vertices, expected.vertices)
+    np.testing.assert_array_equal(hull.faces, expected.faces)
+    np.testing.assert_array_equal(hull.face_normals, expected.face_normals)
+
+
+@pytest.mark.parametrize("count", [1, 3, 4, 20])
+def test_points_in_one_plane_have_no_hull(count: int) -> None:
+    points = np.random.default_rng(0).uniform(size=(count, 3)) * (1.0, 1.0, 0.0)
+    with pytest.raises(InputError, match="span no volume"):
+        compute_hull(points)
 
 
 @pytest.mark.parametrize("vertices", [16, 40])

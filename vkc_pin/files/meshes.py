@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vkc_pin.arrays import LARGEST, Floats, Ints
 from vkc_pin.errors import InputError
-from vkc_pin.files.hulls import FLAT, outer_hull, thickened
+from vkc_pin.files.hulls import FLAT, compute_hull, outer_hull, thickened
 from vkc_pin.files.resources import file_path
 from vkc_pin.files.xml import check_indices
 
@@ -137,8 +137,6 @@ def convex_hull(points: ArrayLike, *, file: str | Path | None = None, about: str
     Raises:
         InputError: There are no points, or coal's volume or area is not that of the hull.
     """
-    import trimesh
-
     given = np.asarray(points, float)
     if not len(given):
         raise InputError("a hull of nothing", file=file, field=about, expected="at least one point")
@@ -146,7 +144,7 @@ def convex_hull(points: ArrayLike, *, file: str | Path | None = None, about: str
     if was_flat:
         named = " of ".join(str(part) for part in (about, file) if part is not None) or "a mesh"
         warnings.warn(f"{named} is flat: it collides as a plate, {1e3 * FLAT:g} mm thick", stacklevel=2)
-    hull = trimesh.convex.convex_hull(given)
+    hull = compute_hull(given)
     if np.bincount(np.asarray(hull.faces).ravel()).max() > _NEIGHBOURS:  # the tip of a finely meshed cone, a fine disc
         hull = outer_hull(hull.vertices, vertices=60)
     vertices, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()

@@ -19,7 +19,7 @@ import numpy as np
 from vkc_pin.arguments import number, quantity, whole
 from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
-from vkc_pin.files.hulls import outer_hull
+from vkc_pin.files.hulls import compute_hull, outer_hull
 from vkc_pin.files.meshes import MeshPart, coarser, load_mesh, to_bvh
 from vkc_pin.files.resources import file_path
 from vkc_pin.importing.slicing import flat, slices, thickened
@@ -118,9 +118,8 @@ def decompose(
                 parts = _cut(given, most_pieces, error, seed, file) or [np.asarray(hull.vertices)]
                 return [piece.vertices.tolist() for piece in _simple(_containing(parts, _surface(given)), corners)]
 
-            found = [
-                trimesh.convex.convex_hull(np.array(part)) for part in record(_key(given, most_pieces, error, corners, seed), cut)
-            ]
+            parts = record(_key(given, most_pieces, error, corners, seed), cut)
+            found = [compute_hull(np.array(part)) for part in parts]
     pieces = tuple(_simple(found, corners))
     solid = min(solid, float(sum(piece.volume for piece in pieces)))  # which contain it: of open meshes, it is but measured
     return Pieces(pieces, solid, _standing_out(pieces, given))
@@ -202,12 +201,10 @@ def _merged(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def _hull(points: Any, file: Path | None) -> trimesh.Trimesh:
-    import trimesh
-
     points = np.asarray(points, float)
     if flat(points):
         raise InputError("the mesh is flat", file=file, expected="triangles around a volume", got="triangles in one plane")
-    return trimesh.convex.convex_hull(points)
+    return compute_hull(points)
 
 
 def _surface(mesh: trimesh.Trimesh) -> Floats:
@@ -245,12 +242,10 @@ def _outside(piece: trimesh.Trimesh, points: Floats) -> Floats:
 
 def _containing(parts: list[Floats], surface: Floats) -> list[trimesh.Trimesh]:
     """Return the hulls of parts, each widened by the points of a surface that lie in none and are nearest to it."""
-    import trimesh
-
-    hulls = [trimesh.convex.convex_hull(part) for part in parts]
+    hulls = [compute_hull(part) for part in parts]
     beyond = np.array([_outside(hull, surface) for hull in hulls])
     nearest, missing = beyond.argmin(axis=0), beyond.min(axis=0) > 1e-9
     return [
-        trimesh.convex.convex_hull(np.vstack([np.asarray(hull.vertices), surface[missing & (nearest == k)]]))
+        compute_hull(np.vstack([np.asarray(hull.vertices), surface[missing & (nearest == k)]]))
         for k, hull in enumerate(hulls)
     ]

@@ -19,6 +19,7 @@ import pinocchio as pin
 from vkc_pin.arrays import Floats
 from vkc_pin.benchmarks.peers.sampled import ranges
 from vkc_pin.errors import InputError
+from vkc_pin.files.hulls import compute_hull
 from vkc_pin.program.problem import TrajectoryProblem
 
 __all__ = ["FRAME", "GROUP", "Description", "describe"]
@@ -164,7 +165,7 @@ def _collision(link: ET.Element, shape: Any, thicker: float, file: Path) -> None
         if thicker:
             around = thicker * _AROUND * trimesh.creation.icosphere(subdivisions=1).vertices
             points = (points[:, None] + around).reshape(-1, 3)
-        trimesh.PointCloud(points).convex_hull.export(file)
+        compute_hull(points).export(file)
         ET.SubElement(geometry, "mesh", {"filename": f"file://{file.resolve()}", "tesseract:make_convex": "true"})
         checking = ET.SubElement(link, "collision_checking")
         ET.SubElement(checking, "convex", name=link.attrib["name"])

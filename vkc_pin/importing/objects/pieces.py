@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.arrays import Floats
+from vkc_pin.files.hulls import compute_hull
 from vkc_pin.importing.convex import ERROR, concavity, decompose
 from vkc_pin.importing.objects.description import Description, Link, Part
 from vkc_pin.importing.objects.tidying import Surfaces
@@ -81,12 +82,10 @@ def _placed(part: Part, error: float, known: Known) -> Sequence[trimesh.Trimesh]
 
 def _convex(mesh: trimesh.Trimesh, error: float) -> Sequence[trimesh.Trimesh]:
     """Return convex pieces that contain a mesh."""
-    import trimesh
-
     if flat(mesh.vertices):
-        return [trimesh.convex.convex_hull(thickened(np.asarray(mesh.vertices)))]
+        return [compute_hull(thickened(np.asarray(mesh.vertices)))]
     if concavity(mesh) <= error:  # quicker to tell than all that `decompose` says
-        return [trimesh.convex.convex_hull(mesh.vertices)]
+        return [compute_hull(mesh.vertices)]
     return decompose(mesh, error=error).meshes
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vkc_pin.errors import InputError
+from vkc_pin.files.hulls import compute_hull
 from vkc_pin.files.meshes import load_mesh
 from vkc_pin.files.resources import choose_file_names
 from vkc_pin.files.urdf import UrdfFile, UrdfShape
@@ -82,7 +83,7 @@ def own_meshes(file: UrdfFile, folder: Path, *, most_pieces: int) -> tuple[Eleme
                     mesh = load_mesh(shape.file, shape.size)
                     error = min(_WHOLE, _SHARE * float(mesh.extents.max()))
                     pieces = decompose(mesh, most_pieces=most_pieces, error=error, overhead=_MORE)
-                    done[key] = pieces, float(mesh.convex_hull.volume)
+                    done[key] = pieces, float(compute_hull(mesh.vertices).volume)
             except InputError as error_:
                 if "flat" not in error_.problem:
                     raise

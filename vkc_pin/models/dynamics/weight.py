@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 
+from vkc_pin.files.hulls import compute_hull
 from vkc_pin.models.shapes import triangles
 
 __all__ = ["mass_of", "solid_inertia", "weigh"]
@@ -37,8 +38,6 @@ def weigh(model: pin.Model, collision: pin.GeometryModel, mass: float) -> None:
 
 def solid_inertia(shape: pin.GeometryObject, density: float = 1.0) -> pin.Inertia:
     """Return the inertia of a convex shape in its own frame, all of one density [kg/m³]."""
-    import trimesh
-
-    solid = trimesh.Trimesh(triangles(shape.geometry)[0]).convex_hull
+    solid = compute_hull(triangles(shape.geometry)[0])
     solid.density = density
     return pin.Inertia(float(solid.mass), np.asarray(solid.center_mass), np.asarray(solid.moment_inertia))

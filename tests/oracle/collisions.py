@@ -102,7 +102,7 @@ def check_collisions(world: World, stage: Stage, allowed: list[Licence], built: 
             if not pairs.counts(one, other):
                 continue
             names = f"{one.label} - {other.label}"
-            close, inside = built.during(stage, one, other)
+            close, built_in = built.during(stage, one, other)
             asked = built.margin(one, other)
             least = min(own_safe if one.owner == other.owner == "robot" else safe, asked - SHORT)
             for k in waypoints[near]:
@@ -111,7 +111,7 @@ def check_collisions(world: World, stage: Stage, allowed: list[Licence], built: 
                 licensed = any(own.covers(one.label, other.label, time, apart) for own in allowed)
                 if apart < least and not close[k] and not licensed:
                     yield Violation("clearance", names, time, least - apart, f"{1e3 * apart:.2f} mm apart at a waypoint")
-            slack = np.where(inside, np.inf, CONTACT + max(0.0, -asked))
+            slack = CONTACT + np.maximum(built_in, max(0.0, -asked))
             for own in allowed:
                 if own.depth and own.names(one.label, other.label):
                     slack[(own.begin <= stage.times) & (stage.times <= own.end)] += own.depth

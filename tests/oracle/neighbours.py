@@ -1,8 +1,9 @@
 """Pairs that may be close for longer than a moment: those that a scene allows, and what is built as close as that.
 
-A link of an object that no hand can carry away, and something else that stands there, are neighbours if they are closer than the
+A shape of an object that no hand can carry away, and another that is fixed there, are neighbours if they are closer than the
 clearance at the start or with every joint at zero: for as long as each of their joints is between the values at which it alone
-would take them that far apart. Neighbours need no clearance, and those that overlap where they stand may do so.
+would take them that far apart. Neighbours need no clearance. Those that overlap where they stand may do so, as deep as one joint
+alone takes them.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 from .riding import distance
 
 if TYPE_CHECKING:
+    from .poses import Poses
     from .stage import Solid, Stage, World
     from .urdf import Shape
 
@@ -29,10 +31,10 @@ VALUES = 150  # of a joint on its way to a limit
 
 @dataclass(frozen=True)
 class Pair:
-    """Two links, by label; whether they may overlap; and joint, as "<object>.<joint>" → between which values."""
+    """Two shapes; how deep they may overlap [m]; and joint, as "<object>.<joint>" → between which values."""
 
-    links: frozenset[str]
-    inside: bool
+    shapes: frozenset[tuple[str, int]]
+    depth: float
     joints: Mapping[str, tuple[float, float]]
 
 
@@ -72,45 +74,48 @@ class Neighbours:
         )
 
     def during(self, stage: Stage, one: Solid, other: Solid) -> tuple[np.ndarray, np.ndarray]:
-        """Return at which samples two shapes need no clearance, and at which they may overlap as well."""
-        close, inside = np.zeros((2, len(stage.times)), bool)
+        """Return at which samples two shapes need no clearance, and how deep they may overlap there [m]."""
+        close, depth = np.zeros(len(stage.times), bool), np.zeros(len(stage.times))
+        shapes = frozenset((part.label, id(part.shape)) for part in (one, other))
         for pair in self.pairs:
-            if pair.links == {one.label, other.label}:
+            if pair.shapes == shapes:
                 holds = np.ones(len(stage.times), bool)
                 for name, (low, high) in pair.joints.items():
                     index, (owner, _, joint) = self.world.plan.index(name), name.partition(".")
                     values = stage.columns[:, index] if index is not None else np.array([self.fixed[owner].state[joint]])
                     holds &= (low <= values) & (values <= high)
                 close |= holds
-                inside |= holds & pair.inside
-        return close, inside
+                depth = np.maximum(depth, np.where(holds, pair.depth, 0.0))
+        return close, depth
 
     def _found(self, state: dict[str, dict[str, float]]) -> list[Pair]:
-        """Return what is close where all objects that stand fixed are in some state."""
+        """Return what is close where all objects that no hand carries away are in some state."""
         links = {name: thing.tree.links(state[name], None, thing.tree.urdf.links) for name, thing in self.fixed.items()}
-        parts = {}
+        parts: list[tuple[str, Shape, Poses]] = []
         for name, thing in self.fixed.items():
             for shape in thing.tree.urdf.shapes:
-                place = thing.at @ links[name][shape.link] @ shape.place
-                parts.setdefault(f"{name}.{shape.link}", []).append((shape, place))
-        for solid in self.world.obstacles:
-            if solid.owner != "floor":
-                parts.setdefault(solid.label, []).append((solid.shape, solid.at))
+                parts.append((f"{name}.{shape.link}", shape, thing.at @ links[name][shape.link] @ shape.place))
+        parts += [(solid.label, solid.shape, solid.at) for solid in self.world.obstacles if solid.owner != "floor"]
         found, done = [], set()
-        for label in parts:
-            for other in parts:
-                owners = {label.partition(".")[0], other.partition(".")[0]}
-                if not self._joints(label) or len(owners) == 1 or frozenset((label, other)) in done:
+        for label, shape, place in parts:
+            for other, second, there in parts if self._joints(label) else ():
+                key = frozenset(((label, id(shape)), (other, id(second))))
+                if label.partition(".")[0] == other.partition(".")[0] or key in done:
                     continue
-                apart = min(self._apart(a, b) for a in parts[label] for b in parts[other])
+                done.add(key)
+                apart = self._apart((shape, place), (second, there))
                 if apart < self.safe - NEARLY:
-                    done.add(frozenset((label, other)))
-                    ranges = {}
-                    for mine, theirs in ((label, other), (other, label)):
+                    ranges, deepest = {}, max(0.0, -apart)
+                    for (mine, own), (_, body, where) in (
+                        ((label, shape), (other, second, there)),
+                        ((other, second), (label, shape, place)),
+                    ):
                         owner = mine.partition(".")[0]
                         for joint in self._joints(mine):
-                            ranges[f"{owner}.{joint}"] = self._range(mine, joint, state[owner], parts[theirs])
-                    found.append(Pair(frozenset((label, other)), apart <= -RESTS, ranges))
+                            ends, deep = self._range(mine, own, joint, state[owner], (body, where))
+                            ranges[f"{owner}.{joint}"], deepest = ends, max(deepest, deep)
+                    depth = 0.0 if apart > -RESTS else np.inf if len(ranges) == 1 else deepest
+                    found.append(Pair(key, depth, ranges))
         return found
 
     def _apart(self, one: tuple[Shape, object], other: tuple[Shape, object], k: int = 0) -> float:
@@ -127,20 +132,27 @@ class Neighbours:
         urdf = self.fixed[owner].tree.urdf
         return [joint for joint in urdf.path_to(link) if urdf.moves(joint)]
 
-    def _range(self, label: str, joint: str, state: dict[str, float], others: list[tuple[Shape, object]]) -> tuple[float, float]:
-        """Return between which values of a joint a link stays closer to others than the clearance."""
+    def _range(
+        self, label: str, shape: Shape, joint: str, state: dict[str, float], other: tuple[Shape, Poses]
+    ) -> tuple[tuple[float, float], float]:
+        """Return between which values of a joint a shape stays closer to another than the clearance, and how deep it gets."""
         owner, _, link = label.partition(".")
-        thing = self.fixed[owner]
+        thing, deepest = self.fixed[owner], 0.0
 
         def apart(values: np.ndarray) -> np.ndarray:
-            place = thing.tree.links({**state, joint: values}, None, [link])[link]
-            own = [(shape, thing.at @ place @ shape.place) for shape in thing.tree.urdf.shapes if shape.link == link]
-            return np.array([min(self._apart(a, b, k) for a in own for b in others) for k in range(len(values))])
+            place = thing.at @ thing.tree.links({**state, joint: values}, None, [link])[link] @ shape.place
+            return np.array([self._apart((shape, place), other, k) for k in range(len(values))])
 
         ends = []
         for limit, sign in zip(thing.limits[joint][:2], (-1.0, 1.0), strict=True):
             values = np.linspace(state[joint], limit if np.isfinite(limit) else state[joint] + sign * np.pi, VALUES)
-            beyond = np.flatnonzero(apart(values) >= self.safe)
+            distances = apart(values)
+            beyond = np.flatnonzero(distances >= self.safe)
+            inside = distances[: beyond[0]] if len(beyond) else distances
+            if len(inside) and inside.min() < 0.0:
+                k = int(np.argmin(inside))
+                around = np.linspace(values[max(k - 1, 0)], values[min(k + 1, VALUES - 1)], VALUES)
+                deepest = max(deepest, float(-apart(around).min()))
             if not len(beyond):
                 ends.append(sign * np.inf)
                 continue
@@ -149,4 +161,4 @@ class Neighbours:
                 middle = (near + far) / 2
                 near, far = (near, middle) if apart(np.array([middle]))[0] >= self.safe else (middle, far)
             ends.append(float(far))
-        return ends[0], ends[1]
+        return (ends[0], ends[1]), deepest

@@ -16,6 +16,7 @@ __all__ = ["check_motion", "check_stage"]
 TIP = 0.1  # [rad] by which what something stands on may tilt
 BACK = 1e-4  # [m] by which what is pushed may come back
 STILL = 1e-5  # [m] or [rad]
+FINE = 5e-4  # [m] and [rad] between two samples at which a grasp is looked at
 
 
 def check_motion(world: World) -> Iterator[Violation]:
@@ -187,16 +188,24 @@ def _push(world: World, stage: Stage, hold: Hold) -> Iterator[Violation]:
 
 def _closure(world: World, stage: Stage, hold: Hold) -> Iterator[Violation]:
     """The tool, or what takes its place, is where the attachment has it."""
-    grasp = world.things[hold.object].grasps[hold.attachment]
-    holder = stage.tool @ world.front(grasp.opening) if grasp.pushed else stage.tool
+    grasp, thing = world.things[hold.object].grasps[hold.attachment], world.things[hold.object]
+    times, columns = stage.times, stage.columns
+    tool, link = stage.tool, stage.links[hold.object, grasp.link]
+    if hold.by is None and not thing.free:  # nothing but the joints moves it: as finely as the curve may bend
+        robot = world.robot
+        times, columns, _, _ = world.samples(stage.number, FINE, FINE)
+        arm = {name: columns[:, 3 + k] for k, name in enumerate(robot.arm)}
+        tool = robot.tree.links({**robot.locked, **robot.moved(arm)}, columns[:, :3], [robot.tool])[robot.tool]
+        link = thing.at @ world.links_of(thing, columns)[grasp.link]
+    holder = tool @ world.front(grasp.opening) if grasp.pushed else tool
     if hold.by is not None:
-        owner, _, link = hold.by.partition(".")
-        holder = stage.links[owner, link]
-    right = stage.links[hold.object, grasp.link] @ grasp.tool(world.freedoms(hold, stage.columns))
-    size = len(stage.times)
+        owner, _, own = hold.by.partition(".")
+        holder = stage.links[owner, own]
+    right = link @ grasp.tool(world.freedoms(hold, columns))
+    size = len(times)
     off = np.broadcast_to(np.linalg.norm(holder.at - right.at, axis=1), size)
     turned = np.broadcast_to(turn_between(holder.turn, right.turn), size)
     for amount, key, unit in ((off, "closure_position", "m"), (turned, "closure_angle", "rad")):
         limit = world.plan.options[key]
         subject, why = f"{hold.object}.{hold.attachment}", f"more than {limit:g} {unit}"
-        yield from _worst("closure", subject, amount - limit - 1e-7, stage.times, why)
+        yield from _worst("closure", subject, amount - limit - 1e-7, times, why)

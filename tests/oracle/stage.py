@@ -156,8 +156,13 @@ class World:
             rows[0] = [before[joint] for joint in fingers.joints]
         return rows
 
-    def samples(self, number: int) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], np.ndarray]:
-        """Return times, coordinates, where the fingers' joints are, and which rows are waypoints, of a phase."""
+    def samples(
+        self, number: int, length: float = LENGTH, angle: float = ANGLE
+    ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], np.ndarray]:
+        """Return times, coordinates, where the fingers' joints are, and which rows are waypoints, of a phase.
+
+        From one sample to the next no coordinate changes by more than `length` [m] or `angle` [rad].
+        """
         plan, phase, fingers = self.plan, self.plan.phases[number], self.opened(number)
         z, t = plan.positions[phase.first : phase.last + 1], plan.times[phase.first : phase.last + 1]
         if plan.curve is None:
@@ -165,13 +170,13 @@ class World:
         else:  # as often as the fastest stretch of it asks for
             parts = np.stack([plan.at(a + (b - a) * np.linspace(0.0, 1.0, _PARTS + 1)) for a, b in itertools.pairwise(t)])
             steps = _PARTS * np.abs(np.diff(parts, axis=1)).max(axis=1)
-        units = np.array([LENGTH if self.slides(name) else ANGLE for name in plan.names])
+        units = np.array([length if self.slides(name) else angle for name in plan.names])
         for joint, (by, factor, _) in self.robot.coupled.items():
-            k, unit = 3 + self.robot.arm.index(by), LENGTH if self.robot.tree.urdf.kind(joint) == "prismatic" else ANGLE
+            k, unit = 3 + self.robot.arm.index(by), length if self.robot.tree.urdf.kind(joint) == "prismatic" else angle
             units[k] = min(units[k], unit / abs(factor))
-        ratio = np.maximum((steps / units).max(axis=1), np.linalg.norm(steps[:, :2], axis=1) / LENGTH)
+        ratio = np.maximum((steps / units).max(axis=1), np.linalg.norm(steps[:, :2], axis=1) / length)
         if self.fingers.joints:
-            own = np.array([LENGTH if self.slides(joint) else ANGLE for joint in self.fingers.joints])
+            own = np.array([length if self.slides(joint) else angle for joint in self.fingers.joints])
             ratio = np.maximum(ratio, (np.abs(np.diff(fingers, axis=0)) / own).max(axis=1))
         counts = np.maximum(1, np.ceil(ratio - 1e-9)).astype(int)
         share = np.concatenate([k + np.arange(n) / n for k, n in enumerate(counts)] + [[len(counts)]])

@@ -91,8 +91,10 @@ def test_what_is_remembered_is_of_these_obstacles_and_states() -> None:
         drawer_scene(), ahead=((0.1, 0.5, 0.2), (1.43, 0.0, 0.755))
     )  # 0.37 m before the front, which is 0.59 m wide
     assert allowances(ahead, SAFE) == ()
-    (met,) = allowances(ahead.with_state("drawer", {"slide": 0.4}), SAFE)
-    assert (met.first, met.second, met.margin) == ("drawer.tray", "ahead", -np.inf)
+    met = allowances(ahead.with_state("drawer", {"slide": 0.4}), SAFE)
+    assert {(one.first, one.second) for one in met} == {("drawer.tray", "ahead")}
+    assert -np.inf in {one.margin for one in met}
+    assert len({one.shapes for one in met}) == len(met)  # each shape of the tray that is close has its own
 
 
 def test_two_drawers_side_by_side_are_neighbours_until_either_is_past_the_other() -> None:
@@ -316,6 +318,92 @@ def test_what_a_link_does_not_reach_is_never_near() -> None:
     label, values = "refrigerator.door", np.linspace(0.0, 2.0, 9)
     reached = standing.reached(label, 0, values)
     others = {one for one in standing.labels if not one.startswith("refrigerator.")}
-    met = {one for one in others if standing.distance(label, one, 0, 0.0)(values).min() < 0.0}
+    met = {one for one in others if standing.distances(label, 0, values, standing.of([one]), 0.0).min() < 0.0}
     assert met <= reached
     assert len(reached & others) < len(others) / 5
+
+
+LEAF = (
+    '<robot name="d"><link name="frame"/><link name="leaf">{leaf}'
+    '<collision><origin xyz="-0.07 -0.7 1"/><geometry><box size="0.02 0.02 0.2"/></geometry></collision></link>'
+    '<joint name="hinge" type="revolute"><parent link="frame"/><child link="leaf"/><axis xyz="0 0 1"/>'
+    '<limit lower="0" upper="1.5" velocity="1" effort="1"/></joint></robot>'
+)
+
+
+def box(position: str, size: str) -> str:
+    return f'<collision><origin xyz="{position}"/><geometry><box size="{size}"/></geometry></collision>'
+
+
+def hinged_at_post(folder: Path, *, block: bool) -> Scene:
+    """Return a room with a leaf that is 1 mm inside the post at its hinge; a block of the same obstacle may be in its way."""
+    post, blocking = box("0.02 0.049 1", "0.1 0.1 2"), box("0.3 -0.25 0.3", "0.2 0.2 0.6")
+    wall = f'<robot name="w"><link name="w">{post}{blocking if block else ""}</link></robot>'
+    (folder / "wall.urdf").write_text(wall, encoding="utf-8")
+    attachment = {"name": "h", "link": "leaf", "position": [-0.07, -0.7, 1.0], "approach": [1, 0, 0], "closing": [0, 1, 0]}
+    door = {"urdf": LEAF.format(leaf=box("0.02 -0.4 1", "0.04 0.8 2")), "attachments": [attachment]}
+    document = {
+        "name": "hinged",
+        "robot": "husky_ur5e",
+        "start": {"base": [-1.5, 0, 0]},
+        "arena": {"x": [-4, 4], "y": [-4, 4]},
+        "obstacles": [{"name": "wall", "type": "urdf", "file": "wall.urdf", "position": [1.5, 0.4, 0]}],
+        "objects": [{"name": "door", "position": [1.5, 0.4, 0], "type": door}],
+    }
+    with pytest.warns(UserWarning, match=r"door\.leaf – wall overlap by 1\.0 mm"):
+        return Scene.from_document(document, folder)
+
+
+def test_an_exemption_is_of_two_shapes_and_not_of_their_links(tmp_path: Path) -> None:
+    """The leaf may turn in the post in which it stands, and goes through no other shape of the same obstacle."""
+    for name in ("free", "blocked"):
+        (tmp_path / name).mkdir()
+    steps = [vkc.Actuate("door", {"hinge": 1.2})]
+    free = hinged_at_post(tmp_path / "free", block=False)
+    opened = vkc.plan(free, steps)
+    assert opened.success, opened.report()
+    (used,) = opened.validation.exemptions
+    assert used.subject == "door.leaf – wall"
+    assert -0.045 < used.distance < -0.03  # the corner of the leaf, 40 mm thick, turns in the post
+    assert "1.0 mm inside each other" in used.reason
+    assert f"exempt      {used}" in opened.report()
+    opened.save(tmp_path / "opened.npz")
+    assert vkc.Plan.load(tmp_path / "opened.npz").validation.exemptions == opened.validation.exemptions
+
+    blocked = hinged_at_post(tmp_path / "blocked", block=True)
+    (one,) = allowances(blocked, SAFE)
+    assert one.shapes == ("door.leaf_0", "wall_0")
+    report = validate(blocked, steps, opened.trajectory)
+    (hit,) = (found for found in report.violations if found.constraint == "penetration")
+    assert hit.subject == "door.leaf – wall"
+    assert hit.amount == pytest.approx(0.161, abs=0.002)
+    refused = vkc.plan(blocked, steps)
+    assert refused.status == "infeasible"
+    assert any("door.leaf – wall overlap by 16" in note for note in refused.validation.notes), refused.report()
+
+
+def test_shapes_that_two_joints_move_overlap_no_deeper_than_either_alone_takes_them() -> None:
+    """A lever on a leaf, 5 mm inside a panel: what both joints do together is not exempt beyond what each does alone."""
+    lever = (
+        '<link name="lever">{}</link><joint name="turn" type="revolute"><parent link="leaf"/><child link="lever"/>'
+        '<origin xyz="0.055 -0.4 1"/><axis xyz="1 0 0"/><limit lower="0" upper="0.5" velocity="1" effort="1"/></joint></robot>'
+    ).format(box("0.025 0.1 0", "0.05 0.3 0.03"))
+    urdf = LEAF.format(leaf=box("0.02 -0.4 1", "0.04 0.8 2")).replace("</robot>", lever)
+    attachment = {"name": "h", "link": "leaf", "position": [-0.07, -0.7, 1.0], "approach": [1, 0, 0], "closing": [0, 1, 0]}
+    document = {
+        "robot": "husky_ur5e",
+        "start": {"base": [-1.5, 0, 0]},
+        "objects": [{"name": "door", "position": [1.5, 0.4, 0], "type": {"urdf": urdf, "attachments": [attachment]}}],
+        "obstacles": [{"name": "panel", "type": "box", "size": [0.06, 0.5, 0.5], "position": [1.63, 0.3, 1.0]}],
+    }
+    with pytest.warns(UserWarning, match=r"door\.lever – panel overlap by 5"):
+        scene = Scene.from_document(document)
+    (one,) = (one for one in allowances(scene, SAFE) if one.first == "door.lever")
+    assert set(one.ranges) == {"door.hinge", "door.turn"}
+    standing, least = neighbours.Standing(scene, scene.objects), 0.0
+    for index, upper in ((0, 1.5), (1, 0.5)):
+        (alone,) = standing.distances("door.lever", index, np.linspace(0.0, upper, 2001), standing.of(["panel"]), 0.1).T
+        inside = alone[0][: int(np.argmax(alone[0] >= SAFE))] if (alone[0] >= SAFE).any() else alone[0]
+        least = min(least, float(inside.min()))
+    assert one.margin == pytest.approx(least, abs=1e-4)
+    assert one.margin < -0.004

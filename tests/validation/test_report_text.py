@@ -43,6 +43,7 @@ def test_defaults() -> None:
         "torque": 0.0,
         "bounds": (),
         "remarks": (),
+        "exemptions": (),
     }
 
 

@@ -62,6 +62,9 @@ class Line:
         spans = zip(pairs.tolist(), first.tolist(), last.tolist(), strict=True)
         return np.array([self.contact.get(span, 0.0) for span in spans])
 
+    def exempt_at(self, pairs: np.ndarray, at: np.ndarray) -> np.ndarray:
+        return np.zeros(len(pairs), bool)
+
     def together_at(self, pairs: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.ndarray:
         spans = zip(pairs.tolist(), first.tolist(), last.tolist(), strict=True)
         return np.array([span in self.together for span in spans], bool)

@@ -169,9 +169,9 @@ def test_what_lies_on_the_floor() -> None:
 @pytest.mark.parametrize(
     ("gap", "allow", "expected"),
     [
-        (0.005, [], (2, 6, 0.0, CONTACT, False)),  # until the front, 18 mm thick, has left it by √(20² - 5²) mm
-        (-0.002, [], (2, 6, -np.inf, np.inf, True)),
-        (-0.002, [{"pair": ["drawer.tray", "side"], "margin": -0.003}], (0, 8, -0.003, 0.003, False)),
+        (0.005, [], (2, 6, 0.0, CONTACT, False, True)),  # until the front, 18 mm thick, has left it by √(20² - 5²) mm
+        (-0.002, [], (2, 6, -np.inf, np.inf, True, True)),
+        (-0.002, [{"pair": ["drawer.tray", "side"], "margin": -0.003}], (0, 8, -0.003, CONTACT + 0.003, False, True)),
     ],
 )
 def test_neighbours_at_the_waypoints_at_which_their_joints_have_them_so(

@@ -12,6 +12,7 @@ import pytest
 from vkc_pin.options import Options
 from vkc_pin.scene.contact import CONTACT
 from vkc_pin.scene.hold import Hold
+from vkc_pin.scene.neighbours import Allowance
 from vkc_pin.validation import touching
 from vkc_pin.validation.goals import MOTION_TOLERANCE
 from vkc_pin.validation.report import Violation
@@ -255,20 +256,20 @@ def test_pairs_are_of_the_smaller_and_the_larger() -> None:
 
 
 def test_a_window_is_no_window_of_what_moves_as_one_unless_that_is_said() -> None:
-    assert Window(np.zeros((0, 2), int), 0, 1, 0.0)[3:] == (0.0, CONTACT, False)
+    assert Window(np.zeros((0, 2), int), 0, 1, 0.0)[3:] == (0.0, CONTACT, False, False)
 
 
-class Allowed:
-    """Stands for `Allowance`: holds at some of the waypoints."""
-
-    first, second = "drawer.tray", "side"
+class Allowed(Allowance):
+    """An allowance of two links that holds at some of the waypoints."""
 
     def __init__(self, holds: list[bool], margin: float) -> None:
-        self.at, self.margin = holds, margin
+        super().__init__("drawer.tray", "side", margin, margin)
+        object.__setattr__(self, "at", holds)
 
     def holds(self, names: Any, rows: np.ndarray) -> np.ndarray:
-        assert len(rows) == len(self.at)
-        return np.array(self.at)
+        at: Any = vars(self)["at"]
+        assert len(rows) == len(at)
+        return np.array(at)
 
 
 @pytest.mark.parametrize(
@@ -277,14 +278,14 @@ class Allowed:
 )
 @pytest.mark.parametrize(
     ("margin", "contact", "together"),
-    [(0.005, CONTACT, False), (-0.003, 0.003, False), (-0.5 * CONTACT, CONTACT, False), (-np.inf, np.inf, True)],
+    [(0.005, CONTACT, False), (-0.003, CONTACT + 0.003, False), (-0.5 * CONTACT, 1.5 * CONTACT, False), (-np.inf, np.inf, True)],
 )
 def test_what_is_allowed_where_it_is(
     holds: str, spans: list[tuple[int, int]], margin: float, contact: float, together: bool
 ) -> None:
     """Up to the last waypoint in a row at which it is."""
     made = windows([0.0], [True] * 4)
-    made.labels = np.array(["drawer.tray", "side"])
+    made.labels = made.keys = np.array(["drawer.tray", "side"])
     made.samples = SimpleNamespace(
         z=np.zeros((9, 2)), waypoint_rows=np.arange(0, 9, 2), world=SimpleNamespace(coordinates=SimpleNamespace(names=()))
     )
@@ -293,6 +294,6 @@ def test_what_is_allowed_where_it_is(
     assert [(window.first, window.last) for window in found] == spans
     for window in found:
         assert window.pairs.tolist() == [[0, 1]]
-        assert window[3:] == (margin, contact, together)
+        assert window[3:] == (margin, contact, together, True)
     made.labels = np.array(["drawer.tray", "other"])
     assert list(made._allowed(one)) == []

@@ -20,7 +20,7 @@ from vkc_pin.models.shapes import bounding_box, link_name, own_name
 from vkc_pin.options import Options
 from vkc_pin.scene.contact import CONTACT, grasped, hand_clearance, moves_as_one, touching
 from vkc_pin.scene.hold import Hold
-from vkc_pin.scene.neighbours import allowances
+from vkc_pin.scene.neighbours import allowances, shape_keys
 from vkc_pin.scene.obstacles import FLOOR
 from vkc_pin.scene.placed import standing_geometry
 from vkc_pin.scene.scene import Scene
@@ -105,7 +105,8 @@ class _Pairing:
         above = [i for i in moving if i in attached or (i in robots and shapes[i].parentJoint > 1)]
         table = np.concatenate([np.array(pairs).reshape(-1, 3), self._with_obstacles(len(shapes), moving, above)])
         labels += scene.obstacle_labels
-        table, near = self._allowed(phase, table, labels)
+        names = [shape.name for shape in shapes] + [shape.name for shape in self._obstacles]
+        table, near = self._allowed(phase, table, labels, shape_keys(labels, names))
         if not len(table):
             expected = "collision geometry in robot or scene"
             raise InputError("no pair of geometries can collide", field=phase.name, expected=expected)
@@ -140,27 +141,36 @@ class _Pairing:
             return -np.inf
         return hand_clearance(self.scene, hold, link, self.options) or -CONTACT
 
-    def _allowed(self, phase: Phase, table: Floats, labels: Sequence[str]) -> tuple[Floats, list[Place]]:
-        """Return pairs with their margins, shape (P, 3), as the scene allows them, and those that may be close for a while."""
+    def _allowed(
+        self, phase: Phase, table: Floats, labels: Sequence[str], keys: Sequence[str]
+    ) -> tuple[Floats, list[Place]]:
+        """Return pairs with their margins, shape (P, 3), as the scene allows them, and those that are exempt for a while.
+
+        Args:
+            phase: The phase.
+            table: Pairs and the margins that they keep otherwise, shape (P, 3).
+            labels: Of all shapes.
+            keys: Of all shapes, see `neighbours.shape_keys`.
+        """
         if not self._allowances:
             return table, []
-        numbers = {label: k for k, label in enumerate(dict.fromkeys(labels))}
-        own = np.array([numbers[label] for label in labels])[table[:, :2].astype(int)]
-        known = [one for one in self._allowances if one.first in numbers and one.second in numbers]
-        named = [numbers[label] for one in known for label in (one.first, one.second)]
-        some = np.flatnonzero(np.all(np.isin(own, named), axis=1))
-        own = np.sort(own[some], axis=1)
-        rows = {one: some[(own == np.sort([numbers[one.first], numbers[one.second]])).all(axis=1)] for one in known}
-        for one in known:
+        base = len(labels)
+        pairs = table[:, :2].astype(int)
+        own = pairs.min(axis=1) * base + pairs.max(axis=1)
+        rows = {}
+        for one in self._allowances:
+            exempt = np.array(one.shape_pairs(labels, keys), int).reshape(-1, 2)
+            rows[one] = np.flatnonzero(np.isin(own, exempt[:, 0] * base + exempt[:, 1]))
+        for one in self._allowances:
             if not one.ranges:
                 table[rows[one], 2] = np.minimum(table[rows[one], 2], one.margin)
         kept = np.isfinite(table[:, 2])
         place, near = np.where(kept, np.cumsum(kept) - 1, -1), []
-        for one in known:
-            pairs, within = place[rows[one]][kept[rows[one]]], self._within(phase, one.ranges)
-            if one.ranges and len(pairs) and within is not None:
-                margin = EASED_SHARE * max(one.distance, 0.0) if np.isfinite(one.margin) else -np.inf
-                near.append(Place(pairs, margin, *within))
+        for one in self._allowances:
+            near_pairs, within = place[rows[one]][kept[rows[one]]], self._within(phase, one.ranges)
+            if one.ranges and len(near_pairs) and within is not None:
+                margin = one.margin if one.margin < 0.0 else EASED_SHARE * max(one.distance, 0.0)
+                near.append(Place(near_pairs, margin, *within))
         return table[kept], near
 
     def _within(self, phase: Phase, ranges: Mapping[str, tuple[float, float]]) -> tuple[Ints, Floats, Floats] | None:

@@ -23,6 +23,7 @@ from vkc_pin.motion.carrying import FreeObjects, as_numbers
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.scene.contact import opening_at_start
 from vkc_pin.scene.hold import Hold
+from vkc_pin.scene.neighbours import shape_keys
 from vkc_pin.scene.scene import Scene
 
 __all__ = ["FREE_JOINT", "World", "scene_after", "units_of"]
@@ -43,6 +44,7 @@ class World:
         collision, visual: All geometry in one, put together when first asked for; what stands still has parent joint 0.
         collision_labels, visual_labels: For each geometry, the link or obstacle it belongs to, e.g. "forearm_link",
             "door.panel", "sofa".
+        collision_keys: For each of `shapes`, its key in every model of the scene, see `neighbours.shape_keys`.
         start: The scene's start and the objects' placements and states, shape (n,).
     """
 
@@ -62,6 +64,7 @@ class World:
         self.bodies = self._geometry(robot.collision, objects)
         self.shapes = (*self.bodies.geometryObjects, *scene.obstacles)
         self.collision_labels = [*(link_name(shape.name) for shape in self.bodies.geometryObjects), *scene.obstacle_labels]
+        self.collision_keys = shape_keys(self.collision_labels, [shape.name for shape in self.shapes])
         self.coordinates = Coordinates(self.model)
         states = [
             np.concatenate([as_numbers(placed.placement) if placed.object.free else [], placed.state])

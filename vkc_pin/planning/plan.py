@@ -130,6 +130,7 @@ class Plan:
             "notes": list(self.validation.notes),
             "bounds": [asdict(bound) for bound in self.validation.bounds],
             "remarks": list(self.validation.remarks),
+            "exemptions": [asdict(exemption) for exemption in self.validation.exemptions],
             "trajectory": self.trajectory.to_dict(),
         }
 

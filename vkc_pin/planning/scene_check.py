@@ -208,7 +208,7 @@ def _reached(problem: TrajectoryProblem, seed: int) -> dict[str, Any]:
 
 
 def _said(one: Allowance) -> str:
-    kept = "at any distance" if one.margin == -np.inf else f"down to {1e3 * one.margin:g} mm"
+    kept = "at any distance" if one.margin == -np.inf else f"down to {1e3 * one.margin:.4g} mm"
     ends = {name: [f"{end:.3g}" if np.isfinite(end) else "its limit" for end in both] for name, both in one.ranges.items()}
     while_ = ", ".join(f"{name} from {low} to {high}" for name, (low, high) in ends.items())
-    return f"{one.first} – {one.second} {kept}, " + (f"with {while_}" if while_ else "as the scene says")
+    return f"{one} {kept}, " + (f"with {while_}" if while_ else "as the scene says")

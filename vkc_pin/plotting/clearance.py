@@ -57,12 +57,17 @@ def clearance_curves(scene: Scene, trajectory: Trajectory, times: ArrayLike) -> 
     world = World(scene)
     solids = Solids(world)
     table = PairTable(scene, solids, trajectory, 0.0)
-    silent = {frozenset((one.first, one.second)) for one in allowances(scene, Options().dist_safe) if one.margin == -np.inf}
+    silent = {
+        pair
+        for one in allowances(scene, Options().dist_safe)
+        for pair in one.shape_pairs(world.collision_labels, world.collision_keys)
+        if one.margin == -np.inf
+    }
     moments = np.atleast_1d(np.asarray(times, float))
     holds = {hold for phase in trajectory.phases for hold in phase.holds} | set(scene.holds)
     gripped = {(link, grasped(scene, hold)) for hold in holds for link in touching(scene, hold)}
     kinds = np.array([_kind(table, pair, gripped) for pair in table.pairs])
-    asked = np.array([frozenset(world.collision_labels[i] for i in pair) not in silent for pair in table.pairs.tolist()], bool)
+    asked = np.array([(min(pair), max(pair)) not in silent for pair in table.pairs.tolist()], bool)
     groups = {kind: table.pairs[(kinds == kind) & asked] for kind in _KINDS if ((kinds == kind) & asked).any()}
     placed, curves = table.solids.at(world.coordinates.q(world.positions(trajectory, moments))), []
     for kind, pairs in groups.items():

@@ -9,8 +9,9 @@
 - What is lifted, put down, or begins or ends a ride, and what is next to it there, may be as near as they are there for
   `EASED_TIME`. So may a link that touches something, and what is at that place.
 - What rides and what it stands on move as one.
-- Links of objects that are closer than `Options.dist_safe` to what else stands there, at the start or with all joints at zero,
-  keep no clearance until their joints have taken them so far apart, and overlap only if they did there; see `neighbours`.
+- Shapes of articulated objects that are closer than `Options.dist_safe` to other fixed shapes, at the start or with all joints at
+  zero, keep no clearance until their joints have taken them so far apart. They overlap only if they did there, and no deeper than
+  one joint alone takes them; see `neighbours`.
 - What a free object stands in where it is lifted for the first time, it may leave within `EASED_TIME`.
 - What is in the hand at the start is lifted there: what it is next to, or in, it may leave within `EASED_TIME`.
 - What the scene allows keeps the margin that the scene says, or none; see `Scene.allowed`.

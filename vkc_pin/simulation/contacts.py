@@ -66,7 +66,7 @@ class Pairs:
         always: Pairs that do at any time, by the numbers of their shapes, shape (P, 2).
         types, affinities: Of every shape, shape (G,): bits of `contype` and `conaffinity`, by which the pairs of holds meet.
         bits: Hold → the bit by which what holds meets the link that it holds, unless it does; 0 if they never meet.
-        overlapping: Links that overlap at the start and so never meet.
+        overlapping: Links with shapes that overlap at the start and so never meet.
     """
 
     always: Ints
@@ -85,26 +85,34 @@ def touching_pairs(world: World, holds: Iterable[Hold]) -> Pairs:
     """
     labels, joints = world.collision_labels, [shape.parentJoint for shape in world.shapes]
     pairs = np.array([pair for pair in _candidates(world) if joints[pair[0]] or joints[pair[1]]], int).reshape(-1, 2)
-    silent = {frozenset((one.first, one.second)) for one in allowances(world.scene, Options().dist_safe) if one.margin < 0.0}
+    silent = {
+        pair
+        for one in allowances(world.scene, Options().dist_safe)
+        for pair in one.shape_pairs(labels, world.collision_keys)
+        if one.margin < 0.0
+    }
+    quiet = np.array([(min(pair), max(pair)) in silent for pair in pairs.tolist()], bool)
     named = [frozenset((labels[i], labels[j])) for i, j in pairs.tolist()]
     placed = Solids(world).at(world.coordinates.q(world.start[None]))
     near = np.flatnonzero(placed.bounds(np.zeros(len(pairs), int), pairs) < 0.0)
     deep = near[placed.distances(np.zeros(len(near), int), pairs[near]) < -CONTACT]
-    overlapping = {named[k] for k in deep.tolist()}
+    apart = {named[k] for k in deep.tolist() if not quiet[k]}
+    quiet[deep] = True
+    never = {named[k] for k in np.flatnonzero(quiet).tolist()}
     types, affinities = np.zeros((2, len(labels)), int)
     bits, groups, gripped = dict[Hold, int](), dict[tuple[frozenset[str], str], int](), set[frozenset[str]]()
     for hold in holds:
         hands, link = frozenset(touching(world.scene, hold)), grasped(world.scene, hold)
         own = {frozenset((hand, link)) for hand in hands}
         bits[hold] = groups.get((hands, link), 0)
-        if (hands, link) not in groups and not own & (silent | overlapping) and len(groups) < _GROUPS:
+        if (hands, link) not in groups and not own & never and len(groups) < _GROUPS:
             bits[hold] = groups[hands, link] = 1 << len(groups)
             types[[label in hands for label in labels]] |= bits[hold]
             affinities[[label == link for label in labels]] |= bits[hold]
         gripped |= own
-    keep = [k for k, name in enumerate(named) if name not in silent and name not in overlapping and name not in gripped]
-    apart = tuple(sorted((min(name), max(name)) for name in overlapping - silent))
-    return Pairs(pairs[keep], types, affinities, bits, apart)
+    keep = [k for k, name in enumerate(named) if not quiet[k] and name not in gripped]
+    links = tuple(sorted((min(name), max(name)) for name in apart))
+    return Pairs(pairs[keep], types, affinities, bits, links)
 
 
 def _candidates(world: World) -> Iterable[tuple[int, int]]:

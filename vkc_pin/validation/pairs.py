@@ -89,6 +89,12 @@ class PairTable:
         np.maximum.at(overlap, k, self._windows.contact[which])
         return overlap
 
+    def exempt_at(self, pairs: Ints, waypoints: Ints) -> Bools:
+        """Return whether the scene exempts pairs from their clearances at waypoints, both of shape (n,), shape (n,)."""
+        exempt, (k, which) = np.zeros(len(pairs), bool), self._windows.at(pairs, waypoints, waypoints)
+        exempt[k[self._windows.exempt[which]]] = True
+        return exempt
+
     def together_at(self, pairs: Ints, first: Ints, last: Ints) -> Bools:
         """Return whether pairs move as one between waypoints `first` and `last`, all of shape (n,), shape (n,)."""
         as_one, (k, which) = np.zeros(len(pairs), bool), self._windows.at(pairs, first, last)
@@ -141,7 +147,7 @@ class _Windows:
     """When which pairs may be close, to be asked for many of them at once.
 
     Attributes:
-        margin, contact, together: What holds in each window, see `Window`; shape (K,).
+        margin, contact, together, exempt: What holds in each window, see `Window`; shape (K,).
     """
 
     def __init__(self, windows: Sequence[Window], pairs: Ints) -> None:
@@ -159,7 +165,7 @@ class _Windows:
         self._begin = np.cumsum(self._count) - self._count
         self._first, self._last = (np.array([getattr(window, end) for window in windows], int) for end in ("first", "last"))
         self.margin, self.contact = (np.array([getattr(w, name) for w in windows], float) for name in ("margin", "contact"))
-        self.together = np.array([window.together for window in windows], bool)
+        self.together, self.exempt = (np.array([getattr(w, name) for w in windows], bool) for name in ("together", "exempt"))
 
     def at(self, pairs: Ints, first: Ints, last: Ints) -> tuple[Ints, Ints]:
         """Return (k, window) for each of some pairs and the windows that hold all the time from waypoint `first` to `last`."""

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from vkc_pin.options import Options
     from vkc_pin.scene.scene import Scene
 
-__all__ = ["Bound", "Judged", "Report", "Violation"]
+__all__ = ["Bound", "Exemption", "Judged", "Report", "Violation"]
 
 SAME = 1e-5  # [m] or [rad] that two checks of the same motion may differ by, on two machines, say
 TOLD = 4  # bounds that the text names
@@ -74,6 +74,26 @@ class Bound:
 
 
 @dataclass(frozen=True)
+class Exemption:
+    """A pair of links that came closer than the clearance, or overlapped, and was exempt from it.
+
+    Attributes:
+        subject: The pair, "door.leaf – wall".
+        distance: Their smallest signed distance where they were exempt [m].
+        reason: Why they were.
+    """
+
+    subject: str
+    distance: float
+    reason: str
+
+    def __str__(self) -> str:
+        by = 1e3 * abs(self.distance)
+        close = f"{by:.1f} mm apart" if self.distance >= 0.0 else f"overlap by {by:.1f} mm"
+        return f"{self.subject}: {close}; {self.reason}"
+
+
+@dataclass(frozen=True)
 class Report:
     """What `validation` says of a motion.
 
@@ -88,6 +108,7 @@ class Report:
         torque: The largest torque of a joint of the arm, as a share of what its motor has; 0 if that is not known.
         bounds: What bounds the duration, the limit that does so for longest first.
         remarks: What was not looked at, as nobody states it: efforts, masses; one line each.
+        exemptions: Pairs that came closer than the clearance, or overlapped, and were exempt from it.
     """
 
     violations: tuple[Violation, ...] = ()
@@ -101,6 +122,7 @@ class Report:
     torque: float = 0.0
     bounds: tuple[Bound, ...] = ()
     remarks: tuple[str, ...] = ()
+    exemptions: tuple[Exemption, ...] = ()
 
     @property
     def ok(self) -> bool:
@@ -130,6 +152,7 @@ class Report:
             *([f"bounded by  {told}"] if told else []),
             *([f"torques     {100.0 * self.torque:.0f} % of what the motors have, at most"] if self.torque > 0.0 else []),
             *(f"unknown     {remark}" for remark in self.remarks),
+            *(f"exempt      {exemption}" for exemption in self.exemptions),
         ]
 
     def by_phase(self, trajectory: Trajectory) -> list[str]:
@@ -183,6 +206,8 @@ class Report:
         fields["bounds"] = tuple(_bound(one, f"bounds[{k}]") for k, one in enumerate(bounds))
         remarks: tuple[Any, ...] = items(fields.get("remarks", ()), "remarks", "a list of texts")
         fields["remarks"] = tuple(text(remark, f"remarks[{k}]") for k, remark in enumerate(remarks))
+        exempt: tuple[Any, ...] = items(fields.get("exemptions", ()), "exemptions", "a list of exemptions")
+        fields["exemptions"] = tuple(_exemption(one, f"exemptions[{k}]") for k, one in enumerate(exempt))
         try:
             return cls(**fields)
         except TypeError as error:  # a field that there is not
@@ -206,6 +231,18 @@ def _violation(data: Any, field: str) -> Violation:
         return Violation(**given)
     except TypeError as error:
         raise InputError("not a violation", field=field, expected="what Report.to_dict returns", got=str(error)) from None
+
+
+def _exemption(data: Any, field: str) -> Exemption:
+    """Return the exemption that plain data describe. Raises `InputError` if something is missing or of another kind."""
+    given = mapping(data, field)
+    for name in ("subject", "reason"):
+        given[name] = text(given.get(name), f"{field}.{name}")
+    given["distance"] = number(given.get("distance"), f"{field}.distance")
+    try:
+        return Exemption(**given)
+    except TypeError as error:
+        raise InputError("not an exemption", field=field, expected="what Report.to_dict returns", got=str(error)) from None
 
 
 def _bound(data: Any, field: str) -> Bound:

@@ -23,6 +23,7 @@ from vkc_pin.scene.scene import Scene
 __all__ = ["ANGLE_STEP", "LENGTH_STEP", "MOST", "Samples"]
 
 LENGTH_STEP, ANGLE_STEP = 5e-3, 1e-2  # [m], [rad] between two configurations that are looked at
+BEND = 0.1  # share of these by which a curve leaves the straight line between the two, at most
 MOST = 100_000
 """Configurations that are looked at, but for the waypoints: of half a kilometre of the base, or 160 turns of a joint."""
 _LARGEST = 1e12  # [m] or [rad] of a coordinate
@@ -31,6 +32,7 @@ _LARGEST = 1e12  # [m] or [rad] of a coordinate
 class Samples:
     """A motion in a scene, sampled at least every 5 mm of the base and of every sliding joint and every 0.01 rad of the rest.
 
+    Between two samples a curve leaves the straight line by at most a tenth of that.
     One that is longer than makes sense, as where it jumps, is sampled at its waypoints alone.
 
     Attributes:
@@ -42,6 +44,7 @@ class Samples:
         z: Minimal coordinates of the world, shape (S, n).
         virtual: Coordinate → the freedom of a grasp that it is.
         needed: How many configurations would have to be looked at; more than `MOST`: only the waypoints are.
+        truncated: Whether it is sampled at its waypoints or knots alone, since it is too long.
 
     Raises:
         UnknownNameError: The trajectory names a coordinate, object or attachment that the scene does not have.
@@ -120,14 +123,19 @@ class Samples:
         curve, edges = self.trajectory.curve, self.trajectory.times
         if curve is None:
             steps = np.abs(np.diff(self.trajectory.positions, axis=0))
-        else:  # as far as it would go at the largest speed on each cubic
-            steps, edges = curve.speeds()[0] * np.diff(curve.times)[:, None], curve.times
+            bends = np.zeros_like(steps)
+        else:  # as far as it would go at the largest speed on each cubic, and leave its chord at the largest acceleration
+            edges, spans = curve.times, np.diff(curve.times)[:, None]
+            speeds, accelerations = curve.speeds()
+            steps, bends = speeds * spans, accelerations * spans**2 / 8.0
         known = dict(zip(self.world.coordinates.names, self.world.coordinates.strides(LENGTH_STEP, ANGLE_STEP), strict=True))
         units = np.array([known.get(n, LENGTH_STEP if self.unit(n) == "m" else ANGLE_STEP) for n in self.trajectory.names])
         planar = np.linalg.norm(steps[:, :2], axis=1) / LENGTH_STEP
-        counts = np.maximum(1, np.ceil(np.maximum(planar, (steps / units).max(axis=1)) - 1e-9))
+        bent = np.sqrt((bends / (BEND * units)).max(axis=1))
+        counts = np.maximum(1, np.ceil(np.maximum.reduce([planar, (steps / units).max(axis=1), bent]) - 1e-9))
         self.needed = float(counts.sum())
-        counts = np.minimum(counts, 1 if self.needed > max(MOST, len(counts)) else np.inf).astype(int)
+        self.truncated = self.needed > max(MOST, len(counts))
+        counts = np.ones(len(counts), int) if self.truncated else counts.astype(int)
         times = [np.linspace(a, b, n, endpoint=False) for (a, b), n in zip(itertools.pairwise(edges), counts, strict=True)]
         rows = np.concatenate([[0], np.cumsum(counts)])
         return np.concatenate([*times, edges[-1:]]), rows[np.searchsorted(edges, self.trajectory.times)]
@@ -177,13 +185,18 @@ class Samples:
 
     def placements(self, rows: Iterable[int], frame: str) -> list[pin.SE3]:
         """Return the placements of a frame in the world at some samples."""
-        turns, origins = self._frames(rows, frame)
+        turns, origins = self._frames(self.z[np.asarray(rows)], frame)
         return [pin.SE3(turn, origin) for turn, origin in zip(turns[:, 0], origins[:, 0], strict=True)]
 
-    def _frames(self, rows: Iterable[int], *names: str) -> tuple[Floats, Floats]:
-        """Return rotations, shape (K, F, 3, 3), and origins, shape (K, F, 3) [m], of F frames in the world at some samples."""
+    def _frames(self, z: Floats, *names: str) -> tuple[Floats, Floats]:
+        """Return rotations, shape (K, F, 3, 3), and origins, shape (K, F, 3) [m], of F frames in the world.
+
+        Args:
+            z: Minimal coordinates of the world, shape (K, n).
+            *names: The frames.
+        """
         model, data = self.world.model, self.world.model.createData()
-        configurations, frames = self.world.coordinates.q(self.z[np.asarray(rows)]), [model.getFrameId(name) for name in names]
+        configurations, frames = self.world.coordinates.q(z), [model.getFrameId(name) for name in names]
         turns, origins = np.empty((len(configurations), len(frames), 3, 3)), np.empty((len(configurations), len(frames), 3))
         for k, q in enumerate(configurations):
             pin.forwardKinematics(model, data, q)
@@ -201,11 +214,19 @@ class Samples:
             rows: Which samples, shape (K,).
             by: The frame that takes the tool's place, "<object>.<link>".
         """
+        return self._grasp_errors(owner, name, self.times[rows], self.z[rows], by)
+
+    def grasp_errors_at(self, owner: str, name: str, times: Floats, by: str | None = None) -> Floats:
+        """Return the same at any moments, increasing, shape (K,) [s]."""
+        z = self.world.positions(self.trajectory, times, self.free)
+        return self._grasp_errors(owner, name, times, z, by)
+
+    def _grasp_errors(self, owner: str, name: str, times: Floats, z: Floats, by: str | None) -> Floats:
         attachment = self.scene.objects[owner].object.attachments[name]
         hand = hand_frame(self.scene.robot, attachment)
-        turns, origins = self._frames(rows, by or self.scene.robot.tool_frame, f"{owner}.{attachment.link}")
-        positions, own = self.trajectory.at(self.times[rows]), [f"{owner}.{suffix}" for suffix in attachment.coordinates]
-        values = np.zeros((len(rows), len(own)))
+        turns, origins = self._frames(z, by or self.scene.robot.tool_frame, f"{owner}.{attachment.link}")
+        positions, own = self.trajectory.at(times), [f"{owner}.{suffix}" for suffix in attachment.coordinates]
+        values = np.zeros((len(times), len(own)))
         for column, coordinate in enumerate(own):
             if coordinate in self.trajectory.names:
                 values[:, column] = positions[:, self.trajectory.names.index(coordinate)]

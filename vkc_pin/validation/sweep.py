@@ -24,7 +24,8 @@ STILL = 1e-6  # [m] of relative motion between two samples that changes nothing,
 class Hit(NamedTuple):
     """A pair's distance [m] at one state: at sample `row`, or between it and the next.
 
-    `margin` is the clearance asked for at waypoints, `contact` the overlap that counts as contact [m].
+    `margin` is the clearance asked for at waypoints, `contact` the overlap that counts as contact [m]. `usual` is the clearance
+    that the pair would have to keep were it not exempt, and 0 where it is not; `shapes` are its numbers in the world.
     """
 
     row: int
@@ -34,6 +35,8 @@ class Hit(NamedTuple):
     margin: float
     contact: float
     at_waypoint: bool
+    usual: float = 0.0
+    shapes: tuple[int, int] = (-1, -1)
 
 
 def sweep(table: PairTable, z: Floats, waypoints: Ints) -> Iterator[Hit]:
@@ -58,7 +61,8 @@ class _Sweep:
         self._waypoints, margins = waypoints, self._table.margins_at(pairs, at)
         apart = np.flatnonzero(margins > -np.inf)  # what moves as one is as close as it was
         closest = apart[_least(at[apart], distances[apart])]
-        chosen = np.union1d(closest, np.flatnonzero(distances < np.maximum(margins, 0.0)))
+        exempt = self._table.exempt_at(pairs, at) & (distances < self._table.margins[pairs])
+        chosen = np.union1d(closest, np.flatnonzero((distances < np.maximum(margins, 0.0)) | exempt))
         yield from self._hits(waypoints[at[chosen]], pairs[chosen], distances[chosen], at_waypoint=True)
         smallest = max(
             RESOLUTION, float(distances[closest].min(initial=np.inf))
@@ -173,9 +177,10 @@ class _Sweep:
         margins = self._table.margins_at(pairs, at)
         contacts = self._table.contact_at(pairs, at, at if at_waypoint else at + 1)
         labels = self._solids.world.collision_labels
-        columns = (column.tolist() for column in (rows, self._table.pairs[pairs], distances, margins, contacts))
-        for row, (i, j), distance, margin, contact in zip(*columns, strict=True):
-            yield Hit(row, labels[i], labels[j], distance, margin, contact, at_waypoint)
+        usual = np.where(self._table.exempt_at(pairs, at), self._table.margins[pairs], 0.0)
+        columns = (rows, self._table.pairs[pairs], distances, margins, contacts, usual)
+        for row, (i, j), distance, margin, contact, clearance in zip(*(c.tolist() for c in columns), strict=True):
+            yield Hit(row, labels[i], labels[j], distance, margin, contact, at_waypoint, clearance, (i, j))
 
 
 class Stretches(NamedTuple):

@@ -48,6 +48,7 @@ class Window(NamedTuple):
         margin: What they must keep at these [m]; -inf: their distance says nothing.
         contact: Overlap that counts as contact [m].
         together: Whether they move as one, so that they need not be looked at between samples.
+        exempt: Whether the scene exempts them, as neighbours or as it says, rather than what the hand does.
     """
 
     pairs: Ints
@@ -56,6 +57,7 @@ class Window(NamedTuple):
     margin: float
     contact: float = CONTACT
     together: bool = False
+    exempt: bool = False
 
 
 def windows(samples: Samples, solids: Solids, steps: Sequence[Step], options: Options) -> list[Window]:
@@ -136,7 +138,7 @@ class _Windows:
     def __init__(self, samples: Samples, solids: Solids, options: Options) -> None:
         self.samples, self.solids, self.options = samples, solids, options
         self.scene, self.trajectory, world = samples.scene, samples.trajectory, samples.world
-        self.labels = np.array(world.collision_labels)
+        self.labels, self.keys = np.array(world.collision_labels), world.collision_keys
         self.q = world.coordinates.q(samples.z[samples.waypoint_rows])
         low, high = self.trajectory.ranges()
         self.steps = (high - low).max(axis=1) > _STILL
@@ -164,14 +166,15 @@ class _Windows:
         yield from self._touches([step for step in steps if isinstance(step, Touch)])
 
     def _allowed(self, one: Allowance) -> Iterator[Window]:
-        """Yield when two links may be closer than others: always, or while joints are where that holds."""
-        pairs, count = self._between({one.first}, {one.second}), len(self.steps) + 1
+        """Yield when two links or shapes may be closer than others: always, or while joints are where that holds."""
+        pairs = np.array(one.shape_pairs(self.labels.tolist(), self.keys), int).reshape(-1, 2)
+        count = len(self.steps) + 1
         rows = self.samples.z[self.samples.waypoint_rows]
         holds = one.holds(self.samples.world.coordinates.names, rows)
-        contact, together = max(CONTACT, -one.margin), one.margin == -np.inf
+        contact, together = CONTACT + max(0.0, -one.margin), one.margin == -np.inf
         for begin, end in np.flatnonzero(np.diff(holds, prepend=False, append=False)).reshape(-1, 2).tolist():
             if len(pairs):
-                yield Window(pairs, begin, min(end, count) - 1, one.margin, contact, together)
+                yield Window(pairs, begin, min(end, count) - 1, one.margin, contact, together, exempt=True)
 
     def _hand(self, hold: Hold, first: int | None, last: int | None) -> Iterator[Window]:
         """Yield what a hold that lasts between two waypoints, or from the start or up to the end, means for what holds."""

@@ -15,21 +15,22 @@ from vkc_pin.arrays import Floats
 from vkc_pin.motion.spans import PhaseSpan
 from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.options import Options
-from vkc_pin.scene.neighbours import Allowance, allowances
+from vkc_pin.scene.neighbours import CONTACT, Allowance, allowances
 from vkc_pin.scene.resting import LEVEL, tilt
 from vkc_pin.scene.scene import Scene
 from vkc_pin.task.steps import Step, as_list
 from vkc_pin.task.terms import Term, traced
+from vkc_pin.validation.closure import find_drift
 from vkc_pin.validation.distances import Solids
 from vkc_pin.validation.goals import MOTION_TOLERANCE, check_goals, check_steps
 from vkc_pin.validation.motors.rates import check_rates
 from vkc_pin.validation.motors.torques import Motors
 from vkc_pin.validation.own_terms import check_terms
 from vkc_pin.validation.pairs import PairTable
-from vkc_pin.validation.report import Report, Violation
+from vkc_pin.validation.report import Exemption, Report, Violation
 from vkc_pin.validation.rolling import check_rolling
 from vkc_pin.validation.samples import MOST, Samples
-from vkc_pin.validation.sweep import sweep
+from vkc_pin.validation.sweep import Hit, sweep
 from vkc_pin.validation.touching import check_gripper, check_pushes, windows
 
 __all__ = ["check_fits", "validate"]
@@ -81,6 +82,7 @@ class _Check:
         self.samples, self.steps, self.options, self.terms = samples, steps, options, terms
         self.scene, self.trajectory = samples.scene, samples.trajectory
         self.found: list[Violation] = []
+        self.exemptions: dict[tuple[str, str], Exemption] = {}
         self._ranges = samples.trajectory.ranges()
 
     def report(self) -> Report:
@@ -105,15 +107,34 @@ class _Check:
             if violation.constraint == "penetration":
                 worst.pop(("clearance", violation.subject, violation.unit), None)
         ordered = tuple(sorted(worst.values(), key=lambda v: (v.time, v.constraint, v.subject, v.unit)))
-        close, states, facts = tuple(nearest.tolist()), len(self.samples.times), motors.facts(self.options.jerk_time)
-        return Report(ordered, min(close), closure_error=error, closure_angle=angle, clearances=close, states=states, **facts)
+        close, facts = tuple(nearest.tolist()), motors.facts(self.options.jerk_time)
+        return Report(
+            ordered,
+            min(close),
+            closure_error=error,
+            closure_angle=angle,
+            clearances=close,
+            states=len(self.samples.times),
+            exemptions=tuple(self.exemptions.values()),
+            **facts,
+        )
 
     def _add(
-        self, constraint: str, subject: str, amount: float, unit: str, detail: str, *, waypoint: int = 0, row: int | None = None
+        self,
+        constraint: str,
+        subject: str,
+        amount: float,
+        unit: str,
+        detail: str,
+        *,
+        waypoint: int = 0,
+        row: int | None = None,
+        time: float | None = None,
     ) -> None:
-        """Note a violation at a waypoint, or at a sample if `row` names one."""
+        """Note a violation at a waypoint, or at a sample if `row` names one, or at a time [s] after the waypoint."""
         at = waypoint if row is None else self.samples.waypoint(row)
-        time = self.trajectory.times[at] if row is None else self.samples.times[row]
+        if time is None:
+            time = self.trajectory.times[at] if row is None else self.samples.times[row]
         self.found.append(
             Violation(constraint, subject, waypoint=int(at), time=float(time), amount=float(amount), unit=unit, detail=detail)
         )
@@ -207,19 +228,19 @@ class _Check:
 
     def _closure(self) -> tuple[float, float]:
         """The hand stays where it holds an object (eq. 2); return the largest drift, [m] and [rad]."""
-        largest = np.zeros(2)
+        largest, limits = np.zeros(2), (self.options.closure_position, self.options.closure_angle)
         for phase in self.trajectory.phases:
-            rows = self.samples.rows(phase)
             for hold in phase.holds:
-                errors = self.samples.grasp_errors(hold.object, hold.attachment, rows, hold.frame)
-                largest = np.maximum(largest, errors.max(axis=0))
-                limits = (self.options.closure_position, self.options.closure_angle)
-                for column, limit, unit in zip(errors.T, limits, ("m", "rad"), strict=True):
-                    worst = int(np.argmax(column))
-                    if not column[worst] <= limit:
-                        detail = f"the grasp drifts by {1e3 * column[worst]:.3f} m{unit}, more than {1e3 * limit:g} m{unit}"
-                        subject = f"{hold.object}.{hold.attachment}"
-                        self._add("closure", subject, column[worst] - limit, unit, detail, row=int(rows[worst]))
+                drift = find_drift(self.samples, phase, hold, limits)
+                largest = np.maximum(largest, drift.found)
+                subject = f"{hold.object}.{hold.attachment}"
+                rows = zip(drift.found, drift.bound, drift.times, limits, ("m", "rad"), strict=True)
+                for found, bound, time, limit, unit in rows:
+                    if not bound <= limit:
+                        amount = found if found > limit else bound
+                        detail = f"the grasp drifts by {1e3 * amount:.3f} m{unit}, more than {1e3 * limit:g} m{unit}"
+                        at = min(int(np.searchsorted(self.trajectory.times, time, side="right")) - 1, phase.last)
+                        self._add("closure", subject, amount - limit, unit, detail, waypoint=at, time=float(time))
         return float(largest[0]), float(largest[1])
 
     def _slides(self) -> None:
@@ -250,20 +271,42 @@ class _Check:
         near = windows(samples, solids, self.steps, self.options)
         safe, own = self.options.dist_safe, self.options.self_distance
         pairs = PairTable(self.scene, solids, self.trajectory, safe, own, windows=near, samples=samples)
-        nearest, neighbours = np.full(len(lasts), np.inf), dict[frozenset[str], list[Allowance]]()
-        for one in allowances(self.scene, safe):
-            if one.margin == -np.inf:
-                neighbours.setdefault(frozenset((one.first, one.second)), []).append(one)
+        nearest, exempt = np.full(len(lasts), np.inf), self._exempt_pairs()
+        names = samples.world.coordinates.names
         for hit in sweep(pairs, samples.z, samples.waypoint_rows):
-            named, state = neighbours.get(frozenset((hit.first, hit.second)), ()), samples.z[[hit.row]]
-            if any(one.holds(samples.world.coordinates.names, state)[0] for one in named):
-                continue  # on the way to the waypoint at which they are neighbours no more, or first are
-            if hit.margin > -np.inf:
+            state = samples.z[[hit.row]]
+            # Also on the way to the waypoint at which the exemption ends, or from that at which it begins.
+            tolerated = max((-one.margin for one in exempt.get(hit.shapes, ()) if one.holds(names, state)[0]), default=0.0)
+            overlap = max(hit.contact, CONTACT + tolerated if tolerated > 0.0 else 0.0)
+            if hit.margin > -np.inf and not tolerated > 0.0:
                 np.minimum.at(nearest, np.searchsorted(lasts, samples.waypoint(hit.row)), hit.distance)
             subject, millimetres = f"{hit.first} – {hit.second}", 1e3 * abs(hit.distance)
-            if hit.distance < -hit.contact:
+            short = (min(hit.margin, -tolerated) if tolerated > 0.0 else hit.margin) - WAYPOINT_TOLERANCE - hit.distance
+            if hit.distance < -overlap:
                 self._add("penetration", subject, -hit.distance, "m", f"overlap by {millimetres:.1f} mm", row=hit.row)
-            elif hit.at_waypoint and hit.row > 0 and (short := hit.margin - WAYPOINT_TOLERANCE - hit.distance) > 0.0:
+            elif hit.at_waypoint and hit.row > 0 and short > 0.0:
                 detail = f"are only {millimetres:.1f} mm apart, {1e3 * hit.margin:.0f} mm are asked for"
                 self._add("clearance", subject, short, "m", detail, row=hit.row)
+            elif hit.distance < -CONTACT or (hit.at_waypoint and hit.row > 0 and hit.distance < hit.usual - WAYPOINT_TOLERANCE):
+                self._note_exemption(hit, exempt.get(hit.shapes, ()))
         return nearest
+
+    def _exempt_pairs(self) -> dict[tuple[int, int], list[Allowance]]:
+        """Return the pairs of shapes that the scene exempts from clearance, each with its allowances."""
+        world, found = self.samples.world, dict[tuple[int, int], list[Allowance]]()
+        for one in allowances(self.scene, self.options.dist_safe):
+            for pair in one.shape_pairs(world.collision_labels, world.collision_keys):
+                found.setdefault(pair, []).append(one)
+        return found
+
+    def _note_exemption(self, hit: Hit, allowed: Sequence[Allowance]) -> None:
+        """Note that a pair came closer than others may, at its closest."""
+        known = self.exemptions.get((hit.first, hit.second))
+        if known is not None and known.distance <= hit.distance:
+            return
+        reason = "as deep as the object stood at first"
+        if allowed:
+            one = allowed[0]
+            stood = f"{abs(1e3 * one.distance):.1f} mm {'apart' if one.distance >= 0.0 else 'inside each other'}"
+            reason = "the scene allows it" if one.shapes is None else f"{one} stand {stood} as built"
+        self.exemptions[hit.first, hit.second] = Exemption(f"{hit.first} – {hit.second}", hit.distance, reason)

@@ -130,6 +130,12 @@ class _Bound(Schema):
     end: Annotated[float, Field(strict=True, allow_inf_nan=False)]
 
 
+class _Exemption(Schema):
+    subject: Text
+    distance: Annotated[float, Field(strict=True, allow_inf_nan=False)]
+    reason: Text
+
+
 class _Report(Schema):
     violations: Annotated[list[_Violation], FailFast()]
     clearance: Distance
@@ -141,6 +147,7 @@ class _Report(Schema):
     torque: Measured = 0.0  # older files have none of these
     bounds: Annotated[tuple[_Bound, ...], FailFast()] = ()
     remarks: Annotated[tuple[Text, ...], FailFast()] = ()
+    exemptions: Annotated[tuple[_Exemption, ...], FailFast()] = ()
 
 
 class _About(Schema):

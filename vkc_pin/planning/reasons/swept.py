@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
 from vkc_pin.planning.reasons.proofs import PROVEN
@@ -46,10 +48,16 @@ def _hit(problem: TrajectoryProblem, phase: Phase, coordinate: str) -> str:
     index = placed.object.coordinates.index(joint)
     for label in links:
         for other in sorted(others & standing.reached(label, index, values)):
-            distance = standing.distance(label, other, index, 0.0)(values)
+            own, hit = standing.of([label]), standing.of([other])
+            distances = standing.distances(label, index, values, hit, 0.0)
             for one in known:
-                if one.between(label, other):
-                    distance[one.holds([coordinate], values[:, None])] += max(0.0, -one.margin)
+                if not one.between(label, other):
+                    continue
+                holds, pairs = one.holds([coordinate], values[:, None]), set(one.shape_pairs(standing.labels, standing.keys))
+                for k, j in itertools.product(range(len(own)), range(len(hit))):
+                    if (min(own[k], hit[j]), max(own[k], hit[j])) in pairs:
+                        distances[holds, k, j] += max(0.0, -one.margin)
+            distance = distances.min(axis=(1, 2))
             worst = int(np.argmin(distance))
             if distance[worst] < deepest:
                 deepest = float(distance[worst])

@@ -15,11 +15,11 @@ import pinocchio as pin
 from PIL import Image
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.anything.given import parsed, ready_robot
-from vkc_pin.benchmarks.anything.pairs import pair
+from vkc_pin.benchmarks.robot_object_matrix.given import parsed, ready_robot
+from vkc_pin.benchmarks.robot_object_matrix.pairs import pair
 from vkc_pin.benchmarks.harness.limits import LIMITS
-from vkc_pin.motion.world import World
-from vkc_pin.plotting.style import new_figure, save_figure, styled
+from vkc_pin.world.trajectory.world_model import World
+from vkc_pin.visualization.plots.style import new_figure, save_figure, styled
 from vkc_pin.visualization.room import drawn_parts
 
 ROOT = Path(__file__).parent.parent

@@ -13,13 +13,14 @@ import numpy as np
 import pinocchio as pin
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks import chores, gap
-from vkc_pin.models.shapes import triangles
-from vkc_pin.motion.dynamics.torques import Torques
-from vkc_pin.motion.world import World
-from vkc_pin.plotting.style import COLOURS, new_figure, save_figure, styled
-from vkc_pin.plotting.top_view import draw_top_view
-from vkc_pin.scene.placed import standing_geometry
+from vkc_pin.benchmarks import chores
+from vkc_pin.benchmarks import gap
+from vkc_pin.world.models.shapes import triangles
+from vkc_pin.world.trajectory.dynamics.torques import Torques
+from vkc_pin.world.trajectory.world_model import World
+from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, styled
+from vkc_pin.visualization.plots.top_view import draw_top_view
+from vkc_pin.world.scene.placed_object import standing_geometry
 from vkc_pin.visualization import drawing
 from vkc_pin.visualization import viewer as visualization
 

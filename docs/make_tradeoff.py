@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.options import Options
-from vkc_pin.plotting.style import COLOURS, new_figure, save_figure, styled
+from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, styled
 
 DOCS = Path(__file__).resolve().parent
 FIELD = "velocity_weight_base"

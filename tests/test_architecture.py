@@ -50,12 +50,12 @@ def test_contracts_hold(copy: Path) -> None:
 @pytest.mark.parametrize(
     ("file", "line", "contract"),
     [
-        ("files/writing.py", "from vkc_pin.models.robot import Robot", "Every import goes down"),
+        ("files/writing.py", "from vkc_pin.world.models.robot import Robot", "Every import goes down"),
         ("models/robot.py", "def _late():\n    from vkc_pin.planning.plan import Plan", "Every import goes down"),
         ("scene/scene.py", "if TYPE_CHECKING:\n    from vkc_pin.planning.plan import Plan", "Every import goes down"),
-        ("validation/distances.py", "from vkc_pin.task.compiler import compile_task", "Validation and motion know neither"),
+        ("validation/distances.py", "from vkc_pin.world.task.compiler import compile_task", "Validation and motion know neither"),
         ("seeds/beam.py", "import casadi", "Few import CasADi"),
-        ("models/coordinates.py", "from vkc_pin.models import robot", "No circles among siblings"),
+        ("models/coordinates.py", "from vkc_pin.world.models import robot", "No circles among siblings"),
         ("program/problem.py", "from vkc_pin.visualization.viewer import show", "Every import goes down"),
         ("new_wing/__init__.py", "", ""),
     ],

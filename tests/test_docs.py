@@ -20,11 +20,11 @@ import yaml
 
 import vkc_pin as vkc
 from vkc_pin.cli.commands import make_parser
-from vkc_pin.files.documents import Document, check
-from vkc_pin.models.dynamics.resistance import ObjectJointSchema
-from vkc_pin.models.object_file import AttachmentSchema, LatchSchema, ObjectSchema
-from vkc_pin.models.robot_schema import BaseSchema, RobotSchema
-from vkc_pin.scene.scene_schema import COLOURS, ObstacleSchema, PlacedObjectSchema, SceneRobotSchema, SceneSchema, StartSchema
+from vkc_pin.world.files.documents import Document, check
+from vkc_pin.world.models.dynamics.joint_resistance import ObjectJointSchema
+from vkc_pin.world.models.object_file import AttachmentSchema, LatchSchema, ObjectSchema
+from vkc_pin.world.models.robot_schema import BaseSchema, RobotSchema
+from vkc_pin.world.scene.scene_schema import COLOURS, ObstacleSchema, PlacedObjectSchema, SceneRobotSchema, SceneSchema, StartSchema
 from vkc_pin.validation.report import Violation
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -18,10 +18,10 @@ import trimesh
 from cutting import cut, solid_volume
 from numpy.typing import NDArray
 
-from vkc_pin.files.hulls import outer_hull
-from vkc_pin.files.urdf import UrdfFile, read_urdf
-from vkc_pin.files.writing import write_atomically
-from vkc_pin.models.robot_schema import python_packages, read_robot
+from vkc_pin.world.files.hulls import outer_hull
+from vkc_pin.world.files.urdf import UrdfFile, read_urdf
+from vkc_pin.world.files.writing import write_atomically
+from vkc_pin.world.models.robot_schema import python_packages, read_robot
 
 CORNERS = 40  # of a piece, at most
 

@@ -8,11 +8,11 @@ from typing import Any
 
 import lazy_loader
 
-from vkc_pin import notebook
+from vkc_pin.utils import notebook
 
 _public, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 __all__.append("__version__")
-notebook.cards_from("vkc_pin.plotting.cards")
+notebook.cards_from("vkc_pin.visualization.plots.notebook_cards")
 
 
 def __getattr__(name: str) -> Any:

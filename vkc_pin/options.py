@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any, Self
 
-from vkc_pin.arguments import number, whole
+from vkc_pin.utils.arguments import number, whole
 from vkc_pin.errors import InputError, shown
 
 __all__ = ["Options"]

@@ -16,10 +16,10 @@ from helpers.small_problems import door_scene, program_of
 
 import vkc_pin as vkc
 from vkc_pin.baselines.paths import BasePaths, headings
-from vkc_pin.driving.path import shortest_path
-from vkc_pin.models.shapes import placed_shapes
-from vkc_pin.scene.obstacles import FLOOR
-from vkc_pin.scene.placed import standing_geometry
+from vkc_pin.planning.base_paths.base_path import shortest_path
+from vkc_pin.world.models.shapes import placed_shapes
+from vkc_pin.world.scene.obstacles import FLOOR
+from vkc_pin.world.scene.placed_object import standing_geometry
 
 START, BESIDE = np.array([-1.5, 1.5, 0.0]), np.array([0.5, 1.0, 0.8])
 AISLE = np.array([1.0, -1.4, 0.0])  # behind the post

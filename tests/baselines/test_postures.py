@@ -13,7 +13,7 @@ from helpers.small_problems import program_of
 import vkc_pin as vkc
 from vkc_pin.baselines import postures as module
 from vkc_pin.baselines.postures import base_poses
-from vkc_pin.seeds.knots import SCATTER, Knots
+from vkc_pin.planning.initialization.keyframes import SCATTER, Knots
 
 
 def reaching(scene: vkc.Scene, attachment: str = "handle") -> vkc.TrajectoryProblem:

@@ -20,14 +20,16 @@ from helpers.drawers import changed, drawer_scene, handle, holding, off, open_sc
 from helpers.small_problems import door_scene
 
 import vkc_pin as vkc
-from vkc_pin.baselines import BASELINES, attempt, plan_separately, separate
+from vkc_pin.baselines import BASELINES, plan_separately
+from vkc_pin.baselines import attempt
+from vkc_pin.baselines import separate
 from vkc_pin.baselines import postures as poses
 from vkc_pin.baselines.attempt import FINER
 from vkc_pin.baselines.following import Followed, follow
 from vkc_pin.baselines.paths import BasePaths
 from vkc_pin.benchmarks.household import TASKS
 from vkc_pin.planning.outcome import TIMES
-from vkc_pin.solver.to_trajectory import as_trajectory
+from vkc_pin.planning.solver.to_trajectory import as_trajectory
 
 ROOT = Path(__file__).resolve().parents[2]
 PULL = vkc.Actuate("drawer", {"slide": 0.3})

@@ -16,10 +16,10 @@ from vkc_pin.benchmarks import chores
 from vkc_pin.benchmarks.harness import step_by_step as stepwise
 from vkc_pin.cli import main
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.models.shapes import clearance
-from vkc_pin.scene.neighbours import close_pairs
-from vkc_pin.scene.placed import standing_geometry
-from vkc_pin.task.actions import actions_of, foresee
+from vkc_pin.world.models.shapes import clearance
+from vkc_pin.world.scene.clearance_exemptions import close_pairs
+from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.task.actions import actions_of, foresee
 
 
 @pytest.mark.parametrize(("name", "number", "actions"), [("home", 18, 10), ("fetch", 10, 6), ("cluttered", 18, 10)])

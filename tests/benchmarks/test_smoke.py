@@ -12,9 +12,9 @@ import pytest
 
 from vkc_pin.benchmarks.initialization import TARGET
 from vkc_pin.cli import main
-from vkc_pin.motion.world import World
+from vkc_pin.world.trajectory.world_model import World
 from vkc_pin.planning.plan import Plan
-from vkc_pin.scene.scene import load_scene
+from vkc_pin.world.scene.scene import load_scene
 from vkc_pin.validation.validate import validate
 
 FIELDS = {

@@ -164,11 +164,11 @@ OUTPUTS = ["--save", "plan.npz", "--json", "plan.json", "--html", "plan.html"]
         "argparse",
         "numpy",
         "pinocchio",
-        "vkc_pin.scene.scene",
+        "vkc_pin.world.scene.scene",
         "coal",
         "casadi",
         "vkc_pin.planning.plan",
-        "vkc_pin.solver.loop",
+        "vkc_pin.planning.solver.loop",
     ],
 )
 def test_ctrl_c_while_it_imports(module: str, tmp_path: Path) -> None:

@@ -14,8 +14,8 @@ from vkc_pin.errors import InputError
 from vkc_pin.planning import outcome
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
-from vkc_pin.scene.scene import load_scene
-from vkc_pin.task.steps import Actuate
+from vkc_pin.world.scene.scene import load_scene
+from vkc_pin.world.task.steps import Actuate
 
 DOCUMENT = load_recipe(SMALL).document
 

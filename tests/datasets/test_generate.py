@@ -176,7 +176,7 @@ def test_full_shards_are_written_once_and_their_work_goes(tmp_path: Path, monkey
 
 
 def test_a_block_that_takes_its_process_with_it_is_tried_one_by_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from vkc_pin.running.engine import Died
+    from vkc_pin.utils.parallel.engine import Died
 
     asked: list[Sequence[int]] = []
 

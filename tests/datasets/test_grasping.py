@@ -7,8 +7,8 @@ import pytest
 from vkc_pin.datasets.grasping import grasped
 from vkc_pin.options import Options
 from vkc_pin.planning.planner import Planner, plan
-from vkc_pin.scene.scene import Scene, load_scene
-from vkc_pin.task.steps import Actuate
+from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin.world.task.steps import Actuate
 
 STEPS = {"drawer": Actuate("drawer", {"slide": 0.2}, "handle"), "door": Actuate("door", {"hinge": 0.6}, "handle")}
 

@@ -9,8 +9,8 @@ from helpers.datasets import SMALL
 from vkc_pin.datasets.problems import NoProblemError, problem
 from vkc_pin.datasets.recipes.recipe import load_recipe, robot_name
 from vkc_pin.planning.planner import Planner
-from vkc_pin.scene.scene import START_CLEARANCE
-from vkc_pin.task.steps import Actuate, Grasp, Place, step_to_dict
+from vkc_pin.world.scene.scene import START_CLEARANCE
+from vkc_pin.world.task.steps import Actuate, Grasp, Place, step_to_dict
 
 PLANNER = Planner()
 

@@ -11,7 +11,7 @@ from vkc_pin.datasets.check import check_dataset
 from vkc_pin.datasets.generate import generate
 from vkc_pin.datasets.recipes.recipe import load_recipe
 from vkc_pin.errors import InputError
-from vkc_pin.models.robot_file import find_robot, load_robot
+from vkc_pin.world.models.robot_file import find_robot, load_robot
 
 
 def test_a_robot_without_a_hand_is_imported_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

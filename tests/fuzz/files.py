@@ -14,7 +14,7 @@ import numpy as np
 import trimesh
 
 import vkc_pin as vkc
-from vkc_pin.files.resources import folder
+from vkc_pin.world.files.resources import folder
 
 from . import odd
 from .calls import TINY

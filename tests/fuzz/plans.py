@@ -32,7 +32,7 @@ def _base() -> tuple[dict[str, Any], dict[str, Any]]:
     steps: list[Any] = [vkc.Actuate("drawer", {"slide": 0.1}), vkc.GoTo(0.1, 0.1)]
     report = vkc.validate(scene(), steps, motion(), terms=terms)
     planned = saved()
-    from vkc_pin.task.terms import traced
+    from vkc_pin.world.task.terms import traced
 
     plan = vkc.Plan(
         scene(),

@@ -9,8 +9,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from vkc_pin.driving.body import Shape
-from vkc_pin.files.meshes import convex_hull
+from vkc_pin.planning.base_paths.base_clearance import Shape
+from vkc_pin.world.files.meshes import convex_hull
 
 HALL = (-5.0, 5.0, -5.0, 5.0)
 MARGIN = 0.02

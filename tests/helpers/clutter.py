@@ -8,7 +8,7 @@ import numpy as np
 
 from helpers.carrying import room
 from helpers.small_problems import door_scene
-from vkc_pin.scene.scene import Scene
+from vkc_pin.world.scene.scene import Scene
 
 
 def things(seed: int, count: int) -> list[dict[str, Any]]:

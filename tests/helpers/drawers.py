@@ -11,11 +11,11 @@ import numpy as np
 import pinocchio as pin
 
 from helpers.carrying import reaching
-from vkc_pin.models.shapes import link_name, shape_distance
+from vkc_pin.world.models.shapes import link_name, shape_distance
 from vkc_pin.options import Options
-from vkc_pin.scene.obstacles import FLOOR
-from vkc_pin.scene.placed import standing_geometry
-from vkc_pin.scene.scene import Scene, load_scene
+from vkc_pin.world.scene.obstacles import FLOOR
+from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.scene.scene import Scene, load_scene
 
 MARGIN, BESIDE_HANDLE = 0.02, 0.005  # [m]: Options.dist_safe and Options.grasp_clearance
 SHORT = Options(reach_waypoints=5, turn_waypoints=3, move_waypoints=8)

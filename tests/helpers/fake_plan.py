@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from vkc_pin.motion.spans import PhaseSpan
-from vkc_pin.motion.trajectory import Trajectory
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
-from vkc_pin.scene.hold import Hold
-from vkc_pin.scene.scene import Scene, load_scene
-from vkc_pin.task.steps import Actuate
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin.world.task.steps import Actuate
 from vkc_pin.validation.report import Report, Violation
 
 HINGE = 1.2

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from vkc_pin.models.articulation import ArticulatedObject
-from vkc_pin.models.object_file import load_object
+from vkc_pin.world.models.articulated_object import ArticulatedObject
+from vkc_pin.world.models.object_file import load_object
 
 BAR = '<collision{}><origin xyz="-0.08 0.5 0" /><geometry><box size="0.02 0.02 0.3"/></geometry></collision>'
 """Upright, 70 mm before a flap that is hinged at y = 0."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from helpers.arm_urdf import HEIGHT, write_arms
-from vkc_pin.scene.scene import Scene
+from vkc_pin.world.scene.scene import Scene
 
 __all__ = ["WIDEST", "between_cheeks", "cheeky_drawer", "write_gripper"]
 

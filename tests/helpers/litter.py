@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from vkc_pin.files.resources import folder
-from vkc_pin.scene.scene import Scene
+from vkc_pin.world.files.resources import folder
+from vkc_pin.world.scene.scene import Scene
 
 AT, BIN, BELOW = (1.0, 0.0, 0.036), (0.0, 2.0, 0.16), (-1.0, 0.0, 0.037)
 

@@ -6,10 +6,10 @@ import numpy as np
 import pinocchio as pin
 
 from helpers.carrying import Script, room, table
-from vkc_pin.motion.spans import PhaseSpan
-from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.scene.hold import Hold
-from vkc_pin.scene.scene import Scene
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.scene.scene import Scene
 from vkc_pin.validation.pairs import PairTable
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from helpers.small_problems import random_configurations
-from vkc_pin.program.merit import Merit, infeasibility, shortfalls
-from vkc_pin.program.problem import TrajectoryProblem
+from vkc_pin.planning.nlp.merit import Merit, infeasibility, shortfalls
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
 
 QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes"}
 CLEARANCE, REST = 31.0, 17.0  # weights

@@ -11,17 +11,17 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.cache import Cache
-from vkc_pin.chain.phase_geometry import PhaseGeometry
-from vkc_pin.models.articulation import ArticulatedObject, Attachment, Freedom
-from vkc_pin.models.object_file import load_object
+from vkc_pin.utils.cache import Cache
+from vkc_pin.planning.chain.phase_geometry import PhaseGeometry
+from vkc_pin.world.models.articulated_object import ArticulatedObject, Attachment, Freedom
+from vkc_pin.world.models.object_file import load_object
 from vkc_pin.options import Options
-from vkc_pin.program.inspection import build
-from vkc_pin.program.problem import TrajectoryProblem
-from vkc_pin.scene.placed import PlacedObject
-from vkc_pin.scene.scene import Scene, load_scene
-from vkc_pin.task.steps import Step
-from vkc_pin.task.terms import Term
+from vkc_pin.planning.nlp.inspection import build
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.world.scene.placed_object import PlacedObject
+from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin.world.task.steps import Step
+from vkc_pin.world.task.terms import Term
 
 CACHE = Cache()
 SHORT = Options(reach_waypoints=5, turn_waypoints=3, move_waypoints=4)

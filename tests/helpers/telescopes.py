@@ -6,7 +6,7 @@ import itertools
 from pathlib import Path
 
 from helpers.grippers import between_cheeks
-from vkc_pin.scene.scene import Scene
+from vkc_pin.world.scene.scene import Scene
 
 __all__ = ["FOLLOWERS", "SEGMENT", "coupled_scene", "joint", "link", "telescope_scene", "write_telescope"]
 

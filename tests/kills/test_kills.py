@@ -11,7 +11,7 @@ pytest.importorskip("distributed")
 
 PROGRAM = """
 import time
-from vkc_pin.running.engine import results
+from vkc_pin.utils.parallel.engine import results
 from helpers.tasks import slow
 if __name__ == "__main__":
     found = dict(results(slow, [(str(k), k) for k in range(6)], jobs=2, dask=True))

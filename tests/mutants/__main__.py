@@ -27,15 +27,15 @@ MODULES = [
 MODULES += ["scene/contact.py", "planning/one_problem.py"]
 TESTS = [
     "tests/validation",
-    "tests/solver",
+    "tests/planning/solver",
     "tests/oracle",
-    "tests/program/test_merit.py",
-    "tests/program/test_merit_numbers.py",
-    "tests/program/test_problem.py",
+    "tests/planning/nlp/test_merit.py",
+    "tests/planning/nlp/test_merit_numbers.py",
+    "tests/planning/nlp/test_problem.py",
 ]
-TESTS += ["tests/scene/test_contact.py"]
+TESTS += ["tests/world/scene/test_contact_rules.py"]
 TESTS += [
-    f"tests/chain/test_{name}.py"
+    f"tests/planning/chain/test_{name}.py"
     for name in ("collision_pairs", "contacts", "contacts_carried", "easing", "easing_parts", "pose", "inverse_kinematics")
 ]
 TESTS += [

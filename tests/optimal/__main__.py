@@ -16,7 +16,7 @@ from vkc_pin.benchmarks.harness.record import commit
 from vkc_pin.benchmarks.harness.tables import foot
 from vkc_pin.benchmarks.problems.problem_set import TASKS as ALL
 from vkc_pin.benchmarks.problems.problem_set import started
-from vkc_pin.running.machine import machine, peak_memory, versions
+from vkc_pin.utils.parallel.machine import machine, peak_memory, versions
 
 from .bound import bound
 

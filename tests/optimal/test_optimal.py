@@ -9,7 +9,7 @@ from helpers.executions import door_plan, drawer_plan
 
 import vkc_pin as vkc
 from optimal.bound import bound
-from vkc_pin.retiming.retime import retimed
+from vkc_pin.planning.retiming.retime import retimed
 
 
 @pytest.mark.parametrize("made", [door_plan, drawer_plan])

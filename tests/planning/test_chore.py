@@ -16,8 +16,8 @@ import pytest
 import vkc_pin as vkc
 from vkc_pin.benchmarks.initialization import TARGET
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.motion.splicing import cut
-from vkc_pin.motion.world import World
+from vkc_pin.world.trajectory.splicing import cut
+from vkc_pin.world.trajectory.world_model import World
 from vkc_pin.planning.one_problem import OneProblem
 from vkc_pin.planning.window import SlidingWindow
 

@@ -62,8 +62,8 @@ def test_progress_is_one_line_that_is_written_over(jupyter: Kernel) -> None:
 @pytest.mark.parametrize(
     ("where", "code"),
     [
-        ("seeds", "vkc_pin.seeds.initialization._SeedSearch, '_search'"),
-        ("solver", "vkc_pin.solver.subproblem.Subproblem, 'solve'"),
+        ("seeds", "vkc_pin.planning.initialization.methods._SeedSearch, '_search'"),
+        ("solver", "vkc_pin.planning.solver.subproblem.Subproblem, 'solve'"),
         ("validation", "vkc_pin.planning.one_problem, 'validate'"),
         ("building", "vkc_pin.planning.one_problem, 'TrajectoryProblem'"),
     ],
@@ -72,7 +72,7 @@ def test_an_interrupted_cell_leaves_a_plan(jupyter: Kernel, where: str, code: st
     """The kernel is interrupted once planning has come to a place where it stays for a while."""
     slow = f"""
 import time, importlib
-import vkc_pin.seeds.initialization, vkc_pin.solver.loop, vkc_pin.planning.one_problem
+import vkc_pin.planning.initialization.methods, vkc_pin.planning.solver.loop, vkc_pin.planning.one_problem
 owner, name = {code}
 original = getattr(owner, name)
 def slow(*arguments, **options):

@@ -18,24 +18,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vkc_pin.benchmarks.scale import crowded
-from vkc_pin.chain import easing
-from vkc_pin.chain.contacts import ContactModel
-from vkc_pin.chain.phase_geometry import PhaseGeometry
-from vkc_pin.distances.clearances import Clearances, Nearest
-from vkc_pin.distances.shapes import asked
-from vkc_pin.driving.body import Body
-from vkc_pin.models import shapes as geometry
-from vkc_pin.models.shapes import clearance, shape_distance
-from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.motion.world import World
+from vkc_pin.planning.chain import easing
+from vkc_pin.planning.chain.contacts import ContactModel
+from vkc_pin.planning.chain.phase_geometry import PhaseGeometry
+from vkc_pin.world.collision.clearances import Clearances, Nearest
+from vkc_pin.world.collision.shapes import asked
+from vkc_pin.planning.base_paths.base_clearance import Body
+from vkc_pin.world.models import shapes as geometry
+from vkc_pin.world.models.shapes import clearance, shape_distance
+from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.world_model import World
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
-from vkc_pin.plotting.clearance import clearance_curves
-from vkc_pin.program.problem import TrajectoryProblem
-from vkc_pin.scene.obstacles import FLOOR
-from vkc_pin.scene.placed import standing_geometry
-from vkc_pin.scene.scene import Scene
-from vkc_pin.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step
+from vkc_pin.visualization.plots.clearance import clearance_curves
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.world.scene.obstacles import FLOOR
+from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step
 from vkc_pin.validation.distances import Placed, Solids, travelled
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.samples import Samples

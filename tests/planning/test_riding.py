@@ -11,8 +11,8 @@ from helpers.judging import names
 from helpers.riding import TOP, plates, slid, trays
 
 import vkc_pin as vkc
-from vkc_pin.motion.carrying import FreeObjects
-from vkc_pin.motion.world import World, scene_after
+from vkc_pin.world.trajectory.free_objects import FreeObjects
+from vkc_pin.world.trajectory.world_model import World, scene_after
 from vkc_pin.options import Options
 from vkc_pin.validation.validate import validate
 

@@ -12,7 +12,7 @@ from helpers.drawers import SHORT, drawer_scene
 import vkc_pin as vkc
 from vkc_pin.baselines import plan_separately
 from vkc_pin.benchmarks.chores import fetch
-from vkc_pin.budget import Budget
+from vkc_pin.utils.budget import Budget
 
 PULL = [vkc.Actuate("drawer", {"slide": 0.3})]
 CALLS: dict[str, Callable[[], vkc.Plan]] = {

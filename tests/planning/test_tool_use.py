@@ -11,12 +11,12 @@ from helpers.small_problems import program_of
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks.initialization import TARGET
-from vkc_pin.motion.world import World, scene_after
+from vkc_pin.world.trajectory.world_model import World, scene_after
 from vkc_pin.planning.one_problem import OneProblem
 from vkc_pin.planning.settings import Settings
 from vkc_pin.planning.stepwise import stages
-from vkc_pin.seeds.seed import Seed, seed_of
-from vkc_pin.task.compiler import compile_task
+from vkc_pin.planning.initialization.initial_guess import Seed, seed_of
+from vkc_pin.world.task.compiler import compile_task
 
 
 @cache
@@ -134,7 +134,7 @@ def test_a_perturbation_that_is_none(bad: object) -> None:
 
 
 def test_a_perturbed_seed_is_another_one_and_the_same_again() -> None:
-    from vkc_pin.seeds.initialization import initialize
+    from vkc_pin.planning.initialization.methods import initialize
 
     problem = program_of(start(), [vkc.GoTo(1.0, -4.0, 0.0)])
     plain, one, same, other = (

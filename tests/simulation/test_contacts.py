@@ -6,11 +6,11 @@ import pytest
 from helpers.executions import door_plan, holding
 
 import vkc_pin as vkc
-from vkc_pin.motion.world import World
+from vkc_pin.world.trajectory.world_model import World
 from vkc_pin.options import Options
-from vkc_pin.scene.contact import grasped, touching
-from vkc_pin.scene.neighbours import allowances
-from vkc_pin.scene.obstacles import FLOOR
+from vkc_pin.world.scene.contact_rules import grasped, touching
+from vkc_pin.world.scene.clearance_exemptions import allowances
+from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.simulation.contacts import touching_pairs, unwanted
 from vkc_pin.validation.distances import Solids
 from vkc_pin.validation.pairs import PairTable

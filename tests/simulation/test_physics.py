@@ -11,7 +11,7 @@ import pytest
 from helpers.executions import drawer_plan, holding
 
 import vkc_pin as vkc
-from vkc_pin.motion.world import World
+from vkc_pin.world.trajectory.world_model import World
 from vkc_pin.simulation.physics import engine, weigh
 
 

@@ -12,7 +12,7 @@ from helpers.executions import door_plan, still
 from helpers.telescopes import coupled_scene
 
 import vkc_pin as vkc
-from vkc_pin.motion.world import World
+from vkc_pin.world.trajectory.world_model import World
 from vkc_pin.simulation.contacts import touching_pairs
 from vkc_pin.simulation.model import Builder
 from vkc_pin.simulation.physics import Physics, weigh

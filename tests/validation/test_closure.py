@@ -10,12 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import vkc_pin as vkc
-from vkc_pin.arrays import Floats
-from vkc_pin.motion.curve import Curve
-from vkc_pin.motion.trajectory import Trajectory
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.trajectory.curve import Curve
+from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
-from vkc_pin.scene.scene import Scene
+from vkc_pin.world.scene.scene import Scene
 from vkc_pin.validation.closure import (
     RESOLUTION,
     _grasp_levers,

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vkc_pin.scene.hold import Hold
-from vkc_pin.task.steps import Actuate, GoTo, Grasp, Place, Release, Step, Touch
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Release, Step, Touch
 from vkc_pin.validation import goals
 
 STICK, DOOR = Hold("stick", "grip"), Hold("door", "handle")

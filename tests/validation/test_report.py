@@ -11,7 +11,7 @@ import pytest
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError
-from vkc_pin.plotting.clearance import clearance_curves
+from vkc_pin.visualization.plots.clearance import clearance_curves
 from vkc_pin.validation.report import Bound, Report, Violation
 
 ONE = Violation("limit", "elbow_joint", waypoint=4, time=1.0, amount=0.05, unit="rad", detail="3.2 rad is outside")

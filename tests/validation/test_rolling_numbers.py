@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vkc_pin.motion.curve import Curve
+from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.rolling import SLIP_TOLERANCE, STEP_TOLERANCE, WHEEL_TOLERANCE, check_rolling
 

@@ -14,10 +14,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.motion.curve import Curve
-from vkc_pin.motion.spans import PhaseSpan
-from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.scene.scene import Scene
+from vkc_pin.world.trajectory.curve import Curve
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.scene.scene import Scene
 from vkc_pin.validation import samples as module
 from vkc_pin.validation.samples import Samples, _angles
 

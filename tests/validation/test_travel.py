@@ -14,7 +14,7 @@ from helpers.telescopes import coupled_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.motion.world import World
+from vkc_pin.world.trajectory.world_model import World
 from vkc_pin.validation.distances import Solids, travelled
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.samples import Samples

@@ -9,11 +9,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from vkc_pin.motion.spans import PhaseSpan
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.options import Options
-from vkc_pin.scene.hold import Hold
-from vkc_pin.scene.neighbours import Allowance
-from vkc_pin.scene.resting import LEVEL
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.scene.clearance_exemptions import Allowance
+from vkc_pin.world.scene.support import LEVEL
 from vkc_pin.validation import validate as module
 from vkc_pin.validation.report import Report, Violation
 from vkc_pin.validation.sweep import Hit

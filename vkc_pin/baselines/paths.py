@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.arrays import Floats
-from vkc_pin.driving.grid import HEADINGS, BaseGrid, fine_cells
-from vkc_pin.driving.path import poses_along, shortest_path
-from vkc_pin.models.coordinates import wrapped
-from vkc_pin.program.problem import TrajectoryProblem
-from vkc_pin.seeds.knots import smooth
-from vkc_pin.seeds.routes import grid_shapes
-from vkc_pin.seeds.seed import Seed
-from vkc_pin.task.steps import GoTo
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.planning.base_paths.grid import HEADINGS, BaseGrid, fine_cells
+from vkc_pin.planning.base_paths.base_path import poses_along, shortest_path
+from vkc_pin.world.models.coordinates import wrapped
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.planning.initialization.keyframes import smooth
+from vkc_pin.planning.initialization.base_routes import grid_shapes
+from vkc_pin.planning.initialization.initial_guess import Seed
+from vkc_pin.world.task.steps import GoTo
 
 __all__ = ["BasePaths", "headings"]
 

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from vkc_pin.arrays import Floats
-from vkc_pin.program.problem import TrajectoryProblem
-from vkc_pin.seeds.approach import Approach
-from vkc_pin.seeds.knots import SCATTER, Knots, smooth
-from vkc_pin.seeds.routes import Routes
-from vkc_pin.solver.trust_region import CLOSE_ENOUGH
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.planning.initialization.approach_paths import Approach
+from vkc_pin.planning.initialization.keyframes import SCATTER, Knots, smooth
+from vkc_pin.planning.initialization.base_routes import Routes
+from vkc_pin.planning.solver.trust_region import CLOSE_ENOUGH
 
 __all__ = ["ENOUGH", "TRIES", "at_home", "base_poses", "postures", "through"]
 

@@ -9,7 +9,7 @@ from vkc_pin.benchmarks.comparison import COMPARED_PLANNERS, Assignment, Compari
 from vkc_pin.benchmarks.comparison_report import compared_methods
 from vkc_pin.benchmarks.harness.charts import criteria_chart
 from vkc_pin.benchmarks.harness.record import Record
-from vkc_pin.task.steps import Actuate
+from vkc_pin.world.task.steps import Actuate
 
 __all__ = ["COMPARED_PLANNERS", "TASKS", "plan_trial", "report", "run"]
 

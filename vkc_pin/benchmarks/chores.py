@@ -21,9 +21,9 @@ from vkc_pin.benchmarks.harness.tables import decimal, failures, foot, markdown
 from vkc_pin.options import Options
 from vkc_pin.planning.chore import plan_chore
 from vkc_pin.planning.plan import Plan
-from vkc_pin.scene.rooms.clutter import cluttered
-from vkc_pin.scene.scene import Scene, load_scene
-from vkc_pin.task.steps import Actuate, Grasp, Place, Step
+from vkc_pin.procedural.rooms.clutter import cluttered
+from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin.world.task.steps import Actuate, Grasp, Place, Step
 
 __all__ = ["CHORES", "Chore", "cluttered_home", "fetch", "home", "plan_trial", "report", "run"]
 

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from vkc_pin.interrupt import raising
+from vkc_pin.utils.interrupt import raising
 
 __all__ = ["EXIT_INTERRUPTED", "EXIT_OK", "add_bench", "natural", "positive", "stopped"]
 
@@ -204,7 +204,7 @@ def _add_choice(parser: argparse.ArgumentParser, names: str, choices: str) -> No
 
 def _bench_door(arguments: argparse.Namespace) -> int:
     from vkc_pin.benchmarks import door
-    from vkc_pin.files.writing import check_outputs, write_atomically
+    from vkc_pin.world.files.writing import check_outputs, write_atomically
 
     if arguments.json is not None:
         check_outputs({"--json": arguments.json})

@@ -16,8 +16,8 @@ from vkc_pin.benchmarks.harness.record import distribution, meta, peak_memory, t
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
-from vkc_pin.scene.scene import Scene, load_scene
-from vkc_pin.task.steps import Actuate, Grasp, Reach
+from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin.world.task.steps import Actuate, Grasp, Reach
 
 __all__ = ["TASKS", "run", "table"]
 

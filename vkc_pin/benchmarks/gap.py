@@ -15,8 +15,8 @@ from vkc_pin.benchmarks.problems.ablation import SUMMARY, every_trial, summary
 from vkc_pin.benchmarks.problems.poses import random_start
 from vkc_pin.benchmarks.problems.trials import tried
 from vkc_pin.errors import InputError
-from vkc_pin.scene.scene import Scene, load_scene
-from vkc_pin.task.steps import Reach
+from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin.world.task.steps import Reach
 
 __all__ = ["POSE", "SCENE", "report", "run", "started"]
 

@@ -13,9 +13,9 @@ from vkc_pin.benchmarks.comparison import COMPARED_PLANNERS, Assignment, Compari
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.charts import means_chart, success_chart
 from vkc_pin.benchmarks.harness.record import Record
-from vkc_pin.files.documents import read_yaml
-from vkc_pin.scene.scene import Scene, load_scene
-from vkc_pin.task.steps import Actuate, GoTo, Place
+from vkc_pin.world.files.documents import read_yaml
+from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin.world.task.steps import Actuate, GoTo, Place
 
 __all__ = [
     "COMPARED_PLANNERS",

@@ -8,7 +8,7 @@ from typing import Any
 
 from vkc_pin.benchmarks.commands import natural
 from vkc_pin.errors import InputError
-from vkc_pin.files.writing import check_outputs
+from vkc_pin.world.files.writing import check_outputs
 
 __all__ = ["add_check"]
 
@@ -45,7 +45,7 @@ def _plan(arguments: argparse.Namespace) -> int:
 
 def _scene(arguments: argparse.Namespace) -> int:
     import vkc_pin as vkc
-    from vkc_pin.plotting.plots import PICTURES
+    from vkc_pin.visualization.plots.plots import PICTURES
 
     if arguments.plot is not None:
         if not arguments.plot.lower().endswith(PICTURES):

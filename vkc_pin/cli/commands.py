@@ -18,9 +18,9 @@ from vkc_pin.cli.datasets import add_datasets
 from vkc_pin.cli.importing import add_importing
 from vkc_pin.cli.simulating import add_simulate
 from vkc_pin.errors import InputError, VkcError
-from vkc_pin.files.writing import check_outputs, write_atomically
-from vkc_pin.motion.formats.rosbag import bag_library
-from vkc_pin.motion.formats.tables import GROUPS
+from vkc_pin.world.files.writing import check_outputs, write_atomically
+from vkc_pin.world.trajectory.formats.rosbag import bag_library
+from vkc_pin.world.trajectory.formats.tables import GROUPS
 
 __all__ = ["EXIT_MISUSE", "make_parser", "parse_settings", "run"]
 
@@ -42,7 +42,7 @@ def parse_settings(settings: Sequence[str]) -> list[Any]:
     Raises:
         InputError: A text is not of that form.
     """
-    from vkc_pin.task.steps import Actuate
+    from vkc_pin.world.task.steps import Actuate
 
     grouped: list[tuple[str, dict[str, float]]] = []
     for text in settings:
@@ -71,7 +71,7 @@ def _progress(row: Any) -> None:
 
 def _plan(arguments: argparse.Namespace) -> int:
     import vkc_pin as vkc
-    from vkc_pin.plotting.plots import PICTURES
+    from vkc_pin.visualization.plots.plots import PICTURES
 
     steps, outputs = parse_settings(arguments.set), _options(_chosen(arguments, _FILES))
     if (folder := arguments.plots) is not None:
@@ -189,8 +189,8 @@ def _view(arguments: argparse.Namespace) -> int:
 
 
 def _srdf(arguments: argparse.Namespace) -> int:
-    from vkc_pin.models.robot_file import load_robot
-    from vkc_pin.models.self_collisions import write_srdf
+    from vkc_pin.world.models.robot_file import load_robot
+    from vkc_pin.world.models.self_collisions import write_srdf
 
     check_outputs({"--output": arguments.output}, kept={"ROBOT": arguments.robot})
     written = write_srdf(load_robot(arguments.robot), arguments.output, samples=arguments.samples, seed=arguments.seed)

@@ -8,7 +8,7 @@ from typing import Any
 
 from vkc_pin.benchmarks.commands import EXIT_OK, natural, positive, stopped
 from vkc_pin.errors import InputError, VkcError
-from vkc_pin.interrupt import raising
+from vkc_pin.utils.interrupt import raising
 
 __all__ = ["add_datasets"]
 

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-from vkc_pin.files.writing import check_outputs
+from vkc_pin.world.files.writing import check_outputs
 
 __all__ = ["add_simulate"]
 

@@ -14,8 +14,8 @@ from vkc_pin.datasets.episode import Episode, work_file
 from vkc_pin.datasets.formats.hdf5 import episodes_of, numbers_of, write_shard
 from vkc_pin.datasets.recipes.recipe import Recipe, load_recipe
 from vkc_pin.errors import InputError
-from vkc_pin.files.resources import file_path
-from vkc_pin.files.writing import check_name, write_atomically
+from vkc_pin.world.files.resources import file_path
+from vkc_pin.world.files.writing import check_name, write_atomically
 
 __all__ = ["EPISODES_A_SHARD", "Dataset", "Register", "write_table"]
 

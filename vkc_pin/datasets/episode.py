@@ -15,24 +15,24 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.arrays import Floats
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.datasets.diversity import way
 from vkc_pin.datasets.problems import NoProblemError, problem
 from vkc_pin.datasets.recipes.recipe import Recipe, load_recipe
 from vkc_pin.errors import InputError
-from vkc_pin.files.resources import folder
-from vkc_pin.files.writing import check_name
-from vkc_pin.motion.trajectory import Trajectory
+from vkc_pin.world.files.resources import folder
+from vkc_pin.world.files.writing import check_name
+from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import Planner, plan
-from vkc_pin.running.machine import peak_memory, process_name, resident_memory
-from vkc_pin.scene.scene import Scene
+from vkc_pin.utils.parallel.machine import peak_memory, process_name, resident_memory
+from vkc_pin.world.scene.scene import Scene
 from vkc_pin.simulation.cameras.images import Images, taken
 from vkc_pin.simulation.execution import simulate
 from vkc_pin.simulation.result import SimulationResult
-from vkc_pin.task.steps import Step, step_from_dict, step_to_dict
-from vkc_pin.task.terms import Term, term_from_dict, term_to_dict
+from vkc_pin.world.task.steps import Step, step_from_dict, step_to_dict
+from vkc_pin.world.task.terms import Term, term_from_dict, term_to_dict
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import validate
 

@@ -11,20 +11,20 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.arrays import Floats
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.datasets.grasping import grasped
 from vkc_pin.datasets.recipes.recipe import Recipe, load_recipe, robot_name
 from vkc_pin.datasets.recipes.terms import meant
 from vkc_pin.errors import VkcError
 from vkc_pin.options import Options
 from vkc_pin.planning.planner import Planner
-from vkc_pin.scene.rooms.parts import CARRIED, Part
-from vkc_pin.scene.rooms.random_room import Layout, random_layout
-from vkc_pin.scene.rooms.settings import RoomSettings
-from vkc_pin.scene.scene import START_CLEARANCE, Scene, load_scene
-from vkc_pin.task.goals import goals
-from vkc_pin.task.steps import Actuate, Grasp, Place, Step
-from vkc_pin.task.terms import Term
+from vkc_pin.procedural.rooms.parts import CARRIED, Part
+from vkc_pin.procedural.rooms.random_room import Layout, random_layout
+from vkc_pin.procedural.rooms.settings import RoomSettings
+from vkc_pin.world.scene.scene import START_CLEARANCE, Scene, load_scene
+from vkc_pin.procedural.tasks import goals
+from vkc_pin.world.task.steps import Actuate, Grasp, Place, Step
+from vkc_pin.world.task.terms import Term
 
 __all__ = ["NoProblemError", "Problem", "problem", "terms_of"]
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vkc_pin.arrays import Floats, Ints
+from vkc_pin.utils.arrays import Floats, Ints
 
 if TYPE_CHECKING:
     import trimesh

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from vkc_pin.arguments import whole
+from vkc_pin.utils.arguments import whole
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import Planner, guarded
 from vkc_pin.planning.settings import Settings, settings_for
 from vkc_pin.planning.window import SlidingWindow
-from vkc_pin.scene.scene import Scene
-from vkc_pin.solver.solution import Iteration
-from vkc_pin.task.actions import foresee
-from vkc_pin.task.phases import stretches
-from vkc_pin.task.steps import Step, as_list
-from vkc_pin.task.terms import Term, check_active
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.planning.solver.solution import Iteration
+from vkc_pin.world.task.actions import foresee
+from vkc_pin.world.task.phases import stretches
+from vkc_pin.world.task.steps import Step, as_list
+from vkc_pin.world.task.terms import Term, check_active
 
 __all__ = ["plan_chore"]
 

@@ -10,22 +10,22 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
 import numpy as np
 
-from vkc_pin.arrays import Floats
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.files.resources import file_path
-from vkc_pin.files.writing import write_atomically
-from vkc_pin.motion.formats.archives import folder_from_data, folder_to_data, read_archive, write_archive
-from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.motion.world import scene_after, units_of
+from vkc_pin.world.files.resources import file_path
+from vkc_pin.world.files.writing import write_atomically
+from vkc_pin.world.trajectory.formats.archives import folder_from_data, folder_to_data, read_archive, write_archive
+from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.world_model import scene_after, units_of
 from vkc_pin.options import Options
-from vkc_pin.plotting import plots as plotting
-from vkc_pin.plotting.cards import motion_html
-from vkc_pin.scene.scene import Scene
+from vkc_pin.visualization.plots import plots as plotting
+from vkc_pin.visualization.plots.notebook_cards import motion_html
+from vkc_pin.world.scene.scene import Scene
 from vkc_pin.simulation.execution import simulate
 from vkc_pin.simulation.result import SimulationResult
-from vkc_pin.task.actions import foresee
-from vkc_pin.task.steps import Step, step_from_dict, step_to_dict
-from vkc_pin.task.terms import Term, term_from_dict, term_to_dict
+from vkc_pin.world.task.actions import foresee
+from vkc_pin.world.task.steps import Step, step_from_dict, step_to_dict
+from vkc_pin.world.task.terms import Term, term_from_dict, term_to_dict
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import check_fits, validate
 from vkc_pin.visualization import viewer as visualization

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from vkc_pin.errors import InputError
 from vkc_pin.errors import shown as told
-from vkc_pin.notebook import in_notebook
+from vkc_pin.utils.notebook import in_notebook
 
 if TYPE_CHECKING:
     from vkc_pin.planning.plan import Plan
-    from vkc_pin.solver.solution import Iteration
+    from vkc_pin.planning.solver.solution import Iteration
 
 __all__ = ["Progress", "shown"]
 

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from vkc_pin.arguments import instance, known, number, whole
-from vkc_pin.budget import Budget
-from vkc_pin.cache import Cache
+from vkc_pin.utils.arguments import instance, known, number, whole
+from vkc_pin.utils.budget import Budget
+from vkc_pin.utils.cache import Cache
 from vkc_pin.errors import InputError, shown
 from vkc_pin.options import Options
 from vkc_pin.planning.progress import Progress
-from vkc_pin.scene.scene import Scene
-from vkc_pin.seeds.initialization import INITIALIZATIONS
-from vkc_pin.solver.solution import Iteration
-from vkc_pin.task.terms import Term, traced
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.planning.initialization.methods import INITIALIZATIONS
+from vkc_pin.planning.solver.solution import Iteration
+from vkc_pin.world.task.terms import Term, traced
 
 __all__ = ["Settings", "budget_for", "check_arguments", "settings_for"]
 

@@ -3,7 +3,7 @@
 from vkc_pin.simulation.contacts import Contact
 from vkc_pin.simulation.execution import simulate
 from vkc_pin.simulation.goals import Miss
-from vkc_pin.simulation.grips import Grip
+from vkc_pin.simulation.welds import Grip
 from vkc_pin.simulation.physics import Physics
 from vkc_pin.simulation.result import SimulationResult, Tracking
 

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.arrays import Floats
-from vkc_pin.models.coordinates import wrapped
-from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.motion.world import World
-from vkc_pin.scene.scene import Scene
-from vkc_pin.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.models.coordinates import wrapped
+from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.world_model import World
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
 
 __all__ = ["Miss", "missed"]
 

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.arguments import flag, number
-from vkc_pin.arrays import Floats
-from vkc_pin.models.dynamics.weight import solid_inertia
-from vkc_pin.motion.world import World
-from vkc_pin.needed import optional_package
+from vkc_pin.utils.arguments import flag, number
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.models.dynamics.mass import solid_inertia
+from vkc_pin.world.trajectory.world_model import World
+from vkc_pin.utils.optional_imports import optional_package
 
 __all__ = ["Physics", "engine", "weigh"]
 

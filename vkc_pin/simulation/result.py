@@ -10,18 +10,18 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.arrays import Floats
-from vkc_pin.files.writing import write_atomically
-from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.scene.scene import Scene
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.files.writing import write_atomically
+from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.scene.scene import Scene
 from vkc_pin.simulation.contacts import Contact
 from vkc_pin.simulation.goals import Miss
-from vkc_pin.simulation.grips import Grip
+from vkc_pin.simulation.welds import Grip
 from vkc_pin.simulation.physics import Physics
 from vkc_pin.simulation.replay import page
 from vkc_pin.simulation.servos import Servo
 from vkc_pin.simulation.snapshots import film, strip
-from vkc_pin.task.steps import Step, step_to_dict
+from vkc_pin.world.task.steps import Step, step_to_dict
 
 __all__ = ["SimulationResult", "Tracking"]
 
@@ -83,7 +83,7 @@ class SimulationResult:
         steps: What was asked for.
         planned: The motion that was followed.
         trajectory: The motion that came of it, every 20 ms, with the same coordinates; freedoms of grasps as planned.
-        rows: The same of everything, carried objects with their placements, shape (K, n); see `motion.world.World`.
+        rows: The same of everything, carried objects with their placements, shape (K, n); see `world.trajectory.world_model.World`.
         misses: How far everything that was asked for is from where it should be.
         tracking: How well the servos follow.
         grips: What was held, and how hard it pulled.

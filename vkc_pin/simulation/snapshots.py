@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vkc_pin import arguments
-from vkc_pin.arrays import Floats
+from vkc_pin.utils import arguments
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.errors import InputError, VkcError
-from vkc_pin.files.writing import write_atomically
-from vkc_pin.scene.obstacles import FLOOR
+from vkc_pin.world.files.writing import write_atomically
+from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.simulation.contacts import Pairs
 from vkc_pin.simulation.model import Builder
 from vkc_pin.simulation.physics import Physics, engine, weigh

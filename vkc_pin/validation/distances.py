@@ -12,13 +12,13 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.arrays import Floats, Ints
-from vkc_pin.distances.placements import ShapePlacements, columns_of
-from vkc_pin.distances.shapes import Shapes
-from vkc_pin.distances.world_boxes import WorldBoxes
-from vkc_pin.models.coordinates import Moved
-from vkc_pin.models.shapes import bounding_box, shape_distance
-from vkc_pin.motion.world import World
+from vkc_pin.utils.arrays import Floats, Ints
+from vkc_pin.world.collision.placements import ShapePlacements, columns_of
+from vkc_pin.world.collision.shapes import Shapes
+from vkc_pin.world.collision.world_boxes import WorldBoxes
+from vkc_pin.world.models.coordinates import Moved
+from vkc_pin.world.models.shapes import bounding_box, shape_distance
+from vkc_pin.world.trajectory.world_model import World
 
 __all__ = ["Placed", "Solids", "travelled"]
 

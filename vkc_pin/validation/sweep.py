@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vkc_pin.arrays import Bools, Floats, Ints
+from vkc_pin.utils.arrays import Bools, Floats, Ints
 from vkc_pin.validation.distances import Placed, travelled
 from vkc_pin.validation.pairs import PairTable
 

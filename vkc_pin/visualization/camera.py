@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vkc_pin.arrays import Bools, Floats
+from vkc_pin.utils.arrays import Bools, Floats
 
 __all__ = ["FIELD_OF_VIEW", "choose_viewpoint"]
 

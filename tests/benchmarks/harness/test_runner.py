@@ -13,7 +13,8 @@ from typing import Any
 import pytest
 from helpers.trials import SETTINGS, fatal, mistaken, square, trials, where
 
-from vkc_pin.benchmarks.harness import record, runner
+from vkc_pin.benchmarks.harness import record
+from vkc_pin.benchmarks.harness import runner
 from vkc_pin.errors import InputError, VkcError
 
 
@@ -290,7 +291,7 @@ def test_progress(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
 
 
 def test_sources_are_those_that_planning_depends_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from vkc_pin.files.resources import folder
+    from vkc_pin.world.files.resources import folder
 
     for name in ("__init__.py", "planner.py", "cli/commands.py", "benchmarks/tables.py", "scenes/a.yaml", "scenes/notes.txt"):
         (tmp_path / name).parent.mkdir(exist_ok=True)

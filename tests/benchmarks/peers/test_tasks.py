@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vkc_pin.benchmarks.peers.tasks import TASKS, ends, given, problem_of
-from vkc_pin.seeds.knots import depth
+from vkc_pin.planning.initialization.keyframes import depth
 
 
 @pytest.mark.parametrize("task", TASKS)

@@ -8,9 +8,9 @@ from helpers.downloads import SDF
 from helpers.homes import HOME_MJCF, PLACES, WALLS, home_urdf
 
 import vkc_pin as vkc
-from vkc_pin.models.shapes import world_box
-from vkc_pin.scene.placed import standing_geometry
-from vkc_pin.scene.scene import START_CLEARANCE
+from vkc_pin.world.models.shapes import world_box
+from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.scene.scene import START_CLEARANCE
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*things that can move stand in others")  # cups in their table, as in real homes
 

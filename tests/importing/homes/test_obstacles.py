@@ -11,7 +11,7 @@ import trimesh
 from vkc_pin.importing.homes.obstacles import write_obstacles
 from vkc_pin.importing.homes.splitting import Home
 from vkc_pin.importing.objects.description import Link, Part
-from vkc_pin.scene.scene import Scene
+from vkc_pin.world.scene.scene import Scene
 
 
 def _part(name: str, kind: str, size: tuple[float, ...], at: pin.SE3, **more: object) -> Part:

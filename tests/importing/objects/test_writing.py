@@ -9,7 +9,7 @@ import trimesh
 import yaml
 
 import vkc_pin as vkc
-from vkc_pin.files.urdf import read_urdf
+from vkc_pin.world.files.urdf import read_urdf
 from vkc_pin.importing.objects.description import Description, Joint, Link, Part
 from vkc_pin.importing.objects.writing import write_description, write_urdf
 

@@ -9,10 +9,10 @@ import pinocchio as pin
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.files.kinematic_tree import check_tree
-from vkc_pin.files.meshes import load_mesh
+from vkc_pin.world.files.kinematic_tree import check_tree
+from vkc_pin.world.files.meshes import load_mesh
 from vkc_pin.importing.robots.mjcf import convert
-from vkc_pin.models.robot_model import configuration
+from vkc_pin.world.models.robot_model import configuration
 
 ARM = """
 <mujoco model="arm"><compiler angle="degree"/>

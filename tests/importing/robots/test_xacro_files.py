@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.files.xml import parse_xml
+from vkc_pin.world.files.xml import parse_xml
 from vkc_pin.importing.robots.xacro_files import expand
 
 TEXT = """<?xml version="1.0"?>

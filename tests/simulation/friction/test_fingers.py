@@ -9,7 +9,7 @@ import pytest
 from helpers.grippers import between_cheeks, write_gripper
 
 import vkc_pin as vkc
-from vkc_pin.motion.world import World
+from vkc_pin.world.trajectory.world_model import World
 from vkc_pin.simulation.friction.fingers import fingers_of, limited
 from vkc_pin.simulation.physics import Physics
 from vkc_pin.simulation.servos import servos

@@ -8,7 +8,7 @@ from helpers.executions import drawer_plan
 from helpers.fake_plan import fake_plan
 
 import vkc_pin as vkc
-from vkc_pin.motion.trajectory import Trajectory
+from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.simulation.friction.pauses import paused
 
 

@@ -1,6 +1,6 @@
 """Many workers, simulated from what tasks took with few: what the one client costs, stragglers, and work in vain.
 
-A simulation of discrete events of how `running.engine` feeds processes. Every worker has a task in hand and one waiting. What it
+A simulation of discrete events of how `utils.parallel.engine` feeds processes. Every worker has a task in hand and one waiting. What it
 returns waits for the client, which takes results one after the other: it writes them down, fills shards, and sends the worker
 another task. A dataset is the first numbers that become episodes, so that it ends when the last of these is there; whatever
 was begun beyond them is in vain. What tasks take is drawn from what they took, the first of a worker from first ones.
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.datasets.dataset import Dataset
-from vkc_pin.running.journal import Kept
+from vkc_pin.utils.parallel.journal import Kept
 
 __all__ = ["WORKERS", "Costs", "measured", "simulated"]
 

@@ -14,8 +14,8 @@ from vkc_pin.benchmarks.harness.tables import foot, markdown
 from vkc_pin.errors import InputError
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
-from vkc_pin.scene.scene import Scene, load_scene
-from vkc_pin.task.steps import Actuate
+from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin.world.task.steps import Actuate
 
 __all__ = ["BASES", "TASKS", "TURNING_RADIUS", "report", "run", "started"]
 

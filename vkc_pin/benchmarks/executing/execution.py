@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.arguments import known
+from vkc_pin.utils.arguments import known
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.limits import LIMITS, allowed
 from vkc_pin.benchmarks.harness.record import Record, trial, values

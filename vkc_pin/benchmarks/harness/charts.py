@@ -12,7 +12,7 @@ from vkc_pin.benchmarks.harness.record import Record
 from vkc_pin.benchmarks.harness.record import values as numbers
 from vkc_pin.benchmarks.harness.tables import common, mean_and_deviation, quartiles, wilson
 from vkc_pin.planning.plan import Plan
-from vkc_pin.plotting.style import COLOURS, new_figure, save_figure, shade_phases, styled
+from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, shade_phases, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

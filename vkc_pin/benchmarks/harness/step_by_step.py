@@ -10,8 +10,8 @@ from vkc_pin.benchmarks.harness.record import trial
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
-from vkc_pin.scene.scene import Scene
-from vkc_pin.task.steps import Step
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.steps import Step
 
 __all__ = ["combined", "step_by_step"]
 

@@ -27,7 +27,7 @@ class Change:
     """One setting with another value.
 
     Attributes:
-        module: The module of a constant, `solver.loop` for one; "Options" for a field of `Options`; "" for no change at all.
+        module: The module of a constant, `planning.solver.loop` for one; "Options" for a field of `Options`; "" for no change at all.
         name: Of the constant or the field.
         value: What it is to be.
     """

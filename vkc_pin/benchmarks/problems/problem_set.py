@@ -12,13 +12,16 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.benchmarks import baselines, door, household, initialization
+from vkc_pin.benchmarks import baselines
+from vkc_pin.benchmarks import door
+from vkc_pin.benchmarks import household
+from vkc_pin.benchmarks import initialization
 from vkc_pin.benchmarks.comparison import Assignment, placed
 from vkc_pin.benchmarks.problems.poses import pose_among, pose_over
 from vkc_pin.errors import InputError
-from vkc_pin.scene.rooms.random_room import random_layout
-from vkc_pin.scene.scene import Scene, load_scene
-from vkc_pin.task.steps import Actuate, Grasp, Place, Reach, Step, Touch
+from vkc_pin.procedural.rooms.random_room import random_layout
+from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin.world.task.steps import Actuate, Grasp, Place, Reach, Step, Touch
 
 __all__ = ["KINDS", "NUMBER", "TASKS", "Problem", "kind_of", "problem", "problem_of_task", "started"]
 

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from vkc_pin.arguments import known
+from vkc_pin.utils.arguments import known
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.limits import LIMITS, allowed
 from vkc_pin.benchmarks.harness.record import Record, distribution, trial
@@ -20,8 +20,8 @@ from vkc_pin.benchmarks.problems.drawn import drawn
 from vkc_pin.benchmarks.problems.problem_set import Problem
 from vkc_pin.errors import InputError
 from vkc_pin.planning.planner import plan
-from vkc_pin.task.goals import random_task
-from vkc_pin.task.steps import Actuate, Grasp
+from vkc_pin.procedural.tasks import random_task
+from vkc_pin.world.task.steps import Actuate, Grasp
 
 __all__ = ["report", "run"]
 

@@ -13,11 +13,11 @@ from vkc_pin.benchmarks.harness.record import trial
 from vkc_pin.benchmarks.problems.changes import UNCHANGED, Change
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import Planner, borrowed, plan
-from vkc_pin.program.problem import TrajectoryProblem
-from vkc_pin.scene.scene import Scene, load_scene
-from vkc_pin.solver.solution import Iteration
-from vkc_pin.task.compiler import compile_task
-from vkc_pin.task.steps import Reach, Step
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin.planning.solver.solution import Iteration
+from vkc_pin.world.task.compiler import compile_task
+from vkc_pin.world.task.steps import Reach, Step
 
 __all__ = ["first_seed", "objective", "tried"]
 

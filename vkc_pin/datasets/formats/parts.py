@@ -11,7 +11,7 @@ from typing import Any
 from vkc_pin.datasets.episode import Episode, Made, attempts, unpacked
 from vkc_pin.datasets.formats.hdf5 import part
 from vkc_pin.datasets.recipes.recipe import load_recipe
-from vkc_pin.models.robot import Robot
+from vkc_pin.world.models.robot import Robot
 
 __all__ = ["parts"]
 

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.importing.objects.description import Description, Joint, Link
-from vkc_pin.importing.objects.tidying import bounds, closed, only, rooted, surfaces
+from vkc_pin.importing.objects.clean_up import bounds, closed, only, rooted, surfaces
 
 __all__ = ["FLOOR_RISE", "Home", "Thing", "split"]
 

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.arrays import Floats
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.errors import InputError
-from vkc_pin.files.meshes import load_mesh
+from vkc_pin.world.files.meshes import load_mesh
 
 if TYPE_CHECKING:
     import trimesh
@@ -32,7 +32,7 @@ class Part:
         name: What the file calls it; need not be unique.
         placement: In the frame of its link.
         kind: "box", "sphere", "cylinder", "capsule" or "mesh".
-        size: As in `vkc_pin.files.urdf.UrdfShape`, [m]; scale of a mesh.
+        size: As in `vkc_pin.world.files.urdf.UrdfShape`, [m]; scale of a mesh.
         file: The mesh's file, or None if it is given as triangles.
         triangles: The mesh, before it is scaled.
         colour: Red, green, blue, opacity, or None.
@@ -175,7 +175,7 @@ def inertia(mass: float, moments: Iterable[float], placement: pin.SE3) -> pin.In
 
     Args:
         mass: [kg].
-        moments: About the centre of mass [kg·m²], in the order of `vkc_pin.files.kinematic_tree.MOMENTS`.
+        moments: About the centre of mass [kg·m²], in the order of `vkc_pin.world.files.kinematic_tree.MOMENTS`.
         placement: Of the centre of mass, and of the axes of the moments, in the link's frame.
 
     Raises:

@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from vkc_pin.errors import InputError
 from vkc_pin.importing.objects.description import Description, Joint, Link, Part
-from vkc_pin.needed import optional_package
+from vkc_pin.utils.optional_imports import optional_package
 
 __all__ = ["read_object_mjcf"]
 

@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.files.urdf import UrdfFile
+from vkc_pin.world.files.urdf import UrdfFile
 
 __all__ = ["Arm", "Body", "base_kind", "bodies", "choose", "find_arms", "own_base", "telescopes"]
 

@@ -7,9 +7,9 @@ from collections.abc import Collection
 
 import numpy as np
 
-from vkc_pin.arrays import Floats
-from vkc_pin.models.robot import Robot
-from vkc_pin.models.shapes import triangles
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.models.robot import Robot
+from vkc_pin.world.models.shapes import triangles
 
 __all__ = ["envelopes", "leave_out"]
 

@@ -10,7 +10,7 @@ from types import ModuleType
 from typing import Any
 
 from vkc_pin.errors import InputError
-from vkc_pin.needed import optional_package
+from vkc_pin.utils.optional_imports import optional_package
 
 __all__ = ["expand"]
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vkc_pin.arrays import Floats
-from vkc_pin.models.robot import Robot
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.models.robot import Robot
 from vkc_pin.simulation.cameras.mount import Camera
 from vkc_pin.simulation.model import Builder, quaternion
 from vkc_pin.simulation.replay import Executed

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.arrays import Floats
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.models.robot import Robot
+from vkc_pin.world.models.robot import Robot
 
 __all__ = ["BASE", "HAND", "Camera", "check_frame", "frame_of"]
 

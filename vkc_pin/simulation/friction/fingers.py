@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.arrays import Floats, Ints
+from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.errors import InputError
-from vkc_pin.models.hands.bars import bar_fits, widest_bar
-from vkc_pin.models.shapes import triangles
-from vkc_pin.motion.world import World
+from vkc_pin.world.models.grippers.bar_width import bar_fits, widest_bar
+from vkc_pin.world.models.shapes import triangles
+from vkc_pin.world.trajectory.world_model import World
 from vkc_pin.simulation.model import Builder, PhysicalWorld, quaternion
 from vkc_pin.simulation.physics import Physics
 from vkc_pin.simulation.servos import Servo, position_servo

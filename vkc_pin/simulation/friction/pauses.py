@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from vkc_pin.arrays import Floats, Ints
+from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.errors import InputError
-from vkc_pin.motion.curve import Curve
-from vkc_pin.motion.trajectory import Trajectory
+from vkc_pin.world.trajectory.curve import Curve
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["paused"]
 

@@ -1,0 +1,43 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import vkc_pin as vkc
+from vkc_pin.importing.homes.home_import import _started
+from vkc_pin.importing.homes.start_pose import free_start
+from vkc_pin.world.scene.scene import START_CLEARANCE
+
+
+def _halves(drawer_x: float, **more: object) -> vkc.Scene:
+    """Return a floor of 10 m by 4 m that a wall cuts into a larger and a smaller half, with a drawer in one of them."""
+    return vkc.Scene.from_document(
+        {
+            "robot": "husky_ur5e",
+            "start": {"base": [0.0, 0.0, 0.0]},
+            "arena": {"x": [-6, 4], "y": [-2, 2]},
+            "obstacles": [{"name": "wall", "type": "box", "size": [0.1, 4.0, 2.0], "position": [0.0, 0.0, 1.0]}],
+            "objects": [{"name": "drawer", "type": "drawer", "position": [drawer_x, 0.0, 0.0]}],
+            **more,
+        }
+    )
+
+
+@pytest.mark.parametrize(("drawer_x", "side"), [(3.0, 1.0), (-2.0, -1.0)])
+def test_the_start_is_where_things_are_reached_not_where_most_floor_is(drawer_x: float, side: float) -> None:
+    for seed in range(3):
+        scene, reached = free_start(_halves(drawer_x), np.random.default_rng(seed))
+        assert np.sign(scene.start[0]) == side
+        assert reached == 1
+        assert scene.start_clearance() >= START_CLEARANCE
+
+
+def test_where_no_robot_fits_that_is_said() -> None:
+    full = [{"name": "block", "type": "box", "size": [10.0, 4.0, 2.0], "position": [-1.0, 0.0, 1.0]}]
+    with pytest.raises(vkc.InputError, match="floor"):
+        free_start(_halves(3.0, obstacles=full), np.random.default_rng(0))
+    with pytest.raises(vkc.InputError, match=r"home\.xml: robot, floor: no place") as caught:
+        _started(_halves(3.0, obstacles=full), Path("home.xml"), np.random.default_rng(0))
+    assert caught.value.field == "robot, floor"

@@ -1,0 +1,190 @@
+"""Margins of single pairs: what the hand keeps from what it holds, what a scene allows, and who can hit the floor."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from vkc_pin.planning.chain import collision_pairs as module
+from vkc_pin.planning.chain.collision_pairs import _boxes, _Pairing
+from vkc_pin.planning.chain.contacts import Contacts, no_contacts
+from vkc_pin.options import Options
+from vkc_pin.world.scene.contact_rules import CONTACT
+from vkc_pin.world.scene.clearance_exemptions import Allowance
+from vkc_pin.world.scene.obstacles import FLOOR
+
+
+def pairing(*allowances: Allowance, **fields: Any) -> Any:
+    made = object.__new__(_Pairing)
+    made._allowances = allowances
+    made.options = Options(dist_safe=0.02)
+    for name, value in fields.items():
+        setattr(made, name, value)
+    return made
+
+
+@pytest.mark.parametrize(
+    ("one", "link", "as_one", "clearance", "expected"),
+    [
+        ("arm", "lever", True, 0.005, 0.02),  # does not take hold
+        ("arm", "panel", False, 0.0, 0.02),
+        ("hand", "panel", True, 0.005, 0.005),
+        ("hand", "panel", True, 0.0, 0.0),
+        ("hand", "lever", True, 0.005, -np.inf),
+        ("hand", "lever", False, 0.005, 0.005),
+        ("hand", "lever", False, 0.0, -CONTACT),  # it touches it
+    ],
+)
+def test_what_is_kept_from_what_is_held(
+    one: str, link: str, as_one: bool, clearance: float, expected: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "touching", lambda scene, hold: ("hand",))
+    monkeypatch.setattr(module, "grasped", lambda scene, hold: "lever")
+    monkeypatch.setattr(module, "moves_as_one", lambda scene, hold: as_one)
+    monkeypatch.setattr(module, "hand_clearance", lambda scene, hold, link, options: clearance)
+    assert pairing(scene=None)._held_margin(None, one, link) == expected
+
+
+LABELS = ["arm", "tray", "side", "tray", "lid"]  # a link may have several shapes
+TABLE = [(0, 1, 0.02), (1, 2, 0.02), (2, 3, 0.01), (0, 4, 0.02), (3, 4, 0.02), (2, 4, 0.02)]
+SLIDE = {"drawer.slide": (-0.1, 0.4)}
+
+
+WITHIN = np.array([5]), np.array([-0.1]), np.array([0.4])
+
+
+def allowed(*allowances: Allowance, within: Any = WITHIN) -> Any:
+    """Return the pairs with their margins, and where some may be close: (pairs, margin) each."""
+    made = pairing(*allowances)
+    made._within = lambda phase, ranges: within if ranges else (np.zeros(0, int), np.zeros(0), np.zeros(0))
+    table, near = made._allowed(None, np.array(TABLE), LABELS, LABELS)
+    for place in near:
+        assert place[2:] == within
+    return table.tolist(), [(place[0].tolist(), place[1]) for place in near]
+
+
+def test_what_a_scene_allows_keeps_what_it_says() -> None:
+    """All shapes of both links, whichever comes first; if that is less than what they keep anyway."""
+    rows = [list(row) for row in TABLE]
+    assert allowed() == (rows, [])
+    for pair in (("side", "tray"), ("tray", "side")):
+        kept, near = allowed(Allowance(*pair, 0.003, 0.003))
+        assert near == []
+        assert kept == [
+            [*row[:2], 0.003 if sorted(LABELS[int(k)] for k in row[:2]) == ["side", "tray"] else row[2]] for row in rows
+        ]
+        kept, _ = allowed(Allowance(*pair, 0.015, 0.015))
+        assert [row[2] for row in kept] == [0.02, 0.015, 0.01, 0.02, 0.02, 0.02]
+    assert allowed(Allowance("side", "cup", 0.0, 0.0), Allowance("cup", "tray", 0.0, 0.0)) == (rows, [])
+
+
+def test_what_may_overlap_is_no_pair_any_more() -> None:
+    kept, near = allowed(Allowance("tray", "side", -np.inf, -np.inf))
+    assert kept == [[0.0, 1.0, 0.02], [0.0, 4.0, 0.02], [3.0, 4.0, 0.02], [2.0, 4.0, 0.02]]
+    assert near == []
+
+
+@pytest.mark.parametrize(
+    ("margin", "distance", "expected"),
+    [(0.0, 0.008, 0.004), (0.0, -0.003, 0.0), (-0.003, -0.002, -0.003), (-np.inf, 0.01, -np.inf)],
+)
+def test_neighbours_keep_half_of_what_they_have_where_they_are(margin: float, distance: float, expected: float) -> None:
+    """Rows are those of the table without what is no pair."""
+    gone = Allowance("tray", "side", -np.inf, -np.inf)
+    kept, near = allowed(gone, Allowance("tray", "lid", margin, distance, SLIDE))
+    assert len(kept) == 4
+    assert near == [([2], expected)]
+    assert allowed(Allowance("side", "tray", margin, distance, SLIDE))[1] == [([1, 2], expected)]
+    assert allowed(Allowance("arm", "side", margin, distance, SLIDE))[1] == []  # they are no pair
+    assert allowed(gone, Allowance("tray", "side", margin, distance, SLIDE))[1] == []
+    assert allowed(Allowance("tray", "lid", margin, distance, SLIDE), within=None)[1] == []  # never where that holds
+
+
+def within(ranges: dict[str, tuple[float, float]], before: dict[str, float]) -> Any:
+    chain = SimpleNamespace(names=("base_x", "door.hinge", "drawer.slide"), index=("base_x", "door.hinge", "drawer.slide").index)
+    placed = SimpleNamespace(
+        state=[0.25, 0.5], object=SimpleNamespace(coordinates=SimpleNamespace(index=("left", "right").index))
+    )
+    made = pairing(chain=chain, scene=SimpleNamespace(objects={"cupboard": placed}))
+    return made._within(SimpleNamespace(before=before), ranges)
+
+
+def test_where_neighbours_are_such() -> None:
+    """Coordinates that move have limits; of what stands the place decides, at the start or where it was left."""
+    columns, low, high = within({"drawer.slide": (0.0, 0.1), "door.hinge": (-1.0, 1.0)}, {})
+    assert (columns.tolist(), low.tolist(), high.tolist()) == ([2, 1], [0.0, -1.0], [0.1, 1.0])
+    for limits, inside in (
+        ((0.4, 0.6), True),
+        ((0.5, 0.6), True),
+        ((0.4, 0.5), True),
+        ((0.51, 0.6), False),
+        ((0.4, 0.49), False),
+    ):
+        found = within({"cupboard.right": limits, "drawer.slide": (0.0, 0.1)}, {})
+        assert (found is not None) == inside
+        if inside:
+            assert [part.tolist() for part in found] == [[2], [0.0], [0.1]]
+    left = {"cupboard.right": 0.0}
+    assert within({"cupboard.right": (-0.1, 0.1)}, left) is not None
+    assert within({"cupboard.left": (0.2, 0.3)}, left) is not None
+    assert within({"cupboard.right": (0.4, 0.6)}, left) is None
+
+
+def test_only_what_is_above_the_floor_can_hit_it() -> None:
+    scene = SimpleNamespace(obstacle_labels=("wall", FLOOR, "box"))
+    made = pairing(scene=scene, _obstacles=[None] * 3)
+    found = made._with_obstacles(10, [0, 3, 5], [3])
+    assert found.tolist() == [
+        [0.0, 10.0, 0.02],
+        [3.0, 10.0, 0.02],
+        [5.0, 10.0, 0.02],
+        [3.0, 11.0, 0.02],
+        [0.0, 12.0, 0.02],
+        [3.0, 12.0, 0.02],
+        [5.0, 12.0, 0.02],
+    ]
+    assert made._with_obstacles(10, [0], []).tolist() == [[0.0, 10.0, 0.02], [0.0, 12.0, 0.02]]
+    none = pairing(scene=SimpleNamespace(obstacle_labels=()), _obstacles=[])
+    assert none._with_obstacles(10, [0, 1], [0]).shape == (0, 3)
+
+
+def test_links_of_an_object_that_can_meet() -> None:
+    own = {frozenset(("door", "rack"))}
+    made = pairing(scene=SimpleNamespace(objects={"washer": SimpleNamespace(object=SimpleNamespace(own_pairs=own))}))
+    assert made._own_pair("washer", "washer.rack", "washer.door")
+    assert not made._own_pair("washer", "washer.rack", "washer.case")
+
+
+def test_boxes_around_shapes_and_where_they_are() -> None:
+    place = pin.SE3(pin.utils.rotate("z", 0.5), np.array([1.0, 2.0, 3.0]))
+    shapes = [
+        pin.GeometryObject("a", 0, place, coal.Box(0.2, 0.4, 0.6)),
+        pin.GeometryObject("b", 0, pin.SE3.Identity(), coal.Sphere(0.1)),
+    ]
+    center, half, rotation, translation = _boxes(shapes)
+    np.testing.assert_allclose(center, np.zeros((2, 3)), atol=1e-12)
+    np.testing.assert_allclose(half, [[0.1, 0.2, 0.3], [0.1, 0.1, 0.1]])
+    np.testing.assert_array_equal(rotation, [place.rotation, np.eye(3)])
+    np.testing.assert_array_equal(translation, [[1.0, 2.0, 3.0], [0.0, 0.0, 0.0]])
+    assert [part.shape for part in _boxes([])] == [(0, 3), (0, 3), (0, 3, 3), (0, 3)]
+
+
+def test_contacts_in_numbers() -> None:
+    distance, margin = np.array([0.01, 0.03, -0.02, 0.5]), np.array([0.02, 0.02, 0.005, 0.0])
+    vectors = np.zeros((4, 3))
+    found = Contacts(np.array([0, 2, 2, 3]), np.array([[0, 1]] * 4), distance, margin, vectors, vectors, vectors)
+    assert found.violation() == pytest.approx(0.025)
+    assert found.shortfall(5).tolist() == pytest.approx([0.01, 0.0, 0.025, 0.0, 0.0])
+    assert found.clearance() == -0.02
+    assert found.place.tolist() == [0, 0, 1, 0]
+    free = found.select(np.array([3]))
+    assert (free.violation(), free.clearance()) == (0.0, 0.5)
+    none = no_contacts()
+    assert (none.violation(), none.clearance(), none.shortfall(2).tolist()) == (0.0, np.inf, [0.0, 0.0])
+    assert [array.shape for array in none.arrays()] == [(0,), (0, 2), (0,), (0,), (0, 3), (0, 3), (0, 3)]
+    assert {array.dtype.kind for array in none.arrays()[:2]} == {"i"}

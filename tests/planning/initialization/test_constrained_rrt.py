@@ -1,0 +1,171 @@
+"""Trees on the manifold of what is held: around a ball in the elbow's way, with a door that may wait, and where there is none."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from helpers.small_problems import door_scene, hand_off_the_handle, program_of
+
+import vkc_pin as vkc
+from vkc_pin.utils.budget import Budget, SpentError
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.planning.initialization import constrained_rrt as held
+from vkc_pin.planning.initialization.beam_search import Beam
+from vkc_pin.planning.initialization.constrained_rrt import held_path, obstructed
+from vkc_pin.planning.initialization.interpolation import Joiner
+from vkc_pin.planning.initialization.keyframes import Knots, depth
+from vkc_pin.planning.initialization.rrt import STEP, TRIES
+
+FEW = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=24)
+OPEN = vkc.Actuate("door", {"hinge": 1.2})
+MOVE = 2  # the phase in which the door swings
+RADIUS = 0.06  # [m] of the ball
+
+
+@cache
+def free_door() -> tuple[vkc.TrajectoryProblem, np.ndarray, np.ndarray]:
+    """Return the problem of opening the door, knots through its last phase, and its waypoints on straight lines through them."""
+    p = program_of(door_scene(), [OPEN], options=FEW)
+    knots = Knots(p, np.random.default_rng(0))
+    found = Beam(knots).search(thorough=True)
+    best = int(np.argmin(np.where(found.trouble == 0.0, found.cost, np.inf)))
+    begin = int(p.ends[MOVE - 1])
+    inside = [k for k, waypoint in enumerate(found.at) if waypoint >= begin]
+    through, steps = found.paths[best, inside], p.segments - begin
+    straight = np.empty((steps, p.chain.size))
+    Joiner(knots, None, None)._straight(straight, through, [found.at[k] - begin for k in inside])  # type: ignore[arg-type]
+    return p, through, straight
+
+
+@cache
+def blocked() -> vkc.TrajectoryProblem:
+    """Return the same with a ball where the elbow is half-way."""
+    p, _, straight = free_door()
+    robot = door_scene().robot
+    _, places = p.chain.joint_placements(straight[len(straight) // 2][None])
+    elbow = p.chain.model.getJointId(str(robot.model.names[4]))
+    ball = {"name": "ball", "type": "sphere", "radius": RADIUS, "position": places[0, elbow].round(4).tolist()}
+    document = door_scene().document
+    scene = Scene.from_document({**document, "obstacles": [*document.get("obstacles", []), ball]}, door_scene().folder)
+    return program_of(scene, [OPEN], options=FEW)
+
+
+def search(seed: int, *, tries: int = TRIES) -> np.ndarray | None:
+    _, through, straight = free_door()
+    return held_path(Knots(blocked(), np.random.default_rng(seed)), MOVE, through, len(straight), tries)
+
+
+def overlap(p: vkc.TrajectoryProblem, rows: np.ndarray) -> float:
+    return float((depth(p, rows, p.contacts.inside(MOVE), reach=0.0) - p.options.dist_safe).max())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_they_lead_around_what_is_in_the_way_with_the_handle_in_the_hand(seed: int) -> None:
+    p, through, straight = free_door()
+    assert overlap(blocked(), straight) > 0.02, "the ball is not in the way"
+    rows = search(seed)
+    assert rows is not None
+    assert rows.shape == straight.shape
+    assert overlap(blocked(), rows) <= 5e-3  # waypoints are between nodes
+    hinge, knob = (p.chain.index(f"door.{name}") for name in ("hinge", "knob"))
+    for row in rows:
+        assert hand_off_the_handle(door_scene(), row, row[hinge], row[knob]) < 1e-3
+    assert rows[-1, hinge] == pytest.approx(1.2)
+    lower, upper = p.lower[-1], p.upper[-1]
+    assert np.all((rows >= lower - 1e-9)[:, :9])
+    assert np.all((rows <= upper + 1e-9)[:, :9])
+    steps = np.abs(np.diff(np.vstack([through[0], rows]), axis=0)).max(axis=1)
+    assert steps[0] < 0.1
+    assert steps.max() < 0.6
+
+
+def test_what_is_free_is_not_obstructed_and_neither_is_what_begins_in_collision() -> None:
+    p, through, straight = free_door()
+    assert overlap(p, straight) <= 0.0
+    assert not obstructed(Knots(p, np.random.default_rng(0)), MOVE, through, straight)
+    knots, inside = Knots(blocked(), np.random.default_rng(0)), through.copy()
+    assert obstructed(knots, MOVE, through, straight)
+    inside[0] = straight[len(straight) // 2]
+    assert not obstructed(knots, MOVE, inside, straight), "no tree leads out of things"
+
+
+def test_without_tries_nothing_is_found() -> None:
+    assert search(0, tries=0) is None
+
+
+def test_equal_random_numbers_give_equal_paths() -> None:
+    one, same, other = search(3), search(3), search(4)
+    np.testing.assert_array_equal(one, same)
+    assert one is not None
+    assert other is None or not np.array_equal(one, other)
+
+
+def test_a_budget_ends_the_search() -> None:
+    with Budget(effort=50).running(), pytest.raises(SpentError):
+        search(0)
+
+
+def finder(p: vkc.TrajectoryProblem, seed: int = 0) -> held._Search:
+    return held._Search(Knots(p, np.random.default_rng(seed)), MOVE, p.segments - int(p.ends[MOVE - 1]))
+
+
+def test_between_two_waypoints_the_door_is_between_them() -> None:
+    p, through, _ = free_door()
+    own, hinge = finder(p), p.chain.index("door.hinge")
+    at = np.array([own.begin, own.begin + 7.0, own.begin + 7.25, own.begin + 8.0, own.end])
+    z, closed = own.close(np.tile(through[2], (5, 1)), at)
+    angles = own.knots.objects[:, hinge]
+    whole = [0.0, angles[own.begin + 6], angles[own.begin + 6] * 0.75 + angles[own.begin + 7] * 0.25, angles[own.begin + 7], 1.2]
+    np.testing.assert_allclose(z[:, hinge], whole, atol=1e-12)
+    for row in z[closed]:
+        assert hand_off_the_handle(door_scene(), row, row[hinge], row[p.chain.index("door.knob")]) < 1e-3
+    assert closed[1:4].any()
+
+
+def test_a_path_becomes_no_longer_and_keeps_its_ends() -> None:
+    _, through, _ = free_door()
+    own = finder(blocked(), 5)
+    path = own.run(through, TRIES)
+    assert path is not None
+    short = own.shortened(path)
+    before, after = (float(own.apart(each.z[1:], each.z[:-1]).sum()) for each in (path, short))
+    assert after < before
+    for each in (path, short):
+        np.testing.assert_array_equal(each.z[0], through[0])
+        assert (each.at[0], each.at[-1]) == (own.begin, own.end)
+        assert own.apart(each.z[1:], each.z[:-1]).max() <= 2.0 * STEP + 1e-9
+        assert own.free(each.z).all()
+    np.testing.assert_array_equal(short.z[-1], path.z[-1])
+
+
+@pytest.mark.parametrize("out", [False, True])
+def test_a_path_that_cannot_be_closed_somewhere_gives_no_waypoints(out: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The base has to stand where no arm reaches the handle from."""
+    _, through, _ = free_door()
+    own = finder(blocked(), 5)
+    path = own.run(through, TRIES)
+    assert path is not None
+    limits = own.knots.limits
+
+    def beyond(z: np.ndarray, waypoint: int) -> tuple[np.ndarray, np.ndarray]:
+        lower, upper = limits(z, waypoint)
+        lower[:, 0] = upper[:, 0] = -3.0
+        return lower, upper
+
+    if out:
+        monkeypatch.setattr(own.knots, "limits", beyond)
+    assert (own.spread(path, own.end - own.begin) is None) == out
+
+
+def test_what_was_chosen_at_the_grasp_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Samples hold as it was grasped; here by what the base's x is, which none of them has."""
+    p, through, _ = free_door()
+    assert len(finder(p).drawn(through, finder(p).end)) > 0
+    monkeypatch.setattr(Knots, "chosen", lambda self, waypoint: [0])
+    own = finder(p)
+    assert len(own.drawn(through, own.end)) == 0
+    z, closed = own.close(through[1:] + 0.01, np.full(len(through) - 1, own.end))
+    assert closed.any()
+    np.testing.assert_array_equal(z[:, 0], through[1:, 0] + 0.01)

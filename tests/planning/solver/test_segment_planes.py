@@ -1,0 +1,135 @@
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from helpers.drives import hall, moved, through
+from helpers.small_problems import program_of
+
+import vkc_pin as vkc
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.planning.solver.segment_planes import CLOSE, KEEP, Between, collisions_between, merge
+
+ARM = [np.pi, -1.2, 1.9, -0.7, np.pi / 2, 0.0]  # stretched out ahead of the base
+WIDTH = 2.0  # [m] the base drives sideways
+FEW = vkc.Options(reach_waypoints=5, dt=1.0)
+
+
+def past_a_post(reach: float = 0.02) -> vkc.Scene:
+    """Return a hall in which the hand, driven sideways, sweeps through a post `reach` [m] ahead of the tool's frame."""
+    tool = hall().with_start(arm=ARM).tool_placement().translation
+    x, y = float(tool[0]) + reach, float(tool[1]) + WIDTH / 2
+    post = {"name": "post", "type": "cylinder", "radius": 0.03, "length": 1.6, "position": [x, y, 0.8]}
+    return hall(obstacles=[post]).with_start(arm=ARM)
+
+
+def straight(scene: vkc.Scene) -> tuple[TrajectoryProblem, np.ndarray]:
+    """Return a problem of few waypoints, and the straight way sideways without the start, shape (N, n)."""
+    problem = program_of(scene, [vkc.GoTo(0.0, WIDTH, 0.0)], options=FEW)
+    return problem, through(scene, scene.start, moved(scene.start, y=WIDTH), steps=FEW.reach_waypoints).positions[1:]
+
+
+def sub_states(problem: TrajectoryProblem, z: np.ndarray, segment: int, count: int) -> np.ndarray:
+    """Return states of one segment, its ends among them, shape (count, n)."""
+    path, s = problem.waypoints(z), np.linspace(0.0, 1.0, count)[:, None]
+    return (1 - s) * path[segment] + s * path[segment + 1]
+
+
+def test_a_thin_obstacle_between_waypoints(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, steps = past_a_post(), [vkc.GoTo(0.0, WIDTH, 0.0)]
+    plan = vkc.plan(scene, steps, options=FEW)
+    assert plan.success, plan.report()
+    assert plan.trajectory.arm_effort() + plan.trajectory.base_effort() > WIDTH + 0.005  # it went round the post
+
+    problem, _ = straight(scene)
+    nothing, free, passed = collisions_between(problem, np.tile(problem.start, (problem.segments, 1)))
+    assert free
+    assert passed == []
+    assert nothing.violation() == 0.0
+    nothing = nothing.select(np.zeros(0, int))
+    monkeypatch.setattr("vkc_pin.planning.solver.loop.collisions_between", lambda problem, z: Between(nothing, True, []))
+    blind = vkc.plan(scene, steps, options=FEW, initialization="interpolated")
+    assert not blind.success
+    assert blind.status == "rejected"  # the solver was content, validation was not
+    assert {(v.constraint, "post" in v.subject) for v in blind.validation.violations} == {("penetration", True)}
+    segment = int(blind.validation.violations[0].waypoint)
+    ends = problem.contacts.evaluate(blind.trajectory.positions[segment : segment + 2], np.array([1, 1]), reach=0.02)
+    assert len(ends.waypoint) == 0  # free at both waypoints
+
+
+def test_planes_are_asked_for_at_both_ends_of_the_segment() -> None:
+    problem, z = straight(past_a_post())
+    assert problem.evaluate_contacts(z, reach=0.02).clearance() == np.inf
+    found = collisions_between(problem, z).contacts
+    labels = problem.contacts.phases[0].labels
+    assert {labels[j] for j in found.pair[:, 1]} == {"post"}
+    assert all(labels[i].startswith("gripper") for i in found.pair[:, 0])
+    assert set(found.waypoint) == {1, 2}  # rows of z_2 and z_3, the segment in the middle
+    keys = np.column_stack([found.waypoint, found.pair])
+    assert len(np.unique(keys, axis=0)) == len(keys)  # one contact a pair and end
+    np.testing.assert_allclose(np.linalg.norm(found.normal, axis=1), 1.0, atol=1e-9)
+
+
+def test_what_is_asked_for_is_what_is_missing_in_between() -> None:
+    problem, z = straight(past_a_post())
+    found = collisions_between(problem, z).contacts
+    states = sub_states(problem, z, 2, 400)
+    dense = problem.contacts.evaluate(states, np.full(len(states), 3), reach=KEEP + CLOSE)
+    pairs = np.unique(found.pair, axis=0)
+    assert len(pairs) > 1
+    for pair in pairs:
+        deepest = dense.distance[(dense.pair == pair).all(axis=1)].min()
+        missing = (found.margin - found.distance)[(found.pair == pair).all(axis=1)]
+        np.testing.assert_allclose(missing, KEEP - deepest, atol=1e-3)
+
+
+def test_lifting_both_ends_lifts_what_is_between_to_first_order() -> None:
+    """Moving both waypoints by ε along the normal moves the sub-state's distance by ε, up to ε²."""
+    problem, z = straight(past_a_post())
+    found = collisions_between(problem, z).contacts
+    index = int(np.argmax(found.margin - found.distance))
+    pair, normal = found.pair[index], found.normal[index]
+
+    def depth(lift: float) -> float:
+        lifted = z.copy()
+        lifted[1:3, :2] -= lift * normal[:2]  # the robot is the first of the pair, the normal points from it
+        states = sub_states(problem, lifted, 2, 2000)
+        contacts = problem.contacts.evaluate(states, np.full(len(states), 3), reach=0.1)
+        return float(contacts.distance[(contacts.pair == pair).all(axis=1)].min())
+
+    value = found.margin[index] - KEEP  # n·(b − a) there, lifted by what is missing: v + KEEP − d
+    assert value == pytest.approx(found.distance[index] - depth(0.0), abs=1e-3)
+    for lift in (1e-3, 4e-3):
+        horizontal = float(normal[:2] @ normal[:2])
+        assert depth(lift) - depth(0.0) == pytest.approx(lift * horizontal, rel=0.15, abs=2e-4)
+
+
+def test_a_start_that_is_close_to_something_may_leave_it() -> None:
+    wall = {"name": "wall", "type": "box", "size": [0.1, 2.0, 0.5], "position": [0.546, 0.0, 0.25]}
+    scene = hall(obstacles=[wall])
+    assert 0.0 < scene.start_clearance() < KEEP
+    problem = program_of(scene, [vkc.GoTo(-1.0, 0.0, 0.0)], options=FEW)
+    away = through(scene, scene.start, moved(scene.start, x=-1.0), steps=FEW.reach_waypoints).positions[1:]
+    assert len(collisions_between(problem, away).contacts.waypoint) == 0
+    into = through(scene, scene.start, moved(scene.start, x=1.0), steps=FEW.reach_waypoints).positions[1:]
+    assert 0 in collisions_between(problem, into).contacts.waypoint
+
+
+def test_merged_contacts_are_in_order() -> None:
+    problem, z = straight(past_a_post())
+    found = collisions_between(problem, z).contacts
+    near = problem.evaluate_contacts(z, reach=0.3)
+    both = merge(near, found)
+    assert len(both.waypoint) == len(near.waypoint) + len(found.waypoint)
+    assert np.all(np.diff(both.waypoint) >= 0)
+    missing = both.distance - both.margin
+    for row in np.unique(both.waypoint):
+        assert np.all(np.diff(missing[both.waypoint == row]) >= 0)
+    shuffled = dataclasses.replace(both).select(np.random.default_rng(0).permutation(len(missing)))
+    np.testing.assert_array_equal(merge(shuffled).waypoint, both.waypoint)
+
+
+def test_standing_still_has_nothing_in_between() -> None:
+    problem, _ = straight(hall().with_start(arm=ARM))
+    assert len(collisions_between(problem, np.tile(problem.start, (problem.segments, 1))).contacts.waypoint) == 0

@@ -1,0 +1,108 @@
+"""From waypoints to a motion, of phases that are made up: where it waits, how long each step takes, and what a hand chose."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.planning.solver.to_trajectory import as_trajectory
+
+DOOR, STICK = Hold("door", "free"), Hold("stick", "grip")
+
+
+def phase(
+    name: str, *, held: tuple[Hold, ...] = (), leaves: tuple[Hold, ...] = (), grasps: tuple[Hold, ...] = (), opening: Any = None
+) -> Any:
+    return SimpleNamespace(name=name, held=held, leaves=leaves, grasps=grasps, opening=opening)
+
+
+def made(
+    phases: list[Any], ends: list[int], *, after: tuple[Hold, ...] = (), holds: tuple[Hold, ...] = ()
+) -> tuple[Trajectory, np.ndarray]:
+    """Return the motion and the waypoints, of one joint and two that rest, and of what the hand chose of the door.
+
+    Steps take 1, 2, 3, ... seconds, and the gripper a tenth of one.
+    """
+    count = ends[-1]
+    path = np.column_stack([10.0 + np.arange(count + 1.0), np.zeros((count + 1, 2)), 100.0 + np.arange(count + 1.0)])
+    names = ("joint", "aside", "turn", "door.free")
+    used = DOOR in holds or any(DOOR in (*phase.held, *phase.grasps) for phase in phases)
+    problem: Any = SimpleNamespace(
+        waypoints=lambda z: np.vstack([path[:1], z]),
+        options=SimpleNamespace(grasp_time=0.1),
+        task=SimpleNamespace(phases=phases, after=after),
+        ends=np.array(ends),
+        chain=SimpleNamespace(
+            names=names,
+            virtual={DOOR: ("door.free",)} if used else {},
+            index=names.index,
+            robot=SimpleNamespace(coordinates=SimpleNamespace(size=3)),
+        ),
+        scene=SimpleNamespace(holds=holds),
+    )
+    motion = as_trajectory(problem, path[1:].copy(), 1.0 + np.arange(count))
+    assert motion.names == names
+    assert motion.robot_size == 3
+    return motion, path
+
+
+def seen(motion: Trajectory) -> tuple[list[float], list[float], list[tuple[str, int, int]]]:
+    spans = [(span.name, span.first, span.last) for span in motion.phases]
+    return motion.positions[:, 0].tolist(), np.diff(motion.times).round(9).tolist(), spans
+
+
+def test_it_waits_where_something_is_grasped() -> None:
+    """At the begin of the phase after."""
+    motion, _ = made([phase("reach", grasps=(STICK,)), phase("carry", held=(STICK,))], [2, 4], after=(STICK,))
+    assert seen(motion) == ([10, 11, 12, 12, 13, 14], [1, 2, 0.1, 3, 4], [("reach", 0, 2), ("carry", 2, 5)])
+    assert motion.times[0] == 0.0
+    assert [span.holds for span in motion.phases] == [(), (STICK,)]
+
+
+def test_it_waits_where_something_is_let_go_of() -> None:
+    """In the first phase, too."""
+    motion, _ = made([phase("away", leaves=(STICK,)), phase("on"), phase("again", leaves=(STICK,))], [1, 2, 4])
+    assert seen(motion) == (
+        [10, 10, 11, 12, 12, 13, 14],
+        [0.1, 1, 2, 0.1, 3, 4],
+        [("away", 0, 2), ("on", 2, 3), ("again", 3, 6)],
+    )
+    both = [phase("reach", grasps=(STICK,)), phase("on", leaves=(STICK,))]
+    assert seen(made(both, [1, 2])[0])[1] == [1, 0.1, 2]  # once, for both
+
+
+def test_at_the_very_end_it_waits_if_something_is_let_go_of() -> None:
+    held = [phase("carry", held=(STICK,), opening=0.05)]
+    motion, _ = made(held, [2], after=())
+    assert seen(motion) == ([10, 11, 12, 12], [1, 2, 0.1], [("carry", 0, 2), ("let go", 2, 3)])
+    assert (motion.phases[-1].holds, motion.phases[-1].opening) == ((), 0.05)
+    assert seen(made(held, [2], after=(STICK,))[0])[2] == [("carry", 0, 2)]
+    grasped = [phase("reach", held=(DOOR,), grasps=(STICK,))]
+    assert seen(made(grasped, [2], after=(DOOR, STICK), holds=(DOOR,))[0])[2] == [("reach", 0, 2)]
+    one_of_both = made(grasped, [2], after=(DOOR,), holds=(DOOR,))[0]
+    assert [span.holds for span in one_of_both.phases] == [(DOOR,), (DOOR,)]
+    assert seen(made([phase("go")], [2])[0])[2] == [("go", 0, 2)]
+
+
+def chosen(phases: list[Any], ends: list[int], *, holds: tuple[Hold, ...] = (), after: tuple[Hold, ...] = ()) -> list[int]:
+    """Return from which waypoint the hand's choice is, at every one; pauses left out."""
+    motion, _ = made(phases, ends, holds=holds, after=after)
+    column, rows = motion.positions[:, 3] - 100.0, motion.positions[:, 0] - 10.0
+    _, first = np.unique(rows, return_index=True)
+    return [int(value) for value in column[first]]
+
+
+def test_what_the_hand_will_choose_is_open_until_then_and_kept_after() -> None:
+    """While the door is held it is the program's own; where it is grasped and held on to are the same place."""
+    hold = (DOOR,)
+    grasp = [phase("reach", grasps=hold), phase("pull", held=hold), phase("away", leaves=hold)]
+    assert chosen(grasp, [2, 4, 6]) == [2, 2, 2, 3, 4, 4, 4]
+    again = [phase("pull", held=hold), phase("away"), phase("reach", grasps=hold)]
+    assert chosen(again, [1, 4, 6], holds=hold, after=hold) == [0, 1, 6, 6, 6, 6, 6]
+    assert chosen([phase("go")], [3], holds=hold) == [0, 0, 0, 0]  # as it was at the start
+    assert chosen([phase("reach", grasps=hold)], [3], after=hold) == [3, 3, 3, 3]
+    assert chosen([phase("go"), phase("pull", held=hold)], [2, 3], after=hold) == [2, 2, 2, 3]

@@ -1,0 +1,129 @@
+"""When blocks become wider or narrower, on either side of every threshold."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vkc_pin.planning.solver.trust_region import (
+    CLOSE_ENOUGH,
+    FIRST_RADIUS,
+    INSIDE,
+    NO_MATTER,
+    SETTLE_RADIUS,
+    SHRINK,
+    Trial,
+    TrustRegion,
+    judge,
+)
+
+
+def adapted(
+    promised: list[float], actual: list[float], step: list[float], *, accepted: bool = True, radius: float = 0.5
+) -> list[float]:
+    """Return the radii of two blocks of two waypoints each, of which so much was promised and came; in units of the radius."""
+    region = TrustRegion(4, 2, np.full(4, radius))
+    before, promise, after = np.full(4, 100.0), np.full(4, 100.0), np.full(4, 100.0)
+    promise[::2] -= np.array(promised)  # all of it at one waypoint of a block
+    after[1::2] -= np.array(actual)  # and what came of it at the other
+    fields: dict[str, Any] = dict.fromkeys(field.name for field in dataclasses.fields(Trial))
+    steps = np.zeros(4)
+    steps[1::2] = radius * np.array(step)
+    region.adapt(before, after, Trial(**{**fields, "promise": promise, "step": steps}), accepted)
+    assert region.radius[0] == region.radius[1]
+    assert region.radius[2] == region.radius[3]
+    return [float(value) / radius for value in region.radius[::2]]
+
+
+def test_what_kept_its_promise_at_the_edge_becomes_wider() -> None:
+    for step, wider in ((1.0, True), (1.01 * INSIDE, True), (0.99 * INSIDE, False), (0.1, False)):
+        assert adapted([10.0, 10.0], [10.0, 10.0], [step, 0.0]) == [pytest.approx(1.5 if wider else 1.0), 1.0]
+
+
+def test_seven_tenths_of_a_promise_are_enough() -> None:
+    """And a little less, in what does not matter."""
+    for share, wider in ((7.1, True), (7.0 - 0.9 * NO_MATTER, True), (7.0 - 1.1 * NO_MATTER, False), (12.0, True)):
+        assert adapted([10.0, 10.0], [share, 5.0], [1.0, 1.0]) == [pytest.approx(1.5 if wider else 1.0), 1.0]
+
+
+def test_what_came_to_less_than_a_quarter_becomes_narrower() -> None:
+    for share, narrower in ((2.4, True), (2.6, False), (-3.0, True)):
+        expected = SHRINK * 0.8 if narrower else 1.0
+        assert adapted([10.0, 10.0], [share, 5.0], [0.8, 0.8]) == [pytest.approx(expected), 1.0]
+    for missing, narrower in ((0.9 * NO_MATTER, False), (1.1 * NO_MATTER, True)):
+        expected = SHRINK * 0.8 if narrower else 1.0
+        assert adapted([0.1, 0.0], [0.1 - missing, 0.0], [0.8, 0.8]) == [pytest.approx(expected), 1.0]
+
+
+def test_a_step_that_was_longer_than_the_radius_does_not_count_as_such() -> None:
+    assert adapted([10.0, 10.0], [0.0, 10.0], [1.2, 0.5]) == [pytest.approx(SHRINK), 1.0]
+
+
+def test_what_is_refused_makes_all_smaller_unless_one_is_to_blame() -> None:
+    assert adapted([10.0, 10.0], [10.0, 10.0], [1.0, 0.5], accepted=False) == pytest.approx([SHRINK, 0.5 * SHRINK])
+    assert adapted([10.0, 10.0], [10.0, 0.0], [1.0, 0.5], accepted=False) == pytest.approx([1.0, 0.5 * SHRINK])
+    assert adapted([10.0, 10.0], [10.0, 0.0], [1.0, 0.5], accepted=True) == pytest.approx([1.5, 0.5 * SHRINK])
+    assert adapted([10.0, 10.0], [0.0, 0.0], [1.0, 0.5], accepted=False) == pytest.approx([SHRINK, 0.5 * SHRINK])
+
+
+def test_radii_do_not_vanish() -> None:
+    assert adapted([10.0, 10.0], [0.0, 0.0], [0.0, 1.0]) == pytest.approx([1e-6 / 0.5, SHRINK])
+
+
+@pytest.mark.parametrize(
+    ("promised", "actual", "merit", "accepted"),
+    [
+        (1.0, 0.051, 5.0, True),
+        (1.0, 0.049, 5.0, False),
+        (1.0, -1.0, 5.0, False),
+        (0.9e-4, -0.9e-4, 0.5, True),  # nothing was to be had, and nothing lost
+        (0.9e-4, -1.1e-4, 0.5, False),
+        (1.1e-4, 0.0, 0.5, False),
+        (0.9e-2, -0.9e-2, 100.0, True),
+        (0.9e-2, -0.9e-2, -100.0, True),
+        (0.9e-2, -1.1e-2, 100.0, False),
+        (1.1e-2, 0.0, 100.0, False),
+        (-1.0, 0.0, 1.0, True),
+    ],
+)
+def test_what_is_accepted(promised: float, actual: float, merit: float, accepted: bool) -> None:
+    assert judge(promised, actual, merit) == accepted
+
+
+def test_where_nothing_moves_any_more() -> None:
+    """Either as the region is too small, or as the step was; at all waypoints at which something is in the way."""
+    fields: dict[str, Any] = dict.fromkeys(field.name for field in dataclasses.fields(Trial))
+
+    def stuck(radius: list[float], step: list[float], short: list[float]) -> bool:
+        region = TrustRegion(3, 1, CLOSE_ENOUGH * np.array(radius))
+        trial = Trial(**{**fields, "step": CLOSE_ENOUGH * np.array(step)})
+        return region.stuck(trial, CLOSE_ENOUGH * np.array(short))
+
+    assert stuck([9.0, 0.9, 9.0], [9.0, 9.0, 9.0], [0.0, 1.1, 0.0])
+    assert stuck([9.0, 9.0, 9.0], [9.0, 0.9, 9.0], [0.0, 1.1, 0.0])
+    assert not stuck([9.0, 1.1, 9.0], [9.0, 1.1, 9.0], [0.0, 1.1, 0.0])
+    assert not stuck([9.0, 0.9, 9.0], [9.0, 9.0, 9.0], [0.0, 1.1, 1.1])
+    assert not stuck([9.0, 0.9, 9.0], [9.0, 9.0, 9.0], [0.0, 0.9, 0.0])
+    assert stuck([0.9, 0.9, 0.9], [9.0, 9.0, 9.0], [0.0, 0.9, 0.0])
+
+
+def test_smaller_steps_and_beginning_again() -> None:
+    region = TrustRegion(3, 1, np.array([0.01, SETTLE_RADIUS, 0.3]))
+    region.settle()
+    np.testing.assert_array_equal(region.radius, [0.01, SETTLE_RADIUS, SETTLE_RADIUS])
+    region.restart()
+    np.testing.assert_array_equal(region.radius, [FIRST_RADIUS] * 3)
+
+
+@pytest.mark.parametrize(
+    ("segments", "length", "blocks"),
+    [(1, 10, [1]), (4, 10, [4]), (14, 10, [14]), (16, 10, [8, 8]), (6, 2, [2, 2, 2]), (7, 2, [2, 2, 2, 1]), (5, 1, [1] * 5)],
+)
+def test_blocks(segments: int, length: int, blocks: list[int]) -> None:
+    found = TrustRegion(segments, length).block
+    assert sorted(np.bincount(found).tolist()) == sorted(blocks)
+    assert (np.diff(found) >= 0).all()
+    assert found[0] == 0

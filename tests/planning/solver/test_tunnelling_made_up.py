@@ -1,0 +1,100 @@
+"""Which overlaps are passages: with normals that are made up, so that every case is there."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vkc_pin.planning.chain.contacts import Contacts
+from vkc_pin.planning.solver.tunnelling import Passage, passages
+
+S = 8
+SEGMENTS = np.array([0, 0, 0, 1, 1, 2, 3, 3])
+
+
+class Made:
+    """Stands for `ContactModel`: normals point along x, but back at some states; a phase begins after some waypoint."""
+
+    def __init__(self, back: set[int], *, boundary: int = 99, aside: bool = False) -> None:
+        self.back, self.boundary, self.aside = back, boundary, aside
+
+    def phases_of(self, waypoints: np.ndarray) -> np.ndarray:
+        np.testing.assert_array_equal(waypoints, SEGMENTS + 1)  # each is at the end of its segment's phase
+        return (waypoints > self.boundary).astype(int)
+
+    def normals(self, z: np.ndarray, waypoints: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+        rows = z[:, 0].astype(int)
+        np.testing.assert_array_equal(waypoints, SEGMENTS[rows] + 1)
+        assert pairs.shape == (len(rows), 2)
+        signs = np.where(np.isin(rows, list(self.back)), -1.0, 1.0)
+        other = np.where(np.isin(rows, list(self.back)), 1.0, 0.0)
+        turned = np.column_stack([1.0 - other, other, 0.0 * other])
+        return turned if self.aside else signs[:, None] * np.array([[1.0, 0.0, 0.0]])
+
+
+def overlaps(*where: tuple[int, int, int], depth: float = 0.01) -> Contacts:
+    """Return contacts (state, first, second), by state as they are found."""
+    rows = np.array(sorted(where), int).reshape(-1, 3)
+    vectors, numbers = np.zeros((len(rows), 3)), np.full(len(rows), -depth)
+    return Contacts(rows[:, 0], rows[:, 1:], numbers, numbers, vectors, vectors, vectors)
+
+
+def found(contacts: Contacts, back: set[int], **how: Any) -> list[Passage]:
+    made: Any = Made(back, **how)
+    return passages(made, np.arange(float(S))[:, None], SEGMENTS, contacts)
+
+
+def test_it_comes_out_on_the_other_side() -> None:
+    """From the segment of the state before to that of the state after."""
+    assert found(overlaps((3, 0, 1), (4, 0, 1)), {5, 6, 7}) == [Passage((0, 1), 0, 2)]
+    assert found(overlaps((5, 0, 1)), {6, 7}) == [Passage((0, 1), 1, 3)]
+    assert found(overlaps((3, 0, 1), (4, 0, 1)), set()) == []
+    assert found(overlaps((3, 0, 1), (4, 0, 1)), {3, 4}) == []  # what normals are inside does not matter
+
+
+@pytest.mark.parametrize("state", range(S))
+def test_what_begins_or_ends_inside_is_none(state: int) -> None:
+    back = set(range(state + 1, S))
+    expected = [Passage((0, 1), int(SEGMENTS[state - 1]), int(SEGMENTS[state + 1]))] if 0 < state < S - 1 else []
+    assert found(overlaps((state, 0, 1)), back) == expected
+
+
+def test_each_time_it_overlaps_is_one_of_its_own() -> None:
+    """Out between the two states 2 and 4, and back through the other way."""
+    twice = overlaps((2, 0, 1), (4, 0, 1), (5, 0, 1))
+    assert found(twice, {3}) == [Passage((0, 1), 0, 1), Passage((0, 1), 1, 3)]
+    assert found(twice, {6, 7}) == [Passage((0, 1), 1, 3)]
+    assert found(overlaps((2, 0, 1), (3, 0, 1), (4, 0, 1), (5, 0, 1)), {3}) == []
+
+
+@pytest.mark.parametrize("other", [(0, 2), (2, 1), (1, 2)])
+def test_another_pair_is_another_overlap(other: tuple[int, int]) -> None:
+    """Though it begins where the first ends."""
+    both = found(overlaps((2, 0, 1), (3, *other)), {3})
+    assert both == [Passage((0, 1), 0, 1)]
+    both = found(overlaps((2, 0, 1), (3, *other)), {4, 5, 6, 7})
+    assert both == [Passage(other, 0, 1)]
+
+
+def test_pairs_that_overlap_at_the_same_states_do_not_mix() -> None:
+    both = overlaps(*((row, 0, k) for row in (2, 3, 4) for k in (1, 2)), *((row, 1, 2) for row in (2, 3, 4)))
+    assert found(both, {5, 6, 7}) == [Passage(pair, 0, 2) for pair in ((0, 1), (0, 2), (1, 2))]
+
+
+def test_what_overlaps_from_one_phase_to_the_next_is_none() -> None:
+    """Shapes are others then."""
+    contacts = overlaps((4, 0, 1))
+    assert found(contacts, {5, 6, 7}, boundary=3) == [Passage((0, 1), 1, 2)]
+    assert found(contacts, {5, 6, 7}, boundary=2) == []
+
+
+def test_only_what_overlaps_counts() -> None:
+    for depth in (0.0, -0.5):
+        assert found(overlaps((3, 0, 1), depth=depth), {4, 5, 6, 7}) == []
+
+
+def test_only_opposite_normals_count() -> None:
+    """Past a corner they are at right angles."""
+    assert found(overlaps((3, 0, 1)), {4, 5, 6, 7}, aside=True) == []

@@ -1,0 +1,73 @@
+"""Clutter: it stands or hangs where there is something to stand or hang on, and nowhere else."""
+
+from __future__ import annotations
+
+import itertools
+from functools import cache
+
+import coal
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import vkc_pin as vkc
+from vkc_pin.errors import InputError
+from vkc_pin.world.models.shapes import clearance, shape_distance
+from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.procedural.rooms.clutter import cluttered
+
+PLACE = ((-3.0, 1.3, 1.051), 0.2)
+
+
+@cache
+def home() -> vkc.Scene:
+    return vkc.load_scene("household")
+
+
+def parts(scene: vkc.Scene) -> tuple[list, list]:
+    """Return what stood there before, and the clutter."""
+    new = [shape for shape in scene.obstacles if shape.name.startswith("clutter_")]
+    old = [shape for shape in scene.obstacles if not shape.name.startswith("clutter_")]
+    return old + [shape for placed in scene.objects.values() for shape in standing_geometry(placed)], new
+
+
+@settings(max_examples=5, deadline=None)
+@given(st.integers(0, 2**31), st.integers(1, 60))
+def test_everything_stands_or_hangs_and_hits_nothing(seed: int, things: int) -> None:
+    old, new = parts(cluttered(home(), things, seed=seed, clear=[PLACE]))
+    assert len(new) == things
+    for shape in new:
+        picture = isinstance(shape.geometry, coal.Box) and 2 * min(shape.geometry.halfSide) == 0.025
+        gaps = sorted(shape_distance(shape.geometry, shape.placement, other.geometry, other.placement) for other in old)
+        if picture:  # let into one wall, away from all else
+            assert gaps[0] == pytest.approx(-0.005, abs=1e-4)
+        else:
+            assert abs(gaps[0]) < 1e-4
+        assert gaps[1] > -1e-4  # two boards side by side may carry it
+    for one, other in itertools.combinations(new, 2):
+        assert shape_distance(one.geometry, one.placement, other.geometry, other.placement) > 0.0
+
+
+def test_hands_have_room_and_so_have_places_that_stay_clear() -> None:
+    _, new = parts(cluttered(home(), 250, seed=2, clear=[PLACE]))
+    shapes = [(shape.geometry, shape.placement) for shape in new]
+    ball = vkc.load_scene("household").objects["cup"].placement.copy()
+    for middle, radius in [PLACE, *((p.placement.translation, 0.15) for p in home().objects.values() if p.object.free)]:
+        ball.translation = np.array(middle)
+        assert clearance(shapes, [(coal.Sphere(radius), ball)]) > -1e-6
+
+
+def test_the_same_seed_gives_the_same_and_another_another() -> None:
+    one, same, other = (cluttered(home(), 20, seed=seed).document for seed in (3, 3, 4))
+    assert one == same
+    assert one != other
+
+
+def test_there_is_an_end_to_it() -> None:
+    with pytest.raises(InputError, match="no place"):
+        cluttered(home(), 5000)
+    with pytest.raises(InputError, match="no place"):
+        cluttered(vkc.Scene.from_document({"robot": "husky_ur5e", "start": {"base": [0, 0, 0]}}), 1)
+    with pytest.raises(InputError, match="things"):
+        cluttered(home(), -1)

@@ -1,0 +1,133 @@
+"""Shapes rebuilt in compiled code have the numbers of coal's, and boxes are taken as they are whatever is asked first."""
+
+from __future__ import annotations
+
+import gc
+import subprocess
+import sys
+import types
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from vkc_pin.utils import optional_imports as needed
+from vkc_pin.world.collision import solids
+from vkc_pin.world.collision.shapes import Shapes
+from vkc_pin.world.collision.solids import solid_of
+from vkc_pin.errors import BuildError, InputError
+from vkc_pin.world.files.meshes import convex_hull, indices
+
+NOWHERE = np.array([[[1.0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0]] * 2])
+
+
+def hull(seed: int) -> coal.Convex:
+    return convex_hull(np.random.default_rng(seed).normal(size=(30, 3)))
+
+
+def distance(first: coal.CollisionGeometry, second: coal.CollisionGeometry) -> float:
+    return float(Shapes([first, second]).distances(NOWHERE, np.zeros(1, int), np.array([[0, 1]]))[0])
+
+
+def test_what_is_not_known_is_refused_by_name() -> None:
+    with pytest.raises(InputError, match="HeightFieldAABB"):
+        solid_of(coal.HeightFieldAABB(1.0, 1.0, np.zeros((3, 3)), 0.0))
+    with pytest.raises(InputError, match="object"):
+        solid_of(object())
+
+
+def test_hulls_are_rebuilt_once_while_they_live_and_stay_the_same() -> None:
+    shape = hull(0)
+    first = solid_of(shape)
+    assert solid_of(shape) is first
+    shape.setSweptSphereRadius(0.1)
+    assert solid_of(shape) is not first
+    other = hull(1)
+    assert solid_of(other) is not solid_of(shape)
+    key = id(shape)
+    assert key in solids._known
+    del shape
+    gc.collect()
+    assert key not in solids._known
+
+
+def test_lengths_that_change_are_seen() -> None:
+    """What is made of a few numbers is rebuilt every time."""
+    box, ball = coal.Box(1.0, 1.0, 1.0), coal.Sphere(0.1)
+    where = NOWHERE.copy()
+    where[0, 1, 9] = 2.0
+    pair = np.zeros(1, int), np.array([[0, 1]])
+    assert Shapes([box, ball]).distances(where, *pair)[0] == pytest.approx(1.4, abs=1e-6)
+    box.halfSide = np.array([1.0, 0.5, 0.5])
+    assert Shapes([box, ball]).distances(where, *pair)[0] == pytest.approx(0.9, abs=1e-6)
+    ball.setSweptSphereRadius(0.2)
+    assert Shapes([box, ball]).distances(where, *pair)[0] == pytest.approx(0.7, abs=1e-6)
+
+
+def test_corners_of_triangles() -> None:
+    mesh = coal.BVHModelOBBRSS()
+    points, faces = np.eye(3), [[0, 2, 1]]
+    mesh.beginModel(1, 3)
+    mesh.addVertices(points)
+    mesh.addTriangles(np.array(faces))
+    mesh.endModel()
+    np.testing.assert_array_equal(indices(mesh), faces)
+    shape = hull(2)
+    corners = indices(shape)
+    assert corners.shape == (shape.num_polygons, 3)
+    assert set(corners.ravel().tolist()) == set(range(shape.num_points))
+
+
+@pytest.mark.parametrize("wrong", [np.array([[0, 1, 3]]), np.array([[0, -1, 2]])])
+def test_faces_of_no_points_are_refused(wrong: np.ndarray) -> None:
+    with pytest.raises(IndexError, match="corner"):
+        solids.compiled().convex(np.eye(3), wrong, 0.0)
+
+
+def test_a_module_that_does_not_fit_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It was compiled against another coal or Pinocchio, or is not there."""
+    solids.compiled.cache_clear()
+    for theirs, mine, said in (("2.9.1", pin.__version__, r"against coal 2\.9\.1"), (coal.__version__, "3.9.0", r"pin 3\.9\.0")):
+        with monkeypatch.context() as patch:
+            built = types.SimpleNamespace(COAL_VERSION=theirs, PINOCCHIO_VERSION=mine)
+            patch.setattr(solids, "compiled_module", lambda _, built=built: built)
+            with pytest.raises(BuildError, match=said):
+                solids.compiled()
+
+    def missing(name: str) -> types.ModuleType:
+        raise ImportError(f"no {name}")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(needed, "import_module", missing)
+        with pytest.raises(BuildError, match="compiler"):
+            solids.compiled()
+    solids.compiled.cache_clear()
+    assert coal.__version__ == solids.compiled().COAL_VERSION
+
+
+_FIRST = """
+import numpy as np
+from vkc_pin.world.collision.shapes import Shapes
+import coal
+where = np.array([[[1.0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0], [1.0, 0, 0, 0, 1, 0, 0, 0, 1, -2, 0, 0]]])
+shapes = Shapes([coal.Box(1.0, 1.0, 1.0), coal.Box(1.0, 1.0, 1.0)])
+print(float(shapes.distances(where, np.zeros(1, int), np.array([[0, 1]]))[0]).hex())
+"""
+
+
+def test_boxes_are_as_large_as_they_are_whatever_is_asked_first() -> None:
+    """Along an axis, as the first question of a process, coal would make them larger by 1e-10 from then on."""
+    answers = {
+        subprocess.run([sys.executable, "-c", before + _FIRST], capture_output=True, text=True, check=True, timeout=60).stdout
+        for before in ("", "import vkc_pin as vkc; vkc.load_scene('door')\n")
+    }
+    assert len(answers) == 1
+    assert float.fromhex(answers.pop().strip()) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_nothing_is_said_of_what_lives_until_the_process_ends() -> None:
+    """Caches and globals keep shapes."""
+    code = "import builtins, coal; from vkc_pin.world.collision.shapes import Shapes; builtins.kept = Shapes([coal.Sphere(0.1)])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout + done.stderr == ""

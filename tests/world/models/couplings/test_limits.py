@@ -1,0 +1,130 @@
+"""Limits of joints that move together: as far as all of them can, as fast as the slowest."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.telescopes import joint, link, write_telescope
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import vkc_pin as vkc
+from vkc_pin.world.files.urdf import read_urdf
+from vkc_pin.world.models.coordinates import Coordinates
+from vkc_pin.world.models.couplings.limits import limited_together, robot_limits
+from vkc_pin.world.models.robot_model import full_model, planned_model, rest_positions
+from vkc_pin.world.models.robot_schema import RobotSchema
+
+
+def two(
+    tmp_path: Path,
+    inside: str,
+    *,
+    first: tuple[float, float] = (-1.0, 1.0),
+    second: tuple[float, float] = (-1.0, 1.0),
+    kinds: tuple[str, str] = ("revolute", "revolute"),
+    yaml: str = "",
+) -> vkc.Robot:
+    """Return a robot of two joints, of which the second follows the first."""
+    parts = [link(f"l{k}", "0.1 0.1 0.1", f"0 0 {k}") for k in range(3)]
+    parts += [joint("one", kinds[0], "l0", "l1", limits=first, velocity=0.4)]
+    parts += [joint("two", kinds[1], "l1", "l2", limits=second, velocity=0.6, inside=f'<mimic joint="one" {inside}/>')]
+    (tmp_path / "robot.urdf").write_text(f'<robot name="robot">{"".join(parts)}</robot>')
+    (tmp_path / "robot.yaml").write_text(f"urdf: robot.urdf\ntool_frame: l2\n{yaml}")
+    return vkc.load_robot(tmp_path, pairs="all")
+
+
+@pytest.mark.parametrize(
+    ("inside", "second", "limits", "velocity"),
+    [
+        ('multiplier="1"', (-1.0, 1.0), (-1.0, 1.0), 0.4),
+        ('multiplier="2"', (-1.0, 1.0), (-0.5, 0.5), 0.3),
+        ('multiplier="-2" offset="0.4"', (-1.0, 1.0), (-0.3, 0.7), 0.3),
+        ('multiplier="0.5"', (-0.1, 3.0), (-0.2, 1.0), 0.4),
+        ('multiplier="-0.5"', (0.1, 0.2), (-0.4, -0.2), 0.4),
+        ('multiplier="0" offset="0.3"', (-1.0, 1.0), (-1.0, 1.0), 0.4),
+    ],
+)
+def test_the_nearest_limit_and_the_slowest_joint_count(
+    tmp_path: Path, inside: str, second: tuple[float, float], limits: tuple[float, float], velocity: float
+) -> None:
+    robot = two(tmp_path, inside, second=second)
+    assert robot.coordinates.names[3:] == ("one",)
+    np.testing.assert_allclose([robot.lower[3], robot.upper[3], robot.velocity[3]], [*limits, velocity], rtol=1e-12)
+    assert robot.lower[3] <= robot.home[0] <= robot.upper[3]
+
+
+def test_the_home_is_where_all_can_be(tmp_path: Path) -> None:
+    """0 is within the limits of the joint that leads, but the other one cannot follow there."""
+    assert two(tmp_path, 'multiplier="1"', second=(0.2, 0.6)).home[0] == pytest.approx(0.4)
+
+
+def test_a_robot_yaml_may_slow_any_of_them(tmp_path: Path) -> None:
+    robot = two(tmp_path, 'multiplier="2"', yaml="joints: {one: {acceleration: 3.0}, two: {velocity: 0.1, acceleration: 4.0}}\n")
+    assert (robot.velocity[3], robot.acceleration[3]) == (0.05, 2.0)
+
+
+def test_where_no_file_says_how_fast(tmp_path: Path) -> None:
+    text = write_telescope(tmp_path).parent / "robot.urdf"
+    text.write_text(text.read_text().replace('velocity="0.5" ', ""))
+    robot = vkc.load_robot(tmp_path)
+    assert (robot.velocity[4], robot.acceleration[4]) == (np.pi, 1.4)
+
+
+def test_without_limits_the_fastest_joint_has_the_usual_ones(tmp_path: Path) -> None:
+    said = "out_2: {joint: out_1, multiplier: 0.5}, out_3: {joint: out_1, multiplier: -2.0, offset: 0.15}"
+    file = write_telescope(tmp_path, couplings=said).parent / "robot.urdf"
+    file.write_text(file.read_text().replace('velocity="0.5" ', ""))
+    robot = vkc.load_robot(tmp_path)
+    assert (robot.velocity[4], robot.acceleration[4]) == (np.pi / 2.0, 0.7)
+
+
+@pytest.mark.parametrize(
+    ("kinds", "limits"), [(("continuous", "revolute"), (-0.5, 0.5)), (("continuous", "continuous"), (-np.inf, np.inf))]
+)
+def test_what_turns_without_end_leads_as_far_as_the_others_can(
+    tmp_path: Path, kinds: tuple[str, str], limits: tuple[float, float]
+) -> None:
+    """A turn is not nothing to one that follows at another rate."""
+    robot = two(tmp_path, 'multiplier="2"', kinds=kinds)
+    assert (robot.lower[3], robot.upper[3]) == limits
+    z = np.array([0.0, 0.0, 0.0, 2.0 * np.pi / 2.0])
+    np.testing.assert_allclose(robot.coordinates.z(robot.coordinates.q(z)), z)
+    assert robot.model.joints[2].nq == 1
+
+
+def test_limits_that_leave_nothing_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(vkc.InputError, match=r"one: 'two', which follows it, has nowhere to go.*2 to 3.*-1 to 1"):
+        two(tmp_path, 'multiplier="1"', second=(2.0, 3.0))
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_within_the_limits_of_a_coordinate_all_joints_are_within_theirs(seed: int) -> None:
+    """And at its speed none is faster than it may be; at one end, and at that speed, one of them is at its own."""
+    rng = np.random.default_rng(seed)
+    parts, bounds, speeds = [link("l0", "0.1 0.1 0.1")], {}, {}
+    for k in range(4):
+        bounds[f"j{k}"], speeds[f"j{k}"] = (-rng.uniform(0.5, 2.0), rng.uniform(0.5, 2.0)), rng.uniform(0.1, 2.0)
+        factor, offset = rng.uniform(0.2, 3.0) * rng.choice([-1.0, 1.0]), rng.uniform(-0.05, 0.05)
+        inside = f'<mimic joint="j0" multiplier="{factor}" offset="{offset}"/>' if k else ""
+        kind = ("revolute", "prismatic")[k % 2]
+        moved = joint(f"j{k}", kind, f"l{k}", f"l{k + 1}", limits=bounds[f"j{k}"], velocity=speeds[f"j{k}"], inside=inside)
+        parts += [link(f"l{k + 1}"), moved]
+    file = read_urdf(Path("robot.urdf"), text=f'<robot name="robot">{"".join(parts)}</robot>')
+    full = limited_together(full_model(file), file, "l4")
+    model = planned_model(full, file, "l4", rest_positions(full, file, {}), {})
+    coordinates, lower, upper, velocity, _ = robot_limits(full, model, RobotSchema(urdf="robot.urdf"), "omni")
+    assert coordinates.names[3:] == ("j0",)
+    reached = []
+    for move in Coordinates(model).moves[3:]:
+        name = str(model.names[move.joint])
+        ends = sorted(move.factor * np.array([lower[3], upper[3]]) + move.offset)
+        low, high = bounds[name]
+        assert low - 1e-9 <= ends[0]
+        assert ends[1] <= high + 1e-9
+        assert abs(move.factor) * velocity[3] <= speeds[name] + 1e-9
+        reached.append((min(ends[0] - low, high - ends[1]) < 1e-9, abs(abs(move.factor) * velocity[3] - speeds[name]) < 1e-9))
+    assert all(any(column) for column in zip(*reached, strict=True))

@@ -1,0 +1,132 @@
+"""How fingers open, and what a robot.yaml may say of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.grippers import WIDEST, write_gripper
+from helpers.robots import at_rest, placement
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import vkc_pin as vkc
+from vkc_pin.world.models.robot import Robot
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> Robot:
+    return vkc.load_robot(write_gripper(tmp_path_factory.mktemp("gripper")))
+
+
+def faces(robot: Robot) -> list[np.ndarray]:
+    """Return the middles of the fingers' shapes in the tool frame."""
+    data, shapes = robot.model.createData(), robot.collision.createData()
+    pin.updateGeometryPlacements(robot.model, data, robot.collision, shapes, robot.coordinates.q(at_rest(robot)))
+    tool = placement(robot, robot.tool_frame, at_rest(robot))
+    fingers = [k for k in range(len(shapes.oMg)) if robot.link_of(k).startswith("finger")]
+    return [tool.actInv(shapes.oMg[k]).translation for k in fingers]
+
+
+def test_a_gripper_stands_open_and_the_joint_that_mimics_follows(robot: Robot) -> None:
+    gripper = robot.gripper
+    assert gripper is not None
+    assert gripper.names == ("finger_a_joint", "finger_b_joint")
+    assert gripper.resting == gripper.widest == pytest.approx(WIDEST, abs=2e-4)
+    assert gripper.narrowest == 0.0
+    assert robot.opened(None) is robot
+    np.testing.assert_allclose(gripper.positions(None), [0.04, 0.04])
+    np.testing.assert_allclose(gripper.positions(0.0), [0.0, 0.0])
+
+
+@settings(max_examples=20, deadline=None)
+@given(opening=st.floats(0.0, 0.0799))
+def test_fingers_stand_so_far_apart_on_both_sides_of_the_tool(robot: Robot, opening: float) -> None:
+    opened = robot.opened(opening)
+    for middle, side in zip(faces(opened), (1.0, -1.0), strict=True):  # fingers are 10 mm thick
+        assert middle[0] == pytest.approx(side * (opening / 2.0 + 0.005), abs=1e-5)
+    for link in ("finger_a", "finger_b", "hand", "tool"):
+        own = placement(opened, link, at_rest(robot)).actInv(placement(robot, link, at_rest(robot)))
+        away = WIDEST / 2.0 - opening / 2.0 if link.startswith("finger") else 0.0
+        assert np.linalg.norm(own.translation) == pytest.approx(away, abs=1e-5)
+
+
+def test_only_the_fingers_move(robot: Robot) -> None:
+    opened = robot.opened(0.03)
+    assert opened is robot.opened(0.03)
+    assert list(opened.model.names) == list(robot.model.names)
+    assert opened.own_margins(0.02) == robot.own_margins(0.02)
+    shapes = zip(robot.collision.geometryObjects, opened.collision.geometryObjects, strict=True)
+    moved = {robot.link_of(k) for k, (one, other) in enumerate(shapes) if one.placement != other.placement}
+    assert moved == {"finger_a", "finger_b"}
+
+
+def test_what_is_asked_for_is_met_as_far_as_the_gripper_goes(robot: Robot) -> None:
+    gripper = robot.gripper
+    assert gripper is not None
+    assert robot.opening(None) is None
+    assert robot.opening(0.05) == 0.05
+    assert robot.opening(0.3) == gripper.widest
+    with pytest.raises(vkc.InputError, match=r"cannot be so far open.*0 to 0\.0799"):
+        robot.opened(0.3)
+
+
+def test_a_robot_without_a_gripper_stays_as_it_is() -> None:
+    robot = vkc.load_robot("husky_ur5e")
+    assert robot.opening(0.05) is None
+    with pytest.raises(vkc.InputError, match="does not open"):
+        robot.opened(0.05)
+
+
+def test_fingers_that_turn_need_no_formula(tmp_path: Path) -> None:
+    """Inner faces go through the joints' axes, 10 mm from the middle; the bar's near edge is 64 mm before these."""
+    file = write_gripper(tmp_path, gripper="gripper: {finger_a_joint: {closed: 0.0, open: 0.5}}\n")
+    urdf = file.parent / "robot.urdf"
+    text = urdf.read_text(encoding="utf-8")
+    for name, sign in (("a", 1), ("b", -1)):
+        straight = f'<joint name="finger_{name}_joint" type="prismatic"><origin xyz="0 0 0.06"/>'
+        turning = f'<joint name="finger_{name}_joint" type="revolute"><origin xyz="0 {sign * 0.01} 0.06"/>'
+        assert straight in text
+        text = text.replace(straight, turning).replace(f'<axis xyz="0 {sign} 0"/>', f'<axis xyz="{-sign} 0 0"/>')
+    urdf.write_text(text.replace('upper="0.04"', 'upper="0.5"'), encoding="utf-8")
+    gripper = vkc.load_robot(file).gripper
+    assert gripper is not None
+    assert gripper.narrowest == pytest.approx(0.02, abs=2e-4)
+    assert gripper.widest == pytest.approx(0.02 + 2.0 * 0.064 * np.tan(0.5), abs=2e-4)
+    for opening in (0.03, 0.05, 0.08):
+        angle = np.arctan((opening / 2.0 - 0.01) / 0.064)
+        np.testing.assert_allclose(gripper.positions(opening), [angle, angle], atol=1e-4)
+
+
+def test_an_arm_that_is_locked_otherwise_wins(tmp_path: Path) -> None:
+    robot = vkc.load_robot(write_gripper(tmp_path), locked_joints={"finger_a_joint": 0.01})
+    gripper = robot.gripper
+    assert gripper is not None
+    assert gripper.resting == pytest.approx(0.02, abs=2e-4)
+    assert gripper.widest == pytest.approx(WIDEST, abs=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("gripper", "problem"),
+    [
+        ("gripper: {finger_c_joint: {closed: 0, open: 0.04}}", "finger_a_joint"),
+        ("gripper: {finger_a_joint: {closed: 0}}", r"gripper\.finger_a_joint\.open.*missing"),
+        ("gripper: {finger_a_joint: {closed: 0, open: wide}}", r"gripper\.finger_a_joint\.open.*number"),
+        ("gripper: {finger_a_joint: {closed: 0, opened: 0.04}}", "did you mean 'open'"),
+        ("gripper: {finger_a_joint: {closed: 0, open: 0.4}}", "between 0 and 0.04"),
+        ("gripper: {finger_a_joint: {closed: -0.1, open: 0.04}}", r"gripper\.finger_a_joint\.closed"),
+        ("gripper: {finger_a_joint: {closed: 0.04, open: 0.04}}", "does not move"),
+        ("gripper: {finger_a_joint: {closed: 0.04, open: 0.0}}", "does not open"),
+        ("gripper: {finger_b_joint: {closed: 0, open: 0.04}}", "'finger_a_joint', which it follows"),
+        ("gripper: {arm_5_joint: {closed: 0, open: 0.04}}", "none of a finger"),
+        ("gripper: open", "gripper"),
+    ],
+)
+def test_mistakes_name_file_line_and_field(tmp_path: Path, gripper: str, problem: str) -> None:
+    file = write_gripper(tmp_path, gripper=gripper + "\n")
+    with pytest.raises(vkc.InputError, match=problem) as caught:
+        vkc.load_robot(file)
+    assert caught.value.file == file
+    assert caught.value.line == 6

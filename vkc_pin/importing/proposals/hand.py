@@ -1,0 +1,74 @@
+"""The hand of a robot as grasps see it: its open gripper's shapes in the tool frame, and how much fits between the fingers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import coal
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.errors import InputError
+from vkc_pin.world.models.grippers.bar_width import THIN, widest_bar
+from vkc_pin.world.models.robot import Robot
+from vkc_pin.world.models.shapes import placed_shapes, world_box
+
+__all__ = ["Hand", "hand_of"]
+
+Placed = tuple[coal.CollisionGeometry, pin.SE3]
+
+
+@dataclass(frozen=True, eq=False)
+class Hand:
+    """An open hand.
+
+    Attributes:
+        robot: The robot's name.
+        touch: Shapes of the links that may touch what is grasped, with their placements in the tool frame.
+        others: Those of the other links behind them that move with the tool.
+        opening: How wide a bar between the fingers may be, at the tool's origin along its x axis [m].
+        tip: How far the fingers reach beyond the tool's origin, along its z axis [m].
+        width: How wide the fingers are, along the tool's y axis [m].
+    """
+
+    robot: str
+    touch: tuple[Placed, ...]
+    others: tuple[Placed, ...]
+    opening: float
+    tip: float
+    width: float
+
+
+def hand_of(robot: Robot) -> Hand:
+    """Return the hand of a robot, open as the robot's description has it.
+
+    Raises:
+        InputError: The description names no touch links, or they leave no room around the tool frame's origin.
+    """
+    if not robot.touch_links:
+        problem = f"the hand of '{robot.name}' is not known"
+        expected = "touch_links in a robot.yaml, such as `vkc-pin import-robot` writes"
+        raise InputError(problem, file=robot.urdf, field="touch_links", expected=expected, got="none")
+    data, frame = robot.model.createData(), robot.model.frames[robot.model.getFrameId(robot.tool_frame)]
+    pin.framesForwardKinematics(robot.model, data, robot.coordinates.q(np.concatenate([np.zeros(3), robot.home])))
+    tool = data.oMi[frame.parentJoint] * frame.placement
+    touch, others = list[pin.GeometryObject](), list[pin.GeometryObject]()
+    for number, shape in enumerate(robot.collision.geometryObjects):
+        placed = pin.GeometryObject(shape)
+        placed.placement = tool.inverse() * data.oMi[shape.parentJoint] * shape.placement
+        if robot.link_of(number) in robot.touch_links:
+            touch.append(placed)
+        elif frame.parentJoint in robot.model.supports[shape.parentJoint]:
+            others.append(placed)
+    fingers, rest = tuple(placed_shapes(touch)), tuple(placed_shapes(others))
+    opening = widest_bar(fingers)
+    if opening < 2.0 * THIN:
+        problem = f"there is no room between the fingers of '{robot.name}' at its tool frame '{robot.tool_frame}'"
+        expected = "an open hand around its origin, x the direction of closing"
+        raise InputError(problem, file=robot.urdf, field="tool_frame", expected=expected)
+    beside = [
+        box for geometry, where in fingers if (box := world_box(geometry, where))[1][2] > 0.0
+    ]  # what reaches past the origin
+    ends = beside or [world_box(geometry, where) for geometry, where in fingers]
+    width = max(high[1] for _, high in ends) - min(low[1] for low, _ in ends)
+    return Hand(robot.name, fingers, rest, opening, max(0.0, float(max(high[2] for _, high in ends))), float(width))

@@ -1,0 +1,66 @@
+"""What a joint of an object takes its links into on the way to where it is to go, whoever moves it."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from vkc_pin.planning.diagnosis.proofs import PROVEN
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.world.scene.clearance_exemptions import Standing, allowances
+from vkc_pin.world.scene.obstacles import FLOOR
+from vkc_pin.world.task.phases import Phase
+
+__all__ = ["swept"]
+
+_SURE = 1e-3  # [m] of overlap: more than validation lets pass
+_VALUES = 200  # of a joint between begin and goal
+
+
+def swept(problem: TrajectoryProblem) -> list[str]:
+    """Return why joints of objects cannot get to where a task wants them, for certain; no line at all proves nothing.
+
+    A link that one joint alone moves is, on any motion, in all places between begin and goal, and so in what stands there.
+    """
+    for phase in problem.task.phases:
+        for coordinate in phase.values:
+            text = _hit(problem, phase, coordinate)
+            if text:
+                return [f"{phase.name}: no way for {coordinate}, {PROVEN}{text}"]
+    return []
+
+
+def _hit(problem: TrajectoryProblem, phase: Phase, coordinate: str) -> str:
+    """Return what a joint takes a link into in a phase; empty if nothing is certain."""
+    scene, (name, _, joint) = problem.scene, coordinate.partition(".")
+    placed = scene.objects[name]
+    if placed.object.free:
+        return ""
+    begin, end = phase.before[coordinate], float(np.clip(phase.values[coordinate], *problem.limits(coordinate)))
+    values = np.linspace(begin, end, _VALUES)
+    fixed = {owner: one for owner, one in scene.objects.items() if not one.object.free}
+    standing, known = Standing(scene, fixed), allowances(scene, problem.options.dist_safe)
+    links = [label for label in (f"{name}.{link}" for link in placed.object.links) if standing.joints(label) == [joint]]
+    others = {f"{owner}.{link}" for owner, one in fixed.items() if owner != name for link in one.object.links}
+    others = {label for label in others if not standing.joints(label)} | set(scene.obstacle_labels) - {FLOOR}
+    deepest, text = -_SURE, ""
+    index = placed.object.coordinates.index(joint)
+    for label in links:
+        for other in sorted(others & standing.reached(label, index, values)):
+            own, hit = standing.of([label]), standing.of([other])
+            distances = standing.distances(label, index, values, hit, 0.0)
+            for one in known:
+                if not one.between(label, other):
+                    continue
+                holds, pairs = one.holds([coordinate], values[:, None]), set(one.shape_pairs(standing.labels, standing.keys))
+                for k, j in itertools.product(range(len(own)), range(len(hit))):
+                    if (min(own[k], hit[j]), max(own[k], hit[j])) in pairs:
+                        distances[holds, k, j] += max(0.0, -one.margin)
+            distance = distances.min(axis=(1, 2))
+            worst = int(np.argmin(distance))
+            if distance[worst] < deepest:
+                deepest = float(distance[worst])
+                where = f"between {begin:.3g} and {end:.3g}, at {values[worst]:.3g}"
+                text = f"{where}, {label} – {other} overlap by {-1e3 * deepest:.1f} mm"
+    return text

@@ -1,0 +1,160 @@
+"""What a program looks like, and what its witness planes say: for people who want to see it before it is solved."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from vkc_pin.utils.arguments import instance
+from vkc_pin.utils.arrays import Floats, Ints
+from vkc_pin.utils.cache import Cache
+from vkc_pin.planning.chain.contacts import ContactModel
+from vkc_pin.options import Options
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.compiler import compile_task
+from vkc_pin.world.task.phases import stretches
+from vkc_pin.world.task.steps import Step
+from vkc_pin.world.task.terms import Term, check_active, traced
+
+__all__ = ["Plane", "build", "patterns", "planes", "sizes"]
+
+_FURTHER = 0.3  # [m]: pairs that much further apart than a plane's are not asked for
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Plane:
+    """The witness plane of a pair at a waypoint: what the program knows of the pair's distance (eqs. 6 and 7).
+
+    Attributes:
+        problem: The program.
+        contacts: What can collide with what along the motion that the plane belongs to.
+        waypoint: Counted from 1.
+        names: The two links or obstacles.
+        pair: Their geometries, shape (2,).
+        distance: Of the pair, from coal [m].
+        margin: The clearance that is asked for [m].
+        coefficients, offset: C, shape (12·joints,), and R: C·vec(M(z)) − R ≥ 0 says that the pair keeps its margin.
+        gradient: Of the plane's value, as the solver has it, shape (n,), [m/m] or [m/rad].
+    """
+
+    problem: TrajectoryProblem
+    contacts: ContactModel
+    waypoint: int
+    names: tuple[str, str]
+    pair: Ints
+    distance: float
+    margin: float
+    coefficients: Floats
+    offset: float
+    gradient: Floats
+
+    def values(self, z: Floats) -> Floats:
+        """Return the distance that the plane takes the pair to have, shape (W,) [m], at z, shape (W, n)."""
+        rotations, translations = self.problem.chain.joint_placements(z)
+        columns = np.concatenate([rotations[:, 1:].swapaxes(2, 3), translations[:, 1:, None]], axis=2)
+        return np.asarray(self.margin + columns.reshape(len(z), -1) @ self.coefficients - self.offset)
+
+    def distances(self, z: Floats) -> Floats:
+        """Return the pair's distance from coal, shape (W,) [m], at z, shape (W, n); NaN where it is far from this one."""
+        reach = max(self.distance, 0.0) + _FURTHER
+        found = self.contacts.evaluate(z, np.full(len(z), self.waypoint), reach=reach)
+        mine, distances = (found.pair == self.pair).all(axis=1), np.full(len(z), np.nan)
+        distances[found.waypoint[mine]] = found.distance[mine]
+        return distances
+
+
+def planes(problem: TrajectoryProblem, z: Floats, waypoint: int) -> list[Plane]:
+    """Return the witness planes at a waypoint, those of the pairs that fall shortest of their margins, worst first.
+
+    Args:
+        problem: The program.
+        z: z_1..z_N, shape (N, n).
+        waypoint: Counted from 1.
+    """
+    t, labels = problem.transcription, problem.contacts.phases[problem.contacts.phase_of(waypoint)].labels
+    model = problem.contacts.settled(z)
+    waypoints = np.arange(1, problem.segments + 1)
+    contacts = model.evaluate(z, waypoints, reach=problem.options.contact_reach, nearest=t.slots)
+    coefficients, offsets = model.planes(z, contacts, slots=t.slots)
+    x = t.pack(z)
+    dt, targets = problem.timing_for(z).dt, problem.target_matrix()
+    weights, penalty = problem.effort.weights(*problem.rates(z)), problem.options.penalty
+    parameters = t.parameter_vector(problem.start, coefficients, offsets, targets, weights=weights, penalty=penalty, dt=dt)
+    jacobian = ca.Function("slopes", [t.x, t.parameters], [t.jacobian])(x, parameters).sparse().tocsr()
+    columns = (waypoint - 1) * t.width + np.arange(t.n)
+    return [
+        Plane(
+            problem=problem,
+            contacts=model,
+            waypoint=waypoint,
+            names=(labels[contacts.pair[k, 0]], labels[contacts.pair[k, 1]]),
+            pair=contacts.pair[k],
+            distance=float(contacts.distance[k]),
+            margin=float(contacts.margin[k]),
+            coefficients=coefficients[waypoint - 1, slot],
+            offset=float(offsets[waypoint - 1, slot]),
+            gradient=jacobian[int(t.slot_rows[waypoint - 1, slot])].toarray().ravel()[columns],
+        )
+        for slot, k in enumerate(np.flatnonzero(contacts.waypoint == waypoint - 1))
+    ]
+
+
+def sizes(problem: TrajectoryProblem) -> dict[str, int]:
+    """Return how many variables and rows of each kind there are.
+
+    The rows of velocity and acceleration are not among those of the program unless it turns out to need them.
+    """
+    t, (first, second) = problem.transcription, problem.rates(problem.still)
+    fixed = int((problem.lower == problem.upper).sum())
+    found = {
+        "variables: coordinates": problem.lower.size - fixed,
+        "variables: coordinates, fixed by bounds": fixed,
+        "variables: slacks": t.slot_rows.size,
+        "variables: shares of what is not reached yet": t.segments,
+    }
+    for goal, at in zip(problem.pose_goals, t.pose_rows, strict=True):
+        kind = f"rows: {goal.name}"
+        found[kind] = found.get(kind, 0) + sum(len(rows) for rows in at.values())
+    found["rows: witness planes"] = t.slot_rows.size
+    found["rows: rolling"] = len(t.base_rows)
+    found["rows: clamped freedoms"] = sum(last - first for _, first, last in t.structure.clamped)
+    found["rows: pushes"] = len(t.pushed_rows)
+    found["rows: own constraints"] = len(problem.term_numbers.rows)
+    found["only if needed: velocities"] = first.size
+    found["only if needed: accelerations"] = second.size
+    return found
+
+
+def patterns(problem: TrajectoryProblem) -> tuple[Any, Any]:
+    """Return where the rows' Jacobian and the Lagrangian's Hessian can differ from zero, as sparse matrices (SciPy)."""
+    t = problem.transcription
+    upper = t.objective_curvature.sparsity() + t.hessian.sparsity()
+    return ca.DM(t.jacobian.sparsity(), 1.0).sparse(), ca.DM(upper + upper.T, 1.0).sparse()
+
+
+def build(
+    scene: Scene, steps: Sequence[Step], *, options: Options | None = None, terms: Sequence[Term] = (), cache: Cache | None = None
+) -> TrajectoryProblem:
+    """Return the nonlinear program of `steps` in `scene`, to look at before solving.
+
+    Args:
+        scene: Robot, objects and obstacles.
+        steps: What should change in the world.
+        options: How to plan.
+        terms: Own constraints and costs.
+        cache: Where the symbolic program is kept, for problems of the same structure in the same thread; None: one of its own.
+
+    Raises:
+        InputError: The steps or terms name something that is not there, or ask for what cannot be done.
+    """
+    options = Options() if options is None else instance(options, Options, "options")
+    cache = None if cache is None else instance(cache, Cache, "cache")
+    instance(scene, Scene, "scene")
+    task, terms = compile_task(scene, steps, options), traced(scene, terms)
+    check_active(terms, stretches(task))
+    return TrajectoryProblem(scene, task, options, terms, cache=cache)

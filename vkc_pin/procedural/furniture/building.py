@@ -1,0 +1,227 @@
+"""Builds objects of boxes, cylinders and balls, link by link, and describes them as URDF and attachments."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.utils.arrays import Floats
+
+__all__ = ["COLOURS", "Article", "Link", "Point"]
+
+Point = Sequence[float]
+
+COLOURS: dict[str, tuple[float, float, float]] = {
+    "dark": (0.2, 0.21, 0.23),
+    "glass": (0.30, 0.36, 0.40),
+    "oak": (0.76, 0.60, 0.42),
+    "sage": (0.55, 0.64, 0.56),
+    "sand": (0.84, 0.79, 0.68),
+    "shade": (0.84, 0.83, 0.79),
+    "slate": (0.38, 0.45, 0.52),
+    "steel": (0.62, 0.64, 0.66),
+    "walnut": (0.45, 0.31, 0.20),
+    "white": (0.93, 0.92, 0.89),
+}
+_DENSITY = 500.0  # [kg/m³] of wood; what is hollow is built of its walls
+_UPRIGHT = (0.0, 0.0, 0.0)
+_TURNED = {"x": (0.0, math.pi / 2.0, 0.0), "y": (math.pi / 2.0, 0.0, 0.0), "z": _UPRIGHT}  # roll, pitch, yaw of a cylinder
+_VELOCITY = {"revolute": 1.0, "prismatic": 0.5}  # [rad/s], [m/s]
+_EFFORT = {"revolute": 30.0, "prismatic": 40.0}  # [N·m], [N]
+
+
+@dataclass(frozen=True)
+class _Shape:
+    """A shape of a link: "box" with its edges, "cylinder" with radius and length, or "sphere" with its radius [m]."""
+
+    kind: str
+    size: tuple[float, ...]
+    centre: tuple[float, ...]
+    rpy: tuple[float, float, float]
+    colour: str
+
+    def xml(self, element: str) -> str:
+        """Return the element <visual> or <collision>."""
+        if self.kind == "box":
+            size = f'size="{_numbers(self.size)}"'
+        else:
+            size = f'radius="{_numbers(self.size[:1])}"' + (f' length="{_numbers(self.size[1:])}"' if self.size[1:] else "")
+        turned = f' rpy="{_numbers(self.rpy, 6)}"' if any(self.rpy) else ""
+        material = f"<material name={quoteattr(self.colour)}/>" if element == "visual" else ""
+        geometry = f"<geometry><{self.kind} {size}/></geometry>"
+        return f'    <{element}><origin xyz="{_numbers(self.centre)}"{turned}/>{geometry}{material}</{element}>'
+
+    @property
+    def mass(self) -> float:
+        """Its mass [kg]."""
+        if self.kind == "box":
+            return _DENSITY * math.prod(self.size)
+        radius = self.size[0]
+        volume = math.pi * radius**2 * self.size[1] if self.kind == "cylinder" else 4.0 / 3.0 * math.pi * radius**3
+        return _DENSITY * volume
+
+    @property
+    def inertia(self) -> Floats:
+        """Its inertia about its centre, along the link's axes, shape (3, 3) [kg·m²]."""
+        if self.kind == "sphere":
+            return np.eye(3) * 0.4 * self.mass * self.size[0] ** 2
+        if self.kind == "box":
+            squares = np.square(self.size)
+            return np.diag(self.mass * (squares.sum() - squares) / 12.0)
+        radius, length = self.size
+        along, across = 0.5 * self.mass * radius**2, self.mass * (3.0 * radius**2 + length**2) / 12.0
+        turned = pin.rpy.rpyToMatrix(*self.rpy)
+        return np.asarray(turned @ np.diag([across, across, along]) @ turned.T)
+
+
+@dataclass
+class Link:
+    """A link that is being built; lengths in metres, in its own frame."""
+
+    name: str
+    shapes: list[_Shape] = field(default_factory=list)
+
+    def box(self, low: Point, high: Point, colour: str) -> None:
+        """Add a box between two corners."""
+        size = tuple(b - a for a, b in zip(low, high, strict=True))
+        self.shapes.append(_Shape("box", size, tuple((a + b) / 2.0 for a, b in zip(low, high, strict=True)), _UPRIGHT, colour))
+
+    def cylinder(self, centre: Point, radius: float, length: float, axis: str, colour: str) -> None:
+        """Add a cylinder along an axis of the link: "x", "y" or "z"."""
+        self.shapes.append(_Shape("cylinder", (radius, length), tuple(centre), _TURNED[axis], colour))
+
+    def rod(self, one: Point, other: Point, radius: float, colour: str) -> None:
+        """Add a cylinder between two points."""
+        way = np.subtract(other, one)
+        length = float(np.linalg.norm(way))
+        turned = (0.0, float(np.arccos(way[2] / length)), float(np.arctan2(way[1], way[0])))
+        self.shapes.append(_Shape("cylinder", (radius, length), tuple(np.add(one, other) / 2.0), turned, colour))
+
+    def ball(self, centre: Point, radius: float, colour: str) -> None:
+        """Add a ball."""
+        self.shapes.append(_Shape("sphere", (radius,), tuple(centre), _UPRIGHT, colour))
+
+    def case(self, low: Point, high: Point, wall: float, colour: str, inside: str) -> None:
+        """Add a box that is open towards -x: two sides, top, bottom and back."""
+        (x0, y0, z0), (x1, y1, z1) = low, high
+        self.box((x0, y0, z0), (x1, y0 + wall, z1), colour)
+        self.box((x0, y1 - wall, z0), (x1, y1, z1), colour)
+        self.box((x0, y0 + wall, z1 - wall), (x1, y1 - wall, z1), colour)
+        self.box((x0, y0 + wall, z0), (x1, y1 - wall, z0 + wall), colour)
+        self.box((x1 - wall, y0 + wall, z0 + wall), (x1, y1 - wall, z1 - wall), inside)
+
+    def xml(self) -> str:
+        """Return the element <link>, with mass and inertia of the shapes."""
+        masses = np.array([shape.mass for shape in self.shapes])
+        centres = np.array([shape.centre for shape in self.shapes], float)
+        middle = masses @ centres / masses.sum()
+        inertia = np.zeros((3, 3))
+        for shape, mass, offset in zip(self.shapes, masses, centres - middle, strict=True):
+            inertia += shape.inertia + mass * (offset @ offset * np.eye(3) - np.outer(offset, offset))
+        entries = " ".join(f'i{"xyz"[i]}{"xyz"[j]}="{_numbers([inertia[i, j]], 6)}"' for i in range(3) for j in range(i, 3))
+        mass, origin = f'<mass value="{_numbers([masses.sum()])}"/>', f'<origin xyz="{_numbers(middle)}"/>'
+        lines = [f"  <link name={quoteattr(self.name)}>", f"    <inertial>{origin}{mass}<inertia {entries}/></inertial>"]
+        lines += [shape.xml(element) for element in ("visual", "collision") for shape in self.shapes]
+        return "\n".join([*lines, "  </link>"])
+
+
+@dataclass
+class Article:
+    """An object that is being built.
+
+    Its base link's frame lies on the floor (or on what it stands on) in the middle below its face: x points into it, away from
+    whoever stands before it, z up. `description` is what `vkc_pin.load_object` takes.
+
+    Attributes:
+        name: Its name.
+        base: Its base link.
+        links: The other links, each with the element <joint> that it hangs on.
+    """
+
+    name: str
+    base: Link
+    links: list[tuple[Link, str]] = field(default_factory=list)
+    accelerations: dict[str, float] = field(default_factory=dict)
+    attachments: list[dict[str, Any]] = field(default_factory=list)
+    latches: list[dict[str, Any]] = field(default_factory=list)
+
+    def joint(
+        self,
+        name: str,
+        kind: str,
+        origin: Point,
+        axis: Point,
+        upper: float,
+        *,
+        lower: float = 0.0,
+        link: str,
+        parent: str | None = None,
+        acceleration: float = 1.0,
+    ) -> Link:
+        """Add a joint, and return the link that it moves.
+
+        Args:
+            name: Of the joint.
+            kind: "revolute" or "prismatic".
+            origin: Of joint and link in the parent's frame [m].
+            axis: Of the joint.
+            upper: The upper limit [rad] or [m].
+            lower: The lower limit.
+            link: The link's name.
+            parent: The link it hangs on; None: the base.
+            acceleration: Its limit [rad/s²] or [m/s²].
+        """
+        moved = Link(link)
+        limits = f'lower="{_numbers([lower])}" upper="{_numbers([upper])}"'
+        rates = f'velocity="{_numbers([_VELOCITY[kind]])}" effort="{_numbers([_EFFORT[kind]])}"'
+        lines = [
+            f'  <joint name={quoteattr(name)} type="{kind}">',
+            f"    <parent link={quoteattr(parent or self.base.name)}/><child link={quoteattr(link)}/>",
+            f'    <origin xyz="{_numbers(origin)}"/><axis xyz="{_numbers(axis)}"/>',
+            f"    <limit {limits} {rates}/>",
+            "  </joint>",
+        ]
+        self.links.append((moved, "\n".join(lines)))
+        self.accelerations[name] = acceleration
+        return moved
+
+    def attach(self, name: str, link: Link, position: Point, approach: Point, closing: Point, **freedom: Any) -> None:
+        """Add an attachment: where and how a hand takes hold of a link, in the link's frame; see `Attachment`."""
+        where = {"position": _rounded(position), "approach": _rounded(approach), "closing": _rounded(closing)}
+        self.attachments.append({"name": name, "link": link.name, **where, **freedom})
+
+    @property
+    def urdf(self) -> str:
+        """The object as a URDF."""
+        links = [self.base, *(link for link, _ in self.links)]
+        used = sorted({shape.colour for link in links for shape in link.shapes})
+        materials = [f'  <material name="{name}"><color rgba="{_numbers(COLOURS[name])} 1"/></material>' for name in used]
+        parts = [part for link, joint in self.links for part in (joint, link.xml())]
+        head = ['<?xml version="1.0"?>', f"<robot name={quoteattr(self.name)}>", *materials]
+        return "\n".join([*head, self.base.xml(), *parts, "</robot>"]) + "\n"
+
+    @property
+    def description(self) -> dict[str, Any]:
+        """The object's description as plain data, the URDF inside it."""
+        plain: dict[str, Any] = {"urdf": self.urdf}
+        plain["joints"] = {name: {"acceleration": value} for name, value in self.accelerations.items()}
+        plain["attachments"] = [_plain(item) for item in self.attachments]
+        return {**plain, **({"latches": [_plain(item) for item in self.latches]} if self.latches else {})}
+
+
+def _numbers(values: Sequence[float] | Floats, digits: int = 4) -> str:
+    return " ".join(f"{round(float(value), digits) + 0.0:.10g}" for value in values)
+
+
+def _rounded(values: Point) -> list[float]:
+    return [round(float(value), 6) + 0.0 for value in values]
+
+
+def _plain(item: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: list(value) if isinstance(value, tuple) else value for key, value in item.items()}

@@ -1,0 +1,102 @@
+"""The kinds of furniture and appliances that are made at random, and where each kind stands."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import yaml
+
+from vkc_pin.utils.arguments import known, mapping, whole
+from vkc_pin.errors import InputError
+from vkc_pin.world.files.resources import file_path
+from vkc_pin.world.files.writing import write_atomically
+from vkc_pin.procedural.furniture import flaps
+from vkc_pin.procedural.furniture import leaves
+from vkc_pin.procedural.furniture import valves
+from vkc_pin.procedural.furniture.building import Article
+from vkc_pin.procedural.furniture.draws import Draws
+from vkc_pin.world.models.object_file import load_object
+
+__all__ = ["KINDS", "Kind", "random_object", "write_object"]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of furniture.
+
+    Attributes:
+        make: Makes one of random sizes.
+        place: "wall" for what stands in an opening of a wall, "floor", or "counter" for what stands on something.
+        beside: How far to either side of it the floor before it is needed, by robot and leaves [m].
+    """
+
+    make: Callable[[Draws], Article]
+    place: str
+    beside: float
+
+
+KINDS: Mapping[str, Kind] = MappingProxyType(
+    {
+        "cabinet": Kind(leaves.cabinet, "floor", 0.7),
+        "chest": Kind(flaps.chest, "floor", 0.5),
+        "dishwasher": Kind(flaps.dishwasher, "floor", 0.6),
+        "door": Kind(leaves.door, "wall", 0.5),
+        "drawers": Kind(flaps.drawers, "floor", 0.5),
+        "faucet": Kind(valves.faucet, "counter", 0.5),
+        "microwave": Kind(leaves.microwave, "counter", 0.6),
+        "oven": Kind(flaps.oven, "floor", 0.6),
+        "refrigerator": Kind(leaves.refrigerator, "floor", 0.7),
+        "valve": Kind(valves.valve, "floor", 0.7),
+    }
+)
+"""Kinds by name."""
+
+
+def random_object(kind: str, seed: int = 0) -> dict[str, Any]:
+    """Return a piece of furniture or an appliance of random, sensible sizes that can be opened or turned.
+
+    Its joints, handles and attachments are in the description, its URDF too. It is what `load_object` takes, and `type` of an
+    object in a scene, and it is the same in every run. Its base link stands on the floor, or on a counter, and looks along -x; a
+    door's is on the hinge line, in the middle of a wall.
+
+    Args:
+        kind: `cabinet`, `chest` (with a lid), `dishwasher`, `door`, `drawers`, `faucet`, `microwave`, `oven`, `refrigerator` or
+            `valve`.
+        seed: Which one, from 0.
+
+    Raises:
+        UnknownNameError: There is no such kind.
+        InputError: `seed` is no whole number of at least 0.
+    """
+    own = KINDS[known(kind, KINDS, "kind of furniture", "kind")]
+    rng = np.random.default_rng([4, zlib.crc32(kind.encode()), whole(seed, "seed", low=0)])
+    return own.make(Draws(rng)).description
+
+
+def write_object(description: Mapping[str, Any], path: str | Path) -> Path:
+    """Write the description of an object to files: `<name>.yaml`, and its URDF beside it if that is part of it.
+
+    Args:
+        description: What `random_object` returns, or plain data of that form.
+        path: The file `<name>.yaml`.
+
+    Returns:
+        The path of the file, which `load_object` and scenes take.
+
+    Raises:
+        InputError: The description is wrong, or a file cannot be written.
+    """
+    plain, file = mapping(description, "description"), file_path(path, "path")
+    if file.suffix not in (".yaml", ".yml"):
+        raise InputError("not a file of an object", field="path", expected="a path that ends with .yaml", got=file.name)
+    load_object(plain, folder=file.parent)  # says what is wrong with it
+    urdf = plain["urdf"]
+    if urdf.lstrip().startswith("<"):
+        plain = {**plain, "urdf": write_atomically(file.with_suffix(".urdf"), urdf.encode()).name}
+    return write_atomically(file, yaml.safe_dump(plain, sort_keys=False).encode())

@@ -1,0 +1,188 @@
+"""What rooms are made of: walls, tables, shelves, boxes, and objects that open, each as part of a scene's description."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from vkc_pin.procedural.rooms.fixtures import Fixture
+from vkc_pin.procedural.rooms.footprints import Floor, Frame, Rectangle
+
+__all__ = ["CARRIED", "Part", "box", "carried", "opened", "shelf", "table", "walls"]
+
+WALL = 0.1  # [m] thickness
+AIR = 0.02  # [m] between a wall and what stands against it
+PLATE, LEG, BOARD = 0.03, 0.06, 0.02  # [m] thicknesses
+BEFORE_TABLE = 1.5  # [m] depth of the floor that stays free on one side of a table
+_LEAST = 0.75  # [m] to either side of the middle of what is stood before: room for a robot to turn
+_ON = 0.001  # [m] of air below what is carried
+
+CARRIED = {"cup": 0.0, "ball": 0.035}
+"""Free objects that stand on tables: type → how high their frame is above what they stand on [m]."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """One thing in a room.
+
+    Attributes:
+        name: Its name in the scene, or the beginning of its obstacles' names.
+        frame: Where it stands; x points away from who stands before it.
+        footprint: What it covers of the floor.
+        obstacles, objects: Its entries in a scene's description.
+        before: Floor before it that stays free, if any.
+        spot: Where a robot can stand and turn before it, in the world frame [m].
+        size: Its extent along the frame's x and y, and its height [m].
+        side: Of the wall in which it stands, for doors: 0 east, 1 north, 2 west, 3 south.
+    """
+
+    name: str
+    frame: Frame
+    footprint: Rectangle
+    obstacles: tuple[dict[str, Any], ...] = ()
+    objects: tuple[dict[str, Any], ...] = ()
+    before: Rectangle | None = None
+    spot: tuple[float, float] | None = None
+    size: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    side: int | None = None
+
+
+def box(name: str, frame: Frame, size: Sequence[float], colour: str) -> Part:
+    """Return a box on the floor, its middle at the frame's origin; edges along the frame's x, y, z [m]."""
+    footprint = Rectangle(frame.x, frame.y, size[0], size[1], frame.yaw)
+    return Part(name, frame, footprint, (_box(name, frame, (0.0, 0.0), (0.0, size[2]), size[:2], colour),))
+
+
+def table(name: str, frame: Frame, size: tuple[float, float, float]) -> Part:
+    """Return a table with plate and four legs, its middle at the frame's origin; the floor before its side at −x stays free.
+
+    Args:
+        name: Its name.
+        frame: Where it stands.
+        size: Depth along x, width along y, height [m].
+    """
+    depth, width, height = size
+    items = [_box(f"{name}_top", frame, (0.0, 0.0), (height - PLATE, height), (depth, width), "oak")]
+    for k, (x, y) in enumerate(((-1, -1), (-1, 1), (1, -1), (1, 1)), start=1):
+        at = (x * (depth - LEG) / 2.0, y * (width - LEG) / 2.0)
+        items.append(_box(f"{name}_leg_{k}", frame, at, (0.0, height - PLATE), (LEG, LEG), "walnut"))
+    half, side = depth / 2.0, max(width / 2.0, _LEAST)
+    before = frame.rectangle((-half - BEFORE_TABLE, -half), (-side, side))
+    spot = frame.point(-half - BEFORE_TABLE / 2.0, 0.0)
+    footprint = Rectangle(frame.x, frame.y, depth, width, frame.yaw)
+    return Part(name, frame, footprint, tuple(items), before=before, spot=spot, size=size)
+
+
+def shelf(name: str, frame: Frame, size: tuple[float, float, float], boards: int) -> Part:
+    """Return an open shelf with two sides, a back and boards, its back against the wall on whose face the frame lies.
+
+    Args:
+        name: Its name.
+        frame: On the wall's inner face, x out of the room.
+        size: Depth, width and height [m].
+        boards: How many, from bottom to top, at least 2.
+    """
+    depth, width, height = size
+    middle = -AIR - depth / 2.0
+    back = _box(f"{name}_back", frame, (-AIR - BOARD / 2.0, 0.0), (0.0, height), (BOARD, width), "walnut")
+    items = [back]
+    for k, y in enumerate((-1, 1), start=1):
+        at = (middle - BOARD / 2.0, y * (width - BOARD) / 2.0)
+        items.append(_box(f"{name}_side_{k}", frame, at, (0.0, height), (depth - BOARD, BOARD), "walnut"))
+    for k, low in enumerate(np.linspace(0.06, height - BOARD, boards).tolist(), start=1):
+        inside = (depth - BOARD, width - 2.0 * BOARD)
+        items.append(_box(f"{name}_board_{k}", frame, (middle - BOARD / 2.0, 0.0), (low, low + BOARD), inside, "oak"))
+    footprint = frame.rectangle((-AIR - depth, -AIR), (-width / 2.0, width / 2.0))
+    return Part(name, frame, footprint, tuple(items), size=size)
+
+
+def opened(name: str, own: Fixture, floor: Floor, side: int, along: float, front: float) -> Part:
+    """Return an object that opens, in a wall, against it, or on a counter against it; the floor before it stays free.
+
+    Args:
+        name: Its name in the scene.
+        own: What it is.
+        floor: Of the room.
+        side: Of the wall.
+        along: Where on the wall its middle is; see `Floor.at_wall` [m].
+        front: How deep the floor before it is that stays free [m].
+    """
+    low, high, counter = own.low, own.high, own.counter
+    middle = (low[1] + high[1]) / 2.0
+    wall = floor.at_wall(side, along - middle)
+    edge = -AIR - counter.size[0] if counter else 0.0  # of the counter, along the wall's frame
+    inwards = WALL / 2.0 if own.in_wall else edge + counter.setback if counter else -AIR - high[0]
+    frame = Frame(*wall.point(inwards, 0.0), wall.yaw)
+    sides, face = (low[1], high[1]), -WALL / 2.0 if own.in_wall else own.face
+    footprint, items, up = frame.rectangle((low[0], high[0]), sides), [], own.lift
+    if counter:
+        depth, width, height = counter.size
+        sides, face, up = (middle - width / 2.0, middle + width / 2.0), -counter.setback, height + own.lift
+        footprint = frame.rectangle((face, face + depth), sides)
+        centre = (face + depth / 2.0, middle)
+        items = [
+            _box(f"{name}_counter", frame, centre, (0.0, height - PLATE), (depth, width), "cream"),
+            _box(f"{name}_worktop", frame, centre, (height - PLATE, height), (depth, width), "oak"),
+        ]
+    beside = (low[1] - own.beside, high[1] + own.beside)
+    before = frame.rectangle((face - front, face), beside)
+    entry = {"name": name, "type": own.type, "position": [frame.x, frame.y, round(up, 4)], "yaw": frame.yaw}
+    spot = frame.point(face - front / 2.0, middle)
+    size = (float(high[0] - low[0]), float(high[1] - low[1]), float(high[2]))
+    return Part(name, frame, footprint, tuple(items), (entry,), before, spot, size, side if own.in_wall else None)
+
+
+def carried(name: str, kind: str, on: Part, x: float, y: float) -> Part:
+    """Return a free object on a table.
+
+    Args:
+        name: Its name in the scene.
+        kind: Its type.
+        on: The table.
+        x: Where along the table's frame, away from its free side [m].
+        y: Where across it [m].
+    """
+    place = on.frame.point(x, y)
+    entry = {"name": name, "type": kind, "position": [*place, round(on.size[2] + CARRIED[kind] + _ON, 3)]}
+    return Part(name, Frame(*place, 0.0), on.footprint, (), (entry,))
+
+
+def walls(floor: Floor, height: float, parts: Sequence[Part]) -> list[dict[str, Any]]:
+    """Return the walls round a floor as entries of a scene's description, with openings for the doors among the parts."""
+    items = []
+    for side, name in enumerate(("east", "north", "west", "south")):
+        half, frame = floor.half_length(side), floor.at_wall(side, 0.0)
+        end = half + WALL if side % 2 else half  # walls in the north and south reach round the corners
+        begin, own = -end, f"wall_{name}"
+        centres = {part.name: _along(frame, part.footprint) for part in parts if part.side == side}
+        doors = sorted((part for part in parts if part.side == side), key=lambda part: centres[part.name])
+        for k, door in enumerate(doors, start=1):
+            middle, width = centres[door.name], door.size[1]
+            low, high, top = middle - width / 2.0, middle + width / 2.0, door.size[2]
+            items.append(_wall(f"{own}_{k}", frame, (begin, low), (0.0, height)))
+            if top < height:
+                items.append(_wall(f"{own}_above_{door.name}", frame, (low, high), (top, height)))
+            begin = high
+        items.append(_wall(f"{own}_{len(doors) + 1}" if doors else own, frame, (begin, end), (0.0, height)))
+    return items
+
+
+def _wall(name: str, frame: Frame, along: tuple[float, float], z: tuple[float, float]) -> dict[str, Any]:
+    return _box(name, frame, (WALL / 2.0, sum(along) / 2.0), z, (WALL, along[1] - along[0]), "wall")
+
+
+def _along(frame: Frame, rectangle: Rectangle) -> float:
+    """Return where the middle of a rectangle is along a frame's y [m]."""
+    return float(-np.sin(frame.yaw) * (rectangle.x - frame.x) + np.cos(frame.yaw) * (rectangle.y - frame.y))
+
+
+def _box(
+    name: str, frame: Frame, at: tuple[float, float], z: tuple[float, float], size: Sequence[float], colour: str
+) -> dict[str, Any]:
+    """Return a box as an entry of a scene's description, its middle at a point of a frame, between two heights [m]."""
+    edges = [round(float(edge), 3) for edge in (*size, z[1] - z[0])]
+    position = [*frame.point(*at), round((z[0] + z[1]) / 2.0, 4)]
+    return {"name": name, "type": "box", "size": edges, "position": position, "yaw": frame.yaw, "colour": colour}

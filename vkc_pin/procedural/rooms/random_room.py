@@ -1,0 +1,268 @@
+"""Random rooms: each a scene that follows from its number alone, with furniture, things to open, and floor to get there."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.utils.arguments import instance, whole
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.world.files.resources import folder
+from vkc_pin.world.models.robot import Robot
+from vkc_pin.world.models.robot_file import load_robot
+from vkc_pin.world.models.shapes import world_box
+from vkc_pin.procedural.rooms import parts
+from vkc_pin.procedural.rooms.fixtures import OPENED, Fixture, fixture, own_name
+from vkc_pin.procedural.rooms.footprints import Floor, Frame
+from vkc_pin.procedural.rooms.parts import Part
+from vkc_pin.procedural.rooms.settings import RoomSettings
+from vkc_pin.world.scene.scene import START_CLEARANCE, Scene
+
+__all__ = ["Layout", "random_layout", "random_room"]
+
+_TRIES = 60  # places for one thing
+_ROOMS = 60  # rooms that are begun anew since something finds no place
+_STARTS = 1000  # places for the robot
+_TURNING = 0.07  # [m] of air round a robot that turns, more than the clearance that a plan keeps and half a grid cell
+_DENSITY = 0.45  # pieces of furniture per square metre of floor at clutter 1
+_BEYOND = 2.0  # [m] of floor beyond a wall with a door
+_COLOURS = ("teal", "terracotta", "blue", "cream", "orange", "grey", "green")
+_EDGE = 0.1  # [m] from the middle of what is carried to the edges of its table
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A room before it is a scene.
+
+    Attributes:
+        number: That of the room.
+        settings: What it had to be like.
+        floor: Its floor.
+        parts: What stands there; what is carried comes last.
+        start: Of the robot's base, shape (3,): x, y [m] and yaw [rad].
+        radius: Of a disc in which the robot can turn with its arm at home [m].
+    """
+
+    number: int
+    settings: RoomSettings
+    floor: Floor
+    parts: tuple[Part, ...]
+    start: tuple[float, float, float]
+    radius: float
+
+    def part(self, name: str) -> Part:
+        """Return the part of a name. Raises `UnknownNameError` if there is none."""
+        known = {part.name: part for part in self.parts}
+        if name not in known:
+            raise UnknownNameError("part", name, known)
+        return known[name]
+
+    def scene(self) -> Scene:
+        """Return it as a scene, which is called `room_<number>`."""
+        reach = [self.floor.half_length(side + 1) for side in range(4)]
+        for part in self.parts:
+            if part.side is not None:
+                reach[part.side] = self.floor.half_length(part.side + 1) + _BEYOND
+        document = {
+            "name": f"room_{self.number}",
+            "robot": self.settings.robot,
+            "start": {"base": list(self.start)},
+            "arena": {"x": [-reach[2], reach[0]], "y": [-reach[3], reach[1]]},
+            "obstacles": [
+                *parts.walls(self.floor, self.settings.height, self.parts),
+                *(entry for part in self.parts for entry in part.obstacles),
+            ],
+            "objects": [entry for part in self.parts for entry in part.objects],
+        }
+        return Scene.from_document(document, folder("scenes"))
+
+
+def random_room(number: int, settings: RoomSettings | None = None, **changes: Any) -> Scene:
+    """Return a random room with a robot in it: the scene that a number stands for, the same in every run.
+
+    Tables, shelves and boxes stand about, doors are in the walls and drawers, cabinets and refrigerators against them. Nothing
+    overlaps. Before whatever can be opened, and on one side of every table, the floor is free, and the robot gets there
+    from its start without folding its arm. Nobody asks a planner whether anything can be done.
+
+    Args:
+        number: Which room, from 0.
+        settings: What rooms are like; None: `RoomSettings()`.
+        changes: Fields of `RoomSettings` that are to be otherwise, `clutter=0.8` for one.
+
+    Raises:
+        InputError: A number or a field is out of range, or the things find no place in a room of this size.
+        UnknownNameError: There is no such field, or no such type of object.
+    """
+    return random_layout(number, settings, **changes).scene()
+
+
+def random_layout(number: int, settings: RoomSettings | None = None, **changes: Any) -> Layout:
+    """Return what a random room is made of; see `random_room`."""
+    number = whole(number, "number", low=0)
+    known = [item.name for item in dataclasses.fields(RoomSettings)]
+    for name in changes:
+        if name not in known:
+            raise UnknownNameError("field of RoomSettings", name, known, field=name)
+    chosen = dataclasses.replace(RoomSettings() if settings is None else instance(settings, RoomSettings, "settings"), **changes)
+    rng, radius = np.random.default_rng([1, number]), _turning_radius(load_robot(chosen.robot))
+    named = None if chosen.objects is None else _named(chosen.objects, number)
+    for _ in range(_ROOMS):
+        found = _Room(chosen, rng, radius).furnished(named)
+        if found is not None:
+            floor, standing, start = found
+            return Layout(number, chosen, floor, standing, start, radius)
+    expected = "less clutter, fewer objects or tables, wider rooms, or a robot whose arm is folded closer at home"
+    got = f"{chosen.clutter:g}, and a robot that turns in a circle of {radius:.2f} m"
+    raise InputError(f"no room in {_ROOMS} had a place for everything", field="clutter", expected=expected, got=got)
+
+
+def _named(kinds: Sequence[str | Mapping[str, Any]], number: int) -> list[tuple[str, Fixture]]:
+    """Return the things to open, each with its name in the room of a number."""
+    names = [own_name(kind) for kind in kinds]
+    names = [name if names.count(name) == 1 else f"{name}_{names[: k + 1].count(name)}" for k, name in enumerate(names)]
+    return [(name, fixture(kind, 100 * number + k)) for k, (name, kind) in enumerate(zip(names, kinds, strict=True))]
+
+
+class _Room:
+    """A room that is being furnished: draws places until one fits, and gives up after some."""
+
+    def __init__(self, settings: RoomSettings, rng: np.random.Generator, radius: float) -> None:
+        self.settings, self.rng, self.radius = settings, rng, radius
+        width, depth = (round(float(size), 2) for size in rng.uniform(*settings.width, 2))
+        self.floor = Floor(width, depth)
+        self.parts: list[Part] = []
+        self.start: tuple[float, float, float] | None = None
+
+    def furnished(
+        self, named: Sequence[tuple[str, Fixture]] | None
+    ) -> tuple[Floor, tuple[Part, ...], tuple[float, float, float]] | None:
+        """Return floor, parts and start, or None if something finds no place.
+
+        Args:
+            named: What can be opened, by name; None: one or two of `OPENED`.
+        """
+        if named is None:
+            count = int(self.rng.integers(1, 3))
+            named = _named([str(kind) for kind in self.rng.choice(list(OPENED), count, replace=False)], 0)
+        fixed = [self._opened(name, own) for name, own in named]
+        fixed += [self._table(f"table_{k + 1}") for k in range(self.settings.tables)]
+        if not all(self._put(draws) for draws in fixed):
+            return None
+        start = self._start()
+        if start is None:
+            return None
+        self.start = start
+        free = self.floor.width * self.floor.depth - sum(part.footprint.length * part.footprint.width for part in self.parts)
+        for k in range(round(self.settings.clutter * _DENSITY * free)):
+            draws = (self._box, self._box, self._shelf, self._table)[int(self.rng.integers(4))]
+            if not self._put(draws(f"{draws.__name__.strip('_')}_{k + 1 + self.settings.tables}")):
+                return None
+        tables = [part for part in self.parts if part.name == "table_1"]
+        standing = [self._carried(kind, k, tables[0]) for k, kind in enumerate(self.settings.carried)]
+        return self.floor, (*self.parts, *standing), start
+
+    def _put(self, draws: Iterator[Part]) -> bool:
+        """Put the first of some draws there that fits; return whether one does."""
+        for _, part in zip(range(_TRIES), draws, strict=False):
+            if self._fits(part):
+                self.parts.append(part)
+                return True
+        return False
+
+    def _fits(self, part: Part) -> bool:
+        """Return whether a part stands in the room, away from the others, and leaves free what has to be."""
+        own, gap = part.footprint, self.settings.gap
+        if (part.side is None and not self.floor.holds(own)) or (part.before and not self.floor.holds(part.before)):
+            return False
+        for other in self.parts:
+            pairs = [(own, other.footprint), (own, other.before), (part.before, other.footprint)]
+            if any(one is not None and two is not None and one.gap(two) < gap for one, two in pairs):
+                return False
+        places = [one.spot for one in (*self.parts, part) if one.spot is not None]
+        if self.start is not None:
+            places.append(self.start[:2])
+        standing = [one.footprint for one in (*self.parts, part)]
+        if self.start is not None and not self.floor.free([own], self.radius, [self.start[:2]])[0]:
+            return False
+        return self.floor.connected(standing, self.radius, places)
+
+    def _start(self) -> tuple[float, float, float] | None:
+        """Return a place from which the robot gets wherever it has to stand; None if none was found."""
+        standing = [part.footprint for part in self.parts]
+        places = [part.spot for part in self.parts if part.spot is not None]
+        half = np.array([self.floor.width, self.floor.depth]) / 2.0
+        for _ in range(_STARTS):
+            x, y, yaw = (round(float(value), 3) for value in self.rng.uniform([*-half, -math.pi], [*half, math.pi]))
+            if self.floor.free(standing, self.radius, [[x, y]])[0] and self.floor.connected(
+                standing, self.radius, [*places, (x, y)]
+            ):
+                return x, y, yaw
+        return None
+
+    def _wall(self, width: float) -> tuple[int, float]:
+        """Return a side, and where along its wall the middle of something of a width [m] may be."""
+        side = int(self.rng.integers(4))
+        reach = max(self.floor.half_length(side) - width / 2.0, 0.0)
+        return side, round(float(self.rng.uniform(-reach, reach)), 3)
+
+    def _anywhere(self, yaw: float) -> Frame:
+        half = np.array([self.floor.width, self.floor.depth]) / 2.0
+        x, y = (round(float(value), 3) for value in self.rng.uniform(-half, half))
+        return Frame(x, y, yaw)
+
+    def _size(self, *intervals: tuple[float, float]) -> tuple[float, ...]:
+        """Return random lengths [m], to the centimetre."""
+        return tuple(round(float(self.rng.uniform(*interval)), 2) for interval in intervals)
+
+    def _opened(self, name: str, own: Fixture) -> Iterator[Part]:
+        while True:
+            side, along = self._wall(1.0)
+            yield parts.opened(name, own, self.floor, side, along, self.settings.front)
+
+    def _table(self, name: str) -> Iterator[Part]:
+        while True:
+            depth, width, height = self._size((0.6, 0.9), (0.8, 1.6), (0.70, 0.78))
+            side, along = self._wall(width)
+            wall = self.floor.at_wall(side, along)
+            frame = Frame(*wall.point(-depth / 2.0 - parts.AIR, 0.0), wall.yaw)
+            frame = frame if self.rng.random() < 0.6 else self._anywhere(wall.yaw)
+            yield parts.table(name, frame, (depth, width, height))
+
+    def _shelf(self, name: str) -> Iterator[Part]:
+        while True:
+            depth, width, height = self._size((0.28, 0.4), (0.6, 1.2), (1.2, 2.0))
+            boards = int(self.rng.integers(4, 6))
+            yield parts.shelf(name, self.floor.at_wall(*self._wall(width)), (depth, width, height), boards)
+
+    def _box(self, name: str) -> Iterator[Part]:
+        colour = _COLOURS[int(self.rng.integers(len(_COLOURS)))]
+        while True:
+            size, yaw = self._size((0.25, 0.8), (0.25, 0.8), (0.3, 1.4)), round(float(self.rng.uniform(-math.pi, math.pi)), 3)
+            yield parts.box(name, self._anywhere(yaw), size, colour)
+
+    def _carried(self, kind: str, number: int, on: Part) -> Part:
+        """Return a free object on a table, near the side at which the robot can stand."""
+        depth, width, _ = on.size
+        count = len(self.settings.carried)
+        slot = (width - 2.0 * _EDGE) / count  # each has a part of the edge of its own
+        y = -width / 2.0 + _EDGE + slot * (number + float(self.rng.uniform(0.25, 0.75)))
+        x = -depth / 2.0 + float(self.rng.uniform(_EDGE, 0.3))
+        kinds = self.settings.carried
+        name = kind if kinds.count(kind) == 1 else f"{kind}_{kinds[: number + 1].count(kind)}"
+        return parts.carried(name, kind, on, x, y)
+
+
+def _turning_radius(robot: Robot) -> float:
+    """Return the radius of a disc about the base in which a robot with its arm at home turns with some air [m]."""
+    data, shapes = robot.model.createData(), robot.collision.createData()
+    rest = np.concatenate([np.zeros(3), robot.home])
+    pin.updateGeometryPlacements(robot.model, data, robot.collision, shapes, robot.coordinates.q(rest))
+    boxes = [world_box(shape.geometry, where) for shape, where in zip(robot.collision.geometryObjects, shapes.oMg, strict=True)]
+    reach = max(float(np.hypot(*np.maximum(np.abs(low[:2]), np.abs(high[:2])))) for low, high in boxes)
+    return reach + max(_TURNING, START_CLEARANCE)

@@ -1,0 +1,50 @@
+"""What keeps a motion from being faster: for every moment, the limit that it is nearest to."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.trajectory.dynamics.torques import Moments
+from vkc_pin.validation.report import Bound
+from vkc_pin.validation.samples import Samples
+
+__all__ = ["bounds"]
+
+_STILL = 1e-9  # of a limit
+_LEAST = 5e-3  # of the duration: less is not told of
+
+
+def bounds(samples: Samples, moments: Moments, torques: Floats, jerk_time: float) -> tuple[Bound, ...]:
+    """Return what bounds a motion and for how long, the longest first; nothing without a curve.
+
+    Args:
+        samples: The motion.
+        moments: When torques are known.
+        torques: As shares of their limits, shape (K, robot's).
+        jerk_time: See `Options.jerk_time`.
+    """
+    curve, names = samples.trajectory.curve, samples.trajectory.names
+    if curve is None:
+        return ()
+    limits = np.array([samples.bounds(name)[2:] for name in names]).T
+    shares = [rates / limit for rates, limit in zip(curve.speeds(), limits, strict=True)]
+    shares.append(jerk_time * curve.jerks()[0] / limits[1])
+    shares.append(np.zeros((len(curve.times) - 1, torques.shape[1])))
+    np.maximum.at(shares[-1], moments.pieces, torques)
+    every = np.hstack(shares)
+    labels = [(name, kind) for kind in ("velocity", "acceleration", "jerk") for name in names]
+    labels += [(name, "torque") for name in names[: torques.shape[1]]]
+    moving = (np.hstack(shares[:2]) > _STILL).any(axis=1)
+    nearest = np.where(moving, every.argmax(axis=1), len(labels))
+    spans, found = np.diff(curve.times), list[Bound]()
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(nearest)) + 1, [len(nearest)]])
+    for number in np.unique(nearest).tolist():
+        stretches = [(curve.times[a], curve.times[b]) for a, b in itertools.pairwise(edges) if nearest[a] == number]
+        begin, end = max(stretches, key=lambda stretch: float(stretch[1] - stretch[0]))
+        name, kind = (*labels, ("", "rest"))[number]
+        share = float(spans[nearest == number].sum() / spans.sum())
+        found.append(Bound(name, kind, share=share, begin=float(begin), end=float(end)))
+    return tuple(sorted((bound for bound in found if bound.share >= _LEAST), key=lambda bound: -bound.share))

@@ -1,0 +1,91 @@
+"""Torques of the arm along a motion, compared with what its motors have, and what bounds its duration."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from vkc_pin.utils.arrays import Floats, Ints
+from vkc_pin.world.trajectory.dynamics.torques import Moments, Torques, moments_of
+from vkc_pin.validation.dynamics.bounds import bounds
+from vkc_pin.validation.report import Violation
+from vkc_pin.validation.samples import Samples
+
+__all__ = ["TORQUE_TOLERANCE", "Motors"]
+
+TORQUE_TOLERANCE = 5e-3  # excess over a limit, relative to it: torques are looked at at three moments of every cubic
+
+
+class Motors:
+    """The motors along a motion: looked at at the ends and in the middle of every cubic, without a curve at every waypoint."""
+
+    def __init__(self, samples: Samples) -> None:
+        self.samples, self.trajectory = samples, samples.trajectory
+        self._torques = Torques(samples.scene, samples.trajectory, samples.free)
+
+    @cached_property
+    def moments(self) -> Moments:
+        """When it is looked at, and how it moves then."""
+        trajectory, curve = self.trajectory, self.trajectory.curve
+        if curve is not None:
+            return moments_of(curve)
+        speeds = np.pad(trajectory.velocities(), ((1, 1), (0, 0)))
+        pieces = np.minimum(np.arange(len(trajectory.times)), len(trajectory.times) - 2)
+        return Moments(
+            trajectory.times, pieces, trajectory.positions, 0.5 * (speeds[1:] + speeds[:-1]), trajectory.accelerations()
+        )
+
+    @cached_property
+    def waypoints(self) -> Ints:
+        """After which waypoint each moment is."""
+        edges = self.trajectory.times if self.trajectory.curve is None else self.trajectory.curve.times
+        before = np.searchsorted(self.trajectory.times, edges[:-1], side="right") - 1
+        return np.asarray(before[self.moments.pieces])
+
+    @cached_property
+    def torques(self) -> Floats:
+        """Torques of the robot's coordinates at every moment, shape (K, robot's) [N·m], [N]."""
+        return self._at(np.arange(len(self.moments.times)))
+
+    @cached_property
+    def shares(self) -> Floats:
+        """The same without sign, as shares of what the motors have, shape (K, robot's); 0 where that is not known."""
+        if not self._torques.efforts.known:
+            return np.zeros((len(self.moments.times), self.trajectory.robot_size))
+        return np.asarray(np.abs(self.torques) / self._torques.efforts.limits)
+
+    def _at(self, rows: Ints, speed: float = 1.0) -> Floats:
+        now, phases = self.moments, self._torques.phases_of(self.waypoints[rows])
+        return self._torques.at(phases, now.positions[rows], speed * now.velocities[rows], speed**2 * now.accelerations[rows])
+
+    def violations(self) -> list[Violation]:
+        """Return what is too heavy or too fast, the worst of each joint."""
+        found = list[Violation]()
+        for k in np.flatnonzero(self.shares.max(axis=0) > 1.0 + TORQUE_TOLERANCE).tolist():
+            row = int(np.argmax(self.shares[:, k]))
+            name, limit, torque = self.trajectory.names[k], float(self._torques.efforts.limits[k]), abs(self.torques[row, k])
+            unit = "N" if self.samples.unit(name) == "m" else "N·m"
+            rest = abs(float(self._at(np.array([row]), 1e-2)[0, k]))
+            why = f"{rest:.4g} {unit} however slow it is" if rest > limit else f"{rest:.4g} {unit} if it were slow"
+            found.append(
+                Violation(
+                    "torque",
+                    name,
+                    waypoint=int(self.waypoints[row]),
+                    time=float(self.moments.times[row]),
+                    amount=float(torque - limit),
+                    unit=unit,
+                    detail=f"{torque:.4g} {unit} are more than the {limit:.4g} {unit} of its motor, {why}",
+                )
+            )
+        return found
+
+    def facts(self, jerk_time: float = 0.0) -> dict[str, Any]:
+        """Return what a report says of it; `jerk_time` is that of `Options`."""
+        notes = [f"torques not checked: {note}" for note in self._torques.efforts.notes]
+        if self._torques.weightless:
+            notes.append(f"carried as if it weighed nothing, as no mass is stated: {', '.join(self._torques.weightless)}")
+        found = bounds(self.samples, self.moments, self.shares, jerk_time)
+        return {"torque": float(self.shares.max(initial=0.0)), "bounds": found, "remarks": tuple(notes)}

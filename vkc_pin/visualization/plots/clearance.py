@@ -1,0 +1,91 @@
+"""How close shapes come to each other over time, and which: for plots."""
+
+from __future__ import annotations
+
+from collections.abc import Set
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from vkc_pin.utils.arrays import Floats, Ints
+from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.world_model import World
+from vkc_pin.options import Options
+from vkc_pin.world.scene.contact_rules import grasped, touching
+from vkc_pin.world.scene.clearance_exemptions import allowances
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.validation.distances import Solids
+from vkc_pin.validation.pairs import PairTable
+
+__all__ = ["ClearanceCurve", "clearance_curves"]
+
+
+@dataclass(frozen=True, eq=False)
+class ClearanceCurve:
+    """The smallest distance of any of some pairs over time.
+
+    Attributes:
+        name: What the pairs have in common.
+        times: Shape (K,) [s].
+        distances: Signed, negative where they overlap, shape (K,) [m].
+        pairs: The closest pair at each time, by the names of its links or obstacles.
+    """
+
+    name: str
+    times: Floats
+    distances: Floats
+    pairs: tuple[tuple[str, str], ...]
+
+    def closest(self) -> tuple[float, float, str]:
+        """Return the smallest distance [m], when it is reached [s], and the pair as text."""
+        k = int(np.argmin(self.distances))
+        return float(self.distances[k]), float(self.times[k]), " – ".join(self.pairs[k])
+
+
+def clearance_curves(scene: Scene, trajectory: Trajectory, times: ArrayLike) -> list[ClearanceCurve]:
+    """Return how close shapes come along a motion, for each kind of pair that there is.
+
+    The kinds are the robot with itself, with articulated objects, with obstacles, objects with what stands around them,
+    and the gripper with what it grasps, which may touch.
+
+    Args:
+        scene: Where it happens.
+        trajectory: The motion.
+        times: When to look, shape (K,) [s].
+    """
+    world = World(scene)
+    solids = Solids(world)
+    table = PairTable(scene, solids, trajectory, 0.0)
+    silent = {
+        pair
+        for one in allowances(scene, Options().dist_safe)
+        for pair in one.shape_pairs(world.collision_labels, world.collision_keys)
+        if one.margin == -np.inf
+    }
+    moments = np.atleast_1d(np.asarray(times, float))
+    holds = {hold for phase in trajectory.phases for hold in phase.holds} | set(scene.holds)
+    gripped = {(link, grasped(scene, hold)) for hold in holds for link in touching(scene, hold)}
+    kinds = np.array([_kind(table, pair, gripped) for pair in table.pairs])
+    asked = np.array([(min(pair), max(pair)) not in silent for pair in table.pairs.tolist()], bool)
+    groups = {kind: table.pairs[(kinds == kind) & asked] for kind in _KINDS if ((kinds == kind) & asked).any()}
+    placed, curves = table.solids.at(world.coordinates.q(world.positions(trajectory, moments))), []
+    for kind, pairs in groups.items():
+        which, distances = placed.nearest(pairs)
+        names = tuple((world.collision_labels[i], world.collision_labels[j]) for i, j in pairs[which])
+        curves.append(ClearanceCurve(kind, moments, distances, names))
+    return curves
+
+
+_KINDS = ("robot – itself", "robot – objects", "robot – obstacles", "objects – surroundings", "gripper – what it grasps")
+
+
+def _kind(table: PairTable, pair: Ints, gripped: Set[tuple[str, str]]) -> str:
+    first, second = (table.group[int(i)] for i in pair)
+    one, other = (table.world.collision_labels[int(i)] for i in pair)
+    if first == "robot" and (one, other) in gripped:
+        return _KINDS[4]
+    if first != "robot" and second != "robot":
+        return _KINDS[3]
+    owner = second if first == "robot" else first
+    return {"robot": _KINDS[0], "": _KINDS[2]}.get(owner, _KINDS[1])

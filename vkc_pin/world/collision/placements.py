@@ -1,0 +1,47 @@
+"""Placements as twelve numbers: the columns of the rotation, then the translation [m]."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.collision.solids import compiled
+
+__all__ = ["ShapePlacements", "columns_of"]
+
+_NUMBERS = 12
+
+
+def columns_of(placements: Sequence[pin.SE3]) -> Floats:
+    """Return placements as numbers, shape (n, 12): the columns of each rotation, then the translation [m]."""
+    columns = np.empty((len(placements), _NUMBERS))
+    for row, placement in zip(columns, placements, strict=True):
+        row[:9], row[9:] = placement.rotation.T.ravel(), placement.translation
+    return columns
+
+
+class ShapePlacements:
+    """Where the shapes of a model are, at one configuration after the other: Pinocchio's kinematics, to the last bit.
+
+    Args:
+        model: The model.
+        geometry: The shapes on its joints, M of them.
+
+    Raises:
+        BuildError: See `solids.compiled`.
+    """
+
+    def __init__(self, model: pin.Model, geometry: pin.GeometryModel) -> None:
+        shapes, described = geometry.geometryObjects, pin.serialization.StreamBuffer()
+        model.saveToBinary(described)
+        content = bytes(described.view())  # as tobytes() does, which leaks a view at every call
+        joints = np.array([shape.parentJoint for shape in shapes], np.int64)
+        self.compiled: Any = compiled().Bodies(content, joints, columns_of([shape.placement for shape in shapes]))
+
+    def at(self, q: Floats) -> Floats:
+        """Return the placements in the world at Pinocchio's configurations, shape (W, nq): shape (W, M, 12), see `columns_of`."""
+        return np.asarray(self.compiled.placements(q), float)

@@ -1,0 +1,229 @@
+"""Grippers: the joints of the fingers, and where these stand when they are so far open.
+
+A hand is as far open as the widest bar is that fits between its fingers, see `bars`. All joints go from where they are
+closed to where they are open by the same share of their ways, as with one motor; joints that mimic others follow them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.utils import arguments
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.errors import InputError
+from vkc_pin.world.files.documents import Document
+from vkc_pin.world.files.urdf import UrdfFile
+from vkc_pin.world.models.coordinates import Coordinates
+from vkc_pin.world.models.couplings.coupled_joints import followers
+from vkc_pin.world.models.grippers.bar_width import EXACT, Placed, bar_fits, widest_bar
+from vkc_pin.world.models.robot_model import unlocked_model
+from vkc_pin.world.models.robot_schema import FingerSchema
+from vkc_pin.world.models.shapes import LIMIT_SLACK
+
+__all__ = ["Gripper", "described_gripper"]
+
+_HALVINGS = 30  # of the way between closed and open: 1e-9 of it
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Gripper:
+    """The fingers of a robot's hand.
+
+    Attributes:
+        model: The robot's model with the joints of the fingers, k of them, which come last, instead of locked ones.
+        names: Of these joints; those that mimic others are among them.
+        closed, open: Where they are when the gripper is closed and fully open, shape (k,), [m] or [rad].
+        rest: Where they are if nobody asks for an opening, shape (k,).
+        tool_frame: The robot's.
+        collision: The robot's collision shapes on `model`.
+    """
+
+    model: pin.Model
+    names: tuple[str, ...]
+    closed: Floats
+    open: Floats
+    rest: Floats
+    tool_frame: str
+    collision: pin.GeometryModel = field(repr=False)
+    _shares: dict[float, float] = field(default_factory=dict, repr=False)
+
+    @cached_property
+    def narrowest(self) -> float:
+        """Its opening when it is closed [m]."""
+        return widest_bar(self._hand(self.closed))
+
+    @cached_property
+    def widest(self) -> float:
+        """Its opening when it is fully open [m]."""
+        return widest_bar(self._hand(self.open))
+
+    @cached_property
+    def resting(self) -> float:
+        """Its opening if nobody asks for one [m]."""
+        return widest_bar(self._hand(self.rest))
+
+    def nearest(self, opening: float) -> float:
+        """Return the opening that it can stand at and is nearest to one that is asked for [m]."""
+        return min(max(opening, self.narrowest), self.widest)
+
+    def positions(self, opening: float | None) -> Floats:
+        """Return where the joints of its fingers are, shape (k,), [m] or [rad], when it is so far open [m]; None: at rest.
+
+        Raises:
+            InputError: It cannot be so far open, or that is no number.
+        """
+        if opening is None:
+            return self.rest
+        opening = arguments.number(opening, "opening", "between the fingers [m]")
+        if not self.narrowest - EXACT <= opening <= self.widest + EXACT:
+            expected = f"{self.narrowest:.4g} to {self.widest:.4g} m"
+            raise InputError("the gripper cannot be so far open", field="opening", expected=expected, got=f"{opening:g} m")
+        if opening not in self._shares:
+            self._shares[opening] = self._share(opening)
+        share = self._shares[opening]
+        return np.asarray((1.0 - share) * self.closed + share * self.open)
+
+    def frames(self, opening: float | None) -> dict[str, pin.SE3]:
+        """Return where the frames on its fingers are when it is so far open [m], by name, in the frame of the robot's joint."""
+        data, first = self._data(self.positions(opening)), self._first
+        found = {}
+        for frame in self.model.frames:
+            joint = frame.parentJoint
+            if joint >= first:
+                carrier = max(j for j in self.model.supports[joint] if j < first)
+                found[str(frame.name)] = data.oMi[carrier].actInv(data.oMi[joint]) * frame.placement
+        return found
+
+    def carried(self, shapes: Sequence[pin.GeometryObject], model: pin.Model) -> list[pin.GeometryObject]:
+        """Return shapes on the joints of `model`, the robot's, as shapes on those of this gripper's model."""
+        return _carried(shapes, model, self.model)
+
+    @property
+    def _first(self) -> int:
+        """The first joint of the fingers."""
+        return int(self.model.njoints - len(self.names))
+
+    def _data(self, fingers: Floats) -> pin.Data:
+        """Return where all is with the fingers at some positions, and all other joints at zero."""
+        data, coordinates = self.model.createData(), Coordinates(self.model)
+        z = np.append(np.zeros(coordinates.size - len(fingers)), fingers)
+        pin.framesForwardKinematics(self.model, data, coordinates.q(z))
+        return data
+
+    def _hand(self, fingers: Floats) -> list[Placed]:
+        """Return the shapes of fingers and palm in the tool frame, with the fingers at some positions."""
+        data, frame = self._data(fingers), self.model.getFrameId(self.tool_frame)
+        back, palm = data.oMf[frame].inverse(), self.model.frames[frame].parentJoint
+        shapes = [
+            shape for shape in self.collision.geometryObjects if shape.parentJoint == palm or shape.parentJoint >= self._first
+        ]
+        return [(shape.geometry, back * data.oMi[shape.parentJoint] * shape.placement) for shape in shapes]
+
+    def _share(self, opening: float) -> float:
+        """Return the least share of the way from closed to open at which a bar so wide fits."""
+        low, high = 0.0, 1.0
+        if opening <= self.narrowest or bar_fits(opening, self._hand(self.closed)):
+            return low
+        for _ in range(_HALVINGS):
+            middle = (low + high) / 2.0
+            fits = bar_fits(opening, self._hand((1.0 - middle) * self.closed + middle * self.open))
+            low, high = (low, middle) if fits else (middle, high)
+        return high
+
+
+def _carried(shapes: Sequence[pin.GeometryObject], model: pin.Model, unlocked: pin.Model) -> list[pin.GeometryObject]:
+    """Return shapes on the joints of `model` as shapes on those of `unlocked`, which begins with the same joints."""
+    found = []
+    for shape in shapes:
+        twin, old = pin.GeometryObject(shape), model.frames[shape.parentFrame]
+        twin.parentFrame = unlocked.getFrameId(old.name, pin.FrameType.BODY)
+        new = unlocked.frames[twin.parentFrame]
+        if new.parentJoint >= model.njoints:
+            twin.placement = new.placement * old.placement.actInv(shape.placement)
+        twin.parentJoint = new.parentJoint
+        found.append(twin)
+    return found
+
+
+def described_gripper(
+    full: pin.Model,
+    file: UrdfFile,
+    model: pin.Model,
+    collision: pin.GeometryModel,
+    tool_frame: str,
+    rest: Mapping[str, float],
+    stated: Mapping[str, FingerSchema],
+    document: Document,
+    *,
+    height: float,
+) -> Gripper | None:
+    """Return the gripper that a robot.yaml describes; None: it says nothing of one.
+
+    Args:
+        full: The robot with all its joints, see `robot_model.full_model`.
+        file: Its URDF.
+        model: The same with all joints locked but those that are planned.
+        collision: The robot's shapes on that.
+        tool_frame: Its frame that grasps.
+        rest: Where all joints are if nobody says otherwise, [m] or [rad].
+        stated: Joint of a finger → where it is closed and open; joints that the robot has.
+        document: The robot.yaml.
+        height: Of the root link above the floor [m].
+
+    Raises:
+        InputError: A joint is none of a finger: it is part of the arm, mimics another, cannot be where it is said to be, or does
+            not move; or there is no more room between the fingers where they are open than where they are closed.
+    """
+    if not stated:
+        return None
+    follows, palm = followers(file.root), list(full.supports[full.frames[full.getFrameId(tool_frame)].parentJoint])
+    arm = max(j for j in palm if full.names[j] in list(model.names))
+    for joint, finger in stated.items():
+        where = ("gripper", joint)
+        if joint in follows:
+            problem, leader = "this joint follows another one", follows[joint].leader
+            raise document.error(where, problem, expected=f"'{leader}', which it follows", got=joint)
+        number = full.getJointId(joint)
+        if number in palm or arm not in list(full.supports[number]):
+            expected = f"a joint of the hand, beyond '{full.names[arm]}'"
+            raise document.error(where, "this joint is none of a finger", expected=expected, got=joint)
+        moving = full.joints[number]
+        low, high = (-np.inf, np.inf)
+        if moving.nq == 1:
+            low, high = full.lowerPositionLimit[moving.idx_q], full.upperPositionLimit[moving.idx_q]
+        for key, value in (("closed", finger.closed), ("open", finger.open)):
+            if not low - LIMIT_SLACK <= value <= high + LIMIT_SLACK:
+                problem = "a finger outside its limits"
+                raise document.error((*where, key), problem, expected=f"between {low:g} and {high:g}", got=value)
+        if finger.closed == finger.open:
+            raise document.error(where, "a finger that does not move", expected="two positions, closed and open", got=finger.open)
+    moved = [name for name in rest if name in stated or (name in follows and follows[name].leader in stated)]
+    names = tuple(sorted(moved, key=full.getJointId))
+    unlocked, shapes = unlocked_model(full, file, model, names, rest, height), pin.GeometryModel()
+    for shape in _carried(list(collision.geometryObjects), model, unlocked):
+        shapes.addGeometryObject(shape)
+
+    def at(position: str) -> Floats:
+        own = {joint: float(getattr(finger, position)) for joint, finger in stated.items()}
+        own |= {name: led.factor * own[led.leader] + led.offset for name, led in follows.items() if led.leader in own}
+        return np.array([own[name] for name in names])
+
+    gripper = Gripper(
+        model=unlocked,
+        names=names,
+        closed=at("closed"),
+        open=at("open"),
+        rest=np.array([rest[name] for name in names]),
+        tool_frame=tool_frame,
+        collision=shapes,
+    )
+    if not gripper.widest > gripper.narrowest:
+        expected = f"more room where it is open than where it is closed, around the frame '{tool_frame}' and along its x axis"
+        got = f"{1e3 * gripper.narrowest:.1f} mm closed, {1e3 * gripper.widest:.1f} mm open"
+        raise document.error(("gripper",), "the gripper does not open", expected=expected, got=got)
+    return gripper

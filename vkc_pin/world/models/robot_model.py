@@ -1,0 +1,299 @@
+"""Builds the Pinocchio model of a robot: planar base, the joints up to the tool, all else locked; and its shapes."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Set
+
+import coal
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.errors import InputError
+from vkc_pin.world.files.meshes import load_parts, to_bvh
+from vkc_pin.world.files.urdf import UrdfFile, UrdfShape, tree_model
+from vkc_pin.world.models.couplings.coupled_joints import Following, coupled_groups, followers, path_to
+from vkc_pin.world.models.couplings.mimic_joints import in_order, with_mimics
+from vkc_pin.world.models.grafting import add_joint, clean
+
+__all__ = [
+    "collision_geometry",
+    "default_tool_frame",
+    "full_model",
+    "nearest_position",
+    "neighbours",
+    "own_base",
+    "planned_model",
+    "rest_positions",
+    "unlocked_model",
+    "visual_geometry",
+]
+
+ROOT = "base"  # the name of the planar joint
+_ROUNDING = 1e-9  # [m] and of a rotation: URDFs write quarter turns with nine digits; exact ones make lean expressions
+_LEVEL = 1e-3  # sine of the angle up to which axes count as level or upright
+_FINGER = 7  # joints in the longest finger of a hand
+_ARM = 4  # joints, at least, that carry a hand
+_DETAIL = 0.0015  # of displayed meshes, [m]
+_GREY = (0.6, 0.6, 0.62, 1.0)
+
+
+def full_model(file: UrdfFile) -> pin.Model:
+    """Return the model of all joints of `file` on a planar joint.
+
+    Raises:
+        InputError: It is no valid URDF.
+    """
+    return tree_model(file, pin.JointModelPlanar(), ROOT)
+
+
+def planned_model(
+    full: pin.Model,
+    file: UrdfFile,
+    tool_frame: str,
+    rest: Mapping[str, float],
+    locked: Mapping[str, float],
+    *,
+    height: float = 0.0,
+) -> pin.Model:
+    """Return `full` with all joints locked but those between the base and `tool_frame`, and those that move with them.
+
+    Joints that follow others are `pinocchio.JointModelMimic`: the model has no coordinate of theirs.
+
+    Args:
+        full: See `full_model`.
+        file: Its file.
+        tool_frame: A frame of it.
+        rest: Where each joint is locked, [m] or [rad]; see `rest_positions`.
+        locked: Joints to lock though they are among these, and where.
+        height: Of the root link above the base's joint, which moves on the floor [m].
+
+    Raises:
+        InputError: No joint is left, or one is locked that follows one that is not.
+    """
+    follows, groups = followers(file.root), coupled_groups(full, file, tool_frame)
+    groups = {leader: group for leader, group in groups.items() if leader not in locked}
+    if stuck := [(joint, led.leader) for group in groups.values() for joint, led in group.items() if joint in locked]:
+        problem, (joint, leader), expected = "a locked joint follows one that moves", stuck[0], "the joint locked that it follows"
+        raise InputError(problem, file=file.path, field=f"locked_joints.{joint}", expected=expected, got=f"'{leader}' moves")
+    alone = {str(full.names[j]) for j in path_to(full, tool_frame) if j > 1} - {*locked, *follows}
+    moving = alone.union(groups, *groups.values())
+    planned = [j for j in range(2, full.njoints) if full.names[j] in moving and full.names[j] in rest]
+    if not planned:
+        expected = "a frame at the end of an arm"
+        raise InputError("no joint moves this frame", file=file.path, field="tool_frame", expected=expected, got=tool_frame)
+    return _reduced(full, {1, *planned}, configuration(full, {**rest, **locked}), height, follows)
+
+
+def unlocked_model(
+    full: pin.Model, file: UrdfFile, model: pin.Model, joints: Collection[str], rest: Mapping[str, float], height: float
+) -> pin.Model:
+    """Return `model`, which `planned_model` made of `full`, with more `joints` that are not locked, all of them after its own.
+
+    Args:
+        full: See `full_model`.
+        file: Its file.
+        model: The planned joints.
+        joints: The others, each of which moves on its own.
+        rest: Where the rest is locked, [m] or [rad].
+        height: As for `planned_model` [m].
+    """
+    own, last = ([full.getJointId(str(name)) for name in names] for names in (list(model.names)[1:], joints))
+    follows = {joint: led for joint, led in followers(file.root).items() if joint not in joints}
+    return _reduced(full, {*own, *last}, configuration(full, rest), height, follows, last)
+
+
+def rest_positions(full: pin.Model, file: UrdfFile, given: Mapping[str, float]) -> dict[str, float]:
+    """Return for each joint of 1 degree of freedom where it rests, [m] or [rad].
+
+    That is what `given` says, else where the joint that it follows has it, else 0, or the middle of limits without 0.
+    """
+    rest = {}
+    for j in range(2, full.njoints):
+        if full.joints[j].nv == 1:
+            i = full.joints[j].idx_q
+            low, high = (-np.inf, np.inf) if full.joints[j].nq == 2 else (full.lowerPositionLimit[i], full.upperPositionLimit[i])
+            rest[full.names[j]] = float(given.get(full.names[j], 0.0 if low <= 0.0 <= high else 0.5 * (low + high)))
+    for name, led in followers(file.root).items():
+        if name in rest and led.leader in rest and name not in given:
+            rest[name] = led.factor * rest[led.leader] + led.offset
+    return rest
+
+
+def nearest_position(model: pin.Model, joint: str, position: float) -> float:
+    """Return `position` [m] or [rad] of a joint, turned by 2π or else moved to the nearest limit if it lies outside."""
+    moving = model.joints[model.getJointId(joint)]
+    if moving.nq == 2:
+        return position
+    low, high = model.lowerPositionLimit[moving.idx_q], model.upperPositionLimit[moving.idx_q]
+    turns = () if "JointModelP" in moving.shortname() else (2.0 * np.pi, -2.0 * np.pi)
+    for turn in (0.0, *turns):
+        if low <= position + turn <= high:
+            return float(position + turn)
+    return float(np.clip(position, low, high))
+
+
+def neighbours(file: UrdfFile, links: Collection[str]) -> tuple[Set[tuple[str, str]], Set[tuple[str, str]]]:
+    """Return two sets of pairs of `links`, each sorted.
+
+    The first has those that one joint connects, or only links that are not among them; the second those that one joint connects
+    that moves, and links that are fixed to either.
+    """
+    parents = dict[str, tuple[str, str]]()
+    for joint in file.root.findall("joint"):
+        parent, child = joint.find("parent"), joint.find("child")
+        if parent is not None and child is not None:
+            parents[child.get("link", "")] = (parent.get("link", ""), joint.get("type", ""))
+    joined, body, above = set[tuple[str, str]](), dict[str, str](), dict[str, str]()
+    for link in links:
+        up, _ = parents.get(link, ("", ""))
+        while up and up not in links:
+            up, _ = parents.get(up, ("", ""))
+        if up:
+            joined.add((min(link, up), max(link, up)))
+        body[link] = _rigid(link, parents)
+        above[link] = _rigid(parents[body[link]][0], parents) if body[link] in parents else ""
+    return joined, {(min(a, b), max(a, b)) for a in links for b in links if above[a] == body[b]}
+
+
+def _rigid(link: str, parents: Mapping[str, tuple[str, str]]) -> str:
+    """Return the uppermost of the links that a link is fixed to."""
+    while link in parents and parents[link][1] == "fixed":
+        link, _ = parents[link]
+    return link
+
+
+def own_base(full: pin.Model, file: UrdfFile) -> tuple[str, ...]:
+    """Return the joints that move a robot in the plane on their own, or none: then its URDF has a base that drives, too.
+
+    They are the first three, one after the other: two that slide along the floor, in different directions, and one that turns
+    about the vertical, in any order. Nothing that could collide is in front of the last.
+    """
+    data, slides, found, joint = full.createData(), list[Floats](), list[str](), 1
+    pin.computeJointJacobians(full, data, pin.neutral(full))
+    solid = {shape.link for shape in file.shapes("collision")}
+    carries = {frame.parentJoint for frame in full.frames if frame.type == pin.FrameType.BODY and frame.name in solid}
+    while len(found) < 3:
+        after = [j for j in range(2, full.njoints) if full.parents[j] == joint]
+        if joint in carries or len(after) != 1 or full.joints[after[0]].nv != 1:
+            return ()
+        (joint,) = after
+        twist = pin.getJointJacobian(full, data, joint, pin.LOCAL_WORLD_ALIGNED)[:, full.joints[joint].idx_v]
+        if np.abs(twist[3:]).max() < _LEVEL and abs(twist[2]) < _LEVEL:
+            slides.append(twist[:2])
+        elif abs(twist[5]) < 1.0 - _LEVEL:
+            return ()
+        found.append(full.names[joint])
+    crossing = len(slides) == 2 and abs(slides[0][0] * slides[1][1] - slides[0][1] * slides[1][0]) > _LEVEL
+    return tuple(found) if crossing else ()
+
+
+def configuration(model: pin.Model, positions: Mapping[str, float]) -> Floats:
+    """Return the configuration, shape (nq,), with joints at `positions`; those not named are neutral."""
+    q: Floats = pin.neutral(model)
+    for j in range(1, model.njoints):
+        joint, value = model.joints[j], positions.get(model.names[j])
+        if value is not None and joint.nv == 1:
+            q[joint.idx_q : joint.idx_q + joint.nq] = value if joint.nq == 1 else (np.cos(value), np.sin(value))
+    return q
+
+
+def default_tool_frame(full: pin.Model, file: UrdfFile) -> str:
+    """Return the last frame of the longest chain of joints, before it branches into fingers."""
+    follows = followers(file.root)
+    children: dict[int, list[int]] = {j: [] for j in range(full.njoints)}
+    depth = np.zeros(full.njoints, int)
+    for j in range(full.njoints - 1, 1, -1):
+        children[full.parents[j]].insert(0, j)
+        counts = full.joints[j].nv == 1 and full.names[j] not in follows
+        depth[full.parents[j]] = max(depth[full.parents[j]], depth[j] + counts)
+    joint, above = 1, 0
+    while children[joint]:
+        hand = len(children[joint]) > 1 and depth[joint] <= _FINGER
+        if hand and above >= _ARM:
+            break
+        joint, above = max(children[joint], key=lambda j: depth[j] + (full.joints[j].nv == 1)), above + 1
+    return str([frame.name for frame in full.frames if frame.parentJoint == joint and frame.name != full.names[joint]][-1])
+
+
+def collision_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
+    """Return the collision shapes of `file` on the joints of `model`, named `<link>_<k>`, meshes as their convex hulls.
+
+    Raises:
+        InputError: A shape is not understood, a mesh cannot be read or is flat, or there is no shape.
+    """
+    geometry = pin.GeometryModel()
+    for shape in file.few_shapes("collision"):
+        geometry.addGeometryObject(_geometry_object(model, shape, shape.name, shape.solid(), _GREY))
+    if len(geometry.geometryObjects) == 0:
+        raise InputError("nothing of this robot can collide", file=file.path, expected="<collision> elements", got="none")
+    return geometry
+
+
+def visual_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
+    """Return what `file` looks like on the joints of `model`: one shape per colour, light enough for a web page.
+
+    The shapes hold triangles (`coal.BVHModelOBBRSS`) and `meshColor`; `meshPath` is empty, so that viewers draw what is
+    here and load no file themselves.
+
+    Raises:
+        InputError: A shape is not understood, or a mesh cannot be read.
+    """
+    geometry = pin.GeometryModel()
+    for shape in file.few_shapes("visual"):
+        if shape.file is None:
+            geometry.addGeometryObject(_geometry_object(model, shape, shape.name, shape.solid(), shape.colour or _GREY))
+            continue
+        parts = load_parts(shape.file, shape.size, detail=_DETAIL)
+        for k, part in enumerate(parts):
+            name = shape.name if len(parts) == 1 else f"{shape.name}_{k}"
+            colour = shape.colour or part.colour or _GREY
+            geometry.addGeometryObject(_geometry_object(model, shape, name, to_bvh(part), colour))
+    return geometry
+
+
+def _reduced(
+    full: pin.Model,
+    planned: Collection[int],
+    q: Floats,
+    height: float,
+    follows: Mapping[str, Following],
+    last: Collection[int] = (),
+) -> pin.Model:
+    """Return `full` with the joints that are not `planned` locked at `q`, and all on joint 1 higher by `height`.
+
+    `pinocchio.buildReducedModel` refuses models in which a link is called like a joint, as many are. Here, the frame of
+    such a joint is left out, so that every frame's name is the only one. Joints come after those they follow, `last` ones last.
+    """
+    data = full.createData()
+    pin.forwardKinematics(full, data, q)
+    model = pin.Model()
+    model.name = full.name
+    placed = {0: (0, pin.SE3.Identity())}
+    coupled = {j: led for j in sorted(planned) if (led := follows.get(full.names[j])) and full.getJointId(led.leader) in planned}
+    before = {j: {full.getJointId(led.leader)} for j, led in coupled.items()} | {j: {*planned} - {*last} for j in last}
+    for j in in_order(full, before):
+        joint, (parent, placement) = full.joints[j], placed[full.parents[j]]
+        if j in planned:
+            index = add_joint(model, parent, joint, clean(placement * full.jointPlacements[j], _ROUNDING), like=(full, j))
+            placed[j] = (index, pin.SE3(np.eye(3), np.array([0.0, 0.0, height if j == 1 else 0.0])))
+        else:
+            placed[j] = (parent, placement * data.liMi[j])
+        model.appendBodyToJoint(placed[j][0], full.inertias[j], placed[j][1])
+    links = {frame.name for frame in full.frames if frame.type == pin.FrameType.BODY}
+    for frame in full.frames[1:]:
+        if frame.type == pin.FrameType.BODY or frame.name not in links:
+            parent, placement = placed[frame.parentJoint]
+            model.addFrame(pin.Frame(frame.name, parent, 0, clean(placement * frame.placement), frame.type))
+    return with_mimics(model, [coupled[j] for j in coupled], [placed[j][0] for j in coupled])
+
+
+def _geometry_object(
+    model: pin.Model, shape: UrdfShape, name: str, solid: coal.CollisionGeometry, colour: tuple[float, ...]
+) -> pin.GeometryObject:
+    """Return `solid` as the geometry of an element of the URDF, on the joint of its link."""
+    frame = model.getFrameId(shape.link, pin.FrameType.BODY)
+    parent = model.frames[frame]
+    added = pin.GeometryObject(name, parent.parentJoint, frame, clean(parent.placement * shape.placement), solid)
+    added.meshColor = np.array(colour)
+    return added

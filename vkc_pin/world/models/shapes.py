@@ -1,0 +1,259 @@
+"""Collision shapes: their names, surfaces, boxes, and the distances between them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+import coal
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from vkc_pin.utils.arrays import Bools, Floats, Ints
+from vkc_pin.errors import InputError
+from vkc_pin.world.files.meshes import indices
+from vkc_pin.world.models.grafting import clean
+
+__all__ = [
+    "LIMIT_SLACK",
+    "LinkDistances",
+    "ShapeDistances",
+    "bounding_box",
+    "clearance",
+    "copy_shape",
+    "link_name",
+    "own_name",
+    "placed_shapes",
+    "shape_distance",
+    "triangles",
+    "within_limits",
+    "world_box",
+]
+
+LIMIT_SLACK = 1e-6
+"""Joint values up to this far outside their limits, [rad] or [m], count as rounding and are moved to the limit."""
+_SEGMENTS = 28  # of a circle
+
+
+def within_limits(value: float, lower: float, upper: float, field: str | None) -> float:
+    """Return `value`, moved to the limit if it is outside by rounding only. Raises `InputError` if it is further out."""
+    if not np.isfinite(value):
+        raise InputError("not a finite number", field=field, expected="a finite number", got=value)
+    if not lower - LIMIT_SLACK <= value <= upper + LIMIT_SLACK:
+        raise InputError("outside the joint's limits", field=field, expected=f"{lower:g} to {upper:g}", got=f"{value:g}")
+    return float(min(max(value, lower), upper))
+
+
+def copy_shape(shape: pin.GeometryObject, name: str, placement: pin.SE3) -> pin.GeometryObject:
+    """Return a copy of `shape` that stands still at `placement` in the world frame."""
+    copy = pin.GeometryObject(shape)
+    copy.name, copy.parentJoint, copy.parentFrame, copy.placement = name, 0, 0, clean(placement)
+    return copy
+
+
+def link_name(shape_name: str) -> str:
+    """Return the name of the link that a shape belongs to: Pinocchio calls its shapes `<link>_<number>`."""
+    return shape_name.rpartition("_")[0]
+
+
+def own_name(shape_name: str) -> str:
+    """Return the name in its object of a shape that is called `<object>.<own name>`."""
+    return shape_name.partition(".")[2]
+
+
+def placed_shapes(shapes: Iterable[pin.GeometryObject]) -> list[tuple[coal.CollisionGeometry, pin.SE3]]:
+    """Return (shape, placement) for shapes that stand in the world, for `clearance`."""
+    return [(shape.geometry, shape.placement) for shape in shapes]
+
+
+def clearance(
+    first: Iterable[tuple[coal.CollisionGeometry, pin.SE3]],
+    second: Iterable[tuple[coal.CollisionGeometry, pin.SE3]],
+    *,
+    reach: float = np.inf,
+) -> float:
+    """Return the smallest signed distance [m] between two groups of shapes with their placements in the world frame.
+
+    Args:
+        first: One group; a negative distance is a penetration depth.
+        second: The other group.
+        reach: Distances above this do not matter [m]: the result is then some number ≥ `reach`.
+    """
+    nearest, others = reach, list(second)
+    boxes = np.array([world_box(shape, placement) for shape, placement in others]).reshape(-1, 2, 3)
+    for shape, placement in first:
+        low, high = world_box(shape, placement)
+        # Moved apart by as much as their boxes overlap, shapes are separate: a bound also where it is negative.
+        gaps = np.maximum(boxes[:, 0] - high, low - boxes[:, 1]).max(axis=1)
+        for k in np.argsort(gaps, kind="stable").tolist():
+            if gaps[k] >= nearest:
+                break
+            nearest = min(nearest, shape_distance(shape, placement, *others[k]))
+    return nearest
+
+
+def shape_distance(
+    first: coal.CollisionGeometry, first_placement: pin.SE3, second: coal.CollisionGeometry, second_placement: pin.SE3
+) -> float:
+    """Return the signed distance [m] between two shapes, each at its placement in a common frame; negative: they overlap."""
+    a, b = (coal.Transform3s(where.rotation, where.translation) for where in (first_placement, second_placement))
+    return float(coal.distance(first, a, second, b, coal.DistanceRequest(), coal.DistanceResult()))
+
+
+def triangles(shape: coal.CollisionGeometry) -> tuple[Floats, NDArray[np.int64]]:
+    """Return the surface of a coal shape in its own frame: vertices, shape (n, 3) [m], and faces, shape (m, 3).
+
+    Raises:
+        InputError: The shape has no surface of finite size (a plane or half-space).
+    """
+    import trimesh.creation as make
+
+    if isinstance(shape, coal.Box):
+        mesh = make.box(extents=2.0 * np.asarray(shape.halfSide))
+    elif isinstance(shape, coal.Sphere):
+        mesh = make.uv_sphere(radius=shape.radius, count=(_SEGMENTS // 2, _SEGMENTS))
+    elif isinstance(shape, coal.Ellipsoid):
+        mesh = make.uv_sphere(radius=1.0, count=(_SEGMENTS // 2, _SEGMENTS))
+        mesh.apply_transform(np.diag([*np.asarray(shape.radii), 1.0]))
+    elif isinstance(shape, coal.Cylinder):
+        mesh = make.cylinder(radius=shape.radius, height=2.0 * shape.halfLength, sections=_SEGMENTS)
+    elif isinstance(shape, coal.Cone):
+        mesh = make.cone(radius=shape.radius, height=2.0 * shape.halfLength, sections=_SEGMENTS)
+        mesh.apply_translation([0.0, 0.0, -shape.halfLength])
+    elif isinstance(shape, coal.Capsule):
+        length = 2.0 * shape.halfLength
+        mesh = make.capsule(height=length, radius=shape.radius, count=(_SEGMENTS, _SEGMENTS))
+        mesh.apply_translation([0.0, 0.0, -(mesh.bounds[0, 2] + mesh.bounds[1, 2]) / 2.0])
+    elif isinstance(shape, coal.BVHModelBase | coal.Convex):
+        points = shape.points() if isinstance(shape, coal.Convex) else shape.vertices()
+        return np.array(points, float), indices(shape)
+    else:
+        raise InputError("this shape cannot be drawn", expected="a solid or a mesh", got=type(shape).__name__)
+    return np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
+
+
+def bounding_box(shape: pin.GeometryObject) -> tuple[Floats, Floats]:
+    """Return centre and half extents of a shape's bounding box in its own frame."""
+    shape.geometry.computeLocalAABB()
+    return np.asarray(shape.geometry.aabb_local.center(), float), _half_extents(shape.geometry)
+
+
+def world_box(shape: coal.CollisionGeometry, placement: pin.SE3) -> tuple[Floats, Floats]:
+    """Return the lower and upper corner, shape (3,) each [m], of a box along the world's axes around a shape."""
+    shape.computeLocalAABB()
+    centre = placement.act(np.asarray(shape.aabb_local.center(), float))
+    extent = np.abs(placement.rotation) @ _half_extents(shape)
+    return centre - extent, centre + extent
+
+
+class ShapeDistances:
+    """Distances of shapes on a model at one configuration after the other, by coal.
+
+    Args:
+        model: What moves them.
+        configuration: Minimal coordinates, shape (n,) → Pinocchio's configuration, shape (nq,).
+        shapes: The shapes.
+    """
+
+    def __init__(self, model: pin.Model, configuration: Callable[[Floats], Floats], shapes: Sequence[pin.GeometryObject]) -> None:
+        self._model, self._configuration, self._data = model, configuration, model.createData()
+        self._solids = [shape.geometry for shape in shapes]
+        self._joints = np.array([shape.parentJoint for shape in shapes])
+        self._locals = [shape.placement for shape in shapes]
+        for solid in self._solids:
+            solid.computeLocalAABB()
+        self._radii = np.array([solid.aabb_radius for solid in self._solids])
+        self._middles = np.array([place.act(solid.aabb_center) for place, solid in zip(self._locals, self._solids, strict=True)])
+        self._turns = np.array([place.rotation for place in self._locals])
+        self._halves = np.array([_half_extents(solid) for solid in self._solids])
+        self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
+
+    def place(self, z: Floats) -> None:
+        """Put the model at coordinates `z`, shape (n,)."""
+        pin.forwardKinematics(self._model, self._data, self._configuration(z))
+        rotations = np.array([place.rotation for place in self._data.oMi])[self._joints]
+        positions = np.array([place.translation for place in self._data.oMi])[self._joints]
+        self._centres = np.einsum("kij,kj->ki", rotations, self._middles) + positions
+        self._verticals = rotations[:, 2]
+        self._places: dict[int, coal.Transform3s] = {}
+
+    def lowest(self) -> Floats:
+        """Return the height of the lowest point of the box around each shape [m], shape (shapes,)."""
+        across = np.abs(np.einsum("kj,kji->ki", self._verticals, self._turns))
+        return np.asarray(self._centres[:, 2] - np.einsum("ki,ki->k", across, self._halves))
+
+    def bounds(self, pairs: Ints) -> Floats:
+        """Return lower bounds of the distances of pairs of shapes, shape (pairs, 2): those of balls around them [m]."""
+        first, second = pairs[:, 0], pairs[:, 1]
+        gaps = self._centres[first] - self._centres[second]
+        return np.asarray(np.sqrt(np.einsum("ki,ki->k", gaps, gaps)) - self._radii[first] - self._radii[second])
+
+    def between(self, parts: Iterable[tuple[int, int]], worth: float = np.inf) -> float:
+        """Return the smallest distance [m] of pairs of shapes; a lower bound of it where it is larger than `worth`."""
+        smallest = np.inf
+        for first, second in parts:
+            gap = self._centres[first] - self._centres[second]
+            bound = float(np.sqrt(gap @ gap) - self._radii[first] - self._radii[second])
+            if bound <= min(smallest, worth):
+                self._result.clear()
+                one, other = ((self._solids[shape], self._place(shape)) for shape in (first, second))
+                bound = coal.distance(*one, *other, self._request, self._result)
+            smallest = min(smallest, float(bound))
+        return smallest
+
+    def _place(self, shape: int) -> coal.Transform3s:
+        if shape not in self._places:
+            place = self._data.oMi[int(self._joints[shape])] * self._locals[shape]
+            self._places[shape] = coal.Transform3s(place.rotation, place.translation)
+        return self._places[shape]
+
+
+class LinkDistances:
+    """Distances of pairs of links, each by the pairs of their shapes, at one configuration after the other.
+
+    Most pairs of links are far apart in most configurations; balls around the shapes say so for all of them at once.
+
+    Args:
+        distances: Of the shapes.
+        groups: Pair of links → pairs of their shapes.
+
+    Attributes:
+        links: The pairs of links that are looked at, in the order in which they were given.
+    """
+
+    links: list[tuple[str, str]]
+
+    def __init__(self, distances: ShapeDistances, groups: Mapping[tuple[str, str], Sequence[tuple[int, int]]]) -> None:
+        self._distances, self._groups = distances, {links: np.array(parts, np.int64) for links, parts in groups.items()}
+        self._gather()
+
+    def keep(self, chosen: Sequence[bool] | Bools) -> None:
+        """Look only at some of the pairs of links from now on: those `chosen`, shape (links,)."""
+        if not all(chosen):
+            self._groups = {links: parts for (links, parts), keep in zip(self._groups.items(), chosen, strict=True) if keep}
+            self._gather()
+
+    def bounds(self) -> Floats:
+        """Return lower bounds of the distances of all pairs of links where the model is placed [m], shape (links,)."""
+        if not self._groups:
+            return np.zeros(0)
+        self._found = self._distances.bounds(self._pairs)
+        return np.asarray(np.minimum.reduceat(self._found, self._starts))
+
+    def between(self, number: int, worth: float) -> float:
+        """Return the distance of pair of links `number` [m], or some number above `worth`; after `bounds`."""
+        start, end = self._starts[number], self._ends[number]
+        close = self._pairs[start:end][self._found[start:end] <= worth]
+        return self._distances.between(map(tuple, close.tolist()), worth)
+
+    def _gather(self) -> None:
+        self.links = list(self._groups)
+        counts = np.array([len(parts) for parts in self._groups.values()], np.int64)
+        self._ends = np.cumsum(counts)
+        self._starts = self._ends - counts
+        self._pairs = np.vstack([np.zeros((0, 2), np.int64), *self._groups.values()])
+
+
+def _half_extents(solid: coal.CollisionGeometry) -> Floats:
+    box = solid.aabb_local
+    return np.array([box.width(), box.height(), box.depth()]) / 2

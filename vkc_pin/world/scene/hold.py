@@ -1,0 +1,246 @@
+"""Holds: what is held, where and through what, whether that fits the objects, from which side, and where it puts them."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import product
+from types import MappingProxyType
+
+import coal
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.utils.arguments import instance, items, mapping, numbers, text
+from vkc_pin.errors import InputError, UnknownNameError, shown
+from vkc_pin.world.models.robot import Robot
+from vkc_pin.world.models.shapes import clearance, placed_shapes, within_limits
+from vkc_pin.world.scene.placed_object import PlacedObject, standing_geometry
+
+__all__ = ["Hold", "Solids", "checked_holds", "holds_of", "in_hand", "in_order", "misdirected", "warn_of_openings"]
+
+Solids = Sequence[tuple[coal.CollisionGeometry, pin.SE3]]
+"""Shapes, each with where it is."""
+
+_DEEP = 0.01  # [m] of a hand in an object, or in the floor, that is no matter of how far it is open
+_ROUNDING = 2e-4  # [m] of an opening, which is measured less exactly than it is written
+_WAY = (0.0, 0.04, 0.08)  # [m] before the grasp where a hand is looked at
+MOST_HELD = 50
+"""So many things may be held at once: they are followed one through the other."""
+
+
+@dataclass(frozen=True)
+class Hold:
+    """One object held at one of its attachments, by the robot's tool or through another object that is held.
+
+    Two holds are the same if what is held, where and through what is the same, whatever values `at` has.
+
+    Attributes:
+        object: Its name in the scene.
+        attachment: Where it is held.
+        by: The hold of the object that it is held through (a stick); None: the robot's tool holds it.
+        link: The link of that object which takes the place of the tool frame.
+        at: Values of the attachment's freedoms at the start of a scene that has this hold, [m] and [rad]; empty elsewhere.
+    """
+
+    object: str
+    attachment: str
+    by: Hold | None = None
+    link: str | None = None
+    at: tuple[float, ...] = field(default=(), compare=False)
+
+    def __post_init__(self) -> None:
+        for name in ("object", "attachment", "link"):
+            if name != "link" or self.link is not None:
+                text(getattr(self, name), f"Hold.{name}", "a name")
+        if self.by is not None:
+            instance(self.by, Hold, "Hold.by")
+        object.__setattr__(self, "at", tuple(numbers(self.at, "Hold.at", "a list of numbers").ravel().tolist()))
+
+    @property
+    def frame(self) -> str | None:
+        """The frame that holds it, "<object>.<link>"; None is the tool frame."""
+        return f"{self.by.object}.{self.link}" if self.by else None
+
+    def __str__(self) -> str:
+        return f"{self.object}.{self.attachment}" + (f" by {self.frame}" if self.by else "")
+
+
+def holds_of(
+    held: Mapping[str, str], by: Mapping[str, str] | None = None, at: Mapping[str, Sequence[float]] | None = None
+) -> tuple[Hold, ...]:
+    """Return the holds that mappings describe, as files do, each after the one it depends on.
+
+    Args:
+        held: Object → attachment.
+        by: Object → "<object>.<link>", for what is not held by the tool itself.
+        at: Object → values of its attachment's freedoms, [m] and [rad].
+
+    Raises:
+        UnknownNameError: `by` or `at` name an object that is not held.
+        InputError: Objects hold each other in a circle, `by` is not of that form, or more is held than anybody can.
+    """
+    held = mapping(held, "held", "object names, each with that of an attachment")
+    by, at = mapping({} if by is None else by, "by"), mapping({} if at is None else at, "at")
+    if len(held) > MOST_HELD:
+        raise InputError("too many things are held", field="held", expected=f"at most {MOST_HELD}", got=len(held))
+    for field_name, names in (("by", by), ("at", at)):
+        for name in names:
+            if name not in held:
+                raise UnknownNameError("held object", name, held, field=field_name)
+    found: dict[str, Hold] = {}
+
+    def find(name: str, above: tuple[str, ...]) -> Hold:
+        if name in above:
+            raise InputError("objects hold each other in a circle", field="by", got=", ".join(sorted(above)))
+        if name not in found:
+            holder, link = None, None
+            if name in by:
+                expected = "<object>.<link>, e.g. stick.tip"
+                owner, _, link = by[name].partition(".") if isinstance(by[name], str) else ("", "", "")
+                if not link:
+                    raise InputError("not a link of an object", field="by", expected=expected, got=shown(by[name]))
+                if owner not in held:
+                    raise UnknownNameError("held object", owner, held, field="by")
+                holder = find(owner, (*above, name))
+            found[name] = Hold(name, held[name], holder, link, at.get(name, ()))
+        return found[name]
+
+    for name in held:
+        find(name, ())
+    return tuple(found.values())
+
+
+def in_order(holds: Iterable[Hold]) -> tuple[Hold, ...]:
+    """Return holds as they are, if each comes after the one it depends on. Raises `InputError` if one does not."""
+    holds = items(holds, "holds", "a list of Hold", Hold)
+    for number, hold in enumerate(holds):
+        if hold.by not in (None, *holds[:number]):
+            raise InputError("held through what is not held before it", field="holds", got=str(hold))
+    return holds
+
+
+def checked_holds(objects: Mapping[str, PlacedObject], holds: Iterable[Hold]) -> tuple[Hold, ...]:
+    """Return holds that fit the objects, with the values of all freedoms: zero where nothing is said; see `Scene.with_held`.
+
+    Raises:
+        UnknownNameError: There is no such object, attachment or link.
+        InputError: Values that do not fit the attachment's freedoms, or one is held through what cannot hold it.
+    """
+    found: dict[Hold, Hold] = {}
+    for hold in in_order(holds):
+        if hold.object not in objects:
+            raise UnknownNameError("object", hold.object, objects, field="held")
+        where, freedoms = f"held.{hold.object}.at", objects[hold.object].object.attachment(hold.attachment).freedoms
+        values = hold.at or (0.0,) * len(freedoms)
+        if len(values) != len(freedoms):
+            raise InputError("wrong number of values", field=where, expected=f"{len(freedoms)}, one a freedom", got=len(values))
+        for value, freedom in zip(values, freedoms, strict=True):
+            within_limits(value, freedom.lower, freedom.upper, where)
+        if hold.by is not None:
+            objects[hold.by.object].link_placement(str(hold.link))
+            if not (objects[hold.object].object.free and objects[hold.by.object].object.free):
+                problem = "only a free object can be held through another, and only through a free one"
+                raise InputError(problem, field=f"held.{hold.object}.by", got=hold.frame)
+        found[hold] = dataclasses.replace(hold, at=values, by=None if hold.by is None else found[hold.by])
+    return tuple(found.values())
+
+
+def in_hand(
+    objects: Mapping[str, PlacedObject], tool: Callable[[], pin.SE3], holds: Iterable[Hold]
+) -> Mapping[str, PlacedObject]:
+    """Return the objects with every free one that is held placed where it is held.
+
+    Args:
+        objects: By name.
+        tool: Returns the placement of the tool frame in the world.
+        holds: With the values of all freedoms, each after the one it depends on.
+    """
+    placed = dict(objects)
+    for hold in holds:
+        one = placed[hold.object]
+        if one.object.free:
+            grasp = one.object.attachment(hold.attachment)
+            in_object = one.object.link_placement(grasp.link, one.state) * grasp.tool(hold.at)
+            holder = placed[hold.by.object].link_placement(str(hold.link)) if hold.by else tool()
+            placed[hold.object] = dataclasses.replace(one, placement=holder * in_object.inverse())
+    return MappingProxyType(placed)
+
+
+def misdirected(objects: Mapping[str, PlacedObject], holds: Iterable[Hold], robot: Robot, floor: Solids) -> list[Hold]:
+    """Return those of some holds whose hand comes out of the object or from below the floor, and would not from the other side.
+
+    Args:
+        objects: All, where they stand.
+        holds: What is to be held, where and through what.
+        robot: Whose hand it is, as far open as the attachment says.
+        floor: The floor, if there is one.
+    """
+    found, hands = list[Hold](), dict[float | None, Solids]()
+    for hold in holds:
+        placed = objects[hold.object]
+        opening = robot.opening(placed.object.attachment(hold.attachment).opening)
+        if opening not in hands:
+            hands[opening] = _hand(robot.opened(opening))
+        hand = hands[opening]
+        if hold.by is not None and hold.link is not None:
+            holder = objects[hold.by.object]
+            back = holder.link_placement(hold.link).inverse()
+            hand = [(shape, back * where) for shape, where in placed_shapes(standing_geometry(holder))]
+        solids = [*placed_shapes(standing_geometry(placed)), *floor]
+        if hold.attachment in placed.reversed or _free(placed, hold.attachment, hand, solids):
+            continue
+        if _free(placed.with_reversed(hold.attachment), hold.attachment, hand, solids):
+            found.append(hold)
+    return found
+
+
+def warn_of_openings(objects: Mapping[str, PlacedObject], robot: Robot, start: float | None, where: str) -> None:
+    """Warn of openings that a robot's gripper cannot stand at: it stands as near to them as it can.
+
+    Args:
+        objects: Whose attachments say how far the hand is open.
+        robot: Whose gripper it is.
+        start: How far it is open at the start [m]; None: nobody says so.
+        where: What the warning begins with.
+    """
+    asked = {} if start is None else {"the start": start}
+    for name, placed in objects.items():
+        own = placed.object.attachments.values()
+        asked |= {f"{name}.{one.name}": one.opening for one in own if one.opening is not None}
+    said = ", ".join(f"{what} {1e3 * opening:g} mm" for what, opening in asked.items())
+    if robot.gripper is None and asked:
+        hint = "it stays as it rests; `gripper` in its robot.yaml says how it opens"
+        warnings.warn(f"{where}: the gripper of '{robot.name}' does not open as asked for ({said}): {hint}", stacklevel=4)
+    elif robot.gripper is not None:
+        least, most = robot.gripper.narrowest, robot.gripper.widest
+        beyond = {what: opening for what, opening in asked.items() if abs(robot.gripper.nearest(opening) - opening) > _ROUNDING}
+        for what, opening in beyond.items():
+            can, nearest = f"{1e3 * least:.1f} to {1e3 * most:.1f} mm", 1e3 * robot.gripper.nearest(opening)
+            text = f"the gripper of '{robot.name}' opens from {can}, not {1e3 * opening:g} mm as asked for {what}"
+            warnings.warn(f"{where}: {text}: it opens to {nearest:.1f} mm", stacklevel=4)
+
+
+def _free(placed: PlacedObject, attachment: str, hand: Solids, solids: Solids) -> bool:
+    """Return whether a hand, given in its tool frame, is nowhere deep in solids when it comes to an attachment."""
+    grasp = placed.object.attachment(attachment)
+    where = placed.link_placement(grasp.link)
+    for values in product(*({freedom.lower, 0.0, freedom.upper} for freedom in grasp.freedoms)):
+        tool = where * grasp.tool(values)
+        way = [tool * pin.SE3(np.eye(3), np.array([0.0, 0.0, -back])) for back in _WAY]
+        if clearance([(shape, at * local) for at in way for shape, local in hand], solids, reach=-_DEEP) >= -_DEEP:
+            return True
+    return False
+
+
+def _hand(robot: Robot) -> Solids:
+    """Return the shapes of a robot's touch links in its tool frame, with all joints at home."""
+    data, shapes = robot.model.createData(), robot.collision.createData()
+    q = robot.coordinates.q(np.concatenate([np.zeros(3), robot.home]))
+    pin.updateGeometryPlacements(robot.model, data, robot.collision, shapes, q)
+    pin.updateFramePlacements(robot.model, data)
+    back = data.oMf[robot.model.getFrameId(robot.tool_frame)].inverse()
+    own = [i for i in range(len(shapes.oMg)) if robot.link_of(i) in robot.touch_links]
+    return [(robot.collision.geometryObjects[i].geometry, back * shapes.oMg[i]) for i in own]

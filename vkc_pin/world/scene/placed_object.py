@@ -1,0 +1,132 @@
+"""Placed objects: articulated objects, each with where it stands in the world and the values of its joints."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.utils.arguments import mapping, number
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.collision.placements import columns_of
+from vkc_pin.errors import UnknownNameError
+from vkc_pin.world.models.articulated_object import ArticulatedObject
+from vkc_pin.world.models.shapes import bounding_box, copy_shape, link_name, within_limits
+
+__all__ = ["PlacedObject", "link_shapes", "moved_shapes", "standing_geometry"]
+
+_OTHER_SIDE = pin.SE3(np.diag([1.0, -1.0, -1.0]), np.zeros(3))  # half a turn about the line on which fingers close
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedObject:
+    """An articulated object that stands in the world (or is held).
+
+    Attributes:
+        name: Its name in the scene.
+        object: What it is.
+        placement: Its base link in the world frame.
+        state: Its joint values, shape (n,), [rad] or [m], in the order of `object.coordinates.names`.
+        reversed: The attachments that are approached from the other side than its description says.
+    """
+
+    name: str
+    object: ArticulatedObject
+    placement: pin.SE3
+    state: Floats
+    reversed: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        state = ", ".join(f"{n}={v:.4g}" for n, v in zip(self.object.coordinates.names, self.state, strict=True))
+        return f"<PlacedObject {self.name}: {self.object.name}{f', {state}' if state else ''}>"
+
+    def with_state(self, values: Mapping[str, float]) -> PlacedObject:
+        """Return the object with joints at `values`, by joint name, [rad] or [m]; the other joints stay.
+
+        Raises:
+            UnknownNameError: It has no such joint.
+            InputError: A value is not finite or outside the joint's limits.
+        """
+        state, coordinates = self.state.copy(), self.object.coordinates
+        for joint, given in mapping(values, "values", "joints, each with its value").items():
+            if joint not in coordinates.names:
+                raise UnknownNameError(f"joint of {self.name}", joint, coordinates.names, field=f"{self.name}.{joint}")
+            index, value = coordinates.index(joint), number(given, f"{self.name}.{joint}")
+            state[index] = within_limits(value, self.object.lower[index], self.object.upper[index], f"{self.name}.{joint}")
+        return dataclasses.replace(self, state=state)
+
+    def with_reversed(self, attachment: str) -> PlacedObject:
+        """Return the object with an attachment approached from the other side, the fingers closing along the same line.
+
+        Raises:
+            UnknownNameError: It has no such attachment.
+        """
+        given = self.object.attachment(attachment)
+        turned = [dataclasses.replace(freedom, axis=_OTHER_SIDE.rotation @ freedom.axis) for freedom in given.freedoms]
+        changed = dataclasses.replace(given, placement=given.placement * _OTHER_SIDE, freedoms=tuple(turned))
+        attachments = MappingProxyType({**self.object.attachments, attachment: changed})
+        listed = tuple(sorted({*self.reversed} ^ {attachment}))
+        return dataclasses.replace(self, object=dataclasses.replace(self.object, attachments=attachments), reversed=listed)
+
+    def link_placement(self, link: str) -> pin.SE3:
+        """Return the placement of `link` in the world frame. Raises `UnknownNameError` if there is none."""
+        return self.placement * self.object.link_placement(link, self.state)
+
+
+def standing_geometry(placed: PlacedObject, *, visual: bool = False) -> list[pin.GeometryObject]:
+    """Return copies of an object's shapes where they stand: parent joint 0, placements in the world frame.
+
+    Args:
+        placed: The object.
+        visual: Return what to draw instead of what collides.
+
+    Returns:
+        The shapes in the object's own order, with their names in the object (`<link>_<number>`).
+    """
+    model, geometry = placed.object.model, placed.object.visual if visual else placed.object.collision
+    data = model.createData()
+    pin.forwardKinematics(model, data, placed.object.coordinates.q(placed.state))
+    return [
+        copy_shape(shape, shape.name, placed.placement * data.oMi[shape.parentJoint] * shape.placement)
+        for shape in geometry.geometryObjects
+    ]
+
+
+def link_shapes(placed: PlacedObject, link: str) -> list[pin.GeometryObject]:
+    """Return the convex shapes of a link of an object, in the frames of their joints."""
+    return [shape for shape in placed.object.collision.geometryObjects if link_name(shape.name) == link]
+
+
+def moved_shapes(placed: PlacedObject, link: str, index: int, values: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return where a link's shapes are in the world while one coordinate of the object takes values, shape (V,).
+
+    Args:
+        placed: The object; its other coordinates stay.
+        link: The link, with K shapes.
+        index: Of the coordinate.
+        values: [rad] or [m].
+
+    Returns:
+        Placements, shape (V, K, 12), see `placements.columns_of`, and the corners of boxes around the shapes, both (V, K, 3) [m].
+    """
+    model, data, own, state = (
+        placed.object.model,
+        placed.object.model.createData(),
+        link_shapes(placed, link),
+        placed.state.copy(),
+    )
+    boxes = [bounding_box(shape) for shape in own]
+    where, lower, upper = np.empty((len(values), len(own), 12)), *np.empty((2, len(values), len(own), 3))
+    for row, value in enumerate(values):
+        state[index] = value
+        pin.forwardKinematics(model, data, placed.object.coordinates.q(state))
+        placements = [placed.placement * data.oMi[shape.parentJoint] * shape.placement for shape in own]
+        where[row] = columns_of(placements)
+        for k, (placement, (center, half)) in enumerate(zip(placements, boxes, strict=True)):
+            middle, extent = placement.act(center), np.abs(placement.rotation) @ half
+            lower[row, k], upper[row, k] = middle - extent, middle + extent
+    return where, lower, upper

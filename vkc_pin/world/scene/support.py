@@ -1,0 +1,105 @@
+"""What stands on what, found from the shapes: whatever carries a link carries what stands on it, too."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.world.models.shapes import link_name, shape_distance, world_box
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.scene.placed_object import PlacedObject, standing_geometry
+
+__all__ = ["LEVEL", "Ride", "borne", "supports", "tilt"]
+
+RESTING = 5e-3
+"""An object stands on what it would overlap by more than half of this if it were lowered by this, but not if lifted [m]."""
+LEVEL = 0.1
+"""A link may tilt by this while something stands on it [rad]: less than friction of dry things holds."""
+_DOWN = np.array([0.0, 0.0, -RESTING])
+
+
+@dataclass(frozen=True, eq=False)
+class Ride:
+    """A free object that stands on a link and moves with it.
+
+    Attributes:
+        object: Its name.
+        hold: What holds the object that the link belongs to.
+        link: The link.
+        local: The placement of its base link in the link's frame.
+        carrier: Where the object that the link belongs to is when the ride begins.
+    """
+
+    object: str
+    hold: Hold
+    link: str
+    local: pin.SE3
+    carrier: pin.SE3
+
+    @property
+    def on(self) -> str:
+        """What it stands on, "<object>.<link>"."""
+        return f"{self.hold.object}.{self.link}"
+
+
+def supports(placed: PlacedObject, shapes: Iterable[tuple[str, pin.GeometryObject]]) -> set[str]:
+    """Return the labels of what an object stands on.
+
+    Args:
+        placed: The object.
+        shapes: Label and shape of all that stands there, placed in the world.
+    """
+    own = standing_geometry(placed)
+    boxes = [world_box(shape.geometry, shape.placement) for shape in own]
+    found: set[str] = set()
+    for label, shape in shapes:
+        if label in found:
+            continue
+        lower, upper = world_box(shape.geometry, shape.placement)
+        near = ((low < upper + RESTING).all() and (high > lower - RESTING).all() for low, high in boxes)
+        if any(_bears(shape, one) for one, close in zip(own, near, strict=True) if close):
+            found.add(label)
+    return found
+
+
+def borne(objects: Mapping[str, PlacedObject], moving: Mapping[str, Collection[str]], free: Iterable[str]) -> dict[str, str]:
+    """Return what rides on links that move: free object → "<object>.<link>" of these, also where others are between.
+
+    Args:
+        objects: All, where they stand.
+        moving: Object → its links that move.
+        free: Those that nobody holds and that may ride.
+    """
+    shapes = [
+        (f"{name}.{link}", shape)
+        for name, links in moving.items()
+        for shape in standing_geometry(objects[name])
+        if (link := link_name(shape.name)) in links
+    ]
+    left, found = [name for name in free if name not in moving], dict[str, str]()
+    while left and shapes:
+        on = {name: min(labels) for name in left if (labels := supports(objects[name], shapes))}
+        found |= {name: found.get(label, label) for name, label in on.items()}
+        left = [name for name in left if name not in on]
+        shapes = [(name, shape) for name in on for shape in standing_geometry(objects[name])]
+    return found
+
+
+def tilt(before: pin.SE3, after: pin.SE3) -> float:
+    """Return by how much a link that was level at `before` tilts at `after` [rad]."""
+    vertical = (after.rotation @ before.rotation.T)[2]
+    return float(np.arctan2(np.hypot(vertical[0], vertical[1]), vertical[2]))
+
+
+def _bears(shape: pin.GeometryObject, one: pin.GeometryObject) -> bool:
+    """Return whether a shape of an object stands on `shape`."""
+
+    def distance(shift: float) -> float:
+        moved = pin.SE3(one.placement.rotation, one.placement.translation + shift * _DOWN)
+        return shape_distance(one.geometry, moved, shape.geometry, shape.placement)
+
+    lowered = distance(1.0)
+    return lowered < -RESTING / 2 and distance(-1.0) - lowered > RESTING

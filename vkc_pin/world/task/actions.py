@@ -1,0 +1,117 @@
+"""What steps come to before anything is planned: actions, what they leave open, and what cannot be done at its place."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.options import Options
+from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.scene.support import supports
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.compiler import compile_task, nothing_to_do
+from vkc_pin.world.task.actuation import driving
+from vkc_pin.world.task.phases import Task
+from vkc_pin.world.task.steps import Actuate, Grasp, Place, Release, Step, as_list
+
+__all__ = ["actions_of", "alternatives", "foresee", "is_open"]
+
+
+def actions_of(steps: Sequence[Step]) -> list[tuple[Step, ...]]:
+    """Return steps by what is done together: a grasp with what comes of it, and letting go with what came before."""
+    actions: list[tuple[Step, ...]] = []
+    for step in steps:
+        last = actions[-1] if actions else ()
+        grasp = last[-1] if last and isinstance(last[-1], Grasp) else None
+        taken = grasp is not None and isinstance(step, Actuate | Place) and step.object == grasp.object
+        if last and (taken or isinstance(step, Release)):
+            actions[-1] = (*last, step)
+        else:
+            actions.append((step,))
+    return actions
+
+
+def is_open(scene: Scene, step: Step) -> bool:
+    """Return whether a step moves joints of what is not held yet, and leaves open by which of several attachments."""
+    if not isinstance(step, Actuate) or step.attachment is not None or step.object in scene.held:
+        return False
+    return len(scene.objects[step.object].object.attachments) > 1
+
+
+def alternatives(scene: Scene, task: Task, *, anew: bool = False) -> Iterator[tuple[str, tuple[Step, ...]]]:
+    """Yield the steps of a task by attachments that it does not use, each with "<object>.<attachment>".
+
+    There are some only where a single one of its steps leaves that open: of several, each is planned alone before. What is held
+    already may have been grasped where it cannot be moved from, or put down: then it is let go of, and taken anew.
+
+    Args:
+        scene: Where the task begins.
+        task: What its steps come to if nobody says otherwise.
+        anew: Whether something may be taken anew, which makes more phases.
+    """
+    if anew and (again := _taken_anew(scene, task.steps[0])):
+        named = again[-1]
+        yield f"{named.object}.{named.attachment}, taken anew", (*again, *task.steps[1:])
+    own = [(number, step) for number, step in enumerate(task.steps) if isinstance(step, Actuate) and is_open(scene, step)]
+    for number, step in own if len(own) == 1 else ():
+        used = {hold.attachment for hold in task.holds if hold.object == step.object}
+        values = {f"{step.object}.{joint}": value for joint, value in step.joints.items()}
+        for name in driving(scene.objects[step.object], {}, values, f"steps[{number}]"):
+            if name not in used:
+                changed = dataclasses.replace(step, attachment=name)
+                yield f"{step.object}.{name}", (*task.steps[:number], changed, *task.steps[number + 1 :])
+
+
+def _taken_anew(scene: Scene, step: Step) -> tuple[Release, Actuate | Place] | None:
+    """Return the steps by which what is held is let go of, taken again and moved; None if that cannot be.
+
+    A free object is let go of only where it stands on something.
+    """
+    if not isinstance(step, Actuate | Place):
+        return None
+    held = scene.held.get(step.object)
+    if held is None or step.attachment not in (None, held):
+        return None
+    placed = scene.objects[step.object]
+    if placed.object.free and not supports(placed, _standing(scene)):
+        return None
+    return Release(step.object), dataclasses.replace(step, attachment=held)
+
+
+def _standing(scene: Scene) -> list[tuple[str, pin.GeometryObject]]:
+    """Return label and shape of all that stands somewhere in a scene."""
+    others = [(name, other) for name, other in scene.objects.items() if name not in scene.held]
+    shapes = [(name, shape) for name, other in others for shape in standing_geometry(other)]
+    return [*shapes, *zip(scene.obstacle_labels, scene.obstacles, strict=True)]
+
+
+def foresee(scene: Scene, steps: Sequence[Step], options: Options) -> list[Task]:
+    """Check that every step can be done at its place, as far as that does not depend on motions; return what each asks for.
+
+    Raises:
+        InputError: It cannot; the error names the first such step.
+    """
+    tasks: list[Task] = []
+    for number, step in enumerate(as_list(steps)):
+        tasks.append(compile_task(scene, [step], options, nothing=True, first=number))
+        scene = _ideally_after(scene, tasks[-1])
+    if not any(task.phases for task in tasks):
+        raise nothing_to_do()
+    return tasks
+
+
+def _ideally_after(scene: Scene, task: Task) -> Scene:
+    """Return the scene in which a task ends if all goes as it says; what it leaves somewhere stands where it stood."""
+    scene = scene.with_held({})
+    for phase in task.phases:
+        for coordinate, value in phase.values.items():
+            name, _, joint = coordinate.partition(".")
+            thing = scene.objects[name].object
+            index = thing.coordinates.index(joint)
+            scene = scene.with_state(name, {joint: float(np.clip(value, thing.lower[index], thing.upper[index]))})
+        for hold, placement in phase.lowered.items():
+            scene = scene.with_placement(hold.object, placement)
+    return scene.with_held(task.after)

@@ -1,0 +1,300 @@
+"""Turns steps into phases."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.errors import InputError, UnknownNameError, shown
+from vkc_pin.options import Options
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.scene.placed_object import PlacedObject
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.actuation import clash, driven, driver, latched, pushed_ways
+from vkc_pin.world.task.lookup import attachment_of, check_link, joint_limits, openings, path_joints, placed_object, robot_frame
+from vkc_pin.world.task.phases import FrameGoal, Mark, Phase, PhaseKind, Task
+from vkc_pin.world.task.supported_objects import Riders
+from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch, as_list
+
+__all__ = ["compile_task", "nothing_to_do"]
+
+LATCH_MARGIN = 0.02  # [rad] or [m] past the threshold at which a latch lets go
+
+
+class _Compiler:
+    def __init__(self, scene: Scene, options: Options) -> None:
+        self.scene, self.options = scene, options
+        self.phases: list[Phase] = []
+        self.held: tuple[Hold, ...] = scene.holds
+        self.holds: list[Hold] = list(self.held)
+        self.initial: dict[str, float] = {}
+        self.state: dict[str, float] = {}
+        self.standing = {n: p.placement for n, p in scene.objects.items() if p.object.free and n not in scene.held}
+        self.left: dict[str, tuple[Hold, int]] = {}
+        self.riders = Riders(scene, self.standing)
+        for hold in self.held:
+            self._enter(scene.objects[hold.object], hold.attachment)
+            self.riders.load(hold, self.state, "held")
+
+    def _enter(self, placed: PlacedObject, attachment: str) -> None:
+        """Make the joints that a grasp can move coordinates of the task, with the values they have at its start."""
+        for joint in path_joints(placed, placed.object.attachments[attachment]):
+            value = float(placed.state[placed.object.coordinates.index(joint)])
+            self.initial.setdefault(f"{placed.name}.{joint}", value)
+            self.state.setdefault(f"{placed.name}.{joint}", value)
+
+    def _move(
+        self, kind: PhaseKind, hold: Hold, where: str, values: dict[str, float], ranges: Mapping[str, tuple[float, float]]
+    ) -> None:
+        """Add a phase in which joints move of what stands fixed and is held, with all that stands on it."""
+        self.riders.begin(hold, {coordinate.partition(".")[2] for coordinate in ranges}, self.state, where)
+        segments = self.options.move_waypoints if kind == "move" else self.options.turn_waypoints
+        placed = self.scene.objects[hold.object]
+        ways = pushed_ways(placed, placed.object.attachments[hold.attachment], self.state, values, f"{where}.joints")
+        self._append(kind, tuple(values), segments, ranges=ranges, values=values, pushed=ways)
+        self.riders.end(self.state, where)
+
+    def _append(self, kind: PhaseKind, about: tuple[str, ...], segments: int, **details: Any) -> None:
+        last = self.phases[-1] if self.phases else None
+        before = (*last.held, *last.grasps) if last else self.scene.holds
+        leaves = tuple(hold for hold in before if hold not in self.held)
+        lifted = {hold: last.standing[hold.object] for hold in last.grasps if hold.object in last.standing} if last else {}
+        phase = Phase(
+            kind,
+            about,
+            segments,
+            held=self.held,
+            leaves=leaves,
+            before=dict(self.state),
+            standing=dict(self.standing),
+            left={name: how for name, how in self.left.items() if name not in self.riders.moved},
+            lifted={hold: where for hold, where in lifted.items() if hold in self.held},
+            rides=self.riders.rides,
+            **details,
+        )
+        self.phases.append(phase)
+        for coordinate, value in phase.values.items():  # a goal beyond a limit is approached as far as it goes
+            lower, upper = joint_limits(self.scene.objects[coordinate.split(".", 1)[0]], coordinate)
+            self.state[coordinate] = min(max(value, lower), upper)
+
+    def _hold_of(self, name: str) -> Hold | None:
+        return next((hold for hold in self.held if hold.object == name), None)
+
+    def _let_go_of_fixed(self) -> None:
+        """Let go of what stands fixed in the world, which cannot come along."""
+        self.held = tuple(hold for hold in self.held if self.scene.objects[hold.object].object.free)
+
+    def grasp(self, name: str, attachment_name: str | None, where: str, by: str | None = None) -> Hold:
+        """Add the phase that takes hold of an object, unless it is held; return the hold."""
+        placed = placed_object(self.scene, name, f"{where}.object")
+        earlier = next((hold.attachment for hold in self.holds if hold.object == name and hold.frame == by), None)
+        attachment = attachment_of(placed, attachment_name or earlier, f"{where}.attachment")
+        through = self._through(by, name, f"{where}.by") if by is not None else None
+        hold = Hold(name, attachment.name, *(through or (None, None)))
+        if hold in self.held:
+            return hold
+        if (held := self._hold_of(name)) is not None and placed.object.free:
+            raise InputError(f"'{name}' is held already, as {held}", field=where, expected="Release or Place before")
+        if through is None:
+            self._let_go_of_fixed()
+            if self.held:
+                kind = "the robot has one hand, and it holds"
+                raise InputError(f"{kind} {self.held[0]}", field=f"{where}.object", expected="Place or Release before", got=name)
+        if not placed.object.free and through is not None:
+            raise InputError(
+                f"'{name}' stands fixed in the world", field=f"{where}.by", expected="the hand itself", got=shown(by)
+            )
+        if name in self.left:
+            problem = f"where '{name}' stands by then is known only after planning"
+            expected = "Place with a full pose before, or a second plan from where the first ends"
+            raise InputError(problem, field=f"{where}.object", expected=expected)
+        if any(ride.object == name for ride in self.riders.carried):
+            problem = f"'{name}' stands on what the robot carries"
+            raise InputError(problem, field=f"{where}.object", expected="Place or Release before")
+        if hold not in self.holds:
+            self._forget_for(hold)
+            self.holds.append(hold)
+        self._enter(placed, attachment.name)
+        about = (hold.object, hold.attachment, hold.frame or "")
+        self._append("grasp", about, self.options.reach_waypoints, grasps=(hold,))
+        self.held = (*self.held, hold)
+        self.riders.load(hold, self.state, where)
+        self.standing.pop(name, None)
+        return hold
+
+    def _forget_for(self, hold: Hold) -> None:
+        """Leave out what the start holds and no phase does, if a new hold moves the same joints: one chain has those once."""
+        used = {*self.held, *(one for phase in self.phases for one in (*phase.held, *phase.grasps))}
+        kept = [one for one in self.holds if one in used or clash(self.scene, (one, hold)) is None]
+        if len(kept) < len(self.holds):
+            self.holds, left = kept, {name for one in kept for name in driven(self.scene, one)}
+            for values in (self.initial, self.state):
+                for name in values.keys() - left:
+                    del values[name]
+
+    def _through(self, frame: str, name: str, where: str) -> tuple[Hold, str]:
+        """Return the hold and link of `frame`, "<object>.<link>", that object `name` is to be held through."""
+        owner, dot, link = str(frame).partition(".")
+        if not dot:
+            raise InputError("not a link of an object", field=where, expected="<object>.<link>, e.g. stick.tip", got=shown(frame))
+        placed = placed_object(self.scene, owner, where)
+        hold = self._hold_of(owner)
+        if hold is None or not placed.object.free:
+            held = ", ".join(str(h) for h in self.held if self.scene.objects[h.object].object.free) or "nothing"
+            problem = f"'{name}' cannot be grasped through '{owner}', which the robot does not carry"
+            raise InputError(problem, field=where, expected=f"a link of what it carries ({held})", got=shown(frame))
+        check_link(placed, link, where)
+        return hold, link
+
+    def actuate(self, step: Actuate, where: str) -> None:
+        placed = placed_object(self.scene, step.object, f"{where}.object")
+        names = placed.object.coordinates.names
+        for joint in step.joints:
+            if joint not in names:
+                raise UnknownNameError(f"joint of '{step.object}'", joint, names, field=f"{where}.joints")
+        if placed.object.free:
+            problem = f"'{step.object}' stands free: its joints are not driven by a hand"
+            raise InputError(problem, field=f"{where}.object", expected="a fixed object")
+        values = {f"{step.object}.{joint}": value for joint, value in step.joints.items()}
+        used = [one.attachment for one in (*self.held, *reversed(self.holds)) if one.object == step.object]
+        hold = self.grasp(step.object, driver(placed, step.attachment, used, self.state, values, where), where)
+        ranges = {coordinate: joint_limits(placed, coordinate) for coordinate in values}
+        path, after = path_joints(placed, placed.object.attachments[hold.attachment]), dict[str, float]()
+        for latch in latched(placed, self.state, values):
+            release = f"{step.object}.{latch.released_by}"
+            if latch.released_by not in path:  # and is where it lets go
+                continue
+            lower, upper = joint_limits(placed, release)
+            turned = min(latch.threshold + LATCH_MARGIN, upper)
+            if self.state[release] < turned:
+                self._move("turn", hold, where, {release: turned}, {release: (lower, upper)})
+            if values.get(release, upper) < turned:  # must wait until the latch is left behind
+                after[release] = values[release]
+            ranges[release] = (turned, upper)
+            values[release] = turned if release in after else values.get(release, turned)
+        self._move("move", hold, where, values, ranges)
+        if after:
+            self._move("turn", hold, where, after, {release: joint_limits(placed, release) for release in after})
+
+    def touch(self, step: Touch, where: str) -> None:
+        """Add the phase that brings a frame to its target, carrying on what is carried."""
+        owner, dot, link = str(step.frame).partition(".")
+        hold = None
+        if dot and owner in self.scene.objects:
+            placed = self.scene.objects[owner]
+            if not placed.object.free:
+                problem = f"'{owner}' stands fixed in the world and cannot be carried anywhere"
+                raise InputError(problem, field=f"{where}.frame", expected="a link of a free object, or a frame of the robot")
+            check_link(placed, link, f"{where}.frame")
+            hold = self._hold_of(owner) or self.grasp(owner, None, where)
+        elif dot and step.frame not in [f.name for f in self.scene.robot.model.frames]:
+            raise UnknownNameError("object", owner, self.scene.objects, field=f"{where}.frame")
+        else:
+            link = robot_frame(self.scene, step.frame, f"{where}.frame")
+        self._let_go_of_fixed()
+        point = not isinstance(step.target, pin.SE3)
+        target = pin.SE3(np.eye(3), np.array(step.target)) if point else step.target
+        goal = FrameGoal(link, target, "point" if point else "pose", hold, touches=True)
+        self._append("touch", (step.frame,), self.options.reach_waypoints, frames=(goal,))
+
+    def place(self, step: Place, where: str) -> None:
+        """Add the phases that bring an object to its place and leave it there."""
+        placed = placed_object(self.scene, step.object, f"{where}.object")
+        if not placed.object.free:
+            raise InputError(f"'{step.object}' stands fixed in the world", field=f"{where}.object", expected="a free object")
+        hold = self._hold_of(step.object) or self.grasp(step.object, step.attachment, where)
+        if step.attachment is not None and hold.attachment != step.attachment:
+            raise InputError("it is held elsewhere", field=f"{where}.attachment", expected=hold.attachment, got=step.attachment)
+        upright = not isinstance(step.pose, pin.SE3)
+        # As it stands; what is in the hand from the start stands with its z axis up.
+        stands = np.eye(3) if step.object in self.scene.held else placed.placement.rotation
+        pose = pin.SE3(stands, np.array(step.pose)) if upright else step.pose
+        goal = FrameGoal(placed.object.base_link, pose, "upright" if upright else "pose", hold)
+        self._append("place", (step.object,), self.options.reach_waypoints, frames=(goal,), lowered={hold: pose})
+        self._release(hold, pose, nearly=upright)
+
+    def release(self, step: Release, where: str) -> None:
+        """Let go of one thing, or of everything."""
+        if not self.held:
+            raise InputError("the hand is empty", field=where, expected="something held", got=shown(step))
+        if step.object is not None and self._hold_of(step.object) is None:
+            held = [hold.object for hold in self.held]
+            raise UnknownNameError("held object", step.object, held, field=f"{where}.object")
+        let_go = [hold for hold in reversed(self.held) if step.object in (None, hold.object)]
+        if not (moved := bool(self.phases)):
+            objects = self.scene.objects
+            lowered = {hold: objects[hold.object].placement for hold in let_go if objects[hold.object].object.free}
+            self._append("stand", (), self.options.turn_waypoints, lowered=lowered)
+        for hold in let_go:
+            if hold in self.held:
+                self._release(hold, self.scene.objects[hold.object].placement, nearly=moved)
+
+    def _release(self, hold: Hold, where: pin.SE3, *, nearly: bool = True) -> None:
+        """Take a hold, and what is held through it, out of the hand; where it stands then, the motion decides, if `nearly`."""
+        for other in [h for h in self.held if h.by == hold]:
+            self._release(other, self.scene.objects[other.object].placement)
+        self.held = tuple(h for h in self.held if h != hold)
+        if self.scene.objects[hold.object].object.free:
+            self.standing[hold.object] = where
+            ridden = self.riders.unload(hold, where)
+            if nearly:
+                self.left |= dict.fromkeys((hold.object, *ridden), (hold, len(self.phases) - 1))
+
+    def add(self, step: Step, where: str) -> None:
+        own: dict[type, Callable[[Any, str], None]]
+        own = {Actuate: self.actuate, Touch: self.touch, Place: self.place, Release: self.release}
+        if type(step) in own:
+            own[type(step)](step, where)
+        elif isinstance(step, Grasp):
+            self.grasp(step.object, step.attachment, where, step.by)
+        elif isinstance(step, Reach):
+            frame = robot_frame(self.scene, step.frame, f"{where}.frame")
+            self._let_go_of_fixed()
+            self._append("reach", (frame,), self.options.reach_waypoints, frames=(FrameGoal(frame, step.pose),))
+        elif isinstance(step, GoTo):
+            self._let_go_of_fixed()
+            self._append("go", (), self.options.reach_waypoints, base=(step.x, step.y, step.yaw))
+
+
+def compile_task(scene: Scene, steps: Sequence[Step], options: Options, *, nothing: bool = False, first: int = 0) -> Task:
+    """Return the phases that bring about `steps`, beginning at the scene's start.
+
+    Args:
+        scene: Robot, objects and what is held at the start.
+        steps: What should change.
+        options: How many waypoints phases have.
+        nothing: Whether steps that change nothing are fine; there are no phases then.
+        first: The number of the first of `steps` in the user's list, for messages.
+
+    Raises:
+        InputError: No steps, an unknown object, joint, attachment or frame, a joint that cannot be moved that way, or a
+            hand that is asked to hold a second thing.
+    """
+    steps = as_list(steps)
+    compiler, marks = _Compiler(scene, options), list[Mark]()
+    for index, step in enumerate(steps, start=first):
+        compiler.add(step, f"steps[{index}]")
+        marks.append(Mark(len(compiler.phases), len(compiler.holds), len(compiler.initial), compiler.held))
+    if not compiler.phases and not nothing:
+        raise nothing_to_do()
+    # Objects that are grasped later stand as they are at the start until then.
+    initial = compiler.initial
+    phases = tuple(
+        replace(
+            phase,
+            before={**initial, **{name: value for name, value in phase.before.items() if name in initial}},
+            opening=opening,
+        )
+        for phase, opening in zip(compiler.phases, openings(scene, compiler.phases), strict=True)
+    )
+    return Task(steps, phases, tuple(compiler.holds), compiler.initial, compiler.held, tuple(marks))
+
+
+def nothing_to_do() -> InputError:
+    """Return the error for steps that change nothing."""
+    expected, got = "a step that changes something", "only what holds already"
+    return InputError("there is nothing to do", field="steps", expected=expected, got=got)

@@ -1,0 +1,93 @@
+"""What steps name, found in a scene: objects, attachments, links, joints, frames, and how far the gripper is open."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import pinocchio as pin
+
+from vkc_pin.utils.arguments import known
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.world.models.articulated_object import Attachment
+from vkc_pin.world.scene.contact_rules import in_gripper, opening_at_start, opening_for
+from vkc_pin.world.scene.placed_object import PlacedObject
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.phases import Phase
+
+__all__ = ["attachment_of", "check_link", "joint_limits", "openings", "path_joints", "placed_object", "robot_frame"]
+
+
+def placed_object(scene: Scene, name: str, where: str) -> PlacedObject:
+    """Return an object of a scene.
+
+    Args:
+        scene: The scene.
+        name: The object's name.
+        where: The field that names it, for the error.
+
+    Raises:
+        UnknownNameError: There is none.
+    """
+    return scene.objects[known(name, scene.objects, "object", where)]
+
+
+def attachment_of(placed: PlacedObject, name: str | None, where: str) -> Attachment:
+    """Return an object's attachment `name`, or the default one, for the field `where`.
+
+    Raises:
+        UnknownNameError: There is none of that name.
+        InputError: There is none at all.
+    """
+    attachments = placed.object.attachments
+    if name is None:
+        if not attachments:
+            raise InputError(f"object '{placed.name}' has no attachment, so it cannot be grasped", field=where)
+        return next(iter(attachments.values()))
+    if name not in attachments:
+        raise UnknownNameError(f"attachment of '{placed.name}'", name, attachments, field=where)
+    return attachments[name]
+
+
+def check_link(placed: PlacedObject, link: str, where: str) -> None:
+    """Check that an object has a link, which the field `where` names. Raises `UnknownNameError` if it has not."""
+    if link not in placed.object.links:
+        raise UnknownNameError(f"link of '{placed.name}'", link, placed.object.links, field=where)
+
+
+def robot_frame(scene: Scene, name: str | None, where: str) -> str:
+    """Return the robot's frame that the field `where` names, or its tool frame. Raises `UnknownNameError` if there is none."""
+    frame = name or scene.robot.tool_frame
+    frames = [f.name for f in scene.robot.model.frames]
+    if frame not in frames:
+        raise UnknownNameError("frame of the robot", frame, frames, field=where)
+    return frame
+
+
+def path_joints(placed: PlacedObject, attachment: Attachment) -> list[str]:
+    """Return the names of the object's joints between its base and the attachment's link, base first."""
+    model = placed.object.model
+    joint = model.frames[model.getFrameId(attachment.link, pin.FrameType.BODY)].parentJoint
+    names: list[str] = []
+    while joint:
+        names.insert(0, str(model.names[joint]))
+        joint = model.parents[joint]
+    return names
+
+
+def joint_limits(placed: PlacedObject, coordinate: str) -> tuple[float, float]:
+    """Return the limits of an object's coordinate `<object>.<joint>`, [rad] or [m]."""
+    index = placed.object.coordinates.names.index(coordinate.partition(".")[2])
+    return float(placed.object.lower[index]), float(placed.object.upper[index])
+
+
+def openings(scene: Scene, phases: Sequence[Phase]) -> list[float | None]:
+    """Return how far the gripper is open in each phase [m]; None: as the robot rests.
+
+    That is what the attachment says which it holds or comes to next. After the last one it stays as it is.
+    """
+    taken, found = [in_gripper((*phase.held, *phase.grasps)) for phase in phases], list[float | None]()
+    for number in range(len(phases)):
+        hold = next((one for one in taken[number:] if one is not None), None)
+        before = found[-1] if found else opening_at_start(scene)
+        found.append(before if hold is None else opening_for(scene, hold))
+    return found

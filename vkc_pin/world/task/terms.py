@@ -1,0 +1,287 @@
+"""A user's own constraints and costs: CasADi expressions of coordinates and frames.
+
+The user's function is called once, with symbols, and what it returns is kept as plain data (`formula`). The program composes
+that with its kinematics; validation evaluates the same on placements of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import KW_ONLY, asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from vkc_pin.utils.arguments import items, mapping, number, numbers
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.errors import InputError, UnknownNameError, shown
+from vkc_pin.world.task.formula import Formula, State
+
+if TYPE_CHECKING:
+    from vkc_pin.world.scene.scene import Scene
+
+__all__ = [
+    "Constraint",
+    "Cost",
+    "State",
+    "Term",
+    "as_data",
+    "check_active",
+    "renamed",
+    "term_from_dict",
+    "term_to_dict",
+    "traced",
+]
+
+Numbers = float | Sequence[float] | NDArray[np.float64]
+Expression = Callable[[State], Any] | Formula
+
+
+@dataclass(frozen=True)
+class _Term:
+    name: str
+    expression: Expression
+    _: KW_ONLY
+    during: Sequence[str] | str | None = None
+    holding: str | None = None
+
+    def _check(self) -> None:
+        if not isinstance(self.name, str) or not self.name:
+            raise InputError("not a name", field=f"{type(self).__name__}.name", expected="text", got=shown(self.name))
+        if not callable(self.expression) and not isinstance(self.expression, Formula):
+            expected = "a function of a State, e.g. lambda s: s.coordinate('elbow_joint')"
+            raise self.error("not a function", "expression", expected, shown(self.expression))
+        if self.during is not None:
+            names = (self.during,) if isinstance(self.during, str) else self.during
+            if not isinstance(names, list | tuple) or not names or not all(isinstance(name, str) for name in names):
+                raise self.error("not phases", "during", "names of phases, e.g. ['place cup']", shown(self.during))
+            object.__setattr__(self, "during", tuple(names))
+        if self.holding is not None and not isinstance(self.holding, str):
+            raise self.error("not an object", "holding", "an object's name", shown(self.holding))
+
+    def error(self, problem: str, field: str, expected: object = None, got: object = None) -> InputError:
+        """Return (not raise) the error that says that one of its fields is wrong."""
+        return InputError(problem, field=f"terms[{self.name!r}].{field}", expected=expected, got=got)
+
+    def positive(self, field: str) -> None:
+        """Check that a field is a positive number."""
+        where, expected = f"terms[{self.name!r}].{field}", "a positive finite number"
+        object.__setattr__(self, field, number(getattr(self, field), where, expected, low=0.0, above=True))
+
+    def active(self, phase: str, held: Iterable[str]) -> bool:
+        """Return whether it holds in a phase of this name, in which these objects are held."""
+        return (self.during is None or phase in self.during) and (self.holding is None or self.holding in held)
+
+    @property
+    def formula(self) -> Formula:
+        """Its expression, once it is data."""
+        if not isinstance(self.expression, Formula):
+            raise self.error("not traced yet", "expression")
+        return self.expression
+
+
+@dataclass(frozen=True)
+class Constraint(_Term):
+    """An expression that must stay between bounds, at every waypoint of the chosen phases after their first.
+
+    Attributes:
+        name: What reports call it.
+        expression: Given a `State`, returns a CasADi number or column. Roots are taken of x + 1e-8 instead of x, so that norms
+            have a slope at zero; comparisons are said by the bounds.
+        lower, upper: Bounds, numbers or one per entry; None is no bound.
+        during: Names of phases, e.g. "place cup" (`plan.trajectory.phases` has them); None is all.
+        holding: The object that must be held for it; None is none.
+        tolerance: By how much validation lets it be off at a waypoint, in the expression's own unit; ten times as much between
+            two waypoints, where the program asks for nothing.
+    """
+
+    _: KW_ONLY
+    lower: Numbers | None = None
+    upper: Numbers | None = None
+    tolerance: float = 1e-3
+
+    def __post_init__(self) -> None:
+        self._check()
+        self.positive("tolerance")
+        for field in ("lower", "upper"):
+            value = getattr(self, field)
+            if value is not None:
+                object.__setattr__(self, field, self._bound(field, value))
+        self.box(self.expression.rows if isinstance(self.expression, Formula) else None)
+
+    def _bound(self, field: str, value: Any) -> float | tuple[float, ...]:
+        given = numbers(value, f"terms[{self.name!r}].{field}", "a number or a list of them", problem="not a number")
+        wrong = np.isnan(given) | (given == (np.inf if field == "lower" else -np.inf))
+        if given.ndim > 1 or not given.size or wrong.any():
+            raise self.error("no such bound", field, "a number or a list of them", shown(value))
+        return float(given) if given.ndim == 0 else tuple(given.tolist())
+
+    def box(self, rows: int | None) -> tuple[Floats, Floats]:
+        """Return both bounds, shape (rows,); None: as many as there are bounds.
+
+        Raises:
+            InputError: They do not fit the expression, or each other.
+        """
+        given = [-np.inf if self.lower is None else self.lower, np.inf if self.upper is None else self.upper]
+        try:
+            if rows is None:
+                lower, upper = np.broadcast_arrays(*given)
+            else:
+                lower, upper = (np.broadcast_to(bound, (rows,)) for bound in given)
+        except ValueError:
+            expected = "as many lower as upper ones" if rows is None else f"one number, or {rows}, like the expression"
+            raise self.error("wrong number of bounds", "lower, upper", expected, shown((self.lower, self.upper))) from None
+        if not (np.isfinite(lower) | np.isfinite(upper)).all():
+            raise self.error("no bound", "lower, upper", "at least one of them, finite", shown((self.lower, self.upper)))
+        if (lower > upper).any():
+            raise self.error("lower is more than upper", "lower, upper", "lower <= upper", shown((self.lower, self.upper)))
+        return lower, upper
+
+
+@dataclass(frozen=True)
+class Cost(_Term):
+    """An expression that should be small: `weight` times its sum over all waypoints of the chosen phases after their first.
+
+    Attributes:
+        name: What errors call it.
+        expression: Given a `State`, returns a CasADi number; see `Constraint`.
+        weight: How much it counts, beside `Options.velocity_weight_*` and the others.
+        during, holding: When, as for a `Constraint`.
+    """
+
+    _: KW_ONLY
+    weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        self._check()
+        self.positive("weight")
+
+
+Term = Constraint | Cost
+
+
+def traced(scene: Scene, terms: Sequence[Term]) -> tuple[Term, ...]:
+    """Return terms with their expressions as data, checked against what a scene has.
+
+    Raises:
+        UnknownNameError: One asks for a frame, coordinate or object that does not exist.
+        InputError: They are no terms, two share a name, or an expression is none.
+    """
+    terms = items(terms, "terms", "a list of Constraint and Cost", (Constraint, Cost))
+    if not terms:
+        return ()
+    robot = [str(frame.name) for frame in scene.robot.model.frames if frame.name != "universe"]
+    things = [(name, placed.object) for name, placed in scene.objects.items()]
+    frames = [*robot, *(f"{name}.{link}" for name, thing in things for link in thing.links)]
+    joints = [f"{name}.{joint}" for name, thing in things for joint in thing.coordinates.names]
+    for term in terms:
+        if term.holding is not None and term.holding not in scene.objects:
+            raise UnknownNameError("object", term.holding, scene.objects, field=f"terms[{term.name!r}].holding")
+    return _all_traced(terms, frames, [*scene.robot.coordinates.names, *joints])
+
+
+def as_data(terms: Sequence[Term]) -> tuple[Term, ...]:
+    """Return terms with their expressions as data, for scenes that are not there yet: frames and coordinates may have any name.
+
+    Raises:
+        InputError: They are no terms, two share a name, or an expression is none.
+    """
+    return _all_traced(items(terms, "terms", "a list of Constraint and Cost", (Constraint, Cost)), None, None)
+
+
+def renamed(term: Term, frames: Mapping[str, str], objects: Mapping[str, str]) -> Term:
+    """Return a traced term about other frames, and another object that must be held for it.
+
+    Args:
+        term: The term.
+        frames: Name of a frame in its expression → the one that is meant; others stay.
+        objects: The same of `holding`.
+    """
+    formula = term.formula
+    formula = replace(formula, frames=tuple(frames.get(name, name) for name in formula.frames))
+    return replace(term, expression=formula, holding=objects.get(term.holding or "", term.holding))
+
+
+def _all_traced(terms: Sequence[Term], frames: Sequence[str] | None, coordinates: Sequence[str] | None) -> tuple[Term, ...]:
+    found: list[Term] = []
+    for term in terms:
+        if term.name in (other.name for other in found):
+            raise InputError("two terms share a name", field="terms", expected="different names", got=shown(term.name))
+        found.append(_traced(term, State(frames, coordinates, f"terms[{term.name!r}].expression")))
+    return tuple(found)
+
+
+def _traced(term: Term, state: State) -> Term:
+    if isinstance(term.expression, Formula):
+        state.know(term.expression)
+        return term
+    try:
+        value = term.expression(state)
+    except UnknownNameError:
+        raise
+    except Exception as error:
+        raise term.error("it cannot be evaluated", "expression", "CasADi operations only", str(error)) from error
+    if isinstance(value, int | float | np.ndarray | np.number | ca.DM):
+        raise term.error("it does not depend on the state", "expression", "an expression of what a State returns", shown(value))
+    if not isinstance(value, ca.SX):
+        raise term.error("no CasADi expression", "expression", "a number or a column, e.g. of ca.vertcat", shown(value))
+    if not value.is_vector() or value.is_empty() or (isinstance(term, Cost) and not value.is_scalar()):
+        expected = "a number" if isinstance(term, Cost) else "a number or a column"
+        raise term.error("wrong shape", "expression", expected, f"shape {value.shape}")
+    try:
+        formula = state.formula(ca.vec(value))
+    except RuntimeError as error:
+        raise term.error("it has symbols of its own", "expression", "only those of its State", str(error)) from error
+    if not formula.inputs:
+        raise term.error("it does not depend on the state", "expression", "an expression of what a State returns", str(value))
+    if formula.compares:
+        raise term.error("a comparison", "expression", "an expression that lower and upper bound", str(value))
+    return replace(term, expression=formula)
+
+
+def check_active(terms: Iterable[Term], phases: Sequence[tuple[str, Iterable[str]]]) -> None:
+    """Check that every term is about some phase of a task.
+
+    Args:
+        terms: The terms.
+        phases: Name of every phase of the task, and the objects held in it.
+
+    Raises:
+        UnknownNameError: `during` names a phase that there is not.
+        InputError: A term is about no phase.
+    """
+    names = list(dict.fromkeys(name for name, _ in phases))
+    for term in terms:
+        for name in term.during or ():
+            if name not in names:
+                raise UnknownNameError("phase", name, names, field=f"terms[{term.name!r}].during")
+        if not any(term.active(name, held) for name, held in phases):
+            held = ", ".join(f"{name!r} holds {', '.join(held) or 'nothing'}" for name, held in phases)
+            raise term.error("never held in these phases", "holding", held, shown(term.holding))
+
+
+def term_to_dict(term: Term) -> dict[str, Any]:
+    """Return a traced term as plain data, e.g. for a saved plan."""
+    return {"term": type(term).__name__, **asdict(term)}
+
+
+def term_from_dict(data: Mapping[str, Any]) -> Term:
+    """Return the term that `term_to_dict` made `data` of.
+
+    Raises:
+        InputError: Something does not fit.
+    """
+    fields = mapping(data, "terms", "a term as data")
+    kinds: dict[str, type[Constraint] | type[Cost]] = {"Constraint": Constraint, "Cost": Cost}
+    try:
+        given = fields.pop("expression")
+        code = tuple(
+            (str(name), tuple(map(int, read)), int(written), float(value)) for name, read, written, value in given["code"]
+        )
+        formula = Formula(tuple(given["frames"]), tuple(given["coordinates"]), int(given["rows"]), code)
+        formula.function  # noqa: B018 - what cannot be built is no expression
+        return kinds[fields.pop("term")](expression=formula, **fields)
+    except (LookupError, TypeError, ValueError, OverflowError, NotImplementedError, RuntimeError) as error:
+        raise InputError("not a saved term", field="terms", expected="what Plan.save wrote", got=str(error)) from error

@@ -1,0 +1,200 @@
+"""Curve: where a motion is at every moment, smooth: cubics in time through knots."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from vkc_pin.utils.arguments import numbers
+from vkc_pin.utils.arrays import Floats, Ints
+from vkc_pin.errors import InputError
+
+__all__ = ["SHORTEST", "Curve", "evenly", "joined", "moments_at"]
+
+SHORTEST = 1e-9
+"""Least time from knot to knot [s]."""
+_OFF = 1e-9  # [m] or [rad] beside a waypoint
+_LARGEST = 1e12  # [m] or [rad] of a coordinate, and of its rate [m/s], [rad/s]
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Cubics in time between knots, with the same velocity on both sides of each (cubic Hermite splines).
+
+    Controllers that are given positions and velocities go along the same curve (`ros2_control`'s joint trajectory controller,
+    "cubic").
+
+    Attributes:
+        times: Of the knots, shape (K,), increasing [s].
+        positions: Shape (K, n), [m] and [rad].
+        rates: Velocities, shape (K, n), [m/s] and [rad/s].
+
+    Raises:
+        InputError: Numbers that are not finite or beyond all measure, shapes that do not fit, or times that do not increase.
+    """
+
+    times: Floats
+    positions: Floats
+    rates: Floats
+
+    def __post_init__(self) -> None:
+        times, positions, rates = (numbers(getattr(self, name), f"curve.{name}") for name in ("times", "positions", "rates"))
+        if times.ndim != 1 or len(times) < 2 or not np.all(np.diff(times) >= SHORTEST):
+            expected = f"at least 2 numbers, each {SHORTEST:g} s after the one before or more"
+            raise InputError("times do not increase", field="curve.times", expected=expected)
+        if positions.ndim != 2 or len(positions) != len(times):
+            expected = f"({len(times)}, n)"
+            raise InputError("wrong shape", field="curve.positions", expected=expected, got=positions.shape)
+        if rates.shape != positions.shape:
+            raise InputError("wrong shape", field="curve.rates", expected=positions.shape, got=rates.shape)
+        for name, array in (("times", times), ("positions", positions), ("rates", rates)):
+            if not np.abs(array).max(initial=0.0) <= _LARGEST:
+                raise InputError("out of range", field=f"curve.{name}", expected=f"numbers up to {_LARGEST:g}")
+            array = np.array(array, float)
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+    def at(self, time: ArrayLike) -> Floats:
+        """Return the positions, shape (..., n), at times [s], shape (...,); outside the curve, its first or last."""
+        return self._cubic(time, 0)
+
+    def velocity(self, time: ArrayLike) -> Floats:
+        """Return the velocities, shape (..., n), at times [s], shape (...,); outside the curve 0, as all stands still there."""
+        return self._cubic(time, 1)
+
+    def acceleration(self, time: ArrayLike) -> Floats:
+        """Return the accelerations, shape (..., n), at times [s], shape (...,); at a knot, that of the cubic after it."""
+        return self._cubic(time, 2)
+
+    def _cubic(self, time: ArrayLike, derivative: int) -> Floats:
+        moments = np.asarray(time, float)
+        k = np.clip(np.searchsorted(self.times, moments, side="right") - 1, 0, len(self.times) - 2)
+        h = np.diff(self.times)[k]
+        s = (np.clip((moments - self.times[k]) / h, 0.0, 1.0))[..., None]
+        h, p, c, d, q = (array[..., None] if array.ndim == k.ndim else array for array in (h, *self._control(k)))
+        if derivative == 0:
+            return _bernstein(s, p, c, d, q)
+        inside = ((moments >= self.times[0]) & (moments <= self.times[-1]))[..., None]
+        if derivative == 1:
+            r = 1.0 - s
+            return np.asarray(np.where(inside, 3.0 / h * (r**2 * (c - p) + 2.0 * s * r * (d - c) + s**2 * (q - d)), 0.0))
+        return np.asarray(np.where(inside, 6.0 / h**2 * ((1.0 - s) * (p - 2.0 * c + d) + s * (c - 2.0 * d + q)), 0.0))
+
+    def _control(self, k: Ints) -> tuple[Floats, Floats, Floats, Floats]:
+        """Return the control points of the cubics with these numbers: each lies in their convex hull."""
+        third = (np.diff(self.times)[k] / 3.0)[..., None]
+        before, after = self.positions[k], self.positions[k + 1]
+        return before, before + third * self.rates[k], after - third * self.rates[k + 1], after
+
+    def extremes(self) -> tuple[Floats, Floats]:
+        """Return the exact least and largest position on each cubic, shape (K − 1, n) each."""
+        p, c, d, q = self._control(np.arange(len(self.times) - 1))
+        first, middle, last = c - p, d - c, q - d
+        bend, sides = first - 2.0 * middle + last, [p, q]
+        root = np.sqrt(np.maximum(middle**2 - first * last, 0.0))
+        for sign in (-1.0, 1.0):  # where the velocity, first·(1−s)² + 2·middle·s(1−s) + last·s², is zero: bend·s² + ... + first
+            straight = first - middle + sign * root
+            other = first - middle - sign * root
+            at = np.divide(
+                straight, bend, out=np.divide(first, other, out=np.zeros_like(p), where=other != 0.0), where=bend != 0.0
+            )
+            sides.append(_bernstein(np.clip(at, 0.0, 1.0), p, c, d, q))
+        return np.asarray(np.min(sides, axis=0)), np.asarray(np.max(sides, axis=0))
+
+    def speeds(self) -> tuple[Floats, Floats]:
+        """Return the exact largest |velocity| and |acceleration| on each cubic, shape (K − 1, n) each."""
+        h = np.diff(self.times)[:, None]
+        p, c, d, q = self._control(np.arange(len(h)))
+        first, middle, last = (3.0 / h * part for part in (c - p, d - c, q - d))
+        bend = first - 2.0 * middle + last
+        at = np.divide(first - middle, bend, out=np.full_like(bend, -1.0), where=np.abs(bend) > 1e-12)
+        at = np.where((at > 0.0) & (at < 1.0), at, 0.0)  # where the velocity, a parabola, turns round
+        between = (1.0 - at) ** 2 * first + 2.0 * at * (1.0 - at) * middle + at**2 * last
+        fastest = np.max(np.abs([first, last, between]), axis=0)
+        strongest = np.max(np.abs([2.0 / h * (middle - first), 2.0 / h * (last - middle)]), axis=0)
+        return np.asarray(fastest), np.asarray(strongest)
+
+    def jerks(self) -> tuple[Floats, Floats]:
+        """Return the |jerk| of each cubic, shape (K − 1, n), and by how much accelerations jump at each knot, shape (K, n).
+
+        Before the first and after the last one, all stands still.
+        """
+        h = np.diff(self.times)[:, None]
+        p, c, d, q = self._control(np.arange(len(h)))
+        begin, end = (6.0 / h**2 * part for part in ((d - c) - (c - p), (q - d) - (d - c)))
+        none = np.zeros((1, self.positions.shape[1]))
+        jumps = np.concatenate([begin, none]) - np.concatenate([none, end])
+        return np.abs(end - begin) / h, np.abs(jumps)
+
+    def part(self, begin: float, end: float, columns: Sequence[int] | slice = slice(None)) -> Curve:
+        """Return what lies between two of the knots' times [s], of some columns."""
+        rows = slice(int(np.searchsorted(self.times, begin)), int(np.searchsorted(self.times, end, side="right")))
+        return Curve(self.times[rows], self.positions[rows][:, columns], self.rates[rows][:, columns])
+
+    def check_through(self, times: Floats, positions: Floats) -> None:
+        """Check that it leads from the first of some waypoints through all others to the last.
+
+        Args:
+            times: Of the waypoints, shape (T,) [s].
+            positions: Shape (T, n).
+
+        Raises:
+            InputError: It does not; every waypoint must be one of the knots, in time to the last bit.
+        """
+        if self.positions.shape[1] != positions.shape[1]:
+            expected, got = positions.shape[1], self.positions.shape[1]
+            raise InputError("wrong number of coordinates", field="curve.positions", expected=expected, got=got)
+        at = np.minimum(np.searchsorted(self.times, times), len(self.times) - 1)
+        if at[0] != 0 or at[-1] != len(self.times) - 1 or not np.array_equal(self.times[at], times):
+            raise InputError("a waypoint is none of its knots", field="curve.times", expected="the times of all waypoints")
+        apart = np.abs(self.positions[at] - positions).max(axis=1)
+        if not apart.max() <= _OFF:
+            where, got = f"positions[{int(np.argmax(apart))}]", f"{apart.max():g} apart"
+            raise InputError("the curve does not lead through a waypoint", field=where, expected=f"at most {_OFF:g}", got=got)
+
+    def shifted(self, time: float) -> Curve:
+        """Return the same, later by some time [s]."""
+        return Curve(self.times + time, self.positions, self.rates)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data of it."""
+        return {"times": self.times.tolist(), "positions": self.positions.tolist(), "rates": self.rates.tolist()}
+
+
+def _bernstein(s: Floats, p: Floats, c: Floats, d: Floats, q: Floats) -> Floats:
+    """Return where cubics with these control points are at a share of their time."""
+    r = 1.0 - s
+    return np.asarray(r**3 * p + 3.0 * s * r**2 * c + 3.0 * s**2 * r * d + s**3 * q)
+
+
+def evenly(times: Floats, rate: float) -> Floats:
+    """Return so many moments a second between the first and the last of some times [s], and the last."""
+    duration = times[-1] - times[0]
+    return np.append(times[0] + np.arange(np.ceil(duration * rate - 1e-6)) / rate, times[-1])
+
+
+def moments_at(knots: Floats, shares: Floats, *, last: bool = False) -> Floats:
+    """Return moments at some shares of every span between knots, shape (k,), one span after the other, and the last knot.
+
+    Args:
+        knots: Shape (K,).
+        shares: From 0 to 1.
+        last: Whether the last knot comes after them.
+    """
+    inside = (knots[:-1, None] + np.diff(knots)[:, None] * shares).ravel()
+    return np.append(inside, knots[-1]) if last else inside
+
+
+def joined(pieces: Sequence[Curve]) -> Curve:
+    """Return curves as one, the first where it is in time; each begins where, and as fast as, the one before it ends."""
+    times, first = [pieces[0].times], pieces[0]
+    for piece in pieces[1:]:
+        times.append(times[-1][-1] + piece.times[1:] - piece.times[0])
+    rest = pieces[1:]
+    positions = np.concatenate([first.positions, *(piece.positions[1:] for piece in rest)])
+    rates = np.concatenate([first.rates, *(piece.rates[1:] for piece in rest)])
+    return Curve(np.concatenate(times), positions, rates)

@@ -15,12 +15,12 @@ import pinocchio as pin
 from PIL import Image
 
 import vkc_pin as vkc
+from vkc_pin.benchmarks.harness.limits import LIMITS
 from vkc_pin.benchmarks.robot_object_matrix.given import parsed, ready_robot
 from vkc_pin.benchmarks.robot_object_matrix.pairs import pair
-from vkc_pin.benchmarks.harness.limits import LIMITS
-from vkc_pin.world.trajectory.world_model import World
 from vkc_pin.visualization.plots.style import new_figure, save_figure, styled
 from vkc_pin.visualization.room import drawn_parts
+from vkc_pin.world.trajectory.world_model import World
 
 ROOT = Path(__file__).parent.parent
 ROBOTS = {"husky_ur5e": "Husky, UR5e", "tiago_pro": "TIAGo Pro", "pr2": "PR2", "panda": "Panda"}

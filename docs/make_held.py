@@ -11,13 +11,13 @@ import pinocchio as pin
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks import chores
-from vkc_pin.world.models.shapes import triangles
-from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, styled
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.planning.initialization import constrained_rrt as held
 from vkc_pin.planning.initialization import interpolation as joining
 from vkc_pin.planning.initialization.keyframes import depth
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, styled
+from vkc_pin.world.models.shapes import triangles
+from vkc_pin.world.scene.obstacles import FLOOR
 
 EVERY = 6  # of the waypoints that are drawn
 

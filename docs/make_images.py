@@ -13,16 +13,15 @@ import numpy as np
 import pinocchio as pin
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks import chores
-from vkc_pin.benchmarks import gap
-from vkc_pin.world.models.shapes import triangles
-from vkc_pin.world.trajectory.dynamics.torques import Torques
-from vkc_pin.world.trajectory.world_model import World
-from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, styled
-from vkc_pin.visualization.plots.top_view import draw_top_view
-from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.benchmarks import chores, gap
 from vkc_pin.visualization import drawing
 from vkc_pin.visualization import viewer as visualization
+from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, styled
+from vkc_pin.visualization.plots.top_view import draw_top_view
+from vkc_pin.world.models.shapes import triangles
+from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.trajectory.dynamics.torques import Torques
+from vkc_pin.world.trajectory.world_model import World
 
 ROOT = Path(__file__).parent.parent
 IMAGES = ROOT / "docs" / "images"

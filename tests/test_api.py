@@ -16,7 +16,13 @@ import vkc_pin as vkc
 ROOT = Path(__file__).resolve().parent.parent
 # Compiled, and a process of its own.
 COMPILED = tuple(
-    f"vkc_pin.{name}" for name in ("cpin._cpin", "distances._distances", "driving._driving", "seeds._trees", "solver._kkt")
+    f"vkc_pin.{name}" for name in (
+        "planning.kinematics._cpin",
+        "world.collision._distances",
+        "planning.base_paths._driving",
+        "planning.initialization._trees",
+        "planning.solver._kkt",
+    )
 )
 SCRIPTS = (*COMPILED, "vkc_pin.visualization.server", "vkc_pin.cli.__main__")
 MODULES = [name for _, name, _ in pkgutil.walk_packages(vkc.__path__, "vkc_pin.") if name not in SCRIPTS]

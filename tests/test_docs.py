@@ -20,12 +20,19 @@ import yaml
 
 import vkc_pin as vkc
 from vkc_pin.cli.commands import make_parser
+from vkc_pin.validation.report import Violation
 from vkc_pin.world.files.documents import Document, check
 from vkc_pin.world.models.dynamics.joint_resistance import ObjectJointSchema
 from vkc_pin.world.models.object_file import AttachmentSchema, LatchSchema, ObjectSchema
 from vkc_pin.world.models.robot_schema import BaseSchema, RobotSchema
-from vkc_pin.world.scene.scene_schema import COLOURS, ObstacleSchema, PlacedObjectSchema, SceneRobotSchema, SceneSchema, StartSchema
-from vkc_pin.validation.report import Violation
+from vkc_pin.world.scene.scene_schema import (
+    COLOURS,
+    ObstacleSchema,
+    PlacedObjectSchema,
+    SceneRobotSchema,
+    SceneSchema,
+    StartSchema,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -204,7 +211,7 @@ def test_every_public_name_is_in_the_reference() -> None:
 
 def test_every_module_is_in_the_reference_once() -> None:
     pages = runpy.run_path(str(ROOT / "docs/_ext/api_pages.py"))
-    text = "".join(pages["page"](wing, files) for wing, files in pages["wings"]().items())
+    text = "".join(pages["page"](package, files) for package, files in pages["packages"]().items())
     found = re.findall(r"^\.\. automodule:: (\S+)", text, re.MULTILINE)
     there = {".".join(file.relative_to(ROOT).with_suffix("").parts) for file in (ROOT / "vkc_pin").rglob("*.py")}
     assert len(found) == len(set(found))

@@ -10,12 +10,20 @@ import lazy_loader
 
 from vkc_pin.utils import notebook
 
-_public, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-__all__.append("__version__")
+_public, _names, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__all__ += ["__version__", "cpin"]
 notebook.cards_from("vkc_pin.visualization.plots.notebook_cards")
 
 
+def __dir__() -> list[str]:
+    return [*_names(), "cpin"]
+
+
 def __getattr__(name: str) -> Any:
+    if name == "cpin":  # the public name of the kinematics
+        from vkc_pin.planning import kinematics
+
+        return globals().setdefault(name, kinematics)
     if name != "__version__":
         return _public(name)
     from importlib.metadata import PackageNotFoundError, version  # takes longer than all the rest

@@ -1,4 +1,4 @@
-"""The exceptions of the package; all of them derive from `VkcError` and carry data, not only text."""
+"""Exceptions of the package. All derive from `VkcError` and carry data, not only text."""
 
 from __future__ import annotations
 

@@ -1,12 +1,12 @@
-"""Everything about a plan that can be chosen, with its unit and default."""
+"""Options of planning, each with its unit and default."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from typing import Any, Self
 
-from vkc_pin.utils.arguments import number, whole
 from vkc_pin.errors import InputError, shown
+from vkc_pin.utils.arguments import number, whole
 
 __all__ = ["Options"]
 

@@ -45,7 +45,7 @@ def read(app: Sphinx, name: str, source: list[str]) -> None:
 
 
 def generate(app: Sphinx) -> None:
-    """Write the reference's pages on the wings, before it is looked which files there are."""
+    """Write the reference pages of the packages before the source files are listed."""
     api_pages.write()
 
 

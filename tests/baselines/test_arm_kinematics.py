@@ -12,8 +12,8 @@ from helpers.small_problems import door_scene, program_of
 import vkc_pin as vkc
 from vkc_pin.baselines.arm_kinematics import ArmKinematics
 from vkc_pin.baselines.postures import base_poses
-from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.initialization.keyframes import Knots
+from vkc_pin.planning.nlp.merit import TOLERANCE
 
 SLIDE = {"slide": 0.3}
 EXACT = np.sqrt(3.0) * TOLERANCE  # [m] and [rad]: it holds for each coordinate

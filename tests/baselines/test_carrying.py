@@ -14,14 +14,13 @@ from helpers.drives import hall
 from helpers.small_problems import program_of
 
 import vkc_pin as vkc
-from vkc_pin.baselines import BASELINES, plan_separately
-from vkc_pin.baselines import attempt
+from vkc_pin.baselines import BASELINES, attempt, plan_separately
 from vkc_pin.baselines import postures as poses
 from vkc_pin.baselines.attempt import Attempt
 from vkc_pin.baselines.following import FailedError
 from vkc_pin.baselines.postures import postures
-from vkc_pin.world.trajectory.world_model import World
 from vkc_pin.planning.initialization.base_routes import Routes
+from vkc_pin.world.trajectory.world_model import World
 
 OPTIONS = vkc.Options(reach_waypoints=20, move_waypoints=15)
 CUP, THERE = (1.5, 0.1, 0.501), (-0.2, 1.7, 0.701)  # on a table before the robot, and on one to its left

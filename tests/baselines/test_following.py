@@ -13,8 +13,8 @@ import vkc_pin as vkc
 from vkc_pin.baselines import following as module
 from vkc_pin.baselines.following import SEEDS, Followed, follow
 from vkc_pin.baselines.refining import CLEAR
-from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.initialization.keyframes import Knots, smooth
+from vkc_pin.planning.nlp.merit import TOLERANCE
 
 STILL = 0.0
 ROUNDING = 1e-6  # [m]

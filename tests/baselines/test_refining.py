@@ -16,8 +16,8 @@ from vkc_pin.baselines import refining as module
 from vkc_pin.baselines.arm_kinematics import ArmKinematics
 from vkc_pin.baselines.postures import base_poses
 from vkc_pin.baselines.refining import CLEAR, refined
-from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.initialization.keyframes import Knots
+from vkc_pin.planning.nlp.merit import TOLERANCE
 
 HALF, ROUNDING = 4, 1e-6  # a waypoint; [m]
 TILT, SLIDE = -2, -1  # columns

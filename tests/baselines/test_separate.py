@@ -20,9 +20,7 @@ from helpers.drawers import changed, drawer_scene, handle, holding, off, open_sc
 from helpers.small_problems import door_scene
 
 import vkc_pin as vkc
-from vkc_pin.baselines import BASELINES, plan_separately
-from vkc_pin.baselines import attempt
-from vkc_pin.baselines import separate
+from vkc_pin.baselines import BASELINES, attempt, plan_separately, separate
 from vkc_pin.baselines import postures as poses
 from vkc_pin.baselines.attempt import FINER
 from vkc_pin.baselines.following import Followed, follow

@@ -13,8 +13,7 @@ from helpers.markdown import cells
 from helpers.pages import clips, commands_of
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks import baselines
-from vkc_pin.benchmarks import comparison
+from vkc_pin.benchmarks import baselines, comparison
 from vkc_pin.benchmarks.baselines import COMPARED_PLANNERS, TASKS
 from vkc_pin.benchmarks.comparison import shown
 from vkc_pin.benchmarks.comparison_report import report
@@ -23,10 +22,10 @@ from vkc_pin.benchmarks.harness.limits import EFFORT, LIMITS
 from vkc_pin.benchmarks.harness.record import peaks
 from vkc_pin.cli import main
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.world.trajectory.phase_span import PhaseSpan
-from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.planning.outcome import spent
 from vkc_pin.validation.report import Report, Violation
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 GOOD = {"B1": {2, 3}, "B2": {1, 2}, "VKC": {0, 1, 2}}
 """Method → the starts from which `solve` has it succeed."""

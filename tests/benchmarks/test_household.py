@@ -17,16 +17,15 @@ from helpers.markdown import cells
 from helpers.small_problems import program_of
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks import comparison
-from vkc_pin.benchmarks import household
+from vkc_pin.benchmarks import comparison, household
 from vkc_pin.benchmarks.comparison import placed
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.limits import LIMITS
 from vkc_pin.benchmarks.household import COMPARED_PLANNERS, COMPARISON, PAPER, TABLE_TOP, TASKS, on_the_coffee_table, papers_home
 from vkc_pin.cli import main
+from vkc_pin.validation.report import Report, Violation
 from vkc_pin.world.models.shapes import clearance, placed_shapes
 from vkc_pin.world.scene.placed_object import standing_geometry
-from vkc_pin.validation.report import Report, Violation
 
 GOOD = {("cup", "B1"): {0}, ("cup", "B2"): {0, 1}, ("door", "B2"): {1}}
 """(task, method) → the starts from which `solve` has it succeed; VKC always does."""

@@ -12,10 +12,10 @@ import pytest
 
 from vkc_pin.benchmarks.initialization import TARGET
 from vkc_pin.cli import main
-from vkc_pin.world.trajectory.world_model import World
 from vkc_pin.planning.plan import Plan
-from vkc_pin.world.scene.scene import load_scene
 from vkc_pin.validation.validate import validate
+from vkc_pin.world.scene.scene import load_scene
+from vkc_pin.world.trajectory.world_model import World
 
 FIELDS = {
     *("key", "scene", "method", "number", "repeat", "perturbation", "start", "seed", "success", "status", "planning_time"),

@@ -16,10 +16,8 @@ import yaml
 
 import vkc_pin as vkc
 from vkc_pin import cli
-from vkc_pin.benchmarks import door
-from vkc_pin.benchmarks import initialization
-from vkc_pin.benchmarks.harness import record
-from vkc_pin.benchmarks.harness import runner
+from vkc_pin.benchmarks import door, initialization
+from vkc_pin.benchmarks.harness import record, runner
 from vkc_pin.cli import commands
 from vkc_pin.planning import planner
 from vkc_pin.planning.stepwise import all_at_once

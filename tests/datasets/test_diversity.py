@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vkc_pin.datasets.diversity import NEAR, Seen, homotopy, spread, way
+from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.scene.scene import Scene, load_scene
 
 
 def along(*points: tuple[float, float]) -> Trajectory:

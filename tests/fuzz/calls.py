@@ -17,8 +17,8 @@ import pinocchio as pin
 
 import vkc_pin as vkc
 from vkc_pin.planning.kinematics import center_of_mass, frame_jacobian, frame_placements, joint_placements, rnea
-from vkc_pin.visualization.plots import plot_clearance, plot_joints, plot_top_view
 from vkc_pin.visualization import to_html
+from vkc_pin.visualization.plots import plot_clearance, plot_joints, plot_top_view
 
 from . import odd
 

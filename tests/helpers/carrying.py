@@ -12,11 +12,11 @@ import pinocchio as pin
 
 from helpers.drives import DT, hall
 from vkc_pin.world.models.object_file import load_object
-from vkc_pin.world.trajectory.phase_span import PhaseSpan
-from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.scene.hold import holds_of
 from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 STICK = pin.SE3(np.eye(3), np.array([0.8, 0.0, 0.55]))  # along y, its tip to the left; its discs stand 0.05 below
 TOP = 0.5  # [m] of the table

@@ -11,8 +11,8 @@ import numpy as np
 import pinocchio as pin
 
 from helpers.carrying import reaching
-from vkc_pin.world.models.shapes import link_name, shape_distance
 from vkc_pin.options import Options
+from vkc_pin.world.models.shapes import link_name, shape_distance
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import standing_geometry
 from vkc_pin.world.scene.scene import Scene, load_scene

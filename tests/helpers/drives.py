@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.scene.scene import Scene
 
 DT = 0.25  # [s]
 

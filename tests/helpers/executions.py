@@ -9,9 +9,9 @@ import numpy as np
 import pinocchio as pin
 
 import vkc_pin as vkc
-from vkc_pin.world.trajectory.trajectory import PhaseSpan, Trajectory
 from vkc_pin.planning.plan import Plan
 from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.trajectory import PhaseSpan, Trajectory
 
 __all__ = ["door_plan", "drawer_plan", "holding", "still", "with_mass"]
 

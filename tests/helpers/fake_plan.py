@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from vkc_pin.world.trajectory.phase_span import PhaseSpan
-from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
+from vkc_pin.validation.report import Report, Violation
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Actuate
-from vkc_pin.validation.report import Report, Violation
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 HINGE = 1.2
 

@@ -8,11 +8,11 @@ from collections.abc import Mapping
 import pinocchio as pin
 
 import vkc_pin as vkc
-from vkc_pin.world.models.articulated_object import Attachment
-from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.scene.scene import Scene
 from vkc_pin.validation.report import Report, Violation
 from vkc_pin.validation.validate import validate
+from vkc_pin.world.models.articulated_object import Attachment
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
 def only(report: Report) -> Violation:

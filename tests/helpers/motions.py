@@ -6,11 +6,11 @@ import numpy as np
 import pinocchio as pin
 
 from helpers.carrying import Script, room, table
-from vkc_pin.world.trajectory.phase_span import PhaseSpan
-from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.validation.pairs import PairTable
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.validation.pairs import PairTable
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
 def wander(scene: Scene, seed: int, *, size: float) -> Trajectory:

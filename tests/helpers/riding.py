@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.world.trajectory.phase_span import PhaseSpan
-from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 TOP = 0.67  # [m] of the plate
 POST = '<link name="post"><collision><origin xyz="0 0 0.3"/><geometry><box size="0.3 0.3 0.6"/></geometry></collision></link>'

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import vkc_pin as vkc
-from vkc_pin.utils import disk_cache as kept
 from vkc_pin.importing import convex
 from vkc_pin.importing.convex import concavity, decompose, solid_volume
+from vkc_pin.utils import disk_cache as kept
 
 box = trimesh.creation.box
 

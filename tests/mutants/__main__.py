@@ -17,14 +17,14 @@ from .running import PACKAGE, ROOT, measured, outcome, warm
 # What judges motions, what is close, poses and their errors, and the solver.
 MODULES = [
     "validation",
-    "chain/collision_pairs.py",
-    "chain/contacts.py",
-    "chain/easing.py",
-    "chain/pose.py",
-    "solver",
-    "program/merit.py",
+    "planning/chain/collision_pairs.py",
+    "planning/chain/contacts.py",
+    "planning/chain/easing.py",
+    "planning/chain/pose.py",
+    "planning/solver",
+    "planning/nlp/merit.py",
 ]
-MODULES += ["scene/contact.py", "planning/one_problem.py"]
+MODULES += ["world/scene/contact_rules.py", "planning/one_problem.py"]
 TESTS = [
     "tests/validation",
     "tests/planning/solver",

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.planning.retiming import retime
 from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["FINE", "bound"]
 

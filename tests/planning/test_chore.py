@@ -16,10 +16,10 @@ import pytest
 import vkc_pin as vkc
 from vkc_pin.benchmarks.initialization import TARGET
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.world.trajectory.splicing import cut
-from vkc_pin.world.trajectory.world_model import World
 from vkc_pin.planning.one_problem import OneProblem
 from vkc_pin.planning.window import SlidingWindow
+from vkc_pin.world.trajectory.splicing import cut
+from vkc_pin.world.trajectory.world_model import World
 
 A, G, P = vkc.Actuate, vkc.Grasp, vkc.Place
 TABLE = (-3.0, 1.3, 1.051)  # on the bar table

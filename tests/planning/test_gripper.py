@@ -19,14 +19,14 @@ from oracle.judge import judge
 import vkc_pin as vkc
 from vkc_pin.planning.chain.chain import consolidate
 from vkc_pin.planning.chain.contacts import ContactModel
-from vkc_pin.world.trajectory.placements import sample_motion
-from vkc_pin.world.trajectory.phase_span import PhaseSpan
-from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.trajectory.world_model import World
+from vkc_pin.validation.validate import validate
 from vkc_pin.world.scene.contact_rules import opening_at_start
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.compiler import compile_task
-from vkc_pin.validation.validate import validate
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.placements import sample_motion
+from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.world_model import World
 
 PULL = [vkc.Actuate("drawer", {"slide": 0.15}), vkc.Release()]
 NARROW = 0.04

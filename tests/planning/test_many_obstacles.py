@@ -18,28 +18,28 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vkc_pin.benchmarks.scale import crowded
+from vkc_pin.planning.base_paths.base_clearance import Body
 from vkc_pin.planning.chain import easing
 from vkc_pin.planning.chain.contacts import ContactModel
 from vkc_pin.planning.chain.phase_geometry import PhaseGeometry
-from vkc_pin.world.collision.clearances import Clearances, Nearest
-from vkc_pin.world.collision.shapes import asked
-from vkc_pin.planning.base_paths.base_clearance import Body
-from vkc_pin.world.models import shapes as geometry
-from vkc_pin.world.models.shapes import clearance, shape_distance
-from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.trajectory.world_model import World
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
-from vkc_pin.visualization.plots.clearance import clearance_curves
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.world.scene.obstacles import FLOOR
-from vkc_pin.world.scene.placed_object import standing_geometry
-from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step
 from vkc_pin.validation.distances import Placed, Solids, travelled
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.sweep import _Sweep, sweep
+from vkc_pin.visualization.plots.clearance import clearance_curves
+from vkc_pin.world.collision.clearances import Clearances, Nearest
+from vkc_pin.world.collision.shapes import asked
+from vkc_pin.world.models import shapes as geometry
+from vkc_pin.world.models.shapes import clearance, shape_distance
+from vkc_pin.world.scene.obstacles import FLOOR
+from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step
+from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.world_model import World
 
 SEEDS = st.integers(0, 2**32 - 1)
 POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array([0.4, 0.2, 0.9]))

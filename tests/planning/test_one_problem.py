@@ -14,16 +14,16 @@ from helpers.small_problems import door_scene, program_of
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks.problems.problem_set import problem as drawn_problem
-from vkc_pin.utils.budget import spend
-from vkc_pin.utils.cache import Cache
 from vkc_pin.planning import one_problem as module
+from vkc_pin.planning.initialization.initial_guess import Seed
 from vkc_pin.planning.one_problem import OneProblem
 from vkc_pin.planning.outcome import TIMES
-from vkc_pin.planning.settings import Settings
 from vkc_pin.planning.retiming.retime import retimed
-from vkc_pin.planning.initialization.initial_guess import Seed
+from vkc_pin.planning.settings import Settings
 from vkc_pin.planning.solver.solution import Iteration, Solution
 from vkc_pin.planning.solver.to_trajectory import as_trajectory
+from vkc_pin.utils.budget import spend
+from vkc_pin.utils.cache import Cache
 from vkc_pin.world.task.compiler import compile_task
 
 PULL = [vkc.Actuate("drawer", {"slide": 0.3})]

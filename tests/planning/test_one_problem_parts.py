@@ -12,14 +12,14 @@ from helpers.drives import hall
 from helpers.small_problems import program_of
 
 import vkc_pin as vkc
-from vkc_pin.utils.cache import Cache
-from vkc_pin.planning.chain.contacts import Contacts
 from vkc_pin.planning import one_problem as module
+from vkc_pin.planning.chain.contacts import Contacts
+from vkc_pin.planning.initialization.initial_guess import Seed
 from vkc_pin.planning.one_problem import OneProblem, _Try
 from vkc_pin.planning.settings import Settings
-from vkc_pin.planning.initialization.initial_guess import Seed
-from vkc_pin.world.task.compiler import compile_task
+from vkc_pin.utils.cache import Cache
 from vkc_pin.validation.report import Report, Violation
+from vkc_pin.world.task.compiler import compile_task
 
 
 def attempt(name: str, *amounts: float, status: str = "rejected") -> _Try:

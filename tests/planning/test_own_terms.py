@@ -18,8 +18,8 @@ from helpers.drives import hall
 
 import vkc_pin as vkc
 from vkc_pin.cli import main
-from vkc_pin.world.trajectory.world_model import World
 from vkc_pin.world.task.terms import Term
+from vkc_pin.world.trajectory.world_model import World
 
 SHORT = vkc.Options(reach_waypoints=16)
 OVER = [vkc.Place("cup", [1.35, 1.1, 0.501])]

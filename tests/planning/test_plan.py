@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 import vkc_pin as vkc
+from vkc_pin.validation.report import Report, Violation
 from vkc_pin.world.files.writing import write_atomically
 from vkc_pin.world.trajectory.formats.archives import FORMAT
-from vkc_pin.validation.report import Report, Violation
 
 TETRAHEDRON = """v 0 0 0
 v 0.4 0 0

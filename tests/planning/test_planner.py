@@ -19,10 +19,10 @@ from helpers.carrying import BALL, STICK, lifted, room, stand, table, tool_at
 from helpers.drives import hall
 
 import vkc_pin as vkc
+from vkc_pin.validation.validate import validate
 from vkc_pin.world.files.resources import folder
 from vkc_pin.world.trajectory.wheels import rolling_of
 from vkc_pin.world.trajectory.world_model import World
-from vkc_pin.validation.validate import validate
 
 ROOT = Path(__file__).resolve().parents[2]
 HINGE = 1.2

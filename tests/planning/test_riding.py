@@ -11,10 +11,10 @@ from helpers.judging import names
 from helpers.riding import TOP, plates, slid, trays
 
 import vkc_pin as vkc
-from vkc_pin.world.trajectory.free_objects import FreeObjects
-from vkc_pin.world.trajectory.world_model import World, scene_after
 from vkc_pin.options import Options
 from vkc_pin.validation.validate import validate
+from vkc_pin.world.trajectory.free_objects import FreeObjects
+from vkc_pin.world.trajectory.world_model import World, scene_after
 
 
 def where(plan: vkc.Plan, name: str = "cup") -> list[pin.SE3]:

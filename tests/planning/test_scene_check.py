@@ -11,8 +11,8 @@ from helpers.drawers import changed, drawer_scene, with_boxes
 import vkc_pin as vkc
 from vkc_pin.errors import InputError
 from vkc_pin.planning.scene_check import SceneCheck, check_scene
-from vkc_pin.world.scene.scene import Scene
 from vkc_pin.validation.validate import validate
+from vkc_pin.world.scene.scene import Scene
 
 
 @pytest.fixture(scope="module")

@@ -16,17 +16,17 @@ from helpers.small_problems import full_scene, program_of, with_objects
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks.robot_object_matrix.pairs import description_of, hall
-from vkc_pin.utils.budget import Budget
-from vkc_pin.world.trajectory.phase_span import PhaseSpan
-from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.trajectory.world_model import scene_after
 from vkc_pin.planning import stepwise as module
 from vkc_pin.planning.one_problem import OneProblem
 from vkc_pin.planning.outcome import TIMES
 from vkc_pin.planning.settings import Settings
+from vkc_pin.utils.budget import Budget
+from vkc_pin.validation.validate import validate
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.validation.validate import validate
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.world_model import scene_after
 
 
 def ending(scene: Scene, base: list[float], arm: np.ndarray, **objects: float) -> Trajectory:

@@ -17,10 +17,10 @@ from oracle.judge import judge
 import vkc_pin as vkc
 from vkc_pin.baselines.arm_kinematics import ArmKinematics
 from vkc_pin.planning.chain.chain import consolidate
+from vkc_pin.planning.initialization.keyframes import Knots
 from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.placements import sample_motion
 from vkc_pin.world.trajectory.world_model import World
-from vkc_pin.planning.initialization.keyframes import Knots
 
 NAMES = ("base_x", "base_y", "base_yaw", "lift", "out_1", "yaw_joint", "pitch_joint", "roll_joint")
 

@@ -11,12 +11,12 @@ from helpers.small_problems import program_of
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks.initialization import TARGET
-from vkc_pin.world.trajectory.world_model import World, scene_after
+from vkc_pin.planning.initialization.initial_guess import Seed, seed_of
 from vkc_pin.planning.one_problem import OneProblem
 from vkc_pin.planning.settings import Settings
 from vkc_pin.planning.stepwise import stages
-from vkc_pin.planning.initialization.initial_guess import Seed, seed_of
 from vkc_pin.world.task.compiler import compile_task
+from vkc_pin.world.trajectory.world_model import World, scene_after
 
 
 @cache

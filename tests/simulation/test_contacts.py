@@ -6,14 +6,14 @@ import pytest
 from helpers.executions import door_plan, holding
 
 import vkc_pin as vkc
-from vkc_pin.world.trajectory.world_model import World
 from vkc_pin.options import Options
-from vkc_pin.world.scene.contact_rules import grasped, touching
-from vkc_pin.world.scene.clearance_exemptions import allowances
-from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.simulation.contacts import touching_pairs, unwanted
 from vkc_pin.validation.distances import Solids
 from vkc_pin.validation.pairs import PairTable
+from vkc_pin.world.scene.clearance_exemptions import allowances
+from vkc_pin.world.scene.contact_rules import grasped, touching
+from vkc_pin.world.scene.obstacles import FLOOR
+from vkc_pin.world.trajectory.world_model import World
 
 
 @pytest.mark.parametrize("grip", [True, False])

@@ -11,8 +11,8 @@ from helpers.executions import door_plan, drawer_plan, holding, still, with_mass
 from helpers.telescopes import telescope_scene
 
 import vkc_pin as vkc
-from vkc_pin.world.scene.scene import Scene
 from vkc_pin.simulation.execution import simulate
+from vkc_pin.world.scene.scene import Scene
 
 
 def test_a_drawer_is_pulled() -> None:

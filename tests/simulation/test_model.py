@@ -13,16 +13,16 @@ from helpers.executions import drawer_plan, still
 from helpers.telescopes import coupled_scene
 
 import vkc_pin as vkc
-from vkc_pin.world.models.dynamics.joint_resistance import Resistance
-from vkc_pin.world.models.shapes import triangles
-from vkc_pin.world.trajectory.world_model import World
-from vkc_pin.world.scene.scene import Scene
 from vkc_pin.simulation.contacts import touching_pairs
-from vkc_pin.simulation.welds import latched
 from vkc_pin.simulation.model import Builder, PhysicalWorld
 from vkc_pin.simulation.physics import Physics, weigh
 from vkc_pin.simulation.result import SimulationResult
 from vkc_pin.simulation.servos import servos
+from vkc_pin.simulation.welds import latched
+from vkc_pin.world.models.dynamics.joint_resistance import Resistance
+from vkc_pin.world.models.shapes import triangles
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.world_model import World
 
 
 def built(scene: Scene, *, guessed: bool = False) -> PhysicalWorld:

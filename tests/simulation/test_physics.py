@@ -11,8 +11,8 @@ import pytest
 from helpers.executions import drawer_plan, holding
 
 import vkc_pin as vkc
-from vkc_pin.world.trajectory.world_model import World
 from vkc_pin.simulation.physics import engine, weigh
+from vkc_pin.world.trajectory.world_model import World
 
 
 def test_without_mujoco_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,11 +12,11 @@ from helpers.executions import door_plan, still
 from helpers.telescopes import coupled_scene
 
 import vkc_pin as vkc
-from vkc_pin.world.trajectory.world_model import World
 from vkc_pin.simulation.contacts import touching_pairs
 from vkc_pin.simulation.model import Builder
 from vkc_pin.simulation.physics import Physics, weigh
 from vkc_pin.simulation.servos import efforts_for, finger_rows, reference, servos
+from vkc_pin.world.trajectory.world_model import World
 
 
 def test_servos_are_made_for_the_inertia_that_they_move() -> None:

@@ -8,9 +8,9 @@ import pytest
 from helpers.executions import door_plan, holding, still, with_mass
 
 import vkc_pin as vkc
-from vkc_pin.world.trajectory.world_model import World
 from vkc_pin.simulation.execution import simulate
 from vkc_pin.simulation.welds import spans
+from vkc_pin.world.trajectory.world_model import World
 
 
 @pytest.mark.parametrize("mass", [0.4, 3.0])

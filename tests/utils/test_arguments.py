@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vkc_pin.utils import arguments as check
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.utils import arguments as check
 from vkc_pin.world.files.resources import file_path
 
 

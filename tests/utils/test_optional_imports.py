@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.utils import optional_imports as needed
-from vkc_pin.planning.base_paths.grid import BaseGrid
-from vkc_pin.planning.base_paths.base_path import shortest_path
 from vkc_pin.errors import BuildError
+from vkc_pin.planning.base_paths.base_path import shortest_path
+from vkc_pin.planning.base_paths.grid import BaseGrid
+from vkc_pin.utils import optional_imports as needed
 
 
 def a_path() -> object:

@@ -30,13 +30,13 @@ from helpers.carrying import (
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.world.trajectory.phase_span import PhaseSpan
-from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.validation.report import Report, Violation
+from vkc_pin.validation.validate import validate
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Step
-from vkc_pin.validation.report import Report, Violation
-from vkc_pin.validation.validate import validate
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 ASIDE = lifted(STICK, [0.0, 0.5, 0.0])
 PLACED = vkc.Place("stick", ASIDE)

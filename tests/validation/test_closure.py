@@ -10,12 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import vkc_pin as vkc
-from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.trajectory.curve import Curve
-from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
-from vkc_pin.world.scene.scene import Scene
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.closure import (
     RESOLUTION,
     _grasp_levers,
@@ -28,6 +25,9 @@ from vkc_pin.validation.closure import (
 )
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.validate import validate
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.curve import Curve
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 LIMITS = (Options().closure_position, Options().closure_angle)
 

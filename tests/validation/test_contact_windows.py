@@ -30,18 +30,18 @@ from helpers.grippers import between_cheeks, write_gripper
 from helpers.riding import plates, slid
 from helpers.small_problems import door_scene
 
-from vkc_pin.world.trajectory.phase_span import PhaseSpan
-from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.options import Options
+from vkc_pin.validation.contact_windows import check_gripper, windows
+from vkc_pin.validation.distances import Solids
+from vkc_pin.validation.samples import Samples
+from vkc_pin.validation.validate import validate
 from vkc_pin.world.scene.contact_rules import CONTACT
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Actuate, Grasp, Step, Touch
-from vkc_pin.validation.distances import Solids
-from vkc_pin.validation.samples import Samples
-from vkc_pin.validation.contact_windows import check_gripper, windows
-from vkc_pin.validation.validate import validate
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 HANDS = set(door_scene().robot.touch_links)
 STEPS = 4  # of `EASED_TIME`

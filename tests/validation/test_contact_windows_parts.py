@@ -10,13 +10,13 @@ import pinocchio as pin
 import pytest
 
 from vkc_pin.options import Options
-from vkc_pin.world.scene.contact_rules import CONTACT
-from vkc_pin.world.scene.hold import Hold
-from vkc_pin.world.scene.clearance_exemptions import Allowance
 from vkc_pin.validation import contact_windows as touching
+from vkc_pin.validation.contact_windows import Window, _Windows, check_gripper, check_pushes
 from vkc_pin.validation.goals import MOTION_TOLERANCE
 from vkc_pin.validation.report import Violation
-from vkc_pin.validation.contact_windows import Window, _Windows, check_gripper, check_pushes
+from vkc_pin.world.scene.clearance_exemptions import Allowance
+from vkc_pin.world.scene.contact_rules import CONTACT
+from vkc_pin.world.scene.hold import Hold
 
 STICK, DOOR = Hold("stick", "grip"), Hold("door", "handle")
 BALL = Hold("ball", "pull", STICK, "tip")

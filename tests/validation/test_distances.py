@@ -11,9 +11,9 @@ import pinocchio as pin
 import pytest
 from helpers.small_problems import door_scene, full_scene, random_configurations
 
+from vkc_pin.validation.distances import POINT, Solids
 from vkc_pin.world.models.shapes import shape_distance
 from vkc_pin.world.trajectory.world_model import World
-from vkc_pin.validation.distances import POINT, Solids
 
 COAL = 1e-5  # [m]
 

@@ -12,9 +12,9 @@ import pytest
 from helpers.motions import whirl
 from helpers.small_problems import full_scene
 
-from vkc_pin.world.trajectory.world_model import World
 from vkc_pin.validation.distances import POINT, Placed, Solids, _free, travelled
 from vkc_pin.validation.samples import Samples
+from vkc_pin.world.trajectory.world_model import World
 
 
 @cache

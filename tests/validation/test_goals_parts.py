@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from vkc_pin.validation import goals
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Release, Step, Touch
-from vkc_pin.validation import goals
 
 STICK, DOOR = Hold("stick", "grip"), Hold("door", "handle")
 BALL = Hold("ball", "pull", STICK, "tip")

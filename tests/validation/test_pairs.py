@@ -10,18 +10,18 @@ from helpers.carrying import Script, moved_base, room, stand, table
 from helpers.motions import pair_names, wander
 from helpers.small_problems import door_scene, full_scene, program_of
 
-from vkc_pin.world.trajectory.phase_span import PhaseSpan
-from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.trajectory.world_model import World
 from vkc_pin.options import Options
+from vkc_pin.validation.contact_windows import Window
+from vkc_pin.validation.distances import Solids
+from vkc_pin.validation.pairs import PairTable
+from vkc_pin.validation.samples import Samples
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import GoTo
-from vkc_pin.validation.distances import Solids
-from vkc_pin.validation.pairs import PairTable
-from vkc_pin.validation.samples import Samples
-from vkc_pin.validation.contact_windows import Window
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.world_model import World
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vkc_pin.validation.pairs import PairTable, _Windows
 from vkc_pin.validation.contact_windows import Window
+from vkc_pin.validation.pairs import PairTable, _Windows
 
 numbers = st.integers(0, 6)
 pairs = st.lists(st.tuples(numbers, numbers), min_size=1, max_size=8, unique=True)

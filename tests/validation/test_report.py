@@ -11,8 +11,8 @@ import pytest
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError
-from vkc_pin.visualization.plots.clearance import clearance_curves
 from vkc_pin.validation.report import Bound, Report, Violation
+from vkc_pin.visualization.plots.clearance import clearance_curves
 
 ONE = Violation("limit", "elbow_joint", waypoint=4, time=1.0, amount=0.05, unit="rad", detail="3.2 rad is outside")
 TWO = Violation("penetration", "forearm_link – sofa", waypoint=7, time=1.9, amount=0.01, unit="m", detail="overlap by 10.0 mm")

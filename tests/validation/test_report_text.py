@@ -11,8 +11,8 @@ import pytest
 from helpers.drives import hall, moved, of_rows
 
 from vkc_pin.errors import InputError
-from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.validation.report import SAME, Bound, Report, Violation
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
 
 WRONG = Violation("limit", "elbow_joint", waypoint=4, time=1.0, amount=0.05, unit="rad", detail="3.2 rad is outside")
 FAST = Bound("base_x", "velocity", share=0.625, begin=1.0, end=2.5)

@@ -10,11 +10,11 @@ from helpers.drives import hall, moved, of_rows, through
 from helpers.judging import only
 
 import vkc_pin as vkc
-from vkc_pin.world.trajectory.curve import Curve
-from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.scene.scene import Scene
 from vkc_pin.validation.rolling import SLIP_TOLERANCE
 from vkc_pin.validation.validate import validate
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.curve import Curve
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
 def test_a_differential_base_does_not_slip() -> None:

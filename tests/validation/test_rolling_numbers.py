@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.rolling import SLIP_TOLERANCE, STEP_TOLERANCE, WHEEL_TOLERANCE, check_rolling
+from vkc_pin.world.trajectory.curve import Curve
 
 WHEELS = SimpleNamespace(rim=2.0, track=0.5)
 TIMES = np.array([0.0, 1.0, 3.0, 4.0])

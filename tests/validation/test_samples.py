@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from vkc_pin.errors import InputError
-from vkc_pin.world.trajectory.phase_span import PhaseSpan
-from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.validation.samples import ANGLE_STEP, LENGTH_STEP, MOST, Samples
 from vkc_pin.world.scene.hold import Hold, holds_of
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.validation.samples import ANGLE_STEP, LENGTH_STEP, MOST, Samples
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 VIRTUAL = {
     "grip": (),

@@ -14,12 +14,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.validation import samples as module
+from vkc_pin.validation.samples import Samples, _angles
+from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.scene.scene import Scene
-from vkc_pin.validation import samples as module
-from vkc_pin.validation.samples import Samples, _angles
 
 
 def standing(scene: Scene) -> Samples:

@@ -14,15 +14,15 @@ from helpers.small_problems import door_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.trajectory.world_model import World
-from vkc_pin.world.scene.scene import Scene
 from vkc_pin.validation import sweep as validation_sweep
+from vkc_pin.validation.contact_windows import Window
 from vkc_pin.validation.distances import Solids
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.sweep import Hit, sweep
-from vkc_pin.validation.contact_windows import Window
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.world_model import World
 
 
 def swept(scene: Scene, motion: Trajectory) -> tuple[PairTable, Samples, list[Hit]]:

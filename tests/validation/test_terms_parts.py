@@ -11,10 +11,10 @@ import pytest
 from helpers.drives import hall, moved, of_rows
 
 import vkc_pin as vkc
+from vkc_pin.validation.samples import Samples
+from vkc_pin.validation.terms import BETWEEN, _inputs, _rows, check_terms
 from vkc_pin.world.task.formula import Formula
 from vkc_pin.world.task.terms import traced
-from vkc_pin.validation.terms import BETWEEN, _inputs, _rows, check_terms
-from vkc_pin.validation.samples import Samples
 
 
 def looked_at(way: list[float], phases: list[tuple[int, int, bool]], each: int = 3) -> tuple[list[int], list[int]]:

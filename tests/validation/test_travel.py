@@ -14,10 +14,10 @@ from helpers.telescopes import coupled_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.world.trajectory.world_model import World
 from vkc_pin.validation.distances import Solids, travelled
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.samples import Samples
+from vkc_pin.world.trajectory.world_model import World
 
 
 @settings(max_examples=25, deadline=None)

@@ -13,14 +13,14 @@ from helpers.judging import check, names, only, until_the_grasp, with_attachment
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.world.trajectory.phase_span import PhaseSpan
-from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.options import Options
+from vkc_pin.validation.validate import validate
 from vkc_pin.visualization.plots.clearance import clearance_curves
 from vkc_pin.world.scene.hold import holds_of
 from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.validation.validate import validate
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 WRIST = "wrist_3_joint"
 

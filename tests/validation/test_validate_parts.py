@@ -9,11 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.options import Options
-from vkc_pin.world.scene.hold import Hold
-from vkc_pin.world.scene.clearance_exemptions import Allowance
-from vkc_pin.world.scene.support import LEVEL
 from vkc_pin.validation import validate as module
 from vkc_pin.validation.report import Report, Violation
 from vkc_pin.validation.sweep import Hit
@@ -25,6 +21,10 @@ from vkc_pin.validation.validate import (
     WAYPOINT_TOLERANCE,
     _Check,
 )
+from vkc_pin.world.scene.clearance_exemptions import Allowance
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.scene.support import LEVEL
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
 
 
 def check(*, phases: list[PhaseSpan] | None = None, times: Any = (0.0, 1.0, 2.0, 3.0), each: int = 2, **fields: Any) -> Any:

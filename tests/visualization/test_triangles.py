@@ -7,10 +7,10 @@ import pytest
 import trimesh
 
 from vkc_pin.errors import InputError
-from vkc_pin.world.files.meshes import MeshPart, to_bvh
-from vkc_pin.world.models.shapes import triangles
 from vkc_pin.visualization.plots.top_view import outline
 from vkc_pin.visualization.triangles import Solid, box_solid, coarse, merge_solids, shade, to_solid, tube
+from vkc_pin.world.files.meshes import MeshPart, to_bvh
+from vkc_pin.world.models.shapes import triangles
 
 
 def as_mesh(solid: Solid) -> trimesh.Trimesh:

@@ -20,10 +20,10 @@ from helpers.fake_plan import HINGE, fake_plan
 from helpers.pages import clips, commands_of
 
 from vkc_pin.errors import InputError
-from vkc_pin.world.trajectory.world_model import World
 from vkc_pin.planning.plan import Plan
-from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.visualization import viewer as visualization
+from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin.world.trajectory.world_model import World
 
 needs_chromium = pytest.mark.skipif(browser.CHROMIUM is None, reason="Chromium is not installed")
 

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Floats, Ints
-from vkc_pin.utils.budget import spend
 from vkc_pin.planning.chain.inverse_kinematics import LONGEST_STEP
+from vkc_pin.planning.initialization.keyframes import Knots
 from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.planning.initialization.keyframes import Knots
+from vkc_pin.utils.arrays import Floats, Ints
+from vkc_pin.utils.budget import spend
 
 __all__ = ["QP", "ArmKinematics"]
 

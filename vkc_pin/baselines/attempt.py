@@ -10,29 +10,29 @@ from dataclasses import replace
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.baselines.following import FailedError, follow
 from vkc_pin.baselines.paths import BasePaths, headings
 from vkc_pin.baselines.postures import at_home, base_poses, postures, through
-from vkc_pin.utils.budget import SpentError, spend
-from vkc_pin.utils.cache import Cache
-from vkc_pin.world.trajectory.splicing import join
-from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.trajectory.world_model import scene_after
 from vkc_pin.options import Options
-from vkc_pin.planning.outcome import TIMES, still
+from vkc_pin.planning.initialization.approach_paths import Approach
+from vkc_pin.planning.initialization.initial_guess import Seed
+from vkc_pin.planning.initialization.keyframes import Knots, smooth
+from vkc_pin.planning.initialization.methods import initialize
 from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.world.scene.scene import Scene
-from vkc_pin.planning.initialization.approach_paths import Approach
-from vkc_pin.planning.initialization.methods import initialize
-from vkc_pin.planning.initialization.keyframes import Knots, smooth
-from vkc_pin.planning.initialization.initial_guess import Seed
+from vkc_pin.planning.outcome import TIMES, still
 from vkc_pin.planning.solver.loop import solve
 from vkc_pin.planning.solver.to_trajectory import as_trajectory
 from vkc_pin.planning.solver.trust_region import CLOSE_ENOUGH
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.budget import SpentError, spend
+from vkc_pin.utils.cache import Cache
+from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Step
+from vkc_pin.world.trajectory.splicing import join
+from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.world_model import scene_after
 
 __all__ = ["FINER", "Attempt", "Doable"]
 

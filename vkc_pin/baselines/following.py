@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.baselines.arm_kinematics import ArmKinematics
 from vkc_pin.baselines.refining import CLEAR, refined
-from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.initialization.keyframes import Knots
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["FailedError", "Followed", "follow"]
 

@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats
-from vkc_pin.planning.base_paths.grid import HEADINGS, BaseGrid, fine_cells
 from vkc_pin.planning.base_paths.base_path import poses_along, shortest_path
-from vkc_pin.world.models.coordinates import wrapped
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.planning.initialization.keyframes import smooth
+from vkc_pin.planning.base_paths.grid import HEADINGS, BaseGrid, fine_cells
 from vkc_pin.planning.initialization.base_routes import grid_shapes
 from vkc_pin.planning.initialization.initial_guess import Seed
+from vkc_pin.planning.initialization.keyframes import smooth
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.models.coordinates import wrapped
 from vkc_pin.world.task.steps import GoTo
 
 __all__ = ["BasePaths", "headings"]

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.initialization.approach_paths import Approach
-from vkc_pin.planning.initialization.keyframes import SCATTER, Knots, smooth
 from vkc_pin.planning.initialization.base_routes import Routes
+from vkc_pin.planning.initialization.keyframes import SCATTER, Knots, smooth
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.solver.trust_region import CLOSE_ENOUGH
+from vkc_pin.utils.arrays import Floats
 
 __all__ = ["ENOUGH", "TRIES", "at_home", "base_poses", "postures", "through"]
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.baselines.arm_kinematics import QP
+from vkc_pin.planning.initialization.keyframes import Knots
 from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.planning.initialization.keyframes import Knots
 from vkc_pin.planning.solver.trust_region import CLOSE_ENOUGH
+from vkc_pin.utils.arrays import Floats, Ints
 
 __all__ = ["CLEAR", "refined"]
 

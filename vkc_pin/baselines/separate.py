@@ -32,21 +32,21 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 
-from vkc_pin.utils.arguments import known, whole
 from vkc_pin.baselines.attempt import FINER, Attempt, Doable
 from vkc_pin.errors import InputError, shown
-from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.options import Options
 from vkc_pin.planning.outcome import outcome, spent
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import Planner, borrowed
-from vkc_pin.planning.settings import budget_for, check_arguments
 from vkc_pin.planning.retiming.repair import accepted
+from vkc_pin.planning.settings import budget_for, check_arguments
+from vkc_pin.utils.arguments import known, whole
+from vkc_pin.validation.report import Report
+from vkc_pin.validation.validate import validate
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.steps import Step
-from vkc_pin.validation.report import Report
-from vkc_pin.validation.validate import validate
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["BASELINES", "RETRIES", "plan_separately"]
 

@@ -23,9 +23,9 @@ from vkc_pin.benchmarks.harness.charts import motions_chart
 from vkc_pin.benchmarks.harness.limits import EFFORT, LIMITS
 from vkc_pin.benchmarks.harness.record import Record, Solve, peaks, trial
 from vkc_pin.errors import InputError
-from vkc_pin.world.files.writing import write_atomically
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import Planner, plan
+from vkc_pin.world.files.writing import write_atomically
 from vkc_pin.world.scene.poses import as_placement
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Actuate, GoTo, Place, Step

@@ -19,9 +19,9 @@ from vkc_pin.benchmarks.harness.charts import success_chart
 from vkc_pin.benchmarks.harness.limits import LIMITS, allowed
 from vkc_pin.benchmarks.harness.record import Solve, trial
 from vkc_pin.benchmarks.harness.tables import comparison_table, foot, methods_table
-from vkc_pin.world.files.writing import write_atomically
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
+from vkc_pin.world.files.writing import write_atomically
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Grasp, Touch
 

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.utils.arguments import whole
 from vkc_pin.datasets.dataset import Dataset
 from vkc_pin.datasets.diversity import Seen, homotopy, way
 from vkc_pin.datasets.episode import Episode, scene_name
@@ -22,9 +21,10 @@ from vkc_pin.datasets.problems import terms_of
 from vkc_pin.datasets.recipes.recipe import Recipe, load_recipe
 from vkc_pin.datasets.statistics import statistics_page
 from vkc_pin.errors import InputError, VkcError
+from vkc_pin.utils.arguments import whole
+from vkc_pin.utils.parallel.engine import Died, clustered, results
 from vkc_pin.world.files.documents import read_text
 from vkc_pin.world.files.writing import check_inside, check_writable, write_atomically
-from vkc_pin.utils.parallel.engine import Died, clustered, results
 
 __all__ = ["DatasetCheck", "check_dataset"]
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["NEAR", "Seen", "homotopy", "spread", "way"]
 

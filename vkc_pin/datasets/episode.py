@@ -15,26 +15,26 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.datasets.diversity import way
 from vkc_pin.datasets.problems import NoProblemError, problem
 from vkc_pin.datasets.recipes.recipe import Recipe, load_recipe
 from vkc_pin.errors import InputError
-from vkc_pin.world.files.resources import folder
-from vkc_pin.world.files.writing import check_name
-from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import Planner, plan
-from vkc_pin.utils.parallel.machine import peak_memory, process_name, resident_memory
-from vkc_pin.world.scene.scene import Scene
 from vkc_pin.simulation.cameras.images import Images, taken
 from vkc_pin.simulation.execution import simulate
 from vkc_pin.simulation.result import SimulationResult
-from vkc_pin.world.task.steps import Step, step_from_dict, step_to_dict
-from vkc_pin.world.task.terms import Term, term_from_dict, term_to_dict
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.parallel.machine import peak_memory, process_name, resident_memory
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import validate
+from vkc_pin.world.files.resources import folder
+from vkc_pin.world.files.writing import check_name
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.steps import Step, step_from_dict, step_to_dict
+from vkc_pin.world.task.terms import Term, term_from_dict, term_to_dict
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["Episode", "Made", "attempt", "attempts", "made_of", "moments", "packed", "scene_name", "unpacked", "work_file"]
 

@@ -15,7 +15,6 @@ from typing import Any
 import yaml
 from tqdm import tqdm
 
-from vkc_pin.utils.arguments import flag, whole
 from vkc_pin.datasets.dataset import Dataset, Register
 from vkc_pin.datasets.episode import Made, work_file
 from vkc_pin.datasets.formats import hdf5
@@ -26,12 +25,13 @@ from vkc_pin.datasets.recipes.recipe import CAMERAS, Recipe, load_recipe
 from vkc_pin.datasets.recipes.terms import as_entries
 from vkc_pin.datasets.robots import check_frames, ready_robots
 from vkc_pin.errors import InputError, VkcError
-from vkc_pin.world.files.resources import file_path
-from vkc_pin.world.files.writing import check_links, check_replaceable, check_writable, write_atomically
+from vkc_pin.simulation.physics import engine
+from vkc_pin.utils.arguments import flag, whole
 from vkc_pin.utils.parallel.engine import Died, needs_dask, results
 from vkc_pin.utils.parallel.journal import Journal
 from vkc_pin.utils.parallel.machine import process_name, versions
-from vkc_pin.simulation.physics import engine
+from vkc_pin.world.files.resources import file_path
+from vkc_pin.world.files.writing import check_links, check_replaceable, check_writable, write_atomically
 from vkc_pin.world.task.terms import Term
 
 __all__ = ["generate"]

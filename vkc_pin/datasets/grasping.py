@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from vkc_pin.options import Options
-from vkc_pin.planning.planner import Planner
+from vkc_pin.planning.initialization.keyframes import Knots, depth
 from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.planning.planner import Planner
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.planning.initialization.keyframes import Knots, depth
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.steps import Actuate
 from vkc_pin.world.task.terms import Term, traced

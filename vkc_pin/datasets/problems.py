@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.datasets.grasping import grasped
 from vkc_pin.datasets.recipes.recipe import Recipe, load_recipe, robot_name
 from vkc_pin.datasets.recipes.terms import meant
@@ -21,8 +20,9 @@ from vkc_pin.planning.planner import Planner
 from vkc_pin.procedural.rooms.parts import CARRIED, Part
 from vkc_pin.procedural.rooms.random_room import Layout, random_layout
 from vkc_pin.procedural.rooms.settings import RoomSettings
-from vkc_pin.world.scene.scene import START_CLEARANCE, Scene, load_scene
 from vkc_pin.procedural.tasks import goals
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.scene.scene import START_CLEARANCE, Scene, load_scene
 from vkc_pin.world.task.steps import Actuate, Grasp, Place, Step
 from vkc_pin.world.task.terms import Term
 

@@ -9,14 +9,14 @@ import yaml
 
 from vkc_pin.datasets.recipes.recipe import Recipe, robot_name
 from vkc_pin.datasets.recipes.terms import check_robot
-from vkc_pin.world.files.documents import read_text
-from vkc_pin.world.files.writing import check_name, write_atomically
 from vkc_pin.importing.robots.robot_import import import_robot
-from vkc_pin.world.models.robot_file import find_robot, load_robot
-from vkc_pin.world.scene.scene import load_scene
 from vkc_pin.simulation.cameras.mount import check_frame
 from vkc_pin.simulation.physics import engine
 from vkc_pin.simulation.snapshots import drawing_context
+from vkc_pin.world.files.documents import read_text
+from vkc_pin.world.files.writing import check_name, write_atomically
+from vkc_pin.world.models.robot_file import find_robot, load_robot
+from vkc_pin.world.scene.scene import load_scene
 
 __all__ = ["check_frames", "ready_robots"]
 

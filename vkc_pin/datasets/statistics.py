@@ -14,9 +14,9 @@ import numpy as np
 from vkc_pin.datasets.diversity import spread
 from vkc_pin.datasets.episode import Episode
 from vkc_pin.datasets.recipes.recipe import Recipe
-from vkc_pin.world.trajectory.world_model import World
 from vkc_pin.visualization.plots.style import COLOURS, new_figure, styled
 from vkc_pin.visualization.plots.top_view import draw_top_view
+from vkc_pin.world.trajectory.world_model import World
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

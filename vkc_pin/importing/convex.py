@@ -16,15 +16,15 @@ from typing import TYPE_CHECKING, Any
 import coal
 import numpy as np
 
+from vkc_pin.errors import InputError
+from vkc_pin.importing.slicing import flat, slices, thickened
 from vkc_pin.utils.arguments import number, quantity, whole
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.errors import InputError
+from vkc_pin.utils.disk_cache import record
+from vkc_pin.utils.optional_imports import optional_package
 from vkc_pin.world.files.hulls import compute_hull, outer_hull
 from vkc_pin.world.files.meshes import MeshPart, coarser, load_mesh, to_bvh
 from vkc_pin.world.files.resources import file_path
-from vkc_pin.importing.slicing import flat, slices, thickened
-from vkc_pin.utils.disk_cache import record
-from vkc_pin.utils.optional_imports import optional_package
 
 if TYPE_CHECKING:
     import trimesh

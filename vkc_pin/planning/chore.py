@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from vkc_pin.utils.arguments import whole
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import Planner, guarded
 from vkc_pin.planning.settings import Settings, settings_for
-from vkc_pin.planning.window import SlidingWindow
-from vkc_pin.world.scene.scene import Scene
 from vkc_pin.planning.solver.solution import Iteration
+from vkc_pin.planning.window import SlidingWindow
+from vkc_pin.utils.arguments import whole
+from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.actions import foresee
 from vkc_pin.world.task.phases import stretches
 from vkc_pin.world.task.steps import Step, as_list

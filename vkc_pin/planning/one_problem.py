@@ -12,28 +12,28 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats
-from vkc_pin.utils.budget import ENDINGS, SpentError, spend, unlimited
-from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.planning.outcome import TIMES, outcome, spent, still
-from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.diagnosis.diagnosis import Blocked, blocked, impossible
+from vkc_pin.planning.diagnosis.paths import ways
 from vkc_pin.planning.diagnosis.proofs import proofs
 from vkc_pin.planning.diagnosis.swept_volumes import swept
-from vkc_pin.planning.diagnosis.paths import ways
-from vkc_pin.planning.settings import Settings
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.planning.retiming.repair import accepted
-from vkc_pin.world.scene.scene import Scene
-from vkc_pin.planning.initialization.methods import initialize
 from vkc_pin.planning.initialization.initial_guess import PhaseWaypoints, Seed
+from vkc_pin.planning.initialization.methods import initialize
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.planning.outcome import TIMES, outcome, spent, still
+from vkc_pin.planning.plan import Plan
+from vkc_pin.planning.retiming.repair import accepted
+from vkc_pin.planning.settings import Settings
 from vkc_pin.planning.solver.loop import solve
 from vkc_pin.planning.solver.solution import Iteration, Solution
 from vkc_pin.planning.solver.to_trajectory import as_trajectory
-from vkc_pin.world.task.phases import Task
-from vkc_pin.world.task.terms import traced
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.budget import ENDINGS, SpentError, spend, unlimited
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import validate
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.phases import Task
+from vkc_pin.world.task.terms import traced
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["OneProblem"]
 

@@ -8,19 +8,19 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from vkc_pin.utils.budget import ENDINGS
-from vkc_pin.world.trajectory.phase_span import PhaseSpan
-from vkc_pin.world.trajectory.splicing import join
-from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.settings import Settings
+from vkc_pin.utils.budget import ENDINGS
+from vkc_pin.validation.report import Report
+from vkc_pin.validation.validate import validate
 from vkc_pin.world.scene.contact_rules import opening_at_start
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Step
 from vkc_pin.world.task.terms import Term
-from vkc_pin.validation.report import Report
-from vkc_pin.validation.validate import validate
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.splicing import join
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["FINAL", "TIMES", "charged", "joined", "outcome", "spent", "still", "summed"]
 

@@ -10,28 +10,25 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.options import Options
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.validation.report import Report
+from vkc_pin.validation.validate import check_fits, validate
 from vkc_pin.world.files.resources import file_path
 from vkc_pin.world.files.writing import write_atomically
-from vkc_pin.world.trajectory.formats.archives import folder_from_data, folder_to_data, read_archive, write_archive
-from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.trajectory.world_model import scene_after, units_of
-from vkc_pin.options import Options
-from vkc_pin.visualization.plots import plots as plotting
-from vkc_pin.visualization.plots.notebook_cards import motion_html
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.simulation.execution import simulate
-from vkc_pin.simulation.result import SimulationResult
 from vkc_pin.world.task.actions import foresee
 from vkc_pin.world.task.steps import Step, step_from_dict, step_to_dict
 from vkc_pin.world.task.terms import Term, term_from_dict, term_to_dict
-from vkc_pin.validation.report import Report
-from vkc_pin.validation.validate import check_fits, validate
-from vkc_pin.visualization import viewer as visualization
+from vkc_pin.world.trajectory.formats.archives import folder_from_data, folder_to_data, read_archive, write_archive
+from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.world_model import scene_after, units_of
 
 if TYPE_CHECKING:
     import meshcat
+
+    from vkc_pin.simulation.result import SimulationResult
 
 __all__ = ["Plan"]
 
@@ -90,6 +87,8 @@ class Plan:
 
     def simulate(self, **options: Any) -> SimulationResult:
         """Execute the motion in physics, with masses and servos; see `simulation.simulate`. Needs the extra `sim`."""
+        from vkc_pin.simulation.execution import simulate
+
         return simulate(self.scene, self.steps, self.trajectory, **options)
 
     def contradictions(self) -> list[str]:
@@ -155,23 +154,33 @@ class Plan:
         return f"<Plan {self.status}: base {m['base_effort']:.2f} m, arm {m['arm_effort']:.2f} rad, {m['planning_time']:.2f} s>"
 
     def _repr_html_(self) -> str:
+        from vkc_pin.visualization.plots.notebook_cards import motion_html
+
         return motion_html(self)
 
     def show(self, **options: Any) -> Any:
         """Show the motion with meshcat: inline in a notebook, otherwise in the browser; see `visualization.show`."""
-        return visualization.show(self, **options)
+        from vkc_pin.visualization.viewer import show
+
+        return show(self, **options)
 
     def animate(self, viewer: meshcat.Visualizer | None = None) -> Any:
         """Put the motion into a meshcat viewer with play, pause and a time slider; return the viewer."""
-        return visualization.animate(self, viewer)
+        from vkc_pin.visualization.viewer import animate
+
+        return animate(self, viewer)
 
     def to_html(self, path: str | Path) -> Path:
         """Write one self-contained page with the animation; return its path."""
-        return visualization.to_html(self, path)
+        from vkc_pin.visualization.viewer import to_html
+
+        return to_html(self, path)
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Draw joints, velocities, clearance and a top view; see `plotting.plot`."""
-        return plotting.plot(self, path)
+        from vkc_pin.visualization.plots.plots import plot
+
+        return plot(self, path)
 
     def save(self, path: str | Path) -> Path:
         """Save it, with its scene, steps, options and report, as an .npz file without pickles; return the path.

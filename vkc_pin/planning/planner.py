@@ -7,15 +7,15 @@ import dataclasses
 import threading
 from collections.abc import Callable, Iterator, Sequence
 
-from vkc_pin.utils.arguments import flag, instance, number, whole
-from vkc_pin.utils.cache import Cache, CacheInfo
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.progress import shown
 from vkc_pin.planning.settings import Settings, settings_for
-from vkc_pin.planning.stepwise import all_at_once, step_by_step
-from vkc_pin.world.scene.scene import Scene
 from vkc_pin.planning.solver.solution import Iteration
+from vkc_pin.planning.stepwise import all_at_once, step_by_step
+from vkc_pin.utils.arguments import flag, instance, number, whole
+from vkc_pin.utils.cache import Cache, CacheInfo
+from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.phases import stretches
 from vkc_pin.world.task.steps import Step

@@ -9,18 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.utils.arguments import instance, whole
-from vkc_pin.utils.arrays import Floats
-from vkc_pin.utils.cache import Cache
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
 from vkc_pin.planning.diagnosis.diagnosis import explain, impossible
-from vkc_pin.visualization.plots.scene_view import Approach, plot_scene
+from vkc_pin.planning.initialization.keyframes import scatter
 from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.utils.arguments import instance, whole
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.cache import Cache
 from vkc_pin.world.scene.clearance_exemptions import Allowance, Close, allowances, close_pairs
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.planning.initialization.keyframes import scatter
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.steps import Grasp, Reach
 
@@ -123,6 +122,8 @@ class SceneCheck:
         Raises:
             InputError: The name's end is none of a picture.
         """
+        from vkc_pin.visualization.plots.scene_view import Approach, plot_scene
+
         arrows = []
         for one in self.attachments:
             placed = self.scene.objects[one.object]

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+from vkc_pin.errors import InputError, shown
+from vkc_pin.options import Options
+from vkc_pin.planning.initialization.methods import INITIALIZATIONS
+from vkc_pin.planning.progress import Progress
+from vkc_pin.planning.solver.solution import Iteration
 from vkc_pin.utils.arguments import instance, known, number, whole
 from vkc_pin.utils.budget import Budget
 from vkc_pin.utils.cache import Cache
-from vkc_pin.errors import InputError, shown
-from vkc_pin.options import Options
-from vkc_pin.planning.progress import Progress
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.planning.initialization.methods import INITIALIZATIONS
-from vkc_pin.planning.solver.solution import Iteration
 from vkc_pin.world.task.terms import Term, traced
 
 __all__ = ["Settings", "budget_for", "check_arguments", "settings_for"]

@@ -6,18 +6,18 @@ import dataclasses
 import itertools
 from typing import NamedTuple
 
-from vkc_pin.utils.budget import ENDINGS
-from vkc_pin.world.trajectory.world_model import scene_after
 from vkc_pin.planning.one_problem import OneProblem
 from vkc_pin.planning.outcome import FINAL, charged, joined
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.settings import Settings
+from vkc_pin.utils.budget import ENDINGS
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.actions import alternatives, is_open
-from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.actuation import clash
+from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.phases import Task
 from vkc_pin.world.task.steps import Step
+from vkc_pin.world.trajectory.world_model import scene_after
 
 __all__ = ["Stage", "all_at_once", "by_any_attachment", "stages", "step_by_step"]
 

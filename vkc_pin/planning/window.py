@@ -7,23 +7,23 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from vkc_pin.utils.budget import ENDINGS
 from vkc_pin.errors import InputError
-from vkc_pin.world.trajectory.splicing import cut
-from vkc_pin.world.trajectory.world_model import scene_after
 from vkc_pin.options import Options
+from vkc_pin.planning.initialization.initial_guess import PhaseWaypoints, Seed, seed_of
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.one_problem import OneProblem
 from vkc_pin.planning.outcome import FINAL, joined
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.settings import Settings
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.utils.budget import ENDINGS
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.planning.initialization.initial_guess import PhaseWaypoints, Seed, seed_of
 from vkc_pin.world.task.actions import actions_of, alternatives
-from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.actuation import clash
+from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.phases import Task
 from vkc_pin.world.task.steps import Step
+from vkc_pin.world.trajectory.splicing import cut
+from vkc_pin.world.trajectory.world_model import scene_after
 
 __all__ = ["SlidingWindow"]
 

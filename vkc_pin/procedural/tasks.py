@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.utils.arguments import instance, number, whole
 from vkc_pin.errors import InputError
-from vkc_pin.world.models.articulated_object import ArticulatedObject, Attachment
 from vkc_pin.procedural.furniture.catalogue import KINDS
-from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.procedural.rooms.fixtures import RANDOM
 from vkc_pin.procedural.rooms.random_room import random_room
 from vkc_pin.procedural.rooms.settings import RoomSettings
+from vkc_pin.utils.arguments import instance, number, whole
+from vkc_pin.world.models.articulated_object import ArticulatedObject, Attachment
+from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Actuate, Grasp, Step
 

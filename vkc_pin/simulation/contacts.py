@@ -13,16 +13,16 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Ints
-from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.trajectory.world_model import World
 from vkc_pin.options import Options
+from vkc_pin.utils.arrays import Ints
+from vkc_pin.validation.distances import Solids
+from vkc_pin.world.scene.clearance_exemptions import allowances
 from vkc_pin.world.scene.contact_rules import CONTACT, EASED_TIME, grasped, touching
 from vkc_pin.world.scene.hold import Hold
-from vkc_pin.world.scene.clearance_exemptions import allowances
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.validation.distances import Solids
+from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.world_model import World
 
 __all__ = ["Contact", "Pairs", "touching_pairs", "unwanted"]
 

@@ -8,25 +8,25 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.utils.arguments import instance
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.errors import InputError
-from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.trajectory.world_model import World
-from vkc_pin.world.scene.contact_rules import CONTACT
-from vkc_pin.world.scene.hold import Hold
-from vkc_pin.world.scene.scene import Scene
 from vkc_pin.simulation.contacts import Contact, Pairs, touching_pairs, unwanted
 from vkc_pin.simulation.friction.fingers import fingers_of, limited
-from vkc_pin.simulation.friction.pauses import paused
 from vkc_pin.simulation.friction.friction_grasps import Span, Squeezes, grip_changes, split
+from vkc_pin.simulation.friction.pauses import paused
 from vkc_pin.simulation.goals import missed
-from vkc_pin.simulation.welds import Grips, Latches, latched, spans
 from vkc_pin.simulation.model import Builder, PhysicalWorld
 from vkc_pin.simulation.physics import Physics, engine, weigh
 from vkc_pin.simulation.result import SimulationResult, Tracking
 from vkc_pin.simulation.servos import Servo, efforts_for, finger_rows, reference, servos
+from vkc_pin.simulation.welds import Grips, Latches, latched, spans
+from vkc_pin.utils.arguments import instance
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.scene.contact_rules import CONTACT
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Step, as_list
+from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.world_model import World
 
 __all__ = ["GRASPS", "simulate"]
 

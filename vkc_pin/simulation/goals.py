@@ -11,10 +11,10 @@ import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.coordinates import wrapped
-from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.trajectory.world_model import World
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
+from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.world_model import World
 
 __all__ = ["Miss", "missed"]
 

@@ -15,17 +15,17 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.errors import InputError
-from vkc_pin.world.models.coordinates import Moved
-from vkc_pin.world.models.dynamics.joint_resistance import Resistance
-from vkc_pin.world.models.shapes import triangles
-from vkc_pin.world.trajectory.world_model import World
-from vkc_pin.world.scene.contact_rules import moves_as_one
-from vkc_pin.world.scene.hold import Hold
 from vkc_pin.simulation.contacts import Pairs
 from vkc_pin.simulation.physics import Physics, engine
 from vkc_pin.simulation.servos import Servo
+from vkc_pin.utils.arrays import Floats, Ints
+from vkc_pin.world.models.coordinates import Moved
+from vkc_pin.world.models.dynamics.joint_resistance import Resistance
+from vkc_pin.world.models.shapes import triangles
+from vkc_pin.world.scene.contact_rules import moves_as_one
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.trajectory.world_model import World
 
 __all__ = ["Builder", "PhysicalWorld", "quaternion"]
 

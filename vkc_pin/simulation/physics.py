@@ -10,9 +10,9 @@ import pinocchio as pin
 
 from vkc_pin.utils.arguments import flag, number
 from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.optional_imports import optional_package
 from vkc_pin.world.models.dynamics.mass import solid_inertia
 from vkc_pin.world.trajectory.world_model import World
-from vkc_pin.utils.optional_imports import optional_package
 
 __all__ = ["Physics", "engine", "weigh"]
 

@@ -10,11 +10,11 @@ import numpy as np
 
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.writing import write_atomically
+from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.free_objects import FreeObjects
 from vkc_pin.world.trajectory.placements import sample_motion
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
-from vkc_pin.world.scene.scene import Scene
 
 __all__ = ["Executed", "Replay", "page"]
 

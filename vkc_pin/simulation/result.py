@@ -10,18 +10,18 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.files.writing import write_atomically
-from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.scene.scene import Scene
 from vkc_pin.simulation.contacts import Contact
 from vkc_pin.simulation.goals import Miss
-from vkc_pin.simulation.welds import Grip
 from vkc_pin.simulation.physics import Physics
 from vkc_pin.simulation.replay import page
 from vkc_pin.simulation.servos import Servo
 from vkc_pin.simulation.snapshots import film, strip
+from vkc_pin.simulation.welds import Grip
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.files.writing import write_atomically
+from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Step, step_to_dict
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["SimulationResult", "Tracking"]
 

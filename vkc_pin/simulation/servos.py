@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from vkc_pin.simulation.physics import Physics
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.trajectory.dynamics.torques import in_base_axes
-from vkc_pin.world.trajectory.wheels import seen
 from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.wheels import seen
 from vkc_pin.world.trajectory.world_model import World
-from vkc_pin.simulation.physics import Physics
 
 __all__ = ["Servo", "efforts_for", "finger_rows", "position_servo", "reference", "servos"]
 

@@ -15,18 +15,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vkc_pin.utils import arguments
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.errors import InputError, VkcError
-from vkc_pin.world.files.writing import write_atomically
-from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.simulation.contacts import Pairs
 from vkc_pin.simulation.model import Builder
 from vkc_pin.simulation.physics import Physics, engine, weigh
 from vkc_pin.simulation.replay import Executed, Replay
 from vkc_pin.simulation.servos import Servo
+from vkc_pin.utils import arguments
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.visualization.camera import FIELD_OF_VIEW
 from vkc_pin.visualization.room import is_wall
+from vkc_pin.world.files.writing import write_atomically
+from vkc_pin.world.scene.obstacles import FLOOR
 
 __all__ = ["Stage", "drawing_context", "film", "strip"]
 

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.scene.hold import Hold
-from vkc_pin.world.scene.scene import Scene
 from vkc_pin.simulation.contacts import Pairs
 from vkc_pin.simulation.model import PhysicalWorld
 from vkc_pin.simulation.physics import Physics, engine
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["Grip", "Grips", "Latches", "latched", "spans"]
 

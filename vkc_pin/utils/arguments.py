@@ -14,8 +14,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from vkc_pin.utils.arrays import LARGEST, Floats
 from vkc_pin.errors import InputError, UnknownNameError, shown
+from vkc_pin.utils.arrays import LARGEST, Floats
 
 __all__ = [
     "finite",

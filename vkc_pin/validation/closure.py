@@ -14,11 +14,11 @@ from typing import NamedTuple
 import numpy as np
 
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.trajectory.phase_span import PhaseSpan
-from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.validation.samples import LENGTH_STEP, MOST, Samples
 from vkc_pin.world.scene.contact_rules import hand_frame
 from vkc_pin.world.scene.hold import Hold
-from vkc_pin.validation.samples import LENGTH_STEP, MOST, Samples
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["Drift", "find_drift"]
 

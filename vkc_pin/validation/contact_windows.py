@@ -8,9 +8,14 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Ints
-from vkc_pin.world.models.grippers.bar_width import EXACT
 from vkc_pin.options import Options
+from vkc_pin.utils.arrays import Ints
+from vkc_pin.validation.distances import Solids
+from vkc_pin.validation.goals import MOTION_TOLERANCE
+from vkc_pin.validation.report import Violation
+from vkc_pin.validation.samples import Samples
+from vkc_pin.world.models.grippers.bar_width import EXACT
+from vkc_pin.world.scene.clearance_exemptions import Allowance, allowances
 from vkc_pin.world.scene.contact_rules import (
     CONTACT,
     EASED_TIME,
@@ -23,13 +28,8 @@ from vkc_pin.world.scene.contact_rules import (
     touching,
 )
 from vkc_pin.world.scene.hold import Hold
-from vkc_pin.world.scene.clearance_exemptions import Allowance, allowances
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Grasp, Step, Touch
-from vkc_pin.validation.distances import Solids
-from vkc_pin.validation.goals import MOTION_TOLERANCE
-from vkc_pin.validation.report import Violation
-from vkc_pin.validation.samples import Samples
 
 __all__ = ["Window", "check_gripper", "check_pushes", "windows"]
 

@@ -9,11 +9,11 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import UnknownNameError
-from vkc_pin.world.models.coordinates import wrapped
 from vkc_pin.options import Options
-from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.samples import Samples
+from vkc_pin.world.models.coordinates import wrapped
+from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
 
 __all__ = ["check_goals", "check_steps"]
 

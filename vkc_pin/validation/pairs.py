@@ -6,14 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Bools, Floats, Ints
 from vkc_pin.errors import InputError
-from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.scene.obstacles import FLOOR
-from vkc_pin.world.scene.scene import Scene
+from vkc_pin.utils.arrays import Bools, Floats, Ints
+from vkc_pin.validation.contact_windows import Window
 from vkc_pin.validation.distances import Placed, Solids
 from vkc_pin.validation.samples import Samples
-from vkc_pin.validation.contact_windows import Window
+from vkc_pin.world.scene.obstacles import FLOOR
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["PairTable"]
 

@@ -6,13 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
-from vkc_pin.utils.arguments import items, mapping, number, text, whole
 from vkc_pin.errors import InputError
+from vkc_pin.utils.arguments import items, mapping, number, text, whole
 
 if TYPE_CHECKING:
-    from vkc_pin.world.trajectory.trajectory import Trajectory
     from vkc_pin.options import Options
     from vkc_pin.world.scene.scene import Scene
+    from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["Bound", "Exemption", "Judged", "Report", "Violation"]
 

@@ -7,11 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from vkc_pin.utils.arrays import Floats
+from vkc_pin.validation.report import Violation
+from vkc_pin.validation.samples import Samples
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.trajectory.curve import moments_at
 from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.validation.report import Violation
-from vkc_pin.validation.samples import Samples
 
 __all__ = ["check_rolling"]
 

@@ -8,17 +8,17 @@ from collections.abc import Iterable
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.world.models.articulated_object import Freedom
 from vkc_pin.world.models.grippers.bar_width import EXACT
+from vkc_pin.world.scene.contact_rules import hand_frame
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.free_objects import FreeObjects
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
-from vkc_pin.world.scene.contact_rules import hand_frame
-from vkc_pin.world.scene.hold import Hold
-from vkc_pin.world.scene.scene import Scene
 
 __all__ = ["ANGLE_STEP", "LENGTH_STEP", "MOST", "Samples"]
 

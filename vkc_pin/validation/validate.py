@@ -10,28 +10,28 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from vkc_pin.options import Options
 from vkc_pin.utils.arguments import instance
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.trajectory.phase_span import PhaseSpan
-from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.options import Options
-from vkc_pin.world.scene.clearance_exemptions import CONTACT, Allowance, allowances
-from vkc_pin.world.scene.support import LEVEL, tilt
-from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.task.steps import Step, as_list
-from vkc_pin.world.task.terms import Term, traced
 from vkc_pin.validation.closure import find_drift
+from vkc_pin.validation.contact_windows import check_gripper, check_pushes, windows
 from vkc_pin.validation.distances import Solids
-from vkc_pin.validation.goals import MOTION_TOLERANCE, check_goals, check_steps
 from vkc_pin.validation.dynamics.rates import check_rates
 from vkc_pin.validation.dynamics.torques import Motors
-from vkc_pin.validation.terms import check_terms
+from vkc_pin.validation.goals import MOTION_TOLERANCE, check_goals, check_steps
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.report import Exemption, Report, Violation
 from vkc_pin.validation.rolling import check_rolling
 from vkc_pin.validation.samples import MOST, Samples
 from vkc_pin.validation.sweep import Hit, sweep
-from vkc_pin.validation.contact_windows import check_gripper, check_pushes, windows
+from vkc_pin.validation.terms import check_terms
+from vkc_pin.world.scene.clearance_exemptions import CONTACT, Allowance, allowances
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.scene.support import LEVEL, tilt
+from vkc_pin.world.task.steps import Step, as_list
+from vkc_pin.world.task.terms import Term, traced
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["check_fits", "validate"]
 

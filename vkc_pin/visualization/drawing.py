@@ -20,16 +20,16 @@ from meshcat.animation import AnimationTrack as Track
 from meshcat.commands import SetAnimation
 
 from vkc_pin.utils.arrays import Bools, Floats
+from vkc_pin.validation.report import Report
+from vkc_pin.visualization.camera import FIELD_OF_VIEW, choose_viewpoint
+from vkc_pin.visualization.room import Part, Room, drawn_parts
+from vkc_pin.visualization.threejs import Ghost, Sun, Triangles, Unshadow, add_node, hexadecimal, material
+from vkc_pin.visualization.triangles import Solid, coarse, merge_solids, to_solid, tube
 from vkc_pin.world.models.robot import Robot
+from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.placements import Motion, sample_motion
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
-from vkc_pin.world.scene.scene import Scene
-from vkc_pin.validation.report import Report
-from vkc_pin.visualization.camera import FIELD_OF_VIEW, choose_viewpoint
-from vkc_pin.visualization.threejs import Ghost, Sun, Triangles, Unshadow, add_node, hexadecimal, material
-from vkc_pin.visualization.room import Part, Room, drawn_parts
-from vkc_pin.visualization.triangles import Solid, coarse, merge_solids, to_solid, tube
 
 __all__ = ["Drawing"]
 

@@ -10,10 +10,10 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats
+from vkc_pin.visualization.triangles import Solid, box_solid, shade, to_solid
 from vkc_pin.world.files.meshes import load_parts
 from vkc_pin.world.models.shapes import world_box
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.visualization.triangles import Solid, box_solid, shade, to_solid
 
 __all__ = ["Part", "Room", "drawn_parts", "is_wall"]
 

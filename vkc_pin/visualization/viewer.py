@@ -18,13 +18,13 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from vkc_pin.utils.arguments import flag, instance, mapping, whole
 from vkc_pin.errors import InputError, VkcError
-from vkc_pin.world.files.writing import write_atomically
+from vkc_pin.utils.arguments import flag, instance, mapping, whole
 from vkc_pin.utils.notebook import in_notebook
+from vkc_pin.validation.report import Judged
+from vkc_pin.world.files.writing import write_atomically
 from vkc_pin.world.scene.poses import as_placement
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.validation.report import Judged
 
 if TYPE_CHECKING:
     import meshcat

@@ -13,8 +13,7 @@ from typing import Any
 import pytest
 from helpers.trials import SETTINGS, fatal, mistaken, square, trials, where
 
-from vkc_pin.benchmarks.harness import record
-from vkc_pin.benchmarks.harness import runner
+from vkc_pin.benchmarks.harness import record, runner
 from vkc_pin.errors import InputError, VkcError
 
 

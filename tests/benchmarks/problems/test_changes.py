@@ -6,8 +6,7 @@ import pytest
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks.problems.changes import UNCHANGED, Change, parsed
-from vkc_pin.planning.solver import loop
-from vkc_pin.planning.solver import trust_region
+from vkc_pin.planning.solver import loop, trust_region
 
 
 def test_an_option() -> None:

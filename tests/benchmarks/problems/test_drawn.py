@@ -13,9 +13,9 @@ from vkc_pin.benchmarks.problems import random_problems
 from vkc_pin.benchmarks.problems.drawn import drawn
 from vkc_pin.cli import main
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.world.files.resources import available
 from vkc_pin.planning.plan import Plan
 from vkc_pin.procedural.tasks import random_task
+from vkc_pin.world.files.resources import available
 from vkc_pin.world.task.steps import step_to_dict
 
 

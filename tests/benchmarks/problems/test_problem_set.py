@@ -11,8 +11,8 @@ import pytest
 import vkc_pin as vkc
 from vkc_pin.benchmarks.problems import poses
 from vkc_pin.benchmarks.problems.problem_set import KINDS, NUMBER, TASKS, kind_of, problem, started
-from vkc_pin.world.models.shapes import shape_distance
 from vkc_pin.procedural.rooms.random_room import random_layout
+from vkc_pin.world.models.shapes import shape_distance
 from vkc_pin.world.scene.scene import START_CLEARANCE
 from vkc_pin.world.task.compiler import compile_task
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from vkc_pin.benchmarks.robot_object_matrix.matrix import chart, report
 from vkc_pin.benchmarks.harness.record import meta
+from vkc_pin.benchmarks.robot_object_matrix.matrix import chart, report
 
 
 def record(robot: str, name: str, status: str = "success", **more: Any) -> dict[str, Any]:

@@ -12,11 +12,11 @@ import pytest
 import vkc_pin as vkc
 from vkc_pin.benchmarks.robot_object_matrix import pairs
 from vkc_pin.benchmarks.robot_object_matrix.pairs import OBJECTS, SHARE, description_of, hall, kind_of, pair
-from vkc_pin.world.files.resources import folder
-from vkc_pin.procedural.furniture.catalogue import KINDS
-from vkc_pin.world.models.shapes import world_box
 from vkc_pin.planning.diagnosis.diagnosis import Blocked
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.procedural.furniture.catalogue import KINDS
+from vkc_pin.world.files.resources import folder
+from vkc_pin.world.models.shapes import world_box
 from vkc_pin.world.scene.placed_object import standing_geometry
 from vkc_pin.world.scene.scene import START_CLEARANCE
 

@@ -9,8 +9,8 @@ import pytest
 from helpers.arm_urdf import write_arms
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.robot_object_matrix.robots import ROBOTS, report, run
 from vkc_pin.benchmarks.harness import runner
+from vkc_pin.benchmarks.robot_object_matrix.robots import ROBOTS, report, run
 from vkc_pin.cli import main
 from vkc_pin.world.models.robot_file import known_robots
 

@@ -9,9 +9,9 @@ import pytest
 from helpers.arm_urdf import write_arms
 
 import vkc_pin as vkc
+from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.robot_object_matrix.pairs import SHARE
 from vkc_pin.benchmarks.robot_object_matrix.run import run
-from vkc_pin.benchmarks.harness import runner
 from vkc_pin.cli import main
 
 

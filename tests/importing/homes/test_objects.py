@@ -6,8 +6,8 @@ import numpy as np
 import pinocchio as pin
 
 import vkc_pin as vkc
-from vkc_pin.importing.homes.splitting import Thing
 from vkc_pin.importing.homes.objects import write_thing
+from vkc_pin.importing.homes.splitting import Thing
 from vkc_pin.importing.objects.description import Description, Link, Part
 
 SETTINGS = {"stem": "can", "most": 2, "dist_safe": 0.02, "grasp_clearance": 0.005}

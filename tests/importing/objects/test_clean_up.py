@@ -12,8 +12,6 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
 from vkc_pin.errors import UnknownNameError
-from vkc_pin.world.files.fields import Name
-from vkc_pin.importing.objects.description import Description, Joint, Link, Part
 from vkc_pin.importing.objects.clean_up import (
     bounds,
     choose_name,
@@ -27,7 +25,9 @@ from vkc_pin.importing.objects.clean_up import (
     upright,
     with_limits,
 )
+from vkc_pin.importing.objects.description import Description, Joint, Link, Part
 from vkc_pin.importing.objects.urdf import read_object_urdf
+from vkc_pin.world.files.fields import Name
 
 
 @pytest.fixture

@@ -8,9 +8,9 @@ import pytest
 import trimesh
 from helpers.downloads import partnet
 
+from vkc_pin.importing.objects.clean_up import surfaces, tidied
 from vkc_pin.importing.objects.description import Description, Joint, Link, Part
 from vkc_pin.importing.objects.pieces import Known, with_pieces
-from vkc_pin.importing.objects.clean_up import surfaces, tidied
 from vkc_pin.importing.objects.urdf import read_object_urdf
 
 HERE = pin.SE3.Identity()

@@ -9,9 +9,9 @@ import trimesh
 import yaml
 
 import vkc_pin as vkc
-from vkc_pin.world.files.urdf import read_urdf
 from vkc_pin.importing.objects.description import Description, Joint, Link, Part
 from vkc_pin.importing.objects.writing import write_description, write_urdf
+from vkc_pin.world.files.urdf import read_urdf
 
 
 def test_a_capsule_is_a_cylinder_and_two_balls(tmp_path: Path) -> None:

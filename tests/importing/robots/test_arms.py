@@ -7,9 +7,9 @@ from helpers.arm_urdf import write_arms
 from helpers.telescopes import write_telescope
 
 import vkc_pin as vkc
+from vkc_pin.importing.robots.arms import Arm, base_kind, bodies, choose, find_arms, own_base, telescopes
 from vkc_pin.world.files import resources
 from vkc_pin.world.files.urdf import UrdfFile, read_urdf
-from vkc_pin.importing.robots.arms import Arm, base_kind, bodies, choose, find_arms, own_base, telescopes
 from vkc_pin.world.models.robot_model import full_model
 
 

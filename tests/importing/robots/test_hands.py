@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from helpers.arm_urdf import write_arms
 
-from vkc_pin.world.files.urdf import read_urdf
 from vkc_pin.importing.robots.arms import Arm, bodies, find_arms
 from vkc_pin.importing.robots.hands import look_at
+from vkc_pin.world.files.urdf import read_urdf
 from vkc_pin.world.models.robot_model import full_model
 
 

@@ -7,9 +7,9 @@ import pytest
 import trimesh
 
 import vkc_pin as vkc
+from vkc_pin.importing.robots.mesh_pieces import own_meshes
 from vkc_pin.world.files.meshes import load_parts
 from vkc_pin.world.files.urdf import UrdfFile, read_urdf
-from vkc_pin.importing.robots.mesh_pieces import own_meshes
 
 TEXT = """<robot name="r">
   <link name="a">

@@ -9,9 +9,9 @@ import pinocchio as pin
 import pytest
 
 import vkc_pin as vkc
+from vkc_pin.importing.robots.mjcf import convert
 from vkc_pin.world.files.kinematic_tree import check_tree
 from vkc_pin.world.files.meshes import load_mesh
-from vkc_pin.importing.robots.mjcf import convert
 from vkc_pin.world.models.robot_model import configuration
 
 ARM = """

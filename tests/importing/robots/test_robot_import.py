@@ -12,8 +12,8 @@ from helpers.arm_urdf import HEIGHT, write_arms
 from helpers.telescopes import FOLLOWERS, write_telescope
 
 import vkc_pin as vkc
-from vkc_pin.world.files.writing import write_atomically
 from vkc_pin.importing.robots.rest_configuration import HOME_ROOM, Clearances
+from vkc_pin.world.files.writing import write_atomically
 
 SAMPLES = 150
 

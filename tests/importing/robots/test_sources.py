@@ -6,8 +6,8 @@ import pytest
 from helpers.arm_urdf import write_arms
 
 import vkc_pin as vkc
-from vkc_pin.world.files import resources
 from vkc_pin.importing.robots.sources import Source, read_source
+from vkc_pin.world.files import resources
 
 
 def read(file: Path, scratch: Path) -> Source:

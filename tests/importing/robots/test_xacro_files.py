@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.world.files.xml import parse_xml
 from vkc_pin.importing.robots.xacro_files import expand
+from vkc_pin.world.files.xml import parse_xml
 
 TEXT = """<?xml version="1.0"?>
 <robot name="two" xmlns:xacro="http://www.ros.org/wiki/xacro">

@@ -10,12 +10,12 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from vkc_pin.planning.base_paths.base_clearance import Shape
-from vkc_pin.planning.base_paths.grid import BaseGrid
-from vkc_pin.planning.base_paths.motion_primitives import BACKWARDS, SIDEWAYS
-from vkc_pin.planning.base_paths.base_path import BasePath, poses_along, shortest_path
-from vkc_pin.planning.base_paths.lattice_search import _Search
 from vkc_pin.errors import InputError
+from vkc_pin.planning.base_paths.base_clearance import Shape
+from vkc_pin.planning.base_paths.base_path import BasePath, poses_along, shortest_path
+from vkc_pin.planning.base_paths.grid import BaseGrid
+from vkc_pin.planning.base_paths.lattice_search import _Search
+from vkc_pin.planning.base_paths.motion_primitives import BACKWARDS, SIDEWAYS
 
 TURNING = 0.3  # [m/rad] where a grid is not told
 

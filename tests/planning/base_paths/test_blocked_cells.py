@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from helpers.base_scenes import HALL, MARGIN, arm, at, chassis, clutter, distance, furniture, wedge
 
-from vkc_pin.planning.base_paths.blocked_cells import Lattice, stuck
 from vkc_pin.planning.base_paths.base_clearance import Shape
+from vkc_pin.planning.base_paths.blocked_cells import Lattice, stuck
 from vkc_pin.planning.base_paths.grid import BaseGrid
 
 CARRIED = [*arm(), (wedge(), at(0.4, 0.4, 0.6, 0.4)), (coal.Box(0.05, 1.4, 0.05), at(0.3, 0.0, 0.8))]

@@ -7,9 +7,9 @@ from helpers.base_scenes import BLINK, HALL, MARGIN, arm, at, between, chassis, 
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
+from vkc_pin.errors import InputError
 from vkc_pin.planning.base_paths.base_clearance import Shape
 from vkc_pin.planning.base_paths.grid import HEADINGS, BaseGrid
-from vkc_pin.errors import InputError
 from vkc_pin.utils.optional_imports import compiled_module
 
 STANDING = [*furniture(), *clutter(2, 20)]

@@ -12,8 +12,8 @@ from scipy.sparse.csgraph import dijkstra
 
 from vkc_pin.planning.base_paths.base_clearance import Shape
 from vkc_pin.planning.base_paths.grid import HEADINGS, BaseGrid
-from vkc_pin.planning.base_paths.motion_primitives import BACKWARDS, SIDEWAYS, Ground, wrapped
 from vkc_pin.planning.base_paths.lattice_search import cheapest
+from vkc_pin.planning.base_paths.motion_primitives import BACKWARDS, SIDEWAYS, Ground, wrapped
 
 TURNING = 0.3  # [m/rad] where a grid is not told
 

@@ -11,12 +11,12 @@ import pytest
 from helpers.carrying import room
 from helpers.small_problems import CABINET_STATE, door_scene, full_scene, random_configurations, with_attachment, with_objects
 
-from vkc_pin.planning.chain.chain import VIRTUAL_ACCELERATION, VIRTUAL_VELOCITY, VirtualKinematicChain, consolidate
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.world.trajectory.world_model import World
+from vkc_pin.planning.chain.chain import VIRTUAL_ACCELERATION, VIRTUAL_VELOCITY, VirtualKinematicChain, consolidate
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.placed_object import standing_geometry
 from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.world_model import World
 
 GRASPS = [
     {"door": "handle"},

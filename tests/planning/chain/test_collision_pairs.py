@@ -10,12 +10,12 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from vkc_pin.options import Options
 from vkc_pin.planning.chain import collision_pairs as module
 from vkc_pin.planning.chain.collision_pairs import _boxes, _Pairing
 from vkc_pin.planning.chain.contacts import Contacts, no_contacts
-from vkc_pin.options import Options
-from vkc_pin.world.scene.contact_rules import CONTACT
 from vkc_pin.world.scene.clearance_exemptions import Allowance
+from vkc_pin.world.scene.contact_rules import CONTACT
 from vkc_pin.world.scene.obstacles import FLOOR
 
 

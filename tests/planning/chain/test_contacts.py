@@ -22,16 +22,16 @@ from helpers.small_problems import (
     with_objects,
 )
 
-from vkc_pin.utils.budget import Budget, SpentError
+from vkc_pin.errors import InputError
+from vkc_pin.options import Options
 from vkc_pin.planning.chain.collision_pairs import phase_geometries
 from vkc_pin.planning.chain.contacts import Contacts
-from vkc_pin.errors import InputError
-from vkc_pin.world.models.shapes import link_name
-from vkc_pin.options import Options
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.utils.budget import Budget, SpentError
+from vkc_pin.world.models.shapes import link_name
+from vkc_pin.world.scene.clearance_exemptions import allowances
 from vkc_pin.world.scene.contact_rules import EASED_TIME
 from vkc_pin.world.scene.hold import Hold
-from vkc_pin.world.scene.clearance_exemptions import allowances
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Reach, Step

@@ -9,8 +9,8 @@ from helpers.objects import SHAPES, joint, load_text
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.planning.chain.inversion import invert
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.planning.chain.inversion import invert
 from vkc_pin.world.models.object_file import load_object
 
 KINDS = ("revolute", "continuous", "prismatic", "fixed")

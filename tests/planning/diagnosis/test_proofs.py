@@ -11,8 +11,8 @@ from helpers.drives import hall
 from helpers.small_problems import SHORT, program_of
 
 import vkc_pin as vkc
-from vkc_pin.planning.base_paths.grid import BaseGrid
 from vkc_pin.planning.base_paths.base_path import shortest_path
+from vkc_pin.planning.base_paths.grid import BaseGrid
 from vkc_pin.planning.diagnosis.proofs import PROVEN, proofs
 from vkc_pin.planning.initialization.base_routes import grid_shapes
 

@@ -10,10 +10,10 @@ import pinocchio as pin
 import pytest
 from helpers.small_problems import door_scene
 
-from vkc_pin.world.models.shapes import link_name, world_box
 from vkc_pin.options import Options
 from vkc_pin.planning.diagnosis.swept_volumes import swept
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.world.models.shapes import link_name, world_box
 from vkc_pin.world.scene.placed_object import standing_geometry
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.compiler import compile_task

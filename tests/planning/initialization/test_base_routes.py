@@ -6,9 +6,9 @@ from helpers.gates import GOAL, NARROW, TIGHT, gated, walled
 from helpers.small_problems import program_of
 
 import vkc_pin as vkc
-from vkc_pin.planning.initialization.methods import initialize
-from vkc_pin.planning.initialization.keyframes import ALIKE
 from vkc_pin.planning.initialization.base_routes import Routes
+from vkc_pin.planning.initialization.keyframes import ALIKE
+from vkc_pin.planning.initialization.methods import initialize
 
 
 def test_the_way_leads_through_the_gap() -> None:

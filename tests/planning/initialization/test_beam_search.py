@@ -12,9 +12,9 @@ from helpers.small_problems import door_scene, hand_off_the_handle, program_of, 
 
 import vkc_pin as vkc
 from vkc_pin.planning.initialization import beam_search as module
+from vkc_pin.planning.initialization.base_routes import Routes
 from vkc_pin.planning.initialization.beam_search import Beam, Found
 from vkc_pin.planning.initialization.keyframes import Knots
-from vkc_pin.planning.initialization.base_routes import Routes
 
 FEW = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20)
 OPEN = vkc.Actuate("door", {"hinge": 1.2})

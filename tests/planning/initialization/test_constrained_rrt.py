@@ -9,14 +9,14 @@ import pytest
 from helpers.small_problems import door_scene, hand_off_the_handle, program_of
 
 import vkc_pin as vkc
-from vkc_pin.utils.budget import Budget, SpentError
-from vkc_pin.world.scene.scene import Scene
 from vkc_pin.planning.initialization import constrained_rrt as held
 from vkc_pin.planning.initialization.beam_search import Beam
 from vkc_pin.planning.initialization.constrained_rrt import held_path, obstructed
 from vkc_pin.planning.initialization.interpolation import Joiner
 from vkc_pin.planning.initialization.keyframes import Knots, depth
 from vkc_pin.planning.initialization.rrt import STEP, TRIES
+from vkc_pin.utils.budget import Budget, SpentError
+from vkc_pin.world.scene.scene import Scene
 
 FEW = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=24)
 OPEN = vkc.Actuate("door", {"hinge": 1.2})

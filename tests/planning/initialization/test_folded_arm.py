@@ -11,8 +11,8 @@ from helpers.small_problems import program_of
 
 import vkc_pin as vkc
 from vkc_pin.planning.initialization import base_routes as folding
-from vkc_pin.planning.initialization.keyframes import depth
 from vkc_pin.planning.initialization.base_routes import Routes, folded_arms
+from vkc_pin.planning.initialization.keyframes import depth
 
 TASKS = {  # scene and steps, in the last phase of which something is carried
     "nothing": ("household", [vkc.GoTo(1.0, 0.5)]),

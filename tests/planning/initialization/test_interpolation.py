@@ -16,10 +16,10 @@ from helpers.small_problems import door_scene, hand_off_the_handle, program_of
 import vkc_pin as vkc
 from vkc_pin.planning.initialization import interpolation as joining
 from vkc_pin.planning.initialization.approach_paths import Approach
+from vkc_pin.planning.initialization.base_routes import Routes
 from vkc_pin.planning.initialization.beam_search import Beam
 from vkc_pin.planning.initialization.interpolation import DrivenPaths, Joiner, Paths, RrtPaths
 from vkc_pin.planning.initialization.keyframes import Knots, smooth
-from vkc_pin.planning.initialization.base_routes import Routes
 from vkc_pin.planning.initialization.rrt import TRIES
 
 FEW = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20)

@@ -16,13 +16,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import vkc_pin as vkc
-from vkc_pin.world.models.coordinates import wrapped
-from vkc_pin.planning.initialization import methods as initialization
 from vkc_pin.planning.initialization import interpolation as joining
+from vkc_pin.planning.initialization import methods as initialization
 from vkc_pin.planning.initialization.beam_search import Beam, Found
-from vkc_pin.planning.initialization.methods import _POOR, INITIALIZATIONS, _in_turn, initialize
-from vkc_pin.planning.initialization.keyframes import scatter
 from vkc_pin.planning.initialization.initial_guess import Seed
+from vkc_pin.planning.initialization.keyframes import scatter
+from vkc_pin.planning.initialization.methods import _POOR, INITIALIZATIONS, _in_turn, initialize
+from vkc_pin.world.models.coordinates import wrapped
 
 OPENED = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20)
 

@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as some
 
 import vkc_pin as vkc
-from vkc_pin.utils.budget import Budget, SpentError
-from vkc_pin.utils.optional_imports import compiled_module
 from vkc_pin.planning.initialization import rrt as trees
 from vkc_pin.planning.initialization.base_routes import Routes
 from vkc_pin.planning.initialization.rrt import connect, spread
+from vkc_pin.utils.budget import Budget, SpentError
+from vkc_pin.utils.optional_imports import compiled_module
 
 SIZE = 9  # x, y and yaw of the base, six joints of the arm
 METRE = np.array([2.0, 2.0, *np.ones(SIZE - 2)])  # how much each coordinate counts

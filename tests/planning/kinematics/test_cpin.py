@@ -13,9 +13,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from vkc_pin.errors import BuildError, InputError, UnknownNameError
 from vkc_pin.planning import kinematics as cpin
 from vkc_pin.planning.kinematics import backends
-from vkc_pin.errors import BuildError, InputError, UnknownNameError
 from vkc_pin.world.models.coordinates import Coordinates
 
 TOLERANCE = 1e-12

@@ -17,15 +17,14 @@ import pytest
 from helpers.small_problems import door_scene, program_of
 
 import vkc_pin as vkc
-from vkc_pin.utils.cache import Cache
-from vkc_pin.planning.kinematics import batch
-from vkc_pin.planning.kinematics import machine_code
+from vkc_pin.options import Options
+from vkc_pin.planning.kinematics import batch, machine_code
 from vkc_pin.planning.kinematics.batch import BatchFunction
 from vkc_pin.planning.kinematics.libraries import VARIABLE, Libraries
 from vkc_pin.planning.kinematics.machine_code import MachineCode, wait, work
-from vkc_pin.options import Options
 from vkc_pin.planning.nlp.transcription import Transcription, transcribe
 from vkc_pin.planning.nlp.waypoint import WaypointFunctions
+from vkc_pin.utils.cache import Cache
 from vkc_pin.world.task.steps import Actuate, Grasp
 
 OPTIONS = Options(reach_waypoints=3, turn_waypoints=2, move_waypoints=3, contact_slots=2)

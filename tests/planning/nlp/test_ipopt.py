@@ -8,8 +8,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from vkc_pin.utils.budget import Budget
 from vkc_pin.planning.nlp.ipopt import Monitor
+from vkc_pin.utils.budget import Budget
 
 
 @pytest.mark.parametrize(("budget", "iterations"), [({"seconds": 0.0}, 0), ({"effort": 30}, 3), ({}, None)], ids=str)

@@ -14,12 +14,12 @@ from helpers.relaxed import check_relaxation, iterates
 from helpers.small_problems import SHORT, door_scene, full_scene, program_of, random_configurations
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.options import Options
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.planning.solver.to_trajectory import as_trajectory
+from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import load_scene
-from vkc_pin.planning.solver.to_trajectory import as_trajectory
 from vkc_pin.world.task.compiler import LATCH_MARGIN
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
 from vkc_pin.world.task.terms import Constraint

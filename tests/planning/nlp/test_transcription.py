@@ -15,13 +15,13 @@ from helpers.carrying import room, stand, table
 from helpers.relaxed import Relaxed, check_relaxation, iterates
 from helpers.small_problems import CACHE, door_scene, full_scene, program_of, random_configurations
 
-from vkc_pin.utils.cache import Cache
-from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.options import Options
 from vkc_pin.planning.nlp.inspection import patterns
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.nlp.transcription import transcribe
 from vkc_pin.planning.nlp.waypoint import waypoint_functions
+from vkc_pin.utils.cache import Cache
+from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
 

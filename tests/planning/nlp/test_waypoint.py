@@ -13,14 +13,14 @@ import pytest
 from helpers.small_problems import door_scene, full_scene, random_configurations
 from helpers.telescopes import coupled_scene
 
-from vkc_pin.utils.cache import Cache
+from vkc_pin.options import Options
 from vkc_pin.planning.chain.chain import VirtualKinematicChain, consolidate
 from vkc_pin.planning.chain.pose import AWAY, PoseRow, target_vector
-from vkc_pin.world.trajectory.wheels import Rolling
-from vkc_pin.options import Options
 from vkc_pin.planning.nlp.waypoint import Structure, WaypointFunctions, waypoint_functions
+from vkc_pin.utils.cache import Cache
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.steps import Actuate
+from vkc_pin.world.trajectory.wheels import Rolling
 
 SLOTS = 3
 

@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
-from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.planning.retiming.jerk_limits import eased
 from vkc_pin.planning.retiming.limits import Limits
-from vkc_pin.planning.retiming.topp_ra import speeds_along
 from vkc_pin.planning.retiming.spline_path import path_through
+from vkc_pin.planning.retiming.topp_ra import speeds_along
+from vkc_pin.world.trajectory.curve import Curve
 
 
 def made(points: np.ndarray, jerk: float) -> tuple[CubicHermiteSpline, Curve, Limits]:

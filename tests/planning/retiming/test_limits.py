@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import vkc_pin as vkc
+from vkc_pin.planning.retiming.limits import Limits
 from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.wheels import Rolling
-from vkc_pin.planning.retiming.limits import Limits
 
 SCENE = vkc.load_scene("drawer")
 NAMES = (*SCENE.robot.coordinates.names, "drawer.slide", "drawer.handle")

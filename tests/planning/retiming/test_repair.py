@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.planning.retiming.repair import accepted
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
 @dataclasses.dataclass(frozen=True)

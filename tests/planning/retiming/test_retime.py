@@ -10,9 +10,9 @@ import pytest
 from helpers.small_problems import door_scene
 
 import vkc_pin as vkc
-from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.planning.retiming import retime
 from vkc_pin.planning.retiming.retime import retimed
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
 def limits(scene: vkc.Scene, names: tuple[str, ...]) -> np.ndarray:

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vkc_pin.planning.retiming.topp_ra import speeds_along
 from vkc_pin.planning.retiming.spline_path import path_through
+from vkc_pin.planning.retiming.topp_ra import speeds_along
 
 FREE = (np.full(2, -np.inf), np.full(2, np.inf))
 

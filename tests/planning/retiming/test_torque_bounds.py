@@ -8,8 +8,8 @@ from helpers.closers import closer
 from helpers.executions import door_plan
 from scipy.interpolate import CubicHermiteSpline
 
-from vkc_pin.world.trajectory.dynamics.torques import Torques
 from vkc_pin.planning.retiming.torque_bounds import Load
+from vkc_pin.world.trajectory.dynamics.torques import Torques
 
 
 def opening(**resistance: float) -> tuple[Load, CubicHermiteSpline]:

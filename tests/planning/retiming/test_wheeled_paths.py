@@ -9,12 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import vkc_pin as vkc
-from vkc_pin.world.trajectory.wheels import Rolling
-from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.planning.retiming import retime
-from vkc_pin.planning.retiming.spline_path import path_through
 from vkc_pin.planning.retiming.retime import retimed
+from vkc_pin.planning.retiming.spline_path import path_through
 from vkc_pin.planning.retiming.wheeled_paths import rolling_paths
+from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.wheels import Rolling
 
 FAR = np.full(4, -np.inf), np.full(4, np.inf)
 STEPS = st.lists(st.tuples(st.floats(-0.3, 0.3), st.floats(-0.4, 0.4)), min_size=1, max_size=8)

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.utils.optional_imports import compiled_module
 from vkc_pin.planning.solver.subproblem import linear_solver
+from vkc_pin.utils.optional_imports import compiled_module
 
 KKT = compiled_module("vkc_pin.planning.solver._kkt")
 OWN = linear_solver()

@@ -12,15 +12,15 @@ from helpers.drives import hall, moved, through
 from helpers.small_problems import door_scene, program_of
 
 import vkc_pin as vkc
-from vkc_pin.utils.budget import Budget
-from vkc_pin.planning.nlp.timing import Timing
-from vkc_pin.planning.nlp.merit import GROWTH, TOLERANCE, Infeasibility, Merit
 from vkc_pin.planning.initialization.methods import initialize
+from vkc_pin.planning.nlp.merit import GROWTH, TOLERANCE, Infeasibility, Merit
+from vkc_pin.planning.nlp.timing import Timing
 from vkc_pin.planning.solver import loop as solver
 from vkc_pin.planning.solver import trust_region
-from vkc_pin.planning.solver.segment_planes import collisions_between
 from vkc_pin.planning.solver.loop import Solution, solve
+from vkc_pin.planning.solver.segment_planes import collisions_between
 from vkc_pin.planning.solver.tunnelling import Passage
+from vkc_pin.utils.budget import Budget
 
 FEW = vkc.Options(reach_waypoints=20, max_outer=12)
 PILLAR = {"name": "pillar", "type": "cylinder", "radius": 0.15, "length": 1.6, "position": [1.6, 0.05, 0.8]}

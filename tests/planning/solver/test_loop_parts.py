@@ -12,15 +12,15 @@ from helpers.drives import hall
 from helpers.small_problems import program_of
 
 import vkc_pin as vkc
-from vkc_pin.utils.budget import SpentError
 from vkc_pin.planning.chain.contacts import Contacts, no_contacts
 from vkc_pin.planning.nlp.merit import TOLERANCE, Infeasibility, Merit
 from vkc_pin.planning.solver import loop as module
-from vkc_pin.planning.solver.segment_planes import Between
 from vkc_pin.planning.solver.loop import _Loop, solve
-from vkc_pin.planning.solver.tunnelling import Passage
+from vkc_pin.planning.solver.segment_planes import Between
 from vkc_pin.planning.solver.solution import Solution
 from vkc_pin.planning.solver.trust_region import CLOSE_ENOUGH
+from vkc_pin.planning.solver.tunnelling import Passage
+from vkc_pin.utils.budget import SpentError
 
 N = 8
 

@@ -9,10 +9,10 @@ import pytest
 from helpers.carrying import STICK, lifted, room, stand, table
 from helpers.small_problems import SHORT, door_scene, program_of, random_configurations
 
-from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.solver.to_trajectory import as_trajectory
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Release, Step
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 ASIDE = lifted(STICK, [0.0, 0.5, 0.0])
 

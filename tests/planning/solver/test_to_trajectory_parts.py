@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.scene.hold import Hold
 from vkc_pin.planning.solver.to_trajectory import as_trajectory
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 DOOR, STICK = Hold("door", "free"), Hold("stick", "grip")
 

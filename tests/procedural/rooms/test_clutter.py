@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError
+from vkc_pin.procedural.rooms.clutter import cluttered
 from vkc_pin.world.models.shapes import clearance, shape_distance
 from vkc_pin.world.scene.placed_object import standing_geometry
-from vkc_pin.procedural.rooms.clutter import cluttered
 
 PLACE = ((-3.0, 1.3, 1.051), 0.2)
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vkc_pin.world.models.shapes import shape_distance
 from vkc_pin.procedural.rooms.footprints import Floor, Frame, Rectangle
+from vkc_pin.world.models.shapes import shape_distance
 
 LENGTHS = st.floats(0.1, 2.0)
 RECTANGLES = st.builds(Rectangle, st.floats(-2, 2), st.floats(-2, 2), LENGTHS, LENGTHS, st.floats(-4, 4))

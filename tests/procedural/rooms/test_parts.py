@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.world.models.shapes import clearance, placed_shapes, world_box
-from vkc_pin.world.scene.placed_object import standing_geometry
 from vkc_pin.procedural.rooms import parts
 from vkc_pin.procedural.rooms.fixtures import OPENED, fixture
 from vkc_pin.procedural.rooms.footprints import Floor, Frame
+from vkc_pin.world.models.shapes import clearance, placed_shapes, world_box
+from vkc_pin.world.scene.placed_object import standing_geometry
 
 FLOOR = Floor(6.0, 5.0)
 

@@ -16,11 +16,11 @@ from hypothesis import strategies as st
 
 import vkc_pin as vkc
 from vkc_pin.procedural.furniture.catalogue import KINDS
+from vkc_pin.procedural.rooms.fixtures import OPENED, fixture
+from vkc_pin.procedural.rooms.random_room import Layout, random_layout
 from vkc_pin.world.models.shapes import clearance, placed_shapes, shape_distance, world_box
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import standing_geometry
-from vkc_pin.procedural.rooms.fixtures import OPENED, fixture
-from vkc_pin.procedural.rooms.random_room import Layout, random_layout
 from vkc_pin.world.scene.scene import START_CLEARANCE
 
 NUMBERS = st.integers(0, 10_000)

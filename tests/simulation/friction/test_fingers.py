@@ -9,10 +9,10 @@ import pytest
 from helpers.grippers import between_cheeks, write_gripper
 
 import vkc_pin as vkc
-from vkc_pin.world.trajectory.world_model import World
 from vkc_pin.simulation.friction.fingers import fingers_of, limited
 from vkc_pin.simulation.physics import Physics
 from vkc_pin.simulation.servos import servos
+from vkc_pin.world.trajectory.world_model import World
 
 
 def test_pads_slide_where_nothing_is_said_of_a_gripper() -> None:

@@ -8,8 +8,8 @@ from helpers.executions import drawer_plan
 from helpers.fake_plan import fake_plan
 
 import vkc_pin as vkc
-from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.simulation.friction.pauses import paused
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
 @pytest.mark.parametrize("make", [drawer_plan, fake_plan])

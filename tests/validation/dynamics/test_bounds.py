@@ -9,9 +9,9 @@ import pytest
 from helpers.executions import door_plan, drawer_plan
 
 import vkc_pin as vkc
-from vkc_pin.world.trajectory.dynamics.torques import moments_of
 from vkc_pin.validation.dynamics.bounds import bounds
 from vkc_pin.validation.samples import Samples
+from vkc_pin.world.trajectory.dynamics.torques import moments_of
 
 
 @pytest.mark.parametrize("made", [door_plan, drawer_plan])

@@ -9,12 +9,12 @@ import pytest
 from helpers.executions import drawer_plan
 
 import vkc_pin as vkc
-from vkc_pin.world.trajectory.curve import Curve
-from vkc_pin.world.trajectory.trajectory import PhaseSpan, Trajectory
 from vkc_pin.planning.retiming.retime import retimed
 from vkc_pin.validation.dynamics.rates import check_rates
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.samples import Samples
+from vkc_pin.world.trajectory.curve import Curve
+from vkc_pin.world.trajectory.trajectory import PhaseSpan, Trajectory
 
 
 def found(motion: Trajectory, **options: float) -> dict[tuple[str, str], Violation]:

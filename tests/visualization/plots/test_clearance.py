@@ -6,9 +6,9 @@ import pinocchio as pin
 import pytest
 from helpers.fake_plan import fake_plan
 
-from vkc_pin.world.trajectory.world_model import World
 from vkc_pin.planning.plan import Plan
 from vkc_pin.visualization.plots.clearance import ClearanceCurve, clearance_curves
+from vkc_pin.world.trajectory.world_model import World
 
 TIMES = np.linspace(0.0, 6.0, 13)
 

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from helpers.fake_plan import fake_plan
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.errors import InputError
-from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.planning.plan import Plan
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.validation.report import Judged
 from vkc_pin.visualization.plots import joints
 from vkc_pin.visualization.plots import plots as plotting
 from vkc_pin.visualization.plots.joints import Quantity
-from vkc_pin.validation.report import Judged
+from vkc_pin.world.trajectory.curve import Curve
 
 
 @pytest.fixture(scope="module")

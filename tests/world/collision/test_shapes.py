@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from vkc_pin.errors import InputError
 from vkc_pin.world.collision import shapes as asking
 from vkc_pin.world.collision.placements import columns_of
 from vkc_pin.world.collision.shapes import Shapes, Witnesses, asked
-from vkc_pin.errors import InputError
 from vkc_pin.world.files.meshes import convex_hull
 
 MOVING = 4

@@ -12,11 +12,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from vkc_pin.errors import BuildError, InputError
 from vkc_pin.utils import optional_imports as needed
 from vkc_pin.world.collision import solids
 from vkc_pin.world.collision.shapes import Shapes
 from vkc_pin.world.collision.solids import solid_of
-from vkc_pin.errors import BuildError, InputError
 from vkc_pin.world.files.meshes import convex_hull, indices
 
 NOWHERE = np.array([[[1.0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0]] * 2])

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.utils.arrays import LARGEST
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.utils.arrays import LARGEST
 from vkc_pin.world.files.urdf import load_urdf, read_urdf
 
 SHAPE = "<collision><geometry><sphere radius='0.1'/></geometry></collision>"

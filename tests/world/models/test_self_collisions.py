@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from vkc_pin.options import Options
 from vkc_pin.utils import disk_cache as kept
 from vkc_pin.world.files import resources
 from vkc_pin.world.files.srdf import read_srdf
@@ -13,7 +14,6 @@ from vkc_pin.world.models import self_collisions
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.world.models.self_collisions import sample_allowed_pairs, survey, write_srdf
-from vkc_pin.options import Options
 
 SRDF = resources.folder("robots") / "husky_ur5e" / "husky_ur5e.srdf"
 

@@ -15,13 +15,13 @@ from hypothesis import strategies as st
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.validation.validate import validate
 from vkc_pin.world.models.shapes import link_name, shape_distance
 from vkc_pin.world.scene import clearance_exemptions as neighbours
 from vkc_pin.world.scene.clearance_exemptions import Allowance, allowances, close_pairs
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import standing_geometry
 from vkc_pin.world.scene.scene import Scene, load_scene
-from vkc_pin.validation.validate import validate
 
 SAFE = 0.02
 TRAY = 0.295  # y of the side of the drawer's front, which reaches from x = 1.885 to 1.903 when it is shut

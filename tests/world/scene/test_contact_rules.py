@@ -12,8 +12,8 @@ from helpers.grippers import between_cheeks, write_gripper
 from helpers.judging import with_object
 from helpers.small_problems import door_scene
 
-from vkc_pin.world.models.articulated_object import Attachment
 from vkc_pin.options import Options
+from vkc_pin.world.models.articulated_object import Attachment
 from vkc_pin.world.scene.contact_rules import (
     EASED_TIME,
     grasped,

@@ -10,8 +10,8 @@ from helpers.riding import TOP, cup, folder, plates, scene_of
 
 from vkc_pin.world.models.shapes import link_name
 from vkc_pin.world.scene.placed_object import standing_geometry
-from vkc_pin.world.scene.support import RESTING, borne, supports, tilt
 from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.scene.support import RESTING, borne, supports, tilt
 
 
 def on(scene: Scene, name: str = "cup") -> set[str]:

@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError
-from vkc_pin.world.models.articulated_object import Attachment, Freedom
 from vkc_pin.options import Options
+from vkc_pin.world.models.articulated_object import Attachment, Freedom
 from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.actuation import advance
+from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.phases import Task
 
 STEP = 1e-6  # [rad] or [m]

@@ -15,8 +15,8 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.options import Options
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.task.compiler import LATCH_MARGIN, compile_task
 from vkc_pin.world.task.actuation import clash
+from vkc_pin.world.task.compiler import LATCH_MARGIN, compile_task
 from vkc_pin.world.task.lookup import path_joints
 from vkc_pin.world.task.phases import Task
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Reach, Release, Step

@@ -28,10 +28,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vkc_pin.errors import InputError
+from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.free_objects import as_numbers
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
-from vkc_pin.world.scene.scene import Scene
 
 TIP = pin.SE3(pin.utils.rotate("x", -np.pi / 2), np.array([0.0, 0.25, 0.0]))  # in the stick
 PULL = (np.pi / 2, 0.0, 0.0)  # how the ball lies on the tip that comes from the right

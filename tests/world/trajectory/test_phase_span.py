@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from vkc_pin.errors import InputError
-from vkc_pin.world.trajectory.phase_span import PhaseSpan, part_of
 from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.trajectory.phase_span import PhaseSpan, part_of
 
 STICK = Hold("stick", "grip")
 

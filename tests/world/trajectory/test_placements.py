@@ -5,9 +5,9 @@ import pinocchio as pin
 import pytest
 from helpers.fake_plan import fake_plan
 
+from vkc_pin.planning.plan import Plan
 from vkc_pin.world.trajectory.placements import Motion, key_times, sample_motion
 from vkc_pin.world.trajectory.world_model import World
-from vkc_pin.planning.plan import Plan
 
 
 @pytest.fixture(scope="module")

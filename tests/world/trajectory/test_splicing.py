@@ -7,10 +7,10 @@ import pytest
 from helpers.written import NAMES, PHASES, ROWS, TIMES, example
 
 from vkc_pin.errors import InputError
+from vkc_pin.world.scene.hold import Hold, holds_of
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.splicing import cut, filled, join
 from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.scene.hold import Hold, holds_of
 
 
 def test_what_is_not_known_is_as_it_was_or_as_it_will_be() -> None:

@@ -10,9 +10,9 @@ import pytest
 from helpers.written import NAMES, PHASES, ROWS, TIMES, example
 
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.world.scene.hold import holds_of
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.scene.hold import holds_of
 
 
 def test_efforts() -> None:

@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import vkc_pin as vkc
+from vkc_pin.planning.plan import Plan
+from vkc_pin.world.scene.placed_object import standing_geometry
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World, units_of
-from vkc_pin.planning.plan import Plan
-from vkc_pin.world.scene.placed_object import standing_geometry
 
 
 @pytest.fixture(scope="module")

@@ -21,9 +21,9 @@ from vkc_pin.datasets.dataset import Dataset
 from vkc_pin.datasets.generate import generate
 from vkc_pin.datasets.recipes.recipe import TASKS, load_recipe
 from vkc_pin.errors import InputError
-from vkc_pin.world.files.writing import write_atomically
-from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, styled
 from vkc_pin.utils.parallel.journal import Kept
+from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, styled
+from vkc_pin.world.files.writing import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.utils.arguments import known
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.limits import LIMITS, allowed
 from vkc_pin.benchmarks.harness.record import Record, trial, values
@@ -23,6 +22,7 @@ from vkc_pin.planning.planner import plan
 from vkc_pin.simulation.execution import GRASPS, simulate
 from vkc_pin.simulation.physics import Physics, engine
 from vkc_pin.simulation.result import SimulationResult
+from vkc_pin.utils.arguments import known
 
 __all__ = ["TASKS", "report", "run"]
 

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.world.files.resources import package_folder
-from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.planning.plan import Plan
 from vkc_pin.utils.parallel.machine import machine, peak_memory, versions
+from vkc_pin.world.files.resources import package_folder
 from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["Record", "Solve", "commit", "distribution", "meta", "peak_memory", "peaks", "trial", "values", "versions"]
 

@@ -19,10 +19,10 @@ from tqdm import tqdm
 from vkc_pin.benchmarks.harness.record import meta, peak_memory
 from vkc_pin.benchmarks.harness.tables import to_csv
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.world.files.resources import folder, package_folder
-from vkc_pin.world.files.writing import check_links, check_writable, write_atomically
 from vkc_pin.utils.parallel.engine import Died, needs_dask, results
 from vkc_pin.utils.parallel.journal import Journal
+from vkc_pin.world.files.resources import folder, package_folder
+from vkc_pin.world.files.writing import check_links, check_writable, write_atomically
 
 __all__ = ["Function", "check_folder", "chosen", "run"]
 

@@ -16,11 +16,11 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.benchmarks.peers.sampled import ranges
 from vkc_pin.errors import InputError
-from vkc_pin.world.files.hulls import compute_hull
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.files.hulls import compute_hull
 
 __all__ = ["FRAME", "GROUP", "Description", "describe"]
 

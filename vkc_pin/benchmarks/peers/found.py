@@ -9,16 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.benchmarks.peers.tasks import Given
-from vkc_pin.world.trajectory.phase_span import PhaseSpan
-from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.outcome import outcome, spent, still
 from vkc_pin.planning.plan import Plan
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.retiming.repair import accepted
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import validate
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["Clock", "Found", "Peer", "clearances", "judged"]
 

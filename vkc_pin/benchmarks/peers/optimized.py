@@ -18,14 +18,14 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.benchmarks.peers.description import FRAME, GROUP, describe
 from vkc_pin.benchmarks.peers.found import Clock, Found
 from vkc_pin.benchmarks.peers.sampled import ranges
 from vkc_pin.benchmarks.peers.tasks import Given, ends
 from vkc_pin.errors import InputError
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.initialization.keyframes import smooth
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.utils.arrays import Floats
 
 __all__ = ["plan_by_trajopt"]
 

@@ -13,13 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.benchmarks.peers.description import FRAME, GROUP, describe
 from vkc_pin.benchmarks.peers.found import Clock, Found
 from vkc_pin.benchmarks.peers.sampled import dense
 from vkc_pin.benchmarks.peers.tasks import Given, beginning, ends
-from vkc_pin.utils.optional_imports import optional_package
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.optional_imports import optional_package
 
 __all__ = ["plan_by_projection"]
 

@@ -9,7 +9,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.baselines.separate import BASELINES, plan_separately
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.record import Record, distribution, trial, values
@@ -20,9 +19,10 @@ from vkc_pin.benchmarks.peers.projected import plan_by_projection
 from vkc_pin.benchmarks.peers.sampled import plan_by_sampling
 from vkc_pin.benchmarks.peers.tasks import TASKS, Given, given, problem_of
 from vkc_pin.errors import InputError
-from vkc_pin.utils.optional_imports import optional_package
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.optional_imports import optional_package
 
 __all__ = ["METHODS", "PEERS", "TIME_LIMIT", "report", "run"]
 

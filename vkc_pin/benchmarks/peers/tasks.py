@@ -7,16 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Bools, Floats
 from vkc_pin.benchmarks.problems.poses import pose_among, pose_over, random_start
-from vkc_pin.utils.cache import Cache
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
+from vkc_pin.planning.initialization.keyframes import depth, scatter
 from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.procedural.rooms.random_room import random_layout
+from vkc_pin.utils.arrays import Bools, Floats
+from vkc_pin.utils.cache import Cache
 from vkc_pin.world.scene.scene import Scene, load_scene
-from vkc_pin.planning.initialization.keyframes import depth, scatter
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.steps import Actuate, Grasp, Reach, Step
 

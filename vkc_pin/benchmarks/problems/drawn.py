@@ -12,16 +12,16 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.benchmarks.problems.problem_set import Problem
 from vkc_pin.errors import InputError
-from vkc_pin.world.files.resources import available
-from vkc_pin.world.models.shapes import world_box
 from vkc_pin.options import Options
-from vkc_pin.world.scene.obstacles import FLOOR
-from vkc_pin.world.scene.placed_object import standing_geometry
 from vkc_pin.procedural.rooms.fixtures import OPENED
 from vkc_pin.procedural.rooms.random_room import random_room
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.files.resources import available
+from vkc_pin.world.models.shapes import world_box
+from vkc_pin.world.scene.obstacles import FLOOR
+from vkc_pin.world.scene.placed_object import standing_geometry
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Step, Touch

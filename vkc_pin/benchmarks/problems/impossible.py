@@ -15,8 +15,8 @@ from vkc_pin.benchmarks.harness.record import distribution, trial
 from vkc_pin.benchmarks.harness.tables import decimal, foot, markdown
 from vkc_pin.benchmarks.problems.ablation import every_trial
 from vkc_pin.errors import InputError
-from vkc_pin.planning.planner import plan
 from vkc_pin.planning.diagnosis.proofs import PROVEN
+from vkc_pin.planning.planner import plan
 from vkc_pin.procedural.rooms.random_room import random_layout
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Step

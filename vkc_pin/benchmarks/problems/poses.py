@@ -10,11 +10,11 @@ import itertools
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.errors import InputError
-from vkc_pin.world.models.shapes import shape_distance, world_box
 from vkc_pin.procedural.rooms.parts import Part
 from vkc_pin.procedural.rooms.random_room import Layout
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.models.shapes import shape_distance, world_box
 from vkc_pin.world.scene.scene import Scene
 
 __all__ = ["pose_among", "pose_over", "random_start"]

@@ -12,10 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.benchmarks import baselines
-from vkc_pin.benchmarks import door
-from vkc_pin.benchmarks import household
-from vkc_pin.benchmarks import initialization
+from vkc_pin.benchmarks import baselines, door, household, initialization
 from vkc_pin.benchmarks.comparison import Assignment, placed
 from vkc_pin.benchmarks.problems.poses import pose_among, pose_over
 from vkc_pin.errors import InputError

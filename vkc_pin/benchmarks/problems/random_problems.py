@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from vkc_pin.utils.arguments import known
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.limits import LIMITS, allowed
 from vkc_pin.benchmarks.harness.record import Record, distribution, trial
@@ -21,6 +20,7 @@ from vkc_pin.benchmarks.problems.problem_set import Problem
 from vkc_pin.errors import InputError
 from vkc_pin.planning.planner import plan
 from vkc_pin.procedural.tasks import random_task
+from vkc_pin.utils.arguments import known
 from vkc_pin.world.task.steps import Actuate, Grasp
 
 __all__ = ["report", "run"]

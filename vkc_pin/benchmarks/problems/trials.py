@@ -11,11 +11,11 @@ import numpy as np
 from vkc_pin.benchmarks.harness.limits import LIMITS
 from vkc_pin.benchmarks.harness.record import trial
 from vkc_pin.benchmarks.problems.changes import UNCHANGED, Change
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import Planner, borrowed, plan
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.planning.solver.solution import Iteration
+from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.steps import Reach, Step
 

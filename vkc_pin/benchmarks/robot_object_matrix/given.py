@@ -13,9 +13,9 @@ import numpy as np
 
 from vkc_pin.benchmarks.robot_object_matrix.pairs import description_of
 from vkc_pin.errors import InputError
-from vkc_pin.world.files.writing import check_name, folder_at_once, write_atomically
 from vkc_pin.importing.objects.object_import import ImportedObject, import_object
 from vkc_pin.importing.robots.robot_import import import_robot
+from vkc_pin.world.files.writing import check_name, folder_at_once, write_atomically
 from vkc_pin.world.models.robot_file import find_robot, load_robot
 
 __all__ = ["DEFAULT", "Given", "parsed", "ready_object", "ready_robot"]

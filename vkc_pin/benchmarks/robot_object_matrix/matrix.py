@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vkc_pin.benchmarks.robot_object_matrix.pairs import kind_of
 from vkc_pin.benchmarks.harness.limits import allowed
 from vkc_pin.benchmarks.harness.record import Record, distribution, values
 from vkc_pin.benchmarks.harness.tables import decimal, foot, markdown
+from vkc_pin.benchmarks.robot_object_matrix.pairs import kind_of
 from vkc_pin.visualization.plots.style import new_figure, save_figure, styled
 
 if TYPE_CHECKING:

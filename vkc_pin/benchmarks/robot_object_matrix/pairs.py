@@ -10,25 +10,25 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.utils.cache import Cache
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.world.files.documents import read_yaml
-from vkc_pin.world.files.resources import available, folder, located
-from vkc_pin.procedural.furniture.catalogue import KINDS, random_object
-from vkc_pin.world.models.object_file import load_object
 from vkc_pin.importing.proposals.hand import hand_of
 from vkc_pin.importing.proposals.proposal import Proposals
 from vkc_pin.importing.proposals.propose import propose_attachments
-from vkc_pin.world.models.robot import Robot
 from vkc_pin.options import Options
 from vkc_pin.planning.diagnosis.diagnosis import explain
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.procedural.furniture.catalogue import KINDS, random_object
 from vkc_pin.procedural.rooms import parts
 from vkc_pin.procedural.rooms.fixtures import RANDOM, Counter, Fixture, fixture
 from vkc_pin.procedural.rooms.footprints import Floor
+from vkc_pin.procedural.tasks import goals
+from vkc_pin.utils.cache import Cache
+from vkc_pin.world.files.documents import read_yaml
+from vkc_pin.world.files.resources import available, folder, located
+from vkc_pin.world.models.object_file import load_object
+from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.compiler import compile_task
-from vkc_pin.procedural.tasks import goals
 from vkc_pin.world.task.steps import Actuate
 
 __all__ = ["OBJECTS", "ROBOTS", "SHARE", "Pair", "description_of", "hall", "kind_of", "pair"]

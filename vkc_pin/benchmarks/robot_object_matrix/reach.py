@@ -7,11 +7,11 @@ import zlib
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.errors import VkcError
+from vkc_pin.options import Options
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.shapes import ShapeDistances
-from vkc_pin.options import Options
 
 __all__ = ["random_poses"]
 

@@ -10,20 +10,20 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from vkc_pin.benchmarks.robot_object_matrix.reach import random_poses
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.limits import LIMITS, allowed
 from vkc_pin.benchmarks.harness.record import Record, distribution, trial
 from vkc_pin.benchmarks.harness.tables import decimal, foot, markdown
+from vkc_pin.benchmarks.robot_object_matrix.reach import random_poses
 from vkc_pin.errors import InputError, VkcError
-from vkc_pin.world.files.srdf import read_srdf
-from vkc_pin.world.files.writing import check_name
 from vkc_pin.importing.robots.rest_configuration import Clearances
 from vkc_pin.importing.robots.robot_import import import_robot
+from vkc_pin.planning.planner import plan
+from vkc_pin.world.files.srdf import read_srdf
+from vkc_pin.world.files.writing import check_name
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import known_robots, load_robot
 from vkc_pin.world.models.self_collisions import with_collision_pairs
-from vkc_pin.planning.planner import plan
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Reach
 

@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.benchmarks.robot_object_matrix.given import parsed, ready_object, ready_robot
-from vkc_pin.benchmarks.robot_object_matrix.matrix import chart, report
-from vkc_pin.benchmarks.robot_object_matrix.pairs import OBJECTS, ROBOTS, SHARE, kind_of, pair
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.limits import LIMITS
 from vkc_pin.benchmarks.harness.record import trial
+from vkc_pin.benchmarks.robot_object_matrix.given import parsed, ready_object, ready_robot
+from vkc_pin.benchmarks.robot_object_matrix.matrix import chart, report
+from vkc_pin.benchmarks.robot_object_matrix.pairs import OBJECTS, ROBOTS, SHARE, kind_of, pair
 from vkc_pin.errors import InputError
-from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.planning.planner import plan
+from vkc_pin.world.models.robot_file import load_robot
 
 __all__ = ["run"]
 

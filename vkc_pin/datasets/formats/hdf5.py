@@ -17,15 +17,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.datasets.episode import Episode, made_of, scene_name
 from vkc_pin.datasets.formats.samples import sampled
 from vkc_pin.errors import InputError
+from vkc_pin.simulation.cameras.images import Images
+from vkc_pin.utils.arrays import Floats, Ints
+from vkc_pin.utils.optional_imports import optional_package
 from vkc_pin.world.files.documents import parse_json, read_text
 from vkc_pin.world.files.writing import check_name, write_atomically
 from vkc_pin.world.models.robot import Robot
-from vkc_pin.utils.optional_imports import optional_package
-from vkc_pin.simulation.cameras.images import Images
 from vkc_pin.world.task.steps import step_to_dict
 from vkc_pin.world.task.terms import term_to_dict
 

@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.datasets.episode import Episode
 from vkc_pin.datasets.formats.samples import sampled
 from vkc_pin.errors import InputError
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.optional_imports import optional_package
 from vkc_pin.world.files.writing import folder_at_once
 from vkc_pin.world.models.robot import Robot
-from vkc_pin.utils.optional_imports import optional_package
 
 __all__ = ["VERSION", "needed", "sentence", "write_lerobot"]
 

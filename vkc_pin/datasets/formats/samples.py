@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.datasets.episode import Episode, moments
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.robot import Robot
 
 __all__ = ["sampled"]

@@ -13,18 +13,18 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from vkc_pin.utils.arguments import mapping
 from vkc_pin.datasets.recipes.terms import TermSchema, check_entries
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.world.files.documents import Document, check, read_yaml
-from vkc_pin.world.files.fields import Name, NotNegative, Number, Positive, Schema, Vector3, count, require, text_for
-from vkc_pin.world.files.resources import available, located
-from vkc_pin.world.models.robot_file import find_robot
 from vkc_pin.options import Options
 from vkc_pin.procedural.rooms.fixtures import known_objects
 from vkc_pin.procedural.rooms.parts import CARRIED
 from vkc_pin.procedural.rooms.settings import RoomSettings
 from vkc_pin.simulation.cameras.mount import BASE, HAND, Camera
+from vkc_pin.utils.arguments import mapping
+from vkc_pin.world.files.documents import Document, check, read_yaml
+from vkc_pin.world.files.fields import Name, NotNegative, Number, Positive, Schema, Vector3, count, require, text_for
+from vkc_pin.world.files.resources import available, located
+from vkc_pin.world.models.robot_file import find_robot
 from vkc_pin.world.task.terms import Term, as_data
 
 __all__ = [

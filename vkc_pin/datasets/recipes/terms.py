@@ -8,12 +8,12 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
+from vkc_pin.simulation.cameras.mount import BASE, HAND, frame_of
 from vkc_pin.utils.arguments import known
 from vkc_pin.world.files.documents import Document
 from vkc_pin.world.files.fields import Positive, Schema, Vector3, count, require
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.simulation.cameras.mount import BASE, HAND, frame_of
 from vkc_pin.world.task.terms import Constraint, State, Term, as_data, renamed, term_from_dict, term_to_dict
 
 __all__ = [

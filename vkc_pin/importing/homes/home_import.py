@@ -13,23 +13,23 @@ import numpy as np
 import pinocchio as pin
 import yaml
 
-from vkc_pin.utils.arguments import flag, instance, number, whole
 from vkc_pin.errors import InputError
+from vkc_pin.importing.homes.objects import ImportedThing, write_thing
+from vkc_pin.importing.homes.obstacles import write_obstacles
+from vkc_pin.importing.homes.splitting import FLOOR_RISE, Home, split
+from vkc_pin.importing.homes.start_pose import free_start
+from vkc_pin.importing.objects.clean_up import bounds, renamed, rooted, surfaces
+from vkc_pin.importing.objects.description import WEIGHTLESS
+from vkc_pin.importing.objects.object_import import read_description
+from vkc_pin.importing.objects.pieces import Known
+from vkc_pin.importing.targets import check_target, format_comment, made_by
+from vkc_pin.options import Options
+from vkc_pin.utils.arguments import flag, instance, number, whole
 from vkc_pin.world.files.documents import read_text
 from vkc_pin.world.files.resources import choose_file_names, file_path
 from vkc_pin.world.files.writing import folder_at_once, write_atomically
 from vkc_pin.world.files.xml import parse_xml
-from vkc_pin.importing.homes.obstacles import write_obstacles
-from vkc_pin.importing.homes.splitting import FLOOR_RISE, Home, split
-from vkc_pin.importing.homes.start_pose import free_start
-from vkc_pin.importing.homes.objects import ImportedThing, write_thing
-from vkc_pin.importing.objects.description import WEIGHTLESS
-from vkc_pin.importing.objects.object_import import read_description
-from vkc_pin.importing.objects.pieces import Known
-from vkc_pin.importing.objects.clean_up import bounds, renamed, rooted, surfaces
-from vkc_pin.importing.targets import check_target, format_comment, made_by
 from vkc_pin.world.models.robot_file import load_robot
-from vkc_pin.options import Options
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.scene import Scene, load_scene
 

@@ -12,13 +12,13 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.importing.homes.splitting import Thing
+from vkc_pin.importing.objects.clean_up import surfaces, tidied, with_limits
 from vkc_pin.importing.objects.description import Description, Joint, Link
 from vkc_pin.importing.objects.pieces import Known, with_pieces
-from vkc_pin.importing.objects.clean_up import surfaces, tidied, with_limits
 from vkc_pin.importing.objects.writing import write_description, write_urdf
-from vkc_pin.world.models.object_file import load_object
 from vkc_pin.importing.proposals.proposal import Proposals
 from vkc_pin.importing.proposals.propose import propose_attachments
+from vkc_pin.world.models.object_file import load_object
 from vkc_pin.world.models.robot import Robot
 
 __all__ = ["ImportedThing", "write_thing"]

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.world.files.resources import choose_file_names
 from vkc_pin.importing.homes.splitting import Home
+from vkc_pin.importing.objects.clean_up import bounds, choose_name, rooted, surfaces
 from vkc_pin.importing.objects.description import Colour, Description, Link, Part
 from vkc_pin.importing.objects.pieces import Known, with_pieces
-from vkc_pin.importing.objects.clean_up import bounds, choose_name, rooted, surfaces
 from vkc_pin.importing.objects.writing import write_urdf
+from vkc_pin.world.files.resources import choose_file_names
 
 __all__ = ["write_obstacles"]
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.importing.objects.description import Description, Joint, Link
 from vkc_pin.importing.objects.clean_up import bounds, closed, only, rooted, surfaces
+from vkc_pin.importing.objects.description import Description, Joint, Link
 
 __all__ = ["FLOOR_RISE", "Home", "Thing", "split"]
 

@@ -6,9 +6,9 @@ import itertools
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats
-from vkc_pin.planning.base_paths.reachable_floor import Cells, Discs, taken
 from vkc_pin.errors import InputError
+from vkc_pin.planning.base_paths.reachable_floor import Cells, Discs, taken
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.shapes import placed_shapes
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import standing_geometry

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.importing.objects.description import Description, Link, Part
+from vkc_pin.utils.arrays import Floats
 
 if TYPE_CHECKING:
     import trimesh

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.errors import InputError
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.meshes import load_mesh
 
 if TYPE_CHECKING:

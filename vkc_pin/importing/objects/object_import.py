@@ -12,17 +12,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arguments import flag, instance, quantity, whole
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.errors import InputError, shown
-from vkc_pin.world.files.documents import read_text
-from vkc_pin.world.files.resources import choose_file_names, file_path
-from vkc_pin.world.files.writing import folder_at_once
-from vkc_pin.world.files.xml import parse_xml
-from vkc_pin.importing.objects.description import WEIGHTLESS, Description
-from vkc_pin.importing.objects.mjcf import read_object_mjcf
-from vkc_pin.importing.objects.pieces import with_pieces
-from vkc_pin.importing.objects.sdf import read_object_sdf
 from vkc_pin.importing.objects.clean_up import (
     bounds,
     closed,
@@ -36,17 +26,27 @@ from vkc_pin.importing.objects.clean_up import (
     upright,
     with_limits,
 )
+from vkc_pin.importing.objects.description import WEIGHTLESS, Description
+from vkc_pin.importing.objects.mjcf import read_object_mjcf
+from vkc_pin.importing.objects.pieces import with_pieces
+from vkc_pin.importing.objects.sdf import read_object_sdf
 from vkc_pin.importing.objects.urdf import read_object_urdf
 from vkc_pin.importing.objects.writing import write_description, write_urdf
-from vkc_pin.importing.targets import check_target, made_by
-from vkc_pin.world.models.articulated_object import ArticulatedObject
-from vkc_pin.world.models.object_file import load_object
+from vkc_pin.importing.proposals.picture import plot_attachments
 from vkc_pin.importing.proposals.proposal import Proposals
 from vkc_pin.importing.proposals.propose import propose_attachments
+from vkc_pin.importing.targets import check_target, made_by
+from vkc_pin.options import Options
+from vkc_pin.utils.arguments import flag, instance, quantity, whole
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.files.documents import read_text
+from vkc_pin.world.files.resources import choose_file_names, file_path
+from vkc_pin.world.files.writing import folder_at_once
+from vkc_pin.world.files.xml import parse_xml
+from vkc_pin.world.models.articulated_object import ArticulatedObject
+from vkc_pin.world.models.object_file import load_object
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import load_robot
-from vkc_pin.options import Options
-from vkc_pin.importing.proposals.picture import plot_attachments
 
 __all__ = ["ImportedObject", "import_object", "read_description"]
 

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pinocchio as pin
 
+from vkc_pin.importing.convex import ERROR, concavity, decompose
+from vkc_pin.importing.objects.clean_up import Surfaces
+from vkc_pin.importing.objects.description import Description, Link, Part
+from vkc_pin.importing.slicing import THICKNESS, flat, thickened
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.hulls import compute_hull
-from vkc_pin.importing.convex import ERROR, concavity, decompose
-from vkc_pin.importing.objects.description import Description, Link, Part
-from vkc_pin.importing.objects.clean_up import Surfaces
-from vkc_pin.importing.slicing import THICKNESS, flat, thickened
 
 if TYPE_CHECKING:
     import trimesh

@@ -9,10 +9,10 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.importing.objects.description import Description, Joint, Link, Part, inertia
 from vkc_pin.world.files.documents import read_text
 from vkc_pin.world.files.kinematic_tree import MOMENTS, numbers_of
 from vkc_pin.world.files.xml import line_of, parse_xml
-from vkc_pin.importing.objects.description import Description, Joint, Link, Part, inertia
 
 __all__ = ["read_object_sdf"]
 

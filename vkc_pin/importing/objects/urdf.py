@@ -10,10 +10,10 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
+from vkc_pin.importing.objects.description import Description, Joint, Link, Part, inertia
 from vkc_pin.world.files.kinematic_tree import check_tree, inertial_of, numbers_of, origin_of
 from vkc_pin.world.files.urdf import UrdfFile
 from vkc_pin.world.files.xml import read_xml
-from vkc_pin.importing.objects.description import Description, Joint, Link, Part, inertia
 
 __all__ = ["read_object_urdf"]
 

@@ -11,12 +11,12 @@ import numpy as np
 import pinocchio as pin
 import yaml
 
+from vkc_pin.importing.objects.description import Colour, Description, Joint, Link, Part
+from vkc_pin.importing.targets import format_comment
 from vkc_pin.world.files.meshes import load_parts
 from vkc_pin.world.files.resources import choose_file_names
 from vkc_pin.world.files.writing import write_atomically
 from vkc_pin.world.files.xml import quote
-from vkc_pin.importing.objects.description import Colour, Description, Joint, Link, Part
-from vkc_pin.importing.targets import format_comment
 from vkc_pin.world.models.articulated_object import DEFAULT_VELOCITY
 
 if TYPE_CHECKING:

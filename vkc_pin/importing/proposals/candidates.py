@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.importing.proposals.hand import Hand
 from vkc_pin.importing.proposals.sections import Piece, Section
+from vkc_pin.utils.arrays import Floats
 
 __all__ = ["Candidate", "Thickness", "candidates"]
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
+from vkc_pin.importing.proposals.hand import Hand
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.articulated_object import ArticulatedObject
-from vkc_pin.importing.proposals.hand import Hand
 from vkc_pin.world.models.shapes import bounding_box, link_name, shape_distance
 
 __all__ = ["Blocked", "Fitting"]

@@ -8,10 +8,10 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from vkc_pin.world.models.articulated_object import Freedom
 from vkc_pin.importing.proposals.candidates import Candidate
 from vkc_pin.importing.proposals.fitting import Fitting
 from vkc_pin.importing.proposals.ranking import Opening
+from vkc_pin.world.models.articulated_object import Freedom
 
 __all__ = ["Grip"]
 

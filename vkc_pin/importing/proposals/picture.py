@@ -11,11 +11,11 @@ import coal
 import numpy as np
 import pinocchio as pin
 
+from vkc_pin.importing.proposals.proposal import Proposal, Proposals
 from vkc_pin.utils.arguments import instance
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.importing.proposals.proposal import Proposal, Proposals
-from vkc_pin.world.models.shapes import link_name, triangles
 from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, styled
+from vkc_pin.world.models.shapes import link_name, triangles
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.world.models.articulated_object import ArticulatedObject, Attachment
 from vkc_pin.importing.proposals.hand import Hand
+from vkc_pin.world.models.articulated_object import ArticulatedObject, Attachment
 
 __all__ = ["Proposal", "Proposals"]
 

@@ -10,10 +10,6 @@ from dataclasses import dataclass, field
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arguments import instance, number, whole
-from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.files.urdf import read_urdf
-from vkc_pin.world.models.articulated_object import ArticulatedObject, Attachment
 from vkc_pin.importing.proposals.candidates import Candidate, Thickness, candidates
 from vkc_pin.importing.proposals.fitting import Blocked, Fitting
 from vkc_pin.importing.proposals.freedom import Grip
@@ -21,6 +17,10 @@ from vkc_pin.importing.proposals.hand import hand_of
 from vkc_pin.importing.proposals.proposal import Proposal, Proposals
 from vkc_pin.importing.proposals.ranking import Opening, names_of_pieces, openings, worth
 from vkc_pin.importing.proposals.sections import Piece
+from vkc_pin.utils.arguments import instance, number, whole
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.files.urdf import read_urdf
+from vkc_pin.world.models.articulated_object import ArticulatedObject, Attachment
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import load_robot
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.models.articulated_object import ArticulatedObject
 from vkc_pin.importing.proposals.candidates import Candidate
 from vkc_pin.importing.proposals.sections import Piece
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.models.articulated_object import ArticulatedObject
 
 __all__ = ["Opening", "names_of_pieces", "openings", "worth"]
 

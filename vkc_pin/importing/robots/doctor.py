@@ -9,18 +9,18 @@ from pathlib import Path
 
 import numpy as np
 
-from vkc_pin.utils.arguments import number, whole
 from vkc_pin.errors import InputError
-from vkc_pin.world.files.meshes import load_mesh
 from vkc_pin.importing.convex import concavity
+from vkc_pin.importing.proposals.hand import hand_of
 from vkc_pin.importing.robots.envelopes import envelopes
 from vkc_pin.importing.robots.rest_configuration import Clearances, never_apart
+from vkc_pin.options import Options
+from vkc_pin.utils.arguments import number, whole
+from vkc_pin.world.files.meshes import load_mesh
 from vkc_pin.world.models.couplings.limits import UNSAID_VELOCITY
 from vkc_pin.world.models.dynamics.torque_limits import UNLIMITED
-from vkc_pin.importing.proposals.hand import hand_of
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import load_robot
-from vkc_pin.options import Options
 
 __all__ = ["Diagnosis", "Finding", "doctor"]
 

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.errors import InputError
-from vkc_pin.world.files.urdf import UrdfFile
 from vkc_pin.importing.robots.arms import Arm, Body
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.files.urdf import UrdfFile
 from vkc_pin.world.models.robot_model import configuration, rest_positions
 
 __all__ = ["Hand", "look_at"]

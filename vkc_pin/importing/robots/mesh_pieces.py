@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vkc_pin.errors import InputError
+from vkc_pin.importing.convex import Pieces, decompose
 from vkc_pin.world.files.hulls import compute_hull
 from vkc_pin.world.files.meshes import load_mesh
 from vkc_pin.world.files.resources import choose_file_names
 from vkc_pin.world.files.urdf import UrdfFile, UrdfShape
-from vkc_pin.importing.convex import Pieces, decompose
 
 __all__ = ["Piece", "own_meshes"]
 

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.errors import InputError
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.optional_imports import optional_package
 from vkc_pin.world.files.resources import choose_file_names
 from vkc_pin.world.files.xml import replace_forbidden
-from vkc_pin.utils.optional_imports import optional_package
 
 __all__ = ["Converted", "convert"]
 

@@ -13,26 +13,26 @@ from typing import Any
 import pinocchio as pin
 import yaml
 
-from vkc_pin.utils.arguments import flag, mapping, text, whole
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.world.files.resources import choose_file_names, file_path
-from vkc_pin.world.files.urdf import UrdfFile
-from vkc_pin.world.files.writing import folder_at_once
-from vkc_pin.world.files.xml import replace_forbidden
 from vkc_pin.importing.robots.arms import Arm, base_kind, bodies, choose, find_arms, own_base, telescopes
 from vkc_pin.importing.robots.doctor import Diagnosis, Finding, doctor
 from vkc_pin.importing.robots.envelopes import envelopes, leave_out
 from vkc_pin.importing.robots.hands import Hand, look_at
-from vkc_pin.importing.robots.rest_configuration import HOME_ROOM, Home, arm_at, find_home, never_apart, standing
 from vkc_pin.importing.robots.mesh_pieces import Piece, own_meshes
+from vkc_pin.importing.robots.rest_configuration import HOME_ROOM, Home, arm_at, find_home, never_apart, standing
 from vkc_pin.importing.robots.sources import Source, free_name, read_source
 from vkc_pin.importing.targets import check_target, format_comment, made_by
+from vkc_pin.options import Options
+from vkc_pin.utils.arguments import flag, mapping, text, whole
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.files.resources import choose_file_names, file_path
+from vkc_pin.world.files.urdf import UrdfFile
+from vkc_pin.world.files.writing import folder_at_once
+from vkc_pin.world.files.xml import replace_forbidden
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.world.models.robot_model import full_model
 from vkc_pin.world.models.self_collisions import sample_allowed_pairs, with_collision_pairs
-from vkc_pin.options import Options
 
 __all__ = ["ImportedRobot", "import_robot"]
 

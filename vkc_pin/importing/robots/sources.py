@@ -8,13 +8,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from vkc_pin.errors import InputError
+from vkc_pin.importing.robots.mjcf import convert
+from vkc_pin.importing.robots.xacro_files import expand
 from vkc_pin.world.files.documents import read_text
 from vkc_pin.world.files.kinematic_tree import check_tree
 from vkc_pin.world.files.srdf import Srdf, read_groups, read_srdf
 from vkc_pin.world.files.urdf import UrdfFile
 from vkc_pin.world.files.xml import parse_xml
-from vkc_pin.importing.robots.mjcf import convert
-from vkc_pin.importing.robots.xacro_files import expand
 
 __all__ = ["Source", "free_name", "read_source"]
 

@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.planning.base_paths.motion_primitives import wrapped
 from vkc_pin.planning.base_paths.reeds_shepp import lengths_of, shortest_words
+from vkc_pin.utils.arrays import Floats, Ints
 
 __all__ = ["Curves", "between", "nearest_arc", "spread_along"]
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats
-from vkc_pin.planning.base_paths.grid import BaseGrid
-from vkc_pin.planning.base_paths.motion_primitives import Drive, Ground, wrapped
-from vkc_pin.planning.base_paths.lattice_search import cheapest
 from vkc_pin.errors import InputError
+from vkc_pin.planning.base_paths.grid import BaseGrid
+from vkc_pin.planning.base_paths.lattice_search import cheapest
+from vkc_pin.planning.base_paths.motion_primitives import Drive, Ground, wrapped
+from vkc_pin.utils.arrays import Floats
 
 __all__ = ["BasePath", "poses_along", "shortest_path"]
 

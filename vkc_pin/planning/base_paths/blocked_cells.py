@@ -16,9 +16,9 @@ import coal
 import numpy as np
 from numpy.typing import NDArray
 
+from vkc_pin.planning.base_paths.base_clearance import FAN, Shape, hull_points
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 from vkc_pin.utils.budget import spend
-from vkc_pin.planning.base_paths.base_clearance import FAN, Shape, hull_points
 
 __all__ = ["Lattice", "PlanViews", "Solid", "slice_of", "solids_of", "stuck"]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.planning.base_paths.motion_primitives import UNIT, Connections, Drive, Ground
+from vkc_pin.utils.arrays import Floats, Ints
 
 __all__ = ["Query"]
 

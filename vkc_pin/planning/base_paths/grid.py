@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from vkc_pin.errors import InputError
+from vkc_pin.planning.base_paths.base_clearance import FAN, Body, Shape, Standing
+from vkc_pin.planning.base_paths.blocked_cells import Lattice, PlanViews, stuck
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 from vkc_pin.utils.budget import spend
 from vkc_pin.utils.cache import Cache
-from vkc_pin.planning.base_paths.blocked_cells import Lattice, PlanViews, stuck
-from vkc_pin.planning.base_paths.base_clearance import FAN, Body, Shape, Standing
-from vkc_pin.errors import InputError
 from vkc_pin.utils.optional_imports import compiled_module
 
 __all__ = ["HEADINGS", "BaseGrid", "fine_cells"]

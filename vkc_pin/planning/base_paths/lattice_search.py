@@ -15,11 +15,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from vkc_pin.utils.arrays import Floats
-from vkc_pin.utils.budget import spend
+from vkc_pin.planning.base_paths.connections import Query
 from vkc_pin.planning.base_paths.grid import HEADINGS
 from vkc_pin.planning.base_paths.motion_primitives import BACKWARDS, UNIT, Drive, Ground, wrapped
-from vkc_pin.planning.base_paths.connections import Query
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.budget import spend
 from vkc_pin.utils.optional_imports import compiled_module
 
 __all__ = ["cheapest"]

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Bools, Floats, Ints
 from vkc_pin.planning.base_paths.grid import BaseGrid
+from vkc_pin.utils.arrays import Bools, Floats, Ints
 
 __all__ = ["BACKWARDS", "SIDEWAYS", "UNIT", "Connections", "Drive", "Ground", "wrapped"]
 

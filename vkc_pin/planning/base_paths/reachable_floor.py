@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Bools, Floats
-from vkc_pin.planning.base_paths.blocked_cells import Solid, slice_of, solids_of
 from vkc_pin.planning.base_paths.base_clearance import Shape
+from vkc_pin.planning.base_paths.blocked_cells import Solid, slice_of, solids_of
+from vkc_pin.utils.arrays import Bools, Floats
 
 __all__ = ["Cells", "Discs", "Wall", "flooded", "taken"]
 

@@ -10,20 +10,20 @@ from functools import cached_property
 import numpy as np
 import pinocchio as pin
 
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.planning.chain.inversion import invert
+from vkc_pin.planning.chain.kinematics import Kinematics, kinematics_of
 from vkc_pin.utils.arguments import instance
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 from vkc_pin.utils.cache import Cache
-from vkc_pin.planning.chain.inversion import invert
-from vkc_pin.planning.chain.kinematics import Kinematics, kinematics_of
-from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.models.grafting import clean, graft, graft_geometry
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.scene.contact_rules import hand_frame
 from vkc_pin.world.scene.hold import Hold, checked_holds, holds_of
 from vkc_pin.world.scene.placed_object import standing_geometry
-from vkc_pin.world.scene.support import Ride
 from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.scene.support import Ride
 
 __all__ = ["Closure", "VirtualKinematicChain", "consolidate"]
 

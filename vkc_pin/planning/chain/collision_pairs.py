@@ -9,18 +9,18 @@ from itertools import combinations
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Floats, Ints
-from vkc_pin.utils.budget import spend
+from vkc_pin.errors import InputError
+from vkc_pin.options import Options
 from vkc_pin.planning.chain.chain import VirtualKinematicChain
 from vkc_pin.planning.chain.easing import EASED_SHARE, eased_pairs
 from vkc_pin.planning.chain.phase_geometry import PhaseGeometry
+from vkc_pin.utils.arrays import Floats, Ints
+from vkc_pin.utils.budget import spend
 from vkc_pin.world.collision.margins import Place
-from vkc_pin.errors import InputError
 from vkc_pin.world.models.shapes import bounding_box, link_name, own_name
-from vkc_pin.options import Options
+from vkc_pin.world.scene.clearance_exemptions import allowances, shape_keys
 from vkc_pin.world.scene.contact_rules import CONTACT, grasped, hand_clearance, moves_as_one, touching
 from vkc_pin.world.scene.hold import Hold
-from vkc_pin.world.scene.clearance_exemptions import allowances, shape_keys
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import standing_geometry
 from vkc_pin.world.scene.scene import Scene

@@ -16,15 +16,15 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from vkc_pin.utils.arrays import Floats, Ints
-from vkc_pin.utils.budget import spend
+from vkc_pin.options import Options
 from vkc_pin.planning.chain.chain import VirtualKinematicChain
 from vkc_pin.planning.chain.collision_pairs import phase_geometries
 from vkc_pin.planning.chain.phase_geometry import PhaseGeometry
+from vkc_pin.utils.arrays import Floats, Ints
+from vkc_pin.utils.budget import spend
 from vkc_pin.world.collision.clearances import Clearances
 from vkc_pin.world.collision.placements import ShapePlacements
 from vkc_pin.world.collision.shapes import Shapes
-from vkc_pin.options import Options
 from vkc_pin.world.scene.placed_object import standing_geometry
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.phases import Task

@@ -9,14 +9,14 @@ import coal
 import numpy as np
 import pinocchio as pin
 
+from vkc_pin.options import Options
 from vkc_pin.planning.chain.chain import VirtualKinematicChain
 from vkc_pin.planning.chain.phase_geometry import PhaseGeometry
 from vkc_pin.world.models.shapes import own_name, shape_distance, world_box
-from vkc_pin.options import Options
 from vkc_pin.world.scene.contact_rules import CONTACT, EASED_TIME, hand_clearance, touching
 from vkc_pin.world.scene.placed_object import PlacedObject, standing_geometry
-from vkc_pin.world.scene.support import Ride
 from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.scene.support import Ride
 from vkc_pin.world.task.phases import Task
 
 __all__ = ["EASED_SHARE", "eased_pairs"]

@@ -6,12 +6,12 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Bools, Floats
-from vkc_pin.utils.budget import spend
-from vkc_pin.utils.cache import Cache
 from vkc_pin.planning.chain.kinematics import kinematics_of
 from vkc_pin.planning.chain.pose import PoseRow, pose_residual, target_vector
 from vkc_pin.planning.kinematics.batch import BatchFunction
+from vkc_pin.utils.arrays import Bools, Floats
+from vkc_pin.utils.budget import spend
+from vkc_pin.utils.cache import Cache
 
 __all__ = ["LONGEST_STEP", "PoseSolver"]
 

@@ -9,9 +9,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
+from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import instance
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.errors import InputError
 from vkc_pin.world.models.articulated_object import ArticulatedObject
 from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.models.grafting import add_joint, clean

@@ -9,8 +9,8 @@ import casadi as ca
 import pinocchio as pin
 
 from vkc_pin.planning import kinematics as cpin
-from vkc_pin.utils.cache import Cache
 from vkc_pin.planning.kinematics.batch import BatchFunction, size_of
+from vkc_pin.utils.cache import Cache
 from vkc_pin.world.models.coordinates import Coordinates
 
 __all__ = ["Kinematics", "kinematics_of"]

@@ -6,13 +6,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats
+from vkc_pin.planning.initialization.keyframes import depth, scatter
 from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.world.scene.contact_rules import CONTACT
-from vkc_pin.planning.initialization.keyframes import depth, scatter
 from vkc_pin.planning.solver.trust_region import CLOSE_ENOUGH
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.report import Violation
+from vkc_pin.world.scene.contact_rules import CONTACT
 
 __all__ = ["Blocked", "blocked", "explain", "impossible"]
 

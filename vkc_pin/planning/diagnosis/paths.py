@@ -7,14 +7,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.planning.base_paths.base_path import BasePath, shortest_path
+from vkc_pin.planning.initialization.base_routes import Routes
+from vkc_pin.planning.initialization.keyframes import depth, scatter
 from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.planning.initialization.keyframes import depth, scatter
-from vkc_pin.planning.initialization.base_routes import Routes
-from vkc_pin.world.task.phases import Phase
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.report import Report
+from vkc_pin.world.task.phases import Phase
 
 __all__ = ["Ways", "ways"]
 

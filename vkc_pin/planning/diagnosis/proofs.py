@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Bools, Floats
 from vkc_pin.planning.base_paths.blocked_cells import solids_of
 from vkc_pin.planning.base_paths.reachable_floor import Cells, Discs, Wall, flooded, taken
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.utils.arrays import Bools, Floats
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.task.phases import Phase
 

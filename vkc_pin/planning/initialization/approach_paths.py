@@ -7,12 +7,12 @@ from collections.abc import Sequence, Sized
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.planning.chain.inverse_kinematics import PoseSolver
 from vkc_pin.planning.chain.pose import PoseRow
-from vkc_pin.planning.nlp.merit import TOLERANCE
-from vkc_pin.world.scene.hold import Hold
 from vkc_pin.planning.initialization.keyframes import Knots
+from vkc_pin.planning.nlp.merit import TOLERANCE
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.task.phases import FrameGoal, Phase
 
 __all__ = ["Approach"]

@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from vkc_pin.planning.base_paths.arcs import Curves, spread_along
+from vkc_pin.planning.base_paths.base_clearance import Shape, hull_points
+from vkc_pin.planning.base_paths.base_path import BasePath, poses_along, shortest_path
+from vkc_pin.planning.base_paths.grid import BaseGrid, fine_cells
+from vkc_pin.planning.initialization.keyframes import ALIKE, depth
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Bools, Floats
 from vkc_pin.world.collision.threads import available_threads
-from vkc_pin.planning.base_paths.base_clearance import Shape, hull_points
-from vkc_pin.planning.base_paths.arcs import Curves, spread_along
-from vkc_pin.planning.base_paths.grid import BaseGrid, fine_cells
-from vkc_pin.planning.base_paths.base_path import BasePath, poses_along, shortest_path
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.obstacles import FLOOR
-from vkc_pin.planning.initialization.keyframes import ALIKE, depth
 
 __all__ = ["Routes", "folded_arms", "grid_shapes"]
 

@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Bools, Floats, Ints
-from vkc_pin.planning.nlp.pose_goals import approach_at
-from vkc_pin.planning.initialization.keyframes import ALIKE, SCATTER, Knots
 from vkc_pin.planning.initialization.base_routes import Routes
+from vkc_pin.planning.initialization.keyframes import ALIKE, SCATTER, Knots
+from vkc_pin.planning.nlp.pose_goals import approach_at
+from vkc_pin.utils.arrays import Bools, Floats, Ints
 
 __all__ = ["Beam", "Found"]
 

@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Bools, Floats, Ints
-from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.initialization.keyframes import SCATTER, Knots, depth
 from vkc_pin.planning.initialization.rrt import STEP, spread
+from vkc_pin.planning.nlp.merit import TOLERANCE
+from vkc_pin.utils.arrays import Bools, Floats, Ints
 
 __all__ = ["held_path", "obstructed"]
 

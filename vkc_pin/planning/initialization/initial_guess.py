@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.trajectory.splicing import filled
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.task.phases import PhaseKey
+from vkc_pin.world.trajectory.splicing import filled
 
 __all__ = ["PhaseWaypoints", "Seed", "perturbed", "seed_of"]
 

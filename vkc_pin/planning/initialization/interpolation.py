@@ -6,13 +6,13 @@ from collections import Counter
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.planning.base_paths.arcs import Curves, between, spread_along
 from vkc_pin.planning.initialization.approach_paths import Approach
+from vkc_pin.planning.initialization.base_routes import Routes
 from vkc_pin.planning.initialization.constrained_rrt import held_path, obstructed
 from vkc_pin.planning.initialization.keyframes import Knots, smooth
-from vkc_pin.planning.initialization.base_routes import Routes
 from vkc_pin.planning.initialization.rrt import TRIES, connect, spread
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.task.phases import Phase
 
 __all__ = ["CurvePaths", "DrivenPaths", "Joiner", "Paths", "RrtPaths", "base_paths"]

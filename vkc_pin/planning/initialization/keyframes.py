@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Bools, Floats
-from vkc_pin.planning.chain.inverse_kinematics import PoseSolver
 from vkc_pin.planning.base_paths.arcs import Curves, nearest_arc
+from vkc_pin.planning.chain.inverse_kinematics import PoseSolver
+from vkc_pin.planning.initialization.collision_recovery import clear_out
 from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.planning.initialization.collision_recovery import clear_out
+from vkc_pin.utils.arrays import Bools, Floats
 
 __all__ = ["ALIKE", "SCATTER", "Knots", "Known", "depth", "follow_objects", "scatter", "smooth"]
 

@@ -9,16 +9,16 @@ from typing import ClassVar
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats, Ints
-from vkc_pin.planning.nlp.merit import Merit, infeasibility
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.initialization.approach_paths import Approach
+from vkc_pin.planning.initialization.base_routes import Routes
 from vkc_pin.planning.initialization.beam_search import Beam, Found
+from vkc_pin.planning.initialization.initial_guess import Seed, perturbed
 from vkc_pin.planning.initialization.interpolation import Joiner, RrtPaths, base_paths
 from vkc_pin.planning.initialization.keyframes import ALIKE, Knots, Known, follow_objects
-from vkc_pin.planning.initialization.base_routes import Routes
 from vkc_pin.planning.initialization.rrt import far_round
-from vkc_pin.planning.initialization.initial_guess import Seed, perturbed
+from vkc_pin.planning.nlp.merit import Merit, infeasibility
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.utils.arrays import Floats, Ints
 
 __all__ = ["INITIALIZATIONS", "initialize"]
 

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from vkc_pin.planning.initialization.keyframes import depth, smooth
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.budget import spend
 from vkc_pin.utils.optional_imports import compiled_module
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.planning.initialization.keyframes import depth, smooth
 
 __all__ = ["STEP", "TRIES", "connect", "far_round", "spread"]
 

@@ -15,8 +15,8 @@ from functools import cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Literal
 
-from vkc_pin.utils.arguments import instance, items, known, whole
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.utils.arguments import instance, items, known, whole
 
 if TYPE_CHECKING:
     import casadi

@@ -8,8 +8,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.planning.kinematics.machine_code import MachineCode
+from vkc_pin.utils.arrays import Floats
 
 __all__ = ["BatchFunction", "size_of"]
 

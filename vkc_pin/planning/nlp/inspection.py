@@ -9,12 +9,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from vkc_pin.options import Options
+from vkc_pin.planning.chain.contacts import ContactModel
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arguments import instance
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.utils.cache import Cache
-from vkc_pin.planning.chain.contacts import ContactModel
-from vkc_pin.options import Options
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.phases import stretches

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.planning.chain.contacts import Contacts
 from vkc_pin.planning.chain.pose import AWAY, away_from
-from vkc_pin.planning.nlp.timing import Timing
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.planning.nlp.timing import Timing
+from vkc_pin.utils.arrays import Floats
 
 __all__ = ["GROWTH", "TOLERANCE", "Infeasibility", "Merit", "infeasibility", "shortfalls"]
 

@@ -8,9 +8,9 @@ from typing import Literal
 import numpy as np
 import pinocchio as pin
 
+from vkc_pin.options import Options
 from vkc_pin.planning.chain.chain import VirtualKinematicChain
 from vkc_pin.planning.chain.pose import PoseRow
-from vkc_pin.options import Options
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.phases import Task
 

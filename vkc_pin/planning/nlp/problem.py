@@ -8,25 +8,25 @@ from functools import cached_property
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats
-from vkc_pin.utils.cache import Cache
+from vkc_pin.options import Options
 from vkc_pin.planning.chain.chain import VirtualKinematicChain, consolidate
 from vkc_pin.planning.chain.contacts import ContactModel, Contacts
 from vkc_pin.planning.chain.pose import ROW_BOUNDS, target_vector
-from vkc_pin.world.models.coordinates import wrapped
 from vkc_pin.planning.nlp.objective import Effort
-from vkc_pin.world.trajectory.wheels import rolling_of
-from vkc_pin.planning.nlp.timing import Timing, runs_between, time_for
-from vkc_pin.options import Options
 from vkc_pin.planning.nlp.pose_goals import approach_at, chosen_freedoms, pose_goals, pushed_steps
 from vkc_pin.planning.nlp.term_locations import TermNumbers, term_goals
 from vkc_pin.planning.nlp.term_rows import TermRow
+from vkc_pin.planning.nlp.timing import Timing, runs_between, time_for
 from vkc_pin.planning.nlp.transcription import transcribe
 from vkc_pin.planning.nlp.waypoint import Structure
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.cache import Cache
+from vkc_pin.world.models.coordinates import wrapped
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.phases import Phase, Task
 from vkc_pin.world.task.terms import Term
+from vkc_pin.world.trajectory.wheels import rolling_of
 
 __all__ = ["TrajectoryProblem"]
 

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Floats
+from vkc_pin.errors import InputError
 from vkc_pin.planning.chain.chain import VirtualKinematicChain
 from vkc_pin.planning.chain.pose import target_vector
-from vkc_pin.errors import InputError
 from vkc_pin.planning.nlp.term_rows import FrameAt, TermAt, TermRow, Tree, Value
 from vkc_pin.planning.nlp.transcription import Transcription
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.phases import Task, stretches
 from vkc_pin.world.task.terms import Cost, Term

@@ -10,12 +10,12 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Ints
-from vkc_pin.utils.cache import Cache
 from vkc_pin.planning.chain.kinematics import kinematics_of
 from vkc_pin.planning.kinematics.batch import size_of
-from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.planning.nlp.sparse import assemble
+from vkc_pin.utils.arrays import Ints
+from vkc_pin.utils.cache import Cache
+from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.task.formula import Formula
 
 __all__ = ["FrameAt", "TermAt", "TermProgram", "TermRow", "Tree", "Value"]

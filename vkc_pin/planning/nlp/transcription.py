@@ -15,19 +15,19 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats, Ints
-from vkc_pin.utils.budget import spend
-from vkc_pin.utils.cache import Cache
 from vkc_pin.planning.chain.inverse_kinematics import PoseSolver
 from vkc_pin.planning.chain.pose import AWAY
 from vkc_pin.planning.kinematics.machine_code import MachineCode
-from vkc_pin.world.models.coordinates import Coordinates
-from vkc_pin.planning.nlp.objective import changed_at
-from vkc_pin.world.trajectory.wheels import Rolling
 from vkc_pin.planning.nlp.ipopt import ENTRY, Ipopt, ipopt
+from vkc_pin.planning.nlp.objective import changed_at
 from vkc_pin.planning.nlp.sparse import assemble, curvature, differences, sparse
 from vkc_pin.planning.nlp.term_rows import TermProgram
 from vkc_pin.planning.nlp.waypoint import StepRows, Structure, waypoint_functions
+from vkc_pin.utils.arrays import Floats, Ints
+from vkc_pin.utils.budget import spend
+from vkc_pin.utils.cache import Cache
+from vkc_pin.world.models.coordinates import Coordinates
+from vkc_pin.world.trajectory.wheels import Rolling
 
 __all__ = ["Transcription", "transcribe"]
 

@@ -13,17 +13,17 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Floats, Ints
-from vkc_pin.utils.budget import spend
-from vkc_pin.utils.cache import Cache
 from vkc_pin.planning.chain.kinematics import kinematics_of
 from vkc_pin.planning.chain.pose import AWAY, PoseRow, pose_rows, receded
 from vkc_pin.planning.kinematics.batch import size_of
 from vkc_pin.planning.kinematics.machine_code import MachineCode
-from vkc_pin.world.models.coordinates import Coordinates
-from vkc_pin.world.trajectory.wheels import ANYWHERE, Rolling
 from vkc_pin.planning.nlp.sparse import assemble
 from vkc_pin.planning.nlp.term_rows import TermRow
+from vkc_pin.utils.arrays import Floats, Ints
+from vkc_pin.utils.budget import spend
+from vkc_pin.utils.cache import Cache
+from vkc_pin.world.models.coordinates import Coordinates
+from vkc_pin.world.trajectory.wheels import ANYWHERE, Rolling
 
 __all__ = ["StepRows", "Structure", "WaypointFunctions", "waypoint_functions"]
 

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vkc_pin.planning.retiming.limits import Limits
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.trajectory.curve import Curve, moments_at
-from vkc_pin.planning.retiming.limits import Limits
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicHermiteSpline

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.wheels import Rolling
-from vkc_pin.world.scene.scene import Scene
 
 __all__ = ["Limits"]
 

@@ -7,9 +7,9 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.planning.retiming.retime import retimed
 from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["accepted"]
 

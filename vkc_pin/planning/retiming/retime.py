@@ -10,19 +10,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Bools, Floats, Ints
 from vkc_pin.planning.base_paths.arcs import between
-from vkc_pin.world.trajectory.curve import SHORTEST, Curve, joined, moments_at
-from vkc_pin.world.trajectory.dynamics.torques import Torques
-from vkc_pin.world.trajectory.wheels import Rolling, rolling_of
-from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.planning.retiming.jerk_limits import eased
 from vkc_pin.planning.retiming.limits import Limits
-from vkc_pin.planning.retiming.torque_bounds import Load
-from vkc_pin.planning.retiming.topp_ra import speeds_along
 from vkc_pin.planning.retiming.spline_path import path_through
+from vkc_pin.planning.retiming.topp_ra import speeds_along
+from vkc_pin.planning.retiming.torque_bounds import Load
 from vkc_pin.planning.retiming.wheeled_paths import rolling_paths, slip
+from vkc_pin.utils.arrays import Bools, Floats, Ints
 from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.curve import SHORTEST, Curve, joined, moments_at
+from vkc_pin.world.trajectory.dynamics.torques import Torques
+from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.wheels import Rolling, rolling_of
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicHermiteSpline

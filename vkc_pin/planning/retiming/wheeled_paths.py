@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vkc_pin.planning.retiming.spline_path import path_through
 from vkc_pin.utils.arrays import Bools, Floats
 from vkc_pin.world.trajectory.curve import Curve, moments_at
 from vkc_pin.world.trajectory.wheels import Rolling, seen
-from vkc_pin.planning.retiming.spline_path import path_through
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicHermiteSpline

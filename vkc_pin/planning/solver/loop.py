@@ -7,16 +7,16 @@ from collections.abc import Callable
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats
-from vkc_pin.utils.budget import ENDINGS, SpentError, spend
 from vkc_pin.planning.chain.contacts import Contacts
 from vkc_pin.planning.nlp.merit import TOLERANCE, Infeasibility, Merit, infeasibility
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.solver.segment_planes import collisions_between, merge
-from vkc_pin.planning.solver.tunnelling import Passage, new
 from vkc_pin.planning.solver.solution import Iteration, Solution
 from vkc_pin.planning.solver.subproblem import Subproblem
 from vkc_pin.planning.solver.trust_region import BLOCK_TIME, CLOSE_ENOUGH, INSIDE, Trial, TrustRegion, judge
+from vkc_pin.planning.solver.tunnelling import Passage, new
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.budget import ENDINGS, SpentError, spend
 
 __all__ = ["solve"]
 

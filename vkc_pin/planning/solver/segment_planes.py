@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.planning.chain.contacts import Contacts, no_contacts
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.planning.solver.tunnelling import Passage, passages
 from vkc_pin.planning.solver.trust_region import CLOSE_ENOUGH
+from vkc_pin.planning.solver.tunnelling import Passage, passages
+from vkc_pin.utils.arrays import Floats, Ints
 
 __all__ = ["Between", "collisions_between", "merge"]
 

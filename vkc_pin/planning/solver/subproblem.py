@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.planning.chain.contacts import Contacts
-from vkc_pin.planning.nlp.timing import Timing
-from vkc_pin.utils.optional_imports import compiled_module
 from vkc_pin.planning.nlp.merit import TOLERANCE, Infeasibility, Merit, shortfalls
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.planning.nlp.timing import Timing
 from vkc_pin.planning.solver.solution import Solution
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.optional_imports import compiled_module
 
 __all__ = ["Step", "Subproblem", "linear_solver"]
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
 
 __all__ = ["as_trajectory"]
 

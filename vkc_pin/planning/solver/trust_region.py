@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.planning.chain.contacts import Contacts
 from vkc_pin.planning.nlp.merit import Infeasibility
 from vkc_pin.planning.solver.tunnelling import Passage
+from vkc_pin.utils.arrays import Floats
 
 __all__ = ["Trial", "TrustRegion", "judge"]
 

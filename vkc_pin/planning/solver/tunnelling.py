@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.planning.chain.contacts import ContactModel, Contacts
+from vkc_pin.utils.arrays import Floats, Ints
 
 __all__ = ["Passage", "new", "passages"]
 

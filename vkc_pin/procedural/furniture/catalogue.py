@@ -12,15 +12,13 @@ from typing import Any
 import numpy as np
 import yaml
 
-from vkc_pin.utils.arguments import known, mapping, whole
 from vkc_pin.errors import InputError
-from vkc_pin.world.files.resources import file_path
-from vkc_pin.world.files.writing import write_atomically
-from vkc_pin.procedural.furniture import flaps
-from vkc_pin.procedural.furniture import leaves
-from vkc_pin.procedural.furniture import valves
+from vkc_pin.procedural.furniture import flaps, leaves, valves
 from vkc_pin.procedural.furniture.building import Article
 from vkc_pin.procedural.furniture.draws import Draws
+from vkc_pin.utils.arguments import known, mapping, whole
+from vkc_pin.world.files.resources import file_path
+from vkc_pin.world.files.writing import write_atomically
 from vkc_pin.world.models.object_file import load_object
 
 __all__ = ["KINDS", "Kind", "random_object", "write_object"]

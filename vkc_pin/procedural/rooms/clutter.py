@@ -11,9 +11,9 @@ import coal
 import numpy as np
 import pinocchio as pin
 
+from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import instance, whole
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.errors import InputError
 from vkc_pin.world.models.shapes import world_box
 from vkc_pin.world.scene.placed_object import standing_geometry
 from vkc_pin.world.scene.scene import Scene

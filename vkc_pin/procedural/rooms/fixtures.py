@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.procedural.furniture.catalogue import KINDS, random_object
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.resources import available
 from vkc_pin.world.models.articulated_object import ArticulatedObject
-from vkc_pin.procedural.furniture.catalogue import KINDS, random_object
 from vkc_pin.world.models.object_file import load_object
 from vkc_pin.world.models.shapes import world_box
 from vkc_pin.world.scene.placed_object import PlacedObject, standing_geometry

@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arguments import instance, whole
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.world.files.resources import folder
-from vkc_pin.world.models.robot import Robot
-from vkc_pin.world.models.robot_file import load_robot
-from vkc_pin.world.models.shapes import world_box
 from vkc_pin.procedural.rooms import parts
 from vkc_pin.procedural.rooms.fixtures import OPENED, Fixture, fixture, own_name
 from vkc_pin.procedural.rooms.footprints import Floor, Frame
 from vkc_pin.procedural.rooms.parts import Part
 from vkc_pin.procedural.rooms.settings import RoomSettings
+from vkc_pin.utils.arguments import instance, whole
+from vkc_pin.world.files.resources import folder
+from vkc_pin.world.models.robot import Robot
+from vkc_pin.world.models.robot_file import load_robot
+from vkc_pin.world.models.shapes import world_box
 from vkc_pin.world.scene.scene import START_CLEARANCE, Scene
 
 __all__ = ["Layout", "random_layout", "random_room"]

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vkc_pin.utils.arguments import is_number, items, known, mapping, text, whole
 from vkc_pin.errors import InputError, shown
-from vkc_pin.world.files.resources import file_path
 from vkc_pin.procedural.rooms.fixtures import known_objects
 from vkc_pin.procedural.rooms.parts import CARRIED
+from vkc_pin.utils.arguments import is_number, items, known, mapping, text, whole
+from vkc_pin.world.files.resources import file_path
 
 __all__ = ["RoomSettings"]
 

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.models.robot import Robot
 from vkc_pin.simulation.cameras.mount import Camera
 from vkc_pin.simulation.model import Builder, quaternion
 from vkc_pin.simulation.replay import Executed
 from vkc_pin.simulation.snapshots import Stage, drawing_context
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.models.robot import Robot
 
 __all__ = ["ROBOT", "Images", "taken"]
 

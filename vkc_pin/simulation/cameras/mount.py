@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.robot import Robot
 
 __all__ = ["BASE", "HAND", "Camera", "check_frame", "frame_of"]

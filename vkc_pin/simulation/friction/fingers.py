@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.errors import InputError
-from vkc_pin.world.models.grippers.bar_width import bar_fits, widest_bar
-from vkc_pin.world.models.shapes import triangles
-from vkc_pin.world.trajectory.world_model import World
 from vkc_pin.simulation.model import Builder, PhysicalWorld, quaternion
 from vkc_pin.simulation.physics import Physics
 from vkc_pin.simulation.servos import Servo, position_servo
+from vkc_pin.utils.arrays import Floats, Ints
+from vkc_pin.world.models.grippers.bar_width import bar_fits, widest_bar
+from vkc_pin.world.models.shapes import triangles
+from vkc_pin.world.trajectory.world_model import World
 
 __all__ = ["Fingers", "Sides", "fingers_of", "limited"]
 

@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Bools, Floats
-from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.scene.contact_rules import grasped, touching
-from vkc_pin.world.scene.hold import Hold
 from vkc_pin.simulation.friction.fingers import Fingers
-from vkc_pin.simulation.welds import Grip
 from vkc_pin.simulation.model import PhysicalWorld
 from vkc_pin.simulation.physics import Physics, engine
+from vkc_pin.simulation.welds import Grip
+from vkc_pin.utils.arrays import Bools, Floats
+from vkc_pin.world.scene.contact_rules import grasped, touching
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["Span", "Squeezes", "grip_changes", "split"]
 

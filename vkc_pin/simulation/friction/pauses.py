@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.errors import InputError
+from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.trajectory import Trajectory
 

@@ -7,9 +7,9 @@ import itertools
 import numpy as np
 
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.trajectory.dynamics.torques import Moments
 from vkc_pin.validation.report import Bound
 from vkc_pin.validation.samples import Samples
+from vkc_pin.world.trajectory.dynamics.torques import Moments
 
 __all__ = ["bounds"]
 

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.options import Options
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.samples import Samples
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.utils.arrays import Floats, Ints
-from vkc_pin.world.trajectory.dynamics.torques import Moments, Torques, moments_of
 from vkc_pin.validation.dynamics.bounds import bounds
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.samples import Samples
+from vkc_pin.world.trajectory.dynamics.torques import Moments, Torques, moments_of
 
 __all__ = ["TORQUE_TOLERANCE", "Motors"]
 

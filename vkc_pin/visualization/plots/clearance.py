@@ -8,15 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vkc_pin.utils.arrays import Floats, Ints
-from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.trajectory.world_model import World
 from vkc_pin.options import Options
-from vkc_pin.world.scene.contact_rules import grasped, touching
-from vkc_pin.world.scene.clearance_exemptions import allowances
-from vkc_pin.world.scene.scene import Scene
+from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.validation.distances import Solids
 from vkc_pin.validation.pairs import PairTable
+from vkc_pin.world.scene.clearance_exemptions import allowances
+from vkc_pin.world.scene.contact_rules import grasped, touching
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.world_model import World
 
 __all__ = ["ClearanceCurve", "clearance_curves"]
 

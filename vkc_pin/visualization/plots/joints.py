@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.visualization.plots.style import COLOURS, shade_phases
 from vkc_pin.validation.report import Judged
+from vkc_pin.visualization.plots.style import COLOURS, shade_phases
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

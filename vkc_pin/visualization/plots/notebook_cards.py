@@ -10,13 +10,13 @@ from typing import Any, cast
 
 import numpy as np
 
-from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.trajectory.world_model import World
 from vkc_pin.utils.notebook import card
+from vkc_pin.validation.report import Judged
 from vkc_pin.visualization.plots.style import STYLE
 from vkc_pin.visualization.plots.top_view import draw_top_view
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.validation.report import Judged
+from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.world_model import World
 
 __all__ = ["motion_html", "scene_html"]
 

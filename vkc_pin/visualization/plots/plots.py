@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vkc_pin.errors import InputError
-from vkc_pin.world.files.resources import file_path
-from vkc_pin.world.trajectory.world_model import World
+from vkc_pin.validation.report import Judged
 from vkc_pin.visualization.plots.clearance import clearance_curves
 from vkc_pin.visualization.plots.joints import SAMPLES, draw_joints, groups_of, name_phases
 from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, shade_phases, styled
 from vkc_pin.visualization.plots.top_view import draw_top_view
-from vkc_pin.validation.report import Judged
+from vkc_pin.world.files.resources import file_path
+from vkc_pin.world.trajectory.world_model import World
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure, FigureBase

@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.errors import InputError
-from vkc_pin.world.files.resources import file_path
-from vkc_pin.world.models.shapes import triangles
-from vkc_pin.world.trajectory.world_model import World
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.visualization.plots.plots import PICTURES
 from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, styled
 from vkc_pin.visualization.plots.top_view import draw_top_view, outline
+from vkc_pin.world.files.resources import file_path
+from vkc_pin.world.models.shapes import triangles
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.world_model import World
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -6,8 +6,8 @@ import io
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vkc_pin.world.files.writing import write_atomically
 from vkc_pin.utils.notebook import in_notebook
+from vkc_pin.world.files.writing import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

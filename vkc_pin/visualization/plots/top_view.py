@@ -9,10 +9,10 @@ import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.shapes import triangles
+from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.trajectory.placements import sample_motion
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
-from vkc_pin.world.scene.obstacles import FLOOR
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,10 +10,10 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.errors import BuildError, InputError
-from vkc_pin.world.files.meshes import indices
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.optional_imports import REBUILD, compiled_module
+from vkc_pin.world.files.meshes import indices
 
 __all__ = ["compiled", "solid_of"]
 

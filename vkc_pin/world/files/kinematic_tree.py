@@ -13,8 +13,8 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 
-from vkc_pin.utils.arrays import LARGEST
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.utils.arrays import LARGEST
 from vkc_pin.world.files.xml import line_of, replace_forbidden
 
 __all__ = ["MOMENTS", "check_tree", "inertial_of", "numbers_of", "origin_of", "plain_tree"]

@@ -18,8 +18,8 @@ import coal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vkc_pin.utils.arrays import LARGEST, Floats, Ints
 from vkc_pin.errors import InputError
+from vkc_pin.utils.arrays import LARGEST, Floats, Ints
 from vkc_pin.world.files.hulls import FLAT, compute_hull, outer_hull, thickened
 from vkc_pin.world.files.resources import file_path
 from vkc_pin.world.files.xml import check_indices

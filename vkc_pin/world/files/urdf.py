@@ -13,8 +13,8 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.errors import InputError
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files import resources
 from vkc_pin.world.files.kinematic_tree import check_tree, numbers_of, plain_tree
 from vkc_pin.world.files.meshes import load_convex, load_mesh, to_bvh

@@ -12,9 +12,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from vkc_pin.errors import InputError, shown
+from vkc_pin.utils.interrupt import deferred
 from vkc_pin.world.files.documents import parse_json, read_text
 from vkc_pin.world.files.resources import file_path
-from vkc_pin.utils.interrupt import deferred
 
 __all__ = [
     "check_inside",

@@ -13,9 +13,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
+from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import known, number, numbers
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.errors import InputError
 from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.models.dynamics.joint_resistance import Resistance
 from vkc_pin.world.models.dynamics.mass import mass_of

@@ -12,9 +12,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
+from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import known, numbers
 from vkc_pin.utils.arrays import Bools, Floats, Ints
-from vkc_pin.errors import InputError
 
 __all__ = ["Coordinates", "Moved", "wrapped"]
 

@@ -11,8 +11,8 @@ import numpy as np
 import pinocchio as pin
 from pydantic import Field, model_validator
 
-from vkc_pin.utils.arguments import mapping
 from vkc_pin.errors import InputError
+from vkc_pin.utils.arguments import mapping
 from vkc_pin.world.files.documents import Document, check, read_yaml
 from vkc_pin.world.files.fields import (
     Name,
@@ -28,7 +28,14 @@ from vkc_pin.world.files.fields import (
 )
 from vkc_pin.world.files.resources import file_path, located
 from vkc_pin.world.files.urdf import load_urdf
-from vkc_pin.world.models.articulated_object import DEFAULT_ACCELERATION, DEFAULT_VELOCITY, ArticulatedObject, Attachment, Freedom, Latch
+from vkc_pin.world.models.articulated_object import (
+    DEFAULT_ACCELERATION,
+    DEFAULT_VELOCITY,
+    ArticulatedObject,
+    Attachment,
+    Freedom,
+    Latch,
+)
 from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.models.dynamics.joint_resistance import ObjectJointSchema, resistances
 from vkc_pin.world.models.dynamics.mass import weigh

@@ -14,9 +14,9 @@ import coal
 import numpy as np
 import pinocchio as pin
 
+from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import whole
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.errors import InputError
 from vkc_pin.world.files.urdf import UrdfFile
 from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.models.dynamics.torque_limits import Efforts, efforts

@@ -11,8 +11,8 @@ from typing import Literal, get_args
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arguments import mapping, quantity, text
 from vkc_pin.errors import InputError, UnknownNameError, shown
+from vkc_pin.utils.arguments import mapping, quantity, text
 from vkc_pin.world.files import resources
 from vkc_pin.world.files.documents import Document
 from vkc_pin.world.files.resources import file_path

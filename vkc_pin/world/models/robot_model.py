@@ -8,8 +8,8 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.errors import InputError
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.meshes import load_parts, to_bvh
 from vkc_pin.world.files.urdf import UrdfFile, UrdfShape, tree_model
 from vkc_pin.world.models.couplings.coupled_joints import Following, coupled_groups, followers, path_to

@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from vkc_pin.utils.arguments import quantity
 from vkc_pin.errors import InputError
+from vkc_pin.utils.arguments import quantity
 from vkc_pin.world.files.documents import Document, check, read_yaml
 from vkc_pin.world.files.fields import JointSchema, NotNegative, Number, Positive, Schema, require, text_for
 

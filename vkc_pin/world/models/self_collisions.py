@@ -17,10 +17,10 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.disk_cache import record
 from vkc_pin.world.files.srdf import Srdf
 from vkc_pin.world.files.writing import write_atomically
 from vkc_pin.world.files.xml import quote
-from vkc_pin.utils.disk_cache import record
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_model import neighbours
 from vkc_pin.world.models.shapes import LinkDistances, ShapeDistances

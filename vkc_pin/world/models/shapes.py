@@ -9,8 +9,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from vkc_pin.utils.arrays import Bools, Floats, Ints
 from vkc_pin.errors import InputError
+from vkc_pin.utils.arrays import Bools, Floats, Ints
 from vkc_pin.world.files.meshes import indices
 from vkc_pin.world.models.grafting import clean
 

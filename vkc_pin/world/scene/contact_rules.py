@@ -26,11 +26,11 @@ from collections.abc import Collection, Iterable
 
 import pinocchio as pin
 
+from vkc_pin.options import Options
 from vkc_pin.world.models.articulated_object import Attachment
 from vkc_pin.world.models.robot import Robot
-from vkc_pin.options import Options
-from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.clearance_exemptions import CONTACT
+from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
 
 __all__ = [

@@ -13,8 +13,8 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arguments import instance, items, mapping, numbers, text
 from vkc_pin.errors import InputError, UnknownNameError, shown
+from vkc_pin.utils.arguments import instance, items, mapping, numbers, text
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.shapes import clearance, placed_shapes, within_limits
 from vkc_pin.world.scene.placed_object import PlacedObject, standing_geometry

@@ -10,10 +10,10 @@ from types import MappingProxyType
 import numpy as np
 import pinocchio as pin
 
+from vkc_pin.errors import UnknownNameError
 from vkc_pin.utils.arguments import mapping, number
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.collision.placements import columns_of
-from vkc_pin.errors import UnknownNameError
 from vkc_pin.world.models.articulated_object import ArticulatedObject
 from vkc_pin.world.models.shapes import bounding_box, copy_shape, link_name, within_limits
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from vkc_pin.errors import InputError, shown
 from vkc_pin.utils.arguments import numbers
 from vkc_pin.utils.arrays import LARGEST
-from vkc_pin.errors import InputError, shown
 
 __all__ = ["as_placement", "as_target"]
 

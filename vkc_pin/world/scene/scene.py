@@ -15,14 +15,14 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
+from vkc_pin.errors import InputError, shown
 from vkc_pin.utils.arguments import instance, is_number, known, mapping, numbers
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.errors import InputError, shown
+from vkc_pin.utils.notebook import show
 from vkc_pin.world.files.resources import file_path, located
 from vkc_pin.world.models.shapes import clearance, placed_shapes, within_limits
-from vkc_pin.utils.notebook import show
-from vkc_pin.world.scene.hold import Hold, checked_holds, holds_of, in_hand, misdirected, warn_of_openings
 from vkc_pin.world.scene.clearance_exemptions import warn_of_overlaps
+from vkc_pin.world.scene.hold import Hold, checked_holds, holds_of, in_hand, misdirected, warn_of_openings
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import PlacedObject, standing_geometry
 from vkc_pin.world.scene.poses import as_placement

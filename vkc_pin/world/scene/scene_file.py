@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.errors import nearest_name
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.documents import Document, check
 from vkc_pin.world.files.resources import file_path
 from vkc_pin.world.files.srdf import read_srdf

@@ -9,7 +9,19 @@ import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.files.fields import Name, NotNegative, Number, Positive, Quaternion, Schema, Vector3, count, fail, require, text_for
+from vkc_pin.world.files.fields import (
+    Name,
+    NotNegative,
+    Number,
+    Positive,
+    Quaternion,
+    Schema,
+    Vector3,
+    count,
+    fail,
+    require,
+    text_for,
+)
 from vkc_pin.world.models.robot import Base
 
 __all__ = [

@@ -10,10 +10,10 @@ import pinocchio as pin
 
 from vkc_pin.options import Options
 from vkc_pin.world.scene.placed_object import standing_geometry
-from vkc_pin.world.scene.support import supports
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.task.compiler import compile_task, nothing_to_do
+from vkc_pin.world.scene.support import supports
 from vkc_pin.world.task.actuation import driving
+from vkc_pin.world.task.compiler import compile_task, nothing_to_do
 from vkc_pin.world.task.phases import Task
 from vkc_pin.world.task.steps import Actuate, Grasp, Place, Release, Step, as_list
 

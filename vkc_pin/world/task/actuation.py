@@ -11,8 +11,8 @@ from itertools import product
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.errors import InputError
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.articulated_object import Attachment, Latch
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.placed_object import PlacedObject

@@ -17,8 +17,8 @@ from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.actuation import clash, driven, driver, latched, pushed_ways
 from vkc_pin.world.task.lookup import attachment_of, check_link, joint_limits, openings, path_joints, placed_object, robot_frame
 from vkc_pin.world.task.phases import FrameGoal, Mark, Phase, PhaseKind, Task
-from vkc_pin.world.task.supported_objects import Riders
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch, as_list
+from vkc_pin.world.task.supported_objects import Riders
 
 __all__ = ["compile_task", "nothing_to_do"]
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import pinocchio as pin
 
-from vkc_pin.utils.arguments import known
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.utils.arguments import known
 from vkc_pin.world.models.articulated_object import Attachment
 from vkc_pin.world.scene.contact_rules import in_gripper, opening_at_start, opening_for
 from vkc_pin.world.scene.placed_object import PlacedObject

@@ -8,8 +8,8 @@ from typing import Any
 
 import pinocchio as pin
 
-from vkc_pin.utils.arguments import items, known, mapping, quantity, text
 from vkc_pin.errors import InputError, UnknownNameError, shown
+from vkc_pin.utils.arguments import items, known, mapping, quantity, text
 from vkc_pin.world.scene.poses import as_placement, as_target
 
 __all__ = [

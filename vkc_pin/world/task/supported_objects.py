@@ -11,8 +11,8 @@ from vkc_pin.errors import InputError
 from vkc_pin.world.models.shapes import link_name
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.placed_object import PlacedObject, standing_geometry
-from vkc_pin.world.scene.support import LEVEL, Ride, borne, supports, tilt
 from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.scene.support import LEVEL, Ride, borne, supports, tilt
 
 __all__ = ["Riders", "after_ride", "rides_of", "where_now"]
 

@@ -14,9 +14,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from vkc_pin.errors import InputError, UnknownNameError, shown
 from vkc_pin.utils.arguments import items, mapping, number, numbers
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.errors import InputError, UnknownNameError, shown
 from vkc_pin.world.task.formula import Formula, State
 
 if TYPE_CHECKING:

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import numbers
 from vkc_pin.utils.arrays import Floats, Ints
-from vkc_pin.errors import InputError
 
 __all__ = ["SHORTEST", "Curve", "evenly", "joined", "moments_at"]
 

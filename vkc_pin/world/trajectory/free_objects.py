@@ -10,11 +10,11 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.scene.placed_object import PlacedObject
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.scene.support import borne
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.scene.placed_object import PlacedObject
-from vkc_pin.world.scene.support import borne
-from vkc_pin.world.scene.scene import Scene
 
 __all__ = ["FreeObjects", "as_numbers"]
 

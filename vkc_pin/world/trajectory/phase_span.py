@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from vkc_pin.utils.arguments import mapping, number, text, whole
 from vkc_pin.errors import InputError
+from vkc_pin.utils.arguments import mapping, number, text, whole
 from vkc_pin.world.scene.hold import Hold, holds_of, in_order
 
 __all__ = ["PhaseSpan", "part_of"]

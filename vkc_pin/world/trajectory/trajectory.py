@@ -11,13 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import finite, instance, items, known, mapping, number, text, whole
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.errors import InputError
 from vkc_pin.world.trajectory.curve import Curve, evenly
-from vkc_pin.world.trajectory.formats import ros
-from vkc_pin.world.trajectory.formats import rosbag
-from vkc_pin.world.trajectory.formats import tables
+from vkc_pin.world.trajectory.formats import ros, rosbag, tables
 from vkc_pin.world.trajectory.phase_span import PhaseSpan, part_of
 
 __all__ = ["Trajectory"]

@@ -19,12 +19,12 @@ from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.models.grafting import graft, graft_geometry
 from vkc_pin.world.models.grippers.gripper import Gripper
 from vkc_pin.world.models.shapes import link_name
-from vkc_pin.world.trajectory.free_objects import FreeObjects, as_numbers
-from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.scene.clearance_exemptions import shape_keys
 from vkc_pin.world.scene.contact_rules import opening_at_start
 from vkc_pin.world.scene.hold import Hold
-from vkc_pin.world.scene.clearance_exemptions import shape_keys
 from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.free_objects import FreeObjects, as_numbers
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["FREE_JOINT", "World", "scene_after", "units_of"]
 

@@ -13,12 +13,12 @@ from oracle.plan import read_plan
 from oracle.stage import World as Judged
 
 import vkc_pin as vkc
+from vkc_pin.validation.dynamics.torques import Motors
+from vkc_pin.validation.samples import Samples
 from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.dynamics.torques import Torques
 from vkc_pin.world.trajectory.trajectory import PhaseSpan, Trajectory
 from vkc_pin.world.trajectory.world_model import World
-from vkc_pin.validation.dynamics.torques import Motors
-from vkc_pin.validation.samples import Samples
 
 
 def swung(mass: float, *, base: float = 0.0) -> tuple[vkc.Scene, Trajectory]:

@@ -20,8 +20,7 @@ import numpy as np
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.baselines import attempt
-from vkc_pin.baselines import following
+from vkc_pin.baselines import attempt, following
 from vkc_pin.world.trajectory.formats import archives
 from vkc_pin.world.trajectory.formats.archives import METRICS, STATUSES, read_archive, write_archive
 

@@ -15,10 +15,10 @@ from hypothesis.extra.numpy import arrays
 from scipy.interpolate import PchipInterpolator
 
 import vkc_pin as vkc
+from vkc_pin.planning.plan import Plan
 from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.formats.ros import along, rates
 from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.planning.plan import Plan
 
 COLUMNS = arrays(float, st.tuples(st.integers(2, 8), st.integers(1, 3)), elements=st.floats(-10.0, 10.0))
 

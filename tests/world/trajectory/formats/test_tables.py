@@ -17,11 +17,11 @@ from hypothesis import given
 
 import vkc_pin as vkc
 from vkc_pin import cli
-from vkc_pin.world.trajectory.phase_span import PhaseSpan
-from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.planning.outcome import spent
 from vkc_pin.planning.plan import Plan
 from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,8 @@ from collections.abc import Set
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.errors import InputError
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.urdf import UrdfFile
 from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.models.couplings.coupled_joints import check_followers, coupled_groups

@@ -13,9 +13,9 @@ from functools import cached_property
 import numpy as np
 import pinocchio as pin
 
+from vkc_pin.errors import InputError
 from vkc_pin.utils import arguments
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.errors import InputError
 from vkc_pin.world.files.documents import Document
 from vkc_pin.world.files.urdf import UrdfFile
 from vkc_pin.world.models.coordinates import Coordinates

@@ -11,12 +11,12 @@ import pinocchio as pin
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.world.models.articulated_object import ArticulatedObject
 from vkc_pin.world.models.dynamics.torque_limits import Efforts
-from vkc_pin.world.trajectory.free_objects import FreeObjects
+from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.curve import Curve, moments_at
 from vkc_pin.world.trajectory.dynamics.handles import Handle, Motion
-from vkc_pin.world.trajectory.wheels import seen
+from vkc_pin.world.trajectory.free_objects import FreeObjects
 from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.wheels import seen
 
 __all__ = ["Moments", "Torques", "in_base_axes", "moments_of"]
 

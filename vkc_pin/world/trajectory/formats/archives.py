@@ -16,8 +16,8 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model, model_validator
 from pydantic.types import FailFast
 
-from vkc_pin.utils.arguments import finite
 from vkc_pin.errors import InputError
+from vkc_pin.utils.arguments import finite
 from vkc_pin.world.files.documents import MOST_FIELDS, Document, check, parse_json, read_bytes
 from vkc_pin.world.files.fields import Schema, fail
 from vkc_pin.world.files.resources import folder

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from vkc_pin.errors import InputError, shown
 from vkc_pin.utils.arguments import flag, is_number, number, text, whole
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.errors import InputError, shown
 from vkc_pin.world.files.resources import file_path
 from vkc_pin.world.trajectory.curve import Curve, evenly
 from vkc_pin.world.trajectory.formats.tables import chosen_columns, one_phase, read_json, size_of_robot

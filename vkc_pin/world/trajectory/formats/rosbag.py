@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.utils.arguments import number, text
 from vkc_pin.errors import InputError
+from vkc_pin.utils.arguments import number, text
+from vkc_pin.utils.optional_imports import optional_package
 from vkc_pin.world.files.writing import folder_at_once
 from vkc_pin.world.trajectory.formats.ros import to_ros
-from vkc_pin.utils.optional_imports import optional_package
 
 __all__ = ["TOPICS", "bag_library", "write_rosbag"]
 

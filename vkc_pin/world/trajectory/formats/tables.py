@@ -16,8 +16,8 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from vkc_pin.utils.arguments import items, mapping, text, whole
 from vkc_pin.errors import InputError, UnknownNameError, shown
+from vkc_pin.utils.arguments import items, mapping, text, whole
 from vkc_pin.world.files.documents import parse_json, read_text
 from vkc_pin.world.files.resources import file_path
 from vkc_pin.world.files.writing import write_atomically
